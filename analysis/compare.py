@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Options:
-    """What is compared, and how."""
+    """Options of ``rgbt compare``."""
 
     a: Annotated[
         str,
@@ -99,7 +99,7 @@ def main(options: Options, overrides: list[str]) -> int:
     from rgbt.metrics.named import parse
     from rgbt.tracking.terminal import path_lines, print_rich, rich_table
 
-    del overrides  # none is heeded
+    del overrides  # none takes effect
     check_out(options.out)
     opened = _opened(options)
     a, b = _counts(opened, options.missing)
@@ -138,10 +138,10 @@ def main(options: Options, overrides: list[str]) -> int:
 
 
 def metrics_of(text: str, every: Sequence[Counts], settings: Resampling) -> list[str]:
-    """The metrics asked for; "auto": those that the counts are known by, also by day and by night.
+    """The requested metrics; "auto": the usual scores of the counts, also by day and by night.
 
     Of single frames mIoU (by day, by night) and Var and every region; of pairs of frames the two
-    of their protocol (by day, by night). Day and night where all counts tell them apart and hold
+    of their protocol (by day, by night). Day and night where all counts distinguish them and have
     enough images of them for `settings`.
     """
     from analysis.uncertainty.blocks import FEWEST
@@ -256,7 +256,7 @@ def _counts(
 
 
 def _labels(opened: Sequence[tuple[NamedCounts, ...]]) -> list[str]:
-    """Labels that differ: what the methods are called, else with their seeds."""
+    """Labels that differ: the names of the methods, with their seeds where these are equal."""
     from analysis.results import label_of
 
     plain = labels = [label_of(each) for each in opened]

@@ -45,7 +45,7 @@ OF_PARTS = {"all": MIOU, **{part: subset(part, MIOU) for part in (DAY, NIGHT)}}
 
 @dataclass(frozen=True)
 class Options:
-    """What is scored, and how."""
+    """Options of ``rgbt score``."""
 
     predictions: Annotated[
         str,
@@ -118,7 +118,7 @@ class Options:
 
     @property
     def source(self) -> str:
-        """What is scored, as it is noted in the folder."""
+        """What is scored, as the folder records it."""
         if self.counts:
             return f"counts={self.counts}"
         folder = Path(self.predictions).resolve()
@@ -149,7 +149,7 @@ def main(options: Options, overrides: list[str]) -> int:
             resamples=options.resamples, level=options.level, blocks=options.blocks
         )
     if given == ["counts"]:
-        counted, remarks = _stored(options, overrides), []
+        counted, remarks = _score_counts(options, overrides), []
     else:
         scored = _scored(options, overrides)
         counted = [(scored.name, counts) for counts in scored.counts]
@@ -263,7 +263,7 @@ def _scored(options: Options, overrides: list[str]) -> FolderScores:
         return score_folder(folder, dataset, split, counting, advance)
 
 
-def _stored(options: Options, overrides: list[str]) -> list[tuple[str, Counts]]:
+def _score_counts(options: Options, overrides: list[str]) -> list[tuple[str, Counts]]:
     from analysis.results import open_counts
     from rgbt.tracking.terminal import info
 

@@ -1,4 +1,4 @@
-"""Command: what a data set looks like by region, and which claims of SpatialSeg hold on it.
+"""Command: statistics of a data set by region, and the claims of SpatialSeg about them.
 
 rgbt spatial dataset=mfnet dataset.root=... split=train out=folder
 """
@@ -27,7 +27,7 @@ if TYPE_CHECKING:  # --help answers without waiting for torch and OpenCV
 
 @dataclass(frozen=True)
 class Options:
-    """What is measured, and how."""
+    """Options of ``rgbt spatial``."""
 
     split: Annotated[str, Help("split whose images are measured")] = "train"
     partition: Annotated[
@@ -74,7 +74,7 @@ class Options:
 
 
 def main(options: Options, overrides: list[str]) -> int:
-    """Measure a data set by region and print what it shows.
+    """Measure a data set by region and print its statistics.
 
     Overrides choose the data set, dataset=mfnet dataset.root=/data/MFNet or dataset=synth;
     data.on_error=skip leaves out files that cannot be read.

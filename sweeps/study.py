@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Options:
-    """Which study, and where its report goes."""
+    """Options of ``rgbt study``."""
 
     name: Annotated[str, Help("name of the study; without a name, all studies are listed")] = ""
     storage: Annotated[
@@ -53,13 +53,13 @@ class Options:
 
 
 NAME_LENGTH = 80
-"""Characters of a folder name; longer study names are cut and told apart by their hash."""
+"""Characters of a folder name; longer names are cut and get a hash."""
 
 
 def main(options: Options, overrides: list[str]) -> int:
     """Show the results of a study: best trials, failures, importances, figures.
 
-    Overrides are of the tracker: tracking=none or tracking.uri=http://host:5000
+    Overrides choose the tracker: tracking=none or tracking.uri=http://host:5000
     """
     runs_dir = options.runs_dir
     place = options.storage or None

@@ -214,7 +214,7 @@ def heads_line(said: str) -> list[str]:
     return [" ".join(line.split()) for line in said.splitlines() if line.split()[:1] == ["heads"]]
 
 
-def test_which_head_predicted_what_is_said(run: Runs, call: Call, tmp_path: Path) -> None:
+def test_heads_of_the_predictions_are_reported(run: Runs, call: Call, tmp_path: Path) -> None:
     folder = run("multi_head_night")
     own = "heads source by day, target at night"
     assert heads_line(run.told("multi_head_night")[1]) == [own]
@@ -223,7 +223,7 @@ def test_which_head_predicted_what_is_said(run: Runs, call: Call, tmp_path: Path
         assert heads_line(call(evaluate.entry, *words)[1]) == [line]
 
 
-def test_images_of_ones_own_are_predicted_with_the_head_that_is_asked(
+def test_user_images_are_predicted_with_the_requested_head(
     run: Runs, call: Call, tmp_path: Path
 ) -> None:
     folder = run("multi_head_night")

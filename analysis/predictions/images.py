@@ -149,8 +149,9 @@ class PredictionReader:
             raise InputError(
                 f"{path}: colour {tuple(colour.tolist())} at row {row}, column {column} is the "
                 f"colour of no class ({int(unknown.sum())} such pixels); the nearest is "
-                f"{self.classes[near]} {tuple(self.palette[near])}: write colours of dataset.palette without "
-                "smoothing, or save indices (format=index where equal channels hold them)."
+                f"{self.classes[near]} {tuple(self.palette[near])}: write colours of "
+                "dataset.palette without smoothing, or save indices (format=index where equal "
+                "channels hold them)."
             )
         return found
 

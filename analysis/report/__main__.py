@@ -25,7 +25,7 @@ MAX_REMARKS = 5
 
 @dataclass(frozen=True)
 class Options:
-    """Where the page goes, and what it is made of."""
+    """Options of ``rgbt report``."""
 
     out: Annotated[Path, Help("output folder; the page is its index.html")] = Path("report")
     runs_dir: Annotated[

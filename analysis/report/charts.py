@@ -19,7 +19,7 @@ from rgbt.files.yaml_files import read_yaml
 Spec = dict[str, Any]
 
 MOST_CHOSEN = 6
-"""Groups in one profile: colours that can be told apart."""
+"""Groups in one profile: as many as there are distinct colours."""
 
 
 def specification(name: str) -> Spec:

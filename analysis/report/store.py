@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, TypeVar
 from urllib.parse import unquote, urlparse
 
 from rgbt.checks import InputError, RunError, nearest
@@ -17,6 +17,7 @@ from rgbt.tracking.provenance import without_passwords
 from rgbt.tracking.run_files import read_result
 from rgbt.tracking.tracker import Tracking
 
+T = TypeVar("T")
 PAGE = 500
 """Runs of one request."""
 
@@ -100,6 +101,19 @@ class MlflowRun:
     def kind(self) -> str:
         """What it is: "run", "table" or "study"."""
         return self.tags.get("kind", "run")
+
+
+def read_each(
+    records: Sequence[MlflowRun], read: Callable[[MlflowRun], T], remarks: list[str]
+) -> list[T]:
+    """What `read` returns for every record; `remarks` gets a sentence for each InputError."""
+    found = []
+    for record in records:
+        try:
+            found.append(read(record))
+        except InputError as error:
+            remarks.append(str(error))
+    return found
 
 
 def read_store(tracking: Tracking, runs_dir: Path, copies: Path) -> list[MlflowRun]:

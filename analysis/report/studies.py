@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from analysis.report.data import StudyEntry, TrialEntry
-from analysis.report.store import MlflowRun
+from analysis.report.store import MlflowRun, read_each
 from rgbt.checks import InputError
 from rgbt.tracking.csv_files import read_csv
 from rgbt.tracking.provenance import without_passwords
@@ -22,10 +22,10 @@ COMPLETE = "complete"
 
 OBJECTIVES = re.compile(r"^Kind: (\w+)\. Objectives: (.+)\.$", re.MULTILINE)
 OBJECTIVE = re.compile(r"(highest|lowest) (.+)")
-# Studies that were recorded before the wording changed have "Begun by".
 CREATED = re.compile(r"^(?:Created|Begun) by `(.+)`\.$", re.MULTILINE)
+"""The command of a study; older records have "Begun by"."""
 FIGURES = re.compile(r"\n## [^\n]*\n\n!\[", re.MULTILINE)
-"""Where the figures of a report begin; they are files of their own and not part of the page."""
+"""Where the figures of a report begin; they are separate files and not part of the page."""
 
 
 def study_entries(records: Sequence[MlflowRun], remarks: list[str]) -> tuple[StudyEntry, ...]:
@@ -35,12 +35,7 @@ def study_entries(records: Sequence[MlflowRun], remarks: list[str]) -> tuple[Stu
         records: runs of MLflow of the kind "study".
         remarks: gets a sentence for each that cannot be read.
     """
-    found = []
-    for record in records:
-        try:
-            found.append(read_study(record))
-        except InputError as error:
-            remarks.append(str(error))
+    found = read_each(records, read_study, remarks)
     return tuple(sorted(found, key=lambda each: each.name))
 
 

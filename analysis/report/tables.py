@@ -10,7 +10,7 @@ from typing import Any
 
 from analysis.report.data import CellEntry, TableEntry, Uncertainty
 from analysis.report.runs import ReportRun
-from analysis.report.store import MlflowRun
+from analysis.report.store import MlflowRun, read_each
 from analysis.report.tables_recorded import (
     NO_CELL,
     CountsSource,
@@ -73,12 +73,7 @@ def table_entries(
             files[name] = load_table(name)
         except InputError as error:
             remarks.append(f"Table '{name}' is omitted: {error}")
-    recorded = []
-    for record in records:
-        try:
-            recorded.append(read_recorded(record))
-        except InputError as error:
-            remarks.append(str(error))
+    recorded = read_each(records, read_recorded, remarks)
     recorded.sort(key=lambda each: (each.name, each.scale, each.extra))
     drafts = [score_again(each, files.get(each.name) or _file_of(each), runs) for each in recorded]
     wanted = (

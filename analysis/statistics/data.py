@@ -109,7 +109,7 @@ class SpatialStatistics:
         return int(self.region_map.max()) + 1
 
     def subsets(self) -> tuple[str, ...]:
-        """What can be told apart: ("all", "day", "night"), or ("all",) without images of both."""
+        """Parts of the images: ("all", "day", "night"), or ("all",) without images of both."""
         both = self.night is not None and 0 < int(self.night.sum()) < len(self.names)
         return (ALL, DAY, NIGHT) if both else (ALL,)
 

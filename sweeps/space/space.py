@@ -163,7 +163,7 @@ def _choices(key: str, entry: Mapping[str, Any]) -> dict[str, Any]:
     if not isinstance(given, list | tuple) or not given:
         raise _wrong(key, f"choices must be a list of at least one value, got {given!r}")
     choices = tuple(_choice(key, item) for item in given)
-    # Optuna tells values apart by ==, which takes 1, 1.0 and true for one.
+    # Optuna compares values by ==, for which 1, 1.0 and true are equal.
     twice = [choice for place, choice in enumerate(choices) if choice in choices[:place]]
     if twice:
         raise _wrong(key, f"choices contain {twice[0]!r} twice, or a value that equals it")

@@ -1,4 +1,4 @@
-"""Executes the trials of a study: some at a time, each in a process of its own.
+"""Executes the trials of a study: some at a time, each in a separate process.
 
 Any number of drivers, on any number of machines, may share a study. Each point is run by one
 driver; trials of a dead driver are executed by another one; a driver that is started again resumes

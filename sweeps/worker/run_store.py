@@ -91,12 +91,12 @@ class RunStore:
         """Record in MLflow why a run was stopped before its end."""
         path = self.runs_dir / key
         if not (path / "run.json").exists() or RunResult(path).is_finished:
-            return  # not begun, or finished while it was being stopped
+            return  # not started, or finished while it was being stopped
         self._describe(RunFolder(path), {"rgbt.stopped": reason}, "KILLED")
 
     def _describe(self, folder: RunFolder, tags: Mapping[str, str], status: Status) -> None:
         description = read_description(folder.path)
-        assert description is not None, "a run that has begun has run.json"
+        assert description is not None, "a run that has started has run.json"
         folder.describe(replace(description, tags={**description.tags, **tags}))
         self._with_mlflow(lambda tracking: tracking.sync(folder, status))
 

@@ -44,7 +44,7 @@ PATIENCE_S = 60.0
 """How long the result of a job that SLURM calls finished may take to appear on a shared disk."""
 
 ASK_S = 5.0
-"""Seconds between two queries of a job that was asked to stop."""
+"""Seconds between two queries of a job that has to stop."""
 
 FAILED = 1
 """Exit code of a job that ended without one; its log holds the reason."""

@@ -77,7 +77,7 @@ class Outcome:
     """A point with its state and its finished runs.
 
     Attributes:
-        state: "finished", "failed", "running" (by another driver) or "waiting" (not begun).
+        state: "finished", "failed", "running" (by another driver) or "waiting" (not started).
         reason: why it failed, or "".
         results: its finished runs; of a waiting point, runs that lack further evaluations only.
         keys: of its runs; () where its configuration is wrong.
@@ -221,7 +221,7 @@ def reason_of(trial: FrozenTrial) -> str:
 
 @dataclass
 class SamplerSource:
-    """Asks the sampler of a study for trials.
+    """Gets trials from the sampler of a study.
 
     Attributes:
         fixed: overrides that all trials share.

@@ -209,7 +209,7 @@ def test_all_tables_are_listed_and_only_listed(call: Call, place: Path, driven: 
         ((), "'table' has no value"),
     ],
 )
-def test_mistakes_cost_one_sentence(
+def test_mistakes_are_reported_in_one_sentence(
     call: Call, place: Path, driven: Driven, words: tuple[str, ...], sentence: str
 ) -> None:
     asked = driven("finished")

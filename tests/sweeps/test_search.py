@@ -135,7 +135,7 @@ def test_search_without_finished_trial_raises(
     assert "trial 1 failed: no memory" in capsys.readouterr().err
 
 
-def test_a_preview_says_what_is_left_and_writes_nothing(
+def test_preview_shows_missing_points_and_writes_nothing(
     wanted: Search, ends: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     search(wanted, settings(dry_run=True))

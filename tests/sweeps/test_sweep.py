@@ -146,7 +146,7 @@ def test_sweep_search_settings_of_grid_are_refused(
     assert asked.lists == []
 
 
-def test_a_mistake_is_told_before_anything_is_run(asked: Asked, tmp_path: Path) -> None:
+def test_mistake_is_reported_before_any_run(asked: Asked, tmp_path: Path) -> None:
     asked.outcomes = [Outcome(Point("a", ()), "failed", "no such key")]
     with pytest.raises(InputError, match="a: no such key"):
         call(tmp_path, "+experiment=grbm", "seed=0,1")

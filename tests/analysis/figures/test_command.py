@@ -297,12 +297,12 @@ def test_methods_on_other_images_are_not_shown_together(
     assert "'B' on 11 of 'val'" in err
 
 
-def test_a_file_in_the_place_of_a_folder_is_told_before_drawing(call: Call, tmp_path: Path) -> None:
+def test_file_instead_of_a_folder_is_refused_before_drawing(call: Call, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     out = tmp_path / "file" / "f.pdf"
     code, _, err = call(entry, "figure=multihead/fig3", f"out={out}")
     assert code == 2
-    assert "is a file; give a folder" in err
+    assert "is a file; choose a folder" in err
 
 
 @pytest.mark.parametrize("figure", ["spatialseg/fig2", "spatialseg/fig3"])

@@ -37,7 +37,7 @@ def test_a_suffix_is_part_of_the_names(tiny: MFNet, tmp_path: Path) -> None:
         find(folder, tiny, "test", "", "refuse")
 
 
-def test_missing_files_stop_unless_left_out(tiny: MFNet, tmp_path: Path) -> None:
+def test_missing_files_are_refused_unless_excluded(tiny: MFNet, tmp_path: Path) -> None:
     folder = put(tmp_path / "p", "00001D.png")
     with pytest.raises(InputError, match=r"lacks .* 1 of the 2 .*\(00002N\.png\).*missing=leave"):
         find(folder, tiny, "test", "", "refuse")

@@ -34,7 +34,7 @@ def with_palette(path: Path, palette: object, values: np.ndarray = INDICES) -> P
     return path
 
 
-def test_the_three_kinds_of_file_say_the_same(tmp_path: Path) -> None:
+def test_three_kinds_of_file_give_equal_counts(tmp_path: Path) -> None:
     opaque = np.dstack([COLOURS, np.full(INDICES.shape, 255, np.uint8)])
     files = [
         grey(tmp_path / "index.png"),
@@ -47,7 +47,7 @@ def test_the_three_kinds_of_file_say_the_same(tmp_path: Path) -> None:
         np.testing.assert_array_equal(reader().read(file), INDICES, err_msg=file.name)
 
 
-def test_colours_can_be_asked_for_of_any_file_and_indices_of_equal_channels(tmp_path: Path) -> None:
+def test_format_colour_reads_any_file_and_index_equal_channels(tmp_path: Path) -> None:
     # A palette in another order: the stored numbers are 0, 2, 1 where the colours say 0, 1, 2.
     shuffled = with_palette(tmp_path / "p.png", [PALETTE[0], PALETTE[2], PALETTE[1]])
     swapped = np.array([[0, 2, 1], [1, 2, 0]])
@@ -90,7 +90,7 @@ def test_a_foreign_palette_is_not_guessed_at(tmp_path: Path) -> None:
         (np.zeros((1, 2, 2), np.uint8), r"bad\.png: .*got grey with transparency"),
     ],
 )
-def test_what_is_no_prediction_is_refused(tmp_path: Path, values: object, message: str) -> None:
+def test_invalid_predictions_are_refused(tmp_path: Path, values: object, message: str) -> None:
     path = grey(tmp_path / "bad.png", np.asarray(values))
     with pytest.raises(InputError, match=message):
         reader().read(path)
@@ -125,7 +125,7 @@ def test_a_file_that_claims_too_many_pixels_is_not_decoded(tmp_path: Path) -> No
             reader(form).read(path)  # type: ignore[arg-type]
 
 
-def test_two_classes_of_one_colour_cannot_be_told_by_colour(tmp_path: Path) -> None:
+def test_two_classes_of_one_colour_are_refused(tmp_path: Path) -> None:
     twice = PredictionReader(CLASSES, ((0, 0, 0), (1, 1, 1), (1, 1, 1)))
     np.testing.assert_array_equal(twice.read(grey(tmp_path / "index.png")), INDICES)
     with pytest.raises(InputError, match=r"gives car and person the same colour"):

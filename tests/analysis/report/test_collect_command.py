@@ -48,7 +48,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     return told
 
 
-def test_it_says_where_the_page_is_and_what_it_holds(
+def test_command_prints_path_and_content_of_the_page(
     call: Call, tmp_path: Path, asked: list[Any]
 ) -> None:
     out, runs = tmp_path / "new" / "report", tmp_path / "runs"
@@ -86,11 +86,11 @@ def test_mistakes_are_one_sentence(
     assert not out.exists()
 
 
-def test_a_file_in_the_place_of_the_folder_is_refused(call: Call, tmp_path: Path) -> None:
+def test_file_instead_of_the_folder_is_refused(call: Call, tmp_path: Path) -> None:
     (tmp_path / "report").write_text("")
     code, _, err = call(entry, f"out={tmp_path / 'report'}")
     assert code == 2
-    assert_one_sentence(err, "is a file; give a folder.")
+    assert_one_sentence(err, "is a file; choose a folder.")
 
 
 @pytest.mark.slow

@@ -121,7 +121,7 @@ def test_blocks_are_neighbours_of_one_sequence(names, choice, said: str, sizes: 
         assert places == list(range(places[0], places[0] + len(block)))
 
 
-def test_auto_takes_the_longest_of_the_scores_and_leaves_enough_blocks():
+def test_auto_uses_the_longest_block_that_gives_enough_blocks():
     rng = np.random.default_rng(0)
     noise, alike = rng.normal(size=300), autoregressive(rng, 300, 0.8)
     length = block_length(alike, [np.arange(300)])
@@ -198,7 +198,7 @@ def test_auto_cuts_runs_of_which_one_is_too_long():
     assert "not shown to be correlated, each image is drawn alone" in alone.reason
 
 
-def test_auto_says_what_single_images_mean():
+def test_auto_explains_single_images():
     for names in (["b", "a", "c"], [f"{video}_7" for video in "abcdefghijkl"], mfnet(12)):
         blocks = make_blocks(names, "auto", np.zeros((1, len(names))))
         assert blocks.count == len(names)

@@ -28,7 +28,7 @@ def compared(metric: str, a: float, b: float, **values) -> Comparison:
     )
 
 
-def test_told_over_images():
+def test_difference_shown_over_images():
     found = compared("mIoU", 61.8, 62.9, p_images=0.0123, images=Interval(0.31, 1.94))
     assert sentence(found, "CRM", "GRBM") == (
         "As trained here, the mIoU of GRBM is 1.10 points higher than that of CRM (62.90 against "
@@ -37,7 +37,7 @@ def test_told_over_images():
     )
 
 
-def test_told_over_images_and_seeds_in_blocks():
+def test_difference_shown_over_images_and_seeds_in_blocks():
     found = compared(
         *("Var", 50.0, 38.5),
         p_images=0.3,
@@ -54,7 +54,7 @@ def test_told_over_images_and_seeds_in_blocks():
     )
 
 
-def test_not_told_over_images_and_seeds():
+def test_difference_not_shown_over_images_and_seeds():
     found = compared(
         *("mIoU", 61.8, 62.1),
         p_images=0.01,
@@ -70,7 +70,7 @@ def test_not_told_over_images_and_seeds():
     )
 
 
-def test_not_told_without_seeds_of_a_variance_by_night():
+def test_difference_not_shown_for_variance_at_night():
     found = compared(
         *("night/Var", 40.0, 42.0),
         p_images=0.4,
@@ -90,7 +90,7 @@ def test_not_told_without_seeds_of_a_variance_by_night():
 @pytest.mark.parametrize(
     ("p", "low", "level"), [(0.06, 0.1, 0.95), (0.01, -0.1, 0.95), (0.03, 0.1, 0.99)]
 )
-def test_told_takes_p_and_interval(p: float, low: float, level: float):
+def test_difference_is_shown_if_p_and_interval_agree(p: float, low: float, level: float):
     found = compared("mIoU", 61.0, 62.0, p_images=p, images=Interval(low, 2.0), level=level)
     assert "is not shown" in sentence(found, "a", "b")
 

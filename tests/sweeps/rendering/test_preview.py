@@ -46,7 +46,7 @@ def test_preview_lists_each_evaluation_command_once() -> None:
     ]
 
 
-def test_runs_that_are_trained_and_lack_evaluations_are_told(tmp_path: Any) -> None:
+def test_trained_runs_without_evaluations_are_reported(tmp_path: Any) -> None:
     (tmp_path / "result.json").write_text('{"seconds_of_last_process": 10}')
     wanted, (first, second) = asked(FRAMES)
     found: Any = (Trained(tmp_path),)

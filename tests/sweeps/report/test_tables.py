@@ -123,7 +123,7 @@ def test_pareto_front_of_five_points() -> None:
     ]
 
 
-def test_conditional_parameters_are_absent_and_infinite_objectives_left_out() -> None:
+def test_conditional_parameters_are_absent_and_infinite_objectives_omitted() -> None:
     study = new_study("maximize")
     both = {"masker": CategoricalDistribution(["grbm", "none"]), "sigma": ALPHA}
     add(study, [1.0], params={"masker": "grbm", "sigma": 0.5}, distributions=both)
@@ -266,7 +266,7 @@ def test_the_direction_of_the_objective_counts() -> None:
         (12, {"x": None}, 3.0, "objective 1: the same value in all trials. rough: 12"),
     ],
 )
-def test_importances_say_why_there_are_none(
+def test_missing_importances_have_a_reason(
     count: int, params: Mapping[str, float | None], values: float | None, reason: str
 ) -> None:
     study = new_study("maximize")
@@ -278,7 +278,7 @@ def test_importances_say_why_there_are_none(
     assert found.remark.startswith(reason)
 
 
-def test_short_names_keep_what_tells_them_apart() -> None:
+def test_short_names_stay_distinct() -> None:
     assert short_names(["optimizer.lr", "head.lr", "masker.alpha"]) == {
         "optimizer.lr": "optimizer.lr",
         "head.lr": "head.lr",

@@ -188,7 +188,7 @@ class Goal:
     metric: str
 
 
-def test_the_signature_names_what_must_not_change() -> None:
+def test_signature_covers_space_and_objectives() -> None:
     space = parse_space({"a": FLOAT, "b": LOSS})
     name = signature(space, [Goal("val/mIoU")])
     assert len(name) == 12

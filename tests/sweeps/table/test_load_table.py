@@ -126,7 +126,7 @@ def test_unknown_name_gets_the_nearest(tmp_path: Path) -> None:
         load_table(str(tmp_path / "none.yaml"))
 
 
-def test_ones_own_table_does_not_hide_a_published_one(tmp_path: Path) -> None:
+def test_user_table_does_not_hide_a_published_one(tmp_path: Path) -> None:
     (tmp_path / "crm").mkdir()
     write(tmp_path).rename(tmp_path / "crm" / "table4.yaml")
     with pytest.raises(InputError, match="as well as"):

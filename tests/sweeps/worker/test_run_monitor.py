@@ -99,7 +99,7 @@ def test_signal_lock_holder_stops_process(tmp_path: Path) -> None:
         assert process.wait() == -signal.SIGTERM
 
 
-def test_a_holder_on_another_machine_is_left_alone(tmp_path: Path) -> None:
+def test_lock_holder_on_another_machine_is_not_signalled(tmp_path: Path) -> None:
     signal_lock_holder(tmp_path, signal.SIGTERM)  # nothing there
     process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
     try:
