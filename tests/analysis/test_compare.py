@@ -47,7 +47,7 @@ def test_table_and_sentence_hold_the_numbers_of_the_comparison(call: Call, files
     code, out, err = call(entry, *files, *FAST)
     assert (code, err) == (0, "")
     lines = out.splitlines()
-    assert lines[0].strip() == "grbm less crm: 40 single images, ring2"
+    assert lines[0].strip() == "grbm minus crm: 40 single images, ring2"
     rows = {
         line.split()[0]: line for line in lines if line.startswith(("  mIoU", "  Var", "  reg"))
     }

@@ -71,8 +71,8 @@ def test_same_trainings_on_corrupted_images(runs: Path) -> None:
     ("corruption", "severity", "sentence"),
     [
         ("nois", "16", r"'?nois'? was not measured in .*did you mean 'noise'"),
-        ("noise", "12", r"severity=12: .* holds noise at 8, 16; give one of these"),
-        ("noise", "", r"severity=: .* holds noise at 8, 16"),
+        ("noise", "12", r"severity=12: .* has noise at 8, 16; give one of these"),
+        ("noise", "", r"severity=: .* has noise at 8, 16"),
     ],
 )
 def test_missing_measurement_is_reported(
@@ -90,17 +90,19 @@ def test_inputs_without_measurements_are_reported(runs: Path) -> None:
     with pytest.raises(InputError, match=r"noise-8.npz' is not a readable file of counts"):
         trainings("k0", runs)
     (place / "test" / "noise-8.json").write_text("{}")
-    with pytest.raises(InputError, match=r"noise-8.json is not of rgbt robustness"):
+    with pytest.raises(InputError, match=r"noise-8.json was not written by rgbt robustness"):
         trainings("k0", runs)
     (place / "test" / "noise-8.json").write_text("{")
     with pytest.raises(InputError, match=r"noise-8.json is damaged"):
         trainings("k0", runs)
     (place / "test" / "noise-8.json").write_text(json.dumps({"format": FORMAT}))
-    with pytest.raises(InputError, match=r"noise-8.json does not say what was measured \('row'\)"):
+    with pytest.raises(
+        InputError, match=r"noise-8.json does not describe what was measured \('row'\)"
+    ):
         trainings("k0", runs)
     (place / "test" / "noise-8.json").unlink()
     (place / "test" / "clean.json").unlink()
-    with pytest.raises(InputError, match=r"holds no counts of clean images"):
+    with pytest.raises(InputError, match=r"contains no counts of clean images"):
         trainings("k0", runs)
     place.rename(place.with_name("gone"))
     with pytest.raises(InputError, match=r"robustness/test is not there; rgbt robustness run="):

@@ -220,7 +220,7 @@ def test_seeds_of_one_method_have_distinct_labels(call: Call, tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("arguments", "word"),
     [
-        (("predictions=a",), "the data set has to be named: dataset=mfnet"),
+        (("predictions=a",), "no data set is named; set dataset=mfnet"),
         (("predictions=a", "dataset=mfnet", "out=/dev/null/x"), "is a file; choose a folder"),
         ((), "expected one of predictions=folder and counts=run, got neither"),
         (("predictions=a", "counts=b"), "got predictions and counts"),

@@ -99,7 +99,7 @@ TC = (Objective("val/TC/aligned", "maximize"),)
         ({"retry": "failed"}, "retry=failed is for grids"),
         ({"sampler": {"seed": 1}}, "sampler: 'kind' has no value"),
         ({"sampler": {"kind": "tpe", "seed": "x"}}, "sampler.seed: expected a whole number"),
-        ({"objectives": TC, "pruner": {"kind": "median"}}, "known at the end alone"),
+        ({"objectives": TC, "pruner": {"kind": "median"}}, "known only at the end"),
         ({"objectives": TC}, r"add consistency=views 'consistency.splits=\[val,test\]'"),
     ],
 )

@@ -60,7 +60,7 @@ def test_the_miou_is_of_the_same_part_as_the_shares(tmp_path: Path) -> None:
         draw(data, ("test", "test")), tmp_path
     )
     for night in (None, (False, False)):
-        with pytest.raises(InputError, match="counts of 'CRM-B' hold no image of the night"):
+        with pytest.raises(InputError, match="counts of 'CRM-B' contain no image of the night"):
             class_regions(stats, "night", ("CRM-B", replace(by_day, night=night)))
 
 

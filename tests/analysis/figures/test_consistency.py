@@ -59,7 +59,7 @@ def test_value_equals_the_metric() -> None:
 @pytest.mark.parametrize(
     ("partition", "title", "axis"),
     [
-        ("released1", "virtual views, frames as they lie (as released)", "CA (released) open"),
+        ("released1", "virtual views, frames not warped (as released)", "CA (released) open"),
         ("next1", "consecutive frames", "CA open"),
     ],
 )

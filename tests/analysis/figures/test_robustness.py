@@ -129,7 +129,7 @@ def test_incompatible_inputs_are_refused(training, methods) -> None:
             panels(both, "released")
     with pytest.raises(InputError, match="'nois' was not measured; did you mean 'noise'"):
         panels(methods, "released", ["nois"])
-    with pytest.raises(InputError, match="clean images alone"):
+    with pytest.raises(InputError, match="only clean images"):
         panels({"x": [training("only", ladder())]}, "released")
     fewer = replace(short.levels[1], counts=short.levels[1].counts.select(["00000D"]))
     cut = replace(short, levels=(short.levels[0], fewer))

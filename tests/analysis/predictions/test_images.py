@@ -65,7 +65,7 @@ def test_a_foreign_palette_is_not_guessed_at(tmp_path: Path) -> None:
     """VOC's colour of index 3 is another class's colour here: both readings are possible."""
     voc = [(0, 0, 0), (128, 0, 0), (0, 128, 0), (64, 0, 128)]
     path = with_palette(tmp_path / "voc.png", voc, np.array([[0, 3]], np.uint8))
-    with pytest.raises(InputError, match=r"only the classes 0 to 2; say what counts: format="):
+    with pytest.raises(InputError, match=r"only the classes 0 to 2; choose one reading: format="):
         reader().read(path)
     unused = with_palette(tmp_path / "unused.png", voc, np.array([[0, 0]], np.uint8))
     assert not reader().read(unused).any()
@@ -74,8 +74,14 @@ def test_a_foreign_palette_is_not_guessed_at(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        (np.array([[0, 3]], np.uint8), r"bad\.png: value 3 is no class; expected 0 to 2 .*person"),
-        (np.array([[0, 255]], np.uint8), r"bad\.png: 1 pixels are 255; a prediction has no pixels"),
+        (
+            np.array([[0, 3]], np.uint8),
+            r"bad\.png: value 3 is not a class; expected 0 to 2 .*person",
+        ),
+        (
+            np.array([[0, 255]], np.uint8),
+            r"bad\.png: 1 pixels are 255; a prediction cannot ignore pixels",
+        ),
         (
             np.array([[[0, 0, 0], [64, 0, 127]]], np.uint8),
             r"bad\.png: colour \(64, 0, 127\) at row 0, column 1 .*\(1 such .*car \(64, 0, 128\)",
@@ -104,7 +110,7 @@ def test_three_different_channels_are_no_indices(tmp_path: Path) -> None:
 def test_files_that_are_no_png_or_half_of_one(tmp_path: Path) -> None:
     text = tmp_path / "text.png"
     text.write_text("no picture, but long enough for a header")
-    with pytest.raises(InputError, match=r"text\.png is no PNG file"):
+    with pytest.raises(InputError, match=r"text\.png is not a PNG file"):
         reader().read(text)
     noise = np.random.default_rng(0).integers(0, 3, (64, 64), np.uint8)
     whole = grey(tmp_path / "whole.png", noise).read_bytes()

@@ -263,7 +263,7 @@ def test_differences_compare_runs_that_differ_in_nothing_else(data: ReportData) 
     paper = [counts_of(seed, 0.7) for seed in range(3)]
     released = [counts_of(seed, 0.9) for seed in range(2)]
     value = compare(paper, released, ["mIoU"], Resampling(resamples=RESAMPLES)).differences[0].value
-    assert f"Released less paper: mIoU {value:+.2f} [" in entry.effect
+    assert f"Released minus paper: mIoU {value:+.2f} [" in entry.effect
     assert "2 seeds against 3 seeds" in entry.effect
     (other,) = (each for each in data.differences if each.topic == "Logits of RTFNet")
     assert other.effect.endswith("model.final_relu=false,true seed=0,1,2")
@@ -339,7 +339,7 @@ def test_counts_that_differ_from_mlflow_are_reported(changeable: Path) -> None:
     found = collected(changeable)
     assert len(found.remarks) == 2
     assert "Run bb0: " in found.remarks[0]
-    assert "are not those in MLflow" in found.remarks[0]
+    assert "differ from those in MLflow" in found.remarks[0]
     assert "Table 'own/t' (paper): " in found.remarks[1]
     assert "are not as recorded" in found.remarks[1]
 
@@ -364,7 +364,7 @@ def test_a_table_whose_file_is_gone_is_as_recorded(
     assert cell.mean == pytest.approx(statistics.fmean(values), abs=1e-6)
     assert (cell.low, cell.published) == (None, 61.0)
     (remark,) = found.remarks
-    assert remark == "Table 'own/t' has no file here any more; it is as recorded."
+    assert remark == "Table 'own/t' has no file any more; it is shown as recorded."
 
 
 def test_unreadable_table_file_is_reported(

@@ -56,9 +56,9 @@ def test_command_prints_path_and_content_of_the_page(
     code, said, err = call(entry, f"out={out}", f"runs_dir={runs}", "resamples=300", uri)
     assert code == 0
     assert f"page   {out}/index.html" in said
-    assert "holds  0 runs, 0 tables with runs, 0 published alone, 0 studies" in said
+    assert "holds  0 runs, 0 tables with runs, 0 published only, 0 studies" in said
     assert err.count("rgbt: Remark ") == 5
-    assert "2 more remarks stand on the page." in err
+    assert "2 more remarks are on the page." in err
     tracking, *others, command, trust = asked
     assert isinstance(tracking, MlflowTracking)
     assert tracking.uri == "http://me:secret@host:5000"

@@ -105,7 +105,7 @@ def test_run_continued_by_other_code_is_reported(tmp_path: Path) -> None:
     text = '[{"git_commit": "aaa"}, {"git_commit": "bbb", "git_dirty": true}]'
     processes = read_provenance(files_of(tmp_path, provenance__json=text), "k", remarks)
     assert len(processes) == 2
-    assert remarks == ["Run k was begun and continued by different code: aaa, then bbb+."]
+    assert remarks == ["Run k was started and continued by different code: aaa, then bbb+."]
 
 
 @pytest.mark.parametrize("text", ["{", "{}"])

@@ -66,7 +66,7 @@ def test_difference_not_shown_over_images_and_seeds():
     assert sentence(found, "CRM", "GRBM") == (
         "A difference in mIoU between GRBM and CRM is not shown (62.10 against 61.80; 95 % "
         "interval of the difference -0.90 to +1.50, p = 0.510), over 3 and 2 trainings and 393 "
-        "images; with this much, one below about 1.20 points cannot be seen."
+        "images; this data shows only differences above about 1.20 points."
     )
 
 
@@ -83,7 +83,7 @@ def test_difference_not_shown_for_variance_at_night():
         "As trained here, a difference in night/Var between GRBM and CRM is not shown (42.00 "
         "against 40.00; 90 % interval of the difference -3.00 to +7.00, p = 0.400), over 393 "
         "images in 12 sequences; with 3 and 1 trainings, it says nothing about other trainings of "
-        "the two; with this much, one below about 5.00 cannot be seen."
+        "the two; this data shows only differences above about 5.00."
     )
 
 

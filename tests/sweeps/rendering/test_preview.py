@@ -39,8 +39,8 @@ def test_preview_lists_each_evaluation_command_once() -> None:
     wanted, outcomes = asked((*FRAMES, RGB))
     assert summary(wanted, outcomes, 2) == [
         "2 runs: 2 waiting.",
-        "Time left with workers=2: known once a run is finished.",
-        "Made of every run that lacks it: rgbt consistency frames=virtual; "
+        "Time left with workers=2: known when one run is finished.",
+        "Evaluations of every run that still lacks them: rgbt consistency frames=virtual; "
         "rgbt consistency frames=next; "
         "rgbt evaluate modality=rgb 'regions=as trained'.",
     ]
@@ -53,9 +53,9 @@ def test_trained_runs_without_evaluations_are_reported(tmp_path: Any) -> None:
     outcomes = [replace(first, results=found, keys=("k",)), second]
     assert summary(wanted, outcomes, 1)[1:] == [
         "Time left with workers=1: 10 s.",
-        "Made of every run that lacks it: rgbt consistency frames=virtual; "
+        "Evaluations of every run that still lacks them: rgbt consistency frames=virtual; "
         "rgbt consistency frames=next.",
-        "Trained already: 1; the time of evaluations is not counted.",
+        "Already trained: 1; the time left excludes their evaluations.",
     ]
     rows = cells_grid(wanted, outcomes).rows
     assert [row[1:] for row in rows] == [

@@ -154,7 +154,7 @@ def test_render_table_notes_shared_runs_and_commits() -> None:
     sheet = render_table(score("t", table(rows), runs, scale="demo"), ["x=1"])
     assert sheet.notes == ("At scale=demo the same runs as row 'a'.",)
     assert sheet.lines[1].label.notes == (1,)
-    assert "Runs of ours come from several git commits: aaa (1), bbb (1)." in sheet.remarks
+    assert "Our runs come from several git commits: aaa (1), bbb (1)." in sheet.remarks
     assert "Every row of ours was run with x=1." in sheet.remarks
 
 

@@ -79,7 +79,7 @@ def test_two_objectives_have_a_front_and_slices_each(tmp_path: Path) -> None:
     study.set_user_attr(attributes.METRICS, ["val/mIoU", "val/Var"])
     found = drawn(study, tmp_path)
     without = {name: picture.reason for name, picture in found.items() if picture.path is None}
-    reason = "trials with several objectives report no values while they train."
+    reason = "trials with several objectives report no values during training."
     assert without == {"intermediate": reason}
     for name in ("pareto", "slices_val_mIoU", "slices_val_Var", "contour_val_Var"):
         assert is_picture(found[name].path)

@@ -147,7 +147,7 @@ def test_trials_grid_of_table_keeps_point_order() -> None:
         ("2", "Ny/2 seed=1", "complete", "52.00"),
         ("3", "Ny seed=1", "running", "-"),
     ]
-    assert failed_grid(data).title == "Failed trials (1 more were tried again)"
+    assert failed_grid(data).title == "Failed trials (1 more were retried)"
     assert [grid.title for grid in tables(data, importances(data))] == ["Study s (list)", "Points"]
     assert importances(data).remark == ""
 
@@ -236,7 +236,8 @@ def test_the_parameter_that_decides_is_the_most_important() -> None:
     for index in (0, 1):
         assert sum(shares[index] for shares in found.shares.values()) == pytest.approx(1.0)
     assert (
-        found.remark == "same: one value only, left out. rough: 40 complete trials, 50 are advised."
+        found.remark
+        == "same: one value only, excluded. rough: 40 complete trials, 50 are recommended."
     )
     grid = importance_grid(read(dominated()), found)
     assert grid.header == ("parameter", "for up, %", "for down, %")

@@ -75,7 +75,7 @@ def test_intervals_are_entries_of_a_space() -> None:
         ("seed=range(3,1)", "'seed=range(3,1)' has no values"),
         ("model=glob(nothing*)", "has no values"),
         ("a=tag(lgo,interval(1,2))", "tag 'lgo' means nothing; did you mean 'log'?"),
-        ("a=tag(log,choice(1,2))", "tags are for interval() alone"),
+        ("a=tag(log,choice(1,2))", "only interval() has tags"),
     ],
 )
 def test_sweeps_that_mean_nothing_are_refused(override: str, sentence: str) -> None:

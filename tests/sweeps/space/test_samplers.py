@@ -158,7 +158,7 @@ def test_cmaes_is_an_extra_for_one_objective(monkeypatch: pytest.MonkeyPatch) ->
     with pytest.raises(InputError, match="pip install cmaes"):
         build_sampler({"kind": "cmaes"})
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
-    with pytest.raises(InputError, match="follows one objective, and this search has 2"):
+    with pytest.raises(InputError, match="supports one objective, but this search has 2"):
         build_sampler({"kind": "cmaes"}, objectives=2)
 
 

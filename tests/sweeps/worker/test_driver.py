@@ -407,7 +407,7 @@ def test_driver_survives_trial_taken_by_other(tmp_path: Path) -> None:
 
     def released(call: Call) -> Process:
         if len(desk.executor.calls) == 1:
-            searcher.store.release(0, "its driver was gone", requeue=False)
+            searcher.store.release(0, "its driver had ended", requeue=False)
         return (yield from succeed(call))
 
     desk = search_desk(tmp_path / "b", released, storage=storage, trials=1, objectives=UP)

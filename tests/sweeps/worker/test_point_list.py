@@ -84,7 +84,7 @@ def test_runs_of_other_code_are_counted_in_one_line(tmp_path: Path) -> None:
     assert other_code_line([Outcome(Point("p", ()), "finished", results=(found[1],))]) == ""
     outcomes.append(Outcome(Point("q", ()), "finished", results=(found[2],)))
     assert other_code_line(outcomes) == (
-        "2 of 3 runs were made by other code; fresh=true trains these again and keeps the old runs."
+        "2 of 3 runs were made by other code; fresh=true retrains them and keeps the old runs."
     )
 
 

@@ -76,7 +76,7 @@ def test_a_run_that_resumes_is_read_from_its_begin(tmp_path: Path) -> None:
         (1, "\udcff\udcfe broken\n", "\ufffd\ufffd broken"),
         (1, "ValueError: " + "x" * 5000, "ValueError: " + "x" * 288),
         (3, "", "it ended with exit code 3 and no output; see"),
-        (-9, "rgbt: x", "stopped by SIGKILL (the system kills what takes too much memory)"),
+        (-9, "rgbt: x", "stopped by SIGKILL (the system kills processes that use too much memory)"),
         (-11, "rgbt: x", "stopped by SIGSEGV"),
         (-99, "rgbt: x", "stopped by signal 99"),
     ],

@@ -162,7 +162,7 @@ def test_gpus_of_this_machine_stay_visible(place: Place, monkeypatch: pytest.Mon
         ({"cluster": "slurm", "slurm_gpus_per_nod": 1}, "did you mean 'gpus_per_node'"),
         ({"cluster": "slurm", "nodes": 2}, "'submitit.nodes' is not an option"),
         ({"cluster": "slurm", "partition": "gpu"}, "submitit.timeout_min has no value"),
-        ({"cluster": "slurm", "timeout_min": 60}, "there is no `srun` here"),
+        ({"cluster": "slurm", "timeout_min": 60}, "this machine has no `srun`"),
         ({"cluster": "local", "timeout_min": "long"}, 'Parameter "timeout_min" expected type'),
     ],
 )
