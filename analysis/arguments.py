@@ -1,4 +1,4 @@
-"""Options that several commands of the analysis take, and what they stand for."""
+"""Options that several commands of the analysis have in common."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rgbt.dataset import LabelledDataset
 
 MOST = 1_000_000
-"""What a count may be, where nothing else limits it."""
+"""Largest value of a count that has no other limit."""
 
 
 Resamples = Annotated[int, Interval(ge=100, le=MOST), Help("number of resamples of the images")]

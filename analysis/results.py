@@ -1,4 +1,4 @@
-"""Counts of what was run or scored, opened by the names that people give them."""
+"""Counts of runs and of scored predictions, opened by their names."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from rgbt.tracking.terminal import info
 SEED = "rgbt.seed"
 
 RUNS = "runs, files of counts or a group"
-"""What a list may hold, for messages."""
+"""What a list may contain, for messages."""
 
 Frames = Literal["", "aligned", "released", "next"]
 """Counts of single frames, or of pairs of frames by one protocol."""
@@ -96,7 +96,7 @@ def open_counts(
 
 
 def _check_trainings_differ(text: str, found: Sequence[NamedCounts]) -> None:
-    """One seed twice, or equal counts, are no two trainings and would make a method look sure."""
+    """Refuse a seed twice or equal counts: they are one training and would narrow the interval."""
     for first, second in combinations(found, 2):
         if first.path == second.path:
             raise InputError(f"'{text}' names {first.path} twice; one training counts once.")
@@ -122,7 +122,7 @@ def groups_in(runs_dir: Path | str) -> list[str]:
 
 
 def label_of(counts: Sequence[NamedCounts]) -> str:
-    """What a method is called: its group, or all that its counts are called."""
+    """Name of a method: its group, or the names of all its counts."""
     return " + ".join(dict.fromkeys(each.label for each in counts))
 
 
@@ -170,7 +170,7 @@ def _of_scores(folder: Path) -> NamedCounts:
 
 
 def _of_file(path: Path) -> NamedCounts:
-    """A file of counts, called like its folder where its own name says only what it holds."""
+    """A file of counts, named after its folder where its file name is generic."""
     path = path.resolve()
     folder = path.parent.parent if path.parent.name == "evaluations" else path.parent
     label = folder.name if path.stem.startswith(("counts_", "consistency_")) else path.stem

@@ -1,4 +1,4 @@
-"""Counts of corrupted images, as ``rgbt robustness`` leaves them beside a run."""
+"""Counts of corrupted images, which ``rgbt robustness`` writes beside a run."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Level:
     Attributes:
         mark: name of its file, e.g. "noise-16".
         row: the corruption: "clean", "noise", "rgb_removed", "features-thermal", ...
-        title: what people call it.
+        title: as shown.
         unit: of the severity; "" where there is one alone.
         severity: 0 is the clean image.
         counts: the counts.

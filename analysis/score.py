@@ -31,11 +31,11 @@ if TYPE_CHECKING:
 OF_A_FOLDER = (
     *("partition", "regions", "format", "missing", "resize", "suffix", "name", "threads"),
 )
-"""Options that say how a folder is counted; counts of runs have been counted already."""
+"""Options of how a folder is counted; they have no effect on counts of runs."""
 
 MAX_THREADS = 256
 SOURCE = "source.txt"
-"""File of a folder of scores that says what was scored."""
+"""File in a folder of scores that records what was scored."""
 
 PARTITION_NAMES = get_args(Partition)
 
@@ -207,7 +207,7 @@ def write_counts(scored: FolderScores, out: Path) -> None:
 
 
 def _check_same_source(out: Path | None, source: str) -> None:
-    """Refuse a folder with other scores: files of both would stand side by side."""
+    """Refuse a folder with other scores, because files of both would be mixed."""
     if out is None or not (out / "scores.csv").is_file():
         return
     noted = out / SOURCE

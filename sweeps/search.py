@@ -1,4 +1,4 @@
-"""A search: a sampler chooses the points, a pruner stops bad ones, drivers share the study."""
+"""A search: a sampler selects the points, a pruner stops bad ones, drivers share the study."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ def _drive(request: Search, settings: SweepSettings, store: TrialStore) -> None:
 
 
 def _preview(request: Search, settings: SweepSettings) -> None:
-    """Say what would be searched, and what there is; write nothing."""
+    """Print what would be searched and the existing trials; write nothing."""
     study = find_study(request.study, settings.storage, request.runs.runs_dir)
     trials = [] if study is None else counted_trials(study)
     states = Counter(trial.state.name.lower() for trial in trials)

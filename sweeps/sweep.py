@@ -1,4 +1,4 @@
-"""What ``-m`` does: a grid of comma lists, a list of points, or a search."""
+"""The sweep behind ``-m``: a grid of comma lists, a list of points, or a search."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""All figures by name: what each shows and takes, and the function that makes it."""
+"""All figures by name: content, inputs, and the function that makes the figure."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ class FigureSpec:
     Attributes:
         maker: module of this package and its function from a `FigureInput` to a figure; imported
             when the figure is made, so that the list of figures is there at once.
-        needs: what must be given, in words.
+        needs: required inputs, in words.
         keys: keys that take effect, beside ``figure`` and ``out``.
         groups: groups of the configuration that take effect.
         metric: the partition unless ``metric=`` is given.
-        idle: keys of the configuration below `groups` that take no effect nevertheless.
+        idle: keys of the configuration below `groups` that have no effect.
         numbers: as `maker`, to what the figure shows as text by the ending of its file; "": none.
     """
 

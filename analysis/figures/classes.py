@@ -75,7 +75,7 @@ def class_regions(
         absent: how a class without pixels counts, see `rgbt.metrics.scores`.
 
     Raises:
-        InputError: counts over other regions, or a part that the data set or the counts lack.
+        InputError: counts over other regions, or a part without images in data set or counts.
     """
     shares = 100 * normalised(class_region_occupancy(statistics, part)[1:])
     label, scores = None, None

@@ -93,7 +93,7 @@ def snr_series(
         average: one of `analysis.statistics.derive.AVERAGES`.
 
     Raises:
-        InputError: an estimator or average that there is not.
+        InputError: an unknown estimator or average.
     """
     check_choice("estimator", estimator, statistics.noise)
     way = estimator, average

@@ -1,4 +1,4 @@
-"""What was given on the command line to make a figure from, opened when a figure asks for it."""
+"""The inputs of a figure from the command line, opened when the figure needs them."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class FigureInput:
     metric: str
 
     def need(self, key: str, what: str) -> Any:
-        """The value of a key; InputError, which says `what` it would be, where it was not given."""
+        """The value of a key; without one, an InputError that describes the key by `what`."""
         if key not in self.values:
             raise InputError(f"figure={self.figure} needs {key}=..., {what}.")
         return self.values[key]
@@ -133,7 +133,7 @@ class FigureInput:
         return names[0]
 
     def refuse(self, keys: Sequence[str], without: str) -> None:
-        """Refuse keys that take effect only beside something that was not given.
+        """Refuse keys that have an effect only together with a missing option.
 
         Raises:
             InputError: one of `keys` was given; `without` says what is missing.

@@ -1,7 +1,7 @@
 """Qualitative panels: RGB, thermal, ground truth and methods, with a box on the centre.
 
 One function for SpatialSeg Figs. 8 and 9, Temporal Fig. 6 and CRM Figs. 4 and 6 to 8. None of the
-papers says how its images were chosen; here they are named, or chosen by a rule that is stated.
+papers says how its images were chosen. Here they are named, or selected by a stated rule.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What is left of each method under corruptions: one panel per corruption, severity along x."""
+"""Scores of each method under corruptions: one panel per corruption, severity along x."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ HEIGHT_BELOW = 1.35
 """Inches of a line of panels, and of the panel below them."""
 
 ROW = "degradation"
-"""What the tables beside the figure have called the column of corruptions from the start."""
+"""Header of the column of corruptions in the tables beside the figure; files depend on it."""
 
 MISSING = "one image missing"
 """Title of the panel of corruptions without a severity."""
@@ -105,8 +105,8 @@ def panels(
         rows: names of the corruptions to show; (): all.
 
     Raises:
-        InputError: methods on other images, or measured at different severities; a row that nobody
-            has; clean images alone.
+        InputError: methods on other images, or measured at different severities; a row that
+            was not measured; only clean images.
     """
     by_method = {
         label: [level for training in each for level in training.levels]
@@ -186,7 +186,7 @@ def draw(data: Sequence[Panel], *, relative: bool) -> Figure:
 
     The dashed line is the score on clean images. Missing images stand side by side below.
 
-    Relative: percent of the score on clean images, of every training for itself.
+    Relative: percent of the score on clean images, for every training separately.
     """
     curves = [panel for panel in data if not panel.ticks]
     below = [panel for panel in data if panel.ticks]

@@ -1,4 +1,4 @@
-"""Which file of a folder is the prediction of which image, and what is missing."""
+"""Finds the prediction of every image in a folder, and the missing ones."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ OVERLAY = "_overlay"
 """Ending of the pictures that `rgbt.predict` writes beside its indices."""
 
 SHOWN = 3
-"""Names that a sentence lists before it says "and so on"."""
+"""Most names that a message lists."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def _stems(folder: Path) -> set[str]:
 
 
 def _hint(stems: set[str], dataset: LabelledDataset, suffix: str) -> str:
-    """What else the names could mean: another split, or the most frequent text after a name."""
+    """A hint what the names may be: another split, or the most frequent suffix."""
     for split in filter(dataset.has, dataset.splits):
         names = dataset.names(split)
         number = sum(f"{name}{suffix}" in stems for name in names)

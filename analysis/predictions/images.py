@@ -1,8 +1,9 @@
 """One predicted label image, read without guessing: indices, a palette with indices, or colours.
 
-A palette PNG says twice which class a pixel is: by its index and by the colour that stands for it.
-Both are believed where they agree with the data set; where they do not, only the user knows which
-one the method meant (PASCAL VOC's palette holds colours of MFNet at other indices).
+A palette PNG states the class of a pixel twice: by its index and by the colour of that index. The
+file is read where both agree with the data set. Where they do not, the user has to choose, because
+only the user knows what the method wrote (PASCAL VOC's palette has colours of MFNet at other
+indices).
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ NUM_COLOURS = 2**24
 
 
 class Header(NamedTuple):
-    """What the first bytes of a PNG say: what its pixels are, and bits per channel."""
+    """Content of the first bytes of a PNG: kind of its pixels, and bits per channel."""
 
     kind: Kind
     bits: int
@@ -66,8 +67,8 @@ def read_header(path: Path) -> Header:
 def check_one_kind(paths: Iterable[Path]) -> None:
     """Refuse files that "auto" would read in different ways, before any of them is decoded.
 
-    An optimiser that stores a black colour image as one channel would else turn colours into
-    indices here and there.
+    Otherwise, an image optimiser that stores a black colour image as one channel would turn the
+    colours of some images into indices.
 
     Raises:
         InputError: not all files are of one kind, or one is no 8 bit PNG.

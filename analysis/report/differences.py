@@ -1,4 +1,4 @@
-"""Paper against release: what differs, and what it does where the store holds both sides."""
+"""Paper against release: the differences, and their effect where the store has both sides."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Choice:
 
 @dataclass(frozen=True)
 class PairedRuns:
-    """Runs that differ by one choice and their seeds alone."""
+    """Runs that differ only in one choice and in their seeds."""
 
     paper: tuple[ReportRun, ...]
     released: tuple[ReportRun, ...]
@@ -94,7 +94,7 @@ def difference_entries(
 
 
 def find_pairs(choice: Choice, runs: Iterable[ReportRun]) -> list[PairedRuns]:
-    """Runs that differ by `choice` alone, those with the most seeds first."""
+    """Runs that differ only in `choice`, those with the most seeds first."""
     keys = {*choice.paper.values, *choice.released.values}
     groups: dict[str, tuple[list[ReportRun], list[ReportRun]]] = {}
     for run in runs:
@@ -115,7 +115,7 @@ def find_pairs(choice: Choice, runs: Iterable[ReportRun]) -> list[PairedRuns]:
 
 
 def _rest(run: ReportRun, keys: set[str]) -> str:
-    """All else that makes the run what it is: configuration and images."""
+    """All other properties of a run: configuration and images."""
     assert run.test_counts is not None, "only runs with counts are compared"
     left_out = (*NOT_IN_KEY, "seed")
     same = {

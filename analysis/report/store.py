@@ -1,4 +1,4 @@
-"""What an MLflow store holds: runs, tables and studies with their files. Nothing is written."""
+"""Reads an MLflow store: runs, tables and studies with their files. Nothing is written."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class RunFiles:
         """Where the file called `path` can be read; None: there is none.
 
         Raises:
-            InputError: the store has it and does not give it.
+            InputError: the store has it, but it cannot be fetched.
         """
         for folder in self.folders:
             if (folder / path).is_file():

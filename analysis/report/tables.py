@@ -1,4 +1,4 @@
-"""Every table beside its paper: our cells from counts with intervals, and those nobody has run."""
+"""Every table beside its paper: our cells from counts with intervals, and tables without runs."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Track = Callable[[Sequence[Any], str], Iterable[Any]]
 """Goes over a sequence and shows how far it is: (sequence, what is done)."""
 
 DEFAULT_SEEDS = (0, 1, 2)
-"""Of a table that nobody has run yet."""
+"""Of a table without runs."""
 
 NOT_HERE = "counts of some runs are not in the store; the value is as recorded, without interval."
 
@@ -58,7 +58,7 @@ def table_entries(
     track: Track,
     remarks: list[str],
 ) -> tuple[TableEntry, ...]:
-    """All tables: those with runs first, then the published ones that wait.
+    """All tables: those with runs first, then the published ones without runs.
 
     Args:
         records: runs of MLflow of the kind "table".

@@ -117,7 +117,7 @@ class SpatialStatistics:
         """(N,): which images belong to `part`: "all", "day" or "night".
 
         Raises:
-            InputError: no such part, a data set that does not tell, or no such image.
+            InputError: no such part, a data set without that information, or no such image.
         """
         check_choice("part", part, (ALL, DAY, NIGHT))
         if part == ALL:

@@ -155,7 +155,7 @@ def _check_column(column: Column, table: Table, before: Sequence[Column], where:
 
 
 def _check_sources(column: Column, table: Table, before: Sequence[Column], where: str) -> None:
-    """Refuse a difference or mean of columns that are computed later, or are no scores."""
+    """Refuse a difference or mean of columns that are computed later or are not scores."""
     if column.mean is not None and len(set(column.mean)) != max(2, len(column.mean)):
         got = ", ".join(column.mean) or "none"
         raise InputError(f"{where}: expected two or more different columns, got {got}.")

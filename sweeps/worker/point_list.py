@@ -1,4 +1,4 @@
-"""Points known beforehand: a grid, a list, the cells of a table."""
+"""Points that are known in advance: a grid, a list, the cells of a table."""
 
 from __future__ import annotations
 

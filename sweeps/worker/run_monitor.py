@@ -54,7 +54,7 @@ class MetricsReader:
 
 
 def failure_reason(code: int, log: Path, start: int) -> str:
-    """Why a process failed, in one sentence.
+    """The reason why a process failed, in one sentence.
 
     Args:
         code: exit code; negative for a signal.

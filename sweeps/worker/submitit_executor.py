@@ -179,7 +179,7 @@ class SubmititExecutor:
     def start(
         self, command: Sequence[str], environment: Mapping[str, str], log: Path
     ) -> SubmititJob:
-        """See `Executor.start`; a job that the cluster refuses fails, saying why.
+        """See `Executor.start`; a job that the cluster refuses fails with the reason.
 
         Raises:
             InputError: a GPU of the driver's machine is requested on SLURM.
@@ -261,7 +261,7 @@ class SubmititJob:
     def poll(self) -> int | None:
         """See `Job.poll`. Cheap: submitit looks for a file, and asks SLURM more and more rarely.
 
-        A job that SLURM ends without a word is noticed within ten minutes.
+        A job that SLURM ends without a message is detected within ten minutes.
         """
         if self._code is None and self._job is not None and self._is_done(self._job):
             self._code = self._outcome(self._job)

@@ -1,4 +1,4 @@
-"""What a driver executes next: a point of a list, or one that the sampler of a search chooses."""
+"""Selects the next trial of a driver: a point of a list, or a proposal of a search sampler."""
 
 from __future__ import annotations
 
