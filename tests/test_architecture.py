@@ -1,4 +1,4 @@
-"""The rules of the house that a tool can check: imports, sizes, nesting, global randomness."""
+"""Rules of this repository that a tool can check: imports, sizes, nesting, global randomness."""
 
 from __future__ import annotations
 

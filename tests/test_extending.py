@@ -1,4 +1,4 @@
-"""What the README promises: an own masker, network and experiment from outside this repository."""
+"""A user masker, network and experiment from outside this repository, as documented."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whatever is written for a key is refused in one sentence, or can be trained with."""
+"""Every value of a key is refused in one sentence, or can be used in training."""
 
 from __future__ import annotations
 

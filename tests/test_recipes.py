@@ -1,4 +1,4 @@
-"""Sizes and steps by data set: the released numbers, and what is told where they are others'."""
+"""Recipes by data set: the released sizes and steps, and warnings for another data set."""
 
 from __future__ import annotations
 

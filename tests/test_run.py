@@ -1,4 +1,4 @@
-"""The commands as a user calls them: end to end, resumed, killed, on files that were replaced."""
+"""The commands as a user calls them: end to end, resumed, killed, on replaced files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Help of the commands is there at once."""
+"""The help of the commands imports no heavy library."""
 
 from __future__ import annotations
 

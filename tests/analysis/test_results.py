@@ -1,4 +1,4 @@
-"""Counts found by the names that people give them."""
+"""Counts opened by the names of runs, groups and files."""
 
 from __future__ import annotations
 

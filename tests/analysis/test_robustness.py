@@ -1,4 +1,4 @@
-"""Counts of failing images, found beside runs; two methods compared on them."""
+"""Counts of corrupted images of runs; two methods compared on them."""
 
 from __future__ import annotations
 

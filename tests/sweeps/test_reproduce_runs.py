@@ -1,4 +1,4 @@
-"""A table comes whatever happens to its cells, its disk, its tracking server or its command."""
+"""A table is completed despite failures of its cells, disk, tracking server or command."""
 
 from __future__ import annotations
 

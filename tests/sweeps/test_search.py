@@ -1,4 +1,4 @@
-"""A search: what is refused before the first trial, what a study keeps to, how it ends."""
+"""A search: what is refused before the first trial, what must not change, how it ends."""
 
 from __future__ import annotations
 

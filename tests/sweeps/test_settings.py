@@ -1,4 +1,4 @@
-"""Settings of a sweep: the file, the checks, what is left for the runs to resolve."""
+"""Settings of a sweep: the file, the checks, what only the runs resolve."""
 
 from __future__ import annotations
 

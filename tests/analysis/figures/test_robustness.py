@@ -1,4 +1,4 @@
-"""The figure of failing images: its numbers by hand, what is drawn, what is refused."""
+"""The figure of corruptions: its numbers by hand, what is drawn, what is refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A store as a researcher's may look, for the tests of the page: 60 runs, 25 tables, 2 studies.
+"""A realistic store for the tests of the page: 60 runs, 25 tables, 2 studies.
 
 Captions, rows and printed values are the papers' (sweeps/tables); scores are drawn around those of
 real runs at demo scale.

@@ -30,8 +30,8 @@ EMPTY = ReportData(
 
 
 @pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """What was asked of the store, which is not read; the page is one line."""
+def collected(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Arguments of the collection; the store is not read and the page is one line."""
     told: list[Any] = []
 
     def fake(*wanted: Any) -> ReportData:
@@ -49,7 +49,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
 
 def test_command_prints_path_and_content_of_the_page(
-    call: Call, tmp_path: Path, asked: list[Any]
+    call: Call, tmp_path: Path, collected: list[Any]
 ) -> None:
     out, runs = tmp_path / "new" / "report", tmp_path / "runs"
     uri = "tracking.uri=http://me:secret@host:5000"
@@ -59,7 +59,7 @@ def test_command_prints_path_and_content_of_the_page(
     assert "holds  0 runs, 0 tables with runs, 0 published only, 0 studies" in said
     assert err.count("rgbt: Remark ") == 5
     assert "2 more remarks are on the page." in err
-    tracking, *others, command, trust = asked
+    tracking, *others, command, trust = collected
     assert isinstance(tracking, MlflowTracking)
     assert tracking.uri == "http://me:secret@host:5000"
     assert (others, trust) == ([runs, 300], ())

@@ -1,4 +1,4 @@
-"""Stores that cannot be read: one sentence each, and nothing is made where nothing was."""
+"""Stores that cannot be read: one sentence each, and no store is created."""
 
 from __future__ import annotations
 

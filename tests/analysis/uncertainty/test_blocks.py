@@ -1,4 +1,4 @@
-"""Which images are drawn together."""
+"""Blocks of images that are resampled together."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a study has found, as data and as tables: values by hand."""
+"""Results of a study as data and as tables: values by hand."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Spaces: every mistake is told, conditions hold, values reach Hydra as they are."""
+"""Spaces: every mistake is reported, conditions hold, values reach Hydra unchanged."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ def column(**keys: Any) -> dict[str, Any]:
 
 
 def behind(**keys: Any) -> dict[str, Any]:
-    """A difference of a column that stands behind it."""
+    """A difference of a column that follows it."""
     columns = column(minus=["mIoU", "c"])["columns"]
     return {"columns": [*columns, {"name": "c", **keys}], "rows": []}
 

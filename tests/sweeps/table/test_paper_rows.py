@@ -222,7 +222,7 @@ def test_printed_consistency_is_of_released_protocol(number: int) -> None:
     ]
     protocols = [evaluation.frames for evaluation in wanted.evaluations()]
     assert protocols == ["released", "aligned"]
-    assert any("come from the released protocol" in remark for remark in wanted.table.remarks)
+    assert any("use the released protocol" in remark for remark in wanted.table.remarks)
 
 
 def test_rtfnet_backbones_differ_at_paper_scale_only() -> None:

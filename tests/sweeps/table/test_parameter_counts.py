@@ -1,4 +1,4 @@
-"""Parameters of the rows' networks, counted on nothing but their configuration."""
+"""Parameters of the rows' networks, counted from their configuration only."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The printed numbers of our tables against the transcription that lies beside the checkout."""
+"""The printed numbers of our tables against the transcription beside the checkout."""
 
 from __future__ import annotations
 

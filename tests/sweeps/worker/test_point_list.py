@@ -1,4 +1,4 @@
-"""Points known beforehand: how long they will take, and whose tags a shared run gets."""
+"""Points known in advance: their estimated time, and the tags of a shared run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a person sees of a driver: lines in a log, a live view in a terminal."""
+"""Progress of a driver: lines in a log, a live view in a terminal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reading a run as it grows, and saying why a process ended."""
+"""Reading a run while it trains, and the reason why a process ended."""
 
 from __future__ import annotations
 

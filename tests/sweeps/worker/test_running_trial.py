@@ -1,4 +1,4 @@
-"""One point at work: its processes, what is adopted, why it fails."""
+"""One running trial: its processes, adopted runs, reasons of failures."""
 
 from __future__ import annotations
 

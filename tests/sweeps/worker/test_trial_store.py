@@ -1,4 +1,4 @@
-"""Trials of a study: who claims what, what counts, and what becomes of a dead driver's trials."""
+"""Trials of a study: claims, valid trials, and the trials of a dead driver."""
 
 from __future__ import annotations
 
