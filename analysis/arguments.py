@@ -1,4 +1,4 @@
-"""Options that several commands of the analysis take, and what they stand for."""
+"""Options that several commands of the analysis have in common."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ if TYPE_CHECKING:
     from rgbt.dataset import LabelledDataset
 
 MOST = 1_000_000
-"""What a count may be, where nothing else limits it."""
+"""Largest value of a count that has no other limit."""
 
 
 Resamples = Annotated[int, Interval(ge=100, le=MOST), Help("number of resamples of the images")]
 
-Level = Annotated[float, Help("share of intervals that shall hold the true value")]
+Level = Annotated[float, Help("confidence level of the intervals, between 0 and 1")]
 
 Blocks = Annotated[
     Literal["auto", "none", "sequence"] | Annotated[int, Interval(ge=1, le=MOST)],
-    Help("images drawn together: auto, none, sequence, or a number of neighbouring frames"),
+    Help("images resampled together: auto, none, sequence, or a number of neighbouring frames"),
 ]
 
 
@@ -34,15 +34,15 @@ def check_out(out: Path | None) -> None:
     """Refuse a folder that cannot be written, before any work.
 
     Raises:
-        InputError: it is a file or lies below one, or may not be written.
+        InputError: it is a file, is below a file, or is not writable.
     """
     if out is None:
         return
     there = next(each for each in (out.absolute(), *out.absolute().parents) if each.exists())
     if not there.is_dir():
-        raise InputError(f"out={out}: {there} is a file; give a folder.")
+        raise InputError(f"out={out}: {there} is a file; choose a folder.")
     if not os.access(there, os.W_OK):
-        raise InputError(f"out={out}: {there} may not be written; give another folder.")
+        raise InputError(f"out={out}: {there} is not writable; choose another folder.")
 
 
 def dataset_of(overrides: Sequence[str]) -> LabelledDataset:
@@ -54,8 +54,8 @@ def dataset_of(overrides: Sequence[str]) -> LabelledDataset:
     # Without this the images of another data set would be scored against the embedded one.
     if not any(word.startswith("dataset=") for word in overrides):
         raise InputError(
-            "the data set has to be named: dataset=mfnet dataset.root=/data/MFNet, or "
-            "dataset=synth, the embedded one."
+            "no data set is named; set dataset=mfnet dataset.root=/data/MFNet, or dataset=synth "
+            "for the embedded data set."
         )
     dataset: LabelledDataset = built("dataset", overrides)
     return dataset

@@ -13,7 +13,7 @@ T = TypeVar("T")
 
 @contextmanager
 def progress(what: str, total: int) -> Iterator[Callable[[], None]]:
-    """A bar on stderr; yields what to call after each of `total` steps."""
+    """A bar on stderr; yields a function to call after each of `total` steps."""
     from rich.console import Console
     from rich.progress import Progress
 
@@ -23,7 +23,7 @@ def progress(what: str, total: int) -> Iterator[Callable[[], None]]:
 
 
 def in_threads(work: Callable[..., T], *items: Iterable[Any], threads: int) -> Iterator[T]:
-    """What `work` gives for each item, in order; the first error stops what has not begun.
+    """Results of `work` for all items, in order; the first error cancels items not yet started.
 
     Args:
         work: decodes, filters and sums, all of which run outside Python's lock.

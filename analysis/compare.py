@@ -28,64 +28,65 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Options:
-    """What is compared, and how."""
+    """Options of ``rgbt compare``."""
 
     a: Annotated[
         str,
         Help(
-            "a run (folder, config key or MLflow run id), a file of counts (.npz, of rgbt evaluate "
-            'or rgbt score), a group of runs ("grbm sigma_div=2": all its seeds), or several of '
-            "these with commas: seeds of one method"
+            "first method: a run (folder, config key or MLflow run id), a file of counts (.npz of "
+            'rgbt evaluate or rgbt score), a group of runs ("grbm sigma_div=2": all its seeds), '
+            "or a list of these with commas: seeds of one method"
         ),
     ] = ""
-    b: Annotated[str, Help("the same of the other method")] = ""
+    b: Annotated[str, Help("second method, in the same form as a")] = ""
     metrics: Annotated[
         str,
         Help(
-            "mIoU,Var,region/1,class/car,night/mIoU ...; auto: mIoU, Var, regions, day and night; "
-            "of pairs of frames: TC,CA,CA_released,class/car/TC,night/TC ...; auto: TC and CA"
+            "scores to compare: mIoU,Var,region/1,class/car,night/mIoU ...; auto: mIoU, Var, "
+            "regions, day and night; for pairs of frames: TC,CA,CA_released,class/car/TC,night/TC "
+            "...; auto: TC and CA"
         ),
     ] = "auto"
-    split: Annotated[str, Help("of runs; default: test")] = ""
+    split: Annotated[str, Help("split of the runs; default: test")] = ""
     frames: Annotated[
         Literal["", "aligned", "released", "next"],
         Help(
-            "of runs, counts of pairs of frames (rgbt consistency run=...): aligned or released "
-            "(virtual views), next (consecutive frames); default: of single frames"
+            "compare the counts of pairs of frames of the runs (rgbt consistency run=...): aligned "
+            "or released (virtual views), next (consecutive frames); default: single frames"
         ),
     ] = ""
     corruption: Annotated[
         str,
         Help(
-            "of runs, counts of corrupted images (rgbt robustness run=...): "
+            "compare the counts of corrupted images of the runs (rgbt robustness run=...): "
             "corruption=noise:rgb severity=16"
         ),
     ] = ""
-    severity: Annotated[str, Help("of the corruption")] = ""
+    severity: Annotated[str, Help("severity of the corruption")] = ""
     missing: Annotated[
         Literal["refuse", "leave_out"],
-        Help("refuse, or leave_out: compare the images that both hold"),
+        Help("images that only one method has: refuse the comparison, or leave_out: exclude them"),
     ] = "refuse"
     level: Level = 0.95
     resamples: Resamples = 10_000
     method: Annotated[
         Literal["auto", "percentile", "bca"],
         Help(
-            "how intervals over images are taken from the resamples: percentile or bca; auto: "
-            "percentile, for the variance of one method without its bias"
+            "method of the intervals over images: percentile or bca; auto: percentile, with the "
+            "bias removed for the variance of one method"
         ),
     ] = "auto"
     blocks: Blocks = "auto"
     absent: Annotated[
         Literal["as counted", "released", "exclude"],
         Help(
-            "released: a class without a pixel scores 0; exclude: it is left out of means; as "
-            "counted: by the convention of the data set"
+            "class without pixels: released: it scores 0; exclude: it is in no mean; as counted: "
+            "convention of the data set"
         ),
     ] = "as counted"
-    seed: Annotated[int, Bounds(ge=0, le=2**31), Help("of the draws")] = 0
+    seed: Annotated[int, Bounds(ge=0, le=2**31), Help("seed of the resampling")] = 0
     runs_dir: RunsDir = Path("runs")
-    out: Annotated[Path | None, Help("folder for comparison.md and comparison.csv")] = None
+    out: Annotated[Path | None, Help("output folder of comparison.md and comparison.csv")] = None
 
 
 def main(options: Options, overrides: list[str]) -> int:
@@ -98,7 +99,7 @@ def main(options: Options, overrides: list[str]) -> int:
     from rgbt.metrics.named import parse
     from rgbt.tracking.terminal import path_lines, print_rich, rich_table
 
-    del overrides  # none is heeded
+    del overrides  # none takes effect
     check_out(options.out)
     opened = _opened(options)
     a, b = _counts(opened, options.missing)
@@ -137,10 +138,10 @@ def main(options: Options, overrides: list[str]) -> int:
 
 
 def metrics_of(text: str, every: Sequence[Counts], settings: Resampling) -> list[str]:
-    """The metrics asked for; "auto": those that the counts are known by, also by day and by night.
+    """The requested metrics; "auto": the usual scores of the counts, also by day and by night.
 
     Of single frames mIoU (by day, by night) and Var and every region; of pairs of frames the two
-    of their protocol (by day, by night). Day and night where all counts tell them apart and hold
+    of their protocol (by day, by night). Day and night where all counts distinguish them and have
     enough images of them for `settings`.
     """
     from analysis.uncertainty.blocks import FEWEST
@@ -186,7 +187,7 @@ def comparison_grid(comparison: Comparison, labels: Sequence[str]) -> TextTable:
     drawn = (
         singles if comparison.said == singles else f"{comparison.images} images, {comparison.said}"
     )
-    title = f"{labels[1]} less {labels[0]}: {drawn}, {comparison.partition}"
+    title = f"{labels[1]} minus {labels[0]}: {drawn}, {comparison.partition}"
     header = ("", *labels, "difference", *over, *more, "p (Holm)")
     return TextTable(title, header, tuple(rows))
 
@@ -221,7 +222,7 @@ def _opened(options: Options) -> list[tuple[NamedCounts, ...]]:
     if severity and not corruption:
         raise InputError("'severity' has no effect without corruption=..., for example noise.")
     if corruption and frames:
-        raise InputError(f"corruption={corruption} is of single frames; omit frames=.")
+        raise InputError(f"corruption={corruption} applies to single frames; omit frames=.")
     opened = []
     for key, side in (("a", options.a), ("b", options.b)):
         if not side:
@@ -244,18 +245,18 @@ def _counts(
     methods = [[named.counts for named in each] for each in opened]
     shared = {each.path for each in opened[0]} & {each.path for each in opened[1]}
     if shared:
-        raise InputError(f"a and b both hold {min(shared)}; a method is compared with another one.")
+        raise InputError(f"a and b both contain {min(shared)}; give two different methods.")
     if missing == "leave_out":
         before = len({name for seeds in methods for counts in seeds for name in counts.names})
         methods = common(methods)
         left = before - len(methods[0][0].names)
         if left:
-            info(f"{left} of {before} images are not in all counts and were left out.")
+            info(f"{left} of {before} images are not in all counts and were excluded.")
     return methods[0], methods[1]
 
 
 def _labels(opened: Sequence[tuple[NamedCounts, ...]]) -> list[str]:
-    """Labels that differ: what the methods are called, else with their seeds."""
+    """Labels that differ: the names of the methods, with their seeds where these are equal."""
     from analysis.results import label_of
 
     plain = labels = [label_of(each) for each in opened]

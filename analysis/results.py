@@ -1,4 +1,4 @@
-"""Counts of what was run or scored, opened by the names that people give them."""
+"""Counts of runs and of scored predictions, opened by their names."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from rgbt.tracking.terminal import info
 SEED = "rgbt.seed"
 
 RUNS = "runs, files of counts or a group"
-"""What a list may hold, for messages."""
+"""What a list may contain, for messages."""
 
 Frames = Literal["", "aligned", "released", "next"]
 """Counts of single frames, or of pairs of frames by one protocol."""
@@ -88,12 +88,15 @@ def open_counts(
     _check_trainings_differ(text, found)
     labels = dict.fromkeys(each.label for each in found)
     if len(labels) > 1:
-        info(f"{' and '.join(labels)} are taken for trainings of one method, as they were listed.")
+        info(
+            f"{' and '.join(labels)} are treated as seeds of one method, because they "
+            "were listed together."
+        )
     return tuple(found)
 
 
 def _check_trainings_differ(text: str, found: Sequence[NamedCounts]) -> None:
-    """One seed twice, or equal counts, are no two trainings and would make a method look sure."""
+    """Refuse a seed twice or equal counts: they are one training and would narrow the interval."""
     for first, second in combinations(found, 2):
         if first.path == second.path:
             raise InputError(f"'{text}' names {first.path} twice; one training counts once.")
@@ -101,7 +104,8 @@ def _check_trainings_differ(text: str, found: Sequence[NamedCounts]) -> None:
         if is_again and first.seed is not None:
             raise InputError(
                 f"'{text}' names seed {first.seed} of '{first.label}' twice ({first.key} and "
-                f"{second.key}, which differ in settings beside their overrides); name the runs."
+                f"{second.key}, which differ in settings other than their overrides); name the "
+                "runs."
             )
         is_one = first.label == second.label or not (first.run and second.run)
         if is_one and np.array_equal(first.counts.counts, second.counts.counts):
@@ -118,7 +122,7 @@ def groups_in(runs_dir: Path | str) -> list[str]:
 
 
 def label_of(counts: Sequence[NamedCounts]) -> str:
-    """What a method is called: its group, or all that its counts are called."""
+    """Name of a method: its group, or the names of all its counts."""
     return " + ".join(dict.fromkeys(each.label for each in counts))
 
 
@@ -137,8 +141,8 @@ def _open(word: str, runs_dir: Path, split: str, frames: Frames) -> list[NamedCo
         groups = groups_in(runs_dir)
         known = f" or a group of {runs_dir} ({nearest(word, groups)})" if groups else ""
         raise InputError(
-            f"'{word}' is no run folder, config key or MLflow run id in {runs_dir}, no file of "
-            f"counts (.npz){known}."
+            f"'{word}' is not a run folder, config key or MLflow run id in {runs_dir}, nor a file "
+            f"of counts (.npz){known}."
         ) from error
     return [_of_run(RunResult(folder), split, frames)]
 
@@ -155,18 +159,18 @@ def _of_scores(folder: Path) -> NamedCounts:
     files = sorted(folder.glob("counts_ring*.npz")) or sorted(folder.glob("counts_*.npz"))
     if not files:
         raise InputError(
-            f"{folder} holds neither a run (config.yaml) nor counts (counts_*.npz); label images "
-            "of a method are counted with: rgbt score predictions=... dataset=..."
+            f"{folder} contains neither a run (config.yaml) nor counts (counts_*.npz); to count "
+            "label images of a method: rgbt score predictions=... dataset=..."
         )
     if len(files) > 1:
         raise InputError(
-            f"{folder} holds {', '.join(file.name for file in files)}; name one of these files."
+            f"{folder} contains {', '.join(file.name for file in files)}; name one of these files."
         )
     return _of_file(files[0])
 
 
 def _of_file(path: Path) -> NamedCounts:
-    """A file of counts, called like its folder where its own name says only what it holds."""
+    """A file of counts, named after its folder where its file name is generic."""
     path = path.resolve()
     folder = path.parent.parent if path.parent.name == "evaluations" else path.parent
     label = folder.name if path.stem.startswith(("counts_", "consistency_")) else path.stem

@@ -1,4 +1,4 @@
-"""Counts of corrupted images, as ``rgbt robustness`` leaves them beside a run."""
+"""Counts of corrupted images, which ``rgbt robustness`` writes beside a run."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Level:
     Attributes:
         mark: name of its file, e.g. "noise-16".
         row: the corruption: "clean", "noise", "rgb_removed", "features-thermal", ...
-        title: what people call it.
+        title: as shown.
         unit: of the severity; "" where there is one alone.
         severity: 0 is the clean image.
         counts: the counts.
@@ -111,7 +111,7 @@ def levels_of(folder: Path) -> tuple[Level, ...]:
     found = [_level(path) for path in sorted(folder.glob("*.json"))]
     if CLEAN not in {level.row for level in found}:
         raise InputError(
-            f"{folder} holds no counts of clean images ({CLEAN}.json); rgbt robustness "
+            f"{folder} contains no counts of clean images ({CLEAN}.json); rgbt robustness "
             "measures them first."
         )
     return tuple(
@@ -147,7 +147,7 @@ def _under(named: NamedCounts, row: str, severity: str) -> NamedCounts:
     level = of_row.get(severity) or (None if severity or len(of_row) > 1 else [*of_row.values()][0])
     if level is None:
         raise InputError(
-            f"severity={severity}: {folder} holds {row} at {', '.join(of_row)}; give one of these."
+            f"severity={severity}: {folder} has {row} at {', '.join(of_row)}; give one of these."
         )
     return replace(named, path=folder / f"{level.mark}.npz", counts=level.counts)
 
@@ -155,13 +155,13 @@ def _under(named: NamedCounts, row: str, severity: str) -> NamedCounts:
 def _level(path: Path) -> Level:
     made = read_json(path, dict[str, Any], "remove it, and rgbt robustness makes it again")
     if made.get("format") != FORMAT:
-        raise InputError(f"{path} is not of rgbt robustness; name another folder.")
+        raise InputError(f"{path} was not written by rgbt robustness; name another folder.")
     try:
         of_level = {key: made[key] for key in ("row", "title", "unit")}
         severity = float(made["severity"])
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(
-            f"{path} does not say what was measured ({error}); rgbt robustness makes it again."
+            f"{path} does not describe what was measured ({error}); rgbt robustness makes it again."
         ) from error
     counts = Counts.load(path.with_suffix(".npz"))
     return Level(path.stem, severity=severity, counts=counts, **of_level)

@@ -31,11 +31,11 @@ if TYPE_CHECKING:
 OF_A_FOLDER = (
     *("partition", "regions", "format", "missing", "resize", "suffix", "name", "threads"),
 )
-"""Options that say how a folder is counted; counts of runs have been counted already."""
+"""Options of how a folder is counted; they have no effect on counts of runs."""
 
 MAX_THREADS = 256
 SOURCE = "source.txt"
-"""File of a folder of scores that says what was scored."""
+"""File in a folder of scores that records what was scored."""
 
 PARTITION_NAMES = get_args(Partition)
 
@@ -45,69 +45,80 @@ OF_PARTS = {"all": MIOU, **{part: subset(part, MIOU) for part in (DAY, NIGHT)}}
 
 @dataclass(frozen=True)
 class Options:
-    """What is scored, and how."""
+    """Options of ``rgbt score``."""
 
     predictions: Annotated[
         str,
         Help(
-            "folder with NAME.png for every image of the split: class indices (8 bit, one "
-            "channel), a palette PNG, or RGB in the colours of dataset.palette"
+            "folder of predictions, NAME.png for every image of the split: class indices (8 bit, "
+            "one channel), a palette PNG, or RGB in the colours of dataset.palette"
         ),
     ] = ""
     counts: Annotated[
         str,
         Help(
-            "instead: counts of runs; run folder, config key, MLflow run id, file, or several with "
-            "commas"
+            "instead of predictions: counts of runs, as run folder, config key, MLflow run id, "
+            "file, or a list of these with commas"
         ),
     ] = ""
     split: Annotated[str, Help("split of the data set; default: test")] = ""
     out: Annotated[
         Path | None,
         Help(
-            "folder for counts_<partition>.npz, maps.npz, scores.md and scores.csv; without one, "
-            "the tables are only shown"
+            "output folder of counts_<partition>.npz, maps.npz, scores.md and scores.csv; without "
+            "it, the tables are only printed"
         ),
     ] = None
-    runs_dir: Annotated[Path, Help("folder of runs, for counts=")] = Path("runs")
+    runs_dir: Annotated[Path, Help("folder of runs for counts=...")] = Path("runs")
     resamples: Annotated[
         int,
         Interval(ge=0, le=MOST),
-        Help("of the intervals over images; 0: no intervals"),
+        Help("number of resamples for the intervals over images; 0: no intervals"),
     ] = 10_000
     level: Level = 0.95
     blocks: Blocks = "auto"
     partition: Annotated[
-        Literal["all", "ring", "vertical", "horizontal"], Help("of a folder: how images are cut")
+        Literal["all", "ring", "vertical", "horizontal"],
+        Help("partition of the images (predictions only)"),
     ] = "all"
     regions: Annotated[
-        int, Interval(ge=1, le=MAX_REGIONS), Help("of a folder: number of regions of equal area")
+        int,
+        Interval(ge=1, le=MAX_REGIONS),
+        Help("number of regions of equal area (predictions only)"),
     ] = 5
     format: Annotated[
         Literal["auto", "index", "colour"],
-        Help("of a folder: auto; index: the stored numbers; colour: the colours shown"),
+        Help(
+            "format of the predictions: index: the stored numbers; colour: the colours shown; "
+            "auto: by the file"
+        ),
     ] = "auto"
     missing: Annotated[
         Literal["refuse", "leave_out"],
-        Help("of a folder: refuse, or leave_out: count only the images that have a file"),
+        Help("images without a prediction: refuse, or leave_out: exclude them"),
     ] = "refuse"
     resize: Annotated[
         Literal["refuse", "nearest"],
-        Help("of a folder: refuse, or nearest: predictions of another size than their label"),
+        Help(
+            "predictions of another size than their label: refuse, or nearest: resize them by the "
+            "nearest pixel"
+        ),
     ] = "refuse"
-    suffix: Annotated[str, Help("of a folder: of the names, NAME<suffix>.png, e.g. _pred")] = ""
+    suffix: Annotated[
+        str, Help("suffix of the file names of predictions, NAME<suffix>.png, such as _pred")
+    ] = ""
     name: Annotated[
-        str, Help("of a folder: of the method, for tables; default: the folder's name")
+        str, Help("name of the method in tables; default: name of the folder of predictions")
     ] = ""
     threads: Annotated[
         int,
         Interval(ge=0, le=MAX_THREADS),
-        Help("of a folder: threads that read and count; 0: one per core"),
+        Help("threads that read and count predictions; 0: one per core"),
     ] = 0
 
     @property
     def source(self) -> str:
-        """What is scored, as it is noted in the folder."""
+        """What is scored, as the folder records it."""
         if self.counts:
             return f"counts={self.counts}"
         folder = Path(self.predictions).resolve()
@@ -138,7 +149,7 @@ def main(options: Options, overrides: list[str]) -> int:
             resamples=options.resamples, level=options.level, blocks=options.blocks
         )
     if given == ["counts"]:
-        counted, remarks = _stored(options, overrides), []
+        counted, remarks = _score_counts(options, overrides), []
     else:
         scored = _scored(options, overrides)
         counted = [(scored.name, counts) for counts in scored.counts]
@@ -196,7 +207,7 @@ def write_counts(scored: FolderScores, out: Path) -> None:
 
 
 def _check_same_source(out: Path | None, source: str) -> None:
-    """Refuse a folder with other scores: files of both would stand side by side."""
+    """Refuse a folder with other scores, because files of both would be mixed."""
     if out is None or not (out / "scores.csv").is_file():
         return
     noted = out / SOURCE
@@ -252,7 +263,7 @@ def _scored(options: Options, overrides: list[str]) -> FolderScores:
         return score_folder(folder, dataset, split, counting, advance)
 
 
-def _stored(options: Options, overrides: list[str]) -> list[tuple[str, Counts]]:
+def _score_counts(options: Options, overrides: list[str]) -> list[tuple[str, Counts]]:
     from analysis.results import open_counts
     from rgbt.tracking.terminal import info
 
@@ -261,12 +272,12 @@ def _stored(options: Options, overrides: list[str]) -> list[tuple[str, Counts]]:
     without_effect += [word.partition("=")[0] for word in overrides]
     if without_effect:
         raise InputError(
-            f"'{without_effect[0]}' has no effect on stored counts, which are counted already; "
-            "leave it out, or give a folder with predictions=..."
+            f"'{without_effect[0]}' has no effect on stored counts; omit it, or give a "
+            "folder with predictions=..."
         )
     found = open_counts(options.counts, options.runs_dir, options.split)
     info(
-        "stored counts hold one partition and no map by pixel; for the others write predictions "
+        "stored counts have one partition and no map by pixel; for others, write predictions "
         "with rgbt predict run=... input=<split> out=folder, and score that folder."
     )
     labels = [each.label for each in found]

@@ -1,4 +1,4 @@
-"""Command: what a data set looks like by region, and which claims of SpatialSeg hold on it.
+"""Command: statistics of a data set by region, and the claims of SpatialSeg about them.
 
 rgbt spatial dataset=mfnet dataset.root=... split=train out=folder
 """
@@ -27,47 +27,54 @@ if TYPE_CHECKING:  # --help answers without waiting for torch and OpenCV
 
 @dataclass(frozen=True)
 class Options:
-    """What is measured, and how."""
+    """Options of ``rgbt spatial``."""
 
-    split: Annotated[str, Help("whose images")] = "train"
-    partition: Annotated[Literal["ring", "vertical", "horizontal"], Help("how images are cut")] = (
-        "ring"
-    )
+    split: Annotated[str, Help("split whose images are measured")] = "train"
+    partition: Annotated[
+        Literal["ring", "vertical", "horizontal"], Help("partition of the images")
+    ] = "ring"
     regions: Annotated[
         int, Interval(ge=1, le=MAX_REGIONS), Help("number of regions of equal area")
     ] = 9
-    aspect: Annotated[Literal["image", "released_3_4"], Help("of rings")] = "image"
+    aspect: Annotated[
+        Literal["image", "released_3_4"],
+        Help("aspect ratio of rings: image, or released_3_4: 3:4, as released"),
+    ] = "image"
     kernel: Annotated[
-        Literal["four", "eight"], Help("of the Laplacian: four or eight neighbours")
+        Literal["four", "eight"], Help("neighbours in the kernel of the Laplacian: four or eight")
     ] = "four"
     estimator: Annotated[
-        Literal["immerkaer", "wavelet_mad", "std"], Help("of the noise in the tables")
+        Literal["immerkaer", "wavelet_mad", "std"], Help("estimator of the noise in the tables")
     ] = "immerkaer"
     average: Annotated[
         Literal["pooled", "images"],
         Help(
-            "of signal to noise over images: pooled (mean signal over mean noise) or images (mean "
-            "of each image's ratio)"
+            "signal-to-noise ratio over images: pooled (mean signal over mean noise) or images "
+            "(mean of the ratios of all images)"
         ),
     ] = "pooled"
     blocks: Annotated[
-        int, Interval(ge=0, le=MOST), Help("neighbouring images that are resampled together")
+        int,
+        Interval(ge=0, le=MOST),
+        Help("number of neighbouring images that are resampled together"),
     ] = 10
-    resamples: Annotated[int, Interval(ge=0, le=MOST), Help("of the images")] = 2000
+    resamples: Annotated[
+        int, Interval(ge=0, le=MOST), Help("number of resamples of the images")
+    ] = 2000
     level: Level = 0.95
-    seed: Annotated[int, Interval(ge=0, le=MOST), Help("of the resamples")] = 0
+    seed: Annotated[int, Interval(ge=0, le=MOST), Help("seed of the resampling")] = 0
     workers: Annotated[int, Interval(ge=0, le=1024), Help("threads; 0: one per core")] = 0
     out: Annotated[
         Path | None,
         Help(
-            "folder for statistics.npz (what rgbt figures draws), regions.csv and statistics.md; "
-            "without one, the tables are only shown"
+            "output folder of statistics.npz (input of rgbt figures), regions.csv and "
+            "statistics.md; without it, the tables are only printed"
         ),
     ] = None
 
 
 def main(options: Options, overrides: list[str]) -> int:
-    """Measure a data set by region and print what it shows.
+    """Measure a data set by region and print its statistics.
 
     Overrides choose the data set, dataset=mfnet dataset.root=/data/MFNet or dataset=synth;
     data.on_error=skip leaves out files that cannot be read.
@@ -125,7 +132,7 @@ def _regions(options: Options) -> Regions:
 
     partition, aspect = options.partition, options.aspect
     if partition != "ring" and aspect != "image":
-        raise InputError(f"aspect={aspect} is one of rings; leave it out with {partition} strips.")
+        raise InputError(f"aspect={aspect} applies to rings; omit it for {partition} strips.")
     return Regions(
         partition=partition,
         regions=options.regions,

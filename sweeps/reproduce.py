@@ -1,6 +1,6 @@
-"""Run what is missing of a table, print it: ``rgbt reproduce table=spatialseg/table3``.
+"""Run the missing runs of a table and print it: ``rgbt reproduce table=spatialseg/table3``.
 
-The same command goes on where it was stopped; any number of machines may give it at once.
+Rerun the command to resume. Any number of machines may run it at the same time.
 """
 
 from __future__ import annotations
@@ -33,51 +33,62 @@ WEIGHTS = "weights."
 
 @dataclass(frozen=True)
 class Options:
-    """Of ``rgbt reproduce``; those of execution are explained in the sweeper's file too."""
+    """Options of ``rgbt reproduce``; the sweeper's file explains those of execution too."""
 
     table: Annotated[
         str,
-        Help("spatialseg/table3, my/ablation (in ./tables), a file; all with dry_run=true"),
+        Help(
+            "table to run: spatialseg/table3, my/ablation (in ./tables) or a file; all: every "
+            "table, with dry_run=true"
+        ),
     ]
-    seeds: Annotated[str, Help("how many (3 for the seeds 0, 1, 2), or which: 0,4,7")] = "1"
-    scale: Annotated[str, Help("demo (minutes, embedded data) or paper (as published)")] = "demo"
+    seeds: Annotated[str, Help("number of seeds (3: seeds 0, 1, 2), or a list: 0,4,7")] = "1"
+    scale: Annotated[str, Help("demo (minutes, embedded data) or paper (published sizes)")] = "demo"
     dry_run: Annotated[
-        bool, Help("true: show the cells, which of them are finished, and how long the rest takes")
+        bool, Help("true: show the runs of the cells, their states and the time left; run nothing")
     ] = False
     runs_dir: RunsDir = Path("runs")
     out: Annotated[
         Path | None,
         Help(
-            "folder of table.md, .csv, .tex and figure.png; default: tables/ in the folder of runs"
+            "output folder of table.md, .csv, .tex and figure.png; default: tables/ in the folder "
+            "of runs"
         ),
     ] = None
-    workers: Annotated[int, Help("runs at a time")] = 1
-    gpus: Annotated[tuple[int, ...] | None, Help("gpus=[0,1] gives each worker one of them")] = None
+    workers: Annotated[int, Help("number of runs at the same time")] = 1
+    gpus: Annotated[
+        tuple[int, ...] | None, Help("GPUs to use: gpus=[0,1] assigns one GPU to each worker")
+    ] = None
     retry: Annotated[
-        Literal["none", "failed"], Help("failed: try again what failed in a previous call")
+        Literal["none", "failed"],
+        Help("failed: retry runs that failed in a previous call; none: do not"),
     ] = "none"
-    retries: Annotated[int, Help("how often a run is tried again in this call")] = 0
+    retries: Annotated[int, Help("how often a failed run is retried in this call")] = 0
     fresh: Annotated[
         bool,
         Help(
-            "true: train again what other code made; the old runs are kept in <runs_dir>/replaced"
+            "true: retrain runs that another version of the code made; the old runs move to "
+            "<runs_dir>/replaced"
         ),
     ] = False
     wait: Annotated[
         bool,
-        Help("false: leave cells to the commands that run them instead of waiting for them"),
+        Help("true: wait for cells that other commands run; false: do not wait"),
     ] = True
     storage: Annotated[
         str | None,
-        Help("where machines agree on who runs what: file.journal, postgresql://user@host/name"),
+        Help("Optuna storage that all machines share: file.journal or postgresql://user@host/name"),
     ] = None
-    timeout_minutes: Annotated[float | None, Help("of one run")] = None
-    max_failures: Annotated[int | None, Help("failed runs after which no other is started")] = None
+    timeout_minutes: Annotated[float | None, Help("time limit of one run")] = None
+    max_failures: Annotated[
+        int | None, Help("start no more runs after this number of failures")
+    ] = None
     executor: Annotated[
-        Literal["local", "submitit"], Help("processes of this machine, or jobs of a cluster")
+        Literal["local", "submitit"],
+        Help("local: processes on this machine; submitit: jobs of a cluster"),
     ] = "local"
     submitit: Annotated[
-        dict[str, Any] | None, Help("options of its jobs: submitit={timeout_min: 60}")
+        dict[str, Any] | None, Help("options of the cluster jobs: submitit={timeout_min: 60}")
     ] = field(default_factory=dict)
 
 
@@ -86,13 +97,14 @@ OF_THE_TABLE = ("table", "seeds", "scale", "runs_dir", "out", "fresh")
 
 
 def main(options: Options, overrides: list[str]) -> int:
-    """Run what is missing of a published table, or of your own, and print it beside the paper.
+    """Run the missing runs of a table and print our values beside the published ones.
 
-    Overrides of every row: dataset.root=/data/MFNet tracking.uri=http://host:5000; with
-    weights.mask2former_swin_b=FILE: weights of the rows with that network, one for each of them.
-    The options of execution are explained in conf/hydra/sweeper/study.yaml.
+    The table is a published one or your own. Words with other keys are overrides of every row:
+    dataset.root=/data/MFNet tracking.uri=http://host:5000. weights.mask2former_swin_b=FILE sets the
+    initial weights of all rows with that network. conf/hydra/sweeper/study.yaml explains the
+    options of execution.
 
-    A table of your own:
+    To write your own table:
     rgbt reproduce new table=my/ablation experiment=grbm masker.sigma_div=1,2,4
     """
     from rgbt.config.compose import compose
@@ -107,7 +119,7 @@ def main(options: Options, overrides: list[str]) -> int:
     tracker = [word for word in overrides if word.lstrip("+~").startswith("tracking")]
     extra = tuple(word for word in overrides if word not in tracker)
     if options.table == ALL and not settings.dry_run:
-        raise InputError("table=all is for dry_run=true; run one table at a time.")
+        raise InputError("table=all requires dry_run=true; run one table at a time.")
     tables = table_names() if options.table == ALL else [options.table]
     requests = [request_of(name, options, extra) for name in tables]
     base = (*readable_paths([f"runs_dir={options.runs_dir}"]), *tracker)
@@ -183,16 +195,16 @@ def _check_override(word: str) -> None:
     key = word.lstrip("+~").partition("=")[0]
     if key in ("seed", "experiment"):
         other = "seeds=3" if key == "seed" else "another table"
-        raise InputError(f"'{word}' belongs to the rows of the table; choose {other}.")
+        raise InputError(f"'{word}' is set by the rows of the table; choose {other}.")
     if key.rpartition("@")[2].partition(".")[0] == "consistency":
         raise InputError(
-            f"'{word}': the columns of the table say what is counted, on the published sets of "
-            "views; measure others with rgbt consistency run=..."
+            f"'{word}': the columns of the table define what is counted, on the published sets "
+            "of views; measure others with rgbt consistency run=..."
         )
     if key == "metric" or key.startswith("metric."):
         raise InputError(
-            f"'{word}': the columns of the table say what is counted; set its `regions` in a "
-            "table of your own."
+            f"'{word}': the columns of the table define what is counted; set `regions` in your "
+            "own table."
         )
 
 
@@ -214,7 +226,7 @@ def request_of(name: str, options: Options, extra: tuple[str, ...]) -> TableRequ
     check_metrics(table)
     if not re.fullmatch(NAME, name):
         raise InputError(
-            f"table={name}: MLflow takes names of letters, digits, spaces and _ - . : / alone; "
+            f"table={name}: MLflow allows only letters, digits, spaces and _ - . : / alone; "
             "rename the file."
         )
     seeds = seeds_of(options.seeds)
@@ -225,7 +237,7 @@ def request_of(name: str, options: Options, extra: tuple[str, ...]) -> TableRequ
     for model in weights:
         if model not in wanted.models():
             raise InputError(
-                f"{WEIGHTS}{model}: no row of {name} names that network at "
+                f"{WEIGHTS}{model}: no row of {name} uses that network at "
                 f"scale={wanted.scale}; {nearest(model, wanted.models())}."
             )
     return wanted

@@ -1,4 +1,4 @@
-"""A search: a sampler chooses the points, a pruner stops bad ones, drivers share the study."""
+"""A search: a sampler selects the points, a pruner stops bad ones, drivers share the study."""
 
 from __future__ import annotations
 
@@ -55,15 +55,15 @@ def search(request: Search, settings: SweepSettings) -> None:
         )
     if settings.retry == "failed":
         raise InputError(
-            "retry=failed is for grids and tables; a search continues with other points: give it "
-            "more trials, or retries=1 to retry each failed point at once."
+            "retry=failed is for grids and tables. A search continues with other points: set more "
+            "trials, or retries=1 to retry each failed point immediately."
         )
     sampler = build_sampler(settings.sampler, len(settings.objectives))
     first = settings.objectives[0]
     if settings.pruner is not None and not first.is_reported:
         raise InputError(
-            f"pruner: trials are compared while they train, but {first.metric} is known at the end "
-            "alone; choose val/mIoU or hydra.sweeper.pruner=null."
+            f"pruner: it compares trials during training, but {first.metric} is known only at the "
+            "end; choose val/mIoU or hydra.sweeper.pruner=null."
         )
     pruner = build_pruner(settings.pruner, len(settings.objectives))
     if settings.dry_run:
@@ -139,11 +139,11 @@ def _drive(request: Search, settings: SweepSettings, store: TrialStore) -> None:
 
 
 def _preview(request: Search, settings: SweepSettings) -> None:
-    """Say what would be searched, and what there is; write nothing."""
+    """Print what would be searched and the existing trials; write nothing."""
     study = find_study(request.study, settings.storage, request.runs.runs_dir)
     trials = [] if study is None else counted_trials(study)
     states = Counter(trial.state.name.lower() for trial in trials)
-    sys.stdout.write(f"study {request.study}: {dict(states) or 'not begun'}\n")
+    sys.stdout.write(f"study {request.study}: {dict(states) or 'not started'}\n")
     for parameter in request.parameters:
         sys.stdout.write(f"  {parameter}\n")
     for objective in settings.objectives:

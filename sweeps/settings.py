@@ -74,7 +74,7 @@ class SweepSettings:
     """See ``conf/hydra/sweeper/study.yaml``, which explains every key and holds the defaults."""
 
     storage: Text | None
-    workers: Annotated[int, Interval(ge=1, le=1024), doc("processes at a time")]
+    workers: Annotated[int, Interval(ge=1, le=1024), doc("processes at the same time")]
     gpus: Annotated[tuple[Annotated[int, Interval(ge=0, le=1023)], ...], Len(1, 1024)] | None
     executor: Literal["local", "submitit"]
     submitit: dict[str, Any] | None
@@ -97,11 +97,13 @@ class SweepSettings:
 
     def __post_init__(self) -> None:
         if self.submitit and self.executor != "submitit":
-            raise InputError("submitit={...} are options of executor=submitit; add that.")
+            raise InputError(
+                "submitit={...} has an effect only with executor=submitit; add executor=submitit."
+            )
         if self.executor == "submitit" and self.timeout_minutes is not None:
             raise InputError(
-                "timeout_minutes would count the time in the queue too; with executor=submitit "
-                "give submitit={timeout_min: ...}."
+                "timeout_minutes would include the time in the queue; with executor=submitit, set "
+                "submitit={timeout_min: ...}."
             )
 
 

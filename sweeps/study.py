@@ -32,31 +32,34 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Options:
-    """Which study, and where its report goes."""
+    """Options of ``rgbt study``."""
 
-    name: Annotated[str, Help("of the study; without one, those of the storage are listed")] = ""
+    name: Annotated[str, Help("name of the study; without a name, all studies are listed")] = ""
     storage: Annotated[
         str,
         Help(
-            "file.journal, sqlite:///FILE or postgresql://USER@HOST/NAME; default: studies.journal "
-            "in the folder of runs"
+            "Optuna storage: file.journal, sqlite:///FILE or postgresql://USER@HOST/NAME; default: "
+            "studies.journal in the folder of runs"
         ),
     ] = ""
     runs_dir: RunsDir = Path("runs")
     out: Annotated[
         Path | None,
-        Help("folder for Markdown, CSV and PNGs; default: studies/<name> in the folder of runs"),
+        Help(
+            "output folder of Markdown, CSV and PNG files; default: studies/<name> in the folder "
+            "of runs"
+        ),
     ] = None
 
 
 NAME_LENGTH = 80
-"""Characters of a folder name; longer study names are cut and told apart by their hash."""
+"""Characters of a folder name; longer names are cut and get a hash."""
 
 
 def main(options: Options, overrides: list[str]) -> int:
     """Show the results of a study: best trials, failures, importances, figures.
 
-    Overrides are of the tracker: tracking=none or tracking.uri=http://host:5000
+    Overrides choose the tracker: tracking=none or tracking.uri=http://host:5000
     """
     runs_dir = options.runs_dir
     place = options.storage or None
@@ -64,7 +67,7 @@ def main(options: Options, overrides: list[str]) -> int:
     storage = open_storage(place, runs_dir)
     if not options.name:
         known = ", ".join(study_names(storage)) or "none"
-        raise InputError(f"give the study with name=...; the storage holds: {known}.")
+        raise InputError(f"choose a study with name=...; the storage has: {known}.")
     study = load_study(options.name, storage)
     tracking = built("tracking", [*readable_paths([f"runs_dir={runs_dir}"]), *overrides])
     out = options.out or study_folder(runs_dir, study.study_name)
@@ -119,7 +122,7 @@ def markdown(data: StudyData, grids: Sequence[TextTable], remark_lines: Sequence
 
     way = ["highest" if up else "lowest" for up in data.maximize]
     objectives = ", ".join(f"{w} {metric}" for w, metric in zip(way, data.metrics, strict=True))
-    created = f"Begun by `{without_passwords(data.command)}`.\n" if data.command else ""
+    created = f"Created by `{without_passwords(data.command)}`.\n" if data.command else ""
     head = f"# Study {data.name}\n\nKind: {data.kind}. Objectives: {objectives}.\n{created}"
     remarked = "".join(f"- {line}\n" for line in remark_lines)
     return "\n".join([head, *map(markdown_table, grids), remarked])
@@ -176,7 +179,7 @@ def _check_exists(storage: str | None, runs_dir: Path) -> None:
     file = storage_file(storage or str(runs_dir / JOURNAL))
     if file is not None and not file.is_file():
         raise InputError(
-            f"there is no file of studies {file}; give the folder of runs with runs_dir=... or the "
+            f"there is no storage {file}; give the folder of runs with runs_dir=... or the "
             "storage with storage=..."
         )
 

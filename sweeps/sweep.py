@@ -1,4 +1,4 @@
-"""What ``-m`` does: a grid of comma lists, a list of points, or a search."""
+"""The sweep behind ``-m``: a grid of comma lists, a list of points, or a search."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def sweep(arguments: Sequence[str], config: DictConfig, loader: ConfigLoader) ->
         taken = {parameter.key for parameter in parameters}
         shared = (*base, *(word for word in fixed if word.partition("=")[0] not in taken))
         if settings.points:
-            raise InputError("points and a search cannot be combined; give each its own command.")
+            raise InputError("points and a search cannot be combined; run them with two commands.")
         identity = (sorted(shared), parameters, settings.objectives, settings.replicates)
         name = settings.study or _name(config.name, [p.key for p in parameters], identity)
         search(Search(name, shared, parameters, runs, _plain(sorted(shared))), settings)
@@ -91,7 +91,7 @@ def sweep(arguments: Sequence[str], config: DictConfig, loader: ConfigLoader) ->
             for own in list_points(settings.points, each.overrides)
         ]
     if len(grid) == 1:
-        info("no list of values was given (such as seed=0,1,2): this is one point.")
+        info("no list of values was given (such as seed=0,1,2); the sweep has one point.")
     name = settings.study or _name(config.name, list(grid[0].params), [p.overrides for p in grid])
     tags = {f"rgbt.study/{name}": "grid"}
     points = tuple(
@@ -117,7 +117,7 @@ def _refuse_search_settings(settings: SweepSettings) -> None:
     }
     for key in (key for key, is_given in given.items() if is_given):
         raise InputError(
-            f"hydra.sweeper.{key} is for searches, and nothing is searched here; give a range "
+            f"hydra.sweeper.{key} is for searches, but no key has a range; give a range "
             "(optimizer.lr=interval(0.001,0.01) or +search=...), or omit it."
         )
 

@@ -1,4 +1,4 @@
-"""What every experiment does, in numbers: a change of structure must leave all of them as they are.
+"""Recorded numbers of every experiment: a change of structure must not change any of them.
 
 ``python -m tests.behaviour record FILE.json`` writes for every file of ``conf/experiment/`` the
 composed configuration and the run key at three settings, and trains ten steps at smoke size: losses

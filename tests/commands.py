@@ -97,7 +97,7 @@ def assert_one_sentence(err: str, sentence: str) -> None:
 
 
 def code_of(entry: Any, words: list[str]) -> int:
-    """Exit code of a command with options of its own."""
+    """Exit code of a command with its own options."""
     from rgbt.config.plain_command import exit_code
 
     return exit_code(lambda: entry.run(words))

@@ -1,4 +1,4 @@
-"""Configurations put together once for many tests: composing takes longer than most of them."""
+"""Configurations composed once for many tests, because composing takes longer than most tests."""
 
 from __future__ import annotations
 

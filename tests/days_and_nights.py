@@ -1,4 +1,4 @@
-"""The small embedded data set of days and nights that runs on two domains are tested on."""
+"""The small embedded data set of days and nights for tests of runs on two domains."""
 
 DAYS_AND_NIGHTS = (
     *("dataset=synth_freiburg", "dataset.num_train_day=6", "dataset.num_train_night=5"),

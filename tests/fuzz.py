@@ -1,4 +1,4 @@
-"""Senseless values for every key of the configuration, and what becomes of each.
+"""Invalid values for every key of the configuration, and the result of each.
 
 Composing takes long, so that a configuration is composed once and its nodes are changed.
 """

@@ -1,4 +1,4 @@
-"""The rules of the house that a tool can check: imports, sizes, nesting, global randomness."""
+"""Rules of this repository that a tool can check: imports, sizes, nesting, global randomness."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ ROOMS = {
 
 
 @pytest.mark.parametrize("path", SWEEPS, ids=lambda path: str(path.relative_to(ROOT)))
-def test_sweeps_call_rgbt_and_know_their_neighbours_alone(path: Path) -> None:
+def test_sweeps_imports_only_allowed_modules(path: Path) -> None:
     inside = path.relative_to(ROOT / "sweeps")
     room = inside.parts[0] if len(inside.parts) > 1 else None
     for name in imports(ast.parse(path.read_text())):
@@ -103,7 +103,7 @@ PARENTS = {"sweeps.report"}
 
 
 @pytest.mark.parametrize("path", ANALYSIS, ids=lambda path: str(path.relative_to(ROOT)))
-def test_analysis_reads_what_is_stored_and_knows_no_network(path: Path) -> None:
+def test_analysis_imports_no_network(path: Path) -> None:
     inside = path.relative_to(ROOT / "analysis")
     is_room = len(inside.parts) > 1 and inside.name != "__main__.py"
     for name in imports(ast.parse(path.read_text())):

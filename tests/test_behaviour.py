@@ -135,7 +135,7 @@ def test_compare_changed_recording_names_the_change(
     assert compare(RECORDING, changed) == elsewhere
 
 
-def test_archive_digest_follows_from_arrays_alone(tmp_path: Path) -> None:
+def test_archive_digest_depends_only_on_arrays(tmp_path: Path) -> None:
     paths = [tmp_path / name for name in ("a.npz", "b.npz", "c.npz")]
     np.savez(paths[0], counts=np.arange(4), names=np.array(["x"]))
     np.savez_compressed(paths[1], names=np.array(["x"]), counts=np.arange(4))

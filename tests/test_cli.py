@@ -154,7 +154,7 @@ def test_commands_of_hydra_are_those_without_options() -> None:
         assert ("@command(" in text) == (name in OF_HYDRA), name
 
 
-def test_scripts_complete_rgbt_and_leave_python_alone() -> None:
+def test_scripts_complete_only_rgbt() -> None:
     for shell, script in SCRIPTS.items():
         assert "rgbt --complete" in script
         assert "python" not in script, shell

@@ -189,7 +189,7 @@ def test_run_image_of_another_shape_does_not_cost_the_training(
 # ---- what is measured of a finished run -----------------------------------------------------
 
 
-def test_consistency_of_a_finished_run_is_its_own(
+def test_consistency_of_a_finished_run_equals_its_own(
     call: Call, trained: Trained, folder: Path, plain: Path
 ) -> None:
     """Measured later, also of a run from before there was any consistency, it is the same."""
@@ -238,7 +238,7 @@ ASIDE = {
 
 
 @pytest.mark.parametrize("words", ASIDE.values(), ids=ASIDE)
-def test_consistency_measured_otherwise_replaces_nothing(
+def test_consistency_with_other_views_replaces_nothing(
     call: Call, folder: Path, data: Path, tmp_path: Path, words: tuple[str, ...]
 ) -> None:
     shutil.copytree(data, tmp_path / "other")
@@ -250,7 +250,7 @@ def test_consistency_measured_otherwise_replaces_nothing(
 
 
 @pytest.mark.slow
-def test_consistency_of_own_views_has_a_file_of_its_own(
+def test_consistency_of_user_views_has_a_separate_file(
     call: Call, trained: Trained, tmp_path: Path
 ) -> None:
     mine = tmp_path / "mine.csv"
@@ -362,7 +362,7 @@ def test_consistency_counts_are_kept_where_no_picture_can_be_drawn(
     ],
     ids=["nothing measured", "nothing asked", "measured", "another split", "other views"],
 )
-def test_finished_run_says_what_was_not_measured(
+def test_finished_run_reports_missing_measurements(
     call: Call,
     trained: Trained,
     data: Path,
@@ -419,7 +419,7 @@ def test_mlflow_gets_what_was_added_once(call: Call, data: Path, tmp_path: Path)
     assert_one_sentence(err, f"rgbt sync run={folder}")
 
 
-def test_name_of_a_run_leaves_out_what_is_measured() -> None:
+def test_name_of_a_run_omits_measurements() -> None:
     def named(*words: str) -> tuple[str, str]:
         overrides = ["+experiment=temporal_con", *words]
         found = describe(specify(compose(overrides), overrides))

@@ -605,7 +605,7 @@ def test_a_thousand_damaged_files(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_run_resumes_with_damaged_lines_and_says_what_it_leaves_out(
+def test_run_resumes_with_damaged_lines_and_reports_them(
     call: Call, trained: Trained, tmp_path: Path
 ) -> None:
     made = trained("+experiment=grbm", *short(4))

@@ -1,4 +1,4 @@
-"""Data sets in front of another one: what each leaves as it is."""
+"""Data sets that wrap another one: what each leaves unchanged."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the README promises: an own masker, network and experiment from outside this repository."""
+"""A user masker, network and experiment from outside this repository, as documented."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Aside:
 
 
 @pytest.mark.slow
-def test_a_second_frame_of_ones_own_is_trained_on(
+def test_user_second_frame_is_used_in_training(
     call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "own_views.py").write_text(VIEW)
@@ -172,7 +172,7 @@ def test_a_wrong_part_is_one_sentence_of_the_command(
     assert_one_sentence(err, sentence)
 
 
-def test_a_misspelt_key_of_ones_own_is_named(lab: Path) -> None:
+def test_misspelt_key_of_a_user_file_is_named(lab: Path) -> None:
     config = compose([*words_of(lab), "masker.cell=4", "+masker.cel=4"])
     with pytest.raises(InputError, match=r"'masker.cel' is not a setting of my_lab.Halves; did"):
         specify(config)

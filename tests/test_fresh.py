@@ -37,7 +37,7 @@ def pretend(folder: Path, **changes: Any) -> None:
 
 
 @pytest.mark.slow
-def test_fresh_trains_again_what_other_code_made_and_keeps_it(
+def test_fresh_retrains_runs_of_other_code_and_keeps_them(
     call: Call, data: Path, runs: Path
 ) -> None:
     words = (data, runs, "+experiment=crm", *short(1))
@@ -64,7 +64,7 @@ def test_fresh_trains_again_what_other_code_made_and_keeps_it(
     assert "other code" not in train(call, *words)[2]
 
 
-def test_fresh_resumes_a_run_that_is_not_finished_and_says_who_began_it(
+def test_fresh_resumes_an_unfinished_run_and_names_its_code(
     call: Call, data: Path, runs: Path
 ) -> None:
     folder = only_run(runs)
@@ -103,7 +103,7 @@ class Scaled(CrossEntropy):
 """
 
 
-def test_a_changed_loss_of_ones_own_is_another_run(
+def test_changed_user_loss_is_another_run(
     call: Call, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "conf" / "loss").mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""Whatever is written for a key is refused in one sentence, or can be trained with."""
+"""Every value of a key is refused in one sentence, or can be used in training."""
 
 from __future__ import annotations
 
@@ -45,7 +45,9 @@ def configs(tmp_path: Path) -> dict[str, DictConfig]:
 
 
 @pytest.mark.slow
-def test_what_is_accepted_can_be_trained(configs: dict[str, DictConfig], tmp_path: Path) -> None:
+def test_accepted_configurations_can_be_trained(
+    configs: dict[str, DictConfig], tmp_path: Path
+) -> None:
     found: list[tuple[DictConfig, Case, str]] = [
         (config, case, outcome(checked, config, case)) for config, case in cases(configs)
     ]

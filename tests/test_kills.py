@@ -1,4 +1,4 @@
-"""Trainings that are killed at any moment, again and again, end as one that never was."""
+"""Trainings that are killed repeatedly give the same result as an uninterrupted one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sizes and steps by data set: the released numbers, and what is told where they are others'."""
+"""Recipes by data set: the released sizes and steps, and warnings for another data set."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_sizes_are_those_of_the_crm_release(
     assert (found.lr, found.backbone_multiplier, found.clip_norm) == (1e-4, 0.1, 0.01)
 
 
-def test_spatialseg_differs_on_mfnet_alone() -> None:
+def test_spatialseg_recipe_differs_only_on_mfnet() -> None:
     ours, theirs = recipe("mfnet_spatialseg"), recipe("mfnet")
     differ = {key for key in theirs if ours[key] != theirs[key]}
     assert differ == {"batch_size", "max_steps", "eval_every"}

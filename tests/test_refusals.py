@@ -1,4 +1,4 @@
-"""What commands refuse: one sentence with the key word, exit code 2, nothing left behind."""
+"""Input that commands refuse: one sentence with the key, exit code 2, no files written."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The commands as a user calls them: end to end, resumed, killed, on files that were replaced."""
+"""The commands as a user calls them: end to end, resumed, killed, on replaced files."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ EXPERIMENTS = sorted(path.stem for path in (ROOT / "conf" / "experiment").glob("
     "experiment",
     [name for name in EXPERIMENTS if not name.startswith(ADAPTATION) and name not in ELSEWHERE],
 )
-def test_every_experiment_trains_evaluates_and_leaves_its_folder(
+def test_every_experiment_trains_evaluates_and_writes_its_folder(
     call: Call, data: Path, tmp_path: Path, experiment: str
 ) -> None:
     unmasked = not experiment.startswith(METHODS)
@@ -219,7 +219,7 @@ def test_multirun_finishes_the_other_points_when_one_is_wrong(
     assert len(list(tmp_path.glob("*/result.json"))) == 2
 
 
-def test_run_is_not_found_by_a_piece_of_text(tmp_path: Path) -> None:
+def test_run_is_not_matched_by_part_of_a_name(tmp_path: Path) -> None:
     folder = tmp_path / "abc"
     folder.mkdir()
     (folder / "config.yaml").write_text("")

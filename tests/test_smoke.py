@@ -1,4 +1,4 @@
-"""``+debug=smoke``: two steps of an experiment on every data set, of files as well as embedded."""
+"""``+debug=smoke``: two steps of an experiment on every data set, embedded or of files."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ def run(call: Call, data: Path, tmp_path: Path) -> Any:
 
 
 @pytest.mark.slow
-def test_the_seed_alone_decides(run: Any) -> None:
+def test_draws_depend_on_the_seed_only(run: Any) -> None:
     """Not the number of workers either."""
     one, helped = run("a", *short(3)), run("b", "scale.num_workers=2", *short(3))
     other = run("c", "seed=1", *short(3))

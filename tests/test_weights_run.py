@@ -78,7 +78,7 @@ def test_weights_are_scored_without_a_run(
 
 
 @pytest.mark.slow
-def test_another_way_of_feeding_is_said(
+def test_other_inputs_are_reported(
     call: Call, data: Path, trained: Trained, tmp_path: Path
 ) -> None:
     first = trained(*ONE)
@@ -152,7 +152,7 @@ def test_weights_that_are_not_there_are_named(call: Call, data: Path, tmp_path: 
     assert_one_sentence(err, "model.fresh")
 
 
-def test_the_key_follows_what_is_in_the_file(tmp_path: Path) -> None:
+def test_key_follows_the_content_of_the_file(tmp_path: Path) -> None:
     first, copy, other = (tmp_path / name for name in ("a.pth", "b.pth", "c.pth"))
     first.write_bytes(b"weights")
     shutil.copy(first, copy)

@@ -1,1 +1,1 @@
-"""The papers' figures: per family a dataclass, a function that fills it and one that draws it."""
+"""The papers' figures: a dataclass per family, a function that fills it and one that draws it."""

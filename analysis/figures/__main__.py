@@ -20,92 +20,116 @@ Count = Annotated[int, Interval(ge=1, le=MOST)]
 
 @dataclass(frozen=True)
 class Options:
-    """The figure, and what single figures take (`analysis.figures.catalogue`)."""
+    """The figure, and the options of single figures (`analysis.figures.catalogue`)."""
 
     figure: Annotated[
-        str, Help('name, e.g. spatialseg/fig5; "list" shows all of them with what each needs')
+        str, Help('name of the figure, such as spatialseg/fig5; "list": all names and their inputs')
     ] = "list"
-    out: Annotated[str, Help("file to write; .pdf, .svg or .png (300 dots per inch)")] = ""
-    maps: Annotated[str | None, Help("folder (or its maps.npz) of rgbt score")] = None
+    out: Annotated[str, Help("output file: .pdf, .svg or .png (300 dots per inch)")] = ""
+    maps: Annotated[str | None, Help("output of rgbt score: folder or maps.npz")] = None
     statistics: Annotated[
         str | None,
-        Help("folder (or its statistics.npz) of rgbt spatial; or dataset=... to measure it now"),
+        Help(
+            "output of rgbt spatial: folder or statistics.npz; or dataset=... to measure the data "
+            "set now"
+        ),
     ] = None
     methods: Annotated[
         str | None,
         Help(
-            "label:folder,label:folder; what rgbt score wrote (spatialseg/fig2, fig3), or "
+            "methods, label:folder,label:folder: output of rgbt score (spatialseg/fig2, fig3), or "
             "predicted label images (qualitative panels)"
         ),
     ] = None
     runs: Annotated[
         str | None,
         Help(
-            "runs, groups or files of counts, with commas; label:run,label:run names them, and "
-            "entries with one label are seeds of one method"
+            "runs, groups or files of counts, separated by commas; label:run,label:run sets their "
+            "labels; entries with the same label are seeds of one method"
         ),
     ] = None
-    runs_dir: Annotated[str | None, Help("folder of runs (runs)")] = None
+    runs_dir: Annotated[str | None, Help("folder of runs (default: runs)")] = None
     frames: Annotated[
         Literal["aligned", "released", "next"] | None,
         Help(
-            "pairs of frames of temporal/fig5: aligned or released (virtual views), or next "
-            "(consecutive frames), as rgbt consistency counts them"
+            "pairs of frames of temporal/fig5, counted by rgbt consistency: aligned or released "
+            "(virtual views), or next (consecutive frames)"
         ),
     ] = None
     split: Annotated[
         str | None,
         Help(
-            "split of the data set or of the runs (test; for statistics: train); a file that holds "
-            "another one is refused"
+            "split of the data set or of the runs (default: test; for statistics: train); a file "
+            "of another split is refused"
         ),
     ] = None
-    part: Annotated[Literal["all", "day", "night"] | None, Help("all, day or night")] = None
-    names: Annotated[str | None, Help("images to show, with commas")] = None
+    part: Annotated[Literal["all", "day", "night"] | None, Help("images: all, day or night")] = None
+    names: Annotated[str | None, Help("names of the images to show, separated by commas")] = None
     pick: Annotated[
         Literal["first", "largest_difference"] | None,
-        Help("instead: rule, first or largest_difference between the first and the last method"),
+        Help(
+            "rule that selects the images instead of names=: first, or largest_difference between "
+            "the first and the last method"
+        ),
     ] = None
-    rows: Annotated[Count | None, Help("number of images (4)")] = None
+    rows: Annotated[Count | None, Help("number of images (default: 4)")] = None
     layout: Annotated[
-        Literal["rows", "columns"] | None, Help("rows or columns: one row, or column, per image")
+        Literal["rows", "columns"] | None, Help("one row or one column per image: rows or columns")
     ] = None
     format: Annotated[
         Literal["auto", "index", "colour"] | None,
-        Help("of predictions: auto, index or colour"),
+        Help("format of predictions: auto, index or colour"),
     ] = None
-    suffix: Annotated[str | None, Help("of predictions: NAME<suffix>.png")] = None
+    suffix: Annotated[
+        str | None, Help("suffix of the file names of predictions, NAME<suffix>.png")
+    ] = None
     regions: Annotated[
-        Count | None, Help("number of regions of each partition of spatialseg/fig2 (5)")
+        Count | None, Help("number of regions of each partition of spatialseg/fig2 (default: 5)")
     ] = None
     absent: Annotated[
         Literal["released", "exclude"] | None,
-        Help("how a class without pixels counts: released (0) or exclude; default: as counted"),
+        Help(
+            "class without pixels: released: it scores 0; exclude: it is in no mean; default: "
+            "convention of the data set"
+        ),
     ] = None
     estimator: Annotated[
         Literal["immerkaer", "wavelet_mad", "std"] | None,
-        Help("of the noise: immerkaer, wavelet_mad or std"),
+        Help("estimator of the noise: immerkaer, wavelet_mad or std"),
     ] = None
     average: Annotated[
-        Literal["pooled", "images"] | None, Help("of signal to noise: pooled or images")
+        Literal["pooled", "images"] | None,
+        Help("signal-to-noise ratio over images: pooled or images"),
     ] = None
     patches: Annotated[
-        tuple[Count, ...] | None, Help("sizes of the patches of crm/fig5 (8,16,32,64)")
+        tuple[Count, ...] | None,
+        Help("sides of the patches of crm/fig5 in pixels (default: 8,16,32,64)"),
     ] = None
-    seed: Annotated[Annotated[int, Interval(ge=0, le=MOST)] | None, Help("of the masks (0)")] = None
+    seed: Annotated[
+        Annotated[int, Interval(ge=0, le=MOST)] | None, Help("seed of the masks (default: 0)")
+    ] = None
     band: Annotated[
         Literal["widest", "images", "seeds", "both"] | None,
-        Help("interval over: widest, images, seeds or both"),
+        Help("interval over images, seeds or both; widest: both if possible"),
     ] = None
-    resamples: Annotated[Count | None, Help("of that interval (10000)")] = None
-    level: Annotated[float | None, Help("of that interval (0.95)")] = None
-    blocks: Blocks | None = None
+    resamples: Annotated[
+        Count | None, Help("number of resamples for that interval (default: 10000)")
+    ] = None
+    level: Annotated[float | None, Help("confidence level of that interval (default: 0.95)")] = None
+    blocks: Annotated[
+        Blocks | None,
+        Help("images resampled together: auto, none, sequence, or a number of neighbouring frames"),
+    ] = None
     size: Annotated[
-        str | None, Help("of the picture of regions/heat (480x640), 16 to 4096 pixels a side")
+        str | None,
+        Help("size of regions/heat, 16 to 4096 pixels per side (default: 480x640)"),
     ] = None
     corruptions: Annotated[
         str | None,
-        Help("to show, with commas (robustness): noise:rgb,frozen; default: all that exist"),
+        Help(
+            "corruptions to show (robustness), separated by commas: noise:rgb,frozen; default: all "
+            "that were measured"
+        ),
     ] = None
 
     @property
@@ -116,10 +140,10 @@ class Options:
 
 
 def main(options: Options, overrides: list[str]) -> int:
-    """Draw a figure of the papers into a file: vector graphics with text as text, or PNG.
+    """Draw a figure of the papers into a file: vector graphics with selectable text, or PNG.
 
-    Overrides choose data set and partition: dataset=mfnet dataset.root=/data/MFNet metric=ring9;
-    stored statistics are of one partition, only heat maps can be cut anew
+    Overrides choose the data set and the partition: dataset=mfnet dataset.root=/data/MFNet
+    metric=ring9. Stored statistics have one partition; only heat maps can use another one
     """
     from analysis.figures.catalogue import FIGURES, make
 

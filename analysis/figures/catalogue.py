@@ -1,4 +1,4 @@
-"""All figures by name: what each shows and takes, and the function that makes it."""
+"""All figures by name: content, inputs, and the function that makes the figure."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rgbt.checks import InputError, check_choice, nearest
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-STATISTICS = "statistics= (of analysis.spatial) or dataset="
+STATISTICS = "statistics= (of rgbt spatial) or dataset="
 SPATIAL = ("statistics", "split")
 DATASET_AND_METRIC = ("dataset", "metric")
 PANELS = "dataset=, methods=label:folder of predictions"
@@ -30,11 +30,11 @@ class FigureSpec:
     Attributes:
         maker: module of this package and its function from a `FigureInput` to a figure; imported
             when the figure is made, so that the list of figures is there at once.
-        needs: what must be given, in words.
+        needs: required inputs, in words.
         keys: keys that take effect, beside ``figure`` and ``out``.
         groups: groups of the configuration that take effect.
         metric: the partition unless ``metric=`` is given.
-        idle: keys of the configuration below `groups` that take no effect nevertheless.
+        idle: keys of the configuration below `groups` that have no effect.
         numbers: as `maker`, to what the figure shows as text by the ending of its file; "": none.
     """
 
@@ -61,7 +61,7 @@ FIGURES = {
     "spatialseg/fig1": FigureSpec(
         "maps.make_heats",
         "pixel-level IoU and sample occupancy, with centre, edge and mean",
-        f"maps= (of analysis.score) for (a); {STATISTICS} for (b)",
+        f"maps= (of rgbt score) for (a); {STATISTICS} for (b)",
         ("maps", "part", *SPATIAL),
         DATASET_AND_METRIC,
         idle=(),
@@ -69,7 +69,7 @@ FIGURES = {
     "spatialseg/fig2": FigureSpec(
         "trends.make",
         "IoU, accuracy and occupancy over vertical, horizontal and ring regions",
-        f"methods=label:folder (of analysis.score); {STATISTICS}",
+        f"methods=label:folder (of rgbt score); {STATISTICS}",
         ("methods", "regions", "absent", *SPATIAL),
         ("dataset",),
     ),
@@ -125,7 +125,7 @@ FIGURES = {
     "multihead/fig3": FigureSpec(
         "gradients.make",
         "gradients of entropy minimisation and maximum squares loss",
-        "nothing: analytic",
+        "no input: it is analytic",
     ),
     "robustness": _robustness(
         "mIoU under corruptions, one panel per corruption, one line per method"

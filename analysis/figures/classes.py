@@ -75,7 +75,7 @@ def class_regions(
         absent: how a class without pixels counts, see `rgbt.metrics.scores`.
 
     Raises:
-        InputError: counts over other regions, or a part that the data set or the counts lack.
+        InputError: counts over other regions, or a part without images in data set or counts.
     """
     shares = 100 * normalised(class_region_occupancy(statistics, part)[1:])
     label, scores = None, None
@@ -91,7 +91,7 @@ def class_regions(
             counts = counts.select(name for name, dark in at_night if dark == (part == NIGHT))
             if not counts.names:
                 raise InputError(
-                    f"part={part}: the counts of '{label}' hold no image of the {part}."
+                    f"part={part}: the counts of '{label}' contain no image of the {part}."
                 )
         scores = 100 * miou(counts.by_region(), absent, counts.scored)
     return ClassRegions(

@@ -22,8 +22,8 @@ from rgbt.metrics.scores import class_mean
 from rgbt.tracking.tables import class_labels
 
 TITLES: dict[Protocol, str] = {
-    "aligned": "virtual views, first frame brought into the second",
-    "released": "virtual views, frames as they lie (as released)",
+    "aligned": "virtual views, first frame warped into the second",
+    "released": "virtual views, frames not warped (as released)",
     "next": "consecutive frames",
 }
 

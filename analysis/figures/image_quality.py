@@ -29,7 +29,7 @@ MARKS = {"all": ("o", "-"), "day": ("s", "--"), "night": ("^", ":")}
 
 LEVEL = 0.95
 SPREAD = 0.5
-"""Regions over which the series stand side by side, so that their bars can be told apart."""
+"""Regions over which the series are drawn side by side, so that their bars do not overlap."""
 
 FAR_APART = 5.0
 """A logarithmic axis where one modality's median is more than this many times the other's."""
@@ -93,7 +93,7 @@ def snr_series(
         average: one of `analysis.statistics.derive.AVERAGES`.
 
     Raises:
-        InputError: an estimator or average that there is not.
+        InputError: an unknown estimator or average.
     """
     check_choice("estimator", estimator, statistics.noise)
     way = estimator, average

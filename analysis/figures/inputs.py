@@ -1,4 +1,4 @@
-"""What was given on the command line to make a figure from, opened when a figure asks for it."""
+"""The inputs of a figure from the command line, opened when the figure needs them."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class FigureInput:
     metric: str
 
     def need(self, key: str, what: str) -> Any:
-        """The value of a key; InputError, which says `what` it would be, where it was not given."""
+        """The value of a key; without one, an InputError that describes the key by `what`."""
         if key not in self.values:
             raise InputError(f"figure={self.figure} needs {key}=..., {what}.")
         return self.values[key]
@@ -133,7 +133,7 @@ class FigureInput:
         return names[0]
 
     def refuse(self, keys: Sequence[str], without: str) -> None:
-        """Refuse keys that take effect only beside something that was not given.
+        """Refuse keys that have an effect only together with a missing option.
 
         Raises:
             InputError: one of `keys` was given; `without` says what is missing.
@@ -142,16 +142,16 @@ class FigureInput:
         for key in keys:
             if key in self.values or key in words:
                 raise InputError(
-                    f"'{key}' has no effect on figure={self.figure} without {without}; leave it "
-                    "out, or give that too."
+                    f"'{key}' has no effect on figure={self.figure} without {without}; omit it, "
+                    "or give both."
                 )
 
     def check_split(self, stored: str, source: object) -> None:
         """Refuse a ``split=`` that is not the `stored` one of an opened file, `source`."""
         if self.get("split", stored) != stored:
             raise InputError(
-                f"split={self.values['split']}: {source} is of split '{stored}' already; leave "
-                "split= out, or give a file of that split."
+                f"split={self.values['split']}: {source} has split '{stored}'; omit split=, "
+                "or give a file of that split."
             )
 
     def maps(self) -> PixelMaps:
@@ -241,7 +241,8 @@ class FigureInput:
             if place.is_dir() and not path.is_file():
                 files = sorted(each.name for each in place.glob("counts*.npz"))
                 raise InputError(
-                    f"{place} lacks {path.name} (it holds {', '.join(files) or 'no counts'}); "
+                    f"{place} does not contain {path.name} "
+                    f"(it contains {', '.join(files) or 'no counts'}); "
                     "score the predictions over that partition with rgbt score."
                 )
             found[label] = Counts.load(path)

@@ -2,7 +2,7 @@
 
 The paper does not state how large its "centre" and its "edge" are, nor how its numbers come from
 its map. Here centre and edge are the innermost and the outermost ring of the partition, which
-stands in the figure and can be changed with ``metric=``; and the numbers are those of the tables:
+the figure names and which can be changed with ``metric=``; and the numbers are those of the tables:
 of (a) the regional mIoU, of (b) the sample occupancy rate, both from the pixels of a ring added up
 over all images before anything is divided. They are not means over the pixels of the map.
 """
@@ -63,7 +63,7 @@ def make_heats(given: FigureInput) -> Figure:
             "occupancy, or both."
         )
     if not has_statistics:
-        given.refuse(["part"], "statistics=... or dataset=..., whose images it chooses")
+        given.refuse(["part"], "statistics=... or dataset=..., whose images it selects")
     heats, part = [], given.get("part", ALL)
     if "maps" in given.values:
         pixel_maps = given.maps()

@@ -1,7 +1,7 @@
 """Qualitative panels: RGB, thermal, ground truth and methods, with a box on the centre.
 
 One function for SpatialSeg Figs. 8 and 9, Temporal Fig. 6 and CRM Figs. 4 and 6 to 8. None of the
-papers says how its images were chosen; here they are named, or chosen by a rule that is stated.
+papers says how its images were chosen. Here they are named, or selected by a stated rule.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def make(given: FigureInput) -> Figure:
         return read
 
     if "names" in given.values and ("pick" in given.values or "rows" in given.values):
-        raise InputError("names= says which images are shown; leave pick= and rows= out.")
+        raise InputError("names= selects the images; omit pick= and rows=.")
     names = given.names(given.get("rows", 4))
     if given.get("pick", "first") == "largest_difference":
         split = given.get("split", "test")
@@ -196,7 +196,7 @@ def most_different(
         InputError: fewer than two methods, or fewer images than requested.
     """
     if len(mious) < 2:
-        raise InputError("pick=largest_difference compares two methods; name two in methods=...")
+        raise InputError("pick=largest_difference compares two methods; give two in methods=...")
     first, *_, last = mious.values()
     gaps = {name: abs(last[name] - first[name]) for name in names}
     known = [name for name, gap in gaps.items() if not np.isnan(gap)]

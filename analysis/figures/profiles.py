@@ -24,7 +24,7 @@ from rgbt.metrics.scores import miou
 from rgbt.tracking.pictures import colour_limits, number_places
 
 LEAST, MOST_PIXELS, LONGEST = 16, 4096, 8
-"""Pixels of a side of ``size=``, and times that one side may be the other."""
+"""Largest side of ``size=`` in pixels, and largest ratio of the two sides."""
 
 SPREAD = 0.3
 """Regions over which bars of several methods stand side by side."""

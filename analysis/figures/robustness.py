@@ -1,4 +1,4 @@
-"""What is left of each method under corruptions: one panel per corruption, severity along x."""
+"""Scores of each method under corruptions: one panel per corruption, severity along x."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ HEIGHT_BELOW = 1.35
 """Inches of a line of panels, and of the panel below them."""
 
 ROW = "degradation"
-"""What the tables beside the figure have called the column of corruptions from the start."""
+"""Header of the column of corruptions in the tables beside the figure; files depend on it."""
 
 MISSING = "one image missing"
 """Title of the panel of corruptions without a severity."""
@@ -105,8 +105,8 @@ def panels(
         rows: names of the corruptions to show; (): all.
 
     Raises:
-        InputError: methods on other images, or measured at different severities; a row that nobody
-            has; clean images alone.
+        InputError: methods on other images, or measured at different severities; a row that
+            was not measured; only clean images.
     """
     by_method = {
         label: [level for training in each for level in training.levels]
@@ -120,7 +120,9 @@ def panels(
         first.setdefault(level.row, level)
     known = [row for row in first if row != CLEAN]
     if not known:
-        raise InputError("runs: clean images alone were measured; rgbt robustness does.")
+        raise InputError(
+            "runs: only clean images were measured; measure the corruptions with rgbt robustness."
+        )
     shown = [row_name(row) for row in rows] or known
     for row in shown:
         if row not in known:
@@ -146,11 +148,13 @@ def _panel(methods: Mapping[str, Sequence[Training]], like: Level, absent: Absen
     }
     measured = {label: found for label, found in ladders.items() if found != {()}}
     if len(set().union(*measured.values())) > 1:
-        told = "; ".join(
+        measured_at = "; ".join(
             f"of '{label}' at {' and '.join(str([*ladder]) for ladder in sorted(found))}"
             for label, found in measured.items()
         )
-        raise InputError(f"runs: {like.row} was measured {told}; rgbt robustness completes them.")
+        raise InputError(
+            f"runs: {like.row} was measured {measured_at}; rgbt robustness measures the rest."
+        )
     severities = next(iter(next(iter(measured.values()))))
     curves = _curves(methods, lambda t: t.of(like.row) or [None] * len(severities), absent)
     return Panel(like.row, like.title, like.unit, (0.0, *severities), (), curves)
@@ -182,7 +186,7 @@ def draw(data: Sequence[Panel], *, relative: bool) -> Figure:
 
     The dashed line is the score on clean images. Missing images stand side by side below.
 
-    Relative: percent of the score on clean images, of every training for itself.
+    Relative: percent of the score on clean images, for every training separately.
     """
     curves = [panel for panel in data if not panel.ticks]
     below = [panel for panel in data if panel.ticks]

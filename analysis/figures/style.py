@@ -1,4 +1,4 @@
-"""How every figure looks: sizes of a paper's column, letters, colours that all eyes tell apart.
+"""Style of all figures: sizes of a paper's column, fonts, colours for colour-blind readers.
 
 Figures are drawn without pyplot (no display, no global state). `styled` sets sizes and letters
 while something is drawn; `save` keeps text as text in PDF and SVG.
@@ -225,7 +225,7 @@ def readable(name: str) -> str:
 
 
 def say_splits(figure: Figure, splits: tuple[str, str]) -> None:
-    """Above the figure, that occupancy and scores are of two splits, where they are."""
+    """A note above the figure where occupancy and scores are of different splits."""
     occupancy, scores = splits
     if scores and occupancy != scores:
         figure.suptitle(f"SOR: split {occupancy}; scores: split {scores}", fontsize=SMALL)

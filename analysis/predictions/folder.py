@@ -1,4 +1,4 @@
-"""Which file of a folder is the prediction of which image, and what is missing."""
+"""Finds the prediction of every image in a folder, and the missing ones."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ OVERLAY = "_overlay"
 """Ending of the pictures that `rgbt.predict` writes beside its indices."""
 
 SHOWN = 3
-"""Names that a sentence lists before it says "and so on"."""
+"""Most names that a message lists."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def find(
     if not there:
         raise InputError(
             f"none of the {len(names)} images of split '{split}' has a file NAME{suffix}.png in "
-            f"{folder}; it holds {listed(sorted(stems), '.png')}{_hint(stems, dataset, suffix)}."
+            f"{folder}; it contains {listed(sorted(stems), '.png')}{_hint(stems, dataset, suffix)}."
         )
     if absent and missing == "refuse":
         raise InputError(
@@ -84,13 +84,13 @@ def _stems(folder: Path) -> set[str]:
     stems = {path.stem for path in folder.glob("*.png")}
     if not stems:
         others = sorted(path.name for path in folder.iterdir())
-        holds = f"it holds {listed(others)}" if others else "it is empty"
+        holds = f"it contains {listed(others)}" if others else "it is empty"
         raise InputError(f"predictions={folder}: expected PNG files named NAME.png, but {holds}.")
     return stems
 
 
 def _hint(stems: set[str], dataset: LabelledDataset, suffix: str) -> str:
-    """What else the names could mean: another split, or the most frequent text after a name."""
+    """A hint what the names may be: another split, or the most frequent suffix."""
     for split in filter(dataset.has, dataset.splits):
         names = dataset.names(split)
         number = sum(f"{name}{suffix}" in stems for name in names)

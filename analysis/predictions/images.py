@@ -1,8 +1,9 @@
 """One predicted label image, read without guessing: indices, a palette with indices, or colours.
 
-A palette PNG says twice which class a pixel is: by its index and by the colour that stands for it.
-Both are believed where they agree with the data set; where they do not, only the user knows which
-one the method meant (PASCAL VOC's palette holds colours of MFNet at other indices).
+A palette PNG states the class of a pixel twice: by its index and by the colour of that index. The
+file is read where both agree with the data set. Where they do not, the user has to choose, because
+only the user knows what the method wrote (PASCAL VOC's palette has colours of MFNet at other
+indices).
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ NUM_COLOURS = 2**24
 
 
 class Header(NamedTuple):
-    """What the first bytes of a PNG say: what its pixels are, and bits per channel."""
+    """Content of the first bytes of a PNG: kind of its pixels, and bits per channel."""
 
     kind: Kind
     bits: int
@@ -51,7 +52,7 @@ def read_header(path: Path) -> Header:
     with path.open("rb") as file:
         start = file.read(26)
     if len(start) < 26 or not start.startswith(PNG):
-        raise InputError(f"{path} is no PNG file, or a damaged one; write the prediction again.")
+        raise InputError(f"{path} is not a PNG file or is damaged; write the prediction again.")
     bits, colour_type = struct.unpack("BB", start[24:26])
     if bits > 8:
         raise InputError(f"{path}: expected 8 bits per channel, got {bits}; save it as 8 bit.")
@@ -66,8 +67,8 @@ def read_header(path: Path) -> Header:
 def check_one_kind(paths: Iterable[Path]) -> None:
     """Refuse files that "auto" would read in different ways, before any of them is decoded.
 
-    An optimiser that stores a black colour image as one channel would else turn colours into
-    indices here and there.
+    Otherwise, an image optimiser that stores a black colour image as one channel would turn the
+    colours of some images into indices.
 
     Raises:
         InputError: not all files are of one kind, or one is no 8 bit PNG.
@@ -79,7 +80,7 @@ def check_one_kind(paths: Iterable[Path]) -> None:
         (kind, path), (other, other_path) = list(seen.items())[:2]
         raise InputError(
             f"some predictions are PNGs with {kind} ({path}), others with {other} ({other_path}); "
-            "say what counts: format=index (the stored numbers) or format=colour (the colours "
+            "choose one reading: format=index (the stored numbers) or format=colour (the colours "
             "shown)."
         )
 
@@ -147,10 +148,11 @@ class PredictionReader:
             away = ((np.array(self.palette, int) - colour) ** 2).sum(1)
             near = int(away.argmin())
             raise InputError(
-                f"{path}: colour {tuple(colour.tolist())} at row {row}, column {column} stands for "
-                f"no class ({int(unknown.sum())} such pixels); the nearest is {self.classes[near]} "
-                f"{tuple(self.palette[near])}: write colours of dataset.palette without smoothing, "
-                "or save indices (format=index where equal channels hold them)."
+                f"{path}: colour {tuple(colour.tolist())} at row {row}, column {column} is the "
+                f"colour of no class ({int(unknown.sum())} such pixels); the nearest is "
+                f"{self.classes[near]} {tuple(self.palette[near])}: write colours of "
+                "dataset.palette without smoothing, or save indices (format=index where equal "
+                "channels hold them)."
             )
         return found
 
@@ -162,11 +164,11 @@ class PredictionReader:
         value = int(indices[wrong][0])
         if value == IGNORE:
             raise InputError(
-                f"{path}: {int((indices == IGNORE).sum())} pixels are {IGNORE}; a prediction has "
-                f"no pixels to ignore, it must name a class 0 to {last} everywhere."
+                f"{path}: {int((indices == IGNORE).sum())} pixels are {IGNORE}; a prediction "
+                f"cannot ignore pixels; it needs a class 0 to {last} at every pixel."
             )
         raise InputError(
-            f"{path}: value {value} is no class; expected 0 to {last} (the last one, "
+            f"{path}: value {value} is not a class; expected 0 to {last} (the last one, "
             f"{self.classes[last]}), so map the method's indices to those of the data set first."
         )
 
@@ -184,7 +186,7 @@ class PredictionReader:
                 raise InputError(
                     f"{path}: palette index {index} is shown as "
                     f"{shown if len(shown) == 3 else 'no colour'} but the "
-                    f"data set has {there}; say what counts: "
+                    f"data set has {there}; choose one reading: "
                     "format=index (the stored numbers) or format=colour (the colours shown)."
                 )
 
@@ -194,7 +196,7 @@ class PredictionReader:
             if colour in first:
                 raise InputError(
                     f"dataset.palette gives {first[colour]} and {name} the same colour {colour}, "
-                    "so colours cannot tell them apart; give predictions as indices."
+                    "so a colour does not identify a class; save predictions as indices."
                 )
             first[colour] = name
 

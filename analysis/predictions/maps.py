@@ -29,7 +29,7 @@ Heat = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class PixelMaps:
-    """How often prediction and label met at each pixel, over the images of a split.
+    """How often prediction and label agreed at each pixel, over the images of a split.
 
     Attributes:
         intersection: (K, H, W) int32, images in which label and prediction are the class there.

@@ -67,7 +67,7 @@ class ScoringOptions:
 
 @dataclass(frozen=True)
 class FolderScores:
-    """What a folder of predictions gave.
+    """Result of counting a folder of predictions.
 
     Attributes:
         counts: one per partition, in the order of `ScoringOptions.partitions`.

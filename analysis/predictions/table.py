@@ -21,7 +21,7 @@ Metric = Literal["IoU", "Acc", "Var"]
 
 @dataclass(frozen=True, kw_only=True)
 class ScoreKey:
-    """What a score is of: two scores of a table differ in one of these.
+    """Key of a score: two scores of a table differ in one of these attributes.
 
     Attributes:
         images: "all", "day" or "night".

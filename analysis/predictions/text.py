@@ -1,4 +1,4 @@
-"""Score tables as grids of text, Markdown and tidy CSV, and what has to be said about them."""
+"""Score tables as grids of text, Markdown and tidy CSV, and remarks about them."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def convention_line(table: ScoreTable) -> str:
 
 
 def remarks_on(scored: FolderScores) -> list[str]:
-    """What a reader of the numbers has to know about the folder, one sentence each."""
+    """Remarks about the folder that a reader of the numbers needs, one sentence each."""
     found, remarks = scored.found, []
     if found.missing:
         number = len(found.missing) + len(found.paths)

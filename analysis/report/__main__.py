@@ -19,24 +19,24 @@ from rgbt.config.plain_command import PlainCommand
 from rgbt.config.shadowing import check_not_shadowed
 from rgbt.config.stored_config import parse_trust
 
-TOLD = 5
+MAX_REMARKS = 5
 """Remarks that are printed to stderr; the page has all."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """Where the page goes, and what it is made of."""
+    """Options of ``rgbt report``."""
 
-    out: Annotated[Path, Help("folder; the page is index.html in it")] = Path("report")
+    out: Annotated[Path, Help("output folder; the page is its index.html")] = Path("report")
     runs_dir: Annotated[
         Path,
-        Help("folder of runs; its mlflow.db is the store unless tracking.uri says another"),
+        Help("folder of runs; its mlflow.db is the store unless tracking.uri names another"),
     ] = Path("runs")
     resamples: Resamples = 2000
     trust: Annotated[
         str,
         Help(
-            "modules of yours with maskers and data sets to draw: trust=my_lab; their code is run"
+            "your modules with maskers and data sets to draw: trust=my_lab; their code is executed"
         ),
     ] = ""
 
@@ -74,14 +74,14 @@ def main(options: Options, overrides: list[str]) -> int:
         data = collect(tracking, runs_dir, options.resamples, typed, trust, track)
     out.mkdir(parents=True, exist_ok=True)
     page = write_page(data, out)
-    for remark in data.remarks[:TOLD]:
+    for remark in data.remarks[:MAX_REMARKS]:
         info(remark)
-    if len(data.remarks) > TOLD:
-        info(f"{len(data.remarks) - TOLD} more remarks stand on the page.")
+    if len(data.remarks) > MAX_REMARKS:
+        info(f"{len(data.remarks) - MAX_REMARKS} more remarks are on the page.")
     run = [table for table in data.tables if table.scale]
     held = (
         f"{len(data.runs)} runs, {len(run)} tables with runs, {len(data.tables) - len(run)} "
-        f"published alone, {len(data.studies)} studies"
+        f"published only, {len(data.studies)} studies"
     )
     size = f"{page.stat().st_size / 1e6:.2f} MB"
     print_rich(path_lines([("page", str(page)), ("size", size), ("holds", held)]))

@@ -19,7 +19,7 @@ from rgbt.files.yaml_files import read_yaml
 Spec = dict[str, Any]
 
 MOST_CHOSEN = 6
-"""Groups in one profile: colours that can be told apart."""
+"""Groups in one profile: as many as there are distinct colours."""
 
 
 def specification(name: str) -> Spec:
@@ -36,7 +36,7 @@ def _specifications() -> Any:
 def table_charts(view: TableView) -> list[Spec]:
     """Ours with intervals and single runs, and the published values, by row.
 
-    At demo scale the published values have a chart and an axis of their own.
+    At demo scale the published values have a separate chart and axis.
     """
     rows = list(_table_rows(view))
     printed = [row for row in rows if row["kind"] == "published"]
@@ -85,7 +85,7 @@ def profile_rows(group: Group) -> list[Spec]:
 
 
 def is_complete(trial: TrialEntry) -> bool:
-    """Whether all its objectives are known."""
+    """Whether all objectives of the trial are known."""
     return trial.state == "complete" and bool(trial.values) and all(map(is_number, trial.values))
 
 

@@ -23,7 +23,7 @@ class RunEntry:
         scale: "demo" or "paper".
         group: what seeds of one method share, or "".
         studies: names of the studies that the run is part of.
-        table_rows: table -> row that the run stands for.
+        table_rows: table -> row that the run belongs to.
         split: that the scores are of.
         partition: e.g. "ring5".
         classes: K names.
@@ -78,7 +78,7 @@ class CellEntry:
         sd: over seeds (n - 1).
         low: lower end of the 95 % interval of the mean, `high` its upper end.
         covers: what the interval is over.
-        difference: mean less published.
+        difference: mean minus published.
         reason: why there is no value, or seeds are missing.
         rank: 1 best, 2 second best of the column among ours, else 0.
         published_rank: the same among the printed values.
@@ -142,7 +142,7 @@ class TrialEntry:
         state: "complete", "pruned", "failed", "running" or "waiting".
         params: name -> value as text.
         values: of the objectives; () where it is not complete.
-        on_front: whether no other trial beats it.
+        on_front: whether no other trial dominates it.
     """
 
     number: int
@@ -161,7 +161,7 @@ class StudyEntry:
         kind: "search", "grid" or "list".
         maximize: whether more is better, by objective.
         note: its report in Markdown.
-        command: that began it, or "".
+        command: that created it, or "".
     """
 
     name: str
@@ -175,7 +175,7 @@ class StudyEntry:
 
 @dataclass(frozen=True, kw_only=True)
 class DifferenceEntry:
-    """A place where paper and release differ, and what it does where the store holds both.
+    """A difference between paper and release, and its effect where the store has both.
 
     Attributes:
         paper: setting and sentence, as `released`.

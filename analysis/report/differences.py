@@ -1,4 +1,4 @@
-"""Paper against release: what differs, and what it does where the store holds both sides."""
+"""Paper against release: the differences, and their effect where the store has both sides."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Choice:
 
 @dataclass(frozen=True)
 class PairedRuns:
-    """Runs that differ by one choice and their seeds alone."""
+    """Runs that differ only in one choice and in their seeds."""
 
     paper: tuple[ReportRun, ...]
     released: tuple[ReportRun, ...]
@@ -94,7 +94,7 @@ def difference_entries(
 
 
 def find_pairs(choice: Choice, runs: Iterable[ReportRun]) -> list[PairedRuns]:
-    """Runs that differ by `choice` alone, those with the most seeds first."""
+    """Runs that differ only in `choice`, those with the most seeds first."""
     keys = {*choice.paper.values, *choice.released.values}
     groups: dict[str, tuple[list[ReportRun], list[ReportRun]]] = {}
     for run in runs:
@@ -115,7 +115,7 @@ def find_pairs(choice: Choice, runs: Iterable[ReportRun]) -> list[PairedRuns]:
 
 
 def _rest(run: ReportRun, keys: set[str]) -> str:
-    """All else that makes the run what it is: configuration and images."""
+    """All other properties of a run: configuration and images."""
     assert run.test_counts is not None, "only runs with counts are compared"
     left_out = (*NOT_IN_KEY, "seed")
     same = {
@@ -134,12 +134,12 @@ def _by_seed(runs: Sequence[ReportRun]) -> tuple[ReportRun, ...]:
 
 def _effect(choice: Choice, pairs: Sequence[PairedRuns], settings: Resampling) -> str:
     if choice.released.setting is None:
-        return "Cannot be compared: one side alone can be run."
+        return "Cannot be compared: only one side can be run."
     if not pairs:
         key, _, first = str(choice.paper.setting).partition("=")
         both = f"{key}={first},{choice.released.setting.partition('=')[2]}"
         words = shlex.join(["python", "-m", "rgbt.run", "-m", *choice.base, both, SEEDS])
-        return f"No two runs differ by this alone; these would: {words}"
+        return f"No two runs differ only in this setting. Runs that would: {words}"
     best, others = pairs[0], len(pairs) - 1
     # Both sides score alike: `metric.absent` is part of what must be equal.
     as_run = Resampling(resamples=settings.resamples, absent=best.paper[0].absent)
@@ -153,7 +153,7 @@ def _effect(choice: Choice, pairs: Sequence[PairedRuns], settings: Resampling) -
 
 
 def sentence(pair: PairedRuns, compared: Comparison) -> str:
-    """Released less paper in every score, with intervals and p-values."""
+    """Released minus paper in every score, with intervals and p-values."""
     over = "images and seeds" if all(each.both for each in compared.differences) else "images"
     shown = []
     for each in compared.differences:
@@ -164,7 +164,7 @@ def sentence(pair: PairedRuns, compared: Comparison) -> str:
     counts = (len(pair.released), len(pair.paper))
     seeds = " against ".join(f"{count} seed{'s' * (count > 1)}" for count in counts)
     return (
-        f"Released less paper: {'; '.join(shown)} ({pair.paper[0].entry.group}; {seeds}; "
+        f"Released minus paper: {'; '.join(shown)} ({pair.paper[0].entry.group}; {seeds}; "
         f"{100 * compared.level:g} % intervals over {over}, {compared.said}; p not corrected for "
         "the number of comparisons)."
     )

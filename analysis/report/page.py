@@ -70,7 +70,7 @@ def page_text(data: ReportData) -> str:
     """The page as HTML.
 
     Its policy lets the browser run its own scripts by their hashes and load nothing: text from
-    the store that would get into the markup after all could neither run nor call home.
+    the store that got into the markup could neither run nor contact a server.
 
     Raises:
         ValueError: a picture that is not inside the data.

@@ -196,8 +196,9 @@ def _disagreements(
     if apart:
         worst = max(apart, key=lambda name: apart[name])
         yield (
-            f"Run {key}: {len(apart)} scores of its counts are not those in MLflow, such as "
-            f"{worst}: {scores[worst]:.2f}, there {logged[worst]:.2f}; the page shows the counts'."
+            f"Run {key}: {len(apart)} scores of its counts differ from those in MLflow, such "
+            f"as {worst}: {scores[worst]:.2f} instead of {logged[worst]:.2f}; the page shows the "
+            "scores of the counts."
         )
 
 

@@ -1,4 +1,4 @@
-"""How a run was made and how it is made again, from what the run noted when it began."""
+"""How a run was made and how to repeat it, from what the run recorded at its start."""
 
 from __future__ import annotations
 
@@ -69,12 +69,12 @@ def as_text(value: Any) -> str:
 
 
 def read_provenance(files: RunFiles, key: str, remarks: list[str]) -> list[dict[str, Any]]:
-    """What every process that worked on a run noted, first one first; [] where nothing is known.
+    """Records of every process that worked on a run, oldest first; [] where nothing is known.
 
     Args:
         files: of the run.
         key: of the run.
-        remarks: gets a sentence where the file is damaged, or where the code changed on the way.
+        remarks: gets a sentence where the file is damaged, or where the code changed between them.
     """
     try:
         found = files.find("provenance.json")
@@ -85,7 +85,7 @@ def read_provenance(files: RunFiles, key: str, remarks: list[str]) -> list[dict[
     commits = dict.fromkeys(commit_of(process) for process in processes)
     if len(commits) > 1:
         named = ", then ".join(commit or "no commit" for commit in commits)
-        remarks.append(f"Run {key} was begun and continued by different code: {named}.")
+        remarks.append(f"Run {key} was started and continued by different code: {named}.")
     return processes
 
 

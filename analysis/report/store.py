@@ -1,4 +1,4 @@
-"""What an MLflow store holds: runs, tables and studies with their files. Nothing is written."""
+"""Reads an MLflow store: runs, tables and studies with their files. Nothing is written."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, TypeVar
 from urllib.parse import unquote, urlparse
 
 from rgbt.checks import InputError, RunError, nearest
@@ -17,6 +17,7 @@ from rgbt.tracking.provenance import without_passwords
 from rgbt.tracking.run_files import read_result
 from rgbt.tracking.tracker import Tracking
 
+T = TypeVar("T")
 PAGE = 500
 """Runs of one request."""
 
@@ -45,7 +46,7 @@ class RunFiles:
         """Where the file called `path` can be read; None: there is none.
 
         Raises:
-            InputError: the store has it and does not give it.
+            InputError: the store has it, but it cannot be fetched.
         """
         for folder in self.folders:
             if (folder / path).is_file():
@@ -100,6 +101,19 @@ class MlflowRun:
     def kind(self) -> str:
         """What it is: "run", "table" or "study"."""
         return self.tags.get("kind", "run")
+
+
+def read_each(
+    records: Sequence[MlflowRun], read: Callable[[MlflowRun], T], remarks: list[str]
+) -> list[T]:
+    """What `read` returns for every record; `remarks` gets a sentence for each InputError."""
+    found = []
+    for record in records:
+        try:
+            found.append(read(record))
+        except InputError as error:
+            remarks.append(str(error))
+    return found
 
 
 def read_store(tracking: Tracking, runs_dir: Path, copies: Path) -> list[MlflowRun]:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from analysis.report.data import StudyEntry, TrialEntry
-from analysis.report.store import MlflowRun
+from analysis.report.store import MlflowRun, read_each
 from rgbt.checks import InputError
 from rgbt.tracking.csv_files import read_csv
 from rgbt.tracking.provenance import without_passwords
@@ -22,9 +22,10 @@ COMPLETE = "complete"
 
 OBJECTIVES = re.compile(r"^Kind: (\w+)\. Objectives: (.+)\.$", re.MULTILINE)
 OBJECTIVE = re.compile(r"(highest|lowest) (.+)")
-BEGUN = re.compile(r"^Begun by `(.+)`\.$", re.MULTILINE)
+CREATED = re.compile(r"^(?:Created|Begun) by `(.+)`\.$", re.MULTILINE)
+"""The command of a study; older records have "Begun by"."""
 FIGURES = re.compile(r"\n## [^\n]*\n\n!\[", re.MULTILINE)
-"""Where the figures of a report begin; they are files of their own and not part of the page."""
+"""Where the figures of a report begin; they are separate files and not part of the page."""
 
 
 def study_entries(records: Sequence[MlflowRun], remarks: list[str]) -> tuple[StudyEntry, ...]:
@@ -34,12 +35,7 @@ def study_entries(records: Sequence[MlflowRun], remarks: list[str]) -> tuple[Stu
         records: runs of MLflow of the kind "study".
         remarks: gets a sentence for each that cannot be read.
     """
-    found = []
-    for record in records:
-        try:
-            found.append(read_study(record))
-        except InputError as error:
-            remarks.append(str(error))
+    found = read_each(records, read_study, remarks)
     return tuple(sorted(found, key=lambda each: each.name))
 
 
@@ -66,7 +62,7 @@ def read_study(record: MlflowRun) -> StudyEntry:
             f"study '{name}' has no {TRIALS_FILE} in the store; "
             f"`rgbt study name={name}` records it again."
         )
-    begun = BEGUN.search(note)
+    created = CREATED.search(note)
     return StudyEntry(
         name=name,
         kind=record.tags.get("rgbt.study.kind", head.group(1)),
@@ -74,7 +70,7 @@ def read_study(record: MlflowRun) -> StudyEntry:
         maximize=maximize,
         trials=_trials(text, name, objectives, maximize),
         note=without_passwords(FIGURES.split(note)[0].strip() + "\n"),
-        command=without_passwords(begun.group(1)) if begun else "",
+        command=without_passwords(created.group(1)) if created else "",
     )
 
 

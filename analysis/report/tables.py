@@ -1,4 +1,4 @@
-"""Every table beside its paper: our cells from counts with intervals, and those nobody has run."""
+"""Every table beside its paper: our cells from counts with intervals, and tables without runs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 from analysis.report.data import CellEntry, TableEntry, Uncertainty
 from analysis.report.runs import ReportRun
-from analysis.report.store import MlflowRun
+from analysis.report.store import MlflowRun, read_each
 from analysis.report.tables_recorded import (
     NO_CELL,
     CountsSource,
@@ -33,7 +33,7 @@ Track = Callable[[Sequence[Any], str], Iterable[Any]]
 """Goes over a sequence and shows how far it is: (sequence, what is done)."""
 
 DEFAULT_SEEDS = (0, 1, 2)
-"""Of a table that nobody has run yet."""
+"""Of a table without runs."""
 
 NOT_HERE = "counts of some runs are not in the store; the value is as recorded, without interval."
 
@@ -58,7 +58,7 @@ def table_entries(
     track: Track,
     remarks: list[str],
 ) -> tuple[TableEntry, ...]:
-    """All tables: those with runs first, then the published ones that wait.
+    """All tables: those with runs first, then the published ones without runs.
 
     Args:
         records: runs of MLflow of the kind "table".
@@ -72,13 +72,8 @@ def table_entries(
         try:
             files[name] = load_table(name)
         except InputError as error:
-            remarks.append(f"Table '{name}' is left out: {error}")
-    recorded = []
-    for record in records:
-        try:
-            recorded.append(read_recorded(record))
-        except InputError as error:
-            remarks.append(str(error))
+            remarks.append(f"Table '{name}' is omitted: {error}")
+    recorded = read_each(records, read_recorded, remarks)
     recorded.sort(key=lambda each: (each.name, each.scale, each.extra))
     drafts = [score_again(each, files.get(each.name) or _file_of(each), runs) for each in recorded]
     wanted = (
@@ -92,7 +87,7 @@ def table_entries(
     known = {each.name for each in recorded}
     for index, each in enumerate(recorded):
         if each.name not in files:
-            remarks.append(f"Table '{each.name}' has no file here any more; it is as recorded.")
+            remarks.append(f"Table '{each.name}' has no file any more; it is shown as recorded.")
             orders = {name: (rho, 0) for name, rho in each.orders.items()}
             made[index] = replace(made[index], orders=orders)
     return (*made, *(_waiting(name, files[name]) for name in files if name not in known))
@@ -217,7 +212,7 @@ def _entry(draft: RescoredTable, intervals: Intervals, remarks: list[str]) -> Ta
     gone = [label for label in recorded.rows() if label not in {row.label for row in table.rows}]
     if gone:
         remarks.append(
-            f"Table '{recorded.name}': its file has no row '{gone[0]}' any more, which was run."
+            f"Table '{recorded.name}': row '{gone[0]}' was run but is no longer in its file."
         )
     remarks += draft.changed()
     return _laid_out(

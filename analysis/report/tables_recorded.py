@@ -83,7 +83,9 @@ def read_recorded(record: MlflowRun) -> RecordedTable:
     """
     text = record.files.text(CSV_FILE)
     if text is None:
-        raise InputError(f"table '{record.name}' has no {CSV_FILE} in the store; run it again.")
+        raise InputError(
+            f"table '{record.name}' has no {CSV_FILE} in the store; rerun its command."
+        )
     markdown = (record.files.text("table.md") or "").splitlines()
     listed = [line[2:] for line in markdown if line.startswith("- ")]
     below = [line for line in listed if not line.startswith(SHOWN)]
@@ -104,7 +106,7 @@ def _lines(text: str, name: str) -> dict[tuple[str, str], RecordedCell]:
     missing = [column for column in HEADER if column not in header]
     if missing:
         raise InputError(
-            f"table '{name}': its {CSV_FILE} lacks the column '{missing[0]}'; run it again."
+            f"table '{name}': its {CSV_FILE} lacks the column '{missing[0]}'; rerun its command."
         )
     try:
         return {

@@ -96,7 +96,7 @@ def letters(index: int) -> str:
 
 
 def unique_names(names: Iterable[str]) -> list[str]:
-    """What stands behind # for each of these: letters, digits, hyphens, none of them twice."""
+    """A distinct anchor (the text after #) for each of these: letters, digits and hyphens."""
     taken: list[str] = []
     for name in names:
         slug = wanted = re.sub(r"[^A-Za-z0-9]+", "-", name).strip("-").lower()

@@ -69,9 +69,9 @@ def collect(
     """
     if dataset.unscored and dataset.unscored[0] != dataset.classes[0]:
         raise InputError(
-            f"these statistics take class 0 for the background, as MFNet has it, but class 0 of "
-            f"{dataset.name} is '{dataset.classes[0]}' and its background "
-            f"{' and '.join(dataset.unscored)}; they are not made for it yet."
+            f"these statistics assume that class 0 is the background, as in MFNet, but class 0 of "
+            f"{dataset.name} is '{dataset.classes[0]}', the background is "
+            f"{' and '.join(dataset.unscored)}; such a data set is not supported."
         )
     names = dataset.names(split)
     like = _first_readable(dataset, names, settings)

@@ -109,7 +109,7 @@ class SpatialStatistics:
         return int(self.region_map.max()) + 1
 
     def subsets(self) -> tuple[str, ...]:
-        """What can be told apart: ("all", "day", "night"), or ("all",) without images of both."""
+        """Parts of the images: ("all", "day", "night"), or ("all",) without images of both."""
         both = self.night is not None and 0 < int(self.night.sum()) < len(self.names)
         return (ALL, DAY, NIGHT) if both else (ALL,)
 
@@ -117,7 +117,7 @@ class SpatialStatistics:
         """(N,): which images belong to `part`: "all", "day" or "night".
 
         Raises:
-            InputError: no such part, a data set that does not tell, or no such image.
+            InputError: no such part, a data set without that information, or no such image.
         """
         check_choice("part", part, (ALL, DAY, NIGHT))
         if part == ALL:

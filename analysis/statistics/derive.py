@@ -1,4 +1,4 @@
-"""What follows from the measurements: occupancy, Laplacian variance, signal to noise, entropy.
+"""Derived from the measurements: occupancy, Laplacian variance, signal to noise, entropy.
 
 Pure functions of `SpatialStatistics`, by part ("all", "day", "night") and modality ("rgb" as grey,
 "thermal"); unknown words are refused (InputError). The functions on arrays take any leading axes,

@@ -1,4 +1,4 @@
-"""How a claim is decided: findings with intervals, and what follows from them.
+"""Decides claims: findings with intervals, and the verdicts that follow from them.
 
 A claim is made of findings, each a number with an interval and the range that the claim puts it in.
 A finding holds where the whole interval lies in the range, does not hold where all of it lies
@@ -45,7 +45,7 @@ class Finding:
         what: is measured, e.g. "rgb, day: centre / edge".
         wanted: (low, high), where the claim puts it.
         interval: NaN ends where the sample is too small for one.
-        note: what else is worth knowing, e.g. "7 of 9 regions".
+        note: further information, e.g. "7 of 9 regions".
     """
 
     what: str

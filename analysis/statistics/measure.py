@@ -31,7 +31,7 @@ std: standard deviation of the pixel values of the region. No noise estimate: al
 
 KERNELS = ("four", "eight")
 """Neighbours that the Laplacian reads. Four is the default: Pertuz et al., whom the paper cites
-for this measure, and `cv2.Laplacian` use it when nothing is said."""
+for this measure, and `cv2.Laplacian` use it by default."""
 
 EIGHT = np.array([[1, 1, 1], [1, -8, 1], [1, 1, 1]], np.float32)
 SECOND_DIFFERENCE = np.array([1, -2, 1], np.float32)

@@ -70,12 +70,12 @@ def make_blocks(
         return _singles(len(names))
     sequences = _sequences(names)
     if sequences is None and choice == "auto":
-        reason = f"Names such as '{names[0]}' hold no frame number that others continue; {ALONE}."
-        return _singles(len(names), " (their names tell no neighbours)", reason)
+        reason = f"Names such as '{names[0]}' have no consecutive frame numbers; {ALONE}."
+        return _singles(len(names), " (their names show no neighbours)", reason)
     if sequences is None:
         raise InputError(
-            f"blocks={choice}: names such as '{names[0]}' tell no neighbouring frames (equal names "
-            "but for one number); use blocks=none."
+            f"blocks={choice}: names such as '{names[0]}' show no neighbouring frames (names that "
+            "differ in one number only); use blocks=none."
         )
     if choice == "auto":
         return _automatic(sequences, series)
@@ -88,8 +88,8 @@ def make_blocks(
         blocks = _pieces(places, choice)
     if blocks.count < FEWEST:
         raise InputError(
-            f"blocks={choice}: {len(names)} images make {blocks.said}, and fewer than {FEWEST} say "
-            "nothing about how sure a score is; take shorter blocks, or blocks=auto."
+            f"blocks={choice}: {len(names)} images make {blocks.said}, but an interval needs at "
+            f"least {FEWEST}; use shorter blocks, or blocks=auto."
         )
     return blocks
 

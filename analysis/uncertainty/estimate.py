@@ -28,7 +28,7 @@ from rgbt.metrics.named import ParsedMetric, parse
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
-    """A score and how sure it is; percent, the variance in squared percent points.
+    """A score with its uncertainty; percent, the variance in squared percent points.
 
     Attributes:
         value: mean over seeds; NaN where there is nothing to score.

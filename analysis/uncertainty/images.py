@@ -195,7 +195,7 @@ def _like(first: Counts, other: Counts) -> Counts:
     check_same_means(first, other)
     if other.partition != first.partition:
         of_pairs = protocol_of(first.partition) or protocol_of(other.partition)
-        how = "rgbt.evaluate regions=..., analysis.score partition=..."
+        how = "rgbt evaluate regions=..., rgbt score partition=..."
         if of_pairs and protocol_of(first.partition) == protocol_of(other.partition):
             raise InputError(
                 f"counts of {first.partition} and of {other.partition} are of different second "
@@ -204,7 +204,7 @@ def _like(first: Counts, other: Counts) -> Counts:
             )
         raise InputError(
             f"counts by {first.partition} cannot be compared with counts by {other.partition}; "
-            f"count both by one partition ({'rgbt.consistency frames=...' if of_pairs else how})."
+            f"count both by one partition ({'rgbt consistency frames=...' if of_pairs else how})."
         )
     if set(other.names) != set(first.names):
         if not set(other.names) & set(first.names):
@@ -216,8 +216,8 @@ def _like(first: Counts, other: Counts) -> Counts:
         only = sorted(set(first.names) ^ set(other.names))
         raise InputError(
             f"the counts are not of the same images: {len(first.names)} of split '{first.split}' "
-            f"against {len(other.names)} of split '{other.split}', '{only[0]}' is in one alone; "
-            "score both on one split, or take missing=leave_out to compare what both hold."
+            f"against {len(other.names)} of split '{other.split}', '{only[0]}' is in only one; "
+            "score both on one split, or set missing=leave_out to compare the common images."
         )
     same = other if other.names == first.names else other.select(first.names)
     if None not in (first.night, same.night) and first.night != same.night:
@@ -234,7 +234,7 @@ def _like(first: Counts, other: Counts) -> Counts:
     unequal = np.flatnonzero((labelled[0] != labelled[1]).any(1))
     if len(unequal):
         raise InputError(
-            f"'{first.names[unequal[0]]}' holds other labels in the one than in the other counts "
+            f"'{first.names[unequal[0]]}' has different labels in the two counts "
             f"({len(unequal)} images do); score both on the same labels at the same size."
         )
     return same

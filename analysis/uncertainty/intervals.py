@@ -98,7 +98,7 @@ def corrected(value: float, bias: float, spread: Spread, level: float) -> Interv
         level: of the interval.
 
     Returns:
-        at least 0; holds `value`, at its upper end where the bias is all that there is.
+        at least 0; contains `value`; `value` is the upper end where the estimate is all bias.
     """
     around = student(value - bias, spread, level)
     return Interval(min(max(0.0, around.low), value), max(around.high, value))
@@ -177,7 +177,7 @@ def swap_p(value: float, swapped: Values) -> float:
 
 
 def holm(ps: Sequence[float]) -> list[float]:
-    """P-values corrected for their number, so that all together rarely raise a false alarm.
+    """P-values corrected for their number (family-wise error rate).
 
     Source: Holm, Scandinavian Journal of Statistics 6 (1979). NaN stays NaN and is not counted.
     """

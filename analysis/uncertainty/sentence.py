@@ -1,4 +1,4 @@
-"""A comparison in one sentence that a reviewer would accept."""
+"""A comparison in one sentence, with its evidence and its limits."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from rgbt.metrics.named import parse
 
 
 def sentence(comparison: Comparison, label_a: str, label_b: str) -> str:
-    """What the first difference of a comparison says, with everything that limits it.
+    """The first difference of a comparison as a sentence, with everything that limits it.
 
     Args:
         comparison: one score or more; the sentence is about the first.
-        label_a: what the first method is called.
-        label_b: the second.
+        label_a: name of the first method.
+        label_b: name of the second method.
     """
     found = comparison.differences[0]
     if found.interval is None:
@@ -51,9 +51,9 @@ def sentence(comparison: Comparison, label_a: str, label_b: str) -> str:
         if count > 1:
             said += f"; corrected for all {count} scores compared, {_p(found.p_corrected)}"
     else:
-        limit = f"with this much, one below about {found.interval.half:.2f}{unit} cannot be seen"
+        limit = f"this data shows only differences above about {found.interval.half:.2f}{unit}"
         if 0.0 not in found.interval:
-            limit = "the interval leaves 0 out, the exchange test does not confirm it"
+            limit = "the interval excludes 0, but the exchange test does not confirm it"
         said = (
             f"{start}a difference in {found.metric} between {label_b} and {label_a} is not shown "
             f"{evidence}, {basis}; {limit}"

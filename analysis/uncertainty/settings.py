@@ -12,7 +12,7 @@ Method = Literal["auto", "percentile", "bca"]
 NamedBlocks = Literal["auto", "none", "sequence"]
 
 MOST = 1_000_000
-"""Resamples beyond which only time is lost."""
+"""Most resamples: more take time without a visible effect."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,11 +21,12 @@ class Resampling:
 
     Attributes:
         resamples: number of resamples, 100..`MOST`.
-        level: share of intervals that shall hold the true value, 0.5..0.999.
+        level: confidence level of the intervals, 0.5..0.999.
         method: of intervals over images. "percentile": quantiles of the resampled scores; "bca":
             bias-corrected and accelerated (Efron, 1987); "auto": percentile, except for the
             variance over regions, whose bias is removed
-            (`analysis.uncertainty.intervals.corrected`); docs/analysis.md has the measurements.
+            (`analysis.uncertainty.intervals.corrected`;
+            docs/explanation/counts-and-intervals.md).
         blocks: what is drawn together, because neighbouring frames show nearly the same:
             "none" single images; a number: that many neighbours; "sequence": whole sequences (names
             that are equal but for one number); "auto": runs of consecutively numbered frames, cut

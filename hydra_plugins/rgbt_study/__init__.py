@@ -1,7 +1,7 @@
-"""Hydra's way to `sweeps`: ``hydra/sweeper=study``.
+"""The Hydra plugin of `sweeps`: ``hydra/sweeper=study``.
 
-Hydra finds sweepers only in modules below ``hydra_plugins`` and imports them at every start, also
-for ``--help``: nothing but the stub lives here.
+Hydra looks for sweepers only in modules below ``hydra_plugins`` and imports them at every start,
+also for ``--help``. This module is therefore only a stub, which imports `sweeps` when a sweep runs.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from omegaconf import DictConfig
 
 
 class StudySweeper(Sweeper):
-    """Runs a grid, a list or a search, each point in a process of its own (`sweeps.sweep`).
+    """Runs a grid, a list or a search, each point in a separate process (`sweeps.sweep`).
 
     Args:
         settings: keys of ``conf/hydra/sweeper/study.yaml``; checked when the sweep begins.
@@ -26,7 +26,7 @@ class StudySweeper(Sweeper):
     def setup(
         self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig
     ) -> None:
-        """Keep the configuration; the task function is not used, points are commands."""
+        """Store the configuration; the task function is not used, because points are commands."""
         del task_function
         self.config = config
         self.hydra_context = hydra_context

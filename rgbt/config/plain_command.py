@@ -32,24 +32,30 @@ class Entry(NamedTuple):
 
 
 COMMANDS = {
-    "run": Entry("rgbt.run", "train one configuration; with -m a grid or a search"),
-    "evaluate": Entry("rgbt.evaluate", "scores of a run, or of weights from a file"),
-    "predict": Entry("rgbt.predict", "class maps and overlays of images, or pseudo-labels"),
-    "consistency": Entry("rgbt.consistency", "temporal consistency (TC, CA) of a run"),
-    "robustness": Entry("rgbt.robustness", "scores under missing, noisy, occluded images"),
-    "reproduce": Entry("sweeps.reproduce", "run a published table, or one of your own (new)"),
-    "study": Entry("sweeps.study", "report of a grid or a search, also while it runs"),
-    "report": Entry("analysis.report.__main__", "one page of everything in the MLflow store"),
-    "compare": Entry("analysis.compare", "two methods: differences, intervals, p-values"),
-    "score": Entry("analysis.score", "scores by region of any method's predictions"),
-    "spatial": Entry("analysis.spatial", "what a data set looks like by region"),
-    "figures": Entry("analysis.figures.__main__", "draw a figure of the papers"),
-    "check": Entry("rgbt.data.check", "read a whole data set and say what is wrong with it"),
-    "prepare": Entry(
-        "rgbt.data.prepare.__main__", "turn an official download into a data set folder"
+    "run": Entry("rgbt.run", "train one configuration; with -m: a grid or a search"),
+    "evaluate": Entry("rgbt.evaluate", "score a run, or weights from a file"),
+    "predict": Entry("rgbt.predict", "predict class maps and overlays of images, or pseudo-labels"),
+    "consistency": Entry("rgbt.consistency", "measure the temporal consistency (TC, CA) of a run"),
+    "robustness": Entry("rgbt.robustness", "score a run under missing, noisy or occluded images"),
+    "reproduce": Entry(
+        "sweeps.reproduce", "run a published table or your own; new: write your own"
     ),
-    "cache": Entry("rgbt.data.cache.__main__", "decode a data set once into a cache, or remove it"),
-    "weights": Entry("rgbt.weights", "inspect a file of weights, or export those of a run"),
+    "study": Entry("sweeps.study", "report a grid or a search, also while it runs"),
+    "report": Entry(
+        "analysis.report.__main__", "write one page with everything in the MLflow store"
+    ),
+    "compare": Entry("analysis.compare", "compare two methods: differences, intervals, p-values"),
+    "score": Entry("analysis.score", "score predictions of any method by region"),
+    "spatial": Entry("analysis.spatial", "measure the statistics of a data set by region"),
+    "figures": Entry("analysis.figures.__main__", "draw a figure of the papers"),
+    "check": Entry("rgbt.data.check", "validate a whole data set and report its problems"),
+    "prepare": Entry(
+        "rgbt.data.prepare.__main__", "convert an official download into a data set folder"
+    ),
+    "cache": Entry(
+        "rgbt.data.cache.__main__", "decode a data set once into a cache, or remove the cache"
+    ),
+    "weights": Entry("rgbt.weights", "inspect a file of weights, or export the weights of a run"),
     "sync": Entry("rgbt.tracking.sync", "send run folders to MLflow"),
     "corruptions": Entry("rgbt.corruptions.__main__", "draw the corruptions of one pair of images"),
     "masks": Entry("rgbt.maskers.sketch", "draw examples of a masker"),

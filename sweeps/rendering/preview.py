@@ -57,7 +57,7 @@ def summary(request: TableRequest, outcomes: Sequence[Outcome], workers: int) ->
     left = len(outcomes) - states["finished"]
     if left:
         seconds = estimated_seconds(outcomes, workers)
-        known = duration(seconds) if seconds is not None else "known once a run is finished"
+        known = duration(seconds) if seconds is not None else "known when one run is finished"
         lines.append(f"Time left with workers={workers}: {known}.")
     lines += [line for line in (other_code_line(outcomes),) if line]
     lines += _evaluations(request, outcomes)
@@ -83,8 +83,8 @@ def _evaluations(request: TableRequest, outcomes: Sequence[Outcome]) -> list[str
     if not outcomes or not commands:
         return []
     shown = "; ".join(dict.fromkeys(commands))
-    lines = [f"Made of every run that lacks it: {shown}."]
+    lines = [f"Evaluations of every run that still lacks them: {shown}."]
     trained = sum(outcome.is_trained for outcome in outcomes)
     if trained:
-        lines.append(f"Trained already: {trained}; the time of evaluations is not counted.")
+        lines.append(f"Already trained: {trained}; the time left excludes their evaluations.")
     return lines

@@ -97,10 +97,10 @@ def _report_missing(scored: ScoredTable, outcomes: Sequence[Outcome]) -> bool:
     if others:
         info(
             f"{len(others)} of {len(outcomes)} runs are not finished: other commands run them, or "
-            "they have not begun; rerun the command later, or with wait=true."
+            "they have not started; rerun the command later, or with wait=true."
         )
     if empty:
-        info("some cells have no value although nothing is missing, see the footnotes.")
+        info("some cells have no value although all runs are finished; see the footnotes.")
     other = other_code_line(outcomes)
     if other:
         info(other)

@@ -128,7 +128,7 @@ def _remarks(scored: ScoredTable, extra: Sequence[str]) -> list[str]:
     if len(scored.commits) > 1:
         named = Counter(scored.commits).most_common()
         commits = ", ".join(f"{commit} ({count})" for commit, count in named)
-        remarks.append(f"Runs of ours come from several git commits: {commits}.")
+        remarks.append(f"Our runs come from several git commits: {commits}.")
     return remarks
 
 

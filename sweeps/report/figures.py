@@ -76,11 +76,11 @@ def _figures(
         yield "history", "Objectives by trial", incomplete, partial(drawing.history, data)
         reason = ""
         if len(data.metrics) > 1:
-            reason = "trials with several objectives report no values while they train."
+            reason = "trials with several objectives report no values during training."
         elif not any(trial.intermediate_values for trial in data.trials):
-            reason = "no trial has reported a value while it trained."
+            reason = "no trial has reported a value during training."
         make = partial(drawing.intermediate, data)
-        yield "intermediate", "Validation while training", reason, make
+        yield "intermediate", "Validation during training", reason, make
     unimportant = "" if shares.shares else shares.remark
     bars = partial(drawing.importance_bars, data, shares)
     yield "importances", "Importance of the parameters", unimportant, bars

@@ -225,9 +225,9 @@ def importances(data: StudyData) -> Importances:
     flat = [data.metrics[i] for i, each in enumerate(found) if math.isnan(each[varied[0]])]
     remark = " ".join(
         [
-            *([f"{constant}: one value only, left out."] if constant else []),
+            *([f"{constant}: one value only, excluded."] if constant else []),
             *([f"{', '.join(flat)}: the same value in all trials."] if flat else []),
-            *([f"rough: {count} complete trials, {ADVISED} are advised."] * (count < ADVISED)),
+            *([f"rough: {count} complete trials, {ADVISED} are recommended."] * (count < ADVISED)),
         ]
     )
     if len(flat) == len(data.metrics):

@@ -78,7 +78,7 @@ def failed_grid(data: StudyData) -> TextTable:
     """Failed trials with their reasons; without those that were retried."""
     failed = [trial for trial in data.latest if trial.state.name == "FAIL"]
     again = data.counts()["FAIL"] - len(failed)
-    title = "Failed trials" + (f" ({again} more were tried again)" if again else "")
+    title = "Failed trials" + (f" ({again} more were retried)" if again else "")
     rows = [
         (_clipped(_reason(t)), str(t.number), data.label(t), _runs(t), _seconds(t)) for t in failed
     ]

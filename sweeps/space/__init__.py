@@ -1,1 +1,1 @@
-"""Which points: grids of comma lists, ranges of a search, samplers and pruners."""
+"""Selection of points: grids of comma lists, ranges of a search, samplers and pruners."""

@@ -105,11 +105,11 @@ def list_points(points: Sequence[Sequence[str]], fixed: Sequence[str]) -> list[G
         sweeps = [_typed(one) for one in parsed if one.is_sweep_override()]
         if sweeps:
             raise InputError(
-                f"points: '{sweeps[0]}' has several values; a point has one of each, write it out "
-                "once per value."
+                f"points: '{sweeps[0]}' has several values; a point has one value per key: write "
+                "one point per value."
             )
         if not parsed:
-            raise InputError("points: a point needs at least one override; take out the empty one.")
+            raise InputError("points: a point needs at least one override; remove the empty one.")
         taken = {_bare(one) for one in parsed}
         others = [_typed(one) for one in _parsed(fixed) if _bare(one) not in taken]
         result.append(_point(others, own))
@@ -168,8 +168,8 @@ def _check_tags(override: Override, known: Sequence[str]) -> None:
     value = override.value()
     for tag in sorted(value.tags) if isinstance(value, Sweep) else ():
         if tag not in known:
-            hint = nearest(tag, known) if known else "tags are for interval() alone"
-            raise InputError(f"'{_typed(override)}': tag '{tag}' means nothing; {hint}.")
+            hint = nearest(tag, known) if known else "only interval() has tags"
+            raise InputError(f"'{_typed(override)}': tag '{tag}' is unknown; {hint}.")
 
 
 def merge_space(

@@ -1,4 +1,4 @@
-"""A sampler that starts afresh for every trial; imported late, as it needs optuna."""
+"""A sampler that starts anew for every trial; imported late, because it needs optuna."""
 
 from __future__ import annotations
 
@@ -16,8 +16,9 @@ class PerTrialSampler(BaseSampler):
     """Draws of a trial follow from the seed and the number of the trial, and the trials before it.
 
     Optuna's samplers draw from one generator for all trials: two drivers with one seed, or a search
-    that is resumed, would propose the same points again. Trials have numbers of their own in a
-    storage, so here no two share draws, and one worker repeats a search, however often it stopped.
+    that is resumed, would propose the same points again. Here every trial
+    draws by its own number in the storage. No two trials share draws, and one worker repeats a
+    search exactly, even if it was stopped and resumed.
 
     Args:
         make: makes the sampler that chooses, from a seed; must keep nothing between trials that is

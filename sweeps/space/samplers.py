@@ -83,8 +83,8 @@ def build_sampler(node: Mapping[str, Any], objectives: int = 1) -> PerTrialSampl
         raise InputError("sampler.kind=cmaes needs the package cmaes; run `pip install cmaes`.")
     if kind == "cmaes" and objectives > 1:
         raise InputError(
-            f"sampler.kind=cmaes follows one objective, and this search has {objectives}; "
-            "take tpe, gp or nsga2."
+            f"sampler.kind=cmaes supports one objective, but this search has {objectives}; "
+            "choose tpe, gp or nsga2."
         )
     make = getattr(optuna.samplers, SAMPLERS[kind])
     _check_options("sampler", kind, make, options)
@@ -115,8 +115,8 @@ def build_pruner(node: Mapping[str, Any] | None, objectives: int = 1) -> BasePru
     kind, options = _kind("pruner", {"kind": "none"} if node is None else node, PRUNERS)
     if kind != "none" and objectives > 1:
         raise InputError(
-            f"pruner.kind={kind} compares trials by one number, and this search has {objectives} "
-            "objectives; take hydra.sweeper.pruner=null or one objective."
+            f"pruner.kind={kind} compares trials by one number, but this search has {objectives} "
+            "objectives; set hydra.sweeper.pruner=null or use one objective."
         )
     options.pop("seed", None)
     make = getattr(optuna.pruners, PRUNERS[kind])
@@ -131,7 +131,9 @@ def _kind(
 ) -> tuple[str, dict[str, Any]]:
     options = dict(node)
     if "kind" not in options:
-        raise InputError(f"hydra.sweeper.{what}: 'kind' has no value, such as {{kind: tpe}}.")
+        raise InputError(
+            f"hydra.sweeper.{what}: 'kind' has no value; give one, such as {{kind: tpe}}."
+        )
     kind = str(options.pop("kind"))
     check_choice(f"{what}.kind", kind, known)
     return kind, options
@@ -147,7 +149,7 @@ def _check_options(what: str, kind: str, make: Any, given: Mapping[str, Any]) ->
     known = {name: PLAIN[word] for name, word in words.items() if word in PLAIN}
     for name in known:
         if parameters[name].default is inspect.Parameter.empty and name not in given:
-            raise InputError(f"{what}.kind={kind} needs a value of '{name}'; give {what}.{name}.")
+            raise InputError(f"{what}.kind={kind} needs the option '{name}'; set {what}.{name}.")
     for name, value in given.items():
         if name not in known:
             hint = nearest(name, known) if known else "it has none"
@@ -165,4 +167,4 @@ def _construct(what: str, kind: str, make: partial[Any]) -> Any:
         return make()
     except ValueError as error:
         reason = str(error).rstrip(".")
-        raise InputError(f"{what}.kind={kind} does not take these options: {reason}.") from error
+        raise InputError(f"{what}.kind={kind} does not accept these options: {reason}.") from error

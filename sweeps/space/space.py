@@ -97,7 +97,9 @@ def parse_space(space: Mapping[str, Any]) -> tuple[Parameter, ...]:
             raise _wrong(key, f"type '{kind}' is unknown; {nearest(kind, KEYS)}")
         for word in map(str, entry):
             if word not in KEYS[kind]:
-                raise _wrong(key, f"'{word}' is no key of type {kind}; {nearest(word, KEYS[kind])}")
+                raise _wrong(
+                    key, f"'{word}' is not a key of type {kind}; {nearest(word, KEYS[kind])}"
+                )
         values = _choices(key, entry) if kind == "categorical" else _range(key, kind, entry)
         when = _conditions(key, entry.get("when") or {}, parameters)
         parameters[key] = Parameter(key=key, type=kind, when=when, **values)
@@ -126,23 +128,23 @@ def _is_key(key: str) -> bool:
 def _range(key: str, kind: str, entry: Mapping[str, Any]) -> dict[str, Any]:
     log = entry.get("log", False)
     if not isinstance(log, bool):
-        raise _wrong(key, f"log is true or false, got {log!r}")
+        raise _wrong(key, f"log must be true or false, got {log!r}")
     low, high = (_number(key, kind, end, entry.get(end)) for end in ("low", "high"))
     if low > high:
-        raise _wrong(key, f"low={low} lies above high={high}; exchange them")
+        raise _wrong(key, f"low={low} is greater than high={high}; exchange them")
     if log and low <= 0:
         raise _wrong(key, f"low={low} has no logarithm; with log: true it must be positive")
     step = entry.get("step")
     if step is not None:
         step = _number(key, kind, "step", step)
         if log:
-            raise _wrong(key, "step and log: true exclude each other; take one of them")
+            raise _wrong(key, "step and log: true exclude each other; use one of them")
         if step <= 0:
             raise _wrong(key, f"step must be positive, got {step}")
         first, last = Decimal(str(entry["low"])), Decimal(str(entry["high"]))
         if (last - first) % Decimal(str(step)):
             raise _wrong(
-                key, f"high={last} is no whole number of steps of {step} above low={first}"
+                key, f"high={last} is not a whole number of steps of {step} above low={first}"
             )
     return {"low": low, "high": high, "log": log, "step": step}
 
@@ -161,10 +163,10 @@ def _choices(key: str, entry: Mapping[str, Any]) -> dict[str, Any]:
     if not isinstance(given, list | tuple) or not given:
         raise _wrong(key, f"choices must be a list of at least one value, got {given!r}")
     choices = tuple(_choice(key, item) for item in given)
-    # Optuna tells values apart by ==, which takes 1, 1.0 and true for one.
+    # Optuna compares values by ==, for which 1, 1.0 and true are equal.
     twice = [choice for place, choice in enumerate(choices) if choice in choices[:place]]
     if twice:
-        raise _wrong(key, f"choices hold {twice[0]!r} twice, or a value that equals it")
+        raise _wrong(key, f"choices contain {twice[0]!r} twice, or a value that equals it")
     return {"choices": choices}
 
 
@@ -188,13 +190,15 @@ def _conditions(
     for name, wanted in given.items():
         if name not in earlier:
             known = nearest(name, earlier)
-            raise _wrong(key, f"when: '{name}' is no parameter above it; {known}")
+            raise _wrong(key, f"when: '{name}' is not a parameter above it; {known}")
         other = earlier[name]
         alternatives = wanted if isinstance(wanted, list | tuple) else [wanted]
         values = tuple(_choice(key, item) for item in alternatives)
         for value in values:
             if other.type == "float":
-                raise _wrong(key, f"when: '{name}' is a float, which hardly ever equals a value")
+                raise _wrong(
+                    key, f"when: '{name}' is a float, which almost never equals a given value"
+                )
             if other.type == "categorical" and value not in other.choices:
                 known = nearest(str(value), map(str, other.choices))
                 raise _wrong(key, f"when: '{name}' is never {value!r}; {known}")

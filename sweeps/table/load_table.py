@@ -72,7 +72,7 @@ def _find(name: str, folder: Path) -> Path:
         return path
     paths = [path for root in (PUBLISHED, folder) if (path := root / f"{name}.yaml").is_file()]
     if len(paths) > 1:
-        raise InputError(f"table={name} is {paths[0]} as well as {paths[1]}; name the file.")
+        raise InputError(f"table={name} is both {paths[0]} and {paths[1]}; give the path of one.")
     if not paths:
         raise InputError(f"there is no table '{name}'; {nearest(name, table_names(folder))}.")
     return paths[0]
@@ -138,16 +138,16 @@ def _check_column(column: Column, table: Table, before: Sequence[Column], where:
     is_of_frames = column.metric is not None and column.frames is None
     if column.head != "as trained" and not is_of_frames:
         raise InputError(
-            f"{where}: 'head' is for scores of single frames alone; remove head: {column.head}."
+            f"{where}: 'head' is only for scores of single frames; remove head: {column.head}."
         )
     if column.corruption is not None and not is_of_frames:
         raise InputError(
-            f"{where}: 'corruption' is for scores of single frames alone; remove corruption: "
+            f"{where}: 'corruption' is only for scores of single frames; remove corruption: "
             f"{column.corruption}."
         )
     if column.corruption is None and column.severity is not None:
         raise InputError(
-            f"{where}: 'severity' is of a corruption; add corruption: NAME, or remove it."
+            f"{where}: 'severity' needs a corruption; add corruption: NAME, or remove it."
         )
     if column.corruption is not None:
         _check_corruption(column.corruption, column.severity, where)
@@ -155,7 +155,7 @@ def _check_column(column: Column, table: Table, before: Sequence[Column], where:
 
 
 def _check_sources(column: Column, table: Table, before: Sequence[Column], where: str) -> None:
-    """Refuse a difference or mean of columns that are computed later, or are no scores."""
+    """Refuse a difference or mean of columns that are computed later or are not scores."""
     if column.mean is not None and len(set(column.mean)) != max(2, len(column.mean)):
         got = ", ".join(column.mean) or "none"
         raise InputError(f"{where}: expected two or more different columns, got {got}.")
@@ -167,7 +167,7 @@ def _check_sources(column: Column, table: Table, before: Sequence[Column], where
             )
         if other.parameters:
             raise InputError(
-                f"{where}: '{other.name}' counts parameters and is no score; remove it."
+                f"{where}: '{other.name}' counts parameters and is not a score; remove it."
             )
 
 
@@ -199,12 +199,12 @@ def _check_frames(column: Column, where: str) -> None:
         )
     if column.frames is not None and not is_consistency:
         raise InputError(
-            f"{where}: 'frames' is for {', '.join(OF_PAIRS)} alone; remove it, or choose one of "
+            f"{where}: 'frames' is only for {', '.join(OF_PAIRS)}; remove it, or choose one of "
             "these."
         )
     if column.frames is not None and column.modality != "default":
         raise InputError(
-            f"{where}: consistency is counted from what the network is made for; remove "
+            f"{where}: consistency uses the images that the network is built for; remove "
             f"modality: {column.modality}."
         )
 
@@ -226,6 +226,6 @@ def _check_row(row: Row, table: Table, where: str) -> None:
         for key in re.findall(r"{(\w+)}", column.metric or ""):
             check_choice(f"{where}, '{key}' of metric {column.metric}", key, row.settings)
     if row.x is not None and table.factor is None:
-        raise InputError(f"{where}: 'x' has no effect without 'factor' of the table; add one.")
+        raise InputError(f"{where}: 'x' has no effect without the table's 'factor'; add a factor.")
     if row.x is not None and table.factor is not None and table.factor.axis == "log" and row.x <= 0:
         raise InputError(f"{where}: 'x' must be > 0 on a log axis, got {row.x:g}.")

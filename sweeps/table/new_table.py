@@ -32,22 +32,26 @@ HEAD = """\
 # {title}
 # Run:  rgbt reproduce table={name} seeds=3 workers=2
 # Look: rgbt reproduce table={name} seeds=3 dry_run=true
-# A row is `python -m rgbt.run +experiment=<experiment> <overrides>`; add, change and remove rows as
-# you like: what is finished is found again, only what is missing is run.
+# A row is the command `rgbt run +experiment=<experiment> <overrides>`. You can add, change and
+# remove rows: finished runs are reused, only missing runs are started.
 """
 
 COLUMNS = """\
-columns: # or: mAcc, mPrecision, mF1, pixel_accuracy, class/person, class/person/acc,
-  # class/person/region/1, day/mIoU, night/mIoU; modality: thermal predicts without RGB,
-  # head: source with one head of a network of two; corruption: noise and severity: 16 of
-  # corrupted images (docs/robustness.md); {name: both, mean: [day, night]} and {name: gain,
-  # minus: [day, night]} of other columns; {name: TC, metric: TC, frames: aligned} and CA, of two
-  # frames (docs/consistency.md); {name: size, parameters: true} counts the network
+# Further columns:
+#   metric: mAcc, mPrecision, mF1, pixel_accuracy, class/person, class/person/acc,
+#     class/person/region/1, day/mIoU, night/mIoU
+#   modality: thermal            predict without RGB
+#   head: source                 predict with one head of a network with two
+#   corruption: noise, severity: 16    corrupted images (docs/how-to/measure-robustness.md)
+#   {name: both, mean: [day, night]}, {name: gain, minus: [day, night]}    from other columns
+#   {name: TC, metric: TC, frames: aligned}, also CA    docs/how-to/measure-consistency.md
+#   {name: size, parameters: true}    millions of parameters of the network
+columns:
 """
 
 ROWS = """\
-# Beside each row may stand: values: {mIoU: 61.79} (printed somewhere, shown beside ours),
-# remarks: [a footnote], settings: {why: said here}, at: {paper: [model=mask2former_swin_s]},
+# Further keys of a row: values: {mIoU: 61.79} (published values, shown beside ours),
+# remarks: [a footnote], settings: {key: value}, at: {paper: [model=mask2former_swin_s]},
 # without: [a column that the row's network has no score for]
 rows:
 """
@@ -72,16 +76,16 @@ class VariedOverride:
 
 @dataclass(frozen=True)
 class NewOptions:
-    """Of ``rgbt reproduce new``."""
+    """Options of ``rgbt reproduce new``."""
 
-    table: Annotated[str, Help("its name, my/ablation for the file tables/my/ablation.yaml")]
-    experiment: Annotated[str, Help("a file of conf/experiment")]
+    table: Annotated[str, Help("name of the new table: my/ablation for tables/my/ablation.yaml")]
+    experiment: Annotated[str, Help("experiment of all rows: a file of conf/experiment")]
 
 
 def new(options: NewOptions, overrides: list[str]) -> int:
-    """Write a table of your own, to be run with `rgbt reproduce table=my/ablation`.
+    """Write your own table, which `rgbt reproduce table=my/ablation` runs.
 
-    Overrides with comma lists say what is varied: masker.sigma_div=1,2,4 masker.patch_size=32,64
+    Overrides with comma lists are the varied keys: masker.sigma_div=1,2,4 masker.patch_size=32,64
     """
     path = write_new(options.table, options.experiment, overrides)
     rows = len(load_table(options.table).rows)
@@ -106,7 +110,7 @@ def write_new(name: str, experiment: str, overrides: Sequence[str], folder: Path
     """
     path = folder / f"{name}.yaml"
     if path.exists():
-        raise InputError(f"{path} exists already; edit it, or choose another name.")
+        raise InputError(f"{path} already exists; edit it, or choose another name.")
     if (PUBLISHED / f"{name}.yaml").exists():
         raise InputError(f"table={name} is a published table; choose another name.")
     if name.endswith((".yaml", ".yml")) or Path(name).is_absolute() or ".." in Path(name).parts:
@@ -114,11 +118,11 @@ def write_new(name: str, experiment: str, overrides: Sequence[str], folder: Path
     factors = [_factor(override) for override in overrides]
     for factor in factors:
         if factor.key == "seed":
-            raise InputError("seed=...: seeds are chosen when the table is run, seeds=3.")
+            raise InputError("seed=...: choose the seeds when you run the table: seeds=3.")
         if factor.key == "runs_dir":
-            raise InputError("runs_dir=...: the folder of runs is chosen when the table is run.")
+            raise InputError("runs_dir=...: choose the folder of runs when you run the table.")
     if not any(len(factor.values) > 1 for factor in factors):
-        raise InputError("nothing is varied; give a comma list, such as masker.sigma_div=1,2,4.")
+        raise InputError("no key is varied; give a comma list, such as masker.sigma_div=1,2,4.")
     points = list(itertools.product(*(factor.values for factor in factors)))
     for point in points:
         chosen = [f"{f.key}={value}" for f, value in zip(factors, point, strict=True)]

@@ -139,8 +139,8 @@ def seeds_of(text: str) -> tuple[int, ...]:
         or (counted and not any(numbers))
     ):
         raise InputError(
-            f"seeds={text}: expected how many (3 for the seeds 0, 1, 2) or a list of different "
-            "ones (0,4,7)."
+            f"seeds={text}: expected a number of seeds (3: seeds 0, 1, 2) or a list of different "
+            "seeds (0,4,7)."
         )
     return tuple(range(numbers[0])) if counted else numbers
 

@@ -1,4 +1,4 @@
-"""Executes the trials of a study: some at a time, each in a process of its own.
+"""Executes the trials of a study: some at a time, each in a separate process.
 
 Any number of drivers, on any number of machines, may share a study. Each point is run by one
 driver; trials of a dead driver are executed by another one; a driver that is started again resumes
@@ -117,7 +117,7 @@ class Driver:
         """Begin as many trials as there are free slots."""
         executing = {trial.number for trial in self.running.values()}
         for stale in self.store.stale_trials(executing):
-            self.store.release(stale.number, "its driver was gone", requeue=self.source.requeues)
+            self.store.release(stale.number, "its driver had ended", requeue=self.source.requeues)
         minutes = self.settings.timeout_minutes
         limit = None if minutes is None else 60 * minutes
         while free > 0 and not self._is_over():
@@ -178,7 +178,7 @@ class Driver:
         """Record a failure; a search retries the same point as often as `retries` allow."""
         key = trial.plan.key
         if self.source.requeues and self._attempts[key] < self.settings.retries:
-            self.store.release(trial.number, f"tried again: {reason}", requeue=True)
+            self.store.release(trial.number, f"retried: {reason}", requeue=True)
         else:
             self.store.fail(trial.number, reason, notes)
             self.failures += 1

@@ -44,7 +44,7 @@ class Job(Protocol):
         """Its exit code, negative for a signal; None while it runs."""
 
     def stop(self) -> None:
-        """Ask it to stop; where it does not, later calls of `poll` kill it."""
+        """Request that it stops; if it does not, later calls of `poll` kill it."""
 
 
 class Executor(Protocol):
@@ -93,7 +93,7 @@ class LocalExecutor:
 
 
 def check_gpus(gpus: tuple[int, ...] | None) -> None:
-    """Refuse numbers of GPUs that this machine does not have, or does not show to us."""
+    """Refuse numbers of GPUs that this machine does not have or that are hidden."""
     if gpus is None:
         return
     shown = os.environ.get(GPUS)
@@ -106,7 +106,7 @@ def check_gpus(gpus: tuple[int, ...] | None) -> None:
     for number in gpus:
         if str(number) not in known:
             here = "this machine" if shown is None else f"{GPUS}={shown}"
-            found = f"the GPUs {', '.join(known)} alone; take" if known else "no GPU; omit"
+            found = f"the GPUs {', '.join(known)} only; choose" if known else "no GPU; omit"
             raise InputError(
                 f"gpus={list(gpus)}: there is no GPU {number}, {here} shows {found} "
                 f"{'some of these' if known else 'gpus'}."

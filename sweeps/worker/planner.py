@@ -98,8 +98,8 @@ class Planner:
             if not any(dataset.has(split) for split in dataset.splits):
                 paths = ", ".join(dict.fromkeys(dataset.splits.values()))
                 raise InputError(
-                    f"{dataset.root} holds none of the lists or files {paths} of the data set; "
-                    "name its folder with dataset.root=..."
+                    f"{dataset.root} contains none of the lists or files {paths} of the data set; "
+                    "set dataset.root=... to its folder"
                 )
             self._fingerprints[name] = str(dataset.fingerprint())
         views = spec.consistency.values

@@ -1,4 +1,4 @@
-"""Points known beforehand: a grid, a list, the cells of a table."""
+"""Points that are known in advance: a grid, a list, the cells of a table."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def other_code_line(outcomes: Sequence[Outcome]) -> str:
     if not others:
         return ""
     return (
-        f"{others} of {len(results)} runs were made by other code; fresh=true trains these again "
+        f"{others} of {len(results)} runs were made by other code; fresh=true retrains them "
         "and keeps the old runs."
     )
 

@@ -1,6 +1,6 @@
-"""Imported last by the process that all runs of a sweep are forked from: notes the code it has.
+"""Imported last by the process that all runs of a sweep are forked from: records its code.
 
-The runs then carry the digests of the code that they execute, whatever is edited meanwhile.
+The runs then have the digests of the code that they execute, even if files are edited meanwhile.
 """
 
 from rgbt.spec.source_code import loaded_modules, user_code

@@ -65,7 +65,7 @@ class ProgressView:
     def began(self, trial: RunningTrial) -> None:
         """Show that a trial begins."""
         if self._live is None:
-            self._say(f"begins   {trial.plan.point.label}")
+            self._say(f"started  {trial.plan.point.label}")
 
     def ended(self, trial: RunningTrial, how: str, reason: str) -> None:
         """Show that a trial ended: "finished", "failed" or "pruned", and why."""

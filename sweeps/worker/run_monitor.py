@@ -54,7 +54,7 @@ class MetricsReader:
 
 
 def failure_reason(code: int, log: Path, start: int) -> str:
-    """Why a process failed, in one sentence.
+    """The reason why a process failed, in one sentence.
 
     Args:
         code: exit code; negative for a signal.
@@ -63,7 +63,7 @@ def failure_reason(code: int, log: Path, start: int) -> str:
     """
     if code < 0:
         name = signal.Signals(-code).name if -code in set(signal.Signals) else f"signal {-code}"
-        hint = " (the system kills what takes too much memory)" if name == "SIGKILL" else ""
+        hint = " (the system kills processes that use too much memory)" if name == "SIGKILL" else ""
         return f"stopped by {name}{hint}"
     text = log.read_bytes()[start:].decode(errors="replace") if log.exists() else ""
     lines = [line.strip() for line in re.split(r"[\r\n]+", text) if line.strip()]

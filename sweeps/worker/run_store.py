@@ -57,8 +57,8 @@ class RunStore:
             raise RunError(str(error)) from error
         if trained_on != dataset:
             raise RunError(
-                f"{result.folder} was made on other files of the data set ({trained_on[:8]}, now "
-                f"{dataset[:8]}); give the runs another folder (runs_dir=...)."
+                f"{result.folder} was trained on other files of the data set ({trained_on[:8]}, "
+                f"now {dataset[:8]}); use another folder of runs (runs_dir=...)."
             )
         return None if self._is_outdated(result) else result
 
@@ -91,12 +91,12 @@ class RunStore:
         """Record in MLflow why a run was stopped before its end."""
         path = self.runs_dir / key
         if not (path / "run.json").exists() or RunResult(path).is_finished:
-            return  # not begun, or finished while it was being stopped
+            return  # not started, or finished while it was being stopped
         self._describe(RunFolder(path), {"rgbt.stopped": reason}, "KILLED")
 
     def _describe(self, folder: RunFolder, tags: Mapping[str, str], status: Status) -> None:
         description = read_description(folder.path)
-        assert description is not None, "a run that has begun has run.json"
+        assert description is not None, "a run that has started has run.json"
         folder.describe(replace(description, tags={**description.tags, **tags}))
         self._with_mlflow(lambda tracking: tracking.sync(folder, status))
 
@@ -128,8 +128,8 @@ class RunStore:
             self._is_unreachable = True
             lines = without_passwords(str(error)).splitlines() or [type(error).__name__]
             info(
-                f"MLflow cannot be used ({lines[0][:120]}); finished runs are searched in "
-                f"{self.runs_dir} alone. Send new runs later: `rgbt sync`."
+                f"MLflow cannot be used ({lines[0][:120]}); finished runs are searched only "
+                f"in {self.runs_dir}. Send new runs later: `rgbt sync`."
             )
             return None
 

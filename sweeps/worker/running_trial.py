@@ -135,8 +135,8 @@ class RunningTrial:
                 result = self.runs.find(run.key, run.dataset)
             if result is None:
                 raise TrialError(
-                    f"the run ended, but not as {run.key}: its configuration, its data set or your "
-                    "own code was changed during the sweep; rerun the command"
+                    f"the run finished with another key than {run.key}: its configuration, its "
+                    "data set or your own code changed during the sweep; rerun the command"
                 )
             self.runs.tag(result, self.plan.point.tags)
             for evaluation in self.plan.point.evaluations:
@@ -174,8 +174,8 @@ class RunningTrial:
             if self.runs.fetch_counts(result, evaluation.path):
                 return
             raise TrialError(
-                f"run {result.key} was made on another machine: its further evaluations "
-                f"({evaluation.label}) can only be made there; to train it here, delete MLflow "
+                f"run {result.key} was trained on another machine: its further evaluations "
+                f"({evaluation.label}) can run only there; to train it here, delete MLflow "
                 f"run {result.run_id} and {result.folder}"
             )
         self.status = f"evaluating {evaluation.label}"

@@ -1,4 +1,4 @@
-"""Imported first by the fork server of the command ``rgbt``: searches user modules as that does."""
+"""Imported first by the fork server of ``rgbt``: sets the same search path for user modules."""
 
 from rgbt.config.shadowing import search_user_folders_last
 

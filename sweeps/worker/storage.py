@@ -65,7 +65,7 @@ def open_storage(storage: str | None, runs_dir: Path) -> optuna.storages.BaseSto
     except Exception as error:  # The border to Optuna, which assumes a whole journal.
         raise InputError(
             f"storage={path} is damaged ({type(error).__name__}: {one_line(error)}); restore it "
-            "from a copy, or remove it: finished runs are reused, other trials start again."
+            "from a copy, or remove it: finished runs are reused, other trials restart."
         ) from error
 
 
@@ -157,7 +157,7 @@ def open_study(
 
     if not re.fullmatch(NAME, name):
         raise InputError(
-            f"study={name}: MLflow takes names of letters, digits, spaces and _ - . : / alone."
+            f"study={name}: MLflow allows only letters, digits, spaces and _ - . : / in names."
         )
     study = _retry(
         lambda: optuna.create_study(
@@ -176,7 +176,7 @@ def open_study(
     for fixed, what in FIXED.items():
         if fixed in known and known[fixed] != wanted.get(fixed):
             raise InputError(
-                f"there is a study '{name}' with {what} already; give this one another name: "
+                f"the study '{name}' already exists, with {what}; choose another name: "
                 "hydra.sweeper.study=..."
             )
     for key, value in wanted.items():
@@ -222,7 +222,7 @@ def load_study(name: str, storage: optuna.storages.BaseStorage) -> optuna.Study:
 
     names = study_names(storage)
     if name not in names:
-        known = nearest(name, names) if names else "the storage holds none"
+        known = nearest(name, names) if names else "the storage has none"
         raise InputError(f"there is no study '{name}'; {known}.")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)

@@ -44,7 +44,7 @@ PATIENCE_S = 60.0
 """How long the result of a job that SLURM calls finished may take to appear on a shared disk."""
 
 ASK_S = 5.0
-"""Seconds between two queries of a job that was asked to stop."""
+"""Seconds between two queries of a job that has to stop."""
 
 FAILED = 1
 """Exit code of a job that ended without one; its log holds the reason."""
@@ -170,8 +170,8 @@ class SubmititExecutor:
             self._executor.update_parameters(**self._named(values))
         except RuntimeError as error:
             raise InputError(
-                "executor=submitit: there is no `srun` here; start the command on a login node of "
-                "the cluster, or use submitit.cluster=local."
+                "executor=submitit: this machine has no `srun`; start the command on a login node "
+                "of the cluster, or use submitit.cluster=local."
             ) from error
         except (AssertionError, TypeError, ValueError) as error:
             raise InputError(f"submitit={dict(options)}: {str(error).splitlines()[0]}") from error
@@ -179,7 +179,7 @@ class SubmititExecutor:
     def start(
         self, command: Sequence[str], environment: Mapping[str, str], log: Path
     ) -> SubmititJob:
-        """See `Executor.start`; a job that the cluster refuses fails, saying why.
+        """See `Executor.start`; a job that the cluster refuses fails with the reason.
 
         Raises:
             InputError: a GPU of the driver's machine is requested on SLURM.
@@ -188,8 +188,8 @@ class SubmititExecutor:
         wanted: dict[str, str | None] = dict(environment)
         if self._cluster == "slurm" and GPUS in wanted:
             raise InputError(
-                "gpus=[...] are GPUs of this machine; with executor=submitit the cluster gives "
-                "each run its own: submitit.gpus_per_node=1."
+                "gpus=[...] selects GPUs of this machine; with executor=submitit, the cluster "
+                "assigns GPUs to each run: set submitit.gpus_per_node=1."
             )
         if self._cluster == "local":
             # submitit hides all GPUs from a local job that did not ask for a number of them.
@@ -220,8 +220,8 @@ class SubmititExecutor:
                 )
         if self._cluster == "slurm" and values.get("timeout_min") is None:
             raise InputError(
-                "submitit.timeout_min has no value; give the minutes that a job may take, at most "
-                "what the partition allows (`sinfo` shows it)."
+                "submitit.timeout_min has no value; set the time limit of a job in minutes, at "
+                "most the limit of the partition (see `sinfo`)."
             )
         return values
 
@@ -261,7 +261,7 @@ class SubmititJob:
     def poll(self) -> int | None:
         """See `Job.poll`. Cheap: submitit looks for a file, and asks SLURM more and more rarely.
 
-        A job that SLURM ends without a word is noticed within ten minutes.
+        A job that SLURM ends without a message is detected within ten minutes.
         """
         if self._code is None and self._job is not None and self._is_done(self._job):
             self._code = self._outcome(self._job)

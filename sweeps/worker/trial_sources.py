@@ -1,4 +1,4 @@
-"""What a driver executes next: a point of a list, or one that the sampler of a search chooses."""
+"""Selects the next trial of a driver: a point of a list, or a proposal of a search sampler."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class Outcome:
     """A point with its state and its finished runs.
 
     Attributes:
-        state: "finished", "failed", "running" (by another driver) or "waiting" (not begun).
+        state: "finished", "failed", "running" (by another driver) or "waiting" (not started).
         reason: why it failed, or "".
         results: its finished runs; of a waiting point, runs that lack further evaluations only.
         keys: of its runs; () where its configuration is wrong.
@@ -216,12 +216,12 @@ def is_evaluated(plan: PlannedPoint, results: Sequence[RunResult]) -> bool:
 
 def reason_of(trial: FrozenTrial) -> str:
     """Why a trial failed."""
-    return str(trial.user_attrs.get(names.REASON, "no reason was noted"))
+    return str(trial.user_attrs.get(names.REASON, "no reason was recorded"))
 
 
 @dataclass
 class SamplerSource:
-    """Asks the sampler of a study for trials.
+    """Gets trials from the sampler of a study.
 
     Attributes:
         fixed: overrides that all trials share.

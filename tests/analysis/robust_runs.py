@@ -1,4 +1,4 @@
-"""What `rgbt robustness` leaves beside runs, with scores that are known."""
+"""Output of `rgbt robustness` for runs, with known scores."""
 
 from __future__ import annotations
 

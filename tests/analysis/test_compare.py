@@ -47,7 +47,7 @@ def test_table_and_sentence_hold_the_numbers_of_the_comparison(call: Call, files
     code, out, err = call(entry, *files, *FAST)
     assert (code, err) == (0, "")
     lines = out.splitlines()
-    assert lines[0].strip() == "grbm less crm: 40 single images, ring2"
+    assert lines[0].strip() == "grbm minus crm: 40 single images, ring2"
     rows = {
         line.split()[0]: line for line in lines if line.startswith(("  mIoU", "  Var", "  reg"))
     }
@@ -91,7 +91,7 @@ def test_group_names_are_shown_whole(call: Call, tmp_path: Path, name: str):
     assert name in next(line for line in out.splitlines() if "difference" in line)
 
 
-def test_equal_names_are_told_apart(call: Call, tmp_path: Path):
+def test_equal_names_get_distinct_labels(call: Call, tmp_path: Path):
     for folder, counts in zip(("x", "y"), pair(), strict=True):
         (tmp_path / folder).mkdir()
         counts.save(tmp_path / folder / "counts_test.npz")
@@ -156,7 +156,7 @@ def test_auto_takes_parts_of_ten_images(call: Call, tmp_path: Path, at_night: in
         assert_one_sentence(err, "9 single images are too few")
 
 
-def test_missing_images_are_refused_or_left_out(call: Call, tmp_path: Path):
+def test_missing_images_are_refused_or_excluded(call: Call, tmp_path: Path):
     a, b = pair()
     lacking = saved(tmp_path, a.select(a.names[:35]), b.select(b.names[3:][::-1]))
     code, out, err = call(entry, *lacking, *FAST)
@@ -164,8 +164,8 @@ def test_missing_images_are_refused_or_left_out(call: Call, tmp_path: Path):
     assert_one_sentence(err, "missing=leave_out")
     code, out, err = call(entry, *lacking, *FAST, "missing=leave_out", "metrics=mIoU")
     assert code == 0
-    assert "grbm less crm: 32 single images" in out
-    assert "8 of 40 images are not in all counts and were left out" in err
+    assert "grbm minus crm: 32 single images" in out
+    assert "8 of 40 images are not in all counts and were excluded" in err
     both = a.names[3:35]
     (found,) = compare([a.select(both)], [b.select(both)], ["mIoU"], SETTINGS).differences
     assert f"{found.b.value:.2f} against {found.a.value:.2f}" in out
@@ -194,13 +194,13 @@ def test_missing_images_are_refused_or_left_out(call: Call, tmp_path: Path):
         (["absent=zero"], "'absent' must be"),
         (["split=val"], "is of split 'test', not of split=val"),
         (["severity=3"], "'severity' has no effect without corruption=..."),
-        (["corruption=noise", "frames=next"], "is of single frames; omit frames="),
+        (["corruption=noise", "frames=next"], "applies to single frames; omit frames="),
         (["corruption=noise"], "is no run; rgbt robustness run=..."),
-        (["out={}/crm.npz"], "is a file; give a folder"),
-        (["b={}/crm.npz"], "a and b both hold"),
+        (["out={}/crm.npz"], "is a file; choose a folder"),
+        (["b={}/crm.npz"], "a and b both contain"),
         (["a={0}/crm.npz,{0}/crm.npz"], "twice; one training counts once"),
         (["b=crn"], "did you mean 'crm'?"),
-        (["b={}/empty"], "holds neither a run (config.yaml) nor counts"),
+        (["b={}/empty"], "contains neither a run (config.yaml) nor counts"),
         (["b={}/none.npz"], "there is no file of counts"),
         (["b="], "'b' has no value; give a run, a file of counts, or a group of runs. Groups in"),
         (["b="], ": crm."),

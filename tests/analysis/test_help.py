@@ -1,4 +1,4 @@
-"""Help of the commands is there at once."""
+"""The help of the commands imports no heavy library."""
 
 from __future__ import annotations
 
@@ -22,7 +22,10 @@ def test_help_waits_for_no_heavy_library() -> None:
     words = [sys.executable, "-c", SCRIPT]
     done = subprocess.run(words, capture_output=True, text=True, check=True)
     assert done.stdout.strip().endswith("[]")
-    for line in ("  missing     refuse, or leave_out", "rgbt score [option=value ...]"):
+    for line in (
+        "  missing     images without a prediction: refuse, or leave_out",
+        "rgbt score [option=value ...]",
+    ):
         assert line in done.stdout
     assert "one of: ring, vertical, horizontal (default: ring)" in done.stdout
-    assert "  figure       name" in done.stdout
+    assert "  figure       name of the figure" in done.stdout

@@ -1,4 +1,4 @@
-"""Counts found by the names that people give them."""
+"""Counts opened by the names of runs, groups and files."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_names_open_runs_groups_files_and_lists(runs: Path, text: str, keys: str
             np.testing.assert_array_equal(each.counts.counts, some(each.seed).counts)
 
 
-def test_split_and_home_folder_are_heeded(runs: Path, monkeypatch: pytest.MonkeyPatch):
+def test_split_and_home_folder_take_effect(runs: Path, monkeypatch: pytest.MonkeyPatch):
     (found,) = open_counts("aaa1", runs, split="val")
     np.testing.assert_array_equal(found.counts.counts, some(101).counts)
     monkeypatch.setenv("HOME", str(runs.parent))
@@ -97,7 +97,7 @@ def test_split_and_home_folder_are_heeded(runs: Path, monkeypatch: pytest.Monkey
     np.testing.assert_array_equal(found.counts.counts, some(7).counts)
 
 
-def test_run_made_before_is_found_by_its_old_group_and_with_new_runs(runs: Path):
+def test_older_run_is_named_by_its_old_group_and_with_new_runs(runs: Path):
     """It wrote ${px:64}; what it stands for is in its parameters."""
     for seed, value in ((0, "${px:64}"), (1, "32")):
         run = RunFolder(make_run(runs, f"fff{seed}", f"grbm patch_size={value}", seed))
@@ -121,7 +121,7 @@ def test_folder_of_scores_is_opened_by_rings(tmp_path: Path):
 
 
 @pytest.mark.parametrize("names", [("ring5", "ring9"), ("horizontal5", "vertical5")])
-def test_folder_of_scores_that_leaves_a_choice_is_refused(tmp_path: Path, names: tuple[str, str]):
+def test_ambiguous_folder_of_scores_is_refused(tmp_path: Path, names: tuple[str, str]):
     for name in names:
         some().save(tmp_path / f"counts_{name}.npz")
     files = ", ".join(f"counts_{name}.npz" for name in names)
@@ -153,7 +153,7 @@ def test_folder_of_scores_that_leaves_a_choice_is_refused(tmp_path: Path, names:
         ("aaa0,ggg0", {}, f"names seed 0 of '{CRM}' twice"),  # same overrides, another default
     ],
 )
-def test_what_is_no_training_or_twice_the_same_is_refused(
+def test_other_inputs_and_repeated_runs_are_refused(
     runs: Path, text: str, options: dict[str, str], word: str
 ):
     (runs.parent / "link.npz").symlink_to(runs / "aaa0" / "counts_test.npz")

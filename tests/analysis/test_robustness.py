@@ -1,4 +1,4 @@
-"""Counts of failing images, found beside runs; two methods compared on them."""
+"""Counts of corrupted images of runs; two methods compared on them."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_runs_groups_and_folders_are_trainings(runs: Path) -> None:
     assert [each.label for each in trainings(f"{folder},k2", runs)] == ["elsewhere", "none"]
 
 
-def test_the_same_trainings_on_failing_images(runs: Path) -> None:
+def test_same_trainings_on_corrupted_images(runs: Path) -> None:
     stored = open_counts("crm", runs)
     noisy = under(stored, "noise", "16")
     assert [value("mIoU", each.counts, "released") for each in noisy] == pytest.approx(
@@ -71,18 +71,18 @@ def test_the_same_trainings_on_failing_images(runs: Path) -> None:
     ("corruption", "severity", "sentence"),
     [
         ("nois", "16", r"'?nois'? was not measured in .*did you mean 'noise'"),
-        ("noise", "12", r"severity=12: .* holds noise at 8, 16; give one of these"),
-        ("noise", "", r"severity=: .* holds noise at 8, 16"),
+        ("noise", "12", r"severity=12: .* has noise at 8, 16; give one of these"),
+        ("noise", "", r"severity=: .* has noise at 8, 16"),
     ],
 )
-def test_what_was_not_measured_is_told(
+def test_missing_measurement_is_reported(
     runs: Path, corruption: str, severity: str, sentence: str
 ) -> None:
     with pytest.raises(InputError, match=sentence):
         under(open_counts("k0", runs), corruption, severity)
 
 
-def test_what_is_no_measured_run_is_told(runs: Path) -> None:
+def test_inputs_without_measurements_are_reported(runs: Path) -> None:
     place = runs / "k0" / "evaluations" / "robustness"
     with pytest.raises(InputError, match=r"counts_test.npz is no run; .*robustness run=\.\.\."):
         under(open_counts(str(runs / "k0" / "counts_test.npz")), "noise", "8")
@@ -90,24 +90,26 @@ def test_what_is_no_measured_run_is_told(runs: Path) -> None:
     with pytest.raises(InputError, match=r"noise-8.npz' is not a readable file of counts"):
         trainings("k0", runs)
     (place / "test" / "noise-8.json").write_text("{}")
-    with pytest.raises(InputError, match=r"noise-8.json is not of rgbt robustness"):
+    with pytest.raises(InputError, match=r"noise-8.json was not written by rgbt robustness"):
         trainings("k0", runs)
     (place / "test" / "noise-8.json").write_text("{")
     with pytest.raises(InputError, match=r"noise-8.json is damaged"):
         trainings("k0", runs)
     (place / "test" / "noise-8.json").write_text(json.dumps({"format": FORMAT}))
-    with pytest.raises(InputError, match=r"noise-8.json does not say what was measured \('row'\)"):
+    with pytest.raises(
+        InputError, match=r"noise-8.json does not describe what was measured \('row'\)"
+    ):
         trainings("k0", runs)
     (place / "test" / "noise-8.json").unlink()
     (place / "test" / "clean.json").unlink()
-    with pytest.raises(InputError, match=r"holds no counts of clean images"):
+    with pytest.raises(InputError, match=r"contains no counts of clean images"):
         trainings("k0", runs)
     place.rename(place.with_name("gone"))
     with pytest.raises(InputError, match=r"robustness/test is not there; rgbt robustness run="):
         trainings("k0", runs)
 
 
-def test_compare_takes_failing_images(call: Call, runs: Path) -> None:
+def test_compare_takes_corrupted_images(call: Call, runs: Path) -> None:
     where = (f"runs_dir={runs}", "metrics=mIoU", "resamples=100", "blocks=none")
     code, out, err = call(entry, "a=k2", "b=k0", "corruption=noise", "severity=16", *where)
     assert code == 0, err

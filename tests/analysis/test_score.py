@@ -104,7 +104,7 @@ def test_intervals_hold_the_score(call: Call, data: Path, tmp_path: Path) -> Non
             assert float(row["low"]) < float(row["value"]) < float(row["high"])
 
 
-def test_each_convention_has_intervals_of_its_own() -> None:
+def test_each_convention_has_separate_intervals() -> None:
     """A class that few images hold is absent from resamples: 0 pulls the mean down, exclude not."""
     images = np.zeros((20, 2, 2, 2), np.int32)
     images[:, :, 0, 0] = 10 + np.arange(20)[:, None]
@@ -126,7 +126,7 @@ def test_each_convention_has_intervals_of_its_own() -> None:
     assert table.scores[ScoreKey(region=2, absent="exclude")].low > 90
 
 
-def test_what_was_left_out_is_said_in_the_terminal_and_in_the_file(
+def test_excluded_images_are_reported_in_terminal_and_file(
     call: Call, data: Path, predictions: Path, tmp_path: Path
 ) -> None:
     (predictions / f"{SPLITS['test'][0]}.png").rename(predictions / "stray.png")
@@ -142,7 +142,7 @@ def test_what_was_left_out_is_said_in_the_terminal_and_in_the_file(
         assert "1 other PNG files of the folder" in text
 
 
-def test_stored_counts_are_scored(
+def test_counts_of_runs_are_scored(
     call: Call, data: Path, predictions: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "scores"
@@ -202,7 +202,7 @@ def test_a_part_that_is_too_small_stops_nothing_else() -> None:
     }
 
 
-def test_seeds_of_one_name_are_told_apart(call: Call, tmp_path: Path) -> None:
+def test_seeds_of_one_method_have_distinct_labels(call: Call, tmp_path: Path) -> None:
     for seed in (0, 1):
         make_run(tmp_path / "runs", f"aaa{seed}", "m", seed)
     out = tmp_path / "out"
@@ -220,8 +220,8 @@ def test_seeds_of_one_name_are_told_apart(call: Call, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "word"),
     [
-        (("predictions=a",), "the data set has to be named: dataset=mfnet"),
-        (("predictions=a", "dataset=mfnet", "out=/dev/null/x"), "is a file; give a folder"),
+        (("predictions=a",), "no data set is named; set dataset=mfnet"),
+        (("predictions=a", "dataset=mfnet", "out=/dev/null/x"), "is a file; choose a folder"),
         ((), "expected one of predictions=folder and counts=run, got neither"),
         (("predictions=a", "counts=b"), "got predictions and counts"),
         (("predictions=a", "dataset=mfnet", "seed=1"), "'seed' has no effect here"),

@@ -63,7 +63,7 @@ def random_counts(seed: int, images: int = 12) -> Counts:
     return counts_of(array.tolist())
 
 
-def test_every_resample_leaves_the_class_out() -> None:
+def test_every_resample_excludes_the_class() -> None:
     counts = random_counts(1)
     found = estimate([counts], ["mIoU", "Var"], replace(FEW, seed=3))
     whole = counts.counts.sum((0, 1)).tolist()
@@ -72,7 +72,7 @@ def test_every_resample_leaves_the_class_out() -> None:
     assert found["Var"].value == pytest.approx(np.var(regions))
 
 
-def test_methods_that_differ_in_unscored_classes_alone_do_not_differ() -> None:
+def test_difference_in_unscored_classes_only_is_none() -> None:
     """What the one method finds void rightly, the other takes for `other`, unscored as well."""
     first = random_counts(1)
     every = {"classes": (*CLASSES, "other"), "unscored": ("void", "other")}
@@ -179,7 +179,7 @@ def test_figures_over_regions() -> None:
     assert panels.image_mious(empty) == {"00000D": pytest.approx(1.5 * LEFT_MEAN)}
 
 
-def test_pixel_maps_leave_the_class_out(tmp_path: Path) -> None:
+def test_pixel_maps_exclude_the_class(tmp_path: Path) -> None:
     intersection, union = np.zeros((2, 4, 6, 8), np.int32)
     union[0], intersection[0] = 4, 1
     union[1, :3], intersection[1, :3] = 2, 1  # the upper half
@@ -216,7 +216,7 @@ def test_report_shows_means_of_the_scored_classes(tmp_path: Path) -> None:
     assert (entry.classes, entry.unscored) == (("road", "car"), ("car",))
 
 
-def test_report_and_comparison_say_which_classes_are_absent(tmp_path: Path) -> None:
+def test_report_and_comparison_name_absent_classes(tmp_path: Path) -> None:
     """By the convention of the counts: the stored configuration of this run has none."""
     run = write_run(tmp_path, "aa0", "grbm", 0)
     array = stored_counts(0).counts.copy()

@@ -1,4 +1,4 @@
-"""Training samples per second, from files to tensors, against the way of the CRM release.
+"""Training samples per second, from files to tensors, compared with the CRM release.
 
 Run: python -m tests.benchmarks.bench_loading [folder in MFNet's layout with a train list] [draws]
 

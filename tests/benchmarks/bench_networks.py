@@ -1,6 +1,6 @@
 """Time and memory of every network at 256x320, and against transformers' where it has the same one.
 
-Each network runs in a process of its own, so that its peak memory is its own. Compared are the RGB
+Each network runs in a separate process, so that its peak memory is its own. Compared are the RGB
 branch of our Mask2Former with all its decoders against transformers' Mask2Former with Swin, and one
 stream of CMX's encoder against SegFormer's; both sides in one process, in turns.
 

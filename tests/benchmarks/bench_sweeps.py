@@ -1,4 +1,4 @@
-"""What the sweeper costs and saves: seconds per point, two workers against one, pruning.
+"""Cost and savings of the sweeper: seconds per point, two workers against one, pruning.
 
 All parts train CMX's tiny network on the embedded data, one thread a run, in a folder of their own:
 

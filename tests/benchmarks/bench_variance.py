@@ -1,7 +1,7 @@
 """How often intervals of the variance over regions hold its true value, by their form.
 
 Simulated splits whose true variance is known (`tests.analysis.uncertainty.simulated_regions`), and
-pairs of methods on the same images. docs/analysis.md shows the tables that this prints.
+pairs of methods on the same images. docs/explanation/counts-and-intervals.md explains them.
 
 Run: python -m tests.benchmarks.bench_variance [trials, 300]
 """

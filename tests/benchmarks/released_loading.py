@@ -1,4 +1,4 @@
-"""The training samples of CRM and SpatialSeg made as their release makes them, as the yardstick.
+"""The training samples of CRM and SpatialSeg as their release makes them, for comparison.
 
 Written anew from what the release does, step by step: files to float32, everything resized and
 then cropped, per-sample arrays, one at a time. Its image library (imageio, which decodes PNG with

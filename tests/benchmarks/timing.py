@@ -1,4 +1,4 @@
-"""How the benchmarks time: calls take turns, so that other load on the machine meets all of them.
+"""Timing of the benchmarks: calls alternate, so that other load on the machine affects all of them.
 
 Import it before torch: threads that wait must not count as work.
 """

@@ -1,4 +1,4 @@
-"""Configurations of the rows of tables, to be read alone: rows share what they have in common."""
+"""Configurations of the rows of tables, read only: rows share their common parts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stand-ins for everything that trains: plans, runs, processes, a driver of them and its view."""
+"""Fakes of everything that trains: plans, runs, processes, a driver and its view."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ def finish(
 
 @dataclass
 class Call:
-    """A process that was asked for, and the folder of the run that it trains."""
+    """A requested process, and the folder of the run that it trains."""
 
     module: str
     words: tuple[str, ...]
@@ -228,7 +228,7 @@ class FakeJob:
 
 
 class FakeExecutor:
-    """Makes fake processes; `calls` are all that were asked for, in order."""
+    """Makes fake processes; `calls` are all requested ones, in order."""
 
     def __init__(self, runs_dir: Path, behaviour: Behaviour = succeed) -> None:
         self.runs_dir = runs_dir
@@ -255,7 +255,7 @@ Look = Callable[[Sequence[RunningTrial]], None]
 
 
 class FakeView:
-    """Notes what it is told; `look` is called at every update with the works."""
+    """Records its calls; `look` is called at every update with the works."""
 
     def __init__(self, look: Look = lambda works: None) -> None:
         self.ends: list[tuple[str, str, str]] = []
@@ -273,7 +273,7 @@ class FakeView:
 
 
 def interrupt_when(condition: Callable[[Sequence[RunningTrial]], bool]) -> FakeView:
-    """A view that stands for a person who presses Ctrl-C."""
+    """A view that acts like a user who presses Ctrl-C."""
 
     def look(works: Sequence[RunningTrial]) -> None:
         if condition(works):

@@ -1,4 +1,4 @@
-"""Real servers for a test: PostgreSQL and MLflow, on this machine's loopback alone."""
+"""Real servers for a test: PostgreSQL and MLflow, only on this machine's loopback."""
 
 from __future__ import annotations
 

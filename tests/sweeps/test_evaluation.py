@@ -1,4 +1,4 @@
-"""Further evaluations of a run: what makes them and where their counts lie."""
+"""Further evaluations of a run: the commands and the paths of their counts."""
 
 from __future__ import annotations
 

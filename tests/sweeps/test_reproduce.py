@@ -200,8 +200,8 @@ def test_all_tables_are_listed_and_only_listed(call: Call, place: Path, driven: 
         (("table=my/small", "seed=1"), "choose seeds=3"),
         (("table=my/small", "+experiment=crm"), "choose another table"),
         (("table=my/small", "tracking=mlfow"), "did you mean 'mlflow'"),
-        (("table=my/small", "metric=ring9"), "the columns of the table say what is counted"),
-        (("table=my/small", "metric.regions=9"), "the columns of the table say what is counted"),
+        (("table=my/small", "metric=ring9"), "the columns of the table define what is counted"),
+        (("table=my/small", "metric.regions=9"), "the columns of the table define what is counted"),
         (("table=my/small", "consistency=none"), "on the published sets of views"),
         (("table=my/small", "camera@consistency.view.camera=synth"), "rgbt consistency"),
         (("table=my/small", "workes=2"), "did you mean 'workers'"),
@@ -209,7 +209,7 @@ def test_all_tables_are_listed_and_only_listed(call: Call, place: Path, driven: 
         ((), "'table' has no value"),
     ],
 )
-def test_mistakes_cost_one_sentence(
+def test_mistakes_are_reported_in_one_sentence(
     call: Call, place: Path, driven: Driven, words: tuple[str, ...], sentence: str
 ) -> None:
     asked = driven("finished")

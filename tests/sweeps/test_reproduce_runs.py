@@ -1,4 +1,4 @@
-"""A table comes whatever happens to its cells, its disk, its tracking server or its command."""
+"""A table is completed despite failures of its cells, disk, tracking server or command."""
 
 from __future__ import annotations
 
@@ -148,9 +148,7 @@ def breaking(place: Path, data: Path, *words: str) -> subprocess.CompletedProces
     return done
 
 
-def test_cells_that_raise_die_and_eat_memory_say_why(
-    data: Path, tmp_path: Path, full_disk: Path
-) -> None:
+def test_failed_cells_have_a_reason(data: Path, tmp_path: Path, full_disk: Path) -> None:
     runs = tmp_path / "runs"
     done = breaking(tmp_path, data, f"runs_dir={runs}", f"tracking.artifact_uri={full_disk}")
     text = table_of(runs)

@@ -1,4 +1,4 @@
-"""A search: what is refused before the first trial, what a study keeps to, how it ends."""
+"""A search: what is refused before the first trial, what must not change, how it ends."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ TC = (Objective("val/TC/aligned", "maximize"),)
         ({"retry": "failed"}, "retry=failed is for grids"),
         ({"sampler": {"seed": 1}}, "sampler: 'kind' has no value"),
         ({"sampler": {"kind": "tpe", "seed": "x"}}, "sampler.seed: expected a whole number"),
-        ({"objectives": TC, "pruner": {"kind": "median"}}, "known at the end alone"),
+        ({"objectives": TC, "pruner": {"kind": "median"}}, "known only at the end"),
         ({"objectives": TC}, r"add consistency=views 'consistency.splits=\[val,test\]'"),
     ],
 )
@@ -135,7 +135,7 @@ def test_search_without_finished_trial_raises(
     assert "trial 1 failed: no memory" in capsys.readouterr().err
 
 
-def test_a_preview_says_what_is_left_and_writes_nothing(
+def test_preview_shows_missing_points_and_writes_nothing(
     wanted: Search, ends: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     search(wanted, settings(dry_run=True))

@@ -1,4 +1,4 @@
-"""Settings of a sweep: the file, the checks, what is left for the runs to resolve."""
+"""Settings of a sweep: the file, the checks, what only the runs resolve."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def objective(metric: str, **more: Any) -> dict[str, Any]:
         ({"points": ["a=1"]}, "points"),
     ],
 )
-def test_a_wrong_setting_is_told_in_one_sentence(
+def test_wrong_setting_is_reported_in_one_sentence(
     composed: DictConfig, values: dict[str, Any], said: str
 ) -> None:
     with pytest.raises(InputError, match=said) as error:
@@ -105,7 +105,7 @@ def test_a_wrong_setting_is_told_in_one_sentence(
     assert "\n" not in str(error.value)
 
 
-def test_objectives_that_are_told_while_a_run_trains() -> None:
+def test_objectives_reported_during_training() -> None:
     metrics = ("val/mIoU", "val/night/mIoU", "val/TC/aligned", "test/CA/released", "test/Var")
     followed = [Objective(metric, "maximize").is_reported for metric in metrics]
     assert followed == [True, True, False, False, False]

@@ -125,7 +125,7 @@ def test_an_unknown_or_missing_name_lists_the_studies(call: Call, tmp_path: Path
     assert_one_sentence(err, "there is no study 'search/grb'; did you mean 'search/grbm'?")
     code, _, err = call(entry, f"runs_dir={tmp_path}")
     assert code == 2
-    assert_one_sentence(err, "give the study with name=...; the storage holds: search/grbm.")
+    assert_one_sentence(err, "choose a study with name=...; the storage has: search/grbm.")
 
 
 @pytest.mark.parametrize("storage", ["", "storage={}/other.journal", "storage=sqlite:///{}/a.db"])
@@ -133,7 +133,7 @@ def test_a_missing_storage_is_not_made(call: Call, tmp_path: Path, storage: str)
     given = [storage.format(tmp_path)] if storage else []
     code, _, err = call(entry, "name=x", f"runs_dir={tmp_path}", *given)
     assert code == 2
-    assert_one_sentence(err, "there is no file of studies")
+    assert_one_sentence(err, "there is no storage")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -1,4 +1,4 @@
-"""What ``-m`` makes of overrides and settings: grids, lists and searches, without running them."""
+"""Points of ``-m`` from overrides and settings: grids, lists and searches, without running them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from sweeps.worker.point_list import PointList
 from sweeps.worker.trial_sources import Outcome
 
 
-class Asked:
+class RecordedCalls:
     """What would have been run."""
 
     def __init__(self) -> None:
@@ -31,8 +31,8 @@ class Asked:
 
 
 @pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch) -> Asked:
-    found = Asked()
+def calls(monkeypatch: pytest.MonkeyPatch) -> RecordedCalls:
+    found = RecordedCalls()
 
     def run_points(wanted: PointList, settings: SweepSettings) -> list[Outcome]:
         del settings
@@ -63,9 +63,11 @@ def call(runs: Path, *words: str, **settings: Any) -> None:
         sweep(task, config, loader)
 
 
-def test_a_grid_is_all_combinations_each_with_its_parameters(asked: Asked, tmp_path: Path) -> None:
+def test_a_grid_is_all_combinations_each_with_its_parameters(
+    calls: RecordedCalls, tmp_path: Path
+) -> None:
     call(tmp_path, "+experiment=grbm", "masker.sigma_div=1,2", "seed=0,3")
-    (wanted,) = asked.lists
+    (wanted,) = calls.lists
     assert [point.label for point in wanted.points] == [
         *("sigma_div=1 seed=0", "sigma_div=1 seed=3", "sigma_div=2 seed=0", "sigma_div=2 seed=3"),
     ]
@@ -75,10 +77,10 @@ def test_a_grid_is_all_combinations_each_with_its_parameters(asked: Asked, tmp_p
     assert wanted.kind == "grid"
 
 
-def test_points_are_run_for_every_value_of_the_grid(asked: Asked, tmp_path: Path) -> None:
+def test_points_are_run_for_every_value_of_the_grid(calls: RecordedCalls, tmp_path: Path) -> None:
     points = [["masker.sigma_div=1", "masker.patch_size=8"], ["masker.sigma_div=4"]]
     call(tmp_path, "+experiment=grbm", "seed=0,1", points=points)
-    (wanted,) = asked.lists
+    (wanted,) = calls.lists
     assert wanted.kind == "list"
     assert [point.label for point in wanted.points] == [
         *("seed=0 sigma_div=1 patch_size=8", "seed=0 sigma_div=4"),
@@ -86,51 +88,51 @@ def test_points_are_run_for_every_value_of_the_grid(asked: Asked, tmp_path: Path
     ]
 
 
-def test_sweep_params_of_file_equal_typed(asked: Asked, tmp_path: Path) -> None:
+def test_sweep_params_of_file_equal_typed(calls: RecordedCalls, tmp_path: Path) -> None:
     params = {"masker.sigma_div": "1,2", "model.weights": None, "seed": 5}
     call(tmp_path, "+experiment=grbm", params=params)
-    (wanted,) = asked.lists
+    (wanted,) = calls.lists
     assert len(wanted.points) == 2
     assert {"model.weights=null", "seed=5"} <= set(wanted.points[0].overrides)
 
 
-def test_sweep_name_is_independent_of_paths(asked: Asked, tmp_path: Path) -> None:
+def test_sweep_name_is_independent_of_paths(calls: RecordedCalls, tmp_path: Path) -> None:
     words = ("+experiment=grbm", "masker.sigma_div=1,2")
     call(tmp_path / "a", *words)
     call(tmp_path / "b", *words, "fresh=true", "dataset.cache_dir=/c")
     call(tmp_path / "a", *words, "trainer.max_steps=3")
-    first, moved, other = (wanted.study for wanted in asked.lists)
+    first, moved, other = (wanted.study for wanted in calls.lists)
     assert first == moved != other
     assert first.startswith("grbm-sigma_div-")
 
 
-def test_sweep_fresh_is_not_passed_to_runs(asked: Asked, tmp_path: Path) -> None:
+def test_sweep_fresh_is_not_passed_to_runs(calls: RecordedCalls, tmp_path: Path) -> None:
     call(tmp_path, "+experiment=grbm", "masker.sigma_div=1,2", "fresh=true")
-    (wanted,) = asked.lists
+    (wanted,) = calls.lists
     assert wanted.runs.fresh
     assert not any(word.startswith("fresh") for point in wanted.points for word in point.overrides)
 
 
-def test_sweep_search_name_ignores_order(asked: Asked, tmp_path: Path) -> None:
+def test_sweep_search_name_ignores_order(calls: RecordedCalls, tmp_path: Path) -> None:
     words = ("+experiment=grbm", "masker.sigma_div=interval(1,4)", "seed=1", "trainer.max_steps=3")
     call(tmp_path, *words, trials=3)
     call(tmp_path, *reversed(words), "fresh=true", trials=3)
     call(tmp_path, *words, trials=3, replicates=2)
-    first, same, other = asked.searches
+    first, same, other = calls.searches
     assert first.study == same.study != other.study
     assert first.identity == same.identity
     assert "trainer.max_steps=3" in first.identity
 
 
-def test_sweep_search_file_runs_are_single(asked: Asked, tmp_path: Path) -> None:
+def test_sweep_search_file_runs_are_single(calls: RecordedCalls, tmp_path: Path) -> None:
     call(tmp_path, "+search=grbm", "masker.sigma_div=4")
-    (wanted,) = asked.searches
+    (wanted,) = calls.searches
     keys = [parameter.key for parameter in wanted.parameters]
     assert keys == ["masker.patch_size", "loss.spatial.alpha"]
     assert "hydra.mode=RUN" in wanted.fixed
     assert "masker.sigma_div=4" in wanted.fixed
     call(tmp_path, "+search=grbm", "masker.sigma_div=1,2")
-    assert not [word for word in asked.searches[1].fixed if "sigma_div" in word]
+    assert not [word for word in calls.searches[1].fixed if "sigma_div" in word]
 
 
 @pytest.mark.parametrize(
@@ -138,25 +140,25 @@ def test_sweep_search_file_runs_are_single(asked: Asked, tmp_path: Path) -> None
     [{"trials": 3}, {"hours": 3}, {"replicates": 2}, {"pruner": {"kind": "median"}}],
 )
 def test_sweep_search_settings_of_grid_are_refused(
-    asked: Asked, tmp_path: Path, settings: dict[str, Any]
+    calls: RecordedCalls, tmp_path: Path, settings: dict[str, Any]
 ) -> None:
     said = f"hydra.sweeper.{next(iter(settings))} is for searches"
     with pytest.raises(InputError, match=said):
         call(tmp_path, "+experiment=grbm", "seed=0,1", **settings)
-    assert asked.lists == []
+    assert calls.lists == []
 
 
-def test_a_mistake_is_told_before_anything_is_run(asked: Asked, tmp_path: Path) -> None:
-    asked.outcomes = [Outcome(Point("a", ()), "failed", "no such key")]
+def test_mistake_is_reported_before_any_run(calls: RecordedCalls, tmp_path: Path) -> None:
+    calls.outcomes = [Outcome(Point("a", ()), "failed", "no such key")]
     with pytest.raises(InputError, match="a: no such key"):
         call(tmp_path, "+experiment=grbm", "seed=0,1")
-    assert asked.lists == []
+    assert calls.lists == []
 
 
 def test_failed_points_end_in_an_error_after_the_table(
-    asked: Asked, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    calls: RecordedCalls, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    asked.outcomes = [
+    calls.outcomes = [
         Outcome(Point("a", ()), "finished", keys=("k1",)),
         Outcome(Point("b", ()), "failed", "out of memory", keys=("k2",)),
     ]
@@ -166,10 +168,10 @@ def test_failed_points_end_in_an_error_after_the_table(
 
 
 def test_a_preview_runs_nothing(
-    asked: Asked, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    calls: RecordedCalls, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     call(tmp_path, "+experiment=grbm", "seed=0,1,2", dry_run=True)
-    assert asked.lists == []
+    assert calls.lists == []
     assert "3 of 3 points would be run" in capsys.readouterr().err
 
 

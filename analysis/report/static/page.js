@@ -127,7 +127,7 @@ function openPanel(address) {
 
 /** One line per run; the chosen one's details stand below. */
 function chooser(shown, pick) {
-  if (!shown.runs.length) return el("p", {}, "No run stands behind it.");
+  if (!shown.runs.length) return el("p", {}, "It has no runs.");
   if (shown.runs.length === 1) return null;
   const scores = shown.values.length ? [shown.value_name] : ["mIoU", "Var"];
   const rows = shown.runs.map((key, index) => {

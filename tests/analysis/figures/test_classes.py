@@ -32,7 +32,7 @@ def test_shares_of_the_largest_region_by_hand() -> None:
     assert data.miou is None
 
 
-def test_a_class_that_occurs_nowhere_has_no_share_and_is_said_so(tmp_path: Path) -> None:
+def test_class_that_occurs_nowhere_has_no_share_and_a_remark(tmp_path: Path) -> None:
     labels = np.minimum(two_images(), 1)
     data = class_regions(statistics(labels, HALVES, None))
     assert np.isnan(data.shares[1]).all()
@@ -60,7 +60,7 @@ def test_the_miou_is_of_the_same_part_as_the_shares(tmp_path: Path) -> None:
         draw(data, ("test", "test")), tmp_path
     )
     for night in (None, (False, False)):
-        with pytest.raises(InputError, match="counts of 'CRM-B' hold no image of the night"):
+        with pytest.raises(InputError, match="counts of 'CRM-B' contain no image of the night"):
             class_regions(stats, "night", ("CRM-B", replace(by_day, night=night)))
 
 

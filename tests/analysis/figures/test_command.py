@@ -218,16 +218,20 @@ def test_bad_input_is_one_sentence(call: Call, figure: str, words: list[str], wo
     ("figure", "change", "word"),
     [
         ("spatialseg/fig5", ["dataset=mfnet"], "(not both)"),
-        ("spatialseg/fig5", ["split=test"], "statistics.npz is of split 'train' already"),
-        ("spatialseg/fig1", ["split=test"], "statistics.npz is of split 'train' already"),
+        ("spatialseg/fig5", ["split=test"], "statistics.npz has split 'train'"),
+        ("spatialseg/fig1", ["split=test"], "statistics.npz has split 'train'"),
         ("spatialseg/fig5", ["metric=vertical5"], "over ring5, not over vertical5; omit metric="),
         ("spatialseg/fig3", ["metric=ring9"], "was measured over ring5, not over ring9"),
         ("spatialseg/fig4", ["names=00001N,00002D"], "shows one image, got 2"),
         ("spatialseg/fig4", ["names=00099D"], "split 'test' has no image '00099D'"),
-        ("spatialseg/fig8", ["names=00001N"], "leave pick= and rows= out"),
+        ("spatialseg/fig8", ["names=00001N"], "omit pick= and rows="),
         ("spatialseg/fig9", ["rows=13"], "rows=13, but split 'test' has 12 images"),
         ("spatialseg/fig9", ["suffix=_pred"], "no prediction"),
-        ("spatialseg/fig2", ["regions=3"], "lacks counts_vertical3.npz (it holds counts_h"),
+        (
+            "spatialseg/fig2",
+            ["regions=3"],
+            "does not contain counts_vertical3.npz (it contains counts_h",
+        ),
         ("spatialseg/fig1", ["metric=vertical5"], "no centre and no edge"),
         ("spatialseg/fig3", ["methods=A:x,B:y"], "there is no file of counts"),
         ("spatialseg/fig3", ["methods=A:{0}/a,B:{0}/b"], "shows one method, got 2"),
@@ -297,12 +301,12 @@ def test_methods_on_other_images_are_not_shown_together(
     assert "'B' on 11 of 'val'" in err
 
 
-def test_a_file_in_the_place_of_a_folder_is_told_before_drawing(call: Call, tmp_path: Path) -> None:
+def test_file_instead_of_a_folder_is_refused_before_drawing(call: Call, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     out = tmp_path / "file" / "f.pdf"
     code, _, err = call(entry, "figure=multihead/fig3", f"out={out}")
     assert code == 2
-    assert "is a file; give a folder" in err
+    assert "is a file; choose a folder" in err
 
 
 @pytest.mark.parametrize("figure", ["spatialseg/fig2", "spatialseg/fig3"])

@@ -46,7 +46,7 @@ def test_ca_is_by_the_union_of_the_protocol() -> None:
         np.testing.assert_allclose(data.ca, [[100 * 60 / union, 0]])
 
 
-def test_is_what_the_metrics_are() -> None:
+def test_value_equals_the_metric() -> None:
     seeds = [pairs_of(10, 0.6, seed) for seed in range(2)]
     data = class_consistency({"ours": seeds}, "released")
     for column, name in enumerate(CLASSES):
@@ -59,7 +59,7 @@ def test_is_what_the_metrics_are() -> None:
 @pytest.mark.parametrize(
     ("partition", "title", "axis"),
     [
-        ("released1", "virtual views, frames as they lie (as released)", "CA (released) open"),
+        ("released1", "virtual views, frames not warped (as released)", "CA (released) open"),
         ("next1", "consecutive frames", "CA open"),
     ],
 )
@@ -84,6 +84,6 @@ def test_counts_of_single_frames_are_refused() -> None:
     [alike(60, "released1"), replace(alike(60), classes=("road", "car"))],
     ids=["protocol", "classes"],
 )
-def test_what_is_not_of_one_kind_is_refused(other: Counts) -> None:
+def test_predictions_of_several_kinds_are_refused(other: Counts) -> None:
     with pytest.raises(InputError, match="give counts of one protocol and data set"):
         class_consistency({"x": [alike(60)], "y": [other]}, "released")

@@ -92,7 +92,7 @@ def test_occupancy_is_the_share_of_labels_that_are_not_background() -> None:
     assert heat.source == "toy, train"
 
 
-def test_occupancy_over_the_measured_regions_is_what_the_statistics_say() -> None:
+def test_occupancy_over_measured_regions_equals_statistics() -> None:
     rng = np.random.default_rng(0)
     labels = rng.integers(0, 3, (5, 12, 16), dtype=np.uint8)
     night = np.array([True, False, True, False, False])
@@ -111,7 +111,7 @@ def test_every_region_is_numbered_inside(tmp_path: Path, regions: Regions) -> No
     assert {str(number + 1) for number in range(regions.regions)} <= set(found)
 
 
-def test_numbers_of_rings_stand_apart() -> None:
+def test_numbers_of_rings_are_separate() -> None:
     places = number_beside(strips(9, "ring").map((480, 640)))
     columns = sorted(place[1] for place in places if place)
     assert min(np.diff(columns)) > 15  # 7 point digits take 15 of 640 pixels in a column

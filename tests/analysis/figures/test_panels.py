@@ -47,7 +47,7 @@ def test_rows_hold_the_images_and_their_scores(dataset: MFNet) -> None:
     assert found.box == (slice(6, 18), slice(8, 24))
 
 
-def test_scores_of_an_image_leave_unscored_classes_out(dataset: MFNet) -> None:
+def test_scores_of_an_image_exclude_unscored_classes(dataset: MFNet) -> None:
     label = dataset.read("00001D").label
     present = sorted(set(np.unique(label).tolist()) - {255})
     # One class is taken for another everywhere: 0, and of the other what is its own.

@@ -54,7 +54,7 @@ def test_means_by_hand_and_over_seeds() -> None:
         (2, "seeds", "seeds"),
     ],
 )
-def test_intervals_are_over_what_was_asked(seeds: int, band: str, covers: str) -> None:
+def test_intervals_cover_requested_sources(seeds: int, band: str, covers: str) -> None:
     found = profile("m", [method(seed) for seed in range(seeds)], FAST, band)
     assert found.covers == covers
     low, high = found.bars
@@ -64,7 +64,7 @@ def test_intervals_are_over_what_was_asked(seeds: int, band: str, covers: str) -
 
 
 @pytest.mark.parametrize("band", ["seeds", "both"])
-def test_one_seed_says_nothing_about_seeds(band: str) -> None:
+def test_one_seed_gives_no_interval_over_seeds(band: str) -> None:
     with pytest.raises(InputError, match=f"band={band} needs at least two seeds, but 'm' has one"):
         profile("m", [method()], FAST, band)
 
@@ -94,7 +94,7 @@ def test_heat_maps_share_one_scale() -> None:
     np.testing.assert_array_equal(first.get_array(), np.where(inner, 10, 90))
 
 
-def test_values_of_rings_stand_apart_and_inside() -> None:
+def test_values_of_rings_are_separate_and_inside() -> None:
     region_map = strips(9, "ring").map((480, 640))
     places = staircase(region_map, 60)
     assert [int(region_map[place]) for place in places if place] == list(range(9))

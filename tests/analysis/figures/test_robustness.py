@@ -1,4 +1,4 @@
-"""The figure of failing images: its numbers by hand, what is drawn, what is refused."""
+"""The figure of corruptions: its numbers by hand, what is drawn, what is refused."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_panels_by_hand(methods) -> None:
     np.testing.assert_allclose(missing.curves[1].mious, [[60, 0, np.nan]], atol=1e-3)
 
 
-def test_mean_deviation_and_what_is_left_of_clean() -> None:
+def test_mean_deviation_and_share_of_clean() -> None:
     curve = Curve("x", np.array([[80.0, 40.0], [50.0, 10.0]]))
     means, spreads = curve.summary(relative=False)
     # Two values lie (80 - 50) / sqrt(2) apart.
@@ -118,7 +118,7 @@ def test_draws_every_panel_with_its_unit_and_methods(
     np.testing.assert_allclose(drawn[0], expected[0], atol=0.01)
 
 
-def test_what_cannot_be_shown_together(training, methods) -> None:
+def test_incompatible_inputs_are_refused(training, methods) -> None:
     def ladder(*severities: float) -> Scores:
         own = {("noise", "noise", "std", each): 50 for each in severities}
         return {("clean", "clean", "", 0.0): 80, **own}
@@ -129,7 +129,7 @@ def test_what_cannot_be_shown_together(training, methods) -> None:
             panels(both, "released")
     with pytest.raises(InputError, match="'nois' was not measured; did you mean 'noise'"):
         panels(methods, "released", ["nois"])
-    with pytest.raises(InputError, match="clean images alone"):
+    with pytest.raises(InputError, match="only clean images"):
         panels({"x": [training("only", ladder())]}, "released")
     fewer = replace(short.levels[1], counts=short.levels[1].counts.select(["00000D"]))
     cut = replace(short, levels=(short.levels[0], fewer))

@@ -24,7 +24,7 @@ def test_changes_from_the_first_region_by_hand() -> None:
     np.testing.assert_allclose(changes["SOR"], [0, -30])
 
 
-def test_absent_classes_count_as_asked() -> None:
+def test_absent_classes_count_by_the_option() -> None:
     lonely = counts_of(np.array([[[4, 0], [0, 0]], [[4, 0], [0, 4]]]))
     released = trend("ring", np.ones(2), {"a": lonely}, "released")
     excluded = trend("ring", np.ones(2), {"a": lonely}, "exclude")

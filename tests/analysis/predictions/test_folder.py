@@ -37,7 +37,7 @@ def test_a_suffix_is_part_of_the_names(tiny: MFNet, tmp_path: Path) -> None:
         find(folder, tiny, "test", "", "refuse")
 
 
-def test_missing_files_stop_unless_left_out(tiny: MFNet, tmp_path: Path) -> None:
+def test_missing_files_are_refused_unless_excluded(tiny: MFNet, tmp_path: Path) -> None:
     folder = put(tmp_path / "p", "00001D.png")
     with pytest.raises(InputError, match=r"lacks .* 1 of the 2 .*\(00002N\.png\).*missing=leave"):
         find(folder, tiny, "test", "", "refuse")
@@ -61,8 +61,8 @@ def test_folders_without_predictions(tiny: MFNet, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"expected PNG files named NAME\.png, but it is empty"):
         find(put(tmp_path / "empty"), tiny, "test", "", "refuse")
     arrays = put(tmp_path / "npy", *(f"{name}.npy" for name in NAMES))
-    with pytest.raises(InputError, match=r"but it holds 00001D\.npy, 00002N\.npy"):
+    with pytest.raises(InputError, match=r"but it contains 00001D\.npy, 00002N\.npy"):
         find(arrays, tiny, "test", "", "refuse")
     foreign = put(tmp_path / "foreign", "a.png", "b.png", "c.png", "d.png", "e.png")
-    with pytest.raises(InputError, match=r"holds a\.png, b\.png, c\.png and 2 more\.$"):
+    with pytest.raises(InputError, match=r"contains a\.png, b\.png, c\.png and 2 more\.$"):
         find(foreign, tiny, "test", "", "refuse")

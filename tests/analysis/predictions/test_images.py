@@ -34,7 +34,7 @@ def with_palette(path: Path, palette: object, values: np.ndarray = INDICES) -> P
     return path
 
 
-def test_the_three_kinds_of_file_say_the_same(tmp_path: Path) -> None:
+def test_three_kinds_of_file_give_equal_counts(tmp_path: Path) -> None:
     opaque = np.dstack([COLOURS, np.full(INDICES.shape, 255, np.uint8)])
     files = [
         grey(tmp_path / "index.png"),
@@ -47,7 +47,7 @@ def test_the_three_kinds_of_file_say_the_same(tmp_path: Path) -> None:
         np.testing.assert_array_equal(reader().read(file), INDICES, err_msg=file.name)
 
 
-def test_colours_can_be_asked_for_of_any_file_and_indices_of_equal_channels(tmp_path: Path) -> None:
+def test_format_colour_reads_any_file_and_index_equal_channels(tmp_path: Path) -> None:
     # A palette in another order: the stored numbers are 0, 2, 1 where the colours say 0, 1, 2.
     shuffled = with_palette(tmp_path / "p.png", [PALETTE[0], PALETTE[2], PALETTE[1]])
     swapped = np.array([[0, 2, 1], [1, 2, 0]])
@@ -65,7 +65,7 @@ def test_a_foreign_palette_is_not_guessed_at(tmp_path: Path) -> None:
     """VOC's colour of index 3 is another class's colour here: both readings are possible."""
     voc = [(0, 0, 0), (128, 0, 0), (0, 128, 0), (64, 0, 128)]
     path = with_palette(tmp_path / "voc.png", voc, np.array([[0, 3]], np.uint8))
-    with pytest.raises(InputError, match=r"only the classes 0 to 2; say what counts: format="):
+    with pytest.raises(InputError, match=r"only the classes 0 to 2; choose one reading: format="):
         reader().read(path)
     unused = with_palette(tmp_path / "unused.png", voc, np.array([[0, 0]], np.uint8))
     assert not reader().read(unused).any()
@@ -74,8 +74,14 @@ def test_a_foreign_palette_is_not_guessed_at(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        (np.array([[0, 3]], np.uint8), r"bad\.png: value 3 is no class; expected 0 to 2 .*person"),
-        (np.array([[0, 255]], np.uint8), r"bad\.png: 1 pixels are 255; a prediction has no pixels"),
+        (
+            np.array([[0, 3]], np.uint8),
+            r"bad\.png: value 3 is not a class; expected 0 to 2 .*person",
+        ),
+        (
+            np.array([[0, 255]], np.uint8),
+            r"bad\.png: 1 pixels are 255; a prediction cannot ignore pixels",
+        ),
         (
             np.array([[[0, 0, 0], [64, 0, 127]]], np.uint8),
             r"bad\.png: colour \(64, 0, 127\) at row 0, column 1 .*\(1 such .*car \(64, 0, 128\)",
@@ -90,7 +96,7 @@ def test_a_foreign_palette_is_not_guessed_at(tmp_path: Path) -> None:
         (np.zeros((1, 2, 2), np.uint8), r"bad\.png: .*got grey with transparency"),
     ],
 )
-def test_what_is_no_prediction_is_refused(tmp_path: Path, values: object, message: str) -> None:
+def test_invalid_predictions_are_refused(tmp_path: Path, values: object, message: str) -> None:
     path = grey(tmp_path / "bad.png", np.asarray(values))
     with pytest.raises(InputError, match=message):
         reader().read(path)
@@ -104,7 +110,7 @@ def test_three_different_channels_are_no_indices(tmp_path: Path) -> None:
 def test_files_that_are_no_png_or_half_of_one(tmp_path: Path) -> None:
     text = tmp_path / "text.png"
     text.write_text("no picture, but long enough for a header")
-    with pytest.raises(InputError, match=r"text\.png is no PNG file"):
+    with pytest.raises(InputError, match=r"text\.png is not a PNG file"):
         reader().read(text)
     noise = np.random.default_rng(0).integers(0, 3, (64, 64), np.uint8)
     whole = grey(tmp_path / "whole.png", noise).read_bytes()
@@ -125,7 +131,7 @@ def test_a_file_that_claims_too_many_pixels_is_not_decoded(tmp_path: Path) -> No
             reader(form).read(path)  # type: ignore[arg-type]
 
 
-def test_two_classes_of_one_colour_cannot_be_told_by_colour(tmp_path: Path) -> None:
+def test_two_classes_of_one_colour_are_refused(tmp_path: Path) -> None:
     twice = PredictionReader(CLASSES, ((0, 0, 0), (1, 1, 1), (1, 1, 1)))
     np.testing.assert_array_equal(twice.read(grey(tmp_path / "index.png")), INDICES)
     with pytest.raises(InputError, match=r"gives car and person the same colour"):

@@ -33,9 +33,7 @@ def test_counts_by_hand(tiny: MFNet, write: Write) -> None:
     assert scored.name == "pred"
 
 
-def test_what_is_counted_says_which_classes_are_left_out_of_means(
-    tiny: MFNet, write: Write
-) -> None:
+def test_unscored_classes_are_stored_with_counts(tiny: MFNet, write: Write) -> None:
     tiny.unscored = ("person",)
     scored = score_folder(write(PREDICTIONS), tiny, "test", STRIPS)
     assert [counts.unscored for counts in scored.counts] == [("person",)] * 2
@@ -113,7 +111,7 @@ def test_every_partition_against_a_loop_over_pixels(tmp_path: Path, write: Write
     np.testing.assert_array_equal(one.maps.intersection.sum((1, 2)), right)
 
 
-def test_left_out_images_are_in_no_number(tiny: MFNet, write: Write) -> None:
+def test_excluded_images_are_in_no_number(tiny: MFNet, write: Write) -> None:
     folder = write({"00002N": PREDICTIONS["00002N"]})
     options = ScoringOptions(partitions=("vertical",), regions=2, missing="leave_out")
     scored = score_folder(folder, tiny, "test", options)

@@ -81,7 +81,7 @@ def test_scores_are_those_that_carry_the_metrics_name(table: ScoreTable) -> None
     assert without == {("Acc", False)}
 
 
-def test_conventions_stand_side_by_side_only_where_they_differ(table: ScoreTable) -> None:
+def test_conventions_are_side_by_side_only_where_they_differ(table: ScoreTable) -> None:
     assert table.conventions() == ("released", "exclude")
     assert table.absent_classes() == ("car", "person")
     assert "released counts that as 0, exclude leaves the class out" in convention_line(table)
@@ -118,7 +118,7 @@ def test_grids_show_the_numbers(table: ScoreTable) -> None:
     assert parts.rows[2] == ("day (1) released", "57.78", "48.23", "69.44", "51.67", "37.78")
 
 
-def test_intervals_stand_beside_their_scores(table: ScoreTable) -> None:
+def test_intervals_are_beside_their_scores(table: ScoreTable) -> None:
     cells = interval_cells(table, "exclude")
     names = ("mIoU", "region/1", "region/2", "Var")
     assert {part: list(each) for part, each in cells.items()} == {

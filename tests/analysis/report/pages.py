@@ -1,4 +1,4 @@
-"""A store as a researcher's may look, for the tests of the page: 60 runs, 25 tables, 2 studies.
+"""A realistic store for the tests of the page: 60 runs, 25 tables, 2 studies.
 
 Captions, rows and printed values are the papers' (sweeps/tables); scores are drawn around those of
 real runs at demo scale.
@@ -217,7 +217,7 @@ def search(runs: Sequence[RunEntry]) -> StudyEntry:
         "# Study masks\n\nKind: search. Objectives: highest `val/mIoU`, lowest `val/Var`.\n\n"
         "**Importance of the parameters**\n\n| parameter | for val/mIoU, % | for val/Var, % |\n"
         "| --- | ---: | ---: |\n| masker.sigma_div | 61.20 | 48.11 |\n| optimizer.lr | 30.0 | 9.7 |"
-        "\n\n- rough: 34 complete trials, 50 are advised.\n"
+        "\n\n- rough: 34 complete trials, 50 are recommended.\n"
     )
     names = {"objectives": ("val/mIoU", "val/Var"), "maximize": (True, False)}
     command = "python -m rgbt.run -m +search=grbm"
@@ -264,14 +264,14 @@ DIFFERENCES = (
         paper="masker.cell_position=centre: the distance of a cell is that of its centre.",
         released="masker.cell_position=corner: the distance of a cell is that of its corner.",
         source="SpatialSeg, Sec. IV-B, Eq. 7",
-        effect="Released less paper: mIoU +0.42 [-0.81, +1.66].",
+        effect="Released minus paper: mIoU +0.42 [-0.81, +1.66].",
     ),
     DifferenceEntry(
         topic="Absent classes",
         paper="A class without a pixel is left out of the mean.",
         released="It counts as 0.",
         source="SpatialSeg, Sec. V-A",
-        effect="No two runs differ by this alone.",
+        effect="No two runs differ only in this setting.",
     ),
 )
 

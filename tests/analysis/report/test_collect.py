@@ -107,7 +107,7 @@ def miou(matrix: np.ndarray) -> float:
     return 100 * statistics.fmean(ious)
 
 
-def test_everything_is_there_and_nothing_is_said(data: ReportData) -> None:
+def test_complete_run_prints_nothing(data: ReportData) -> None:
     assert data.remarks == ()
     assert len(data.runs) == 8
     assert [table.scale for table in data.tables if table.scale] == ["paper"]
@@ -130,7 +130,7 @@ def test_a_run_has_scores_of_its_counts(data: ReportData) -> None:
     assert (run.images, run.classes, run.partition) == (12, CLASSES, "ring2")
 
 
-def test_a_run_says_where_it_comes_from(data: ReportData) -> None:
+def test_run_shows_its_provenance(data: ReportData) -> None:
     run = run_of(data, "aa1")
     assert (run.name, run.group, run.scale, run.seed) == (
         "grbm scale=paper seed=1",
@@ -216,7 +216,7 @@ def test_the_table_has_ranks_orders_and_notes(data: ReportData) -> None:
     )
 
 
-def test_tables_that_wait_are_listed_with_what_they_need(data: ReportData) -> None:
+def test_tables_not_run_are_listed_with_their_needs(data: ReportData) -> None:
     table = table_of(data, "spatialseg/table3")
     assert table.scale == ""
     assert table.command == "rgbt reproduce table=spatialseg/table3 seeds=3 scale=demo"
@@ -244,7 +244,7 @@ def test_the_search_has_its_front(data: ReportData) -> None:
     assert "A remark." in study.note
 
 
-def test_collected_search_stands_on_the_page(data: ReportData) -> None:
+def test_collected_search_is_on_the_page(data: ReportData) -> None:
     text = page.page_text(data)
     assert "4 trials: 3 complete, 1 failed." in visible(text)
     assert 'data-chart="study-search-two/0"' in text
@@ -256,14 +256,14 @@ def test_collected_search_stands_on_the_page(data: ReportData) -> None:
     ]
 
 
-def test_differences_compare_runs_that_differ_by_them_alone(data: ReportData) -> None:
+def test_differences_compare_runs_that_differ_in_nothing_else(data: ReportData) -> None:
     (entry,) = (each for each in data.differences if each.topic == "Learning rate")
     # Two seeds of the released schedule against three of the paper's.
     assert entry.runs == ("aa0", "aa1", "aa2", "cc0", "cc1")
     paper = [counts_of(seed, 0.7) for seed in range(3)]
     released = [counts_of(seed, 0.9) for seed in range(2)]
     value = compare(paper, released, ["mIoU"], Resampling(resamples=RESAMPLES)).differences[0].value
-    assert f"Released less paper: mIoU {value:+.2f} [" in entry.effect
+    assert f"Released minus paper: mIoU {value:+.2f} [" in entry.effect
     assert "2 seeds against 3 seeds" in entry.effect
     (other,) = (each for each in data.differences if each.topic == "Logits of RTFNet")
     assert other.effect.endswith("model.final_relu=false,true seed=0,1,2")
@@ -334,17 +334,17 @@ def test_a_run_without_configuration_shows_its_parameters(changeable: Path) -> N
     assert "config.yaml cannot be read" in remark
 
 
-def test_counts_that_are_not_those_of_mlflow_are_told(changeable: Path) -> None:
+def test_counts_that_differ_from_mlflow_are_reported(changeable: Path) -> None:
     counts_of(5, 0.6).save(changeable / "bb0" / "counts_test.npz")
     found = collected(changeable)
     assert len(found.remarks) == 2
     assert "Run bb0: " in found.remarks[0]
-    assert "are not those in MLflow" in found.remarks[0]
+    assert "differ from those in MLflow" in found.remarks[0]
     assert "Table 'own/t' (paper): " in found.remarks[1]
     assert "are not as recorded" in found.remarks[1]
 
 
-def test_a_missing_evaluation_costs_its_column_alone(changeable: Path) -> None:
+def test_missing_evaluation_affects_only_its_column(changeable: Path) -> None:
     found = damaged(changeable, "bb1", RGB_FILE, None)
     assert cell_of(found, "B", "mIoU").covers == "images and seeds"
     cell = cell_of(found, "B", "rgb")
@@ -364,10 +364,10 @@ def test_a_table_whose_file_is_gone_is_as_recorded(
     assert cell.mean == pytest.approx(statistics.fmean(values), abs=1e-6)
     assert (cell.low, cell.published) == (None, 61.0)
     (remark,) = found.remarks
-    assert remark == "Table 'own/t' has no file here any more; it is as recorded."
+    assert remark == "Table 'own/t' has no file any more; it is shown as recorded."
 
 
-def test_an_unreadable_table_file_is_told(
+def test_unreadable_table_file_is_reported(
     runs_dir: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     (tmp_path / "tables" / "own").mkdir(parents=True)

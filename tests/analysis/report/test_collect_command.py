@@ -30,8 +30,8 @@ EMPTY = ReportData(
 
 
 @pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """What was asked of the store, which is not read; the page is one line."""
+def collected(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Arguments of the collection; the store is not read and the page is one line."""
     told: list[Any] = []
 
     def fake(*wanted: Any) -> ReportData:
@@ -48,18 +48,18 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     return told
 
 
-def test_it_says_where_the_page_is_and_what_it_holds(
-    call: Call, tmp_path: Path, asked: list[Any]
+def test_command_prints_path_and_content_of_the_page(
+    call: Call, tmp_path: Path, collected: list[Any]
 ) -> None:
     out, runs = tmp_path / "new" / "report", tmp_path / "runs"
     uri = "tracking.uri=http://me:secret@host:5000"
     code, said, err = call(entry, f"out={out}", f"runs_dir={runs}", "resamples=300", uri)
     assert code == 0
     assert f"page   {out}/index.html" in said
-    assert "holds  0 runs, 0 tables with runs, 0 published alone, 0 studies" in said
+    assert "holds  0 runs, 0 tables with runs, 0 published only, 0 studies" in said
     assert err.count("rgbt: Remark ") == 5
-    assert "2 more remarks stand on the page." in err
-    tracking, *others, command, trust = asked
+    assert "2 more remarks are on the page." in err
+    tracking, *others, command, trust = collected
     assert isinstance(tracking, MlflowTracking)
     assert tracking.uri == "http://me:secret@host:5000"
     assert (others, trust) == ([runs, 300], ())
@@ -86,11 +86,11 @@ def test_mistakes_are_one_sentence(
     assert not out.exists()
 
 
-def test_a_file_in_the_place_of_the_folder_is_refused(call: Call, tmp_path: Path) -> None:
+def test_file_instead_of_the_folder_is_refused(call: Call, tmp_path: Path) -> None:
     (tmp_path / "report").write_text("")
     code, _, err = call(entry, f"out={tmp_path / 'report'}")
     assert code == 2
-    assert_one_sentence(err, "is a file; give a folder.")
+    assert_one_sentence(err, "is a file; choose a folder.")
 
 
 @pytest.mark.slow

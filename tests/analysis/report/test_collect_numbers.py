@@ -1,4 +1,4 @@
-"""Numbers of the page that depend on a choice: absent classes, percent, seeds, runs there twice."""
+"""Numbers of the page that depend on a choice: absent classes, percent, seeds, duplicate runs."""
 
 from __future__ import annotations
 

@@ -100,22 +100,22 @@ def test_a_run_is_repeated_with_its_own_overrides(command: str, expected: str) -
     assert repeat_command(command, config, GRID) == expected
 
 
-def test_a_run_continued_by_other_code_is_told(tmp_path: Path) -> None:
+def test_run_continued_by_other_code_is_reported(tmp_path: Path) -> None:
     remarks: list[str] = []
     text = '[{"git_commit": "aaa"}, {"git_commit": "bbb", "git_dirty": true}]'
     processes = read_provenance(files_of(tmp_path, provenance__json=text), "k", remarks)
     assert len(processes) == 2
-    assert remarks == ["Run k was begun and continued by different code: aaa, then bbb+."]
+    assert remarks == ["Run k was started and continued by different code: aaa, then bbb+."]
 
 
 @pytest.mark.parametrize("text", ["{", "{}"])
-def test_damaged_provenance_is_told(tmp_path: Path, text: str) -> None:
+def test_damaged_provenance_is_reported(tmp_path: Path, text: str) -> None:
     remarks: list[str] = []
     assert read_provenance(files_of(tmp_path, provenance__json=text), "k", remarks) == []
     assert "provenance.json cannot be read" in remarks[0]
 
 
-def test_a_front_holds_what_nothing_beats() -> None:
+def test_front_contains_points_that_no_other_dominates() -> None:
     values = [(1.0, 5.0), (2.0, 6.0), (1.5, 7.0), (), (math.nan, 0.0), (2.0, 6.0)]
     assert pareto_front(values, (True, False)) == {0, 1, 5}
     assert pareto_front(values, (True, True)) == {1, 2, 5}
@@ -190,7 +190,7 @@ def composed(choice: Choice, side: Side) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("choice", load_choices(), ids=lambda choice: choice.topic)
-def test_choices_are_settings_that_differ_in_their_keys_alone(choice: Choice) -> None:
+def test_choices_differ_only_in_their_keys(choice: Choice) -> None:
     paper = composed(choice, choice.paper)
     assert {key: paper[key] for key in choice.paper.values} == choice.paper.values
     if choice.released.setting is None:
@@ -204,7 +204,7 @@ def test_choices_are_settings_that_differ_in_their_keys_alone(choice: Choice) ->
 CHOICE = Choice("t", "s", (), Side("a.x=1", {"a.x": 1}, ""), Side("a.x=2", {"a.x": 2}, ""))
 
 
-def test_pairs_differ_by_the_choice_alone() -> None:
+def test_pairs_differ_only_in_the_choice() -> None:
     same = {"model.width": 4, "tracking.uri": "here", "dataset.root": "/a"}
     elsewhere = {"model.width": 4.0, "tracking.uri": "there", "dataset.root": "/b"}
     paper = [run_of({"a.x": 1, **same}, seed) for seed in (1, 0)]
@@ -235,7 +235,7 @@ def quiet(items: Any, what: str) -> Any:
     return items
 
 
-def test_maskers_are_told_apart_by_their_settings() -> None:
+def test_maskers_are_distinguished_by_their_settings() -> None:
     runs = [
         run_of({**masked_config(), "group": "one"}, 0),
         run_of({**masked_config(sigma_div=2.0), "group": "two"}, 0),
@@ -285,14 +285,14 @@ def test_own_masker_is_drawn_where_trusted(tmp_path: Path, monkeypatch: pytest.M
     assert len(mask_pictures(runs, quiet, remarks, trust=("my_maskers",))) == 1
 
 
-def test_a_masker_that_cannot_be_built_is_told() -> None:
+def test_masker_that_cannot_be_built_is_reported() -> None:
     remarks: list[str] = []
     runs = [run_of(masked_config(sampler="guess"))]
     assert mask_pictures(runs, quiet, remarks) == ()
     assert remarks[0].startswith("Masks of 'grbm' cannot be drawn: ")
 
 
-def test_more_maskers_than_fit_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_maskers_than_fit_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(masks, "MOST", 1)
     remarks: list[str] = []
     runs = [run_of(masked_config(sigma_div=float(div))) for div in (1, 2, 4)]
@@ -307,7 +307,7 @@ def test_pictures_stay_small_whatever_they_show() -> None:
 
 
 @pytest.mark.parametrize("name", ["spatialseg/table3", "gone/t"])
-def test_overrides_of_a_table_stand_beside_its_name(
+def test_overrides_of_a_table_are_shown_beside_its_name(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tables, "table_names", lambda: ["spatialseg/table3"])

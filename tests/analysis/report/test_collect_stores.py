@@ -1,4 +1,4 @@
-"""Stores that cannot be read: one sentence each, and nothing is made where nothing was."""
+"""Stores that cannot be read: one sentence each, and no store is created."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_evaluation_path_is_that_of_sweeps() -> None:
     assert RGB.path == RGB_FILE
 
 
-def test_replaced_runs_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_replaced_runs_are_excluded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def stored(run_id: str, **tags: str) -> MlflowRun:
         known = {"run_id": run_id, "name": run_id, "status": "RUNNING", "started": ""}
         return MlflowRun(

@@ -188,7 +188,7 @@ def test_cell_has_a_line_per_kind_and_its_marks() -> None:
     ]
 
 
-def test_tables_with_other_overrides_have_own_places(text: str) -> None:
+def test_tables_with_other_overrides_are_separate(text: str) -> None:
     ids = re.findall(r'\bid="([^"]*)"', re.sub(r"<script.*?</script>", "", text, flags=re.S))
     assert len(set(ids)) == len(ids)
     titles = [visible(each).split("#")[0].split() for each in re.findall("<h3>.*?</h3>", text)]
@@ -232,7 +232,7 @@ def test_panel_behind_a_number_has_its_runs_and_values(data: ReportData, script_
     assert config == dict(run.config)
 
 
-def test_classes_left_out_of_means_are_marked(data: ReportData) -> None:
+def test_unscored_classes_are_marked(data: ReportData) -> None:
     run = replace(data.runs[0], unscored=(data.runs[0].classes[1],))
     (group,) = views.groups_of([run])
     names = [row[0] for row in class_records(group)["classes"]]

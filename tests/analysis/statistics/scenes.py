@@ -1,4 +1,4 @@
-"""Data sets in memory and statistics made by hand, for the tests of this room."""
+"""Data sets in memory and statistics made by hand, for the tests of this folder."""
 
 from __future__ import annotations
 

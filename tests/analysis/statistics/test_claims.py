@@ -179,7 +179,7 @@ def _judge(regions: int) -> Judge:
     return Judge(stats, ConsecutiveBlocks(stats, size=10, resamples=100), 0.95)
 
 
-def test_of_many_steps_each_has_to_be_surer() -> None:
+def test_more_steps_require_higher_confidence() -> None:
     """One of 4 steps at 2.6 standard errors: t is 2.20 for one number, 2.98 for one of four."""
     error = math.sqrt(12 / 11)  # what a standard error of 1 is enlarged to
     values = np.zeros((5, 5)) + [100, 80, 60, 40, 40 - 2.6 * error]
@@ -215,7 +215,7 @@ def test_blocks_are_neighbours_in_name_within_day_and_night() -> None:
 
 
 @pytest.mark.slow
-def test_intervals_cover_what_they_should() -> None:
+def test_intervals_cover_the_true_value() -> None:
     """Frames of a block share their scene; a day / night ratio of 1 is inside 95 % of the time."""
     rng = np.random.default_rng(0)
     rounds, inside, inside_without_blocks = 600, 0, 0

@@ -108,7 +108,7 @@ def test_an_image_of_another_size_or_without_label_is_refused() -> None:
         collect(InMemory([first, replace(other, label=None)]), "train", SETTINGS)
 
 
-def test_an_unreadable_file_stops_or_is_left_out(write_mfnet) -> None:
+def test_unreadable_file_is_refused_or_excluded(write_mfnet) -> None:
     root = write_mfnet({"train": ["00001D", "00002N", "00003D"]})
     (root / "images" / "00001D.png").write_bytes(b"no image")
     with pytest.raises(InputError, match="00001D.png cannot be decoded"):

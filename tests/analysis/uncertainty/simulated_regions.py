@@ -1,4 +1,4 @@
-"""Counts by region whose variance over regions is known: a split like MFNet's in small."""
+"""Counts by region whose variance over regions is known: a small split like MFNet's."""
 
 from __future__ import annotations
 

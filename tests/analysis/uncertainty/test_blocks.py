@@ -1,4 +1,4 @@
-"""Which images are drawn together."""
+"""Blocks of images that are resampled together."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ VIDEOS = [f"V{v:02d}_I{frame:03d}" for v in range(12) for frame in range(11)]
         (VIDEOS, 4, "36 blocks of up to 4 neighbouring frames", [3] * 12 + [4] * 24),
         (VIDEOS, 500, "12 blocks of up to 11 neighbouring frames", [11] * 12),
         (VIDEOS, "sequence", "12 sequences", [11] * 12),
-        (["a", "b", "c3"], "auto", "3 single images (their names tell no neighbours)", [1] * 3),
+        (["a", "b", "c3"], "auto", "3 single images (their names show no neighbours)", [1] * 3),
     ],
 )
 def test_blocks_are_neighbours_of_one_sequence(names, choice, said: str, sizes: list[int]):
@@ -121,7 +121,7 @@ def test_blocks_are_neighbours_of_one_sequence(names, choice, said: str, sizes: 
         assert places == list(range(places[0], places[0] + len(block)))
 
 
-def test_auto_takes_the_longest_of_the_scores_and_leaves_enough_blocks():
+def test_auto_uses_the_longest_block_that_gives_enough_blocks():
     rng = np.random.default_rng(0)
     noise, alike = rng.normal(size=300), autoregressive(rng, 300, 0.8)
     length = block_length(alike, [np.arange(300)])
@@ -143,7 +143,7 @@ def test_auto_takes_the_longest_of_the_scores_and_leaves_enough_blocks():
             "blocks=sequence: names such as '00001D' tell no neigh",
         ),
         ([*mfnet(20), "final"], 5, "blocks=5: names such as '00001D' tell no neigh"),
-        ([f"{c}_{n}" for n, c in enumerate("abcdefghijklm")], 5, "tell no neighbouring frames"),
+        ([f"{c}_{n}" for n, c in enumerate("abcdefghijklm")], 5, "show no neighbouring frames"),
         (mfnet(100), 20, "blocks=20: 100 images make 5 blocks of up to 20"),
         (mfnet(100) + mfnet(100, "N"), "sequence", "200 images make 2 sequences"),
     ],
@@ -198,7 +198,7 @@ def test_auto_cuts_runs_of_which_one_is_too_long():
     assert "not shown to be correlated, each image is drawn alone" in alone.reason
 
 
-def test_auto_says_what_single_images_mean():
+def test_auto_explains_single_images():
     for names in (["b", "a", "c"], [f"{video}_7" for video in "abcdefghijkl"], mfnet(12)):
         blocks = make_blocks(names, "auto", np.zeros((1, len(names))))
         assert blocks.count == len(names)

@@ -25,7 +25,7 @@ def drawn(images: int = 40, trainings: int = 1, seed: int = 0, **changes) -> lis
     return [counts_of(each) for each in array]
 
 
-def test_values_are_means_over_seeds_in_the_order_asked_for():
+def test_values_are_means_over_seeds_in_requested_order():
     seeds = drawn(trainings=3, training_sd=0.2)
     found = estimate(seeds, METRICS, SETTINGS)
     assert tuple(found) == METRICS
@@ -92,7 +92,7 @@ def test_both_adds_the_errors_up():
     assert found.both.high == pytest.approx(scores.mean() + half, rel=1e-10)
 
 
-def test_too_few_images_leave_the_seeds():
+def test_too_few_images_use_seeds_only():
     seeds = drawn(9, trainings=3, training_sd=0.2)
     found = estimate(seeds, ["mIoU"], SETTINGS)["mIoU"]
     assert found.images is None
@@ -145,7 +145,7 @@ def test_correlated_neighbours_make_wider_intervals():
     assert halves["auto"] > 1.7 * halves["none"]
 
 
-def test_an_interval_does_not_depend_on_what_else_was_asked_for():
+def test_interval_does_not_depend_on_other_requested_metrics():
     """The class is correlated over other lengths than the mean is."""
     seeds = drawn(300, seed=3, block=12, image_sd=1.5)
     settings = replace(SETTINGS, blocks="auto")

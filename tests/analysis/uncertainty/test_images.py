@@ -241,7 +241,7 @@ def changed_label(counts: Counts) -> Counts:
         (lambda b: replace(b, partition="ring1", counts=b.counts[:, :1]), "mIoU", "by ring1"),
         (lambda b: b.select(b.names[:-1]), "mIoU", "12 .* against 11 .* '00011D' .*leave_out"),
         (lambda b: replace(b, names=tuple(f"1{n}" for n in b.names)), "mIoU", "different images"),
-        (changed_label, "mIoU", "'00007D' holds other labels .*1 images do"),
+        (changed_label, "mIoU", "'00007D' has different labels .*1 images do"),
         (lambda b: replace(b, night=None), "night/mIoU", "'night/mIoU'"),
         # Else the nights of the one are compared with other images of the other.
         (lambda b: replace(b, night=DARK[::-1]), "night/mIoU", "night"),
@@ -262,7 +262,7 @@ def test_other_labels_of_pairs_of_frames():
     prepare([[a], [b]], parse("TC"), FEW)
     changed = b.counts.copy()
     changed[7, [0, 1], 0, 0] += [-1, 1]
-    with pytest.raises(InputError, match=r"'00007D' holds other labels .*1 images do"):
+    with pytest.raises(InputError, match=r"'00007D' has different labels .*1 images do"):
         prepare([[a], [replace(b, counts=changed)]], parse("TC"), FEW)
 
 

@@ -48,7 +48,7 @@ def test_bca_counts_half_of_the_ties():
 
 
 @pytest.mark.parametrize("method", ["bca", "percentile"])
-def test_nan_is_left_out(method):
+def test_nan_is_omitted(method):
     rng = np.random.default_rng(0)
     known, without = rng.normal(size=400), rng.normal(size=30)
     holes = np.full(100, np.nan)

@@ -86,7 +86,7 @@ def test_both_by_hand():
     assert found.p_both == pytest.approx(expected, rel=1e-9)
 
 
-def test_both_is_never_surer_than_the_seeds_alone():
+def test_both_is_never_narrower_than_seeds_only():
     """Two trainings each: else 6 % false alarms at 5 % (1000 simulations), and 3 % so."""
     varied = Population(training_sd=0.3)
     for seed in range(10):
@@ -110,7 +110,7 @@ def test_the_same_predictions():
         assert each.p_corrected == pytest.approx(1.0)
 
 
-def test_one_seed_on_one_side_leaves_the_images():
+def test_one_seed_on_one_side_uses_images_only():
     a, b = pair(Population(), trainings=3)
     for one, other in ((a[:1], b), (a, b[:1])):
         (found,) = compare(one, other, ["mIoU"], SETTINGS).differences
@@ -142,7 +142,7 @@ def test_too_few_images_are_refused():
         compare(a, b, ["mIoU"], SETTINGS)
 
 
-def test_a_metric_asked_for_twice_counts_once_for_holm():
+def test_metric_requested_twice_counts_once_for_holm():
     a, b = pair(Population(skill=1.7))
     once = compare(a, b, ["mIoU", "Var"], SETTINGS)
     twice = compare(a, b, ["mIoU", "mIoU", "Var"], SETTINGS)

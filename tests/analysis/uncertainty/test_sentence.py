@@ -28,7 +28,7 @@ def compared(metric: str, a: float, b: float, **values) -> Comparison:
     )
 
 
-def test_told_over_images():
+def test_difference_shown_over_images():
     found = compared("mIoU", 61.8, 62.9, p_images=0.0123, images=Interval(0.31, 1.94))
     assert sentence(found, "CRM", "GRBM") == (
         "As trained here, the mIoU of GRBM is 1.10 points higher than that of CRM (62.90 against "
@@ -37,7 +37,7 @@ def test_told_over_images():
     )
 
 
-def test_told_over_images_and_seeds_in_blocks():
+def test_difference_shown_over_images_and_seeds_in_blocks():
     found = compared(
         *("Var", 50.0, 38.5),
         p_images=0.3,
@@ -54,7 +54,7 @@ def test_told_over_images_and_seeds_in_blocks():
     )
 
 
-def test_not_told_over_images_and_seeds():
+def test_difference_not_shown_over_images_and_seeds():
     found = compared(
         *("mIoU", 61.8, 62.1),
         p_images=0.01,
@@ -66,11 +66,11 @@ def test_not_told_over_images_and_seeds():
     assert sentence(found, "CRM", "GRBM") == (
         "A difference in mIoU between GRBM and CRM is not shown (62.10 against 61.80; 95 % "
         "interval of the difference -0.90 to +1.50, p = 0.510), over 3 and 2 trainings and 393 "
-        "images; with this much, one below about 1.20 points cannot be seen."
+        "images; this data shows only differences above about 1.20 points."
     )
 
 
-def test_not_told_without_seeds_of_a_variance_by_night():
+def test_difference_not_shown_for_variance_at_night():
     found = compared(
         *("night/Var", 40.0, 42.0),
         p_images=0.4,
@@ -83,14 +83,14 @@ def test_not_told_without_seeds_of_a_variance_by_night():
         "As trained here, a difference in night/Var between GRBM and CRM is not shown (42.00 "
         "against 40.00; 90 % interval of the difference -3.00 to +7.00, p = 0.400), over 393 "
         "images in 12 sequences; with 3 and 1 trainings, it says nothing about other trainings of "
-        "the two; with this much, one below about 5.00 cannot be seen."
+        "the two; this data shows only differences above about 5.00."
     )
 
 
 @pytest.mark.parametrize(
     ("p", "low", "level"), [(0.06, 0.1, 0.95), (0.01, -0.1, 0.95), (0.03, 0.1, 0.99)]
 )
-def test_told_takes_p_and_interval(p: float, low: float, level: float):
+def test_difference_is_shown_if_p_and_interval_agree(p: float, low: float, level: float):
     found = compared("mIoU", 61.0, 62.0, p_images=p, images=Interval(low, 2.0), level=level)
     assert "is not shown" in sentence(found, "a", "b")
 

@@ -1,4 +1,4 @@
-"""What a dry run says of a table: the state of its runs, and what is made of them."""
+"""The preview of a table: states of its runs and their evaluations."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ RGB = Column(name="rgb", metric="mIoU", modality="rgb")
 ROWS = (Row(label="a", experiment="crm"), Row(label="b", experiment="grbm"))
 
 
-def asked(columns: tuple[Column, ...]) -> tuple[TableRequest, list[Outcome]]:
+def request_of(columns: tuple[Column, ...]) -> tuple[TableRequest, list[Outcome]]:
     wanted = TableRequest("own/t", table(ROWS, columns), "demo", (0,))
     return wanted, [Outcome(point, "waiting") for point in wanted.points()]
 
@@ -36,26 +36,26 @@ class Trained:
 
 
 def test_preview_lists_each_evaluation_command_once() -> None:
-    wanted, outcomes = asked((*FRAMES, RGB))
+    wanted, outcomes = request_of((*FRAMES, RGB))
     assert summary(wanted, outcomes, 2) == [
         "2 runs: 2 waiting.",
-        "Time left with workers=2: known once a run is finished.",
-        "Made of every run that lacks it: rgbt consistency frames=virtual; "
+        "Time left with workers=2: known when one run is finished.",
+        "Evaluations of every run that still lacks them: rgbt consistency frames=virtual; "
         "rgbt consistency frames=next; "
         "rgbt evaluate modality=rgb 'regions=as trained'.",
     ]
 
 
-def test_runs_that_are_trained_and_lack_evaluations_are_told(tmp_path: Any) -> None:
+def test_trained_runs_without_evaluations_are_reported(tmp_path: Any) -> None:
     (tmp_path / "result.json").write_text('{"seconds_of_last_process": 10}')
-    wanted, (first, second) = asked(FRAMES)
+    wanted, (first, second) = request_of(FRAMES)
     found: Any = (Trained(tmp_path),)
     outcomes = [replace(first, results=found, keys=("k",)), second]
     assert summary(wanted, outcomes, 1)[1:] == [
         "Time left with workers=1: 10 s.",
-        "Made of every run that lacks it: rgbt consistency frames=virtual; "
+        "Evaluations of every run that still lacks them: rgbt consistency frames=virtual; "
         "rgbt consistency frames=next.",
-        "Trained already: 1; the time of evaluations is not counted.",
+        "Already trained: 1; the time left excludes their evaluations.",
     ]
     rows = cells_grid(wanted, outcomes).rows
     assert [row[1:] for row in rows] == [

@@ -36,7 +36,7 @@ def words(scored: ScoredTable) -> list[list[str]]:
     return [line.split() for line in lines(scored)]
 
 
-def test_terminal_few_columns_stand_beside_each_other() -> None:
+def test_terminal_few_columns_are_on_one_line() -> None:
     shown = words(Made(ROWS).scored())
     assert shown[0] == ["own,", "TABLE", "I:", "Rows"]
     assert shown[1] == ["seeds", "acc", "published", "difference"]
@@ -45,7 +45,7 @@ def test_terminal_few_columns_stand_beside_each_other() -> None:
     assert shown[5] == ["theirs", "-", "*50.0", "-"]
 
 
-def test_terminal_order_of_rows_and_remarks_stand_below() -> None:
+def test_terminal_shows_order_of_rows_and_remarks_below() -> None:
     shown = lines(Made({"a": ((1,), 1.0), "b": ((2,), 3.0), "c": ((3,), 2.0)}).scored())
     assert re.fullmatch(r"order of rows: rho +\+0.50", shown[6])
     assert re.fullmatch(r"n +3", shown[7])
@@ -154,7 +154,7 @@ def test_render_table_notes_shared_runs_and_commits() -> None:
     sheet = render_table(score("t", table(rows), runs, scale="demo"), ["x=1"])
     assert sheet.notes == ("At scale=demo the same runs as row 'a'.",)
     assert sheet.lines[1].label.notes == (1,)
-    assert "Runs of ours come from several git commits: aaa (1), bbb (1)." in sheet.remarks
+    assert "Our runs come from several git commits: aaa (1), bbb (1)." in sheet.remarks
     assert "Every row of ours was run with x=1." in sheet.remarks
 
 

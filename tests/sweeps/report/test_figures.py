@@ -79,13 +79,13 @@ def test_two_objectives_have_a_front_and_slices_each(tmp_path: Path) -> None:
     study.set_user_attr(attributes.METRICS, ["val/mIoU", "val/Var"])
     found = drawn(study, tmp_path)
     without = {name: picture.reason for name, picture in found.items() if picture.path is None}
-    reason = "trials with several objectives report no values while they train."
+    reason = "trials with several objectives report no values during training."
     assert without == {"intermediate": reason}
     for name in ("pareto", "slices_val_mIoU", "slices_val_Var", "contour_val_Var"):
         assert is_picture(found[name].path)
 
 
-def test_optuna_figure_leaves_style_of_others_alone() -> None:
+def test_optuna_figure_keeps_global_style() -> None:
     import matplotlib
     from matplotlib import pyplot
 
@@ -99,7 +99,7 @@ def test_optuna_figure_leaves_style_of_others_alone() -> None:
     assert pyplot.get_fignums() == []
 
 
-def test_an_empty_study_says_why(tmp_path: Path) -> None:
+def test_empty_study_has_a_reason(tmp_path: Path) -> None:
     stale = tmp_path / "history.png"
     stale.write_bytes(b"of a study of the same name that was deleted")
     found = drawn(new_study("maximize"), tmp_path)
@@ -108,7 +108,7 @@ def test_an_empty_study_says_why(tmp_path: Path) -> None:
     assert not stale.exists()
 
 
-def test_only_failed_and_running_trials_say_why(tmp_path: Path) -> None:
+def test_only_failed_and_running_trials_have_a_reason(tmp_path: Path) -> None:
     study = new_study("maximize")
     for _ in range(3):
         trial = study.ask()
@@ -145,7 +145,7 @@ def test_constant_parameter_and_constant_objective(tmp_path: Path) -> None:
     assert found["contour"].reason.endswith("no parameter took two values.")
 
 
-def test_contour_of_parameters_that_never_meet_says_so(tmp_path: Path) -> None:
+def test_contour_of_unrelated_parameters_has_a_reason(tmp_path: Path) -> None:
     study = new_study("maximize")
     for index in range(20):
         trial = study.ask()

@@ -1,4 +1,4 @@
-"""What a study has found, as data and as tables: values by hand."""
+"""Results of a study as data and as tables: values by hand."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ def test_pareto_front_of_five_points() -> None:
     ]
 
 
-def test_conditional_parameters_are_absent_and_infinite_objectives_left_out() -> None:
+def test_conditional_parameters_are_absent_and_infinite_objectives_omitted() -> None:
     study = new_study("maximize")
     both = {"masker": CategoricalDistribution(["grbm", "none"]), "sigma": ALPHA}
     add(study, [1.0], params={"masker": "grbm", "sigma": 0.5}, distributions=both)
@@ -147,7 +147,7 @@ def test_trials_grid_of_table_keeps_point_order() -> None:
         ("2", "Ny/2 seed=1", "complete", "52.00"),
         ("3", "Ny seed=1", "running", "-"),
     ]
-    assert failed_grid(data).title == "Failed trials (1 more were tried again)"
+    assert failed_grid(data).title == "Failed trials (1 more were retried)"
     assert [grid.title for grid in tables(data, importances(data))] == ["Study s (list)", "Points"]
     assert importances(data).remark == ""
 
@@ -236,7 +236,8 @@ def test_the_parameter_that_decides_is_the_most_important() -> None:
     for index in (0, 1):
         assert sum(shares[index] for shares in found.shares.values()) == pytest.approx(1.0)
     assert (
-        found.remark == "same: one value only, left out. rough: 40 complete trials, 50 are advised."
+        found.remark
+        == "same: one value only, excluded. rough: 40 complete trials, 50 are recommended."
     )
     grid = importance_grid(read(dominated()), found)
     assert grid.header == ("parameter", "for up, %", "for down, %")
@@ -266,7 +267,7 @@ def test_the_direction_of_the_objective_counts() -> None:
         (12, {"x": None}, 3.0, "objective 1: the same value in all trials. rough: 12"),
     ],
 )
-def test_importances_say_why_there_are_none(
+def test_missing_importances_have_a_reason(
     count: int, params: Mapping[str, float | None], values: float | None, reason: str
 ) -> None:
     study = new_study("maximize")
@@ -278,7 +279,7 @@ def test_importances_say_why_there_are_none(
     assert found.remark.startswith(reason)
 
 
-def test_short_names_keep_what_tells_them_apart() -> None:
+def test_short_names_stay_distinct() -> None:
     assert short_names(["optimizer.lr", "head.lr", "masker.alpha"]) == {
         "optimizer.lr": "optimizer.lr",
         "head.lr": "head.lr",

@@ -75,7 +75,7 @@ def test_intervals_are_entries_of_a_space() -> None:
         ("seed=range(3,1)", "'seed=range(3,1)' has no values"),
         ("model=glob(nothing*)", "has no values"),
         ("a=tag(lgo,interval(1,2))", "tag 'lgo' means nothing; did you mean 'log'?"),
-        ("a=tag(log,choice(1,2))", "tags are for interval() alone"),
+        ("a=tag(log,choice(1,2))", "only interval() has tags"),
     ],
 )
 def test_sweeps_that_mean_nothing_are_refused(override: str, sentence: str) -> None:
@@ -96,7 +96,7 @@ def test_lists_go_in_pairs() -> None:
     assert points[1].overrides == ("+experiment=grbm", "seed=1", "masker.sigma_div=4")
 
 
-def test_a_points_own_override_replaces_the_fixed_one() -> None:
+def test_override_of_a_point_replaces_the_fixed_one() -> None:
     (point,) = list_points([["experiment=crm"]], ["+experiment=grbm", "seed=1"])
     assert point.overrides == ("seed=1", "experiment=crm")
 
@@ -129,7 +129,7 @@ def test_optuna_can_draw_a_grid() -> None:
     assert [trial.params for trial in study.trials] == [point.params for point in points]
 
 
-def test_without_a_word_the_file_stands() -> None:
+def test_without_overrides_the_file_is_unchanged() -> None:
     node = OmegaConf.create(SPACE)
     assert merge_space(node, ["seed=1"], {}, {}) == parse_space(SPACE)
 

@@ -116,7 +116,7 @@ def test_sampler_ends_trial_of_other_driver() -> None:
     assert adopter.trials[number].state == TrialState.COMPLETE
 
 
-def test_seeds_differ_and_stay_what_they_are() -> None:
+def test_seeds_differ_and_are_reproducible() -> None:
     seeds = {trial_seed(seed, number) for seed in range(30) for number in range(30)}
     assert len(seeds) == 900
     assert all(0 <= seed < 2**32 for seed in seeds)
@@ -158,7 +158,7 @@ def test_cmaes_is_an_extra_for_one_objective(monkeypatch: pytest.MonkeyPatch) ->
     with pytest.raises(InputError, match="pip install cmaes"):
         build_sampler({"kind": "cmaes"})
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
-    with pytest.raises(InputError, match="follows one objective, and this search has 2"):
+    with pytest.raises(InputError, match="supports one objective, but this search has 2"):
         build_sampler({"kind": "cmaes"}, objectives=2)
 
 

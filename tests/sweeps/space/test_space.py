@@ -1,4 +1,4 @@
-"""Spaces: every mistake is told, conditions hold, values reach Hydra as they are."""
+"""Spaces: every mistake is reported, conditions hold, values reach Hydra unchanged."""
 
 from __future__ import annotations
 
@@ -46,27 +46,30 @@ def test_ranges_arrive_as_written() -> None:
         ({"type": "flaot"}, "type 'flaot' is unknown; did you mean 'float'?"),
         ({"low": 1, "high": 2}, "type 'None' is unknown"),
         ("0..1", "expected a mapping"),
-        ({**FLOAT, "hihg": 3}, "'hihg' is no key of type float; did you mean 'high'?"),
-        ({**LOSS, "low": 3}, "'low' is no key of type categorical"),
-        ({"type": "float", "low": 3, "high": 1}, "low=3.0 lies above high=1.0"),
+        ({**FLOAT, "hihg": 3}, "'hihg' is not a key of type float; did you mean 'high'?"),
+        ({**LOSS, "low": 3}, "'low' is not a key of type categorical"),
+        ({"type": "float", "low": 3, "high": 1}, "low=3.0 is greater than high=1.0"),
         ({"type": "float", "low": 3}, "high must be a finite float, got None"),
         ({"type": "float", "low": "1", "high": 2}, "low must be a finite float, got '1'"),
         ({"type": "float", "low": 0, "high": float("inf")}, "high must be a finite float"),
         ({"type": "int", "low": 0.5, "high": 2}, "low must be a finite int, got 0.5"),
         ({"type": "int", "low": True, "high": 2}, "low must be a finite int, got True"),
         ({**FLOAT, "low": 0}, "low=0.0 has no logarithm"),
-        ({**FLOAT, "log": "yes"}, "log is true or false, got 'yes'"),
+        ({**FLOAT, "log": "yes"}, "log must be true or false, got 'yes'"),
         ({**FLOAT, "step": 0.5}, "step and log: true exclude each other"),
         ({"type": "int", "low": 0, "high": 4, "step": 0}, "step must be positive, got 0"),
         ({"type": "int", "low": 0, "high": 4, "step": 3}, "no whole number of steps of 3"),
         ({"type": "categorical"}, "at least one value, got None"),
         ({"type": "categorical", "choices": []}, "at least one value, got []"),
-        ({"type": "categorical", "choices": [1, 2.5, True]}, "choices hold True twice"),
+        ({"type": "categorical", "choices": [1, 2.5, True]}, "choices contain True twice"),
         ({"type": "categorical", "choices": [{"a": 1}]}, "a plain value or a list of them"),
         ({"type": "categorical", "choices": [float("nan")]}, "must be finite"),
         ({**FLOAT, "when": "loss"}, "when must be a mapping"),
-        ({**FLOAT, "when": {"los": "x"}}, "'los' is no parameter above it; did you mean 'loss'?"),
-        ({**FLOAT, "when": {"k": 1}}, "'k' is no parameter above it"),
+        (
+            {**FLOAT, "when": {"los": "x"}},
+            "'los' is not a parameter above it; did you mean 'loss'?",
+        ),
+        ({**FLOAT, "when": {"k": 1}}, "'k' is not a parameter above it"),
         ({**FLOAT, "when": {"loss": "set_criterio"}}, "did you mean 'set_criterion'?"),
         ({**FLOAT, "when": {"n": [1, 9]}}, "'n' is never 9 but an int from 1 to 4"),
         ({**FLOAT, "when": {"f": 1.0}}, "'f' is a float"),
@@ -188,7 +191,7 @@ class Goal:
     metric: str
 
 
-def test_the_signature_names_what_must_not_change() -> None:
+def test_signature_covers_space_and_objectives() -> None:
     space = parse_space({"a": FLOAT, "b": LOSS})
     name = signature(space, [Goal("val/mIoU")])
     assert len(name) == 12

@@ -43,7 +43,7 @@ def column(**keys: Any) -> dict[str, Any]:
 
 
 def behind(**keys: Any) -> dict[str, Any]:
-    """A difference of a column that stands behind it."""
+    """A difference of a column that follows it."""
     columns = column(minus=["mIoU", "c"])["columns"]
     return {"columns": [*columns, {"name": "c", **keys}], "rows": []}
 
@@ -75,7 +75,7 @@ def test_own_table_needs_no_printed_values(tmp_path: Path) -> None:
         (row(experiment="grmb"), "experiment: 'grmb' is not a choice; did you mean 'grbm'"),
         (row(at={"papr": ["a=1"]}), "row 'small', at: 'papr' is not a choice; did you mean"),
         (row(x=0), "'x' must be > 0 on a log axis, got 0"),
-        ({**row(x=1), "factor": None}, "'x' has no effect without 'factor'"),
+        ({**row(x=1), "factor": None}, "'x' has no effect without the table's 'factor'"),
         ({"rows": [{"experiment": "grbm"}]}, "row 1: 'label' has no value"),
         ({"rows": [{"label": "a"}, {"label": "a"}]}, "rows: 'a' is used twice"),
         ({"rows": ["a"]}, "'rows[0]': input should be an object"),
@@ -91,20 +91,20 @@ def test_own_table_needs_no_printed_values(tmp_path: Path) -> None:
         (column(mean=["mIoU", "IoU"]), "column 'b', mean: 'IoU' is not a choice"),
         (column(mean=["mIoU", "mIoU"]), "two or more different columns, got mIoU, mIoU."),
         (column(mean=["mIoU", "b"]), "'b' is computed from other columns itself; move it in front"),
-        (behind(parameters=True), "minus: 'c' counts parameters and is no score"),
+        (behind(parameters=True), "minus: 'c' counts parameters and is not a score"),
         (behind(mean=["mIoU", "b"]), "minus: 'c' is computed from other columns itself; move it"),
         (column(metric="Var", head="target "), "'head': input should be 'as trained', 'own'"),
-        (column(mean=["mIoU", "b"], head="source"), "'head' is for scores of single frames alone"),
+        (column(mean=["mIoU", "b"], head="source"), "'head' is only for scores of single frames"),
         (column(metric="TC", frames="aligned", head="target"), "remove head: target"),
         (column(metric="Var", corruption="nois"), "corruption: 'nois' is not a choice; did you"),
         (column(metric="Var", corruption="noise"), "needs a severity (grey levels (std)); one of"),
         (column(metric="Var", corruption="noise", severity=300), "'b': severity (standard dev"),
-        (column(metric="Var", severity=8), "'severity' is of a corruption; add corruption"),
-        (column(needs="x", corruption="removed:rgb"), "for scores of single frames alone; remove"),
+        (column(metric="Var", severity=8), "'severity' needs a corruption; add corruption"),
+        (column(needs="x", corruption="removed:rgb"), "only for scores of single frames; remove"),
         (column(metric="TC", frames="aligned", corruption="removed:rgb"), "remove corruption: re"),
         ({**column(metric="class/{kind}"), **row()}, "'kind' of metric class/{kind}"),
         (column(metric="TC"), "TC compares two frames; add frames: aligned, released or next"),
-        (column(metric="Var", frames="aligned"), "'frames' is for TC, CA, CA_released alone"),
+        (column(metric="Var", frames="aligned"), "'frames' is only for TC, CA, CA_released"),
         (column(metric="TC", frames="aligned", modality="thermal"), "remove modality: thermal"),
         ({**column(metric="Var", printed=False), **row(values={"b": 3})}, "'b' is not printed"),
         ({**column(metric="Var", printed=False), **row(doubtful=["b"])}, "'b' is not printed"),
@@ -126,10 +126,10 @@ def test_unknown_name_gets_the_nearest(tmp_path: Path) -> None:
         load_table(str(tmp_path / "none.yaml"))
 
 
-def test_ones_own_table_does_not_hide_a_published_one(tmp_path: Path) -> None:
+def test_user_table_does_not_hide_a_published_one(tmp_path: Path) -> None:
     (tmp_path / "crm").mkdir()
     write(tmp_path).rename(tmp_path / "crm" / "table4.yaml")
-    with pytest.raises(InputError, match="as well as"):
+    with pytest.raises(InputError, match="is both"):
         load_table("crm/table4", tmp_path)
 
 

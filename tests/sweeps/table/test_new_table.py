@@ -50,8 +50,8 @@ def test_a_product_has_no_axis(tmp_path: Path) -> None:
         (("grbm", ["masker.sigma_div=1,abc"]), "masker.sigma_div"),
         (("grbn", ["masker.sigma_div=1,2"]), "did you mean 'grbm'"),
         (("grbm", ["seed=0,1"]), "seeds=3"),
-        (("grbm", ["masker.sigma_div=1,2", "runs_dir=/tmp/r"]), "when the table is run"),
-        (("grbm", ["masker.sigma_div=1"]), "nothing is varied"),
+        (("grbm", ["masker.sigma_div=1,2", "runs_dir=/tmp/r"]), "when you run the table"),
+        (("grbm", ["masker.sigma_div=1"]), "no key is varied"),
     ],
 )
 def test_refused(tmp_path: Path, arguments: tuple[str, list[str]], sentence: str) -> None:

@@ -47,7 +47,7 @@ def assert_printed(row: Row, found: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize(("table", "row"), rows_of(""))
-def test_row_masks_fit_and_settings_are_printed_ones(table: Table, row: Row) -> None:
+def test_row_masks_match_printed_settings(table: Table, row: Row) -> None:
     config = row_config(table, row, "demo")
     masker, loss = config.masker, config.loss
     assert min(build(masker).grid_hw(tuple(config.transform.crop_hw))) > 1
@@ -201,7 +201,7 @@ def test_printed_mean_is_that_of_both_columns(number: int) -> None:
             assert printed == pytest.approx((first + second) / 2, abs=0.0501), row.label
 
 
-def test_columns_a_network_has_no_score_for_are_left_out() -> None:
+def test_columns_without_a_score_of_the_network_are_omitted() -> None:
     three, four = request("multihead/table3"), request("multihead/table4")
     assert three.evaluations(["HeatNet*"]) == four.evaluations(["HeatNet RGB-only*"]) == ()
     assert three.evaluations(["Multi-head"]) == (ExtraEvaluation("thermal"),)
@@ -222,7 +222,7 @@ def test_printed_consistency_is_of_released_protocol(number: int) -> None:
     ]
     protocols = [evaluation.frames for evaluation in wanted.evaluations()]
     assert protocols == ["released", "aligned"]
-    assert any("come from the released protocol" in remark for remark in wanted.table.remarks)
+    assert any("use the released protocol" in remark for remark in wanted.table.remarks)
 
 
 def test_rtfnet_backbones_differ_at_paper_scale_only() -> None:

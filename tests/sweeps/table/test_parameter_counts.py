@@ -1,4 +1,4 @@
-"""Parameters of the rows' networks, counted on nothing but their configuration."""
+"""Parameters of the rows' networks, counted from their configuration only."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_parameter_cells_use_paper_scale() -> None:
     assert (cell.seeds, cell.keys, cell.reason, math.isnan(cell.sd)) == (0, (), "", True)
 
 
-def test_a_network_is_counted_once_and_takes_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_network_is_counted_once_without_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     built: list[str] = []
     allocate = torch.nn.Parameter.__new__
 

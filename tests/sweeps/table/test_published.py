@@ -1,4 +1,4 @@
-"""The printed numbers of our tables against the transcription that lies beside the checkout."""
+"""The printed numbers of our tables against the transcription beside the checkout."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_numbers_arrive_unchanged(name: str, published: dict[str, Any]) -> None:
         assert (row.origin, row.proposed) == (other["origin"], other["proposed"]), row.label
 
 
-def test_columns_stand_in_the_printed_order(published: dict[str, Any]) -> None:
+def test_columns_are_in_the_printed_order(published: dict[str, Any]) -> None:
     for name, table in published.items():
         ours = OURS[name]
         names = [column.name for column in ours.columns if column.printed]

@@ -113,7 +113,7 @@ def test_no_seeds(text: str) -> None:
         seeds_of(text)
 
 
-def test_rows_of_different_networks_take_weights_of_their_own() -> None:
+def test_rows_of_different_networks_use_separate_weights() -> None:
     options = Options(table="spatialseg/table7", scale="paper")
     given = ("weights.mask2former_swin_t=/w/t=1.pth", "weights.mask2former_swin_b=b.pth", "x=1")
     wanted = request_of(options.table, options, given)

@@ -363,7 +363,7 @@ def test_driver_replicates_average_and_report_first(tmp_path: Path) -> None:
     assert len(one.user_attrs[names.RUNS]) == 3
 
 
-def test_driver_tells_two_objectives_in_order(tmp_path: Path) -> None:
+def test_driver_reports_two_objectives_in_order(tmp_path: Path) -> None:
     both = (Objective("test/Var", "minimize"), Objective("test/mIoU", "maximize"))
     desk = search_desk(tmp_path, objectives=both, trials=2).run()
     assert [each.values for each in desk.store.trials()] == [[9.0, 25.0]] * 2
@@ -407,7 +407,7 @@ def test_driver_survives_trial_taken_by_other(tmp_path: Path) -> None:
 
     def released(call: Call) -> Process:
         if len(desk.executor.calls) == 1:
-            searcher.store.release(0, "its driver was gone", requeue=False)
+            searcher.store.release(0, "its driver had ended", requeue=False)
         return (yield from succeed(call))
 
     desk = search_desk(tmp_path / "b", released, storage=storage, trials=1, objectives=UP)

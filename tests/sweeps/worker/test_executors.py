@@ -221,7 +221,7 @@ def driver(module: Path, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
     process.communicate()
 
 
-def test_ctrl_c_reaches_driver_alone(driver: subprocess.Popen[str], tmp_path: Path) -> None:
+def test_ctrl_c_reaches_only_the_driver(driver: subprocess.Popen[str], tmp_path: Path) -> None:
     (pid,) = pids(tmp_path / "pid")
     os.killpg(driver.pid, signal.SIGINT)  # what a terminal does
     told, _ = driver.communicate(timeout=DEADLINE_S)

@@ -101,7 +101,7 @@ def test_the_data_set_is_named_by_its_files(planner: Planner, data: Path) -> Non
         ("dataset.root=/nowhere/to/be/found", "/nowhere/to/be/found"),
     ],
 )
-def test_what_does_not_fit_is_told_in_one_sentence(
+def test_conflicting_settings_are_reported_in_one_sentence(
     planner: Planner, override: str, said: str
 ) -> None:
     with pytest.raises(InputError) as error:
@@ -110,7 +110,7 @@ def test_what_does_not_fit_is_told_in_one_sentence(
     assert "\n" not in str(error.value)
 
 
-def test_a_survey_writes_nothing_and_knows_what_is_there(
+def test_survey_writes_nothing_and_lists_existing_runs(
     base: tuple[str, ...], planner: Planner, tmp_path: Path
 ) -> None:
     runs_dir = tmp_path / "runs"

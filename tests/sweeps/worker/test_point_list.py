@@ -1,4 +1,4 @@
-"""Points known beforehand: how long they will take, and whose tags a shared run gets."""
+"""Points known in advance: their estimated time, and the tags of a shared run."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_runs_of_other_code_are_counted_in_one_line(tmp_path: Path) -> None:
     assert other_code_line([Outcome(Point("p", ()), "finished", results=(found[1],))]) == ""
     outcomes.append(Outcome(Point("q", ()), "finished", results=(found[2],)))
     assert other_code_line(outcomes) == (
-        "2 of 3 runs were made by other code; fresh=true trains these again and keeps the old runs."
+        "2 of 3 runs were made by other code; fresh=true retrains them and keeps the old runs."
     )
 
 

@@ -1,4 +1,4 @@
-"""What a person sees of a driver: lines in a log, a live view in a terminal."""
+"""Progress of a driver: lines in a log, a live view in a terminal."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_progress_in_log_prints_begin_and_end(console: Make) -> None:
         view.rejected("p", "x does not fit.")
     lines = [line[9:] for line in text.getvalue().splitlines()]
     assert lines == [
-        "begins   Ny/4 seed=1",
+        "started  Ny/4 seed=1",
         "finished Ny/4 seed=1  100 s  val mIoU 45.67",
         "failed   Ny/4 seed=1  100 s  val mIoU 45.67: ValueError: [red]not a colour[/red] [1,2]",
         "failed   p: x does not fit.",

@@ -1,4 +1,4 @@
-"""Reading a run as it grows, and saying why a process ended."""
+"""Reading a run while it trains, and the reason why a process ended."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_a_run_that_resumes_is_read_from_its_begin(tmp_path: Path) -> None:
         (1, "\udcff\udcfe broken\n", "\ufffd\ufffd broken"),
         (1, "ValueError: " + "x" * 5000, "ValueError: " + "x" * 288),
         (3, "", "it ended with exit code 3 and no output; see"),
-        (-9, "rgbt: x", "stopped by SIGKILL (the system kills what takes too much memory)"),
+        (-9, "rgbt: x", "stopped by SIGKILL (the system kills processes that use too much memory)"),
         (-11, "rgbt: x", "stopped by SIGSEGV"),
         (-99, "rgbt: x", "stopped by signal 99"),
     ],
@@ -99,7 +99,7 @@ def test_signal_lock_holder_stops_process(tmp_path: Path) -> None:
         assert process.wait() == -signal.SIGTERM
 
 
-def test_a_holder_on_another_machine_is_left_alone(tmp_path: Path) -> None:
+def test_lock_holder_on_another_machine_is_not_signalled(tmp_path: Path) -> None:
     signal_lock_holder(tmp_path, signal.SIGTERM)  # nothing there
     process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
     try:

@@ -64,7 +64,7 @@ def test_tags_are_added_to_those_that_a_run_has(runs: RunStore) -> None:
     assert (found.folder / "run.json").stat().st_mtime_ns == before, "nothing new, nothing written"
 
 
-def test_a_stopped_run_says_why(runs: RunStore) -> None:
+def test_stopped_run_has_a_reason(runs: RunStore) -> None:
     finish(runs.runs_dir / "a")
     (runs.runs_dir / "a" / "result.json").unlink()
     runs.mark_stopped("a", "pruned at step 2")

@@ -1,4 +1,4 @@
-"""One point at work: its processes, what is adopted, why it fails."""
+"""One running trial: its processes, adopted runs, reasons of failures."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ def test_mean_scores_averages_shared_scores(tmp_path: Path) -> None:
         (say("rgbt: masker.sigma_div must be positive, got -1.", 2), "masker.sigma_div must be"),
         (leave(3), "it ended with exit code 3 and no output"),
         (leave(-11), "stopped by SIGSEGV"),
-        (leave(0), f"the run ended, but not as {KEY}: its configuration"),
+        (leave(0), f"the run finished with another key than {KEY}: its configuration"),
     ],
     ids=["raises", "our sentence", "silent", "crashes", "another configuration"],
 )

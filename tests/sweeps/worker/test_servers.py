@@ -211,7 +211,7 @@ def test_search_on_four_drivers_survives_killed_driver(
     assert {trial.state.name for trial in counted} == {"COMPLETE"}
     assert all(trial.state.is_finished() for trial in trials)
     dropped = [trial for trial in trials if trial.user_attrs.get(DROPPED)]
-    assert any("driver was gone" in trial.user_attrs[REASON] for trial in dropped)
+    assert any("driver had ended" in trial.user_attrs[REASON] for trial in dropped)
     # Every run was finished once, and MLflow knows each of them once.
     keys = [key for trial in counted for key in trial.user_attrs[RUNS]]
     assert len(set(keys)) == 10

@@ -134,7 +134,7 @@ def test_open_study_with_other_attributes_raises(tmp_path: Path) -> None:
 
 def test_load_study_unknown_name_lists_studies(tmp_path: Path) -> None:
     storage = open_storage(None, tmp_path)
-    with pytest.raises(InputError, match="no study 'x'; the storage holds none"):
+    with pytest.raises(InputError, match="no study 'x'; the storage has none"):
         load_study("x", storage)
     open_study("table/one", storage, UP, {})
     with pytest.raises(InputError, match="did you mean 'table/one'"):
@@ -148,7 +148,7 @@ def test_looking_for_a_study_makes_nothing(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_journal_in_the_home_folder_is_found(
+def test_journal_in_the_home_folder_is_opened(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))

@@ -162,11 +162,11 @@ def test_gpus_of_this_machine_stay_visible(place: Place, monkeypatch: pytest.Mon
         ({"cluster": "slurm", "slurm_gpus_per_nod": 1}, "did you mean 'gpus_per_node'"),
         ({"cluster": "slurm", "nodes": 2}, "'submitit.nodes' is not an option"),
         ({"cluster": "slurm", "partition": "gpu"}, "submitit.timeout_min has no value"),
-        ({"cluster": "slurm", "timeout_min": 60}, "there is no `srun` here"),
+        ({"cluster": "slurm", "timeout_min": 60}, "this machine has no `srun`"),
         ({"cluster": "local", "timeout_min": "long"}, 'Parameter "timeout_min" expected type'),
     ],
 )
-def test_wrong_options_are_told_in_a_sentence(
+def test_wrong_options_are_reported_in_a_sentence(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: dict[str, Any], sentence: str
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
@@ -274,7 +274,7 @@ def test_slurm_stop_cancels_and_waits_for_the_end(
     assert code(other) == 0
 
 
-def test_a_job_that_slurm_takes_away_leaves_no_result(
+def test_job_removed_by_slurm_has_no_result(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A result would end the job for submitit, and SLURM would queue it again in vain."""

@@ -1,4 +1,4 @@
-"""What is worked on next: points of a list, and points that a sampler chooses."""
+"""Selection of the next trial: points of a list, and proposals of a sampler."""
 
 from __future__ import annotations
 

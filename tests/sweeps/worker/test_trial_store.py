@@ -1,4 +1,4 @@
-"""Trials of a study: who claims what, what counts, and what becomes of a dead driver's trials."""
+"""Trials of a study: claims, valid trials, and the trials of a dead driver."""
 
 from __future__ import annotations
 
@@ -207,7 +207,7 @@ def test_release_requeues_search_trial_with_parameters() -> None:
     storage = memory()
     number, x = taken(searching(storage, GONE), 1)
     mine = searching(storage)
-    mine.release(number, "its driver was gone", requeue=True)
+    mine.release(number, "its driver had ended", requeue=True)
     assert states(mine) == ["WAITING"]
     again = mine.ask(1)
     assert again is not None
@@ -221,7 +221,7 @@ def test_release_trial_without_point_is_not_enqueued() -> None:
     storage = memory()
     searching(storage, GONE).ask(1)
     mine = searching(storage)
-    mine.release(0, "its driver was gone", requeue=True)
+    mine.release(0, "its driver had ended", requeue=True)
     assert states(mine) == []
     assert mine.ask(1) is not None
 
