@@ -143,7 +143,7 @@ def test_folder_of_scores_that_leaves_a_choice_is_refused(tmp_path: Path, names:
         ("images.npz", {}, "is no file of counts"),
         ("", {}, "expected runs, files of counts or a group"),
         ("aaa0,,aaa1", {}, "expected runs, files of counts or a group"),
-        ("aaa0", {"split": "all"}, "has counts of the splits test, val, not of 'all'.*rgbt.eval"),
+        ("aaa0", {"split": "all"}, "splits test, val, but not of 'all'.*rgbt.evaluate"),
         ("other method.npz", {"split": "val"}, "is of split 'test', not of split=val"),
         ("aaa0,mlflow-aaa0", {}, "twice; one training counts once"),
         (f"{CRM},aaa1", {}, "twice; one training counts once"),
