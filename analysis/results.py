@@ -189,15 +189,13 @@ def _runs(runs_dir: Path) -> list[RunResult]:
 def _of_run(run: RunResult, split: str, frames: Frames) -> NamedCounts:
     split = split or "test"
     path = run.folder / file_name(frames, split) if frames else run.counts_path(split)
-    if not path.is_file():
-        there = [each.stem.removeprefix("counts_") for each in run.folder.glob("counts_*.npz")]
-        what = f"has counts of the splits {', '.join(sorted(there)) or 'none'}, not of '{split}'"
-        how = f"rgbt evaluate run={run.folder} split={split} out={path}"
-        if frames:
-            what = f"has no counts of pairs of frames {path.relative_to(run.folder)}"
-            views = "next" if frames == "next" else "virtual"
-            how = f"rgbt consistency run={run.folder} split={split} frames={views}"
-        raise InputError(f"{run.folder} {what}; {how} makes them once it is finished.")
+    if frames and not path.is_file():
+        views = "next" if frames == "next" else "virtual"
+        raise InputError(
+            f"{run.folder} has no counts of pairs of frames {path.relative_to(run.folder)}; "
+            f"rgbt consistency run={run.folder} split={split} frames={views} makes them once it is "
+            "finished."
+        )
     if not run.is_finished:
         info(f"{run.folder} is not finished; its counts are those of its last evaluation.")
     description = _description(run)
@@ -205,7 +203,7 @@ def _of_run(run: RunResult, split: str, frames: Frames) -> NamedCounts:
     return NamedCounts(
         label=_groups(description)[0] or run.key,
         path=path,
-        counts=Counts.load(path),
+        counts=Counts.load(path) if frames else run.counts_of(split),
         run=run,
         seed=int(seed) if seed else None,
     )

@@ -1,4 +1,25 @@
 """A lab for RGB-thermal semantic segmentation of driving scenes.
 
-``python -m rgbt.run +experiment=grbm`` is the way in; importing this package imports nothing else.
+``python -m rgbt.run +experiment=grbm`` trains; `rgbt.load_run` and `rgbt.results` read what was
+trained. Importing this package imports nothing else until one of these names is used.
 """
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rgbt.api import Results, Run, load_run, results
+
+__all__ = ["Results", "Run", "load_run", "results"]
+
+
+def __getattr__(name: str) -> Any:
+    """The names of `rgbt.api`, imported at their first use (PEP 562)."""
+    if name in __all__:
+        from rgbt import api
+
+        return getattr(api, name)
+    raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

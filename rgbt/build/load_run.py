@@ -82,6 +82,17 @@ def open_trained(
     return TrainedNetwork(session, 0, runs_dir / "evaluations" / name, path.name)
 
 
+def stored_settings(folder: Path, trust: Collection[str] = ()) -> dict[str, Any]:
+    """The configuration of a run, whose objects may be built.
+
+    Raises:
+        InputError: not readable, or a target that is not trusted.
+    """
+    settings = read_settings(folder / "config.yaml")
+    check_targets(settings, trust, str(folder / "config.yaml"))
+    return settings
+
+
 def open_run(
     folder: Path,
     overrides: Sequence[str],
@@ -102,8 +113,7 @@ def open_run(
         InputError: a target that is not trusted, overrides that do not fit, no checkpoint, other
             classes than trained.
     """
-    trained_with = read_settings(folder / "config.yaml")
-    check_targets(trained_with, trust, str(folder / "config.yaml"))
+    trained_with = stored_settings(folder, trust)
     spec = load_spec(trained_with, overrides)
     _warn_of_other_code(folder, trained_with)
     check_choice("checkpoint", checkpoint, CHECKPOINTS)

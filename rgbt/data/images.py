@@ -131,6 +131,10 @@ class PairReader:
             values = read_array(path, "thermal values of shape (rows, columns)")
         else:
             values = decode(path)
+        return self.check_values(values, path)
+
+    def check_values(self, values: NDArray[Any], path: Path) -> NDArray[Any]:
+        """Thermal values as (H, W); errors as of `values`, in messages with the name `path`."""
         if values.dtype.kind not in "iuf" or values.ndim not in (2, 3):
             raise InputError(
                 f"{path}: expected thermal values of shape (rows, columns), got {values.shape} "

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
+
+import numpy as np
 
 from rgbt.checks import InputError, nearest
 from rgbt.data.images import PairReader, ReadsPairs
@@ -123,6 +125,51 @@ def of_files(dataset: LabelledDataset, rgb: Path, thermal: Path) -> ToPredict:
         lambda name: images.read(name, rgb, thermal),
         frozenset({rgb.parent, thermal.parent}),
     )
+
+
+def of_arrays(dataset: LabelledDataset, rgb: Any, thermal: Any) -> Sample:
+    """One pair of arrays, without a label.
+
+    Thermal values of 8 bits are grey levels, as in `Sample`. Values of other types are those of the
+    camera, and both images are read like files of the data set: cut, and scaled by its
+    ``thermal_range``.
+
+    Args:
+        dataset: of the network.
+        rgb: (H, W, 3) uint8, RGB order.
+        thermal: (H, W), uint8 or camera values.
+
+    Raises:
+        InputError: other types, shapes or values.
+    """
+    for name, image in (("rgb", rgb), ("thermal", thermal)):
+        if not isinstance(image, np.ndarray):
+            raise InputError(
+                f"{name}: expected a NumPy array, got {type(image).__name__}; convert it with "
+                "numpy.asarray(...), or give the paths of both files."
+            )
+    if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3 or not rgb.size:
+        raise InputError(
+            "rgb: expected uint8 of shape (rows, columns, 3) in the order red, green, blue, got "
+            f"{rgb.dtype} of shape {rgb.shape}."
+        )
+    if thermal.shape != rgb.shape[:2]:
+        raise InputError(
+            f"thermal: expected shape {rgb.shape[:2]}, the rows and columns of rgb, got "
+            f"{thermal.shape}."
+        )
+    reader = reader_of(dataset)
+    if thermal.dtype != np.uint8:
+        images = images_of(dataset)
+        path = Path("thermal")
+        return images.sample("image", rgb, images.check_values(thermal, path), path)
+    limits = reader.images.thermal_range if isinstance(reader, ReadsPairs) else None
+    if limits is not None and limits[0] < 255:
+        raise InputError(
+            f"thermal: 8 bits may be grey levels or values of dataset.thermal_range={list(limits)};"
+            " convert values of the camera to float32, or give the paths of both files."
+        )
+    return Sample(np.ascontiguousarray(rgb), np.ascontiguousarray(thermal), None, "image")
 
 
 def images_of(dataset: LabelledDataset) -> PairReader:

@@ -19,6 +19,7 @@ from rgbt.evaluation.request import EvaluationRequest
 from rgbt.files.atomic import write_atomic
 from rgbt.tracking.pictures import overlay
 from rgbt.tracking.terminal import info
+from rgbt.types import Batch, Sample
 
 
 def chosen_images(session: Session, source: str, rgb: str, thermal: str) -> ToPredict:
@@ -66,9 +67,7 @@ def write_images(
     with progress() as display:
         task = display.add_task("predicting", total=len(images.names), note="images")
         for sample in images.samples(session.loading.on_error):
-            # One image at a time: a folder may hold images of any size.
-            batch = collate([session.transform.test(sample)], "").to(session.fabric.device)
-            classes = predictor.classes(batch)[0].cpu().numpy()
+            classes = predictor.classes(batch_of(session, sample))[0].cpu().numpy()
             classes = classes if label_map is None else label_map(classes)
             painted = overlay(sample.rgb, classes, palette)
             write_png(out / f"{sample.name}_overlay.png", painted[..., ::-1])
@@ -80,6 +79,11 @@ def write_images(
     for path in images.others[:1]:
         info(f"{len(images.others)} image(s) belong to no pair and were not read; first: {path}")
     return f"{written} images in {out.resolve()}"
+
+
+def batch_of(session: Session, sample: Sample) -> Batch:
+    """One image on the device; one at a time, because images of a folder may have any sizes."""
+    return collate([session.transform.test(sample)], "").to(session.fabric.device)
 
 
 def write_png(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None:

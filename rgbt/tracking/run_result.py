@@ -26,6 +26,9 @@ from rgbt.tracking.run_files import (
 CHECKPOINT = "best.pt"
 """The network that evaluations are made with; other machines do not get it."""
 
+ALL_COUNTS = "counts_*.npz"
+"""Pattern of the files of counts that a run ended with."""
+
 
 @dataclass(frozen=True)
 class RunResult:
@@ -117,6 +120,24 @@ class RunResult:
             InputError: the file is missing or damaged.
         """
         return Counts.load(self.folder / path)
+
+    def counts_of(self, split: str) -> Counts:
+        """Counts of a split, which the run ended with or which were written beside them.
+
+        Raises:
+            InputError: the folder has no counts of the split, or the file is damaged.
+        """
+        path = self.counts_path(split)
+        if path.is_file():
+            return Counts.load(path)
+        there = sorted(each.stem.removeprefix("counts_") for each in path.parent.glob(ALL_COUNTS))
+        how = "rerun the command of the run to finish it"
+        if self.is_finished:
+            how = f"write them with: rgbt evaluate run={self.folder} split={split} out={path}"
+        raise InputError(
+            f"{self.folder} has counts of the splits {', '.join(there) or 'none'}, but not of "
+            f"'{split}'; {how}."
+        )
 
     def has_counts(self, path: str) -> bool:
         """Whether `path` holds counts of the test split that this training made."""

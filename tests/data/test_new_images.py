@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -15,7 +16,8 @@ from rgbt.data.kp import KP
 from rgbt.data.mfnet import MFNet
 from rgbt.data.new_images import find_pairs
 from rgbt.data.pst900 import PST900
-from rgbt.data.to_predict import of_files, of_path, of_split
+from rgbt.data.to_predict import of_arrays, of_files, of_path, of_split
+from rgbt.types import Sample
 from tests.conftest import WriteMFNet, write_png
 from tests.data import folder_files as own
 from tests.data.folder_files import refused
@@ -151,6 +153,43 @@ def test_new_freiburg_images_are_cropped_and_scaled(tmp_path: Path) -> None:
     # Count 21800 + 100 n lies at 100 n / 1900 of the range: 255 n / 19, halves upwards.
     index = np.arange(48).reshape(HW)[1:5, 2:8]
     assert np.array_equal(sample.thermal, np.minimum((2 * 255 * index + 19) // 38, 255))
+
+
+class Reading:
+    """A data set that only says how its images are read."""
+
+    def __init__(self, images: PairReader) -> None:
+        self.images = images
+
+    def pair(self, name: str) -> Sample:
+        raise NotImplementedError
+
+
+@pytest.mark.parametrize("dtype", [np.uint16, np.float32])
+def test_arrays_of_camera_values_are_read_like_files(tmp_path: Path, dtype: type) -> None:
+    write(tmp_path, "fl_rgb/fl_rgb_1.png", "fl_ir_aligned/fl_ir_aligned_1.png")
+    images = PairReader(layouts=FREIBURG, crop=(1, 5, 2, 8), thermal_range=(21800, 23700))
+    ((_, rgb, thermal),) = find_pairs(tmp_path, images.layouts, "freiburg").pairs
+    expected = images.read("1", rgb, thermal)
+    sample = of_arrays(Reading(images), RGB, COUNTS.astype(dtype))
+    assert np.array_equal(sample.rgb, expected.rgb)
+    assert np.array_equal(sample.thermal, expected.thermal)
+    seen = of_arrays(Reading(images), sample.rgb, sample.thermal)
+    assert np.array_equal(seen.thermal, expected.thermal), "grey levels are neither cut nor scaled"
+
+
+def test_arrays_of_unclear_or_wrong_values_are_refused() -> None:
+    low = Reading(PairReader(layouts=FREIBURG, thermal_range=(0, 200)))
+    assert "8 bits may be grey levels or values of dataset.thermal_range=[0, 200]" in refused(
+        lambda: of_arrays(low, RGB, GREY)
+    )
+    counts = Reading(PairReader(layouts=FREIBURG, counts=True, thermal_range=(21800, 23700)))
+    assert "expected a thermal image of 16 bits" in refused(
+        lambda: of_arrays(counts, RGB, COUNTS.astype(np.float32))
+    )
+    assert "does not declare how new images are read" in refused(
+        lambda: of_arrays(SimpleNamespace(splits=("test",)), RGB, COUNTS)
+    )
 
 
 def test_bad_new_images_raise_or_are_skipped(tmp_path: Path) -> None:
