@@ -76,7 +76,7 @@ class TableText:
                 for kind in KINDS
             ]
             return [[label, seeds, *texts]]
-        lines = []
+        lines: list[list[str]] = []
         for kind in kinds or ["published"]:
             first = ["", KINDS[kind], ""] if lines else [label, KINDS[kind], seeds]
             lines.append([*first, *(self._text(cell, kind) for cell in cells)])
