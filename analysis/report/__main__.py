@@ -1,5 +1,7 @@
 """The report: ``rgbt report out=report/`` makes one page from the MLflow store.
 
+With format=markdown it makes the pages of ``docs/results``.
+
 Progress goes to stderr; where the page is, how large it is and what it holds to stdout.
 """
 
@@ -10,7 +12,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from analysis.arguments import Resamples, check_out
 from rgbt.config.command import built
@@ -28,6 +30,10 @@ class Options:
     """Options of ``rgbt report``."""
 
     out: Annotated[Path, Help("output folder; the page is its index.html")] = Path("report")
+    format: Annotated[
+        Literal["html", "markdown"],
+        Help("html: one page; markdown: index.md, a page of tables per paper, networks.md"),
+    ] = "html"
     runs_dir: Annotated[
         Path,
         Help("folder of runs; its mlflow.db is the store unless tracking.uri names another"),
@@ -61,6 +67,8 @@ def main(options: Options, overrides: list[str]) -> int:
     from rich.progress import Progress
 
     from analysis.report.collect import collect
+    from analysis.report.markdown import write_pages
+    from analysis.report.networks import network_entries
     from analysis.report.page import write_page
     from rgbt.tracking.provenance import command_line
     from rgbt.tracking.terminal import info, path_lines, print_rich
@@ -72,8 +80,9 @@ def main(options: Options, overrides: list[str]) -> int:
             return progress.track(items, description=what)
 
         data = collect(tracking, runs_dir, options.resamples, typed, trust, track)
+        networks = network_entries(track) if options.format == "markdown" else ()
     out.mkdir(parents=True, exist_ok=True)
-    page = write_page(data, out)
+    pages = write_pages(data, networks, out) if networks else [write_page(data, out)]
     for remark in data.remarks[:MAX_REMARKS]:
         info(remark)
     if len(data.remarks) > MAX_REMARKS:
@@ -83,8 +92,10 @@ def main(options: Options, overrides: list[str]) -> int:
         f"{len(data.runs)} runs, {len(run)} tables with runs, {len(data.tables) - len(run)} "
         f"published only, {len(data.studies)} studies"
     )
-    size = f"{page.stat().st_size / 1e6:.2f} MB"
-    print_rich(path_lines([("page", str(page)), ("size", size), ("holds", held)]))
+    size = f"{sum(page.stat().st_size for page in pages) / 1e6:.2f} MB"
+    print_rich(
+        path_lines([*(("page", str(page)) for page in pages), ("size", size), ("holds", held)])
+    )
     return 0
 
 

@@ -7,6 +7,7 @@ from collections.abc import Collection, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
+from analysis.report.contrasts import contrast_entries
 from analysis.report.data import ReportData
 from analysis.report.differences import difference_entries
 from analysis.report.masks import mask_pictures
@@ -60,6 +61,7 @@ def collect(
         studies = study_entries(records["study"], remarks)
         masks = mask_pictures(runs, track, remarks, trust)
         differences = difference_entries(runs, resamples, track)
+        contrasts = contrast_entries(runs, resamples, track)
     assert isinstance(tracking, MlflowTracking), "read_store refuses others"
     if not runs:
         remarks.insert(0, "The store holds no runs yet; tables show what the papers printed.")
@@ -74,6 +76,7 @@ def collect(
         masks=masks,
         differences=differences,
         remarks=tuple(remarks),
+        contrasts=contrasts,
     )
 
 

@@ -38,6 +38,8 @@ class RunEntry:
         repeat: command that makes the run again.
         dataset: fingerprint of the data set.
         config: dotted key -> value as text.
+        hardware: GPUs, else processor and cores; without the name of the machine.
+        versions: of Python and of the packages that decide the numbers.
     """
 
     key: str
@@ -67,6 +69,8 @@ class RunEntry:
     host: str
     dataset: str
     config: Mapping[str, str]
+    hardware: str = ""
+    versions: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,6 +197,42 @@ class DifferenceEntry:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ContrastEntry:
+    """Two methods compared in one score; the score of `method` less that of `reference`.
+
+    Attributes:
+        question: what is compared, in words.
+        source: table or section of the paper, or that it is not in one.
+        reference: group of the runs that are compared against.
+        method: group of the other runs.
+        scale: "demo" or "paper"; "" where the runs are missing.
+        values: mean over seeds of the reference and of the method.
+        seeds: of the reference and of the method.
+        low: lower end of the 95 % interval of the difference, `high` its upper end.
+        p: of the difference.
+        verdict: one sentence about `expected`, or which runs are missing.
+        command: that compares the same runs.
+    """
+
+    question: str
+    source: str
+    reference: str
+    method: str
+    metric: str
+    expected: str
+    scale: str = ""
+    values: tuple[float, float] | None = None
+    seeds: tuple[int, int] = (0, 0)
+    difference: float | None = None
+    low: float | None = None
+    high: float | None = None
+    covers: Uncertainty = "none"
+    p: float | None = None
+    verdict: str
+    command: str
+
+
+@dataclass(frozen=True, kw_only=True)
 class PagePicture:
     """A picture inside the page: title, caption, data address ("data:image/png;base64,...")."""
 
@@ -213,6 +253,7 @@ class ReportData:
         runs: newest first.
         tables: those with runs first, then those that wait.
         remarks: what could not be read, one sentence each.
+        contrasts: declared comparisons, see `analysis.report.contrasts`.
         silent: configuration keys (with all below them) in which runs that are the same run may
             differ: paths, labels, hardware.
     """
@@ -227,4 +268,5 @@ class ReportData:
     masks: tuple[PagePicture, ...]
     differences: tuple[DifferenceEntry, ...]
     remarks: tuple[str, ...] = field(default=())
+    contrasts: tuple[ContrastEntry, ...] = ()
     silent: tuple[str, ...] = NOT_IN_KEY

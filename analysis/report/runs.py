@@ -14,9 +14,11 @@ from analysis.report.data import RunEntry
 from analysis.report.runs_provenance import (
     COMMIT_TAG,
     as_text,
+    hardware_of,
     host_of,
     read_provenance,
     repeat_command,
+    versions_of,
 )
 from analysis.report.store import MlflowRun, RunFiles
 from rgbt.checks import InputError, check_choice
@@ -136,6 +138,8 @@ def open_run(run: MlflowRun, remarks: list[str]) -> ReportRun:
         command=command,
         repeat=repeat_command(command, config, run.tags),
         host=host_of(first),
+        hardware=hardware_of(first),
+        versions=versions_of(first),
         dataset=run.tags.get("rgbt.dataset") or ("" if counts is None else counts.dataset),
         config={name: as_text(value) for name, value in config.items()} or dict(run.params),
     )

@@ -18,6 +18,9 @@ COMMIT_TAG = "mlflow.source.git.commit"
 NOT_REPEATED = re.compile(r"-m|--multirun|runs_dir=|out=|fresh=|\+*(tracking|hydra)[./=]")
 """Words of a command that belong to a machine, or to a grid that the run was a point of."""
 
+PACKAGES = ("torch", "numpy", "hydra-core", "lightning-fabric", "opencv-python-headless", "rgbt")
+"""Packages whose versions are shown; provenance.json has all."""
+
 IS_GRID = re.compile(r"(range|choice|interval|glob)\(")
 
 
@@ -91,8 +94,17 @@ def read_provenance(files: RunFiles, key: str, remarks: list[str]) -> list[dict[
 
 def host_of(process: Mapping[str, Any]) -> str:
     """Name and devices of the machine: "vm: AMD EPYC, 2 cores"."""
-    if not process.get("host"):
-        return ""
-    gpus = process.get("gpus") or []
-    cpu = f"{process.get('cpu', '')}, {process.get('cpu_usable')} cores"
-    return f"{process['host']}: {', '.join(gpus) or cpu}"
+    return f"{process['host']}: {hardware_of(process)}" if process.get("host") else ""
+
+
+def hardware_of(process: Mapping[str, Any]) -> str:
+    """GPUs, else processor and cores: "AMD EPYC, 2 cores"."""
+    cpu = f"{process['cpu']}, {process.get('cpu_usable')} cores" if process.get("cpu") else ""
+    return ", ".join(process.get("gpus") or []) or cpu
+
+
+def versions_of(process: Mapping[str, Any]) -> dict[str, str]:
+    """Versions of Python and of `PACKAGES`, where they are known."""
+    packages = process.get("packages") or {}
+    named = {"Python": process.get("python"), **{name: packages.get(name) for name in PACKAGES}}
+    return {name: str(version) for name, version in named.items() if version}
