@@ -2,7 +2,7 @@
 # make test       install, lint-free default test suite (offline, two cores, minutes)
 # make test-all   the slow tests as well
 # make test-servers  the tests on PostgreSQL and an MLflow server, started on loopback
-# make lint       formatting, lint, types
+# make lint       formatting, lint, types, spelling
 # make bench      benchmarks, as ratios measured in one run
 
 PYTHON ?= python3
@@ -13,6 +13,9 @@ BIN := $(VENV)/bin
 # the end of another's list, so that tests of a module mostly stay together and share its fixtures.
 # `make test SPREAD=` runs one after the other.
 SPREAD ?= -n auto --maxprocesses 4 --dist worksteal
+
+# What is spelled: tests misspell names on purpose.
+TEXTS := README.md CONTRIBUTING.md CHANGELOG.md CITATION.cff docs conf rgbt sweeps analysis hydra_plugins
 
 .PHONY: demo test test-all test-servers lint bench
 
@@ -36,6 +39,7 @@ lint: $(VENV)/.ready
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+	$(BIN)/codespell $(TEXTS)
 
 bench: $(VENV)/.ready
 	for file in tests/benchmarks/bench_*.py; do echo "== $$file"; $(BIN)/python -m tests.benchmarks.$$(basename $$file .py) || exit 1; done

@@ -11,7 +11,7 @@ import pytest
 from tests.commands import Call
 from tests.docs.blocks import Page
 from tests.docs.reader_folder import reading_in
-from tests.docs.run_page import SMOKE, Reader, copied
+from tests.docs.run_page import ENOUGH, SMOKE, Reader, copied
 
 
 @pytest.fixture(scope="session")
@@ -23,7 +23,7 @@ def finished_runs(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Path], 
         from rgbt.run import main
 
         if not source.exists():
-            words = ["+experiment=grbm", f"runs_dir={source}", "tracking=none", *SMOKE]
+            words = ["+experiment=grbm", f"runs_dir={source}", "tracking=none", *SMOKE, ENOUGH]
             with pytest.MonkeyPatch.context() as patch:
                 patch.setattr(sys, "argv", ["rgbt", *words])
                 with pytest.raises(SystemExit) as left:

@@ -28,7 +28,12 @@ Call = Callable[..., tuple[int, str, str]]
 SMOKE = ("+debug=smoke", "trainer.accelerator=cpu", "trainer.threads=1")
 """Overrides that make a training take seconds."""
 
-NAMED = {word.lstrip("+").rpartition(".")[2] for word in SMOKE}
+ENOUGH = "dataset.num_test=12"
+"""Images without which no two methods are compared; of a page that compares."""
+
+COMPARING = ("rgbt compare", "rgbt figures", "compare(")
+
+NAMED = {word.lstrip("+").rpartition(".")[2] for word in (*SMOKE, ENOUGH)}
 """What the groups of runs are called after them."""
 
 SIZES = ("trainer.max_steps", "trainer.eval_every", "trainer.checkpoint_every", "scale.max_steps")
@@ -140,6 +145,9 @@ class Reader:
         if name == "run" or (is_table and "dry_run=true" not in words):
             words = [word for word in words if word.partition("=")[0] not in SIZES]
             words += SMOKE
+            is_embedded = all(w.startswith("dataset=synth") for w in words if w[:8] == "dataset=")
+            if is_embedded and any(word in self.page.text for word in COMPARING):
+                words.append(ENOUGH)
             if not any(word in self.page.text for word in STORE):
                 words.append("tracking=none")
             if "hydra.sweeper.trials" in " ".join(words) or "+search=" in " ".join(words):
