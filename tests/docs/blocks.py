@@ -22,6 +22,8 @@ TITLE = re.compile(r'title="([^"]+)"')
 NEEDS = re.compile(r"<!-- *needs: *(.*?) *-->\s*\Z", re.DOTALL)
 INLINE_CODE = re.compile(r"(?<!`)`([^`\n]+)`(?!`)")
 LINK = re.compile(r"(?<!\\)\]\(([^()\s]+)\)")
+SHOWN = 25
+"""Characters of a sentence by which it is recognised: what follows may hold paths."""
 
 
 class PageError(Exception):
@@ -42,7 +44,7 @@ class Block:
         title: file that the reader creates; "": none.
         needs: what it cannot run without; "": it runs anywhere.
         text: what is between the fences.
-        answer: the block of output that follows; "": none.
+        answer: the next block, where it is one of output below the same heading; "": none.
     """
 
     page: str
@@ -52,6 +54,12 @@ class Block:
     title: str = ""
     needs: str = ""
     answer: str = ""
+
+    @property
+    def shown(self) -> str:
+        """The sentence of `answer` that the program writes to stderr, its beginning; "": none."""
+        found = re.search(r"^rgbt: (.+(?:\n.+)*)", self.answer, re.MULTILINE)
+        return " ".join(found[1].split())[:SHOWN] if found else ""
 
     def place(self, line: int = 0) -> str:
         """Page and line; `line` counts from one inside the block."""
@@ -84,7 +92,9 @@ class Page:
     def blocks(self) -> list[Block]:
         """All fenced blocks, in the order of the page."""
         blocks: list[Block] = []
+        has_heading = False
         for number, token in enumerate(self.tokens):
+            has_heading = has_heading or token.type == "heading_open"
             if token.type != "fence" or token.map is None:
                 continue
             before = self.tokens[number - 1] if number else None
@@ -95,9 +105,10 @@ class Page:
                 title=title[1] if title else "",
                 needs=found[1] if found else "",
             )
-            if blocks and language == "text":
+            if blocks and language == "text" and not title and not has_heading:
                 blocks[-1] = Block(**{**vars(blocks[-1]), "answer": token.content})
             blocks.append(block)
+            has_heading = False
         return blocks
 
     @cached_property

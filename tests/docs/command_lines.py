@@ -28,9 +28,32 @@ NOT_COMPOSED = ("corruption.", "weights.", "hydra.searchpath=")
 """Words that are no overrides of one configuration: what a command reads by itself."""
 
 FILES = {"cd", "mkdir", "cp", "mv", "cat", "ls", "rm", "head", "tail", "find", "echo", "touch"}
-FILES |= {"wc", "grep", "sed", "sort", "tar", "unzip", "chmod", "export", "true", "test", "tree"}
+FILES |= {
+    "umask",
+    "wc",
+    "grep",
+    "sed",
+    "sort",
+    "tar",
+    "unzip",
+    "chmod",
+    "export",
+    "true",
+    "test",
+    "tree",
+}
 SETUP = {"pip", "git", "source", "make", "conda", "uv", "sudo", "curl", "deactivate", "eval"}
-SERVERS = {"mlflow", "optuna-dashboard", "torchrun", "sbatch", "srun", "squeue", "scancel", "ssh"}
+SERVERS = {
+    "initdb",
+    "mlflow",
+    "optuna-dashboard",
+    "torchrun",
+    "sbatch",
+    "srun",
+    "squeue",
+    "scancel",
+    "ssh",
+}
 SERVERS |= {"psql", "createdb", "createuser", "pg_ctl", "initdb", "docker", "rsync", "scp", "kill"}
 SERVERS |= {"nvidia-smi", "sinfo", "scontrol", "sleep", "xdg-open", "open", "jupyter", "nohup"}
 PYTHON = {"python", "python3", ".venv/bin/python"}
@@ -133,8 +156,8 @@ def _check_options(command: PlainCommand[Any], words: list[str]) -> None:
         from sweeps.table.load_table import load_table
 
         load_table(table)
-    if any(word.startswith("run=") for word in words) and "dataset" not in map(_key, overrides):
-        overrides = ["dataset=mfnet", *overrides]  # the data set of the run has files of its own
+    if "dataset" not in map(_key, overrides) and any(w[:8] == "dataset." for w in overrides):
+        overrides = ["dataset=mfnet", *overrides]  # that of the run, the weights or the table
     _check_overrides(overrides)
 
 
@@ -146,7 +169,7 @@ def _check_overrides(words: Sequence[str], *, is_run: bool = False) -> None:
     """Compose overrides; of a run, check it as `rgbt run` does before it starts."""
     check_words([word for word in words if not word.startswith("hydra.searchpath=")])
     overrides = [
-        _first_value(word)
+        word
         for word in readable_paths(words)
         if not word.startswith(("-", *NOT_COMPOSED)) and not PLACEHOLDER.search(word)
     ]
@@ -157,6 +180,7 @@ def _check_overrides(words: Sequence[str], *, is_run: bool = False) -> None:
     if not overrides or (key in composed and not own):
         return
     with composing(overrides):
+        overrides = [_first_value(word) for word in overrides]
         config = compose(overrides)
         check_keys(config)
         if is_run and not PLACEHOLDER.search(" ".join(words)):

@@ -117,6 +117,9 @@ def _cut(word: str) -> list[str]:
 
 def _line(place: str, words: list[str], alone: bool) -> Line:
     variables = {}
+    if words[0].startswith("("):  # a shell of its own, around the whole command
+        words = [words[0].lstrip("("), *words[1:]]
+        words[-1] = words[-1].removesuffix(")")
     while words and ASSIGNMENT.match(words[0]):
         name, _, value = words.pop(0).partition("=")
         variables[name] = value
@@ -128,6 +131,8 @@ def _line(place: str, words: list[str], alone: bool) -> Line:
         words[0] = "rgbt"
     elif len(words) > 2 and PYTHON.fullmatch(words[0]) and words[1] == "-m":
         words = _module(words)
+    if words and words[0].startswith("$"):  # a program in a folder that a variable names
+        words[0] = words[0].rpartition("/")[2]
     return Line(place, tuple(words), variables, alone)
 
 

@@ -165,12 +165,12 @@ rgbt scenes out=nowhere/sheet.png
 ~~~
 
 ~~~text
-rgbt: nowhere: there is no such folder
+rgbt: out=nowhere/sheet.png cannot be written; name a PNG in an existing folder.
 ~~~
 """
 
 
-def test_page_is_followed_in_order(follow: Callable[[Page], int]) -> None:
+def test_page_is_followed_in_order(follow: Callable[..., int]) -> None:
     assert follow(page(FOLLOWED)) == 6
 
 
@@ -182,13 +182,13 @@ def test_page_is_followed_in_order(follow: Callable[[Page], int]) -> None:
         ("~~~python\nassert 1 == 2\n~~~\n", "page.md:3: Traceback"),
         (bash("for n in 1 2; do rgbt run seed=$n; done"), "page.md:3: a training in a loop"),
         (
-            bash("rgbt scenes") + "\n~~~text\nrgbt: a mistake\n~~~\n",
-            "page.md:4: rgbt scenes: exit code 0, expected a mistake",
+            bash("rgbt scenes out=nowhere/x.png") + "\n~~~text\nrgbt: another mistake\n~~~\n",
+            "page.md:4: rgbt scenes out=nowhere/x.png: exit code 2, expected the sentence 'another",
         ),
     ],
 )
 def test_failure_of_a_followed_page_is_named_with_its_line(
-    text: str, problem: str, follow: Callable[[Page], int]
+    text: str, problem: str, follow: Callable[..., int]
 ) -> None:
     with pytest.raises(PageError) as caught:
         follow(page(text))
@@ -196,7 +196,7 @@ def test_failure_of_a_followed_page_is_named_with_its_line(
 
 
 @pytest.mark.slow
-def test_newest_run_stands_for_the_key(follow: Callable[[Page], int]) -> None:
+def test_newest_run_stands_for_the_key(follow: Callable[..., int]) -> None:
     text = bash(
         "rgbt evaluate run=runs/<key>",
         "rgbt run +experiment=grbm masker.sigma_div=3 trainer.max_steps=40000",
