@@ -2,7 +2,7 @@
 # make test       install, lint-free default test suite (offline, two cores, minutes)
 # make test-all   the slow tests as well
 # make test-servers  the tests on PostgreSQL and an MLflow server, started on loopback
-# make lint       formatting, lint, types
+# make lint       formatting, lint, types, spelling
 # make docs       the site, into site/index.html; fails on a broken link
 # make bench      benchmarks, as ratios measured in one run
 
@@ -14,6 +14,9 @@ BIN := $(VENV)/bin
 # the end of another's list, so that tests of a module mostly stay together and share its fixtures.
 # `make test SPREAD=` runs one after the other.
 SPREAD ?= -n auto --maxprocesses 4 --dist worksteal
+
+# What is spelled: tests misspell names on purpose.
+TEXTS := README.md CONTRIBUTING.md CHANGELOG.md CITATION.cff docs conf rgbt sweeps analysis hydra_plugins
 
 .PHONY: demo test test-all test-servers lint docs bench
 
@@ -37,6 +40,7 @@ lint: $(VENV)/.ready
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+	$(BIN)/codespell $(TEXTS)
 
 docs: $(VENV)/.ready
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet

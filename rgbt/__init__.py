@@ -6,6 +6,8 @@ trained. Importing this package imports nothing else until one of these names is
 
 from typing import TYPE_CHECKING, Any
 
+__version__ = "0.1.0"  # read by the build (`tool.hatch.version`); CITATION.cff repeats it
+
 if TYPE_CHECKING:
     from rgbt.api import Results, Run, load_run, results
 

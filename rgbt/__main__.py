@@ -9,6 +9,7 @@ from __future__ import annotations
 import runpy
 import sys
 
+import rgbt
 from rgbt.checks import nearest
 from rgbt.config.plain_command import COMMANDS, exit_code, say
 from rgbt.config.shadowing import search_user_folders_last
@@ -20,6 +21,7 @@ usage: rgbt COMMAND [key=value ...]
 {commands}
 
 rgbt COMMAND --help explains one; start with rgbt run +experiment=grbm.
+rgbt --version shows the version.
 Completion of the command line: rgbt --completion bash (zsh, fish).
 """
 
@@ -34,6 +36,8 @@ def main() -> None:
         runpy.run_module(COMMANDS[name].module, run_name="__main__", alter_sys=True)
     elif name in ("-h", "--help"):
         sys.stdout.write(help_text())
+    elif name in ("-V", "--version"):
+        sys.stdout.write(f"rgbt {rgbt.__version__}\n")
     elif name in ("--completion", "--complete"):
         from rgbt.config.completion import print_candidates, print_script
 

@@ -2,7 +2,7 @@
 
 The driver stays where it was started (a login node, inside tmux) and submits as many jobs at a time
 as it has workers. Nothing of a run is kept in submitit: what is submitted is the plain command,
-which continues its own run folder. So a job that SLURM pre-empts and requeues resumes from its
+which continues its own run folder. So a job that SLURM preempts and requeues resumes from its
 checkpoint, and so does one that reaches its time limit: submitit's signal shortly before it has
 the job queued again, at most ``max_num_timeout`` times.
 """
@@ -38,7 +38,7 @@ NOT_OURS = {"time", "job_name", "nodes", "ntasks_per_node", "tasks_per_node", "a
 """Options with a second name (timeout_min, name), or for jobs that are not one process each."""
 
 KILL_S = 600.0
-"""How long a pre-empted job waits for SLURM to end it."""
+"""How long a preempted job waits for SLURM to end it."""
 
 PATIENCE_S = 60.0
 """How long the result of a job that SLURM calls finished may take to appear on a shared disk."""
