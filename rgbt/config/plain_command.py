@@ -1,8 +1,8 @@
-"""Commands: their names, their options, and how each of them ends.
+"""The list of commands, and the code that parses their options and sets their exit codes.
 
 ``rgbt NAME`` is ``python -m MODULE``. Words ``key=value`` that are no options
-(`rgbt.config.options`) are overrides of the configuration. What ends a command is one sentence on
-stderr and an exit code: 0 done, 1 the run failed or a check found problems, 2 the input was wrong,
+(`rgbt.config.options`) are overrides of the configuration. A command that fails prints one message
+on stderr. Exit codes: 0 done, 1 the run failed or a check found problems, 2 the input was wrong,
 129, 130 and 143 stopped by SIGHUP, Ctrl-C and SIGTERM.
 """
 
@@ -32,24 +32,29 @@ class Entry(NamedTuple):
 
 
 COMMANDS = {
-    "run": Entry("rgbt.run", "train one configuration; with -m a grid or a search"),
-    "evaluate": Entry("rgbt.evaluate", "scores of a run, or of weights from a file"),
-    "predict": Entry("rgbt.predict", "class maps and overlays of images, or pseudo-labels"),
-    "consistency": Entry("rgbt.consistency", "temporal consistency (TC, CA) of a run"),
-    "robustness": Entry("rgbt.robustness", "scores under missing, noisy, occluded images"),
-    "reproduce": Entry("sweeps.reproduce", "run a published table, or one of your own (new)"),
-    "study": Entry("sweeps.study", "report of a grid or a search, also while it runs"),
-    "report": Entry("analysis.report.__main__", "one page of everything in the MLflow store"),
-    "compare": Entry("analysis.compare", "two methods: differences, intervals, p-values"),
-    "score": Entry("analysis.score", "scores by region of any method's predictions"),
-    "spatial": Entry("analysis.spatial", "what a data set looks like by region"),
-    "figures": Entry("analysis.figures.__main__", "draw a figure of the papers"),
-    "check": Entry("rgbt.data.check", "read a whole data set and say what is wrong with it"),
-    "prepare": Entry(
-        "rgbt.data.prepare.__main__", "turn an official download into a data set folder"
+    "run": Entry("rgbt.run", "train one configuration, or with -m a grid or a search"),
+    "evaluate": Entry("rgbt.evaluate", "score a run or a file of weights"),
+    "predict": Entry("rgbt.predict", "predict class maps, overlays or pseudo-labels"),
+    "consistency": Entry("rgbt.consistency", "measure the temporal consistency (TC, CA) of a run"),
+    "robustness": Entry("rgbt.robustness", "score a run on missing, noisy or occluded images"),
+    "reproduce": Entry("sweeps.reproduce", "reproduce a published table, or create your own (new)"),
+    "study": Entry("sweeps.study", "report a grid or a search, also while it runs"),
+    "report": Entry(
+        "analysis.report.__main__", "write one HTML page about all runs in the MLflow store"
     ),
-    "cache": Entry("rgbt.data.cache.__main__", "decode a data set once into a cache, or remove it"),
-    "weights": Entry("rgbt.weights", "inspect a file of weights, or export those of a run"),
+    "compare": Entry("analysis.compare", "compare two methods: differences, intervals, p-values"),
+    "score": Entry("analysis.score", "score the predictions of any method by region"),
+    "spatial": Entry("analysis.spatial", "compute statistics of a data set by region"),
+    "figures": Entry("analysis.figures.__main__", "draw a figure of the papers"),
+    "check": Entry("rgbt.data.check", "read a whole data set and report its problems"),
+    "prepare": Entry(
+        "rgbt.data.prepare.__main__", "convert an official download to a data set folder"
+    ),
+    "cache": Entry(
+        "rgbt.data.cache.__main__",
+        "write the decoded images of a data set to a cache, or remove it",
+    ),
+    "weights": Entry("rgbt.weights", "inspect a file of weights, or export the weights of a run"),
     "sync": Entry("rgbt.tracking.sync", "send run folders to MLflow"),
     "corruptions": Entry("rgbt.corruptions.__main__", "draw the corruptions of one pair of images"),
     "masks": Entry("rgbt.maskers.sketch", "draw examples of a masker"),
@@ -58,7 +63,7 @@ COMMANDS = {
 
 
 def exit_code(work: Callable[[], int | None], *, catch_interrupt: bool = True) -> int:
-    """Exit code of `work`; a user's mistake is reported in one sentence on stderr.
+    """Run `work` and return its exit code; an InputError is printed on stderr.
 
     Args:
         work: what to do.
@@ -83,7 +88,7 @@ def exit_code(work: Callable[[], int | None], *, catch_interrupt: bool = True) -
             words = [word for word in sys.argv[1:] if not word.startswith("-")]
             return say(hydra_sentence(error, words), 2)
         if isinstance(error, FileExistsError | NotADirectoryError):
-            place = f"{error.filename}: a file is where a folder is needed"
+            place = f"{error.filename} is a file, but a folder is needed"
             return say(f"{place}; name another path.", 2)
         if isinstance(error, OSError):
             return say(f"{error.filename or 'a file'}: {error.strerror or error}.", 2)
@@ -91,7 +96,7 @@ def exit_code(work: Callable[[], int | None], *, catch_interrupt: bool = True) -
 
 
 def say(sentence: str, code: int) -> int:
-    """Write a sentence to stderr; returns `code`."""
+    """Print a message on stderr and return `code`."""
     with suppress(OSError):  # output may go to a file on a disk that is full
         sys.stdout.flush()
     # Names of files and words of damaged files may hold anything.
@@ -154,12 +159,12 @@ class PlainCommand(Generic[T]):
 
 @dataclass(frozen=True)
 class CommandGroup:
-    """Commands of which the first word chooses one: ``rgbt weights inspect FILE``.
+    """A command with subcommands: ``rgbt weights inspect FILE``.
 
     Attributes:
         about: what ``--help`` shows, unless there is a default.
         commands: by name.
-        default: runs if the first word names none; None: one must be named.
+        default: runs if the first word is not a subcommand; None: a subcommand is required.
     """
 
     about: str

@@ -1,9 +1,9 @@
-"""Scores by the names that tables and comparisons give them, from counts.
+"""Compute scores from counts by the names that tables and comparisons use.
 
 ``[day/ or night/]`` and then one of ``mIoU Var mAcc mPrecision mF1 pixel_accuracy``, ``region/<n>``
 (mIoU of region n), ``class/<name>`` (IoU), ``class/<name>/acc``, ``class/<name>/region/<n>``; of
 counts of pairs of frames (`rgbt.metrics.pairs`) ``TC CA CA_released`` and ``class/<name>/TC`` etc.
-Means are over the scored classes (`Counts.scored`); every class can be asked for by its name.
+Means are over the scored classes (`Counts.scored`); every single class is available by name.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def parse(metric: str) -> ParsedMetric:
     """Take a metric name apart.
 
     Raises:
-        InputError: it is none, with the nearest one.
+        InputError: it is not a metric name; the message contains the nearest one.
     """
     words = metric.split("/")
     part = words.pop(0) if words[0] in (names.DAY, names.NIGHT) else None
@@ -74,7 +74,7 @@ def parse(metric: str) -> ParsedMetric:
             return ParsedMetric(metric, part, "IoU", name, int(number))
     known = nearest("/".join(words), [*MEANS, names.VAR, *OF_PAIRS, *FORMS])
     raise InputError(
-        f"'{metric}' is not a metric; {known}; day/ or night/ may stand before each of them."
+        f"'{metric}' is not a metric; {known}; each may have the prefix day/ or night/."
     )
 
 
@@ -85,7 +85,7 @@ def value(metric: str, counts: Counts, absent: Absent) -> float:
 
     Raises:
         InputError: no such metric, class or region, a metric that such counts do not have, or
-            images that are not told apart.
+            images without a time of day.
     """
     asked = parse(metric)
     by_region = images_of(asked, counts).by_region()
@@ -142,13 +142,13 @@ def check_kind(asked: ParsedMetric, partition: str) -> None:
     if of_pairs and asked.score not in OF_PAIRS:
         raise InputError(
             f"'{asked.metric}' is a score of single frames, but these counts ({partition}, of "
-            "rgbt consistency run=...) are of pairs of frames; ask for "
-            f"{', '.join(OF_PAIRS)}, or name counts of single frames."
+            f"rgbt consistency run=...) are of pairs of frames. Use {', '.join(OF_PAIRS)}, or "
+            "name counts of single frames."
         )
     if not of_pairs and asked.score in OF_PAIRS:
         raise InputError(
             f"'{asked.metric}' is a score of pairs of frames, but these counts ({partition}) are "
-            "of single frames; rgbt consistency run=... counts the pairs of a run."
+            "of single frames. Count pairs with rgbt consistency run=..."
         )
 
 
@@ -156,7 +156,7 @@ def images_of(asked: ParsedMetric, counts: Counts) -> Counts:
     """The images that a metric is over: all, those of the day or those of the night.
 
     Raises:
-        InputError: the split does not hold both, the data set does not tell them apart, or such
+        InputError: the split does not hold both, the data set does not distinguish them, or such
             counts do not have the metric.
     """
     check_kind(asked, counts.partition)
@@ -165,8 +165,8 @@ def images_of(asked: ParsedMetric, counts: Counts) -> Counts:
     parts = counts.parts()
     if asked.part not in parts:
         raise InputError(
-            f"'{asked.metric}': split '{counts.split}' of the run's data set does not hold images "
-            "of day and of night that are told apart."
+            f"'{asked.metric}': split '{counts.split}' of the run's data set does not contain "
+            "both images marked as day and images marked as night."
         )
     return parts[asked.part]
 
