@@ -134,7 +134,7 @@ def overview(
     heads = session.domains.heads_in_words(head or session.domains.tested_head)
     lines = [*([("heads", heads)] if heads else []), ("counts", str(path))]
     if result.skipped:
-        lines.append(("left out", f"{len(result.skipped)} images that cannot be read"))
+        lines.append(("skipped", f"{len(result.skipped)} images that cannot be read"))
     return result_view(tables, path.parent, lines)
 
 

@@ -79,7 +79,7 @@ def read_bytes(path: Path, budget: Budget, advice: str = "") -> bytes:
     """
     status = path.stat()
     if not stat.S_ISREG(status.st_mode):
-        what = "a folder" if stat.S_ISDIR(status.st_mode) else "no regular file"
+        what = "a folder" if stat.S_ISDIR(status.st_mode) else "not a regular file"
         raise InputError(f"{path} is {what}, expected a file{advice and f'; {advice}'}.")
     budget.check(path, status.st_size)
     return path.read_bytes()

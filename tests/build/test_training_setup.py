@@ -127,19 +127,19 @@ def test_pseudo_labels_of_another_split(
 ) -> None:
     folder = write_folder(composed("sh_both"), tmp_path / "night", "train_night")
     typed = ("sh_both", f"domains.target.labels={folder}")
-    sentence = f"domains.target.labels: {folder} has no pseudo-labels of 3 of the 3 images"
+    sentence = f"domains.target.labels: {folder} has no pseudo-labels for 3 of the 3 images"
     refused(call, words(*typed), sentence, tmp_path / "runs")
     # A file that is left out among others is none that the run goes without unasked ...
     folder = write_folder(composed("sh_both"), tmp_path / "day", "train_day")
     next(iter((folder / "labels").iterdir())).unlink()
     typed = ("sh_both", f"domains.target.labels={folder}")
-    with pytest.raises(InputError, match="no pseudo-labels of 1 of the 3 images of train_day"):
+    with pytest.raises(InputError, match="no pseudo-labels for 1 of the 3 images of train_day"):
         set_up_training(composed(*typed))
     set_up_training(composed(*typed, "data.on_error=skip"))
     # ... and without any there is nothing to learn from.
     for path in (folder / "labels").iterdir():
         path.unlink()
-    with pytest.raises(InputError, match="no pseudo-labels of 3 of the 3 images of train_day"):
+    with pytest.raises(InputError, match="no pseudo-labels for 3 of the 3 images of train_day"):
         set_up_training(composed(*typed, "data.on_error=skip"))
 
 
@@ -147,7 +147,7 @@ def test_pseudo_labels_of_which_none_was_kept(
     call: Call, composed: Composed, words: Callable[..., list[str]], tmp_path: Path
 ) -> None:
     folder = write_folder(composed("sh_both"), tmp_path / "none", "train_day", kept=0)
-    sentence = "holds no label of any pixel, its threshold of 0.9 was above every confidence"
+    sentence = "does not label any pixel, because its threshold of 0.9 was above every confidence"
     typed = ("sh_both", f"domains.target.labels={folder}")
     refused(call, words(*typed), sentence, tmp_path / "runs")
 
@@ -167,7 +167,7 @@ def test_predicted_labels_of_other_files(
     spec = composed("multi_head_night_stage1")
     labels = finished_teacher(spec) / "pseudo_labels" / "train_night_thermal_best"
     write_folder(spec, labels, "train_night", fingerprint="of other files")
-    sentence = f"{labels} was predicted on other files of synth_freiburg than those of"
+    sentence = f"{labels} was predicted on other files of synth_freiburg than those in"
     refused(call, words("multi_head_night_stage1"), sentence, tmp_path / "runs")
     write_folder(spec, labels, "train_night")
     set_up_training(spec)

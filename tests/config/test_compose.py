@@ -47,7 +47,7 @@ def test_by_scale_unknown_scale_says_to_choose(own: Path) -> None:
     words = ["+experiment=mfnet", "scale=middle", word(own)]
     with pytest.raises(InputError) as caught, composing(words):
         compose(words)
-    assert "names files for these scales alone: {demo:mfnet_tiny,paper:mfnet}" in str(caught.value)
+    assert "supports only these scales: {demo:mfnet_tiny,paper:mfnet}" in str(caught.value)
 
 
 def test_available_lists_the_search_path_of_the_command(own: Path) -> None:

@@ -131,9 +131,9 @@ def test_trust_is_a_list_of_dotted_names() -> None:
     [
         ([1], "expected a mapping"),
         ("text", "expected a mapping"),
-        ({"a": "${oc.env:HOME}"}, r"'a' is \$\{oc.env:HOME\}; .* no interpolations"),
+        ({"a": "${oc.env:HOME}"}, r"'a' is \$\{oc.env:HOME\}; .* must not contain interpolations"),
         ({"a": [{"b": "x ${px:64}"}]}, "'a.0.b'"),
-        ({"a": {1: 2}}, "keys are text"),
+        ({"a": {1: 2}}, "is not text"),
         ({"model": "os.system"}, "'model' must be a mapping"),
         ({"data": None}, "'data' must be a mapping"),
     ],

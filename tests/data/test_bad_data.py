@@ -115,10 +115,10 @@ def change_values(path: Path, _: Path) -> None:
 DAMAGES: dict[str, tuple[Callable[[Path, Path], None], str]] = {
     "missing": (move, "is missing"),
     "empty": (partial(fill, content=b""), "the file is empty|cannot be read as an array"),
-    "cut short": (cut, "the file is (cut short|damaged or no)|cannot be read as an array"),
-    "no image": (partial(fill, content=b"<html>404</html>"), "the file is damaged or no"),
+    "cut short": (cut, "the file is (truncated|damaged or not)|cannot be read as an array"),
+    "no image": (partial(fill, content=b"<html>404</html>"), "the file is damaged or not"),
     "a folder": (make_folder, "is a folder, expected a file"),
-    "a pipe": (make_pipe, "is no regular file, expected a file"),
+    "a pipe": (make_pipe, "is not a regular file, expected a file"),
     "a link that leads out": (partial(move, link="kept"), "leads out of dataset.root, to .*kept;"),
     "a link to nowhere": (partial(move, link="gone"), "is missing: it is a link to .*/gone, where"),
     "another depth": (change_depth, "expected 8 bits|of 16 bits|whole numbers|got 8 bits"),

@@ -240,7 +240,9 @@ def test_skip_with_nothing_left(dataset: MFNet) -> None:
 @pytest.mark.parametrize("cache", ["", " ", "none", "None", "null", "false", False])
 def test_invalid_cache_folder_is_refused(cache: object) -> None:
     """They would be folders where the command was typed."""
-    sentence = rf"^data\.cache: {cache!r} is not a folder; expected auto or a folder \(\./NAME .*"
+    sentence = (
+        rf"^data\.cache: {cache!r} is not a folder; expected auto or a folder \(write \./NAME .*"
+    )
     with pytest.raises(InputError, match=sentence):
         settings(cache=cache)
     for known in (None, "auto", "./none", "/fast/disk"):

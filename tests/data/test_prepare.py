@@ -164,9 +164,9 @@ def twice(source: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (without_pair, r"2 files that lists name .* images/00002N.png, of .*train"),
+        (without_pair, r"2 listed files .* images/00002N.png, of .*train"),
         (without_lists, r"source: there is none of train\.txt, .*lists=\.\.\."),
-        (with_outside_line, "2 files that lists name are not in"),
+        (with_outside_line, "2 listed files are not in"),
         (twice, r"several times \(a/, b/\)"),
         (shutil.rmtree, "source: there is no file or folder"),
     ],
@@ -430,7 +430,7 @@ def test_repeated_command_compares_every_byte(
     assert call("mfnet", mfnet, out) == 0
     write_stored(label, 2)
     assert label.stat().st_size == length
-    refused(r"differs .* in 1 files, the first is .*labels/00002N", "mfnet", mfnet, out)
+    refused(r"differs .* in 1 files; the first is .*labels/00002N", "mfnet", mfnet, out)
     (out / "images" / "00001D.png").unlink()
     refused("differs .* in 2 files", "mfnet", mfnet, out)
     assert {path: before[path] for path in files_in(out)} == state(out)
@@ -451,7 +451,7 @@ def test_other_files_in_out_are_refused(tmp_path: Path, out: Path) -> None:
     for kind in ("rgb", "thermal", "labels"):
         (source / "train" / kind / f"{pst900_files.TRAIN[0]}.png").unlink()
     before = state(out)
-    refused(r"^out: .* in 3 files, the first is .*train/labels/", "pst900", source, out)
+    refused(r"^out: .* in 3 files; the first is .*train/labels/", "pst900", source, out)
     assert state(out) == before
 
 
@@ -486,7 +486,7 @@ def test_too_small_disk_is_refused(
     monkeypatch.setattr(
         copying.shutil, "disk_usage", lambda path: usage._replace(free=copying.SPARE)
     )
-    refused(r"GB are to be copied to .* has 0\.02 GB left", "mfnet", mfnet, out)
+    refused(r"GB must be copied to .* has 0\.02 GB left", "mfnet", mfnet, out)
     assert list(tmp_path.glob("*out*")) == []
     monkeypatch.undo()
 
@@ -576,7 +576,7 @@ def test_damaged_archives(mfnet: Path, tmp_path: Path, out: Path) -> None:
 
 
 def test_arguments_without_effect_are_refused(mfnet: Path, tmp_path: Path, out: Path) -> None:
-    refused(r"dataset: 'mfnt' is not a choice; did you mean 'mfnet'", "mfnt", mfnet, out)
+    refused(r"dataset: 'mfnt' is not a valid choice; did you mean 'mfnet'", "mfnt", mfnet, out)
     refused(r"labels has no effect for dataset=mfnet", "mfnet", mfnet, out, labels=mfnet)
     refused(r"lists has no effect for dataset=pst900", "pst900", mfnet, out, lists=mfnet)
     with pytest.raises(InputError, match=r"'sources' has no effect here; did you mean 'source'"):

@@ -170,7 +170,7 @@ def test_threshold_zero_keeps_all_and_one_out_of_range_is_refused(
     written(session, tmp_path / "all", threshold=0)
     assert np.array_equal(image(tmp_path / "all" / "labels" / f"{NAMES[0]}.png"), WHERE)
     for wrong in (-0.1, 1.1):
-        with pytest.raises(InputError, match=r"threshold must lie in \[0, 1\]"):
+        with pytest.raises(InputError, match=r"threshold must be between 0 and 1"):
             written(session, tmp_path / "never", threshold=wrong)
 
 
@@ -346,7 +346,7 @@ def test_other_settings_are_refused(session: Session, root: Path, tmp_path: Path
         "label_map (None, now": {"label_map": other_ids},
     }
     for said, changes in others.items():
-        with pytest.raises(InputError, match="was begun with pseudo-labels of another") as raised:
+        with pytest.raises(InputError, match="holds pseudo-labels of another") as raised:
             written(session, out, **changes)
         assert said in str(raised.value)
     session.model.shift.data += 1

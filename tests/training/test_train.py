@@ -35,7 +35,7 @@ def steps(*shares: float) -> list[tuple[str, dict[str, float]]]:
 def test_much_waiting_is_reported_with_what_helps(capsys: pytest.CaptureFixture[str]) -> None:
     # The median of 0.1, 0.5 and 0.9: one slow step, as the first always is, says nothing.
     said = told(capsys, steps(0.9, 0.1, 0.5), None)
-    assert "50% of the time of a step was waiting for images; data.cache=auto" in said
+    assert "50% of the time of a step was spent waiting for images; data.cache=auto" in said
     said = told(capsys, steps(0.9, 0.1, 0.5), "auto")
     assert "50%" in said
     assert "data.cache" not in said
@@ -102,7 +102,7 @@ def test_steps_that_were_not_saved_are_named_on_resuming(
     prepared: Any = SimpleNamespace(session=SimpleNamespace(trainer=SimpleNamespace(log_every=1)))
     for saved, said in (
         (5, ""),
-        (2, "rgbt: steps 3 to 5 were not saved before and are repeated.\n"),
+        (2, "rgbt: steps 3 to 5 were not saved and are repeated.\n"),
     ):
         state = State(seed=0, step=saved, evaluated_step=saved)
         Run(prepared, folder, nothing, nothing)._truncate(state)
