@@ -54,14 +54,14 @@ class Runs:
         """Of a run, whether it is there or not."""
         return self.runs / specify(compose(self.words(experiment, *overrides))).key
 
-    def told(self, experiment: str, *overrides: str) -> tuple[int, str, str]:
+    def run_main(self, experiment: str, *overrides: str) -> tuple[int, str, str]:
         return self.call(main, *self.words(experiment, *overrides))
 
     def __call__(self, experiment: str, *overrides: str) -> Path:
         """Of a run that is finished."""
         folder = self.folder(experiment, *overrides)
         if not (folder / "result.json").exists():
-            code, _, err = self.told(experiment, *overrides)
+            code, _, err = self.run_main(experiment, *overrides)
             assert code == 0, err
             assert (folder / "result.json").exists()
         return folder
@@ -217,13 +217,13 @@ def heads_line(said: str) -> list[str]:
 def test_which_head_predicted_what_is_said(run: Runs, call: Call, tmp_path: Path) -> None:
     folder = run("multi_head_night")
     own = "heads source by day, target at night"
-    assert heads_line(run.told("multi_head_night")[1]) == [own]
+    assert heads_line(run.run_main("multi_head_night")[1]) == [own]
     for head, line in (("as trained", own), ("target", "heads target for all images")):
         words = (f"run={folder}", f"head={head}", f"out={tmp_path / 'x.npz'}")
         assert heads_line(call(evaluate.entry, *words)[1]) == [line]
 
 
-def test_images_of_ones_own_are_predicted_with_the_head_that_is_asked(
+def test_new_images_are_predicted_with_the_requested_head(
     run: Runs, call: Call, tmp_path: Path
 ) -> None:
     folder = run("multi_head_night")
@@ -329,10 +329,10 @@ def test_stopped_in_the_critics_phase_and_continued(
     phase = Adversarial._discriminator_phase
     with monkeypatch.context() as patch:
         patch.setattr(Adversarial, "_discriminator_phase", stop)
-        assert stopped.told(*words, *short(6))[0] == 130
+        assert stopped.run_main(*words, *short(6))[0] == 130
     folder = stopped.folder(*words, *short(6))
     assert not (folder / "result.json").exists()
-    code, _, err = stopped.told(*words, *short(6))
+    code, _, err = stopped.run_main(*words, *short(6))
     assert code == 0, err
     assert "resumes at step 4" in err
     assert_same_runs(folder, straight(*words, *short(6)))

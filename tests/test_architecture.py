@@ -103,7 +103,7 @@ PARENTS = {"sweeps.report"}
 
 
 @pytest.mark.parametrize("path", ANALYSIS, ids=lambda path: str(path.relative_to(ROOT)))
-def test_analysis_reads_what_is_stored_and_knows_no_network(path: Path) -> None:
+def test_analysis_imports_no_network(path: Path) -> None:
     inside = path.relative_to(ROOT / "analysis")
     is_room = len(inside.parts) > 1 and inside.name != "__main__.py"
     for name in imports(ast.parse(path.read_text())):

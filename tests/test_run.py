@@ -168,7 +168,7 @@ def test_unfinished_run_on_other_images_is_refused(call: Call, data: Path, runs:
     assert_one_sentence(err, "was started on other images")
 
 
-def test_evaluate_and_predict_a_stored_run(
+def test_evaluate_and_predict_a_finished_run(
     call: Call, data: Path, runs: Path, tmp_path: Path
 ) -> None:
     folder = only_run(runs)
@@ -219,7 +219,7 @@ def test_multirun_finishes_the_other_points_when_one_is_wrong(
     assert len(list(tmp_path.glob("*/result.json"))) == 2
 
 
-def test_run_is_not_found_by_a_piece_of_text(tmp_path: Path) -> None:
+def test_part_of_a_name_does_not_select_a_run(tmp_path: Path) -> None:
     folder = tmp_path / "abc"
     folder.mkdir()
     (folder / "config.yaml").write_text("")

@@ -1,4 +1,4 @@
 """Read and write files of tensors within a memory budget, without executing their content.
 
-`stored.read_stored` reads any supported file; `stored.save` writes one of rgbt with a digest.
+`stored.read_torch_file` reads any supported file; `stored.save` writes one of rgbt with a digest.
 """

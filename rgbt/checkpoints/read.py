@@ -10,7 +10,7 @@ from typing import Any
 from torch import Tensor
 
 from rgbt.checkpoints.pickles import DamagedError, RefusedError, printable
-from rgbt.checkpoints.stored import beginning_of, explained, read_stored
+from rgbt.checkpoints.stored import beginning_of, explained, read_torch_file
 
 WRAPPERS = ("state_dict", "model", "module")
 """Keys under which releases put their weights."""
@@ -72,7 +72,7 @@ def read(path: Path) -> Contents:
         # A header of at most 100 MB, the limit of safetensors; a pickle that begins so says more.
         if beginning[8:9] == b"{" and int.from_bytes(beginning[:8], "little") <= 100_000_000:
             return _read_safetensors(path)
-        value, container = read_stored(path)
+        value, container = read_torch_file(path)
         return _unwrapped(path, value, container)
 
 

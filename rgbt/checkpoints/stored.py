@@ -68,7 +68,7 @@ def explained(path: Path, kind: str, advice: str) -> Iterator[None]:
         ) from damage
 
 
-def read_stored(path: Path) -> tuple[Any, str]:
+def read_torch_file(path: Path) -> tuple[Any, str]:
     """The value of a file of torch.save or pickle, and the name of its format.
 
     Objects of known classes of configurations are `pickles.Inert`.
@@ -114,7 +114,7 @@ def plain(value: Any, num_bytes: int) -> Any:
     """A value that rgbt wrote, with its tensors copied from the file.
 
     Args:
-        value: see `read_stored`.
+        value: see `read_torch_file`.
         num_bytes: size of the file, which bounds what all tensors together may take.
 
     Raises:

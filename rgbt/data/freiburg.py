@@ -251,7 +251,7 @@ class Freiburg(FileDataset):
 
     def unused(self, lists: SplitNames) -> list[Path]:  # noqa: ARG002 - as every data set
         """Thermal images and labels without an RGB image."""
-        return self._found[1]
+        return self._frames_and_unused[1]
 
     def own_problems(self, lists: SplitNames) -> list[str]:
         """Frames in two parts, by their time stamps; names differ between the parts."""
@@ -274,13 +274,13 @@ class Freiburg(FileDataset):
         return problems
 
     @cached_property
-    def _found(self) -> tuple[dict[str, FolderFrame], list[Path]]:
+    def _frames_and_unused(self) -> tuple[dict[str, FolderFrame], list[Path]]:
         """See `find_frames`; listed once, so later changes of the folder have no effect."""
         return find_frames(self.root)
 
     @property
     def _frames(self) -> dict[str, FolderFrame]:
-        return self._found[0]
+        return self._frames_and_unused[0]
 
     def _of(self, split: str) -> tuple[FolderFrame, ...]:
         self.check_split(split)

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from rgbt.checkpoints.stored import ZIP, explained, plain, read_stored
+from rgbt.checkpoints.stored import ZIP, explained, plain, read_torch_file
 from rgbt.checks import InputError
 
 
@@ -94,7 +94,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
         raise InputError(f"the checkpoint {path} does not exist.")
     advice = "copy it again from an intact copy, or train the run again in another runs_dir=..."
     with explained(path, "a checkpoint", advice):
-        value, container = read_stored(path)
+        value, container = read_torch_file(path)
         payload = plain(value, path.stat().st_size) if container == ZIP else None
     loaded: dict[str, Any] = payload if isinstance(payload, dict) else {}
     weights = loaded.get("model")

@@ -47,7 +47,7 @@ from rgbt.tracking.tables import TextTable, percent
 from rgbt.tracking.terminal import info
 from rgbt.types import IGNORE
 
-BEGUN = "pseudo_labels.begun.json"
+UNFINISHED = "pseudo_labels.begun.json"
 """File with the settings of a folder that is not finished."""
 
 LOCK = ".lock"
@@ -135,7 +135,7 @@ def write_pseudo_labels(
         )
         if not finished or set(missing) - set(PseudoLabels(out).manifest["skipped"]):
             # In this order, a killed process leaves a folder that can be resumed.
-            write_atomic(out / BEGUN, _text(settings))
+            write_atomic(out / UNFINISHED, _text(settings))
             (out / MANIFEST).unlink(missing_ok=True)
             skipped = _predict(session, request, labelling, out, missing, len(names))
             _finish(out, settings, [name for name in names if name not in skipped], skipped)
@@ -210,7 +210,7 @@ def _network(spec: RunSpec) -> str:
 
 
 def _refuse_other_content(out: Path) -> None:
-    ours = (MANIFEST, BEGUN)
+    ours = (MANIFEST, UNFINISHED)
     if not out.is_dir() or any((out / name).exists() for name in ours):
         return
     others = sorted(path.name for path in out.iterdir() if not path.name.startswith("."))
@@ -239,14 +239,14 @@ def _is_finished(out: Path, settings: dict[str, Any]) -> bool:
     """Whether all files exist; InputError if they were written with other settings."""
     finished = (out / MANIFEST).exists()
     if finished:
-        begun = PseudoLabels(out).manifest
-    elif (out / BEGUN).exists():
-        begun = read_json(out / BEGUN, dict[str, Any], "remove it and predict again")
+        settings_before = PseudoLabels(out).manifest
+    elif (out / UNFINISHED).exists():
+        settings_before = read_json(out / UNFINISHED, dict[str, Any], "remove it and predict again")
     else:
         return False
     for key, value in settings.items():
-        if key != "teacher" and begun.get(key) != value:
-            before, now = (str(each)[:60] for each in (begun.get(key), value))
+        if key != "teacher" and settings_before.get(key) != value:
+            before, now = (str(each)[:60] for each in (settings_before.get(key), value))
             raise InputError(
                 f"{out} holds pseudo-labels of another {key} ({before}, now {now}). Choose "
                 "another folder, or remove this one."
@@ -321,7 +321,7 @@ def _finish(out: Path, settings: dict[str, Any], names: list[str], skipped: dict
         "digest": digest.hexdigest(),
     }
     write_atomic(out / MANIFEST, _text(settings | found))
-    (out / BEGUN).unlink(missing_ok=True)
+    (out / UNFINISHED).unlink(missing_ok=True)
 
 
 def _text(values: dict[str, Any]) -> bytes:

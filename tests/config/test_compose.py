@@ -67,7 +67,7 @@ def test_compose_reads_folders_of_the_environment(
     assert compose(["+experiment=own_stage"]).name == "own_stage"
 
 
-def test_upstream_run_is_found_on_the_search_path(own: Path) -> None:
+def test_upstream_experiment_on_the_search_path_is_used(own: Path) -> None:
     with searching([word(own)]):
         config = compose(["+experiment=sh_adversarial"])
         value = "experiment:own_stage/last.pt"

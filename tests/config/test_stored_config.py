@@ -92,11 +92,11 @@ def test_what_shipped_configurations_name_is_allowed() -> None:
         check_targets({"masker": node("rgbt.data.kp.KP")}, (), "store", "masker")
     assert all(name.startswith("rgbt.") for name in shipped_targets())
     assert shipped_targets() >= {
-        str(target) for path in conf_dir().rglob("l*/*.yaml") for target in found_in(path)
+        str(target) for path in conf_dir().rglob("l*/*.yaml") for target in loaded_targets(path)
     }
 
 
-def found_in(path: Path) -> Any:
+def loaded_targets(path: Path) -> Any:
     plain = OmegaConf.to_container(OmegaConf.load(path))
     return [each for each in targets(plain).values() if str(each).startswith("rgbt.")]
 

@@ -240,7 +240,7 @@ def noise(*severities: float) -> Noise:
         (lambda: noise(8.0).check(float("nan")), r"got nan"),
     ],
 )
-def test_bad_settings_are_told(make: Callable[[], object], sentence: str) -> None:
+def test_bad_settings_are_refused(make: Callable[[], object], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         make()
 

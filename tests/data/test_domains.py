@@ -120,7 +120,7 @@ def test_the_head_of_a_night() -> None:
 
 @pytest.mark.parametrize("target_is", ["view", "night"])
 @pytest.mark.parametrize("night", [True, False, None])
-def test_one_head_for_all_where_asked(target_is: str, night: bool | None) -> None:
+def test_requested_head_predicts_all_images(target_is: str, night: bool | None) -> None:
     found = two(target_is, tested_head="source")
     for view in ("rgb", "thermal"):
         assert found.head_of(view, night, "source") == "day"

@@ -252,7 +252,7 @@ def test_invalid_cache_folder_is_refused(cache: object) -> None:
 @pytest.mark.parametrize(
     ("workers", "ahead", "gpu"), [(0, None, True), (2, 5, True), (2, 5, False)]
 )
-def test_what_the_loader_is_asked_for(
+def test_arguments_of_the_loader(
     dataset: MFNet, monkeypatch: pytest.MonkeyPatch, workers: int, ahead: int | None, gpu: bool
 ) -> None:
     """Batches ahead of the one that is used, and pinned where there is a GPU to copy them to."""

@@ -55,7 +55,7 @@ def test_known_pixel(tmp_path: Path, png) -> None:
     assert sample.label.tolist() == [[8, 8, 8], [8, 8, 8]]
 
 
-def test_layout_is_found_or_as_configured(write_mfnet, expected_pair, png) -> None:
+def test_layout_is_detected_or_as_configured(write_mfnet, expected_pair, png) -> None:
     root = write_mfnet({"train": ["00001D"]}, layout="folders")
     with pytest.raises(InputError, match=r"does not hold the folders images\+labels"):
         MFNet(str(root), layout="packed")

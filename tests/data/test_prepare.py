@@ -180,7 +180,7 @@ def test_incomplete_mfnet_is_refused(
     assert not out.exists(), "nothing is begun"
 
 
-def test_data_set_is_found_three_folders_deep(mfnet: Path, tmp_path: Path, out: Path) -> None:
+def test_data_set_three_folders_deep_is_prepared(mfnet: Path, tmp_path: Path, out: Path) -> None:
     shutil.move(mfnet, tmp_path / "a" / "b" / "c" / "d")
     assert call("mfnet", tmp_path / "a", out) == 0
     refused("does not hold the folders train", "pst900", tmp_path / "a", tmp_path / "other")
@@ -419,7 +419,7 @@ def test_repeated_command_compares_every_byte(
     mfnet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], out: Path
 ) -> None:
     label = mfnet / "labels" / "00002N.png"
-    write_stored(label, 1)
+    write_uncompressed(label, 1)
     assert call("mfnet", mfnet, out) == 0
     text = capsys.readouterr().out
     assert "0 problem(s)" in text
@@ -428,7 +428,7 @@ def test_repeated_command_compares_every_byte(
     (out / "notes.txt").write_text("mine")
     before, length = state(out), label.stat().st_size
     assert call("mfnet", mfnet, out) == 0
-    write_stored(label, 2)
+    write_uncompressed(label, 2)
     assert label.stat().st_size == length
     refused(r"differs .* in 1 files; the first is .*labels/00002N", "mfnet", mfnet, out)
     (out / "images" / "00001D.png").unlink()
@@ -436,7 +436,7 @@ def test_repeated_command_compares_every_byte(
     assert {path: before[path] for path in files_in(out)} == state(out)
 
 
-def write_stored(path: Path, value: int) -> None:
+def write_uncompressed(path: Path, value: int) -> None:
     """A label of one class whose length does not depend on it: PNG without compression."""
     label = np.full((6, 8), value, np.uint8)
     assert cv2.imwrite(str(path), label, [cv2.IMWRITE_PNG_COMPRESSION, 0])

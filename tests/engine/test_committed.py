@@ -132,7 +132,7 @@ def last_two(folder: Path) -> bytes:
 
 
 @pytest.mark.parametrize("how", ["damaged", "missing", "best"])
-def test_the_state_before_takes_the_place_of_a_damaged_one(tmp_path: Path, how: str) -> None:
+def test_damaged_state_is_replaced_by_the_previous_one(tmp_path: Path, how: str) -> None:
     whole, folder = last_two(tmp_path), tmp_path / "run"
     if how == "best":  # of step 4, as the state before is: there is nothing to fall back to
         damage(folder / "best.pt")
@@ -198,6 +198,7 @@ def test_files_are_copied_where_there_are_no_links(
 
     monkeypatch.setattr(os, "link", refuse)
     agree(tmp_path, run(tmp_path, RISING))
+    assert (tmp_path / "best.pt").stat().st_nlink == 1, "a copy and not a link"
 
 
 def test_a_run_of_before_resumes(tmp_path: Path) -> None:

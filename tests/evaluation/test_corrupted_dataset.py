@@ -35,7 +35,9 @@ def shown(data: CorruptedDataset, names: Sequence[str]) -> list[str]:
         (DELAYED, 4, [0, 0, 0, 0, 0, 1, 2]),
     ],
 )
-def test_late_thermal_is_of_earlier_frame(kind: OfTime, severity: int, expected: list[int]) -> None:
+def test_late_thermal_is_that_of_a_previous_frame(
+    kind: OfTime, severity: int, expected: list[int]
+) -> None:
     names = tuple(f"{number:02d}" for number in range(7))
     data = CorruptedDataset(Recorded(names, by_night=False), kind, severity, split="test")
     assert shown(data, names) == [names[number] for number in expected]

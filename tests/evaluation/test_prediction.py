@@ -140,7 +140,12 @@ def test_decode_ahead_decodes_the_requested_splits(
         dataset.read("00004N")
 
 
-def test_decode_ahead_without_cache_reads_nothing(write_mfnet) -> None:
+def test_decode_ahead_without_cache_reads_nothing(
+    write_mfnet, capsys: pytest.CaptureFixture[str]
+) -> None:
     dataset = MFNet(str(write_mfnet({"train": ["00001D"]})))
     (dataset.root / "images" / "00001D.png").unlink()
     decode_ahead(SimpleNamespace(dataset=dataset), "train")
+    assert capsys.readouterr().err == "", "no progress bar"
+    with pytest.raises(InputError, match="00001D.png is missing"):
+        dataset.read("00001D")

@@ -159,7 +159,7 @@ def unnoted(runs_dir: Path, name: str) -> RunFolder:
 @pytest.mark.parametrize(
     ("name", "content"), [('it\'s \\ "unnoted"', None), ("unnoted", ""), ("other", '{"uri": 3')]
 )
-def test_a_run_whose_id_was_not_noted_is_found_by_its_key(
+def test_run_without_noted_id_is_identified_by_its_key(
     runs_dir: Path,
     name: str,
     content: str | None,
