@@ -20,7 +20,7 @@ usage: rgbt COMMAND [key=value ...]
 
 {commands}
 
-rgbt COMMAND --help explains one; start with rgbt run +experiment=grbm.
+rgbt COMMAND --help shows its options. Start with: rgbt run +experiment=grbm
 rgbt --version shows the version.
 Completion of the command line: rgbt --completion bash (zsh, fish).
 """

@@ -1,4 +1,4 @@
-"""One wording for bad input, the shape check of public borders."""
+"""The errors that rgbt raises, and checks of values, shapes and members with uniform messages."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ if TYPE_CHECKING:  # the command line answers --help without waiting for torch
     from torch import Tensor
 
 
-EXTENDING = "docs/extending.md has an example"
+EXTENDING = "see docs/how-to/add-other-components.md"
 
 
 class InputError(ValueError):
-    """A mistake of the user's: one sentence, shown without a traceback, exit code 2.
+    """A mistake of the user: a message without a traceback, exit code 2.
 
-    The sentence says what was expected, what came, which file or key, and what to do.
+    The message says what is wrong, where, what was expected, and what to do.
     """
 
 
 class RunError(RuntimeError):
-    """A run that cannot continue (a loss that is no longer finite): one sentence, exit code 1."""
+    """A run that cannot continue (a loss that is not finite): a message, exit code 1."""
 
 
 def without_controls(text: str) -> str:
@@ -39,7 +39,7 @@ def one_line(text: object) -> str:
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
-    """`known`, listed, led by the nearest name: "did you mean 'grbm'? known: crm, grbm"."""
+    """The names `known` after the nearest one: "did you mean 'grbm'? known: crm, grbm"."""
     names = sorted(known)
     close = difflib.get_close_matches(word, names, n=1, cutoff=0.5)
     hint = f"did you mean '{close[0]}'? " if close else ""
@@ -65,21 +65,21 @@ def split_list(text: str, what: str) -> list[str]:
     inner = whole[1] if whole else text
     words = [word.strip() for word in re.split(r",(?![^\[]*\])", inner)]
     if not all(words):
-        raise InputError(f"'{text}': expected {what}, with commas between them.")
+        raise InputError(f"'{text}': expected {what}, separated by commas.")
     return words
 
 
 def check_range(name: str, value: float, low: float, high: float) -> None:
     """Raise InputError unless low <= value <= high (NaN never passes)."""
     if not low <= value <= high:
-        raise InputError(f"{name} must lie in [{low:g}, {high:g}], got {value:g}.")
+        raise InputError(f"{name} must be between {low:g} and {high:g}, got {value:g}.")
 
 
 def check_choice(name: str, value: str, known: Iterable[str]) -> None:
     """Raise InputError unless `value` is one of `known`; names the nearest one."""
     names = list(known)
     if value not in names:
-        raise InputError(f"{name}: '{value}' is not a choice; {nearest(value, names)}.")
+        raise InputError(f"{name}: '{value}' is not a valid choice; {nearest(value, names)}.")
 
 
 def not_finite(tensors: Mapping[str, Tensor]) -> list[str]:
@@ -120,7 +120,7 @@ def check_shape(name: str, tensor: Tensor, letters: str, **sizes: int) -> dict[s
 def check_members(
     key: str, part: object, attributes: Iterable[str], calls: Mapping[str, Sequence[str]]
 ) -> None:
-    """Refuse a user's part that lacks what the lab uses of it.
+    """Refuse a user's component that lacks a member that rgbt uses.
 
     Args:
         key: node of the configuration that names it, for the message.
@@ -147,13 +147,13 @@ def check_members(
             )
         except TypeError as error:
             raise InputError(
-                f"{key}: {name}.{method} is called as {used}, which it does not accept ({error}); "
+                f"{key}: {name}.{method} must accept the call {used}, but it does not ({error}); "
                 f"{EXTENDING}."
             ) from None
 
 
 def described(value: object) -> str:
-    """What a value is, for a message: "Tensor (2, 9, 4, 6) float32", "dict with loss", "None"."""
+    """A value in words, for a message: "Tensor (2, 9, 4, 6) float32", "dict with loss", "None"."""
     if value is None:
         return "None"
     kind = type(value).__name__

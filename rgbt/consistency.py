@@ -1,6 +1,7 @@
-"""Temporal consistency of a run or of released weights: ``rgbt consistency run=...``.
+"""Measure temporal consistency of a run or of released weights: ``rgbt consistency run=...``.
 
-TC says how far the predictions of two frames of a scene agree, CA how far both are also right.
+TC is the agreement of the predictions of two frames of a scene; CA counts agreement on the correct
+class.
 """
 
 from __future__ import annotations
@@ -16,15 +17,15 @@ from rgbt.config.plain_command import PlainCommand
 
 @dataclass(frozen=True)
 class Options(NetworkOptions):
-    """What is measured, and on which pairs of frames."""
+    """Options of the command."""
 
     frames: Annotated[
         Literal["virtual", "next"],
         Help(
-            "virtual: virtual views of every image, by three published sets of angles; written as "
-            '"aligned" (the first prediction is brought into the second frame, as in the paper) '
-            'and "released" (it is not). next: true second frames with known motion (dataset=synth '
-            "dataset.ego_forward_m=0.5, or a data set with a folder next/)"
+            "virtual: virtual views of every image, with three published sets of angles; reported "
+            'as "aligned" (the first prediction is warped to the second frame, as in the paper) '
+            'and "released" (it is not warped). next: real second frames with known motion '
+            "(dataset=synth dataset.ego_forward_m=0.5, or a data set with a folder next/)"
         ),
     ] = "virtual"
     split: Split = "test"
@@ -32,9 +33,8 @@ class Options(NetworkOptions):
     out: Annotated[
         Path | None,
         Help(
-            "folder of the counts and of a picture; default: evaluations/ in the run folder, where "
-            "counts on other images or other views than the published ones say so in their names, "
-            "and those on second frames of one motion are not replaced by those of another"
+            "folder for the counts and a picture; default: evaluations/ in the run folder. Counts "
+            "of other images, other views or another motion have names of their own there"
         ),
     ] = None
 
@@ -42,8 +42,8 @@ class Options(NetworkOptions):
 def main(options: Options, overrides: list[str]) -> int:
     """Measure TC and CA of a run, or of a network with weights from a file.
 
-    Overrides such as consistency.sets=[my.csv] consistency.view.camera.fx=700 dataset=mfnet; what
-    they do not name is as in conf/consistency/views.yaml, whatever the run measured
+    Overrides such as consistency.sets=[my.csv] consistency.view.camera.fx=700 dataset=mfnet; all
+    other settings are those of conf/consistency/views.yaml, not those of the run
     """
     from rgbt.evaluation.consistency_files import PairFiles, add_to_result
     from rgbt.evaluation.request import EvaluationRequest, NetworkRequest

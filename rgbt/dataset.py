@@ -77,13 +77,13 @@ class LabelledDataset(Protocol):
 
 
 class DatasetWrapper:
-    """A data set in front of another one; a subclass overrides the members in which they differ.
+    """Base class of a data set that changes another one; a subclass overrides what it changes.
 
     Args:
-        source: the data set behind it.
+        source: the wrapped data set.
 
     Attributes:
-        source: the same.
+        source: the wrapped data set.
     """
 
     def __init__(self, source: LabelledDataset) -> None:
@@ -97,12 +97,12 @@ class DatasetWrapper:
 
     @property
     def record(self) -> Record:
-        """That of the source."""
+        """Record of the source."""
         return record_of(self.source)
 
     @property
     def splits(self) -> Mapping[str, str]:
-        """Those of the source."""
+        """Splits of the source."""
         return self.source.splits
 
     def has(self, split: str) -> bool:
@@ -134,7 +134,7 @@ class DatasetWrapper:
         return self.source.nights(names)
 
     def fingerprint(self) -> str:
-        """That of the source."""
+        """Fingerprint of the source."""
         return self.source.fingerprint()
 
 

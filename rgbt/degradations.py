@@ -1,4 +1,4 @@
-"""The command ``python -m rgbt.corruptions`` by the name that it had before."""
+"""The former name of the command ``python -m rgbt.corruptions``."""
 
 from __future__ import annotations
 
@@ -7,5 +7,5 @@ import sys
 from rgbt.corruptions.__main__ import entry
 
 if __name__ == "__main__":
-    sys.stderr.write("rgbt.degradations is called rgbt.corruptions now.\n")
+    sys.stderr.write("rgbt.degradations was renamed to rgbt.corruptions.\n")
     entry()

@@ -1,6 +1,6 @@
 """Evaluate a run, or weights from a file: ``rgbt evaluate run=runs/<key>``.
 
-Counts are written, and the tables that follow from them are shown.
+The command writes the counts and prints the tables derived from them.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from rgbt.config.plain_command import PlainCommand
 
 @dataclass(frozen=True)
 class Options(NetworkOptions):
-    """What is evaluated, and on which images."""
+    """Options of the command."""
 
     split: Split = "test"
     modality: Modality = "default"
@@ -26,22 +26,22 @@ class Options(NetworkOptions):
     corruption: Annotated[
         str,
         Help(
-            "of the images: a file of conf/corruption such as noise, with a severity: "
-            "corruption=noise severity=16; of one image: corruption=noise:rgb, removed:thermal; "
-            "rgbt robustness measures all of them"
+            "corruption of the images, a file of conf/corruption with a severity: "
+            "corruption=noise severity=16. Of one image only: corruption=noise:rgb or "
+            "removed:thermal. `rgbt robustness` measures all corruptions"
         ),
     ] = "none"
-    severity: Annotated[str, Help("of the corruption")] = ""
+    severity: Annotated[str, Help("severity of the corruption")] = ""
     out: Annotated[
-        Path | None, Help("file of the counts; default: evaluations/ in the run folder")
+        Path | None, Help("file for the counts; default: evaluations/ in the run folder")
     ] = None
 
 
 def main(options: Options, overrides: list[str]) -> int:
     """Evaluate a run, on its own data set or another one, or a network with weights from a file.
 
-    Overrides such as dataset=mfnet dataset.root=/data/MFNet data.eval_batch_size=1, and of the
-    corruption: corruption.block=16 corruption.seed=1
+    Overrides such as dataset=mfnet dataset.root=/data/MFNet data.eval_batch_size=1, and settings
+    of the corruption: corruption.block=16 corruption.seed=1
     """
     from rgbt.evaluation.corruption_request import requested_corruption, split_overrides
     from rgbt.evaluation.request import EvaluationRequest, NetworkRequest
@@ -50,7 +50,10 @@ def main(options: Options, overrides: list[str]) -> int:
     from rgbt.training.overview import announce_network
 
     if options.out is not None and options.out.is_dir():
-        raise InputError(f"out={options.out} is a folder; name the file of the counts, x.npz.")
+        raise InputError(
+            f"out={options.out} is a folder; give a file name for the counts, such as "
+            "out=counts.npz."
+        )
     words, overrides = split_overrides(overrides)
     network = NetworkRequest(options, overrides, options.regions)
     corruption = requested_corruption(options.corruption, options.severity, words, network.trust)

@@ -1,7 +1,7 @@
 """Predict images with a trained network: ``rgbt predict run=... input=... out=folder``.
 
-For every image a colour overlay and a PNG of class indices are written; with pseudo_labels=true
-labels and confidences of a split instead, to train other networks on
+The command writes a colour overlay and a PNG of class indices for every image. With
+pseudo_labels=true it writes labels and confidences of a split instead, to train other networks on
 (`rgbt.evaluation.pseudo_labels`).
 """
 
@@ -19,38 +19,40 @@ from rgbt.config.plain_command import PlainCommand
 
 @dataclass(frozen=True, kw_only=True)
 class Options(NetworkOptions):
-    """What is predicted, and how it is written."""
+    """Options of the command."""
 
-    out: Annotated[Path, Help("folder, created if it is missing")]
+    out: Annotated[Path, Help("folder for the predictions, created if it is missing")]
     input: Annotated[
         str,
         Help(
-            "a folder of new images, laid out as the data set of the run, or with folders rgb and "
-            "thermal of equal names; PNG of four channels (R, G, B, thermal), one or a folder of "
-            "such; or a split of the data set. Labels are not needed"
+            "one of: a folder of new images with the layout of the run's data set; a folder with "
+            "subfolders rgb and thermal of equal file names; a PNG of four channels (R, G, B, "
+            "thermal) or a folder of such files; a split of the data set. Labels are not needed"
         ),
     ] = ""
-    rgb: Annotated[str, Help("instead of input, with thermal: the RGB file of one pair")] = ""
-    thermal: Annotated[str, Help("the thermal file of that pair")] = ""
+    rgb: Annotated[str, Help("RGB file of one pair; use it with thermal, instead of input")] = ""
+    thermal: Annotated[str, Help("thermal file of the pair")] = ""
     modality: Modality = "default"
     head: Head = "as trained"
     label_map: Annotated[
         str,
         Help(
-            "a file of conf/label_map, for a network that knows other classes than the data set: "
-            "vistas_to_freiburg (of 66 classes), cityscapes_to_freiburg, freiburg_to_mfnet"
+            "map of classes, a file of conf/label_map, for a network that was trained on other "
+            "classes than those of the data set: vistas_to_freiburg (66 classes), "
+            "cityscapes_to_freiburg, freiburg_to_mfnet"
         ),
     ] = "none"
     pseudo_labels: Annotated[
         bool,
         Help(
-            "true: of a split, write labels/NAME.png (class indices, 255 where not sure), "
-            "confidence/NAME.png (16 bit) and pseudo_labels.json; the same command resumes"
+            "true: write labels/NAME.png (class indices, 255 below the threshold), "
+            "confidence/NAME.png (16 bit) and pseudo_labels.json for a split; rerun the command "
+            "to resume"
         ),
     ] = False
     threshold: Annotated[
         float,
-        Help("smallest confidence of a pixel that gets a label, 0 to 1; 0: every pixel gets one"),
+        Help("smallest confidence, 0 to 1, at which a pixel gets a label; 0: every pixel gets one"),
     ] = 0.0
 
 
@@ -67,8 +69,8 @@ def main(options: Options, overrides: list[str]) -> int:
 
     if not options.pseudo_labels and options.threshold:
         raise InputError(
-            f"threshold={options.threshold:g} is for pseudo_labels=true; class maps and overlays "
-            "show every pixel."
+            f"threshold={options.threshold:g} requires pseudo_labels=true; class maps and "
+            "overlays always show every pixel."
         )
     label_map = pseudo_labels.label_map_of(options.label_map)
     labelling = pseudo_labels.Labelling(options.threshold, label_map)
@@ -83,8 +85,8 @@ def main(options: Options, overrides: list[str]) -> int:
     splits = session.dataset.splits
     if request.split not in splits or options.rgb or options.thermal:
         raise InputError(
-            f"input={request.split}: pseudo-labels are written of a split of "
-            f"{session.dataset.name}; name one of {', '.join(splits)}."
+            f"input={request.split}: pseudo_labels=true requires a split of "
+            f"{session.dataset.name} as input, one of: {', '.join(splits)}."
         )
     teacher = opened.folder.parent.name if options.run else opened.label
     labels = pseudo_labels.write_pseudo_labels(session, teacher, request, labelling, out)

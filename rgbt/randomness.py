@@ -1,7 +1,7 @@
-"""Generators derived from (run seed, purpose, index): no draw in the lab comes from a global one.
+"""Derive every random generator from (run seed, purpose, index); global generators are never used.
 
-So results do not depend on the number of loader workers, a resumed run draws what an
-uninterrupted one would have drawn, and a single mask or augmentation can be replayed alone.
+Results therefore do not depend on the number of loader workers. A resumed run draws the same
+numbers as an uninterrupted one, and a single mask or augmentation can be reproduced alone.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Ranges of settings as types.
+"""Type aliases that declare the ranges of settings.
 
 A constructor that a configuration names declares the range of each setting in its annotations:
 ``ratio: Share``, or ``block: Annotated[int, Interval(ge=1, le=480)]``. `rgbt.config` checks them.
@@ -11,16 +11,16 @@ from typing import Annotated
 from annotated_types import Interval, Len, Predicate, doc
 
 Text = Annotated[str, Len(1, 4096), Predicate(str.isprintable), doc("printable characters")]
-"""A name, a path or a pattern: an empty one would be read as the current folder."""
+"""A name, a path or a pattern that is not empty: "" would mean the current folder."""
 
 Share = Annotated[float, Interval(ge=0, le=1)]
 """A share of something, or a probability."""
 
 ShareBelowOne = Annotated[float, Interval(ge=0, lt=1)]
-"""A share that leaves something: a dropout rate, a momentum."""
+"""A share below 1: a dropout rate, a momentum."""
 
 NonNegative = Annotated[float, Interval(ge=0, le=1e6)]
-"""A weight or a factor; 0 leaves out what it weighs."""
+"""A weight or a factor; 0 disables the term."""
 
 Positive = Annotated[float, Interval(gt=0, le=1e6)]
 """A factor, a norm or a length that cannot be 0."""
@@ -31,12 +31,12 @@ Power = Annotated[float, Interval(ge=0, le=100)]
 LearningRate = Annotated[float, Interval(gt=0, le=1000)]
 
 Epsilon = Annotated[float, Interval(ge=1e-12, le=1)]
-"""What is added to a denominator."""
+"""A constant added to a denominator."""
 
 GreyLevel = Annotated[float, Interval(ge=0, le=255)]
 
 Seed = Annotated[int, Interval(ge=0, lt=2**32)]
-"""Of generators; 0 is a seed."""
+"""A seed of generators; 0 is valid."""
 
 NumSteps = Annotated[int, Interval(ge=1, le=10**8), doc("more steps would take years")]
 
@@ -52,7 +52,7 @@ Pixels = Annotated[int, Interval(ge=1, le=8192), doc("pixels")]
 """Side of an image or of a part of it."""
 
 Lengths = Annotated[tuple[Pixels, ...], Len(1, 1000)]
-"""Sides that one is drawn from."""
+"""Side lengths from which one is drawn."""
 
 Size = tuple[Pixels, Pixels]
 """Height and width."""
@@ -70,7 +70,7 @@ Depths = tuple[Blocks, Blocks, Blocks, Blocks]
 """Blocks of four stages."""
 
 MlpRatio = Annotated[float, Interval(gt=0, le=64)]
-"""Width of a block's feed-forward network over the block's."""
+"""Width of a block's feed-forward network divided by the width of the block."""
 
 Names = tuple[Text, ...]
 

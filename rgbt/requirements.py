@@ -1,8 +1,8 @@
-"""What a component provides to the other components of a run, and what it requires of them.
+"""The record in which a component declares what it provides and what it requires of others.
 
 A component (network, loss, scheme, masker, transform, domains, ...) states both in one `Record`,
 its attribute or property `record`. `rgbt.build.requirements` compares the records of a run before
-anything is trained; whoever needs to know something of a component reads it with `record_of`.
+anything is trained; other code reads a record with `record_of`.
 A class that takes long to build has a static method `record_from`, which makes the record of an
 object from its settings.
 """
@@ -27,9 +27,9 @@ class Requirement:
     Attributes:
         node: key of the other component in the configuration, such as "model".
         key: attribute of its `Record`, or a key of `Record.others`.
-        value: that it must have; where the record holds a tuple, values that it must hold.
-        setting: what the requirement follows from, "scheme.guidance_weight=0.01"; "" where the
-            component always has it.
+        value: the required value; where the record holds a tuple, the values that it must contain.
+        setting: the setting that causes the requirement, "scheme.guidance_weight=0.01"; "" where
+            the component always requires it.
     """
 
     node: str
@@ -38,7 +38,7 @@ class Requirement:
     setting: str = ""
 
     def is_met_by(self, record: Record) -> bool:
-        """Whether a component with this record will do; None in a record is not compared."""
+        """Whether a component with this record meets it; None in a record is not compared."""
         provided = record.get(self.key)
         if isinstance(provided, tuple):
             return set(self.value) <= set(provided)
@@ -52,11 +52,11 @@ class Record:
     Attributes:
         requires: of other components.
         outputs: network: what it returns in training.
-        views: network: what it predicts from; it is evaluated with the first one.
+        views: network: the input images it can predict from; it is evaluated with the first one.
         heads: network and domains: names of the heads.
         auxiliary: network: whether it returns `aux["aux_logits"]`.
         stacks_passes: network: whether `forward` takes `passes` of a batch, each as its own call.
-        dense_logits: network: whether it has a method `dense_logits` that makes scores of masks.
+        dense_logits: network: whether its method `dense_logits` converts masks to class scores.
         pretrained_parts: network: beginnings of the names of the parameters that an ImageNet file
             covers; they get the backbone's learning rate.
         drawn_anew: network: beginnings of the names of parameters that are not read from a file
@@ -79,7 +79,7 @@ class Record:
         target_confidence: domains: whether these carry a confidence.
         separate_heads: domains: whether source and target have a head each.
         num_classes: data set: K.
-        others: further things that a user's components agree on, by name.
+        others: further values that a user's own components share, by name.
     """
 
     requires: tuple[Requirement, ...] = ()
@@ -115,7 +115,7 @@ class Record:
 
 
 PLAIN = Record()
-"""Of every component that has no record."""
+"""The record of a component that does not declare one."""
 
 FORMER = {
     **{
@@ -125,7 +125,7 @@ FORMER = {
     },
     **{"reads_warped": "frames", "works_on_batches": "works_on_batches"},
 }
-"""Attributes that records replaced -> key of the record."""
+"""Former attribute -> key of the record that replaces it."""
 
 
 def record_of(component: object) -> Record:
@@ -138,8 +138,9 @@ def record_of(component: object) -> Record:
     former = [name for name in FORMER if record is PLAIN and hasattr(component, name)]
     if former:
         raise InputError(
-            f"{type(component).__name__}.{former[0]} is not read; state it as "
-            f"record = rgbt.requirements.Record({FORMER[former[0]]}=...), see docs/extending.md."
+            f"{type(component).__name__}.{former[0]} is ignored; declare record = "
+            f"rgbt.requirements.Record({FORMER[former[0]]}=...) instead, see "
+            "docs/how-to/add-other-components.md."
         )
     if not isinstance(record, Record):
         raise InputError(

@@ -1,7 +1,7 @@
-"""What is left when images are missing or partly wrong: ``rgbt robustness run=...``.
+"""Evaluate a run on missing or corrupted images: ``rgbt robustness run=...``.
 
-Every severity of every corruption is evaluated and its counts are kept beside the run, each with a
-file that says what it was made of. Counts that exist are not made again.
+The command evaluates every severity of every corruption. It stores the counts in the run folder,
+each with a file that describes its inputs. Counts that exist are reused.
 """
 
 from __future__ import annotations
@@ -18,39 +18,41 @@ from rgbt.config.plain_command import PlainCommand
 
 @dataclass(frozen=True, kw_only=True)
 class Options(NetworkOptions):
-    """What is measured, and under which corruptions."""
+    """Options of the command."""
 
     run: Annotated[
         str,
         Help(
-            "run folders, config keys or MLflow run ids, with commas; without one, name a network "
-            "and its weights: model=mfnet model.weights=final.pth dataset.root=/data/MFNet"
+            "run folders, config keys or MLflow run ids, separated by commas. Without a run, name "
+            "a network and its weights: model=mfnet model.weights=final.pth "
+            "dataset.root=/data/MFNet"
         ),
     ] = ""
     split: Split = "test"
     corruptions: Annotated[
         str,
         Help(
-            "files of conf/corruption with commas, such as frozen,noise:rgb (also :thermal, "
-            ":both), or all of them; the clean images and, of networks that can decode one branch "
-            "alone, both branches are always measured beside them"
+            "files of conf/corruption separated by commas, such as frozen,noise:rgb (also "
+            ":thermal, :both), or all. Clean images are always evaluated as well, and so is each "
+            "branch alone if the network can decode it"
         ),
     ] = "all"
     regions: RegionsFile = "as trained"
     out: Annotated[
         Path | None,
-        Help("folder of the counts of one run; default: evaluations/robustness/ in the run folder"),
+        Help(
+            "folder for the counts of one run; default: evaluations/robustness/ in the run folder"
+        ),
     ] = None
 
 
 def main(options: Options, overrides: list[str]) -> int:
     """Evaluate runs under every severity of every corruption; one table per run.
 
-    Overrides such as dataset=mfnet dataset.root=/data/MFNet, corruption.seed=1 (of what is drawn),
-    and of a single corruption any key: corruptions=noise corruption.severities=[4,12]
-
-    The same command resumes; what exists is made again only where the data, the weights or the
-    corruption differ. rgbt figures figure=robustness draws it.
+    Overrides such as dataset=mfnet dataset.root=/data/MFNet, corruption.seed=1 (random draws), and
+    any key of a single corruption: corruptions=noise corruption.severities=[4,12]. Rerun the
+    command to resume; existing counts are replaced only if the data, the weights or the corruption
+    changed. `rgbt figures figure=robustness` draws the results.
     """
     from rgbt.evaluation.corruption_request import choose_corruptions, split_overrides
     from rgbt.evaluation.request import NetworkRequest
@@ -67,7 +69,7 @@ def main(options: Options, overrides: list[str]) -> int:
     corruptions = choose_corruptions(options.corruptions, words, networks[0].trust)
     if out and len(networks) > 1:
         raise InputError(
-            f"out= is the folder of one run, but run= names {len(networks)}; omit out=."
+            f"out= is the folder for a single run, but run= names {len(networks)} runs; omit out=."
         )
     for network in networks:  # before the first of them is measured
         network.check_comparable(out)

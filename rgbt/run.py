@@ -1,6 +1,6 @@
 """Train one configuration: ``python -m rgbt.run +experiment=grbm``.
 
-The same command on the same configuration resumes its run folder; a finished run shows its tables.
+The same command resumes an unfinished run; for a finished run it prints the tables.
 """
 
 from __future__ import annotations
@@ -26,7 +26,10 @@ def main(config: DictConfig) -> int:
 
     run = specify(config, list(HydraConfig.get().overrides.task))
     if run.pretrained is not None and not run.uses_pretrained:
-        info(f"pretrained={run.pretrained} is ignored: {run.name} does not start from it.")
+        info(
+            f"pretrained={run.pretrained} is ignored: the experiment {run.name} does not use "
+            "ImageNet weights."
+        )
     run_pipeline(run, tags_from_environment())
     return 0
 

@@ -1,4 +1,4 @@
-"""The values that carry everything between the parts of the lab.
+"""The types that the components of rgbt exchange.
 
 Letters, everywhere: ``B`` batch, ``C`` channels, ``H W`` pixels, ``h w`` cells or feature grid,
 ``K`` classes, ``Q`` queries, ``R`` regions, ``P`` stacked passes of one batch, ``L`` prediction
@@ -21,7 +21,7 @@ from torch import Tensor
 IGNORE = 255
 
 View = Literal["rgbt", "rgb", "thermal"]
-"""What a prediction is made from: both images, or one alone."""
+"""Input images of a prediction: both, or one alone."""
 
 VIEWS: tuple[View, ...] = ("rgbt", "rgb", "thermal")
 
@@ -31,15 +31,15 @@ GeneratorOf = Callable[[str], torch.Generator]
 
 @dataclass(frozen=True)
 class Sample:
-    """One labelled RGB-thermal pair as it lies on disk: no augmentation, no masking.
+    """One labelled RGB-thermal pair as stored on disk: no augmentation, no masking.
 
     Attributes:
         rgb: (H, W, 3) uint8, RGB order.
         thermal: (H, W) uint8.
         label: (H, W) uint8, class index or 255 = ignore; None where the pair is unlabelled.
         name: name in the split list, without extension.
-        confidence: (H, W) float32 in [0, 1], how sure the teacher was whose labels these are; None
-            where labels carry none.
+        confidence: (H, W) float32 in [0, 1], confidence of the teacher that predicted the labels;
+            None for labels without confidence.
     """
 
     rgb: NDArray[np.uint8]
@@ -51,21 +51,21 @@ class Sample:
 
 @dataclass(frozen=True)
 class Example:
-    """A sample after the transform, not padded to what a network asks for.
+    """A sample after the transform, not yet padded to the size that a network requires.
 
     Attributes:
         rgb: (H, W, 3), uint8 or float32, 0..255, RGB order.
         thermal: (H, W), dtype and range of `rgb`.
         label: (H', W') uint8, class index or 255 = ignore. H' = H and W' = W after `train`; after
-            `test` the size of the file, which the images may have left.
+            `test` the size of the file, which may differ from that of the images.
         centre_yx: pixel of the example that is nearest to pixel (rows // 2, columns // 2) of the
             original image; the first in row-major order on a tie.
         position: (2, H, W) float32, (row, column) in the original image of every pixel; None
             where it is not tracked.
         original_hw: size of the original image.
         name: name in the split list.
-        confidence: (H', W') float32, of the label, moved as the label is and by nearest; None
-            where labels carry none.
+        confidence: (H', W') float32, of the label, transformed as the label is, with nearest
+            interpolation; None for labels without confidence.
     """
 
     rgb: NDArray[Any]
@@ -93,7 +93,7 @@ class Batch:
         centre_yx: (B, 2) int64, the pixel of this crop that is nearest to the centre
             (rows // 2, columns // 2) of the original image; the first in row-major order on a tie.
         position: (B, 2, H, W) float32, (row, column) in the original image of every crop pixel;
-            None where the transform was asked not to track it.
+            None where the transform is configured not to track it.
         original_hw: (B, 2) int64, height and width of the original image.
         confidence: (B, H', W') float32 in [0, 1], of the labels; None where they carry none.
     """
@@ -126,7 +126,7 @@ class Batch:
 
 
 class Loadable(Protocol):
-    """What a loader yields: a batch, or examples that become one on their way to the device."""
+    """An item of a loader: a batch, or examples that become a batch on the device."""
 
     @property
     def name(self) -> tuple[str, ...]:
@@ -140,7 +140,7 @@ class Loadable(Protocol):
 
 @dataclass(frozen=True)
 class TwoDomains:
-    """What a step of domain adaptation gets: a batch of each domain, drawn independently.
+    """The input of one step of domain adaptation: a batch of each domain, drawn independently.
 
     Attributes:
         source: with labels.
@@ -161,7 +161,7 @@ class MaskPair(NamedTuple):
 
 
 class Output(NamedTuple):
-    """What a network returns.
+    """The output of a network.
 
     Attributes:
         logits: (B, K, H, W) class scores at the size of the input image. None in training mode for
@@ -203,7 +203,7 @@ class Phase(NamedTuple):
 
 
 class AnyMasker(Protocol):
-    """Draws which cells are hidden (see `rgbt.maskers.masker.Masker`).
+    """The interface of a masker, which draws hidden cells (see `rgbt.maskers.masker.Masker`).
 
     A crop is padded at the bottom and right to multiples of 32 pixels before cells are cut
     (`rgbt.geometry.padding.padded_hw`: 120 x 160 becomes 128 x 160), so that h and w divide the
@@ -218,7 +218,7 @@ class AnyMasker(Protocol):
 
 
 class Loss(Protocol):
-    """Compares what a network returned with a batch."""
+    """The interface of a loss between the output of a network and a batch."""
 
     def __call__(
         self, output: Output, batch: Batch, generator: torch.Generator

@@ -1,4 +1,4 @@
-"""Look at files of weights, and write those of a run.
+"""Inspect files of weights, and export the weights of a run.
 
     rgbt weights inspect FILE [model=...]
     rgbt weights export run=runs/KEY format=safetensors out=FILE
@@ -32,20 +32,23 @@ NOT_SETTINGS = ("_target_", "weights", "fresh", "inputs")
 
 @dataclass(frozen=True)
 class InspectOptions:
-    """Of `inspect`."""
+    """Options of `inspect`."""
 
-    file: Annotated[Path, Help("of weights, ours or a released one")]
+    file: Annotated[Path, Help("file of weights, from rgbt or a released one")]
     trust: Annotated[
         str,
-        Help("modules of yours with the network of its run: trust=my_lab; their code is run"),
+        Help(
+            "your own modules that define the network of the run: trust=my_lab; their code is "
+            "executed"
+        ),
     ] = ""
 
 
 def inspect(options: InspectOptions, overrides: list[str]) -> int:
-    """Say what a file is and what it would do to a network.
+    """Describe a file of weights and which parameters of a network it would set.
 
-    Overrides choose the network, model=mask2former_tiny model.fresh=[sem_seg_head]; without, it is
-    the one that fits, or the one of the run that the file belongs to
+    Overrides choose the network: model=mask2former_tiny model.fresh=[sem_seg_head]. Without
+    overrides it is the network that fits, or that of the run to which the file belongs.
     """
     from rich.text import Text
 
@@ -104,7 +107,7 @@ def _built(node: DictConfig) -> Any:
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """Of `export`."""
+    """Options of `export`."""
 
     run: Annotated[str, Help("run folder, config key or MLflow run id")]
     format: Annotated[
@@ -114,7 +117,7 @@ class ExportOptions:
             "released_temporal (CMX as the temporal paper's code loads it)"
         ),
     ]
-    out: Annotated[Path, Help("the new file; one that exists is left alone")]
+    out: Annotated[Path, Help("new file; an existing file is never overwritten")]
     checkpoint: Checkpoint = "best"
     runs_dir: RunsDir = Path("runs")
 
@@ -150,8 +153,8 @@ def export(options: ExportOptions, overrides: list[str]) -> int:
     others = differences(model, CONVENTIONS.get((options.format, family), ()))
     if others:
         info(
-            f"the authors' code does {' '.join(others)}, this run did something else; there its "
-            "scores will not be ours."
+            f"the authors' code uses {' '.join(others)}, but this run used other settings, so its "
+            "scores will differ in the authors' code."
         )
     if remark:
         info(f"{remark}.")

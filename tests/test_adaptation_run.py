@@ -235,7 +235,7 @@ def test_user_images_are_predicted_with_the_requested_head(
     words = (f"run={broken}", f"input={tmp_path / 'mine'}", f"out={out}")
     code, _, err = call(entry, *words)
     assert code == 2
-    assert_one_sentence(err, "so no head can be chosen; set head=source or head=target")
+    assert_one_sentence(err, "so no head can be selected. Set head=source or head=target")
 
     found = {}
     for head in ("source", "target"):

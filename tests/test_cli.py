@@ -93,7 +93,7 @@ GRID = ("-m", "+experiment=grbm", "seed=0,1", "tracking=none", "hydra.sweeper.dr
 def test_python_m_says_which_folder_shadows_sweeps(shadowed: Path) -> None:
     wrong = python(shadowed, "-m", "rgbt.run", *GRID)
     assert wrong.returncode == 2
-    assert_one_sentence(wrong.stderr, f"{shadowed}/sweeps is imported instead of rgbt's own")
+    assert_one_sentence(wrong.stderr, f"{shadowed}/sweeps would be imported instead of rgbt's own")
     assert "type `rgbt ...`" in wrong.stderr
 
 

@@ -177,7 +177,7 @@ def test_run_image_of_another_shape_does_not_cost_the_training(
     assert code == 0, err
     folder = only_run(tmp_path / "runs")
     assert_one_sentence(err, f"consistency.view, image '{name}': ")
-    assert "Consistency is left out; rgbt consistency measures it later" in err
+    assert "Consistency was not measured; measure it later with `rgbt consistency`" in err
     result = read(folder, "result.json")
     assert result["test"]["mIoU"] is not None
     assert not set(SCORES) & set(result["test"])
@@ -305,7 +305,7 @@ def test_consistency_of_true_second_frames(call: Call, folder: Path, tmp_path: P
     aside = (*where, "split=val", f"out={tmp_path / 'out'}")
     code, _, err = call(consistency.entry, *aside)
     assert code == 2
-    assert_one_sentence(err, "dataset=synth writes them with dataset.ego_forward_m=0.5")
+    assert_one_sentence(err, "dataset=synth writes it with dataset.ego_forward_m=0.5")
     assert not (tmp_path / "out").exists()
     out = measure(call, *aside, "dataset.ego_forward_m=0.5")
     assert "TC next" in out
@@ -327,7 +327,7 @@ def test_consistency_on_another_motion_replaces_no_counts(
     before, result = path.read_bytes(), (plain / "result.json").read_bytes()
     code, _, err = call(consistency.entry, *where, "dataset.ego_forward_m=0.7")
     assert code == 2, err
-    assert_one_sentence(err, f"{path} holds counts on second frames of another motion")
+    assert_one_sentence(err, f"{path} holds counts for second frames of another motion")
     assert path.read_bytes() == before
     # The same motion again, and the other one in a place of its own.
     kept = counts_of(path)

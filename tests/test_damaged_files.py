@@ -638,4 +638,6 @@ def test_a_log_that_was_cut_off_is_reported(call: Call, trained: Trained, tmp_pa
     (folder / "metrics.jsonl").write_text(first + first[:20])
     code, _, err = train(call, made.parents[1] / "mf", tmp_path / "runs", *WORDS)
     assert code == 0, err
-    assert "metrics.jsonl ends at step 1, the checkpoint is of step 4; the lines between" in err
+    assert (
+        "metrics.jsonl ends at step 1, but the checkpoint is of step 4. The lines in between" in err
+    )

@@ -139,7 +139,7 @@ def test_the_page_runs(lab: Path, call: Call) -> None:
     code, _, err = call(predict.entry, *words, f"input={lab}")
     assert code == 2
     assert_one_sentence(
-        err, "Arrays does not declare how new images are read; name one of its splits"
+        err, "Arrays does not declare how to read new images. Name one of its splits"
     )
 
 

@@ -19,7 +19,7 @@ from rgbt.tracking.run_files import read_description, read_provenance
 from rgbt.tracking.run_folder import runs_in
 from tests.commands import Call, Trained, only_run, short, train
 
-MADE_BY_OTHER_CODE = "This result was made by other code (commit 0000000 of"
+MADE_BY_OTHER_CODE = "this result was made by other code (commit 0000000 of"
 
 
 @pytest.fixture
@@ -47,12 +47,12 @@ def test_fresh_retrains_runs_of_other_code_and_keeps_them(
     before = Counts.load(folder / "counts_test.npz")
     _, _, err = train(call, *words)
     assert MADE_BY_OTHER_CODE in err
-    assert "fresh=true trains again and keeps the old run" in err
+    assert "fresh=true trains the run again and keeps the old result" in err
 
     code, _, err = train(call, *words, "fresh=true")
     assert code == 0, err
     kept = runs / "replaced" / f"{folder.name}-1"
-    assert f"run={kept} opens it" in err
+    assert f"open it with run={kept}" in err
     assert (kept / "best.pt").is_file()
     assert [run.path for run in runs_in(runs)] == [folder]
     assert (Counts.load(folder / "counts_test.npz").counts == before.counts).all()

@@ -53,7 +53,7 @@ def test_pseudo_labels_of_a_run(call: Call, trained: Trained, tmp_path: Path) ->
     assert (out / "pseudo_labels.json").read_bytes() == before
     code, _, err = call(PREDICT, *asked, "threshold=0.9")
     assert code == 2
-    assert_one_sentence(err, "was begun with pseudo-labels of another threshold (0.0, now 0.9)")
+    assert_one_sentence(err, "holds pseudo-labels of another threshold (0.0, now 0.9)")
 
 
 @pytest.mark.slow

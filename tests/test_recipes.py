@@ -134,8 +134,14 @@ PUBLISHED = {
         ({"weights": None, "parts": ()}, []),
         ({"data": "mine", "recipe": "mine"}, []),
         ({"data": "pst900"}, ["those for mfnet, not", "choose recipe=pst900, or set recipe."]),
-        ({"data": "mine", "recipe": "kp"}, ["those for kp, not for mine; set recipe.train_sizes"]),
-        ({"weights": None}, ["starts from ImageNet weights, this run from random ones"]),
+        (
+            {"data": "mine", "recipe": "kp"},
+            ["published for kp, not for mine; set recipe.train_sizes"],
+        ),
+        (
+            {"weights": None},
+            ["starts from ImageNet weights, but this run starts from random weights"],
+        ),
         ({"val": ("x", "b", "y"), "scale": "demo"}, ["val: 2 of its 3 images are test images"]),
         # Requested by name, as the releases do, or not picked at all.
         ({"val": ("x",), "picked": "test"}, []),

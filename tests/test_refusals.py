@@ -40,7 +40,7 @@ RUN = [
     ("out=x.png", "omit out=..."),
     ("~dataset.root", "'dataset.root'"),
     ("dataset.root=???", "'dataset.root' has no value"),
-    ("dataset.root=/no/such", "there is no folder '/no/such'"),
+    ("dataset.root=/no/such", "the folder '/no/such' does not exist"),
     ("masker.patch_size=48", "masker.patch_size"),
     ("masker.patch_size=6", "masker.patch_size"),
     ("masker=none scheme=crm", "requires hides_cells=true of the masker"),
@@ -52,16 +52,19 @@ RUN = [
         for words, word in (
             (
                 "scheme.view.camera.height=1024 scheme.view.camera.width=1280",
-                "intrinsics of another image size",
+                "intrinsics for another image size",
             ),
             (
                 "consistency.view.camera.height=1024 consistency.view.camera.width=1280",
-                "intrinsics of another image size",
+                "intrinsics for another image size",
             ),
-            ("scheme.view.camera.cx=900", "intrinsics of another image size"),
-            ("scale.crop_hw=[48,48]", "intrinsics of another image size"),
-            ("scheme.view.yaw=[-50,50]", "leave no valid rectangle"),
-            ("consistency.view.yaw=[-50,50]", "leave no valid rectangle"),
+            ("scheme.view.camera.cx=900", "intrinsics for another image size"),
+            ("scale.crop_hw=[48,48]", "intrinsics for another image size"),
+            ("scheme.view.yaw=[-50,50]", "leave no rectangle of the view without empty pixels"),
+            (
+                "consistency.view.yaw=[-50,50]",
+                "leave no rectangle of the view without empty pixels",
+            ),
             ("scheme=supervised", "requires frames=2 of the scheme"),
             ("loss=cross_entropy", "requires frames=2 of the loss"),
             ("masker=crm masker.patch_size=32", "choose masker=none"),
@@ -106,7 +109,7 @@ ADAPTATION = [
     ("sh_both scheme=supervised", "requires num_domains=2 of the scheme"),
     ("sh_adversarial scheme.supervise_target=true", "requires target_labels=true of the domains"),
     ("sh_adversarial domains.target.labels=given", "requires target_labels=false of the domains"),
-    ("sh_source domains.source.labels=none", "every scheme reads labels of the source"),
+    ("sh_source domains.source.labels=none", "every scheme requires labels of the source"),
     ("multi_head_thermal_stage1 domains.source.head=left", "requires heads=left of the model"),
     ("sh_source model.heads=[source,target]", "requires heads=source,target of the domains"),
     ("sh_both model=mask2former_tiny loss=set_criterion", "requires outputs=scores of the model"),
@@ -179,7 +182,7 @@ def test_run_images_of_another_shape_are_refused(
     data = write_data(tmp_path / "mf", SPLITS, (48, 48))
     code, _, err = train(call, data, tmp_path / "runs", *TEMPORAL, *words, *short(1))
     assert code == 2, err
-    assert_one_sentence(err, "intrinsics of another image size")
+    assert_one_sentence(err, "intrinsics for another image size")
     assert not (tmp_path / "runs").exists()
 
 
@@ -188,7 +191,9 @@ def test_run_broken_angles_are_refused(call: Call, files: Path, tmp_path: Path) 
     words = (*TEMPORAL, f"consistency.sets=[{tmp_path / 'mine.csv'}]", *short(1))
     code, _, err = train(call, files, tmp_path / "runs", *words)
     assert code == 2, err
-    assert_one_sentence(err, "yaw 80, pitch 2, roll 3 degrees leave no valid rectangle")
+    assert_one_sentence(
+        err, "yaw 80, pitch 2, roll 3 degrees leave no rectangle of the view without empty pixels"
+    )
     assert not (tmp_path / "runs").exists()
 
 
@@ -255,19 +260,19 @@ OF_A_RUN = {
     evaluate.entry: (
         CRM,
         [
-            ("modality=infrared", "modality: 'infrared' is not a choice"),
+            ("modality=infrared", "modality: 'infrared' is not a valid choice"),
             ("split=tset", "no split 'tset'"),
             ("checkpoint=first", "'checkpoint' must be 'best' or 'last'"),
             ("model.num_queries=3", "'model.num_queries' cannot be changed"),
             ("data.batch_siz=1", "did you mean 'data.batch_size'?"),
-            ("scale=paper", "'scale' cannot be changed of a finished run"),
+            ("scale=paper", "'scale' of a finished run cannot be changed"),
             ("model=mask2former_swin_t", "'model' cannot be changed"),
             ("data.eval_batch_size=[1", "data.eval_batch_size cannot be read as YAML"),
-            ("head=source", "head=source chooses between the heads of two domains"),
+            ("head=source", "head=source selects one of two heads"),
             ("degradation=noise", "'degradation' is called 'corruption' now"),
             ("severity=1", "'severity' has no effect without corruption="),
             ("corruption.block=1", "'corruption.block' has no effect without corruption="),
-            ("corruption=noise", "needs a number (grey levels (std))"),
+            ("corruption=noise", "requires a number (grey levels (std))"),
         ],
     ),
     predict.entry: (
@@ -279,12 +284,15 @@ OF_A_RUN = {
             ("rgb=a.png thermal=b.png input=val", "expected either input=FOLDER"),
             ("input=vall", "did you mean 'val'?"),
             ("input=val dataset.rot=x", "did you mean 'dataset.root'?"),
-            ("input=val threshold=0.5", "threshold=0.5 is for pseudo_labels=true"),
+            ("input=val threshold=0.5", "threshold=0.5 requires pseudo_labels=true"),
             ("input=val pseudo_labels=yes", "'pseudo_labels' must be true or false"),
-            ("input=val pseudo_labels=true threshold=2", "threshold must lie in [0, 1], got 2"),
+            (
+                "input=val pseudo_labels=true threshold=2",
+                "threshold must be between 0 and 1, got 2",
+            ),
             ("input=pictures pseudo_labels=true", "name one of"),
             ("input=val pseudo_labels=true label_map=x", "there is no label_map 'x'"),
-            ("input=val head=target", "head=target chooses between the heads"),
+            ("input=val head=target", "head=target selects one of two heads"),
         ],
     ),
     consistency.entry: (
@@ -293,15 +301,15 @@ OF_A_RUN = {
             ("frames=nxt", "did you mean 'next'?"),
             ("frames=next", "has no second frames: expected the folder next/"),
             ("consistency=none", "consistency.sets is empty"),
-            ("transform.test_short_edge=96", "name a folder for these counts with out="),
+            ("transform.test_short_edge=96", "choose a separate folder for these counts with out="),
             ("trainer.precision=bf16-mixed", "changes how the run is measured"),
-            ("modality=rgb", "modality: 'rgb' is not a choice"),
+            ("modality=rgb", "modality: 'rgb' is not a valid choice"),
             ("consistency.sets=[released_4]", "did you mean 'released_3'?"),
             ("consistency.veiw.mode=both", "did you mean 'view'?"),
             ("consistency=veiws", "there is no consistency 'veiws'"),
             ("camera@consistency.view.camera=no", "there is no camera 'no'"),
-            ("consistency.view.camera.cx=900", "intrinsics of another image size"),
-            ("scheme.view.mode=rotation", "cannot be changed of a finished run"),
+            ("consistency.view.camera.cx=900", "intrinsics for another image size"),
+            ("scheme.view.mode=rotation", "of a finished run cannot be changed"),
         ],
     ),
     robustness.entry: (

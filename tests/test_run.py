@@ -78,10 +78,10 @@ def test_finished_run_shows_its_tables_again(call: Call, data: Path, tmp_path: P
         assert (only_run(tmp_path) / "figures" / picture).stat().st_size > 1000
     again = train(call, *words)
     assert again[:2] == (0, first[1])
-    assert "is finished" in again[2]
+    assert "is already finished" in again[2]
     # The default, typed: the same run, shown under the name that says more.
     for more in (["masker.sigma_div=4"], []):
-        assert "is finished" in train(call, *words, *more)[2]
+        assert "is already finished" in train(call, *words, *more)[2]
         assert "sigma_div=4" in json.loads((only_run(tmp_path) / "run.json").read_text())["name"]
 
 
@@ -168,7 +168,7 @@ def test_unfinished_run_on_other_images_is_refused(call: Call, data: Path, runs:
     assert_one_sentence(err, "was started on other images")
 
 
-def test_evaluate_and_predict_a_stored_run(
+def test_evaluate_and_predict_a_finished_run(
     call: Call, data: Path, runs: Path, tmp_path: Path
 ) -> None:
     folder = only_run(runs)

@@ -86,7 +86,7 @@ def test_other_inputs_are_reported(
         words = (f"model.weights={first}", f"model/inputs={inputs}")
         code, _, err = train(call, data, tmp_path / runs, *ONE, *words)
         assert code == 0, err
-        assert ("this network with something else" in err) == (inputs == "crm")
+        assert ("but this network has other settings" in err) == (inputs == "crm")
 
     # An export carries what it was fed with; the released layout of MFNet has no room for that.
     exported = tmp_path / "mine.safetensors"
@@ -96,7 +96,7 @@ def test_other_inputs_are_reported(
         words = (f"model.weights={exported}", f"model/inputs={inputs}")
         code, _, err = train(call, data, tmp_path / runs, *ONE, *words)
         assert code == 0, err
-        assert ("this network with something else" in err) == (inputs == "crm")
+        assert ("but this network has other settings" in err) == (inputs == "crm")
 
     state = torch.load(first / "best.pt", weights_only=True)["model"]
     torch.save(state, tmp_path / "final.pth")
@@ -105,7 +105,7 @@ def test_other_inputs_are_reported(
     for change in ("model.final_activation=true", "model.final_activation=false"):
         code, _, err = call(EVALUATE, *named, *small, change)
         assert code == 0, err
-        said = "goes with model.final_activation=true" in err
+        said = "was trained with model.final_activation=true" in err
         assert said == change.endswith("false")
 
 
@@ -118,7 +118,7 @@ def test_networks_with_random_parts_are_not_scored(
     )
     code, _, err = call(EVALUATE, *named)
     assert code == 2
-    assert "does not hold the whole network, the rest would be random" in err
+    assert "does not hold all parameters of the network, and the others would be random" in err
     code, _, err = call(EVALUATE, *named, "checkpoint=last")
     assert code == 2
     assert_one_sentence(err, "checkpoint=last is one of a run")
@@ -137,7 +137,7 @@ def test_a_network_of_one_image_is_scored_from_it(call: Call, data: Path, tmp_pa
     assert (folder / "evaluations" / "mfnet_test_rgb_ring5.npz").exists()
     code, _, err = call(EVALUATE, f"run={folder}", "modality=thermal")
     assert code == 2
-    assert_one_sentence(err, "'thermal' is not a choice")
+    assert_one_sentence(err, "'thermal' is not a valid choice")
 
 
 def test_weights_that_are_not_there_are_named(call: Call, data: Path, tmp_path: Path) -> None:

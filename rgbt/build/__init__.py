@@ -1,1 +1,1 @@
-"""The objects of a run, built from its specification; a finished run opened again."""
+"""Build the objects of a run from its specification, and load finished runs."""

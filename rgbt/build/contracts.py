@@ -1,9 +1,9 @@
-"""What a user's own parts must be: checked where they enter the lab, one sentence each.
+"""Check a user's own components against the interfaces that rgbt expects.
 
-Classes of this package are tested, and pass unchecked; others are compared with `rgbt.types` and
-with `rgbt.dataset` before a training starts, and what they return the first time they are
-used. Each raises InputError, naming the member or what was returned and what was expected;
-docs/extending.md has an example of each.
+Classes of this package are not checked, because the test suite covers them. Other classes are
+compared with `rgbt.types` and `rgbt.dataset` before training starts. What they return is checked
+the first time they are used. Each check raises InputError, which names the member or the returned
+value and what was expected; docs/how-to/add-other-components.md has an example of each.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ EXAMPLE = ("rgb", "thermal", "label", "centre_yx", "position", "original_hw", "n
 
 
 def is_own(part: object) -> bool:
-    """Whether a part is the user's own, not of this package."""
+    """Whether a component is the user's own, that is, not a class of this package."""
     return type(part).__module__.partition(".")[0] != "rgbt"
 
 
@@ -67,7 +67,9 @@ def check_first_sample(dataset: Any, split: str) -> None:
             "names, each a str."
         )
     if not names:
-        raise InputError(f"dataset: {kind}.names('{split}') returned no name; expected some.")
+        raise InputError(
+            f"dataset: {kind}.names('{split}') returned an empty tuple; expected at least one name."
+        )
     sample = dataset.read(names[0])
     check_sample(f"dataset: {kind}.read('{names[0]}') returned", sample, names[0])
     if sample.label is None:
@@ -81,7 +83,7 @@ def check_first_sample(dataset: Any, split: str) -> None:
 
 
 def check_sample(returned: str, sample: Any, name: str) -> None:
-    """Refuse what is no `rgbt.types.Sample` of that name; `returned` begins the sentence."""
+    """Refuse anything but a `rgbt.types.Sample` of that name; `returned` begins the message."""
     if not isinstance(sample, Sample):
         raise InputError(f"{returned} {described(sample)}; expected rgbt.types.Sample.")
     if sample.name != name:
@@ -123,7 +125,7 @@ def check_transform(transform: Any, sample: Sample, rng: np.random.Generator) ->
 
 
 def check_regions(regions: Any, image_hw: tuple[int, int]) -> None:
-    """Refuse a partition that is not like `rgbt.metrics.metric.Regions`."""
+    """Refuse a partition that does not behave like `rgbt.metrics.metric.Regions`."""
     members = ("name", "partition", "regions", "absent")
     check_members("metric", regions, members, {"map": ("image_hw",)})
     found = regions.map(image_hw)
@@ -143,9 +145,9 @@ def check_corruption(kind: Any) -> None:
 
 
 def watch_model(model: nn.Module, num_classes: int) -> None:
-    """Compare what a user's network returns, in its first training and evaluation pass.
+    """Check the output of a user's network in its first training and evaluation pass.
 
-    At once: whether its `forward` takes what it is called with.
+    The arguments of its `forward` are checked at once.
     """
     check_members("model", model, (), MODEL_CALLS)
     left = {True, False}
@@ -185,7 +187,7 @@ def _check_output(module: nn.Module, shape: torch.Size, found: object, num_class
 
 
 class CheckedLoss:
-    """A user's loss with all its attributes; what it first returns is compared with `Loss`."""
+    """A wrapper of a user's loss that checks the first returned value against `Loss`."""
 
     def __init__(self, loss: Any) -> None:
         check_members("loss", loss, (), LOSS_CALLS)
@@ -198,7 +200,7 @@ class CheckedLoss:
         return getattr(self._loss, key)
 
     def __call__(self, output: Output, batch: Batch, generator: torch.Generator) -> Any:
-        """As the loss."""
+        """Call the loss; check what the first call returns."""
         found = self._loss(output, batch, generator)
         if not self._is_checked:
             name = getattr(self._loss, "__name__", f"{type(self._loss).__name__}.__call__")
@@ -208,7 +210,7 @@ class CheckedLoss:
 
 
 class CheckedScheme:
-    """A user's scheme with all its attributes; its phases may name these `optimizers` alone."""
+    """A wrapper of a user's scheme whose phases may only name these `optimizers`."""
 
     def __init__(self, scheme: Any, optimizers: Collection[str]) -> None:
         check_members("scheme", scheme, (), SCHEME_CALLS)
@@ -221,7 +223,7 @@ class CheckedScheme:
         return getattr(self._scheme, key)
 
     def phases(self, batch: Any, generator_of: GeneratorOf) -> Iterator[Phase]:
-        """As the scheme."""
+        """Yield the phases of the scheme and check each one."""
         kind = f"scheme: {type(self._scheme).__name__}.phases"
         found = self._scheme.phases(batch, generator_of)
         if not hasattr(found, "__iter__") or isinstance(found, Phase | Tensor):
@@ -236,7 +238,7 @@ class CheckedScheme:
             for name in phase.optimizers:
                 if name not in self._optimizers:
                     raise InputError(
-                        f"{kind} yielded a phase of the optimizer '{name}'; expected names out of "
+                        f"{kind} yielded a phase with the optimizer '{name}'; expected one of: "
                         f"{', '.join(self._optimizers)}."
                     )
             _check_parts(f"{kind} yielded", phase.parts, dims=0)
@@ -244,13 +246,20 @@ class CheckedScheme:
 
 
 def _check_parts(returned: str, parts: object, *, dims: int) -> None:
-    """Refuse what is no mapping of named tensors of so many dimensions."""
-    what = "(P,), one value per stacked pass (loss[None] for one)" if dims else "scalars"
-    expected = f"expected a dictionary of named tensors, {what}"
+    """Refuse anything but a mapping of named tensors with this number of dimensions."""
+    what = (
+        "of shape (P,) with one value per stacked pass (loss[None] for one pass)"
+        if dims
+        else "scalars"
+    )
+    expected = f"expected a dictionary of named tensors {what}"
     if not isinstance(parts, dict) or not parts:
         raise InputError(f"{returned} {described(parts)}; {expected}.")
     for name, part in parts.items():
         if not isinstance(part, Tensor) or part.dim() != dims:
             raise InputError(f"{returned} '{name}': {described(part)}; {expected}.")
     if not any(part.requires_grad for part in parts.values()):
-        raise InputError(f"{returned} {described(parts)}, of which no part depends on the network.")
+        raise InputError(
+            f"{returned} {described(parts)}, but none of its values depends on the parameters of "
+            "the network."
+        )

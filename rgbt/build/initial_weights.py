@@ -1,4 +1,4 @@
-"""Weights from a file as the start of a network, and whether the network is fed as they were."""
+"""Start a network from a file of weights; warn if it has other inputs than the weights."""
 
 from __future__ import annotations
 
@@ -19,9 +19,10 @@ from rgbt.tracking.terminal import info
 
 
 def start_from_weights(model: nn.Module, spec: RunSpec) -> Report | None:
-    """Load what `model.weights` names and report it in a line on stderr; None for no weights.
+    """Load the weights that `model.weights` names and report this on stderr; None without weights.
 
-    A second line warns where the inputs or settings of the network are not those of the weights.
+    A second line warns if the network has other inputs or settings than the weights were trained
+    with.
 
     Raises:
         InputError: the file does not fit, or `model.fresh` without a file.
@@ -30,8 +31,8 @@ def start_from_weights(model: nn.Module, spec: RunSpec) -> Report | None:
     if source is None:
         if fresh:
             raise InputError(
-                f"model.fresh=[{','.join(fresh)}] keeps parts of a network whose weights come from "
-                "a file; name that with model.weights=..., or omit model.fresh."
+                f"model.fresh=[{','.join(fresh)}] has no effect without a file of weights. Name "
+                "the file with model.weights=..., or omit model.fresh."
             )
         return None
     report = load_weights(model, source, fresh)
@@ -48,8 +49,8 @@ def start_from_weights(model: nn.Module, spec: RunSpec) -> Report | None:
         others = [] if is_same else ["the inputs noted beside it"]
     if others:
         info(
-            f"{source} goes with {' '.join(others)}, this network with something else: its scores "
-            "are not those that the weights were trained for."
+            f"{source} was trained with {' '.join(others)}, but this network has other settings: "
+            "its scores will differ from those of the trained network."
         )
     return report
 

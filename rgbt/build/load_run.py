@@ -1,4 +1,4 @@
-"""A trained network: a finished run opened again, or a network with weights from a file."""
+"""Load a trained network from a run folder or from a file of weights."""
 
 from __future__ import annotations
 
@@ -67,15 +67,18 @@ def open_trained(
             "model=mfnet model.weights=final.pth dataset.root=/data/MFNet."
         )
     if checkpoint != "best":
-        raise InputError(f"checkpoint={checkpoint} is one of a run; name that with run=...")
+        raise InputError(
+            f"checkpoint={checkpoint} selects a checkpoint of a run, but no run is given; name "
+            "one with run=..."
+        )
     spec = specify(config)
     path = spec.weights_path
     assert path is not None, "model.weights has a value"
     session = open_session(spec, label_map)
     if session.weights is not None and session.weights.fresh:
         raise InputError(
-            f"{path} does not hold the whole network, the rest would be random: "
-            f"{session.weights.sentence()}; train it first with python -m rgbt.run."
+            f"{path} does not hold all parameters of the network, and the others would be random: "
+            f"{session.weights.sentence()}. Train the network first with python -m rgbt.run."
         )
     # Copies of a data set in other folders may hold other images.
     name = f"{spec.key}-{session.dataset.fingerprint()[:8]}"
@@ -120,8 +123,8 @@ def open_run(
     weights = folder / f"{checkpoint}.pt"
     if not weights.is_file():
         raise InputError(
-            f"{folder} has no {weights.name}: the run has not reached its first evaluation; rerun "
-            "its command to resume it"
+            f"{folder} has no {weights.name}, because the run has not reached its first "
+            "evaluation; rerun its command to resume it"
             + (", or use checkpoint=last." if (folder / "last.pt").is_file() else ".")
         )
     payload = load_checkpoint(weights)
@@ -131,8 +134,8 @@ def open_run(
         if label_map is None and trained != tuple(session.dataset.classes):
             raise InputError(
                 f"{folder} was trained with the classes {', '.join(trained)}, but "
-                f"{session.dataset.name} has {', '.join(session.dataset.classes)}; rgbt.predict "
-                "can map them with label_map=..."
+                f"{session.dataset.name} has {', '.join(session.dataset.classes)}. `rgbt predict` "
+                "can map classes with label_map=..."
             )
     restore_weights(session.model, payload["model"], weights)
     if trained_with["dataset"].get("name") == spec.dataset.plain.get("name"):
@@ -148,8 +151,8 @@ def _warn_of_other_code(folder: Path, trained_with: Mapping[str, Any]) -> None:
     if before is not None and before != now:
         modules = sorted(name for name in {*before, *now} if before.get(name) != now.get(name))
         warn(
-            f"{', '.join(modules)} changed after {folder.name} was trained; what is "
-            "computed now is not what this run made. Restore the code, or train again."
+            f"{', '.join(modules)} changed after {folder.name} was trained, so the results will "
+            "differ from those of the run. Restore the code, or train again."
         )
 
 
@@ -167,6 +170,7 @@ def _warn_of_other_splits(folder: Path, session: Session) -> None:
         return  # nothing to compare with
     if before is not None and now != before["names"]:
         warn(
-            f"the splits of {session.dataset.name} ({session.dataset.root}) are not those "
-            f"that {folder.name} was trained with: training images may be evaluated."
+            f"the splits of {session.dataset.name} ({session.dataset.root}) are not those that "
+            f"{folder.name} was trained with, so training images may be among the evaluated "
+            "images."
         )

@@ -1,4 +1,4 @@
-"""Problems that one sample or one mask shows, checked before a run starts."""
+"""Checks on one sample and one mask, made before a run starts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The components of a run are compared by their records (`rgbt.requirements`), before it starts."""
+"""Compare the records (`rgbt.requirements`) of a run's components before the run starts."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def check_requirements(components: Mapping[str, Any], plain: Mapping[str, Any]) 
     subject = _name(components[node]) + (f" with {wanted.setting}" if wanted.setting else "")
     provided = records[wanted.node].get(wanted.key)
     raise InputError(
-        f"{subject} requires {wanted.key}={_shown(wanted.value)} of the {wanted.node}, "
+        f"{subject} requires {wanted.key}={_shown(wanted.value)} of the {wanted.node}, but "
         f"{_name(components[wanted.node])} provides {wanted.key}={_shown(provided)}; "
         f"{', or '.join(advice) or f'change {node} or {wanted.node}'}."
     )

@@ -1,4 +1,4 @@
-"""The objects of a run made from its configuration."""
+"""Build the objects that every command needs from the specification of a run."""
 
 from __future__ import annotations
 
@@ -87,8 +87,9 @@ def open_session(
         fabric = Fabric(accelerator=trainer.accelerator, devices=1, precision=trainer.precision)
     except (RuntimeError, ValueError) as error:
         raise InputError(
-            f"trainer.accelerator={trainer.accelerator} with trainer.precision={trainer.precision} "
-            f"cannot be used on this machine ({str(error).splitlines()[0]})."
+            f"trainer.accelerator={trainer.accelerator} with "
+            f"trainer.precision={trainer.precision} cannot be used on this machine "
+            f"({str(error).splitlines()[0]}). Choose another accelerator or precision."
         ) from error
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(derive(spec.seed, "weights"))
@@ -103,8 +104,8 @@ def open_session(
     elif num_classes != dataset.num_classes:
         raise InputError(
             f"model.num_classes is {num_classes} but {dataset.name} has {dataset.num_classes} "
-            "classes; omit it, so that the data set decides, or let rgbt.predict map the classes "
-            "of a network that was trained on others with label_map=..."
+            "classes; omit model.num_classes to take the number from the data set. For a network "
+            "that was trained on other classes, `rgbt predict` can map them with label_map=..."
         )
     if is_own(model):
         watch_model(model, num_classes)

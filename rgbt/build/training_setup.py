@@ -1,4 +1,4 @@
-"""The objects of a training, built and checked before anything is written."""
+"""Build and check the objects of a training before anything is written."""
 
 from __future__ import annotations
 
@@ -160,14 +160,15 @@ def _report_unpublished_settings(session: Session) -> None:
     expected: object = spec.scale.pretrained and record_of(session.model).pretrained_parts
     if expected and session.weights is None:
         info(
-            "the published recipe starts from ImageNet weights, this run from random ones; name a "
-            "file with pretrained=..., or expect less than published."
+            "the published recipe starts from ImageNet weights, but this run starts from random "
+            "weights. Name a file with pretrained=..., or expect lower scores than published."
         )
     meant = spec.recipe.dataset
     if spec.scale.name == "paper" and meant != data.name:
         known = data.name in available("recipe")
         info(
-            f"sizes, batch and steps of the recipe are those for {meant}, not for {data.name}; "
+            f"the image sizes, batch size and steps of this recipe were published for {meant}, "
+            f"not for {data.name}; "
             + (f"choose recipe={data.name}, or " if known else "")
             + "set recipe.train_sizes, crop_hw, batch_size, max_steps and eval_every, then "
             f"recipe.dataset={data.name}."
@@ -177,8 +178,9 @@ def _report_unpublished_settings(session: Session) -> None:
         shared = set(data.names(picked)) & set(data.names("test"))
         if shared:
             info(
-                f"trainer.selection_split={picked}: {len(shared)} of its {len(data.names(picked))} "
-                "images are test images, so that the best checkpoint is picked on what is reported."
+                f"trainer.selection_split={picked}: {len(shared)} of its "
+                f"{len(data.names(picked))} images are test images, so the best checkpoint is "
+                "selected on images that are also reported."
             )
 
 
@@ -200,22 +202,22 @@ def _labelled(session: Session, name: str, domain: Domain) -> LabelledDataset:
         missing = found.labels.missing(listed)
         if missing and (session.loading.on_error == "raise" or len(missing) == len(listed)):
             raise InputError(
-                f"domains.{name}.labels: {folder} has no pseudo-labels of {len(missing)} of the "
-                f"{len(listed)} images of {domain.split}, such as '{missing[0]}'; predict that "
+                f"domains.{name}.labels: {folder} has no pseudo-labels for {len(missing)} of the "
+                f"{len(listed)} images of {domain.split}, such as '{missing[0]}'. Predict that "
                 "split."
             )
         if found.labels.manifest["kept"] == 0:
             raise InputError(
-                f"domains.{name}.labels: {folder} holds no label of any pixel, its threshold of "
-                f"{found.labels.manifest['threshold']:g} was above every confidence; predict with "
-                "a lower one."
+                f"domains.{name}.labels: {folder} does not label any pixel, because its threshold "
+                f"of {found.labels.manifest['threshold']:g} was above every confidence. Predict "
+                "again with a lower threshold."
             )
         made_on = found.labels.manifest["fingerprint"]
         if domain.labels.startswith("experiment:") and made_on != session.dataset.fingerprint():
             raise InputError(
-                f"{folder} was predicted on other files of {session.dataset.name} than those of "
-                f"{session.dataset.root}; give the runs another folder (runs_dir=...), or remove "
-                "that one to predict again."
+                f"{folder} was predicted on other files of {session.dataset.name} than those in "
+                f"{session.dataset.root}. Choose another folder of runs (runs_dir=...), or remove "
+                "the pseudo-labels to predict again."
             )
         return found
     return Unlabelled(session.dataset) if domain.labels == NONE else session.dataset
@@ -227,15 +229,15 @@ def _check_labelled(session: Session, name: str, domain: Domain) -> None:
         return
     if first_readable(session, domain.split).label is None:
         raise InputError(
-            f"domains.{name}.labels=given, but {session.dataset.name} has no labels of "
-            f"{domain.split}; name pseudo-labels (experiment:thermal_teacher/best.pt), or set it "
+            f"domains.{name}.labels=given, but {session.dataset.name} has no labels for "
+            f"{domain.split}. Name pseudo-labels (experiment:thermal_teacher/best.pt), or set it "
             "to none."
         )
     shared = set(session.dataset.names(domain.split)) & set(session.dataset.names("test"))
     if shared:
         info(
             f"domains.{name}.split={domain.split}: {len(shared)} of its images are test images, "
-            "so that the test says nothing of new ones."
+            "so test scores will not measure performance on unseen images."
         )
 
 

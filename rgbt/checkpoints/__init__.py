@@ -1,4 +1,4 @@
-"""Files of tensors: written with a digest, read as data within a budget, never executed.
+"""Read and write files of tensors within a memory budget, without executing their content.
 
-`stored.read_stored` -> the value of a file, ours or foreign; `stored.save` writes one of ours.
+`stored.read_torch_file` reads any supported file; `stored.save` writes one of rgbt with a digest.
 """

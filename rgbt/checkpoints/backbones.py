@@ -1,4 +1,4 @@
-"""ImageNet backbones: how each file is recognised, and how the networks take it.
+"""Recognise files of ImageNet backbones, and map them to the networks.
 
 Swin Transformers (the original files, and the pickles that detectron2 reads), MiT (``mit_b0.pth``
 to ``mit_b5.pth``), ResNets of torchvision, and the DeepLab v2 start of AdaptSegNet and ADVENT.
@@ -89,9 +89,9 @@ def _swin_rule(family: str, model: nn.Module, facts: Facts) -> Rule | None:
     own = _window(size_at(shapes_of(model.state_dict()), f"{BRANCHES[0]}{TABLE}"))
     if own != facts.window and facts.window is not None:
         raise InputError(
-            f"{facts.title} with windows of {facts.window} x {facts.window} tokens, while those of "
-            f"this network are {own} x {own} and their bias tables cannot be exchanged; take the "
-            "file for windows of that size (7 x 7: ImageNet at 224 pixels)."
+            f"{facts.title} with windows of {facts.window} x {facts.window} tokens, while those "
+            f"of this network are {own} x {own} and their bias tables cannot be exchanged; use "
+            "the file for windows of that size (7 x 7: ImageNet at 224 pixels)."
         )
     return Rule(
         source=lambda entry: entry.removeprefix(BRANCHES[0]).removeprefix(BRANCHES[1]),
@@ -104,7 +104,7 @@ def _swin_rule(family: str, model: nn.Module, facts: Facts) -> Rule | None:
         leftover=(
             (r".*\.relative_position_index$", DERIVED),
             (r".*\.attn_mask$", DERIVED),
-            (r"norm\.", "normalises ImageNet's features, of which the decoder takes others"),
+            (r"norm\.", "normalises ImageNet's last features, which the decoder does not use"),
             (r"head\.", CLASSIFIER),
         ),
         stems=("backbone.THR_branch.patch_embed.proj.weight",),

@@ -1,4 +1,4 @@
-"""How a kind of file is described: how it is recognised, and where each of its names belongs."""
+"""Types that describe a kind of file: how it is recognised, and where each of its names belongs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rgbt.checkpoints.read import Contents
 Shapes = Mapping[str, tuple[int, ...]]
 Overrides = tuple[str, ...]
 Reasons = tuple[tuple[str, str], ...]
-"""(regular expression at the beginning of a name, why); the first that fits counts."""
+"""(regular expression for the beginning of a name, reason); the first match counts."""
 
 NOT_IN_FILE = "not part of the ImageNet network"
 DERIVED = "rebuilt from the sizes of the network"
@@ -23,7 +23,7 @@ COUNTER = "num_batches_tracked"
 
 @dataclass(frozen=True)
 class Facts:
-    """What a file is, read off its names and shapes.
+    """Description of a file, derived from its names and shapes.
 
     Attributes:
         layout: name of the layout.
@@ -34,10 +34,10 @@ class Facts:
         prefix: before every name that belongs to the network.
         window: side of the attention windows in tokens, where there are such.
         fits: command-line overrides of the networks that the file fits; the first is the usual.
-        convention: overrides of what the release does and its weights do not tell: how the
-            network is fed and evaluated.
-        inputs: how the network was fed, as the file itself says it; None where it does not.
-        remarks: what whoever uses the file should know.
+        convention: overrides for the release's inputs and evaluation, which its weights do not
+            show.
+        inputs: inputs of the network as noted in the file; None without a note.
+        remarks: remarks for the user of the file.
     """
 
     layout: str
@@ -54,7 +54,7 @@ class Facts:
 
     @property
     def title(self) -> str:
-        """All in words."""
+        """Layout, size and classes in words."""
         classes = "" if self.classes is None else f"{self.classes} classes"
         details = ", ".join(filter(None, (self.size, classes)))
         return f"{self.what} ({details})" if details else self.what

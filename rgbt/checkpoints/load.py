@@ -1,4 +1,4 @@
-"""Weights from a file into a network, completely or not at all."""
+"""Load weights from a file into a network, completely or not at all."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from rgbt.checks import InputError, not_finite
 def load_weights(model: nn.Module, path: Path | str, fresh: tuple[str, ...] = ()) -> Report:
     """Set the weights of a network from a file, ours or a released one.
 
-    Every name of the file must be used or expected to be left over, every entry of the network set
-    or expected not to be in such a file; otherwise nothing is changed.
+    Every name of the file must be used or known to be unused. Every entry of the network must be
+    set or known to be absent from such a file. Otherwise nothing is changed.
 
     Args:
         model: the network; its class says which layouts fit.
@@ -40,8 +40,8 @@ def load_weights(model: nn.Module, path: Path | str, fresh: tuple[str, ...] = ()
     if broken:
         raise InputError(
             f"{contents.path}: '{broken[0]}' holds NaN or infinity ({len(broken)} of "
-            f"{len(plan.values)} tensors do): the training that wrote it failed; give a checkpoint "
-            "of an earlier step."
+            f"{len(plan.values)} tensors do), because the training that wrote it diverged. Use a "
+            "checkpoint of an earlier step."
         )
     with torch.no_grad():
         for entry, name in plan.values.items():
@@ -95,11 +95,13 @@ def _another_network(model: nn.Module, contents: Contents, facts: Facts) -> str:
     family = family_of(type(model))
     if not family:
         return (
-            f"{contents.path} ({facts.title}) has other names than {type(model).__name__}, which "
-            "is none of the networks of rgbt.models; such a network takes files of its own runs."
+            f"{contents.path} ({facts.title}) has other parameter names than "
+            f"{type(model).__name__}. A network that is not part of rgbt.models can only load "
+            "files of its own runs."
         )
     fits = " or ".join(" ".join(each) for each in facts.fits)
-    advice = f"it fits {fits}" if fits else "rgbt weights inspect shows its names"
+    advice = f"it fits {fits}" if fits else "`rgbt weights inspect` shows its names"
     return (
-        f"{contents.path} is no file for {FAMILIES.get(family, family)}: {facts.title}; {advice}."
+        f"{contents.path} ({facts.title}) cannot be loaded into {FAMILIES.get(family, family)}; "
+        f"{advice}."
     )

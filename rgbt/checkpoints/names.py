@@ -1,4 +1,4 @@
-"""The names that a pickle may mention besides those that are answered (`pickles.BUILDERS`)."""
+"""Names that a pickle may contain in addition to those that rgbt builds (`pickles.BUILDERS`)."""
 
 from __future__ import annotations
 
@@ -63,4 +63,4 @@ STAND_INS = frozenset(
         *("pathlib.PureWindowsPath", "pathlib._local.PosixPath", "pathlib._local.WindowsPath"),
     }
 )
-"""Classes of settings, known by name; an `Inert` takes the place of their objects."""
+"""Classes of settings, known by name; their objects are read as `Inert`."""

@@ -1,4 +1,4 @@
-"""Files of whole networks: those of the releases, and those that this project wrote.
+"""Recognise files of whole networks, from the releases and from rgbt, and map their names.
 
 The names in a release's file are ours, but for its prefix and a few constants: each rule says what
 is left over, and each `released_*` writes a network's entries under the released names.
@@ -63,7 +63,7 @@ def _recognise_mask2former(contents: Contents) -> Facts | None:
     shapes = {name.removeprefix(prefix): s for name, s in shapes_of(contents.tensors).items()}
     rows = size_at(shapes, CLASS_WEIGHT)
     size = swin_size(shapes, RGB)
-    # What the configuration in the file says and the weights do not.
+    # Settings that only the configuration in the file shows.
     settings = {key.split("MODEL.")[-1]: value for key, value in contents.settings.items()}
     joined = settings.get("FUSION.AGGREGATION")
     fusion = () if joined is None else (f"model.fusion={str(joined).lower()}",)
@@ -131,7 +131,7 @@ CMX_TEMPORAL = ("model/inputs=temporal",)
 
 
 def _recognise_cmx(contents: Contents) -> Facts | None:
-    """Both streams under `backbone.`; `voting.`, never used, tells the releases apart."""
+    """Both streams under `backbone.`; the unused `voting.` distinguishes the releases."""
     shapes = shapes_of(contents.tensors)
     if not has_parts(shapes, "backbone.patch_embed", "backbone.extra_patch_embed", "backbone.F"):
         return None
@@ -202,7 +202,7 @@ def _recognise_mfnet(contents: Contents) -> Facts | None:
 
 HEATNET_PREFIX = "trgb_segnet."
 HEATNET_WRAPPED = "module."
-"""What the released files carry before every name."""
+"""Prefix of every name in the released files."""
 
 HEATNET_STEMS = {1: "heatnet_thermal", 3: "heatnet_rgb", 4: "heatnet_early"}
 """Channels of a single stem -> configuration."""
@@ -252,14 +252,14 @@ RELEASES = {
     "mfnet": Layout(_recognise_mfnet, _own_names()),
     "heatnet": Layout(
         _recognise_heatnet,
-        _own_names((r"critics\.", "a discriminator, which is a network of its own here")),
+        _own_names((r"critics\.", "a discriminator, which is a separate network here")),
     ),
 }
 """By name."""
 
 
 def _recognise_own(contents: Contents) -> Facts | None:
-    """A file that says of itself that it is ours; the network is recognised by its names."""
+    """A file with a note that rgbt wrote it; the network is recognised by its names."""
     if not contents.ours:
         return None
     guesses = (layout.recognise(contents) for layout in RELEASES.values())

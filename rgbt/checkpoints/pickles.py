@@ -1,7 +1,8 @@
-"""Pickles as data: Python's unpickler with a table of names in the place of its imports.
+"""Read pickles as data with Python's unpickler and a fixed table of names instead of imports.
 
-A name in a file is never imported, looked up or called. It stays a `Name`; calling it gives what
-one of `BUILDERS` makes of the arguments, or an `Inert`. Others are refused where they occur.
+A name in a file is never imported, looked up or called. It becomes a `Name`. A call of a known
+name returns what its entry in `BUILDERS` makes of the arguments, or an `Inert`. Unknown names are
+refused.
 
 Python's unpickler in C is not used, because a memo index of 2^31, in a file of ten bytes, makes it
 allocate gigabytes. Neither is torch.load, which takes sizes of storages from the pickle.
@@ -38,38 +39,36 @@ SIZED = (str, bytes, bytearray, list, tuple, dict, set, frozenset)
 
 
 class RefusedError(Exception):
-    """A file wants what it does not get; the message continues the file's name."""
+    """Content that is refused; the message follows the file name."""
 
     @classmethod
     def code(cls, name: str) -> RefusedError:
         """For a name outside the known ones."""
         return cls(
-            f"asks for {printable(name)}, which would run code on reading, so nothing of it was "
-            "read; give a file that holds tensors and plain values only, such as a saved "
-            "state_dict()."
+            f"refers to {printable(name)}, which would execute code while the file is read. The "
+            "file was not read; give one that holds only tensors and plain values, such as a "
+            "saved state_dict()."
         )
 
     @classmethod
     def greedy(cls) -> RefusedError:
-        """For content that would grow beyond all proportion."""
-        return cls(
-            "would take far more memory than it has bytes; it is damaged, or made to do harm."
-        )
+        """The error for content that would need far more memory than its size."""
+        return cls("would need far more memory than its size; it is damaged or malicious.")
 
 
 class DamagedError(Exception):
-    """A file that is cut short, overwritten, or not what its beginning says."""
+    """A file that is truncated, overwritten, or of another format than its first bytes indicate."""
 
 
 DAMAGE = (
     *(DamagedError, ValueError, TypeError, LookupError, AttributeError, ArithmeticError),
     *(RuntimeError, MemoryError, RecursionError, EOFError, struct.error, pickle.UnpicklingError),
 )
-"""What overwritten or invented bytes lead to, wherever they are made sense of."""
+"""Exceptions that damaged or invented bytes can cause."""
 
 
 def printable(text: str, limit: int = 100) -> str:
-    """`text` from a file, for a terminal: no control characters, not endless."""
+    """`text` from a file for a terminal, without control characters and shortened."""
     shown = text if text.isprintable() else text.encode("unicode_escape").decode("ascii")
     return shown if len(shown) <= limit else f"{shown[: limit - 3]}..."
 
@@ -82,10 +81,10 @@ class Name:
 
 
 class Inert(dict[Any, Any]):
-    """Stands for an object of a configuration class: its keys and attributes, and nothing else."""
+    """The keys and attributes of an object of a configuration class."""
 
     def extend(self, items: object) -> None:
-        """Elements of lists of configurations are of no use here."""
+        """Ignore elements of lists of configurations."""
 
     append = extend
 
@@ -160,7 +159,7 @@ class _Unpickler(PYTHONS):  # type: ignore[misc]
             raise RefusedError.code(callee.full)
 
     def build(self) -> None:
-        """BUILD: hand a state to the value below it; few take one."""
+        """BUILD: set the state of the value below it; few values accept one."""
         state, target = self.stack.pop(), self.stack[-1]
         self.spend(state if type(state) is tuple else (state,))
         if type(target) is Inert:
@@ -174,7 +173,7 @@ class _Unpickler(PYTHONS):  # type: ignore[misc]
             raise TypeError(f"{type(target).__name__} takes no state")
 
     def spend(self, values: Iterable[Any]) -> None:
-        """Count what is about to be copied, which a file may ask for over and over."""
+        """Count the bytes to copy, because a file may request the same copy many times."""
         self.budget -= sum(len(value) for value in values if isinstance(value, SIZED))
         if self.budget < 0:
             raise RefusedError.greedy()
@@ -234,7 +233,7 @@ PLAIN_KEYS = (str, int, float, bool, bytes, type(None), Name)
 
 
 def _checked(key: Any) -> Any:
-    """`key` where hashing and printing it takes no time: nested tuples can take for ever."""
+    """`key`, if it is plain: hashing or printing nested tuples may take unlimited time."""
     inner = key if type(key) is tuple else (key,)
     if not all(type(each) in PLAIN_KEYS for each in inner):
         raise TypeError("a key must be plain")
@@ -287,7 +286,7 @@ def _parameter(data: Any, *_ignored: Any) -> Tensor:
 
 def _number_type(code: Any, *_ignored: Any) -> NumberType:
     if type(code) is not str or not re.fullmatch(r"[<>=|]?([iu][1248]|f[248]|b1)", code):
-        raise RefusedError("holds an array of something else than plain numbers.")
+        raise RefusedError("holds an array whose elements are not plain numbers.")
     return NumberType(np.dtype(code))
 
 

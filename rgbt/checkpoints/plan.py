@@ -1,4 +1,4 @@
-"""Where each tensor of a file goes, and what is left on either side."""
+"""Assign the tensors of a file to the entries of a network, and list what does not fit."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ NAMED_FRESH = "named in model.fresh"
 
 @dataclass
 class Plan:
-    """What a file does to a network.
+    """The effect of a file on a network.
 
     Attributes:
         values: entry of the network -> name in the file.
         zeros: counters of batch normalisation that the file lacks; they begin at 0.
         fresh: entry that keeps its initial value -> why.
         leftover: name in the file without a place -> why.
-        missing: entries that the file should hold and does not.
+        missing: entries that the file should hold but does not.
         unexpected: names in the file that nothing explains.
         unfit: entry -> how the file's tensor differs in shape or kind.
-        torn: pairs of entries that are one tensor in the network and two different in the file.
+        torn: pairs of entries that share one tensor in the network but differ in the file.
     """
 
     values: dict[str, str] = field(default_factory=dict)
@@ -120,8 +120,8 @@ def check_parts(parts: tuple[str, ...], state: Mapping[str, Tensor]) -> None:
             close = nearest(part, known).split("known: ")[0].rstrip("? ")
             hint = f" ({close}?)" if close else ""
             raise InputError(
-                f"model.fresh: the network has no part '{part}'{hint}; a part is named by the "
-                "first words of its entries, such as they stand in its state_dict()."
+                f"model.fresh: the network has no part '{part}'{hint}; name a part by the "
+                "beginning of its names in state_dict()."
             )
 
 
@@ -151,7 +151,7 @@ def _shape(tensor: Tensor) -> str:
 def _torn(
     state: Mapping[str, Tensor], tensors: Mapping[str, Tensor], values: Mapping[str, str]
 ) -> Iterator[tuple[str, str]]:
-    """Entries that are one parameter under two names and would get different values."""
+    """Entries that share one parameter but would get different values."""
     shared: dict[int, list[str]] = defaultdict(list)
     for entry in values:
         shared[id(state[entry])].append(entry)

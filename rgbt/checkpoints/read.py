@@ -1,4 +1,4 @@
-"""Files of weights as names and tensors, whatever container they come in."""
+"""Read names and tensors from files of weights in all supported formats."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from typing import Any
 from torch import Tensor
 
 from rgbt.checkpoints.pickles import DamagedError, RefusedError, printable
-from rgbt.checkpoints.stored import beginning_of, explained, read_stored
+from rgbt.checkpoints.stored import beginning_of, explained, read_torch_file
 
 WRAPPERS = ("state_dict", "model", "module")
 """Keys under which releases put their weights."""
 
 PREFIXES = ("module.", "_orig_mod.")
-"""What DataParallel and torch.compile put before every name."""
+"""Prefixes that DataParallel and torch.compile add to every name."""
 
 OURS = (
     *({"model", "others", "optimizers", "state"}, {"model", "optimizers", "state"}),
@@ -26,7 +26,7 @@ OURS = (
 and of the best one."""
 
 NOTE = "rgbt"
-"""Key of what an export says about itself."""
+"""Key of the note in an export."""
 
 PLAIN = (str, int, float, bool)
 
@@ -41,10 +41,10 @@ class Contents:
         tensors: by name, views of the file where possible; prefixes of wrappers are taken off.
         where: key that the tensors were found under; "" where they are all there is.
         prefix: that was taken off every name.
-        others: names of what else lies beside the tensors.
+        others: names of other entries of the file.
         settings: values of configuration objects in the file, by dotted key.
         ours: written by this project, with the names of its network.
-        note: what an export says about itself.
+        note: the note of an export.
     """
 
     path: Path
@@ -72,7 +72,7 @@ def read(path: Path) -> Contents:
         # A header of at most 100 MB, the limit of safetensors; a pickle that begins so says more.
         if beginning[8:9] == b"{" and int.from_bytes(beginning[:8], "little") <= 100_000_000:
             return _read_safetensors(path)
-        value, container = read_stored(path)
+        value, container = read_torch_file(path)
         return _unwrapped(path, value, container)
 
 
@@ -92,7 +92,7 @@ def _read_safetensors(path: Path) -> Contents:
 
 
 def _unwrapped(path: Path, value: Any, container: str) -> Contents:
-    """The tensors in what a file holds: they lie at the top, or under one known key."""
+    """The tensors of a file, which are at the top level or under one known key."""
     if type(value) is not dict:
         kind = "one tensor" if isinstance(value, Tensor) else f"a {type(value).__name__}"
         raise RefusedError(
@@ -111,7 +111,7 @@ def _unwrapped(path: Path, value: Any, container: str) -> Contents:
     tensors = {name: found for name, found in state.items() if isinstance(found, Tensor)}
     outside = [key for key in value if key != where] if inner else []
     inside = [key for key in state if key not in tensors]
-    # Texts by name; anything else that a stranger's file may hold there is left alone.
+    # Texts by name; other values in the file are ignored.
     own = value.get(NOTE) if inner else None
     items = own.items() if isinstance(own, dict) else ()
     contents = Contents(
@@ -142,7 +142,7 @@ def _without_prefixes(contents: Contents, tensors: dict[str, Tensor]) -> Content
         tensors = {name.removeprefix(found): tensor for name, tensor in tensors.items()}
         prefix += found
         if not all(tensors):
-            raise RefusedError("has names without a word in them.")
+            raise RefusedError("has empty names of tensors.")
     return replace(contents, tensors=tensors, prefix=prefix)
 
 

@@ -1,4 +1,4 @@
-"""What a file of weights is, by its names and shapes."""
+"""Recognise files of weights by their names and shapes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rgbt.checkpoints.read import Contents
 LAYOUTS: Mapping[str, Layout] = MappingProxyType(NETWORKS | BACKBONES)
 """By name, in the order they are tried: whole networks before backbones."""
 
-UNKNOWN = Facts("unknown", "file of weights in no layout known here")
+UNKNOWN = Facts("unknown", "file of weights in an unknown layout")
 
 
 def recognise(contents: Contents) -> Facts:
@@ -24,9 +24,9 @@ def recognise(contents: Contents) -> Facts:
     found = (layout.recognise(contents) for layout in LAYOUTS.values())
     facts = next((each for each in found if each is not None), UNKNOWN)
     if contents.note:
-        # How it is fed is in the note and does not follow from the layout.
+        # The inputs are in the note and do not follow from the layout.
         origin = " ".join(filter(None, map(contents.note.get, ("run", "checkpoint"))))
-        noted = f"exported from {printable(origin or 'this project')}, fed as its note says"
+        noted = f"exported from {printable(origin or 'rgbt')}, with the inputs of its note"
         return replace(
             facts,
             fits=tuple(each[:1] for each in facts.fits),

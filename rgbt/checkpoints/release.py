@@ -1,4 +1,4 @@
-"""Weights written so that the authors' code, or anybody's, can load them."""
+"""Export weights in the formats of the released code and as safetensors."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from rgbt.files.atomic import replacing
 FORMATS = ("safetensors", "released", "released_temporal")
 
 Note = Mapping[str, str]
-"""What an export says about itself: which network, how it is fed, which run."""
+"""The note of an export: network, inputs and run."""
 
 
 Container = Callable[[Mapping[str, Tensor], Note], Any]
@@ -37,7 +37,7 @@ RELEASED: Mapping[str, Container] = {
     "mfnet": lambda state, _: OrderedDict(state),
     "pspnet": lambda state, _: networks.released_heatnet(state),
 }
-"""Family -> what its release's torch.load gives."""
+"""Family -> value that torch.load returns for its released files."""
 
 CONVENTIONS: Mapping[tuple[str, str], tuple[str, ...]] = {
     ("released", "mask2former"): ("model/inputs=crm", "model.fusion=max"),
@@ -51,24 +51,24 @@ CONVENTIONS: Mapping[tuple[str, str], tuple[str, ...]] = {
 
 SAID: Mapping[tuple[str, str], str] = {
     ("released", "pspnet"): (
-        "no name under module.critics. is written, because a discriminator is not part of this "
-        "network; HeatNet's code loads the file with no_conf, without its critics"
+        "the file has no entries under module.critics., because a discriminator is not part of "
+        "this network; HeatNet's code loads it with no_conf, without critics"
     ),
     ("released_temporal", "cmx"): (
-        "voting.weight and voting.bias are zeros, because nothing ever uses them"
+        "voting.weight and voting.bias are zeros, because they are never used"
     ),
 }
-"""What to tell about a format and a family."""
+"""The remark about a format and a family."""
 
 
 def payload(layout: str, family: str, state: Mapping[str, Tensor], note: Note) -> Any:
-    """What torch.save writes for a released layout.
+    """The value that torch.save writes for a released layout.
 
     Args:
         layout: "released", or "released_temporal" for CMX as the temporal paper uses it.
         family: of the network.
         state: its entries.
-        note: goes in where the container has room for it.
+        note: stored if the container supports it.
 
     Raises:
         InputError: there is no such layout for this family.
@@ -76,14 +76,14 @@ def payload(layout: str, family: str, state: Mapping[str, Tensor], note: Note) -
     if layout == "released_temporal":
         if family != "cmx":
             raise InputError(
-                f"format={layout} is the temporal release's CMX; this network is "
-                f"{FAMILIES.get(family, 'none of rgbt.models')}; take another format."
+                f"format={layout} is for CMX of the temporal release, but this network is "
+                f"{FAMILIES.get(family, 'not part of rgbt.models')}. Choose another format."
             )
         return networks.released_temporal(state)
     if family not in RELEASED:
         raise InputError(
-            f"there is no release of {FAMILIES.get(family, 'this network')} whose layout could be "
-            "written; take format=safetensors."
+            f"no released format exists for {FAMILIES.get(family, 'this network')}; use "
+            "format=safetensors."
         )
     return RELEASED[family](state, note)
 
@@ -98,17 +98,17 @@ def save(
         layout: one of `FORMATS`.
         family: of the network, "" for one from elsewhere.
         state: its entries.
-        note: what the file says about itself.
+        note: the note of the file.
 
     Returns:
-        a remark on what was written, if there is one to make.
+        a remark about the file, or none.
 
     Raises:
         InputError: the file exists, the format is unknown or does not fit the network.
     """
     check_choice("format", layout, FORMATS)
     if path.exists():
-        raise InputError(f"out={path} exists already; remove it or name another file.")
+        raise InputError(f"out={path} already exists; remove it or choose another file name.")
     content = None if layout == "safetensors" else payload(layout, family, state, note)
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as file:

@@ -1,4 +1,4 @@
-"""What a file of weights is, and what was or would be done with it, in words."""
+"""Describe a file of weights, and report which entries of a network it sets."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from rgbt.checkpoints.plan import Plan
 from rgbt.checkpoints.read import Contents
 
 ANOTHER_SIZE = 0.05
-"""Share of entries that do not fit, above which the network is of another size than the file."""
+"""Share of entries that do not fit above which the network is assumed to have another size."""
 
 
 @dataclass(frozen=True)
 class Report:
-    """What was set from a file.
+    """The entries that were set from a file.
 
     Attributes:
         path: of the file.
@@ -32,7 +32,7 @@ class Report:
         num_zeros: counters that the file lacks and that begin at 0.
         fresh: why entries keep their initial values -> how many.
         leftover: why names of the file have no place -> how many.
-        remarks: what else one should know.
+        remarks: further remarks for the user.
     """
 
     path: Path
@@ -46,14 +46,14 @@ class Report:
     remarks: tuple[str, ...]
 
     def sentence(self) -> str:
-        """All in one line."""
+        """All counts in one line."""
         parts = [f"{self.num_set} of {self.num_entries} entries set"]
         if self.num_zeros:
             parts.append(f"{self.num_zeros} counters of batch normalisation begin at 0")
         if self.fresh:
             parts.append(f"fresh: {_reasons(self.fresh)}")
         if self.leftover:
-            parts.append(f"left over in the file: {_reasons(self.leftover)}")
+            parts.append(f"unused entries of the file: {_reasons(self.leftover)}")
         return f"weights of {self.path}, {self.facts.title}: {'; '.join([*parts, *self.remarks])}"
 
 
@@ -68,12 +68,12 @@ def _reasons(counts: Mapping[str, int]) -> str:
 
 
 def refusal(path: Path, facts: Facts, plan: Plan, family: str, num_entries: int) -> str:
-    """Why a file does not fit a network: what lacks, what is too much, what differs."""
+    """Why a file does not fit a network: missing, unexpected and different entries."""
     parts = [
-        _some(plan.missing, "of the network not in the file"),
-        _some(plan.unexpected, "of the file without a place"),
+        _some(plan.missing, "of the network missing from the file"),
+        _some(plan.unexpected, "of the file unknown to the network"),
         _some(_unfit(plan), "of another shape or kind"),
-        _some(_torn(plan), "of the network that are one tensor there and differ in the file"),
+        _some(_torn(plan), "that share one tensor in the network but differ in the file"),
     ]
     return (
         f"{path} ({facts.title}) does not fit this network: {', '.join(filter(None, parts))}"
@@ -105,16 +105,16 @@ def _hint(facts: Facts, plan: Plan, family: str, num_entries: int) -> str:
     if plan.unfit and by_class and not (plan.missing or plan.unexpected):
         trained = "" if facts.classes is None else f" (the file has {facts.classes})"
         return (
-            f"; only what depends on the number of classes{trained} differs, start that anew with "
-            f"'model.fresh=[{','.join(parts)}]'."
+            f". Only parts that depend on the number of classes{trained} differ; initialise them "
+            f"at random with 'model.fresh=[{','.join(parts)}]'."
         )
     if plan.torn:
-        return "; build the network as it was trained, such as with model.share_start=4."
+        return ". Build the network as it was trained, for example with model.share_start=4."
     wrong = len(plan.missing) + len(plan.unfit)
     if wrong > ANOTHER_SIZE * num_entries and facts.fits:
-        return f"; the file fits {' '.join(facts.fits[0])}."
+        return f". The file fits {' '.join(facts.fits[0])}."
     if wrong and not plan.unexpected:
-        return "; parts named in 'model.fresh=[...]' keep their initial values."
+        return ". Name parts in 'model.fresh=[...]' to keep their initial values."
     return "."
 
 
@@ -128,7 +128,7 @@ MILLION = 1e6
 
 
 def count_parameters(tensors: Mapping[str, Tensor]) -> int:
-    """Numbers that were trained; what lies under two names counts once."""
+    """Number of trained values; a tensor under two names counts once."""
     trained = {
         (tensor.data_ptr() or name, tensor.shape): tensor.numel()
         for name, tensor in tensors.items()
@@ -138,12 +138,12 @@ def count_parameters(tensors: Mapping[str, Tensor]) -> int:
 
 
 def facts_view(contents: Contents, facts: Facts) -> RenderableType:
-    """What the file is, line by line."""
+    """The description of the file, as lines."""
     tensors = contents.tensors.values()
     kinds = sorted({str(tensor.dtype).removeprefix("torch.") for tensor in tensors})
     size = contents.path.stat().st_size / MILLION
     where = f", under '{contents.where}'" if contents.where else ""
-    taken = f", '{contents.prefix}' taken off every name" if contents.prefix else ""
+    taken = f", prefix '{contents.prefix}' removed from every name" if contents.prefix else ""
     parameters = count_parameters(contents.tensors)
     notes = sorted(contents.note)
     lines = [
@@ -168,14 +168,14 @@ PLAN_HEADER = ("", "tensors", "why", "such as")
 
 
 def plan_rows(plan: Plan) -> tuple[tuple[str, str, str, str], ...]:
-    """What would happen to a network, one row per reason, columns as in `PLAN_HEADER`."""
+    """The effect on a network, one row per reason, columns as in `PLAN_HEADER`."""
     rows: list[tuple[str, str, Iterable[str]]] = [
         ("set", "", [entry for entry in plan.values if entry not in plan.unfit]),
         ("begin at 0", "counters that the file lacks", plan.zeros),
-        *(("stay fresh", why, names) for why, names in _by_reason(plan.fresh)),
-        *(("left over", why, names) for why, names in _by_reason(plan.leftover)),
-        ("MISSING", "the network has them, the file does not", plan.missing),
-        ("UNEXPECTED", "the file has them, the network does not", plan.unexpected),
+        *(("keep initial values", why, names) for why, names in _by_reason(plan.fresh)),
+        *(("unused", why, names) for why, names in _by_reason(plan.leftover)),
+        ("MISSING", "in the network, but not in the file", plan.missing),
+        ("UNEXPECTED", "in the file, but not in the network", plan.unexpected),
         ("DIFFERENT", "of another shape or kind", _unfit(plan)),
         ("TORN", "one tensor in the network, two in the file", _torn(plan)),
     ]

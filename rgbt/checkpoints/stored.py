@@ -1,6 +1,6 @@
-"""One reader for all files of tensors, and the writer of ours.
+"""Read all files of tensors, and write those of rgbt.
 
-Whatever a file holds, reading it gives plain values and tensors or one sentence.
+Reading returns plain values and tensors, or raises an error with one message.
 """
 
 from __future__ import annotations
@@ -27,30 +27,30 @@ ZIP = "torch.save"
 
 OTHERS = {
     (b"version https://git-lfs",): (
-        "is a Git LFS pointer, not the file it points to; fetch that (git lfs pull)."
+        "is a Git LFS pointer and not the file itself; download the file with git lfs pull."
     ),
     (b"<!doctype", b"<html", b"<?xml", b"<head"): (
-        "is a web page, probably of the host's download button; download it again."
+        "is a web page, probably the download page of the host; download the file itself."
     ),
     (b"\x1f\x8b", b"bzh", b"\xfd7zxz", b"7z\xbc\xaf", b"rar!"): (
         "is a compressed archive; unpack it and name the file of weights."
     ),
 }
-"""First bytes, in lower case, of what is often saved or downloaded in the place of weights."""
+"""First bytes, in lower case, of files that are often downloaded by mistake instead of weights."""
 
 PLAIN = (str, int, float, bool, type(None))
 DEPTH = 20
-"""Levels of containers in a value of ours; state_dict() of optimisers have four."""
+"""Levels of containers in a value that rgbt writes; state_dict() of optimizers have four."""
 
 
 @contextmanager
 def explained(path: Path, kind: str, advice: str) -> Iterator[None]:
-    """Turn what is wrong with the content of a file into one sentence.
+    """Turn errors in the content of a file into an InputError.
 
     Args:
         path: of the file.
         kind: what it was read as: "a file of weights".
-        advice: what to do about a damaged one: "copy or download it again".
+        advice: what to do if the file is damaged: "copy or download it again".
 
     Raises:
         InputError: refused or damaged.
@@ -63,12 +63,12 @@ def explained(path: Path, kind: str, advice: str) -> Iterator[None]:
         raise InputError(f"{path} {refusal}") from refusal
     except DAMAGE as damage:
         raise InputError(
-            f"{path} cannot be read as {kind}: it is cut short, damaged, or of another kind; "
+            f"{path} cannot be read as {kind}: it is truncated, damaged or of another format; "
             f"{advice}."
         ) from damage
 
 
-def read_stored(path: Path) -> tuple[Any, str]:
+def read_torch_file(path: Path) -> tuple[Any, str]:
     """The value of a file of torch.save or pickle, and the name of its format.
 
     Objects of known classes of configurations are `pickles.Inert`.
@@ -84,10 +84,11 @@ def read_stored(path: Path) -> tuple[Any, str]:
         if beginning.lstrip().lower().startswith(others):
             raise RefusedError(what)
     if beginning[257:262] == b"ustar":
-        raise RefusedError("is a tar archive; unpack it, or save it anew with torch 1.6 or later.")
+        raise RefusedError("is a tar archive; unpack it, or save it again with torch 1.6 or later.")
     if not beginning.startswith((b"\x80", b"(", b"}", b"c", b"]")):
         raise RefusedError(
-            "is no file of weights; read are torch.save, pickles of arrays or tensors, safetensors."
+            "is not a file of weights. Supported formats: torch.save, pickles of arrays or "
+            "tensors, safetensors."
         )
     return read_pickles(mapped(path))
 
@@ -99,9 +100,9 @@ def beginning_of(path: Path) -> bytes:
         InputError: there is no such file, or nothing in it.
     """
     if path.is_dir():
-        raise InputError(f"{path} is a folder; name a file of weights in it.")
+        raise InputError(f"{path} is a folder; name a file of weights instead.")
     if not path.is_file():
-        raise InputError(f"{path}: there is no such file of weights.")
+        raise InputError(f"the file of weights {path} does not exist.")
     with path.open("rb") as file:
         beginning = file.read(512)
     if not beginning:
@@ -110,10 +111,10 @@ def beginning_of(path: Path) -> bytes:
 
 
 def plain(value: Any, num_bytes: int) -> Any:
-    """A value of ours with its tensors copied out of the file.
+    """A value that rgbt wrote, with its tensors copied from the file.
 
     Args:
-        value: see `read_stored`.
+        value: see `read_torch_file`.
         num_bytes: size of the file, which bounds what all tensors together may take.
 
     Raises:
@@ -150,7 +151,7 @@ def plain(value: Any, num_bytes: int) -> Any:
 
 
 class _Hashing:
-    """Hands on what is written, and hashes it."""
+    """A stream that writes to a file and hashes what is written."""
 
     def __init__(self, file: BinaryIO) -> None:
         self.file = file
@@ -168,7 +169,7 @@ def save(path: Path, value: Any) -> None:
     """Write tensors and plain values with their digest: a whole file, or none.
 
     Raises:
-        OSError: the file cannot be written; an older one of this name is left as it was.
+        OSError: the file cannot be written; an older file of this name is kept.
     """
     with replacing(path) as file:
         hashing = _Hashing(file)

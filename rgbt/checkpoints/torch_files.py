@@ -1,11 +1,11 @@
-"""Files of torch.save: the zip archive since 1.6 and the sequence of pickles before.
+"""Read files of torch.save: zip archives since torch 1.6, sequences of pickles before.
 
-A zip archive is checked before anything in it is made sense of. One of ours ends with its digest,
-in the comment that every zip archive may have:
+A zip archive is checked before its content is interpreted. An archive of rgbt ends with its
+digest, in the comment of the zip archive:
 
     sha256 = SHA-256 of the file as torch.save wrote it, that is without the comment
 
-so that a copy carries it. Files without one (older ones, foreign ones) are held against the CRC-32
+so that a copy carries it. Files without one (older ones, foreign ones) are checked with the CRC-32
 of every entry. torch compresses nothing: what an entry declares lies in the file, or is refused.
 
 Tensors of an archive are views of the mapped file. The mapping is private: writing to a tensor does
@@ -55,7 +55,7 @@ Buffer = mmap.mmap | bytes
 
 
 def mapped(path: Path) -> mmap.mmap:
-    """The file as memory that is read where it is touched; writing to it leaves the file alone."""
+    """The file as a private memory map; writing to it does not change the file."""
     with path.open("rb") as file:
         return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
 
@@ -72,12 +72,12 @@ def read_zip(path: Path) -> Any:
     root = next((name[:-8] for name in listed if name.endswith("data.pkl")), None)
     if root is None:
         raise RefusedError(
-            "is a zip archive, but not one of torch.save; unpack it and name a file."
+            "is a zip archive, but not of torch.save; unpack it and name a file in it."
         )
     if f"{root}constants.pkl" in listed:
         raise RefusedError(
-            "is a TorchScript program, which would have to run; give a file that holds its "
-            "state_dict()."
+            "is a TorchScript program, which would have to be executed; give a file that holds "
+            "its state_dict()."
         )
     spans = _verified(buffer, listed)
     start, end = spans.get(f"{root}byteorder", (0, 0))
@@ -125,7 +125,7 @@ def _verified(
     for name, entry in listed.items():
         with memoryview(buffer) as content, content[slice(*spans[name])] as part:
             if zlib.crc32(part) != entry.CRC:
-                raise DamagedError("an entry is not what its checksum says")
+                raise DamagedError("an entry does not match its checksum")
     return spans
 
 
@@ -133,8 +133,8 @@ def _span(buffer: mmap.mmap, entry: zipfile.ZipInfo) -> tuple[int, int]:
     """Where the content of a zip entry lies."""
     if entry.compress_type != zipfile.ZIP_STORED or entry.flag_bits & ENCRYPTED:
         raise RefusedError(
-            "was packed again with compression; unpack it and pack it with torch.save, or store it "
-            "uncompressed."
+            "is compressed; unpack it and save it with torch.save, or repack it without "
+            "compression."
         )
     header = buffer[entry.header_offset : entry.header_offset + LOCAL_HEADER.size]
     if len(header) < LOCAL_HEADER.size:
@@ -159,7 +159,7 @@ def _check_digest(buffer: mmap.mmap) -> bool:
         digest = hashlib.sha256(written)
     digest.update(bytes(2))  # the length of the comment, before there was one
     if buffer[-length:] != COMMENT % digest.hexdigest().encode():
-        raise DamagedError("the content is not what its digest says")
+        raise DamagedError("the content does not match its digest")
     return True
 
 
@@ -194,8 +194,8 @@ class _Storages:
         """
         if reference[0] == "module":
             raise RefusedError(
-                "holds a whole network with its source code, which would have to run; give a file "
-                "that holds its state_dict()."
+                "holds a whole network with its source code, which would have to be executed; "
+                "give a file that holds its state_dict()."
             )
         word, kind, key, _, count, *view = reference
         types = type(kind), type(key), type(count)

@@ -1,1 +1,1 @@
-"""Configuration: composed by Hydra, checked, and the command line."""
+"""Compose the configuration with Hydra, check it, and parse the command line."""

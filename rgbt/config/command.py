@@ -1,4 +1,4 @@
-"""Commands that are called with Hydra overrides alone, and configurations composed for others.
+"""Commands whose arguments are all Hydra overrides, and composition for the other commands.
 
 For commands with options of their own see `rgbt.config.plain_command`.
 """
@@ -37,7 +37,7 @@ def command(*, sweeper: str = "basic") -> Callable[[Main], Callable[[], None]]:
     ``sys.exit``.
 
     Args:
-        sweeper: what works off the points of ``-m``, unless ``hydra/sweeper=`` is given.
+        sweeper: runs the points of ``-m``, unless ``hydra/sweeper=`` is given.
     """
 
     def decorate(main: Main) -> Callable[[], None]:
@@ -60,7 +60,7 @@ def command(*, sweeper: str = "basic") -> Callable[[Main], Callable[[], None]]:
 
             def run() -> None:
                 check_words(words)
-                # Only so does Hydra hand its own errors to us instead of printing them and leaving.
+                # Otherwise Hydra prints its own errors and exits.
                 os.environ["HYDRA_FULL_ERROR"] = "1"
                 # Hydra's root logger shows the INFO lines of every library.
                 logging.getLogger("matplotlib").setLevel(logging.WARNING)
@@ -80,7 +80,7 @@ def command(*, sweeper: str = "basic") -> Callable[[Main], Callable[[], None]]:
 
 @contextmanager
 def composing(overrides: Sequence[str]) -> Iterator[None]:
-    """Turn what Hydra or OmegaConf refuses about `overrides` into an InputError."""
+    """Turn errors of Hydra or OmegaConf about `overrides` into an InputError."""
     try:
         yield
     except (HydraException, OmegaConfBaseException) as error:

@@ -9,35 +9,43 @@ from typing import Annotated, Final, Literal
 from rgbt.config.options import Help
 
 AS_TRAINED: Final = "as trained"
-"""Value of an option: what the run was trained with."""
+"""Value of an option that keeps the setting of the trained run."""
 
 RunsDir = Annotated[Path, Help("folder of runs")]
 Trained = Annotated[
     str,
     Help(
-        "run folder, config key or MLflow run id; without one, name a network and its weights: "
-        "model=mfnet model.weights=final.pth dataset.root=/data/MFNet (scale=paper)"
+        "run folder, config key or MLflow run id. Without a run, name a network and its weights: "
+        "model=mfnet model.weights=final.pth dataset.root=/data/MFNet (implies scale=paper)"
     ),
 ]
 Split = Annotated[str, Help("split of the data set")]
-Checkpoint = Annotated[Literal["best", "last"], Help("best (by validation mIoU) or last, of a run")]
+Checkpoint = Annotated[
+    Literal["best", "last"], Help("checkpoint of the run: best (by validation mIoU) or last")
+]
 Modality = Annotated[
     str,
-    Help("rgbt, rgb or thermal: what is predicted from; by default what the network is made for"),
+    Help(
+        "input images of the network: rgbt, rgb or thermal; by default those that it was designed "
+        "for"
+    ),
 ]
 Head = Annotated[
     Literal["as trained", "own", "source", "target"],
-    Help("of a network with a head per domain: own, source or target"),
+    Help("head of a network with one head per domain: own, source or target"),
 ]
-RegionsFile = Annotated[str, Help("a file of conf/metric: ring5, ring9, vertical5, horizontal5")]
+RegionsFile = Annotated[
+    str, Help("partition of the image, a file of conf/metric: ring5, ring9, vertical5, horizontal5")
+]
 Trust = Annotated[
-    str, Help("modules of yours that the run was made with: trust=my_lab; their code is run")
+    str,
+    Help("your own Python modules that the run uses, such as trust=my_lab; their code is executed"),
 ]
 
 
 @dataclass(frozen=True, kw_only=True)
 class NetworkOptions:
-    """Which trained network; what the options of every command that evaluates one begin with."""
+    """Options that select a trained network, common to all commands that evaluate one."""
 
     run: Trained = ""
     runs_dir: RunsDir = Path("runs")

@@ -1,7 +1,7 @@
-"""What may follow on a command line of ``rgbt``: commands, options, groups, keys and values.
+"""Shell completion of ``rgbt``: commands, options, groups, keys and values.
 
-``eval "$(rgbt --completion bash)"`` makes a shell complete the command ``rgbt`` alone. (Hydra's own
-script takes over ``python``.)
+``eval "$(rgbt --completion bash)"`` adds completion for ``rgbt`` only. (Hydra's own script changes
+the completion of ``python``.)
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ complete -c rgbt -a '(rgbt --complete (commandline -cp | string collect) 2>/dev/
 SCRIPTS = {"bash": BASH, "zsh": ZSH, "fish": FISH}
 
 OF_HYDRA = ("run", "check", "masks")
-"""Commands whose words are all overrides."""
+"""Commands whose arguments are all overrides."""
 
 HYDRA_OPTIONS = ("-m", "--multirun", "--help", "--cfg", "--resolve")
 
@@ -65,8 +65,8 @@ def print_script(words: Sequence[str]) -> int:
 
 
 def print_candidates(words: Sequence[str]) -> int:
-    """Write `candidates` of a line, which is one word of `words`, one candidate a line."""
-    with suppress(Exception):  # a shell that completes shows nothing of what went wrong
+    """Print the `candidates` for the command line in `words`, one per line."""
+    with suppress(Exception):  # errors must not appear while a shell completes
         sys.stdout.write("".join(f"{each}\n" for each in candidates(" ".join(words))))
     return 0
 

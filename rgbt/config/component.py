@@ -28,7 +28,7 @@ RUN_SETTINGS: dict[str, dict[str, Any]] = {
     "model": {"weights": Text | None, "fresh": tuple[Text, ...]},
     "dataset": {"absent": Literal["released", "exclude"]},
 }
-"""Settings of a node that the run reads itself and the constructor does not take, by node."""
+"""Settings, by node, that the run reads itself and that are not passed to the constructor."""
 
 
 @dataclass(frozen=True)
@@ -159,7 +159,7 @@ def authorized(target: Any, path: str) -> functools.partial[Any]:
         if _partial(target).func is not get_object(target):  # its module was imported anew
             _partial.cache_clear()
         return _partial(target)
-    except Exception as error:  # a module of the user's may fail in any way as it is imported
+    except Exception as error:  # importing a user's module can raise anything
         raise refusal(target, path, error) from error
 
 
@@ -172,7 +172,7 @@ def _partial(target: str) -> functools.partial[Any]:
 
 
 def refusal(target: str, path: str, error: Exception) -> InputError:
-    """The sentence for a target that cannot be imported, or that Hydra's policy refuses."""
+    """The message for a target that cannot be imported or that Hydra's policy refuses."""
     cause = error.__cause__
     if cause is None:  # the policy's own sentences
         reason = " ".join(str(error).partition("full_key:")[0].split()).partition(". ")[0]
@@ -183,7 +183,7 @@ def refusal(target: str, path: str, error: Exception) -> InputError:
 
 @functools.cache
 def setting_types(target: Any) -> dict[str, Any]:
-    """What the settings of a constructor take, by key: types with their ranges."""
+    """Types of a constructor's settings with their ranges, by key."""
     function = target.__init__ if inspect.isclass(target) else target
     hints = typing.get_type_hints(function, include_extras=True)
     hints.pop("return", None)

@@ -1,4 +1,4 @@
-"""Hydra's composition: files and keys of the configuration, and what its files may compute."""
+"""Compose the configuration with Hydra, list its files, and register its resolvers."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def conf_dir() -> Path:
 
 @contextmanager
 def searching(words: Sequence[str]) -> Iterator[None]:
-    """Compose with the search path in the `words` of a command line, as long as the command runs.
+    """Use the search path in the `words` of a command line for all compositions of the command.
 
     Upstream runs, defaults and groups of a run that is opened again are composed without these
     words, and need the folders of ``hydra.searchpath=...`` too.
@@ -55,7 +55,7 @@ def own_folders() -> str:
 
 
 def compose(overrides: Sequence[str]) -> DictConfig:
-    """The configuration that `rgbt.run` would get from these overrides, not checked."""
+    """The configuration that `rgbt.run` would compose from these overrides, unchecked."""
     with own_hydra():
         return hydra.compose("config", list(overrides))
 
@@ -131,7 +131,7 @@ def own_hydra() -> Iterator[None]:
 
 
 def register_resolvers() -> None:
-    """What configuration files may say beside values, by the chosen scale.
+    """Register the resolvers that configuration files may use.
 
     ``${by_scale:{demo:cmx_tiny,paper:cmx_b2}}``: the entry of the scale, also in a defaults list.
     ``${px:64}``: 64 pixels of the paper's images, scaled to the images of the scale.

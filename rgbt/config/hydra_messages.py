@@ -1,6 +1,6 @@
-"""What is wrong with the words of a command line, in one sentence.
+"""Error messages for a command line that Hydra refuses or would misread.
 
-Hydra's own messages name neither the key that was meant nor what to type.
+Hydra's own messages name neither the intended key nor the correct command.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from rgbt.config.compose import (
 )
 
 ADDED = ("experiment", "search", "debug")
-"""Groups of which the configuration holds no file by itself: they are added with a plus."""
+"""Groups that are not in the defaults list; a command adds them with a plus."""
 
 
 def check_words(words: Sequence[str]) -> None:
-    """Refuse words of a command that Hydra would misread, or leave aside with a warning.
+    """Refuse words of a command that Hydra would misread or ignore with a warning.
 
     Raises:
         InputError: an unknown option, a list of seeds, a folder of configurations that is missing.
@@ -42,16 +42,18 @@ def check_words(words: Sequence[str]) -> None:
         key, _, value = word.partition("=")
         if word.startswith("-") and key not in options:
             typed = _typed(key.lstrip("-"), value or "...")
-            raise InputError(f"'{word}' is no option; a setting is written as {typed}.")
+            raise InputError(f"'{word}' is not an option; write settings as {typed}.")
         if key == "seed" and value.startswith("["):
             seeds = ",".join(split_list(value, "seeds"))
-            raise InputError(f"'{word}': a run has one seed; several are a grid: -m seed={seeds}.")
+            raise InputError(
+                f"'{word}': a run has one seed; for several runs use a grid: -m seed={seeds}."
+            )
         for folder in split_list(value, "folders") if key == SEARCH_PATH else ():
             scheme, _, path = folder.strip("'\"").rpartition("://")
             if scheme in ("", "file") and not Path(path).is_dir():
                 raise InputError(
-                    f"'{word}': there is no folder {path}; name an existing one "
-                    "with its absolute path, 'hydra.searchpath=[file:///my/conf]'."
+                    f"'{word}': the folder {path} does not exist; give the absolute path of an "
+                    "existing folder: 'hydra.searchpath=[file:///my/conf]'."
                 )
 
 
@@ -60,7 +62,7 @@ def _typed(key: str, value: str) -> str:
 
 
 def hydra_sentence(error: Exception, overrides: Sequence[str]) -> str:
-    """What Hydra or OmegaConf refused of typed overrides, with the nearest known name."""
+    """The message for overrides that Hydra or OmegaConf refused, with the nearest known name."""
     if isinstance(error, MissingConfigException):
         missing = error.missing_cfg_file or ""
         group, _, name = missing.rpartition("/")
@@ -83,7 +85,7 @@ def own_folder_hint() -> str:
     if own_folders():
         return ""
     return (
-        f" For a file of your own add '{SEARCH_PATH}=[file:///my/conf]', or set RGBT_CONF=/my/conf."
+        f" To use your own file, add '{SEARCH_PATH}=[file:///my/conf]' or set RGBT_CONF=/my/conf."
     )
 
 
@@ -97,21 +99,21 @@ def _no_override(word: str) -> str:
         "key=value, with quotes around a value that holds commas, brackets or spaces: "
         "'key=\"a, b\"'"
     )
-    return f"'{word}' is no override; expected {expected}."
+    return f"'{word}' is not a valid override; expected {expected}."
 
 
 def _of_the_defaults(first: str, overrides: Sequence[str]) -> str:
-    """Messages on files that are chosen, and on several values."""
+    """Messages about files of groups and about lists of values."""
     several = re.search(r"Ambiguous value for argument '([^']+)'", first)
     if several:
         return (
-            f"'{several[1]}' names several values, which is a grid: add -m; quotes make one value "
-            "of it: 'key=\"a, b\"'."
+            f"'{several[1]}' holds several values. Add -m to run a grid, or quote them as one "
+            "value: 'key=\"a, b\"'."
         )
     sizes = re.search(r"'\$\{by_scale:(.*)\}'", first)
     if sizes:
         return (
-            f"the experiment names files for these scales alone: {sizes[1]}; choose one yourself "
+            f"the experiment supports only these scales: {sizes[1]}; choose the file yourself "
             "with group=NAME."
         )
     absent = re.search(r"Could not override '([^']+)'", first)
@@ -120,9 +122,9 @@ def _of_the_defaults(first: str, overrides: Sequence[str]) -> str:
         return f"'{word}' needs a plus: +{word}."
     twice = re.search(r"Multiple values for ([^.]+)\. .*override [^:]+: ([^']+)'", first)
     if twice and twice[1] in ADDED:
-        return f"+{twice[1]}= may be given once; leave one of them out."
+        return f"+{twice[1]}= is given more than once; remove all but one."
     if twice:
-        return f"'+{twice[1]}={twice[2]}' is written without plus: {twice[1]}={twice[2]}."
+        return f"remove the plus from '+{twice[1]}={twice[2]}': {twice[1]}={twice[2]}."
     return f"{first}; see `python -m rgbt.run --help`."
 
 
@@ -134,12 +136,12 @@ def _unknown_key(full_key: str, overrides: Sequence[str]) -> str:
     others = [word for word in overrides if word.lstrip("+~").partition("=")[0] != full_key]
     try:
         config = compose(others)
-    except HydraException:  # a second mistake, or the comma lists of a grid
+    except HydraException:  # another mistake, or the comma lists of a grid
         config = compose([])
     if full_key == "dataset.root" and "cache_dir" in config.dataset:
         return (
-            "'dataset.root' is not a key of an embedded data set; name the data set in that "
-            "folder: dataset=mfnet (or pst900, kp, freiburg, folder) dataset.root=..."
+            "'dataset.root' is not a key of an embedded data set. Choose the data set that the "
+            "folder contains: dataset=mfnet (or pst900, kp, freiburg, folder) dataset.root=..."
         )
     known = _settings(OmegaConf.select(config, ".".join(parents)) if parents else config)
     hint = f"{nearest(last, known)}." if parents else _key_hint(config, last, known)
@@ -147,7 +149,7 @@ def _unknown_key(full_key: str, overrides: Sequence[str]) -> str:
 
 
 def check_key(word: str, names: Sequence[str]) -> None:
-    """Refuse a word without a dot that is no key of the configuration: a misspelt option.
+    """Refuse a word without a dot that is not a key of the configuration: a misspelt option.
 
     `names` are the options of the command.
     """
@@ -156,7 +158,7 @@ def check_key(word: str, names: Sequence[str]) -> None:
     if key in (*nodes, *values, *ADDED) or word.startswith("+") or set(key) & set("./@"):
         return
     hint = _key_hint(compose([]), key, [*names, *nodes])
-    raise InputError(f"'{key}' is no option of this command; {hint}")
+    raise InputError(f"'{key}' is not an option of this command; {hint}")
 
 
 def _settings(node: Any) -> list[str]:

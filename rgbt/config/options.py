@@ -1,4 +1,4 @@
-"""The options of a command: declared once, as the fields of a frozen dataclass.
+"""Parse the options of a command, which are the fields of a frozen dataclass.
 
     @dataclass(frozen=True)
     class Options:
@@ -25,7 +25,7 @@ from rgbt.checks import InputError, nearest, split_list
 PATHS = ("model.weights", "pretrained", "dataset.root", "runs_dir", "out")
 
 RENAMED = {"degradation": "corruption", "degradations": "corruptions"}
-"""Options by the name that they had before, with the name that they have now."""
+"""Renamed options: former name -> current name."""
 
 WIDTH = 100
 """Columns of a help text."""
@@ -35,7 +35,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Help:
-    """What an option means, in an annotation: ``Annotated[str, Help("of the data set")]``."""
+    """Help text of an option, in its annotation: ``Annotated[str, Help("run folder")]``."""
 
     text: str
 
@@ -135,7 +135,7 @@ def _check_override(word: str, names: Sequence[str], heeds: Sequence[str] | None
     option, dot, setting = key.partition(".")
     if option in RENAMED:
         now = f"{RENAMED[option]}{dot}{setting}"
-        raise InputError(f"'{key}' is called '{now}' now; give {now}=...")
+        raise InputError(f"'{key}' was renamed to '{now}'; use {now}=...")
     if heeds is None:
         check_key(word, names)
         return

@@ -1,8 +1,8 @@
-"""Commands: their names, their options, and how each of them ends.
+"""The list of commands, and the code that parses their options and sets their exit codes.
 
 ``rgbt NAME`` is ``python -m MODULE``. Words ``key=value`` that are no options
-(`rgbt.config.options`) are overrides of the configuration. What ends a command is one sentence on
-stderr and an exit code: 0 done, 1 the run failed or a check found problems, 2 the input was wrong,
+(`rgbt.config.options`) are overrides of the configuration. A command that fails prints one message
+on stderr. Exit codes: 0 done, 1 the run failed or a check found problems, 2 the input was wrong,
 129, 130 and 143 stopped by SIGHUP, Ctrl-C and SIGTERM.
 """
 
@@ -64,7 +64,7 @@ COMMANDS = {
 
 
 def exit_code(work: Callable[[], int | None], *, catch_interrupt: bool = True) -> int:
-    """Exit code of `work`; a user's mistake is reported in one sentence on stderr.
+    """Run `work` and return its exit code; an InputError is printed on stderr.
 
     Args:
         work: what to do.
@@ -89,7 +89,7 @@ def exit_code(work: Callable[[], int | None], *, catch_interrupt: bool = True) -
             words = [word for word in sys.argv[1:] if not word.startswith("-")]
             return say(hydra_sentence(error, words), 2)
         if isinstance(error, FileExistsError | NotADirectoryError):
-            place = f"{error.filename}: a file is where a folder is needed"
+            place = f"{error.filename} is a file, but a folder is needed"
             return say(f"{place}; name another path.", 2)
         if isinstance(error, OSError):
             return say(f"{error.filename or 'a file'}: {error.strerror or error}.", 2)
@@ -97,7 +97,7 @@ def exit_code(work: Callable[[], int | None], *, catch_interrupt: bool = True) -
 
 
 def say(sentence: str, code: int) -> int:
-    """Write a sentence to stderr; returns `code`."""
+    """Print a message on stderr and return `code`."""
     with suppress(OSError):  # output may go to a file on a disk that is full
         sys.stdout.flush()
     # Names of files and words of damaged files may hold anything.
@@ -160,12 +160,12 @@ class PlainCommand(Generic[T]):
 
 @dataclass(frozen=True)
 class CommandGroup:
-    """Commands of which the first word chooses one: ``rgbt weights inspect FILE``.
+    """A command with subcommands: ``rgbt weights inspect FILE``.
 
     Attributes:
         about: what ``--help`` shows, unless there is a default.
         commands: by name.
-        default: runs if the first word names none; None: one must be named.
+        default: runs if the first word is not a subcommand; None: a subcommand is required.
     """
 
     about: str

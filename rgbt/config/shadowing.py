@@ -1,4 +1,4 @@
-"""A user's own package ``sweeps`` or ``analysis``, and ours.
+"""Prevent a user's modules from replacing rgbt's packages, such as ``sweeps`` and ``analysis``.
 
 ``python -m`` looks for modules in the working directory and in the folders of PYTHONPATH first; the
 command ``rgbt`` looks there last, so that it imports a user's own maskers and nothing of ours is
@@ -26,7 +26,7 @@ SAFE_PATH = "PYTHONSAFEPATH"
 
 
 def search_user_folders_last() -> None:
-    """Let imports look in the folders of PYTHONPATH and the working directory after all others."""
+    """Move the folders of PYTHONPATH and the working directory to the end of the search path."""
     users = [path for path in _python_path() if Path(path).resolve() != ROOT]
     users = list(dict.fromkeys([*users, str(Path.cwd())]))
     sys.path[:] = [*(path for path in sys.path if path not in ("", *users)), *users]
@@ -71,10 +71,10 @@ def check_not_shadowed(package: str, *, in_jobs: bool = False) -> None:
     is_here = shadow.parent == Path.cwd()
     first = "in the working directory" if is_here else "in the folders of PYTHONPATH"
     remedy = "" if in_jobs else "type `rgbt ...` instead of `python -m ...`, "
-    away = "work in another folder" if is_here else f"take {shadow.parent} off PYTHONPATH"
+    away = "work in another folder" if is_here else f"remove {shadow.parent} from PYTHONPATH"
     raise InputError(
-        f"{shadow} is imported instead of rgbt's own package `{package}`, because python -m looks "
-        f"{first} first; {remedy}rename it, or {away}."
+        f"{shadow} would be imported instead of rgbt's own package `{package}`, because python -m "
+        f"searches {first} first; {remedy}rename it, or {away}."
     )
 
 

@@ -1,11 +1,10 @@
-"""A stored configuration is data: what is read from a run folder, a store or a stranger's file.
+"""Read the configuration of a stored run without executing code that it names.
 
-Whoever wrote it can name any callable in a ``_target_``, and building the node would run it. So a
-stored configuration may name what the files of ``conf/`` name inside `rgbt`, and the content of a
-module that the user names with ``trust=``. Everything else is refused before it is imported.
-Classes and functions of `rgbt` that no file of ``conf/`` names are refused as well: some of them
-write files. What a user types or composes now is the user's own and follows Hydra's rules
-(`rgbt.config.component`).
+A ``_target_`` can name any callable, and building the node would run it. A stored configuration
+may therefore name only the targets of ``conf/`` inside `rgbt`, and the content of modules that the
+user names with ``trust=``. Everything else is refused before it is imported. Classes and functions
+of `rgbt` that no file of ``conf/`` names are refused as well: some of them write files. Overrides
+on the command line follow Hydra's rules (`rgbt.config.component`).
 """
 
 from __future__ import annotations
@@ -57,8 +56,8 @@ def settings_of(plain: Any, source: str) -> dict[str, Any]:
     for key, value in _walk(plain):
         if isinstance(value, str) and "${" in value:
             raise InputError(
-                f"{source}: '{_shown(key)}' is {_shown(value)}; a stored configuration holds "
-                "values and no interpolations. Replace it by its value."
+                f"{source}: '{_shown(key)}' is {_shown(value)}; a stored configuration must not "
+                "contain interpolations. Replace it with its value."
             )
     for key in top_level()[0]:
         if key in plain and not isinstance(plain[key], dict):
@@ -107,7 +106,7 @@ def parse_trust(text: str) -> tuple[str, ...]:
     for word in words:
         if not DOTTED.fullmatch(word):
             raise InputError(
-                f"trust={text}: expected names of your own modules with commas, such as "
+                f"trust={text}: expected names of your own modules, separated by commas, such as "
                 f"trust=my_lab or trust=my_lab.models,other; got '{word}'."
             )
     return tuple(words)
@@ -125,7 +124,7 @@ def _walk(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
     parts = dict(enumerate(node)) if isinstance(node, list) else node
     for key, value in parts.items() if isinstance(parts, Mapping) else ():
         if not isinstance(key, str) and parts is node:
-            raise InputError(f"'{_shown(path)}': {key!r} is not a name; keys are text.")
+            raise InputError(f"'{_shown(path)}': the key {key!r} is not text.")
         dotted = f"{path}.{key}" if path else str(key)
         yield dotted, value
         yield from _walk(value, dotted)
@@ -139,16 +138,17 @@ def _refusal(source: str, key: str, target: Any, home: str | None, group: str) -
     what = f"{source}: '{_shown(key)}' names {_shown(target)}, which "
     if home is not None:
         return (
-            f"{what}is defined in {home}, a module that is not trusted. Only if you know that "
-            f"code, add {home} to trust=... (it is run)."
+            f"{what}is defined in {home}, a module that is not trusted. If you know that code, "
+            f"add {home} to trust=... (the code is executed)."
         )
     what += f"no file of conf/{group} names. " if group else "is not part of rgbt's conf/. "
     is_name = isinstance(target, str) and DOTTED.fullmatch(target) is not None
     if not is_name or target.partition(".")[0] in sys.stdlib_module_names:
-        return f"{what}It is not built: the configuration was damaged or made to run code."
+        return f"{what}It is refused: the configuration was damaged, or written to execute code."
     return (
-        f"{what}A configuration can run any code that it names. Only if you know this code and who "
-        f"made the configuration, add trust={_shown(target.rpartition('.')[0] or target)}."
+        f"{what}A configuration can execute any code that it names. If you know this code and "
+        "trust the author of the configuration, add "
+        f"trust={_shown(target.rpartition('.')[0] or target)}."
     )
 
 

@@ -1,7 +1,7 @@
-"""One value of a configuration against its annotation: type and range, refused in one sentence.
+"""Check one value of a configuration against its annotated type and range.
 
 The range of a setting is declared once, in the annotations of the constructor that takes it
-(aliases in `rgbt.ranges`); sentences are made of these annotations. Part of `rgbt.config`.
+(aliases in `rgbt.ranges`). Messages are written from these annotations.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ def check_value(path: str, value: Any, annotation: Any) -> Any:
         return _adapter(annotation).validate_json(json.dumps(plain), strict=True)
     except pydantic.errors.PydanticSchemaGenerationError:
         raise InputError(
-            f"'{path}' takes an object, not {_shown(plain)}: give a mapping with `_target_`, or "
-            "omit it where the run itself provides it."
+            f"'{path}' must be an object, got {_shown(plain)}. Give a mapping with `_target_`, or "
+            "omit the key if the run provides the object."
         ) from None
     except pydantic.ValidationError as error:
         first = error.errors()[0]
@@ -134,7 +134,7 @@ def _members(annotation: Any) -> tuple[Any, ...]:
 
 
 def expected(annotation: Any) -> str:
-    """What an annotation takes, in words: "a number from 0 to 1, or null"."""
+    """The values that an annotation allows, in words: "a number from 0 to 1, or null"."""
     limits: list[Any] = []
     if typing.get_origin(annotation) is typing.Annotated:
         annotation, *limits = typing.get_args(annotation)

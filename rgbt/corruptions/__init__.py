@@ -1,4 +1,4 @@
-"""Images that are missing or partly wrong, each kind of corruption with a severity.
+"""Corruptions of images, each with a severity: missing, hidden, noisy, blurred, late, shifted.
 
 A corruption is chosen by its file in ``conf/corruption/``; `rgbt.evaluation.corrupted_dataset` is a
 data set seen under it.

@@ -1,4 +1,4 @@
-"""Draw corruptions of one pair: ``rgbt corruptions dataset=synth out=sheet.png``."""
+"""Draw corruptions of one pair of images: ``rgbt corruptions dataset=synth out=sheet.png``."""
 
 from __future__ import annotations
 
@@ -32,27 +32,27 @@ CELL = 2.4
 
 @dataclass(frozen=True)
 class Options:
-    """What is drawn."""
+    """Options of the command."""
 
-    out: Annotated[str, Help("picture to write, .png or .jpg")] = ""
+    out: Annotated[str, Help("picture file to write, .png or .jpg")] = ""
     corruptions: Annotated[
         str,
         Help(
-            "files of conf/corruption with commas, such as frozen,noise:rgb, or all; default: "
-            "those of one image alone are left out where both can be corrupted"
+            "files of conf/corruption separated by commas, such as frozen,noise:rgb, or all; by "
+            "default without the variants of a single image if both can be corrupted"
         ),
     ] = ""
     split: Annotated[
-        str, Help("split of the data set, whose order says which frames are earlier")
+        str, Help("split of the data set; its order defines which frames are earlier")
     ] = "test"
-    name: Annotated[str, Help("of the sample; default: the twelfth of the split")] = ""
+    name: Annotated[str, Help("name of the sample; default: the twelfth of the split")] = ""
 
 
 def main(options: Options, overrides: list[str]) -> int:
     """Draw a pair under every severity of the corruptions: RGB left, thermal right.
 
     Overrides choose the data set, dataset=mfnet dataset.root=/data/MFNet (default: the embedded
-    data), and what is drawn at random, corruption.seed=1
+    data set), and the random draws, corruption.seed=1
     """
     from rgbt.evaluation.corruption_request import (
         choose_corruptions,
@@ -62,7 +62,9 @@ def main(options: Options, overrides: list[str]) -> int:
 
     path = Path(options.out).expanduser()
     if path.suffix not in SUFFIXES:
-        raise InputError(f"out must name the picture to write, .png or .jpg, got '{options.out}'.")
+        raise InputError(
+            f"out must be the path of a picture to write, .png or .jpg, got '{options.out}'."
+        )
     words, overrides = split_overrides(overrides)
     known = standard_corruptions()
     usual = [name for name in known if name.partition(":")[0] not in known or ":" not in name]
@@ -72,7 +74,9 @@ def main(options: Options, overrides: list[str]) -> int:
     name = options.name or listed[min(POSITION, len(listed) - 1)]
     if name not in listed:
         near = nearest(name, listed[:20])
-        raise InputError(f"name={name}: split '{options.split}' has no such sample; {near}.")
+        raise InputError(
+            f"name={name}: split '{options.split}' has no sample of this name; {near}."
+        )
     kinds = [each.corruption for each in chosen]
     lines = sheet(dataset, kinds, name, options.split, chosen[0].seed)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""What a corruption is: a missing or partly wrong image with a severity, in one of two forms.
+"""The interface of corruptions, which change the pixels of a pair or show another frame.
 
 Severity 0 is the clean image and never reaches a corruption: `rgbt.evaluation.corrupted_dataset`
 returns such samples as they are. Lengths are given in pixels of an image of `REFERENCE_HEIGHT` rows
@@ -31,7 +31,7 @@ IMAGES: dict[Images, tuple[Image, ...]] = {
     "both": ("rgb", "thermal"),
 }
 NAMES: dict[Images, str] = {"rgb": "RGB", "thermal": "thermal", "both": "RGB and thermal"}
-"""What tables and figures call them."""
+"""Names in tables and figures."""
 
 RngOf = Callable[[str], np.random.Generator]
 """Purpose -> generator of a sample. It does not depend on the severity: a higher one hides the
@@ -43,12 +43,12 @@ Severities = Annotated[tuple[Annotated[float, Interval(gt=0, le=1000)], ...], Le
 
 
 class Kind(Protocol):
-    """What every corruption declares.
+    """Members that every corruption declares.
 
     Attributes:
-        title: what tables and figures call it, e.g. "noise, RGB".
+        title: name in tables and figures, e.g. "noise, RGB".
         unit: of the severity, e.g. "grey levels (std)"; "" where there is one severity alone.
-        severities: its ladder, rising; what `rgbt.robustness` goes through.
+        severities: its severities, rising; `rgbt robustness` measures all of them.
     """
 
     title: str
@@ -90,8 +90,8 @@ def check_ladder(kind: Kind) -> None:
     ladder = kind.severities
     if not ladder or any(low >= high for low, high in zip((0.0, *ladder), ladder, strict=False)):
         raise InputError(
-            "corruption.severities must rise from above 0 (0 is the clean image and always "
-            f"measured), got {list(ladder)}."
+            "corruption.severities must be rising numbers above 0 (0 is the clean image, which is "
+            f"always measured), got {list(ladder)}."
         )
     for severity in ladder:
         kind.check(severity)

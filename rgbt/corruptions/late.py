@@ -1,7 +1,7 @@
-"""A thermal camera that does not keep pace with the colour camera.
+"""Corruptions of time: the thermal image is delayed or frozen.
 
-Frames are counted in the order of the split list; by day and by night apart where the data set
-tells them apart. A list that leaves frames out (as those of the published data sets do) makes a
+Frames are counted in the order of the split list, separately by day and by night if the data set
+distinguishes them. A list that leaves frames out (as those of the published data sets do) makes a
 step of one longer than the time between two frames of the camera.
 """
 
@@ -38,7 +38,7 @@ class Delayed:
             raise InputError(f"severity counts frames: expected 1, 2, 3, ..., got {severity:g}.")
 
     def shown(self, index: int, severity: float) -> int:
-        """See `rgbt.corruptions.corruption.OfTime`."""
+        """Index of the frame whose thermal image is shown at `index`."""
         return max(0, index - int(severity))
 
 
@@ -57,10 +57,10 @@ class Frozen(Delayed):
         super().check(severity)
         if severity < 2:
             raise InputError(
-                "severity of frozen counts the frames from one thermal image to the next: 1 is "
-                "no corruption; give 2 or more."
+                "severity of frozen is the number of frames from one thermal image to the next, "
+                "and 1 changes nothing; give 2 or more."
             )
 
     def shown(self, index: int, severity: float) -> int:
-        """See `rgbt.corruptions.corruption.OfTime`."""
+        """Index of the frame whose thermal image is shown at `index`."""
         return index - index % int(severity)

@@ -46,7 +46,7 @@ class OneOrBoth:
     unit: str
     measure: str
     highest: float
-    """What a severity is, and the highest one."""
+    """Meaning of the severity, and the highest value."""
 
     def __init__(self, *, image: Images, severities: Severities) -> None:
         self.image: Images = image
@@ -59,7 +59,7 @@ class OneOrBoth:
         check_range(f"severity ({self.measure})", severity, 0, self.highest)
 
     def __call__(self, sample: Sample, severity: float, rng_of: RngOf) -> Sample:
-        """See `rgbt.corruptions.corruption.OfPixels`."""
+        """The corrupted `sample`, see `rgbt.corruptions.corruption.OfPixels`."""
         changed: dict[str, Any] = {
             image: self._changed(getattr(sample, image), severity, rng_of, image)
             for image in IMAGES[self.image]
@@ -118,8 +118,9 @@ class Occluded(OneOrBoth):
         number = nearest_whole(share * rows * columns)
         if number == 0:
             raise InputError(
-                f"a share of {share:g} of {rows} x {columns} blocks is none; give a severity of at "
-                f"least {0.5 / (rows * columns):.2g}, or a smaller corruption.block."
+                f"a share of {share:g} of {rows} x {columns} blocks hides no block; give a "
+                f"severity of at least {0.5 / (rows * columns):.2g}, or a smaller "
+                "corruption.block."
             )
         blocks = np.zeros(rows * columns, bool)
         blocks[rng.permutation(rows * columns)[:number]] = True
@@ -186,12 +187,10 @@ class Removed:
     def check(self, severity: float) -> None:
         """An image is missing or not."""
         if severity != 1:
-            raise InputError(
-                f"severity of an image that is missing can only be 1, got {severity:g}."
-            )
+            raise InputError(f"the severity of a missing image must be 1, got {severity:g}.")
 
     def __call__(self, sample: Sample, severity: float, rng_of: RngOf) -> Sample:
-        """See `rgbt.corruptions.corruption.OfPixels`."""
+        """The corrupted `sample`, see `rgbt.corruptions.corruption.OfPixels`."""
         del severity, rng_of  # there is one way to be missing
         black: dict[str, Any] = {self.image: np.zeros_like(getattr(sample, self.image))}
         return replace(sample, **black)

@@ -1,4 +1,4 @@
-"""Members of transforms that the loader uses, and stacking of examples to a batch."""
+"""The interface of transforms for the loader, and code that stacks examples to a batch."""
 
 from __future__ import annotations
 
@@ -46,8 +46,8 @@ def collate(examples: Sequence[Example], advice: str = "") -> Batch:
     `advice` ends the message if sizes differ; it names the key to change.
 
     Raises:
-        InputError: images or labels differ in size, naming the first two that do; labels of some
-            examples alone carry confidences.
+        InputError: images or labels differ in size, naming the first two that do; only some of the
+            labels carry confidences.
     """
     first = examples[0]
     for example in examples[1:]:
@@ -85,8 +85,7 @@ def _confidences(examples: Sequence[Example]) -> list[NDArray[np.float32]]:
             for missing in (False, True)
         )
         raise InputError(
-            f"either all labels of one batch must carry confidences or none, but those of "
-            f"'{with_one}' do and those of '{without}' do not; write the pseudo-labels of the "
-            "whole split again."
+            f"all labels of one batch must carry confidences, or none. Those of '{with_one}' do "
+            f"and those of '{without}' do not; write the pseudo-labels of the whole split again."
         )
     return found

@@ -1,4 +1,4 @@
-"""Command that reads a whole data set and reports its content and its problems.
+"""The command ``rgbt check``, which reads a whole data set and reports its problems.
 
     rgbt check dataset=mfnet dataset.root=...
     rgbt check dataset=kp dataset.root=...
@@ -30,9 +30,9 @@ def main(config: DictConfig) -> int:
     dataset = build(config.dataset)
     if not isinstance(dataset, FileDataset):
         raise InputError(
-            f"dataset: {type(dataset).__name__} cannot be checked, it is no "
-            "rgbt.data.file_dataset.FileDataset; choose dataset=mfnet, freiburg, synth or another "
-            "file of conf/dataset, or derive it from that class."
+            f"dataset: {type(dataset).__name__} cannot be checked, because it is not a "
+            "rgbt.data.file_dataset.FileDataset. Choose dataset=mfnet, freiburg, synth or another "
+            "file of conf/dataset, or derive your class from FileDataset."
         )
     return check_and_print(dataset)
 

@@ -7,5 +7,5 @@ import sys
 from rgbt.data.cache.__main__ import entry
 
 if __name__ == "__main__":
-    sys.stderr.write("rgbt: use python -m rgbt.data.cache; rgbt.data.decoded is its former name.\n")
+    sys.stderr.write("rgbt: rgbt.data.decoded was renamed to rgbt.data.cache.\n")
     entry()

@@ -1,4 +1,4 @@
-"""Training domains of a run: one, or a labelled source and a target to adapt to."""
+"""The training domains of a run: one, or a labelled source and a target to adapt to."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rgbt.types import View
 GIVEN, NONE = "given", "none"
 
 TestedHead = Literal["own", "source", "target"]
-"""The head that predicts an image: that of its domain, or that of one domain for all images."""
+"""Which head predicts an image: that of its domain, or that of one domain for all images."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,14 +23,13 @@ class Domain:
 
     Attributes:
         split: of the data set.
-        view: what the network sees of a pair; null leaves it to the network.
+        view: images of a pair that the network gets; null leaves the choice to the network.
         head: the network's head for this domain; null where it has one for all.
         labels: "given", those of the data set; "none", none at all, whatever the data set has; or a
             folder that `rgbt predict ... pseudo_labels=true` wrote.
             "experiment:NAME/best.pt" predicts them with that checkpoint of the run of the
             experiment NAME, with the same seed and on the same data, which is trained first.
-        teacher_view: what the network of "experiment:..." sees; null for all else, and where it
-            is left to that network.
+        teacher_view: the same for the network of "experiment:..."; null for other labels.
         threshold: least confidence of a pixel that keeps its label of "experiment:..."; 0 for all
             else.
         confidence: whether the loss of a pixel is weighted by the confidence of its label; needs
@@ -52,19 +51,19 @@ class Domain:
         predicts = self.labels.startswith("experiment:")
         if not predicts and (self.threshold or self.teacher_view is not None):
             raise InputError(
-                f"domains: threshold and teacher_view are for labels=experiment:..., with labels="
-                f"{self.labels} they have no effect; set teacher_view=null and threshold=0 of that "
-                "domain."
+                f"domains: threshold and teacher_view have no effect with labels={self.labels}, "
+                "because they require labels=experiment:... Set teacher_view=null and threshold=0 "
+                "for that domain."
             )
         if self.confidence and self.labels in (GIVEN, NONE):
             raise InputError(
-                f"domains: confidence=true needs pseudo-labels, but labels={self.labels} carry no "
-                "confidence; name a folder that rgbt predict ... pseudo_labels=true "
-                "wrote, or set confidence=false."
+                f"domains: confidence=true requires pseudo-labels, but labels={self.labels} have "
+                "no confidence. Name a folder written by rgbt predict ... pseudo_labels=true, or "
+                "set confidence=false."
             )
 
     def requires(self, key: str) -> Iterator[Requirement]:
-        """What follows from the settings of the domain at `key` of the configuration."""
+        """The requirements that follow from the settings of the domain at `key`."""
         if self.view is not None:
             yield Requirement("scheme", "shows_views", True, f"{key}.view={self.view}")
             yield Requirement("model", "views", (self.view,), f"{key}.view={self.view}")
@@ -104,35 +103,35 @@ class Domains:
     def __post_init__(self) -> None:
         if self.source.labels == NONE:
             raise InputError(
-                "domains.source.labels=none, but every scheme reads labels of the source; set it "
-                "to given, or name a folder of pseudo-labels."
+                "domains.source.labels=none, but every scheme requires labels of the source. Set "
+                "it to given, or name a folder of pseudo-labels."
             )
         heads = self.heads
         if self.target is not None and len(heads) == 1 and None in self._own_heads():
             raise InputError(
-                "domains: source and target need a head each, or none; got "
+                "domains: source and target must both have a head, or neither; got "
                 f"{self.source.head or 'null'} and {self.target.head or 'null'}."
             )
         if (self.target_is is not None) != (len(heads) == 2):
             raise InputError(
-                f"domains.target_is={self.target_is or 'null'} with {len(heads)} heads: it says "
-                "which of two heads predicts an image; give it with two, and null otherwise."
+                f"domains.target_is={self.target_is or 'null'} with {len(heads)} heads. The "
+                "setting selects one of two heads: set it for two heads, and to null otherwise."
             )
         if self.target_is == "view" and self.named["target"].view in (None, self.source.view):
             raise InputError(
-                "domains.target_is=view distinguishes the images of the heads by their view, but "
-                f"both domains have the view {self.source.view or 'null'}; give "
-                "domains.target.view another value, or set domains.target_is=night."
+                "domains.target_is=view selects the head of an image by its view, but both "
+                f"domains have the view {self.source.view or 'null'}. Give domains.target.view "
+                "another value, or set domains.target_is=night."
             )
         if self.tested_head == "source" and len(heads) < 2:
             raise InputError(
-                "domains.tested_head=source chooses between two heads, but there are "
-                f"{len(heads)}; set it to own."
+                f"domains.tested_head=source requires two heads, but there are {len(heads)}; set "
+                "it to own."
             )
 
     @property
     def record(self) -> Record:
-        """What both domains are, and what these require of the network, the loss and the scheme."""
+        """What the domains provide, and what they require of other components."""
         of_two = Requirement("scheme", "num_domains", 2)
         named = self.named.items()
         return Record(
@@ -188,8 +187,8 @@ class Domains:
         if len(heads) < 2:
             if choice != "own":
                 raise InputError(
-                    f"head={choice} chooses between the heads of two domains, but this run has one "
-                    "for all images; omit it."
+                    f"head={choice} selects one of two heads, but the network of this run has one "
+                    "head for all images; omit head=."
                 )
             return heads[0] if heads else None
         if choice == "own" and self.target_is == "view":
@@ -197,8 +196,8 @@ class Domains:
         elif choice == "own":
             if night is None:
                 raise InputError(
-                    "domains.target_is=night: the data set does not say which images were taken "
-                    "at night, so no head can be chosen; set head=source or head=target."
+                    "domains.target_is=night: the data set does not state which images were taken "
+                    "at night, so no head can be selected. Set head=source or head=target."
                 )
             choice = "target" if night else "source"
         return self.named[choice].head

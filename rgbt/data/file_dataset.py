@@ -1,4 +1,4 @@
-"""The base of data sets that read each image and label from a file of its own."""
+"""The base class of data sets that read each image and label from a separate file."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SplitNames = Mapping[str, tuple[str, ...]]
 
 
 class Expected(NamedTuple):
-    """Numbers of the published data set, which `rgbt check` compares a copy with.
+    """Numbers of the published data set, with which `rgbt check` compares a copy.
 
     Attributes:
         name: of the data set; those with another name are not compared.
@@ -40,10 +40,10 @@ class Expected(NamedTuple):
 
 
 class FileDataset:
-    """A reader only: it never resizes, augments or remaps, and refuses what it cannot read exactly.
+    """A reader of files that never resizes, augments or remaps and refuses inexact content.
 
-    Subclasses give the attributes below, `frame` and `nights`; and what `rgbt check` asks, where
-    it differs.
+    Subclasses define the attributes below, `frame` and `nights`, and the members for `rgbt check`
+    if they differ.
 
     Args:
         root: its folder, which exists.
@@ -81,8 +81,8 @@ class FileDataset:
         for key, length in (("classes", len(classes)), ("palette", len(palette))):
             if length != num_classes:
                 raise InputError(
-                    f"dataset.num_classes is {num_classes} but dataset.{key} has {length} entries; "
-                    "make them agree."
+                    f"dataset.num_classes is {num_classes} but dataset.{key} has {length} "
+                    "entries; both numbers must be equal."
                 )
         self.root = root
         self.name = name
@@ -178,7 +178,7 @@ class FileDataset:
         names = {split: self.names(split) if self.has(split) else () for split in self.splits}
         return hash_of_files(names, self.files)
 
-    # What `rgbt check` asks.
+    # Members for `rgbt check`.
 
     @property
     def title(self) -> str:
@@ -202,7 +202,7 @@ class FileDataset:
         return split.endswith(("_day", "_night"))
 
     def sources(self, split: str) -> tuple[str, ...]:
-        """What a split is made of; splits of one source may share names."""
+        """The source of a split; splits of one source may share names."""
         return (self.splits[split],)
 
     def thermal_values(self, name: str) -> NDArray[Any]:

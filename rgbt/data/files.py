@@ -1,4 +1,4 @@
-"""Decodes files into RGB, thermal and label arrays, and refuses files it could misread.
+"""Decode files into RGB, thermal and label arrays, and refuse files that would be misread.
 
 OpenCV only decodes here. By default it drops a fourth channel, and it returns B, G, R. The thermal
 image is in the alpha channel, so the four channels must not be processed as one image.
@@ -61,8 +61,7 @@ def read_indices(path: Path) -> NDArray[Any]:
     if data.startswith(JPEG) or (colours == 0 and depth < 8):
         kind = "a JPEG, which changes values" if data.startswith(JPEG) else f"a PNG of {depth} bit"
         raise InputError(
-            f"{path}: expected class indices as they were written, got {kind}; save labels as PNG "
-            "of 8 bits."
+            f"{path}: expected unchanged class indices, got {kind}; save labels as PNG of 8 bits."
         )
     label = _palette_indices(data, path) if colours == 3 else _decoded(data, path)
     if channels(label) != 1:
@@ -84,8 +83,8 @@ def read_colours(path: Path) -> Array:
     data = read_image(path)
     if data.startswith(JPEG):
         raise InputError(
-            f"{path}: expected colours as they were written, got a JPEG, which changes them; save "
-            "labels as PNG."
+            f"{path}: expected unchanged colours, got a JPEG, which changes them; save labels as "
+            "PNG."
         )
     image = _decoded(data, path)
     if channels(image) == 4 and (image[..., 3] == np.iinfo(image.dtype).max).all():
@@ -114,8 +113,8 @@ def read_array(path: Path, what: str) -> NDArray[Any]:
         if isinstance(error, InputError):
             raise
         raise InputError(
-            f"{path} cannot be read as an array ({one_line(error)}): the file is damaged or none; "
-            f"{LEFT_OUT}."
+            f"{path} cannot be read as an array ({one_line(error)}): the file is damaged or not "
+            f"an array; {LEFT_OUT}."
         ) from error
     return array
 
@@ -146,10 +145,12 @@ def _decoded(data: bytes, path: Path) -> NDArray[Any]:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:  # a header with more pixels than possible
         if error.code == cv2.Error.StsNoMem:
-            raise MemoryError(f"{path} cannot be decoded, its pixels do not fit") from error
+            raise MemoryError(f"{path} cannot be decoded, because its pixels do not fit") from error
         image = None
     if image is None:
-        raise InputError(f"{path} cannot be decoded, the file is damaged or no image; {LEFT_OUT}.")
+        raise InputError(
+            f"{path} cannot be decoded, because the file is damaged or not an image; {LEFT_OUT}."
+        )
     return np.asarray(image)
 
 
@@ -160,5 +161,5 @@ def _palette_indices(data: bytes, path: Path) -> Array:
             return np.array(image, np.uint8)
     except (*UNREADABLE, zlib.error) as error:
         raise InputError(
-            f"{path} cannot be decoded, the file is damaged or no image; {LEFT_OUT}."
+            f"{path} cannot be decoded, because the file is damaged or not an image; {LEFT_OUT}."
         ) from error

@@ -1,7 +1,7 @@
-"""Freiburg Thermal: labelled days and unlabelled nights for training, both labelled for testing.
+"""Read Freiburg Thermal: training days with labels, training nights without, labelled tests.
 
-A reader only: it crops frames, converts thermal counts to grey levels and resizes labels to the
-frame, as configured, and refuses files it cannot read exactly.
+The reader crops frames, converts thermal counts to grey levels and resizes labels to the frame, as
+configured. It refuses files that it cannot read exactly.
 """
 
 from __future__ import annotations
@@ -131,8 +131,8 @@ class Freiburg(FileDataset):
         self._split_frames: dict[str, tuple[FolderFrame, ...]] = {}
         if not any(inside(folder, part).is_dir() for part in ("train", "test")):
             raise InputError(
-                f"dataset.root: '{root}' holds neither the folder train nor test; give the folder "
-                "into which both archives were unpacked."
+                f"dataset.root: '{root}' holds neither the folder train nor the folder test; give "
+                "the folder into which both archives were unpacked."
             )
         for key, chosen in (("unscored", unscored), ("ignored_test", ignored_test)):
             for word in chosen:
@@ -154,8 +154,8 @@ class Freiburg(FileDataset):
             thermal_range=thermal_range,
             counts=True,
             crop=crop,
-            advice="use the original file, a converted one no longer holds the counts that "
-            "dataset.thermal_range cuts",
+            advice="use the original file, because a converted file no longer holds the counts "
+            "to which dataset.thermal_range applies",
         )
 
     @property
@@ -185,9 +185,12 @@ class Freiburg(FileDataset):
                         f"{nearest(word, {each for each in known if '/' not in each})}."
                     )
             if split == "val":
-                hint = f"it is {list(self.val_sequences)}, name existing day sequences"
+                hint = (
+                    f"dataset.val_sequences is {list(self.val_sequences)}; name existing day "
+                    "sequences"
+                )
             elif by_day:
-                hint = "every day sequence is in dataset.val_sequences, remove one of them"
+                hint = "every day sequence is in dataset.val_sequences; remove one of them"
         if not frames:
             raise InputError(
                 f"split '{split}' of {self.name} is empty: expected {self.splits[split]} in "
@@ -248,7 +251,7 @@ class Freiburg(FileDataset):
 
     def unused(self, lists: SplitNames) -> list[Path]:  # noqa: ARG002 - as every data set
         """Thermal images and labels without an RGB image."""
-        return self._found[1]
+        return self._frames_and_unused[1]
 
     def own_problems(self, lists: SplitNames) -> list[str]:
         """Frames in two parts, by their time stamps; names differ between the parts."""
@@ -264,20 +267,20 @@ class Freiburg(FileDataset):
                 trained = {form: name for name in lists.get(other, ()) for form in forms(name)}
                 both = [name for name in lists.get(test, ()) if forms(name)[0] in trained]
                 problems += [
-                    f"splits {test} and {other} share {len(both)} frames by their time stamps, "
+                    f"splits {test} and {other} share {len(both)} frames by their time stamps; "
                     f"the first is '{name}', which is '{trained[forms(name)[0]]}'."
                     for name in both[:1]
                 ]
         return problems
 
     @cached_property
-    def _found(self) -> tuple[dict[str, FolderFrame], list[Path]]:
+    def _frames_and_unused(self) -> tuple[dict[str, FolderFrame], list[Path]]:
         """See `find_frames`; listed once, so later changes of the folder have no effect."""
         return find_frames(self.root)
 
     @property
     def _frames(self) -> dict[str, FolderFrame]:
-        return self._found[0]
+        return self._frames_and_unused[0]
 
     def _of(self, split: str) -> tuple[FolderFrame, ...]:
         self.check_split(split)
@@ -301,8 +304,8 @@ class Freiburg(FileDataset):
             aspects = [height / width for height, width in (label.shape, hw)]
             if abs(aspects[0] / aspects[1] - 1) > MOST_STRETCH:
                 raise InputError(
-                    f"{path} is {label.shape[0]}x{label.shape[1]} pixels and its frame "
-                    f"{hw[0]}x{hw[1]}, which is another aspect ratio; use the label of the whole "
+                    f"{path} has {label.shape[0]}x{label.shape[1]} pixels but its frame "
+                    f"{hw[0]}x{hw[1]}, which is another aspect ratio. Use the label of the whole "
                     "frame."
                 )
             size = (hw[1], hw[0])

@@ -1,4 +1,4 @@
-"""The files of each frame of the Freiburg Thermal archives; nothing is opened here."""
+"""Find the files of each frame of the Freiburg Thermal archives, without opening them."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ def find_frames(root: Path) -> tuple[dict[str, FolderFrame], list[Path]]:
         times = [time for time in ("day", "night") if time in values["sequence"].lower()]
         if folder.is_dir() and len(times) != 1:
             raise InputError(
-                f"{folder}: expected a name of a sequence with day or night, such as seq_00_day; "
-                "rename the folder, or move it out of the training part."
+                f"{folder}: expected the name of a sequence with day or night, such as "
+                "seq_00_day; rename the folder, or move it out of the training part."
             )
     frames: dict[str, FolderFrame] = {}
     others: list[Path] = []

@@ -1,4 +1,4 @@
-"""Pairs of RGB and thermal images without a label: how a data set reads them.
+"""Read pairs of RGB and thermal images without a label, as a data set reads them.
 
 A data set declares the paths of its images (`PairPattern`) and how they are decoded (`PairReader`),
 so that new images of any folder are read like the training images.
@@ -138,7 +138,7 @@ class PairReader:
         if values.dtype.kind not in "iuf" or values.ndim not in (2, 3):
             raise InputError(
                 f"{path}: expected thermal values of shape (rows, columns), got {values.shape} "
-                f"{values.dtype}; save whole or real numbers."
+                f"{values.dtype}; save integers or floats."
             )
         if self.counts and (values.dtype != np.uint16 or values.ndim != 2):
             raise InputError(
@@ -152,8 +152,8 @@ class PairReader:
         if values.dtype.kind == "f" and not np.isfinite(values).all():
             wrong = np.count_nonzero(~np.isfinite(values))
             raise InputError(
-                f"{path}: {wrong} thermal values are NaN or infinite; write a temperature there "
-                "(that of a neighbour, or one outside dataset.thermal_range)."
+                f"{path}: {wrong} thermal values are NaN or infinite; replace them with a "
+                "temperature (of a neighbour, or outside dataset.thermal_range)."
             )
         return values if values.ndim == 2 else self._mean(values, path)
 
@@ -165,8 +165,8 @@ class PairReader:
         if bottom > image.shape[0] or right > image.shape[1]:
             raise InputError(
                 f"'{name}': the frame is {image.shape[0]}x{image.shape[1]} pixels but "
-                f"dataset.crop={list(self.crop)} reaches to row {bottom} and column {right}; give "
-                "a crop inside it, or dataset.crop=null for whole frames."
+                f"dataset.crop={list(self.crop)} reaches to row {bottom} and column {right}. Give "
+                "a crop inside the frame, or dataset.crop=null for whole frames."
             )
         return image[top:bottom, left:right]
 
@@ -204,8 +204,8 @@ def grey(values: NDArray[Any], limits: Range | None, path: Path) -> Array:
         return np.asarray(values, np.uint8)
     if values.dtype == np.uint8 and limits[0] >= 255:
         raise InputError(
-            f"{path}: expected values of the camera in dataset.thermal_range={plain(limits)}, got "
-            "8 bits; use the original file, or set dataset.thermal_range=null for grey levels."
+            f"{path}: expected camera values in dataset.thermal_range={plain(limits)}, got 8 "
+            "bits; use the original file, or set dataset.thermal_range=null for grey levels."
         )
     if values.dtype == np.uint16:
         return np.take(_levels_of_16_bits(*limits), values)
@@ -213,7 +213,7 @@ def grey(values: NDArray[Any], limits: Range | None, path: Path) -> Array:
 
 
 def check_limits(limits: Range | None) -> None:
-    """Refuse a range that is no range."""
+    """Refuse limits that are not a range."""
     if limits is not None and not -math.inf < limits[0] < limits[1] < math.inf:
         raise InputError(
             "dataset.thermal_range: expected [low, high] with low < high, the thermal values that "

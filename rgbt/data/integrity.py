@@ -1,7 +1,7 @@
-"""Reads the bytes of a file and refuses damaged ones.
+"""Read the bytes of a file, and refuse damaged files.
 
 Some decoders accept damaged files without an error. Refused here are a truncated image, a wrong
-check sum, a broken link, a folder or a pipe instead of a file, and an image too large for the
+checksum, a broken link, a folder or a pipe instead of a file, and an image too large for the
 memory. Decoding is in `rgbt.data.files`.
 """
 
@@ -25,14 +25,14 @@ PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 """First bytes of these formats, independent of the suffix of the name."""
 
 PNG_END = b"IEND\xaeB`\x82"
-"""The last chunk of every PNG, with its check sum but without its length, which is 0."""
+"""The last chunk of every PNG, with its checksum but without its length, which is 0."""
 
 JPEG_SCAN, JPEG_END = 0xDA, b"\xff\xd9"
 
 Image.MAX_IMAGE_PIXELS = None  # `PIXELS` is checked instead, which the user can set
 warnings.filterwarnings("ignore", module=r"PIL\.")  # on damaged files, which are refused
 
-LEFT_OUT = "replace it, or use data.on_error=skip to leave it out"
+LEFT_OUT = "replace it, or skip unreadable files with data.on_error=skip"
 
 UNREADABLE = (OSError, ValueError, SyntaxError, EOFError, OverflowError, struct.error)
 """Exceptions of Pillow for damaged headers, and for files that are not images."""
@@ -51,14 +51,14 @@ def read_whole(path: Path, advice: str = LEFT_OUT) -> bytes:
         why = ""
         if os.path.islink(path):  # noqa: PTH114
             why = (
-                f": it is a link to {path.readlink()}, where nothing is; restore that file, or use "
-                "data.on_error=skip to leave it out"
+                f": it is a link to {path.readlink()}, which does not exist; restore that file, "
+                "or skip unreadable files with data.on_error=skip"
             )
         raise InputError(f"{path} is missing{why}.") from None
     except PermissionError:
         raise InputError(
-            f"{path} may not be read, permission is denied; allow it (chmod a+r, and a+x for the "
-            "folders above it), or use data.on_error=skip to leave it out."
+            f"{path} cannot be read: permission denied; allow access (chmod a+r, and a+x for the "
+            "folders above it), or skip unreadable files with data.on_error=skip."
         ) from None
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror}); {advice}.") from error
@@ -67,9 +67,9 @@ def read_whole(path: Path, advice: str = LEFT_OUT) -> bytes:
 def read_image(path: Path, advice: str = LEFT_OUT) -> bytes:
     """Every byte of an image that is not truncated and not too large.
 
-    The check sums of a PNG are compared, so damage cannot change pixels. In a JPEG the end marker
+    The checksums of a PNG are compared, so damage cannot change pixels. In a JPEG the end marker
     is searched after the start of the main image, as a thumbnail has an end of its own. JPEG, TIFF
-    and BMP have no check sums: damage inside them is refused if the decoder fails, and otherwise
+    and BMP have no checksums: damage inside them is refused if the decoder fails, and otherwise
     changes pixels. Bytes after the end are ignored.
 
     Args:
@@ -82,18 +82,18 @@ def read_image(path: Path, advice: str = LEFT_OUT) -> bytes:
     """
     data = read_whole(path, advice)
     if not data:
-        raise InputError(f"{path} cannot be decoded, the file is empty; {advice}.")
+        raise InputError(f"{path} cannot be decoded, because the file is empty; {advice}.")
     cut_png = data.startswith(PNG) and data.rfind(PNG_END) < 0
     cut_jpeg = data.startswith(JPEG) and data.rfind(JPEG_END, _scan(data)) < 0
     if cut_png or cut_jpeg:
         raise InputError(
-            f"{path} cannot be decoded, the file is cut short (its end is missing after "
+            f"{path} cannot be decoded, because the file is truncated (its end is missing after "
             f"{len(data)} bytes, as after an interrupted copy); {advice}."
         )
     if data.startswith(PNG) and not _is_whole_png(data):
         raise InputError(
-            f"{path} cannot be decoded, the file is damaged (a check sum of the PNG is another "
-            f"one); {advice}."
+            f"{path} cannot be decoded, because the file is damaged (a checksum of the PNG does "
+            f"not match); {advice}."
         )
     try:
         PIXELS.check(path, math.prod(_size(data)))
@@ -101,7 +101,7 @@ def read_image(path: Path, advice: str = LEFT_OUT) -> bytes:
         if isinstance(error, InputError):
             raise
         raise InputError(
-            f"{path} cannot be decoded, the file is damaged or no image; {advice}."
+            f"{path} cannot be decoded, because the file is damaged or not an image; {advice}."
         ) from error
     return data
 
@@ -134,8 +134,8 @@ def read_names(path: Path, key: str) -> tuple[str, ...]:
         raise InputError(f"{key}: {error}") from None
     if "\0" in text:
         raise InputError(
-            f"{key}: '{path}' is not a text in UTF-8; give a list of one name per line, saved as "
-            "plain text."
+            f"{key}: '{path}' is not UTF-8 text; give a list of one name per line, saved as plain "
+            "text."
         )
     names = tuple(line.strip() for line in text.splitlines() if line.strip())
     if not names:
@@ -157,8 +157,8 @@ def within(path: Path, root: Path) -> Path:
     if found.startswith(home.rstrip(os.sep) + os.sep) or not os.path.exists(found):  # noqa: PTH110
         return path
     raise InputError(
-        f"{path} leads out of dataset.root, to {found}; give dataset.root the folder in which the "
-        "files themselves lie, or copy the files (cp -rL, or rgbt prepare)."
+        f"{path} leads out of dataset.root, to {found}. Set dataset.root to the folder that holds "
+        "the files themselves, or copy the files (cp -rL, or rgbt prepare)."
     )
 
 
@@ -175,7 +175,7 @@ def _resolved(folder: str) -> str:
 
 
 def _is_whole_png(data: bytes) -> bool:
-    """Whether the check sum of every chunk up to the last one is correct."""
+    """Whether the checksum of every chunk up to the last one is correct."""
     at, view = len(PNG), memoryview(data)
     while at + 12 <= len(data):
         end = at + 12 + int.from_bytes(view[at : at + 4], "big")

@@ -1,4 +1,4 @@
-"""KP: the KAIST multispectral street scenes that carry labels of the 19 classes of Cityscapes."""
+"""Read KP: the KAIST multispectral street scenes with labels of the 19 classes of Cityscapes."""
 
 from __future__ import annotations
 
@@ -209,7 +209,7 @@ class KP(FileDataset):
         """Labels of other names, and splits that are not the union of their day and their night."""
         strange = [name for name in self.labels_on_disk if NAME.fullmatch(name) is None]
         problems = [
-            f"{len(strange)} labels have names without a set, the first is '{name}.png'."
+            f"{len(strange)} labels have names without a set; the first is '{name}.png'."
             for name in strange[:1]
         ]
         for split, names in lists.items():
@@ -219,8 +219,8 @@ class KP(FileDataset):
             differ = sorted(set(names) ^ {name for part in parts for name in lists[part]})
             if differ:
                 problems.append(
-                    f"split {split} is not {parts[0]} and {parts[1]} together: {len(differ)} names "
-                    f"are in one of them alone, the first is '{differ[0]}'."
+                    f"split {split} is not the union of {parts[0]} and {parts[1]}: {len(differ)} "
+                    f"names are missing on one side; the first is '{differ[0]}'."
                 )
         return problems
 
@@ -228,8 +228,8 @@ class KP(FileDataset):
         """The source of the splits, and whether it is the division of MS-UDA."""
         if self.lists == "sets":
             notes = [
-                "no list is read: all labels on disk are divided into splits by set numbers, as in "
-                "the CRM release."
+                "no list is used: all labels on disk are divided into splits by set numbers, as "
+                "in the CRM release."
             ]
         else:
             files = dict.fromkeys(path for split in self.splits for path in self.list_files(split))
@@ -240,8 +240,8 @@ class KP(FileDataset):
         if self.name == "kp" and is_ms_uda and not {6, 7, 8}.isdisjoint(map(set_of, train)):
             notes.append(
                 "the training split has only days and the validation split only nights, as in "
-                "MS-UDA: scores are not comparable with those of CRM, which trains on both; "
-                "dataset.lists=sets divides as CRM does."
+                "MS-UDA. Scores are not comparable with those of CRM, which trains on both; "
+                "dataset.lists=sets uses the splits of CRM."
             )
         return notes
 
@@ -283,8 +283,8 @@ class KP(FileDataset):
         path = self.root / self._files[split]
         if not path.is_file():
             raise InputError(
-                f"dataset.splits.{split}: there is no list '{path}'; write it (one name per line), "
-                "or divide the labels on disk by their sets with dataset.lists=sets."
+                f"dataset.splits.{split}: the list '{path}' does not exist; write it (one name "
+                "per line), or divide the labels on disk by their sets with dataset.lists=sets."
             )
         lines = read_names(path, f"dataset.splits.{split}")
         names = tuple(MODALITY.sub("_", line.removesuffix(".png")) for line in lines)
@@ -313,7 +313,8 @@ def _find_lists(root: Path, splits: dict[str, str], wanted: ListSource) -> Liter
     if wanted == "sets":
         if changed:
             raise InputError(
-                "dataset.splits names lists but dataset.lists=sets reads none; omit one of them."
+                "dataset.splits names lists, but dataset.lists=sets does not use lists; omit one "
+                "of them."
             )
         return "sets"
     exist = any((root / path).is_file() for path in splits.values())

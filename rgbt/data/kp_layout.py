@@ -1,4 +1,4 @@
-"""Names, split lists and label folders of KP; a name contains recording, video and frame.
+"""Parse names, split lists and label folders of KP; a name contains recording, video and frame.
 
 The recording decides time of day and split. Nothing is opened here.
 """
@@ -50,7 +50,8 @@ def parts_of(name: str) -> tuple[str, str, str]:
     """Set, video and frame, as ("set00", "V000", "I00050"); InputError if it is invalid."""
     if NAME.fullmatch(name) is None:
         raise InputError(
-            f"'{name}' is not {FORM}; its files and its time of day are unknown; correct the name."
+            f"'{name}' is not {FORM}, so its files and its time of day are unknown; correct the "
+            "name."
         )
     recording, video, frame = name.split("_")
     return recording, video, frame

@@ -1,4 +1,4 @@
-"""Class ids of one data set as those of another, for networks trained on other classes."""
+"""Map class ids of one data set to those of another, for networks trained on other classes."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from rgbt.ranges import Byte, Names, NumClasses, Text
 class LabelMap:
     """The class of a data set for each class of a network.
 
-    Ids are mapped after the argmax, as in the thesis: probabilities of classes that come to one
-    class are not added up, so that its confidence is that of the class that was most probable.
+    Ids are mapped after the argmax, as in the thesis: probabilities of classes that map to one
+    class are not added up. The confidence is that of the most probable class.
 
     Attributes:
         num_source: classes of the network, 1 to 255; their ids are 0 .. num_source - 1.
@@ -37,7 +37,7 @@ class LabelMap:
         for name in self.groups:
             if name not in self.targets:
                 raise InputError(
-                    f"label_map.groups: '{name}' is no class of label_map.targets; "
+                    f"label_map.groups: '{name}' is not a class of label_map.targets; "
                     f"{nearest(name, self.targets)}."
                 )
         mapped = sorted(source for group in self.groups.values() for source in group)
@@ -62,14 +62,15 @@ class LabelMap:
         return table[classes]
 
     def check(self, num_source: int, targets: tuple[str, ...], dataset: str) -> None:
-        """Refuse a network, or a data set of the classes `targets`, that this map is not about."""
+        """Refuse a network or a data set with other classes than those of this map."""
         if num_source != self.num_source:
             raise InputError(
-                f"label_map is for a network with {self.num_source} classes, but model.num_classes "
-                f"is {num_source}; choose the label_map of the network's own classes."
+                f"label_map is for a network with {self.num_source} classes, but "
+                f"model.num_classes is {num_source}. Choose the label_map for the classes of the "
+                "network."
             )
         if targets != self.targets:
             raise InputError(
-                f"label_map leads to the classes {', '.join(self.targets)}, but {dataset} has "
+                f"label_map maps to the classes {', '.join(self.targets)}, but {dataset} has "
                 f"{', '.join(targets)}; choose another label_map or data set."
             )

@@ -1,4 +1,4 @@
-"""The meaning of values in label files: each is a class, or ignored."""
+"""Map the values of label files to classes or to "ignored"."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class LabelCodes:
             colour = [code // 65536, code // 256 % 256, code % 256]
             return (
                 f"colour {colour} ({count} pixels{more}) is neither in dataset.colours nor in "
-                "dataset.ignored; add it there, or save labels that were never resized."
+                "dataset.ignored; add it there, or save labels without resizing them."
             )
         return (
             f"label value {code} ({count} pixels{more}) is neither in dataset.ids nor in "
@@ -118,7 +118,7 @@ def label_codes(
     colours: Colours | None,
     ignored: tuple[int | Colour, ...],
 ) -> LabelCodes:
-    """What the configuration says of label values, see `rgbt.data.folder.dataset.Folder`.
+    """The map of label values of a configuration, see `rgbt.data.folder.dataset.Folder`.
 
     Without `ids` and `colours` a value is the index of its class; 255 is ignored unless `ids` gives
     it a class.
@@ -140,7 +140,7 @@ def label_codes(
         pairs = [(word, one) for word, given in colours.items() for one in each_colour(given)]
     for word, _ in pairs:
         if word not in classes:
-            raise InputError(f"{key}: '{word}' is no class; {nearest(word, classes)}.")
+            raise InputError(f"{key}: '{word}' is not a class; {nearest(word, classes)}.")
     codes: dict[int, int] = {}
     named = [(classes.index(word), value) for word, value in pairs]
     for index, value in [*named, *((IGNORE, value) for value in ignored)]:
@@ -168,7 +168,7 @@ def _code(value: int | Colour, *, of_colours: bool) -> int:
     if isinstance(value, int) == of_colours:
         wanted = "a colour [red, green, blue]" if of_colours else "a whole number"
         raise InputError(
-            f"dataset.ignored: expected {wanted}, as labels hold such, got {_plain(value)}."
+            f"dataset.ignored: expected {wanted}, as in the labels, got {_plain(value)}."
         )
     if isinstance(value, int):
         return value

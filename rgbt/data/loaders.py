@@ -1,4 +1,4 @@
-"""Batches for training and evaluation.
+"""Load batches for training and evaluation.
 
 The samples of a batch and their augmentation depend on (seed, step) alone, not on the number of
 worker processes. Batches are not padded: networks pad images and losses pad labels.
@@ -40,8 +40,8 @@ from rgbt.types import Batch, Loadable
 LOG = logging.getLogger(__name__)
 
 CROP_ADVICE = (
-    "; choose transform.crop_hw so that it fits into every resized image, or the sizes for this "
-    "data set (recipe=kp, ...)"
+    "; choose a transform.crop_hw that fits into every resized image, or the sizes for this data "
+    "set (recipe=kp, ...)"
 )
 EVAL_ADVICE = "; set data.eval_batch_size=1"
 
@@ -65,8 +65,8 @@ class LoaderSettings:
             of the network, with the same result; "auto": "device" on a GPU if the transform can.
         cache: images are decoded once into memory-mapped files of this folder and read from there
             (`rgbt.data.cache`); "auto": in the folder of the user's cache; None: no such files.
-        on_error: "raise" stops at an unreadable file; "skip" names it once and takes the
-            next readable sample of the list instead (training) or leaves it out (evaluation).
+        on_error: "raise" stops at an unreadable file; "skip" reports it once and uses the next
+            readable sample of the list instead (training) or skips it (evaluation).
     """
 
     batch_size: BatchSize
@@ -96,7 +96,7 @@ class Batches(Iterator[Kind]):
         settings: processes that read, and how far ahead.
 
     Attributes:
-        skipped: name -> why it could not be read, of the samples left out so far.
+        skipped: name -> error, of the samples skipped so far.
     """
 
     def __init__(
@@ -132,8 +132,8 @@ class Batches(Iterator[Kind]):
                 if not DEAD_WORKER.search(str(error)):
                     raise
                 raise RunError(
-                    f"A loader process died ({str(error).splitlines()[0].rstrip('. ')}), most "
-                    "often because memory ran out. Lower data.num_workers, data.prefetch or "
+                    f"A loader process died ({str(error).splitlines()[0].rstrip('. ')}), probably "
+                    "because memory ran out. Lower data.num_workers, data.prefetch or "
                     "data.batch_size, and rerun the command to resume."
                 ) from error
             for name, reason in loaded.skipped.items():

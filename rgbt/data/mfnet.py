@@ -1,4 +1,4 @@
-"""MFNet and data sets in its layout: split lists, images, labels, time of day by name."""
+"""Read MFNet and data sets in its layout: split lists, images, labels, time of day by name."""
 
 from __future__ import annotations
 
@@ -117,8 +117,8 @@ class MFNet(FileDataset):
             return None
         if without:
             raise InputError(
-                f"the name '{without[0]}' has no time of day: expected a name that ends in D or N "
-                f"(before '{MIRRORED}'); rename it in the split lists of {self.root}."
+                f"the name '{without[0]}' does not state a time of day: expected a name that ends "
+                f"in D or N (before '{MIRRORED}'); rename it in the split lists of {self.root}."
             )
         return tuple(time_of(name) == "N" for name in names)
 
@@ -134,7 +134,8 @@ class MFNet(FileDataset):
     def own_problems(self, lists: SplitNames) -> list[str]:
         """Names of another form."""
         return [
-            f"split {split}: '{name}' is not five digits and D or N (or that with '{MIRRORED}')."
+            f"split {split}: '{name}' is not five digits followed by D or N (with or without "
+            f"'{MIRRORED}')."
             for split, names in lists.items()
             for name in dict.fromkeys(names)
             if not NAME.fullmatch(name)

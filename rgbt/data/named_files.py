@@ -23,14 +23,16 @@ def existing_root(root: str, content: str) -> Path:
     """The folder `root`; InputError if there is none, which requests "the one" with `content`."""
     path = Path(root).expanduser()
     if not path.is_dir():
-        raise InputError(f"dataset.root: there is no folder '{root}'; give the one {content}.")
+        raise InputError(
+            f"dataset.root: the folder '{root}' does not exist; give the folder {content}."
+        )
     return path
 
 
 def existing_file(what: str, path: Path, name: str, root: Path) -> Path:
     """`path`, one file of the sample `name`; InputError if it is missing or outside `root`."""
     if not is_there(path):
-        advice = "restore it, or use data.on_error=skip to leave the frame out"
+        advice = "restore it, or skip unreadable frames with data.on_error=skip"
         if name.endswith("_flip"):
             advice = "the list names a mirrored copy: write it, or use a list without such names"
         raise InputError(f"'{name}': its {what} {path} is missing; {advice}.")
@@ -47,7 +49,7 @@ def check_size(rgb: Array, what: str, image: NDArray[Any], name: str, path: Path
     if image.shape != rgb.shape[:2]:
         raise InputError(
             f"'{name}': RGB is {rgb.shape[0]}x{rgb.shape[1]} pixels but {what} is "
-            f"{image.shape[0]}x{image.shape[1]}; both must show the same pixels, align them "
+            f"{image.shape[0]}x{image.shape[1]}; both must show the same pixels. Align them "
             f"first: {path}."
         )
 

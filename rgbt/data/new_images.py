@@ -1,4 +1,4 @@
-"""Pairs of files in a folder of new images, by the layouts of a data set.
+"""Find pairs of files in a folder of new images, by the layouts of a data set.
 
 A folder is read by the first layout of which it has a complete pair; other files are named.
 """
@@ -76,10 +76,10 @@ def find_pairs(folder: Path, layouts: Sequence[PairPattern], name: str) -> NewIm
             f"{what_is_in(thermal.parent)}"
         )
     raise InputError(
-        f"{KEY}={folder} holds no pair of images: {reason}. Expected were the files of {name} "
+        f"{KEY}={folder} holds no pair of images: {reason}. Expected the files of {name} "
         f"({'; '.join(map(str, layouts))}; also without the first folders), folders rgb and "
-        "thermal with equal names, or PNG files of four channels (red, green, blue, thermal). One "
-        "pair is predicted with rgb=FILE thermal=FILE instead of input."
+        "thermal with equal names, or PNG files of four channels (red, green, blue, thermal). To "
+        "predict a single pair, use rgb=FILE thermal=FILE instead of input."
     )
 
 
@@ -157,8 +157,8 @@ def _partner(
         return exact if found else None
     if len(found) > 1:
         raise InputError(
-            f"{KEY}={folder}: {found[0]} and {found[1]} may both be the thermal image of one pair; "
-            "remove or rename one of them."
+            f"{KEY}={folder}: {found[0]} and {found[1]} could both be the thermal image of one "
+            "pair; remove or rename one of them."
         )
     return found[0]
 

@@ -1,4 +1,4 @@
-"""True second frames of a data set: the folder `next` beside its images.
+"""Read real second frames of a data set from the folder `next` beside its images.
 
 `synth` writes one (``dataset.ego_forward_m=...``); any data set in MFNet's layout may hold one:
 
@@ -38,16 +38,15 @@ class NextFrames:
         first = reader_of(first)
         if not isinstance(first, MFNet):
             raise InputError(
-                f"{first.name} ({first.root}) has no second frames: they are read in MFNet's "
-                "layout only; choose dataset=synth with dataset.ego_forward_m=0.5, and "
-                "frames=virtual needs none."
+                f"{first.name} ({first.root}) has no second frames, which require MFNet's layout. "
+                "Choose dataset=synth with dataset.ego_forward_m=0.5, or use frames=virtual."
             )
         root = first.root / FOLDER
         if not (root / "flow").is_dir():
             raise InputError(
                 f"{first.name} ({first.root}) has no second frames: expected the folder {FOLDER}/ "
-                "with images, labels and flow; dataset=synth writes them with "
-                "dataset.ego_forward_m=0.5, and frames=virtual needs none."
+                "with images, labels and flow. dataset=synth writes it with "
+                "dataset.ego_forward_m=0.5; frames=virtual does not require it."
             )
         self.dataset = MFNet(
             str(root),
@@ -86,8 +85,8 @@ class NextFrames:
         first_yx = np.rint(np.where(seen[..., None], grid + flow, 0)).astype(np.int64)
         if (first_yx < 0).any() or (first_yx >= image_hw).any():
             raise InputError(
-                f"{path} leads out of the first frame of {image_hw[0]}x{image_hw[1]} "
-                "pixels; points that were not visible there must be NaN."
+                f"{path} points outside the first frame of {image_hw[0]}x{image_hw[1]} pixels; "
+                "points that were not visible there must be NaN."
             )
         first_yx[~seen] = -1
         return first_yx[..., 0], first_yx[..., 1]

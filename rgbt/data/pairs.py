@@ -1,4 +1,4 @@
-"""Batches of two domains side by side."""
+"""Load batches of two domains together."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ class LoadedPair:
 class PairedBatches(Iterator[LoadedPair]):
     """A batch of the source with a batch of the target, each from its own stream.
 
-    The two lists need not be of one length: each is shuffled anew when it is through, and an epoch
-    of the run is one of the source.
+    The two lists may differ in length. Each is shuffled again at its end, and an epoch of the run
+    is one of the source.
 
     Args:
         source: of the labelled domain.
@@ -68,7 +68,7 @@ class PairedBatches(Iterator[LoadedPair]):
 
     @property
     def skipped(self) -> dict[str, str]:
-        """Name -> why it could not be read, of the samples left out so far."""
+        """Name -> error, of the samples skipped so far."""
         return self._source.skipped | self._target.skipped
 
     def close(self) -> None:

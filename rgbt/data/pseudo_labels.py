@@ -1,8 +1,8 @@
-"""Labels that a trained network predicted, used instead of those of a data set.
+"""Read labels that a trained network predicted, instead of those of a data set.
 
 A folder of them (written by `rgbt.evaluation.pseudo_labels`) holds:
 
-    labels/NAME.png       8 bit, class ids of the data set, 255 where the network was not sure
+    labels/NAME.png       8 bit, class ids of the data set, 255 below the confidence threshold
     confidence/NAME.png   16 bit, 65535 times the probability of the predicted class
     pseudo_labels.json    teacher and settings; written last, so a folder with it is complete
 """
@@ -65,7 +65,7 @@ class PseudoLabels:
 
     Attributes:
         folder: its path.
-        manifest: what ``pseudo_labels.json`` says: "format", "teacher" (a run's key, or a file),
+        manifest: content of ``pseudo_labels.json``: "format", "teacher" (a run's key, or a file),
             "weights" (SHA-256 of the teacher's parameters), "network" (SHA-256 of how it is
             built and fed), "view", "head", "label_map" (num_source, targets, groups; None: none),
             "threshold", "dataset", "fingerprint" (of the data set), "split", "classes" (their
@@ -83,14 +83,14 @@ class PseudoLabels:
         if not path.is_file():
             state = "is not complete" if self.folder.is_dir() else "does not exist"
             raise InputError(
-                f"the folder of pseudo-labels {self.folder} {state}: expected {MANIFEST} in it; "
-                f"write it with rgbt predict ... out={self.folder} pseudo_labels=true."
+                f"the folder of pseudo-labels {self.folder} {state}: expected {MANIFEST} in it. "
+                f"Write it with rgbt predict ... out={self.folder} pseudo_labels=true."
             )
         self.manifest: dict[str, Any] = read_json(path, Manifest, "remove it and predict again")
         if self.manifest.get("format") != FORMAT:
             raise InputError(
                 f"{path}: expected the format '{FORMAT}', got '{self.manifest.get('format')}'; "
-                "predict into another folder."
+                "choose another folder."
             )
 
     @property
@@ -146,7 +146,7 @@ def read_pair(
         )
         raise InputError(
             f"{path}: expected one channel of 16 bit and {label.shape[0]} x {label.shape[1]} "
-            f"pixels, as the label has, got {found}; predict into another folder."
+            f"pixels, as the label has, got {found}; choose another folder."
         )
     return label, np.asarray(confidence, np.uint16)
 

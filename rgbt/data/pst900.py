@@ -1,4 +1,4 @@
-"""PST900: RGB-thermal images of mines and tunnels, with four objects of search and rescue."""
+"""Read PST900: RGB-thermal images of mines and tunnels, with four objects of search and rescue."""
 
 from __future__ import annotations
 
@@ -66,8 +66,8 @@ class PST900(FileDataset):
             PairPattern("{part}/rgb/{name}.png", "{part}/thermal/{name}.png"),
             PairPattern("rgb/{name}.png", "thermal/{name}.png"),
         ),
-        advice="the folder thermal holds grey levels, one channel of 8 bits; thermal_raw holds the "
-        "counts of the camera and is not read",
+        advice="use the folder thermal, which holds grey levels in one channel of 8 bits; "
+        "thermal_raw holds the counts of the camera and is not supported",
     )
     clipping = (0, 255)
     # The archive holds 597 training pairs; the data set's page says 606.
@@ -132,7 +132,7 @@ class PST900(FileDataset):
         part = self.part_of(split)
         advice = f"unpack the folder '{part}' of the archive there"
         if self.val_bags and part == "train":
-            advice = "every image is of a bag in dataset.val_bags, remove one of them"
+            advice = "every image is of a bag in dataset.val_bags; remove one of them"
             known = {bag for name in self._part("train") if (bag := bag_of(name)) is not None}
             for bag in self.val_bags:
                 if bag not in known:
@@ -194,9 +194,9 @@ class PST900(FileDataset):
         notes = []
         if self.repeats("val"):
             notes.append(
-                "split val is the test part, as in the CRM release: a checkpoint chosen on it is "
-                "chosen on what is reported; dataset.val_bags takes recordings out of training "
-                "instead."
+                "split val is the test part, as in the CRM release, so the best checkpoint is "
+                "selected on the test images. dataset.val_bags validates on recordings of the "
+                "training part instead."
             )
         if self.name != "pst900":
             return notes
@@ -205,9 +205,9 @@ class PST900(FileDataset):
         if tested:
             part = "is" if tested == bags["train"].total() else "holds"
             notes.append(
-                f"split train {part} {tested} images of the bags 21 to 25, which the archive has "
-                "for testing: the folders train and test seem to be exchanged, as in the drawing "
-                "on the data set's page; exchange them back."
+                f"split train {part} {tested} images of the bags 21 to 25, which belong to the "
+                "test part of the archive. The folders train and test seem to be swapped, as in "
+                "the drawing on the data set's page; swap them back."
             )
         if bags["test"] and bags["test"] != Counter(TEST_BAGS):
             found, listed = (
@@ -254,8 +254,8 @@ def _has_lists(root: Path) -> bool:
         advice = f"give {near}, which does"
     elif is_flat:
         advice = (
-            "it holds rgb, thermal and labels themselves, but neither train.txt nor test.txt says "
-            "which image belongs to which part; write these lists (one name per line)"
+            "it holds rgb, thermal and labels, but neither train.txt nor test.txt. Write these "
+            "lists of the parts (one name per line)"
         )
     raise InputError(
         f"dataset.root: '{root}' does not hold train/rgb or test/rgb of PST900; {advice}."

@@ -1,6 +1,6 @@
-"""The work of a loader process: read the samples of one batch, transform and stack them.
+"""Read, transform and stack the samples of one batch in a loader process.
 
-Part of `rgbt.data.loaders`, which chooses the samples of each batch.
+`rgbt.data.loaders` chooses the samples of each batch.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ class LoadedBatch:
 
     Attributes:
         batch: a dataclass of tensors; None if every sample was left out, or after an error.
-        skipped: name -> why it could not be read.
+        skipped: name -> error.
         error: message of an InputError; a text, because torch wraps exceptions of workers.
     """
 

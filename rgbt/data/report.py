@@ -1,4 +1,4 @@
-"""Reads a whole data set and reports its content and its problems.
+"""Read a whole data set and report its content and its problems.
 
 Every listed sample is read once, in threads. `rgbt.data.check` prints the report. The numbers of a
 published data set, and what only one data set can check, are in its class
@@ -123,7 +123,7 @@ def check_dataset(
     num_threads: int = 4,
     advance: Callable[[], object] = lambda: None,
 ) -> DatasetReport:
-    """Read every sample of the splits and report problems; none: nothing is wrong.
+    """Read every sample of the splits and report problems.
 
     Args:
         dataset: reads files.
@@ -222,7 +222,7 @@ def _time_of(dataset: FileDataset, name: str) -> str:
     """Either "day" or "night", or "" if that is unknown."""
     try:
         nights = dataset.nights((name,))
-    except InputError:  # reading it says what is wrong
+    except InputError:  # reading it reports the problem
         nights = None
     return "" if nights is None else "night" if nights[0] else "day"
 
@@ -251,8 +251,8 @@ def _list_problems(dataset: FileDataset, lists: dict[str, tuple[str, ...]]) -> l
         flipped = [name for name in names if _is_mirrored(dataset, name)]
         if flipped and "train" not in split:
             problems.append(
-                f"split {split} lists {len(flipped)} mirrored copies, the first is '{flipped[0]}'; "
-                "only training splits may."
+                f"split {split} lists {len(flipped)} mirrored copies; the first is "
+                f"'{flipped[0]}'. Only training splits may list them."
             )
     for one, other in combinations(lists, 2):
         words, other_words = set(one.split("_")), set(other.split("_"))
@@ -263,7 +263,7 @@ def _list_problems(dataset: FileDataset, lists: dict[str, tuple[str, ...]]) -> l
         both = [name for name in lists[one] if name in in_other]
         if both:
             problems.append(
-                f"splits {one} and {other} share {len(both)} names, the first is '{both[0]}'."
+                f"splits {one} and {other} share {len(both)} names; the first is '{both[0]}'."
             )
     return problems
 
@@ -271,7 +271,7 @@ def _list_problems(dataset: FileDataset, lists: dict[str, tuple[str, ...]]) -> l
 def _unused(dataset: FileDataset, lists: SplitNames) -> list[str]:
     unused = sorted(dataset.unused(lists))
     return [
-        f"{len(unused)} files belong to no image of a split, the first is {path}."
+        f"{len(unused)} files belong to no image of a split; the first is {path}."
         for path in unused[:1]
     ]
 
@@ -287,8 +287,8 @@ def _clipped(dataset: FileDataset, splits: tuple[SplitReport, ...]) -> list[str]
         if outside > dataset.most_clipped * filled:
             problems.append(
                 f"split {split.split}: {outside / filled:.2%} of the thermal values other than 0 "
-                f"lie outside dataset.thermal_range={plain(limits)} and become black or white; "
-                f"they run from {thermal.lowest:g} to {thermal.highest:g}, choose a range among "
+                f"lie outside dataset.thermal_range={plain(limits)} and become black or white. "
+                f"They range from {thermal.lowest:g} to {thermal.highest:g}; choose a range among "
                 "them."
             )
     return problems
@@ -303,10 +303,10 @@ def _thermal_notes(dataset: FileDataset, splits: tuple[SplitReport, ...]) -> lis
         empty, below, above = (f"{each / thermal.pixels:.2%}" for each in thermal[1:4])
         others = f"{below} lie below and {above} above dataset.thermal_range={plain(limits)}"
         if dataset.images.thermal_range is None:
-            others = "which those without a measurement are"
+            others = "which marks pixels without a measurement"
         notes.append(
-            f"split {split.split}: {empty} of the thermal pixels are 0, {others}; the others run "
-            f"from {thermal.lowest:g} to {thermal.highest:g}."
+            f"split {split.split}: {empty} of the thermal pixels are 0, {others}; the others "
+            f"range from {thermal.lowest:g} to {thermal.highest:g}."
         )
     return notes
 
@@ -322,19 +322,20 @@ def _other_numbers(splits: tuple[SplitReport, ...], expected: Expected) -> list[
         official = times.get(split.split, found)
         if official != found:
             notes.append(
-                f"split {split.split} has {found[0]} day and {found[1]} night images, the "
-                f"official list has {official[0]} and {official[1]} ({sum(official)} in all)."
+                f"split {split.split} has {found[0]} day and {found[1]} night images, but the "
+                f"official list has {official[0]} and {official[1]} ({sum(official)} in total)."
             )
         num_images = expected.images.get(split.split, split.num_names)
         if num_images != split.num_names:
             notes.append(
-                f"split {split.split} has {split.num_names} images, the archive has {num_images}."
+                f"split {split.split} has {split.num_names} images, but the archive has "
+                f"{num_images}."
             )
     others = sorted(set().union(*(split.sizes for split in splits)) - {expected.hw})
     if expected.hw and others:
         listed = ", ".join(f"{height}x{width}" for height, width in others)
         notes.append(
-            f"images are {listed}, the original ones {expected.hw[0]}x{expected.hw[1]}: scores of "
-            "resized images are not comparable with those of original ones."
+            f"images are {listed}, but the original images are {expected.hw[0]}x{expected.hw[1]}. "
+            "Scores on resized images are not comparable with those on original images."
         )
     return notes

@@ -1,4 +1,4 @@
-"""Images to predict: a split, a folder of new images, one file or two files."""
+"""Find the images to predict: a split, a folder of new images, one file or two files."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class ToPredict:
         names: of the images; names of written files begin with them.
         read: name -> its images, without a label.
         folders: of the files, which must not be overwritten.
-        skipped: name -> why it was left out; `samples` adds to it.
+        skipped: name -> error, of skipped images; `samples` adds to it.
         others: further images, which belong to no pair.
     """
 
@@ -60,7 +60,8 @@ class ToPredict:
         """Refuse a folder in which input or output images would be overwritten."""
         if out.resolve() in {folder.resolve() for folder in self.folders}:
             raise InputError(
-                f"out={out} holds the input images, which would be overwritten; name another one."
+                f"out={out} holds the input images, which would be overwritten; choose another "
+                "folder."
             )
         written: dict[str, str] = {}
         for name in self.names:
@@ -95,15 +96,15 @@ def of_path(dataset: LabelledDataset, text: str, on_error: Literal["raise", "ski
         return of_files(dataset, path, path)
     if not path.is_dir():
         raise InputError(
-            f"input={text}: there is no such file or folder, and no such split of {dataset.name}; "
+            f"input={text}: this is neither a file, nor a folder, nor a split of {dataset.name}; "
             f"splits: {nearest(text, dataset.splits)}."
         )
     found = find_pairs(path, images.layouts, dataset.name)
     for rgb, thermal in list(found.alone.items())[: on_error == "raise"]:
         raise InputError(
-            f"input={text}: {len(found.alone)} of {len(found.alone) + len(found.pairs)} RGB images "
-            f"have no thermal image, the first is {rgb}: expected {thermal}; restore it, or use "
-            "data.on_error=skip to leave such images out."
+            f"input={text}: {len(found.alone)} of {len(found.alone) + len(found.pairs)} RGB "
+            f"images have no thermal image, the first is {rgb}: expected {thermal}. Restore it, "
+            "or skip such images with data.on_error=skip."
         )
     pairs = {pair.name: pair for pair in found.pairs}
     folders = {path, *(file.parent for pair in found.pairs for file in pair[1:])}
@@ -177,8 +178,8 @@ def images_of(dataset: LabelledDataset) -> PairReader:
     reader = reader_of(dataset)
     if not isinstance(reader, ReadsPairs):
         raise InputError(
-            f"{type(reader).__name__} does not declare how new images are read; name one of its "
-            f"splits ({', '.join(reader.splits)}), or give it `images` and `pair` "
-            "(docs/extending.md, data set)."
+            f"{type(reader).__name__} does not declare how to read new images. Name one of its "
+            f"splits ({', '.join(reader.splits)}), or give the class `images` and `pair` (see "
+            "docs/tutorials/own-data-set.md)."
         )
     return reader.images

@@ -1,4 +1,4 @@
-"""The training loop and what it needs: optimizers, schedules, checkpoints, evaluation, progress.
+"""The training loop with optimizers, schedules, checkpoints, evaluation and progress.
 
-Nothing here knows a network, a loss or a data set: they arrive as objects.
+Networks, losses and data sets are passed in as objects.
 """

@@ -1,4 +1,4 @@
-"""The allocator setting that makes large activations up to twice as fast on Linux CPUs."""
+"""Set the memory allocator so that large activations are up to twice as fast on Linux CPUs."""
 
 from __future__ import annotations
 

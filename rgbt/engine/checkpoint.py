@@ -1,9 +1,9 @@
-"""What a run's checkpoints hold: the state to resume from, and the best weights.
+"""Read and write the content of checkpoints: the state to resume from, and the best weights.
 
-Which one is taken when a run starts, first match wins:
+When a run starts, the first of these that exists is used:
 1. ``last.pt`` of the run folder (the run resumes; `rgbt.engine.committed`);
 2. `model.weights` (read by `rgbt.weights`);
-3. fresh weights.
+3. random weights.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from rgbt.checkpoints.stored import ZIP, explained, plain, read_stored
+from rgbt.checkpoints.stored import ZIP, explained, plain, read_torch_file
 from rgbt.checks import InputError
 
 
@@ -27,9 +27,9 @@ class State:
     Attributes:
         step: optimiser steps done.
         best_score: highest selection score so far, fraction; -1 before the first evaluation.
-        best_step: the step it was reached at.
+        best_step: the step of the best score.
         seed: run seed, from which every generator is derived together with `step`.
-        skipped: names of unreadable files that were left out so far, sorted.
+        skipped: names of the unreadable files that were skipped so far, sorted.
         evaluated_step: step of the last evaluation; below `step` where a signal came before the
             evaluation of `step`, which is then made on resuming.
         unlogged: values of the steps since the last line of ``metrics.jsonl``.
@@ -44,7 +44,7 @@ class State:
     unlogged: dict[str, float] = field(default_factory=dict)
 
     def skip(self, names: Iterable[str]) -> None:
-        """Note files that were left out."""
+        """Note files that were skipped."""
         self.skipped = sorted({*self.skipped, *names})
 
     @classmethod
@@ -75,7 +75,7 @@ def training_payload(
     optimizers: dict[str, torch.optim.Optimizer],
     state: State,
 ) -> dict[str, Any]:
-    """Everything a run needs to go on as if it had not stopped."""
+    """Everything a run needs to resume as if it had not stopped."""
     return {
         "model": model.state_dict(),
         "others": {name: module.state_dict() for name, module in others.items()},
@@ -88,13 +88,13 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     """The payload of a checkpoint file, tensors on the CPU.
 
     Raises:
-        InputError: missing, damaged, or not a checkpoint of ours; nothing in it is executed.
+        InputError: missing, damaged, or not a checkpoint of rgbt; nothing in it is executed.
     """
     if not path.is_file():
-        raise InputError(f"{path}: there is no such checkpoint.")
-    advice = "copy it again from where it is whole, or train the run again in another runs_dir=..."
+        raise InputError(f"the checkpoint {path} does not exist.")
+    advice = "copy it again from an intact copy, or train the run again in another runs_dir=..."
     with explained(path, "a checkpoint", advice):
-        value, container = read_stored(path)
+        value, container = read_torch_file(path)
         payload = plain(value, path.stat().st_size) if container == ZIP else None
     loaded: dict[str, Any] = payload if isinstance(payload, dict) else {}
     weights = loaded.get("model")
@@ -102,7 +102,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
         isinstance(name, str) and isinstance(tensor, Tensor) for name, tensor in weights.items()
     ):
         raise InputError(
-            f"{path} holds no weights under 'model'; give a checkpoint written by rgbt.run."
+            f"{path} holds no weights under 'model'; give a checkpoint written by `rgbt run`."
         )
     return loaded
 
@@ -116,21 +116,23 @@ def step_of(payload: Mapping[str, Any], source: Path) -> int:
     state = payload.get("state", payload)
     step = state.get("step") if isinstance(state, dict) else None
     if not isinstance(step, int):
-        raise InputError(f"{source} does not say its step; give a checkpoint written by rgbt.run.")
+        raise InputError(
+            f"{source} does not contain its step; give a checkpoint written by `rgbt run`."
+        )
     return step
 
 
 def restore_optimizer(optimizer: torch.optim.Optimizer, stored: Any, source: Path) -> None:
-    """Put the state of an optimiser back.
+    """Restore the state of an optimizer.
 
     Raises:
-        InputError: it is the state of another one.
+        InputError: it is the state of another optimizer.
     """
     try:
         optimizer.load_state_dict(stored)
     except (ValueError, TypeError, LookupError, AttributeError, RuntimeError) as error:
         raise InputError(
-            f"{source} holds the state of another optimizer than the one of this run; resume with "
+            f"{source} holds the state of a different optimizer than this run uses. Resume with "
             "the code that wrote it, or train the run again in another runs_dir=..."
         ) from error
 

@@ -1,15 +1,15 @@
-"""The checkpoints in a run's folder, of which one rename commits a state as a whole.
+"""Write the checkpoints of a run folder so that a single rename commits each state.
 
 ====================  ============================================================================
 last.pt               the committed state: model, optimisers, step, and which step is the best
 last_previous.pt      the state committed before it, for the case that last.pt is damaged
-checkpoints/<step>/   what the evaluation at that step made: best.pt, counts_val.npz, ...; kept for
+checkpoints/<step>/   files of the evaluation at that step: best.pt, counts_val.npz, ...; kept for
                       the best steps of these two states
 best.pt, ...          hard links to the files of the best step of last.pt
 ====================  ============================================================================
 
-An evaluation writes its files under its step first; until last.pt names that step they count for
-nothing. What a process killed in between left is repaired on resuming.
+An evaluation first writes its files under its step. They are used only once last.pt names that
+step. If a process is killed in between, the files are repaired when the run resumes.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from rgbt.engine.checkpoint import State, load_checkpoint, step_of
 
 BEST = "best.pt"
 NO_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK, errno.EACCES)
-"""What file systems say that know no hard links; files are copied there."""
+"""Errors of file systems without hard links; files are copied there."""
 
 
 class Checkpoints:
-    """See the module.
+    """Read and commit the checkpoints of one run folder (see the module).
 
     Args:
         folder: of the run.
 
     Attributes:
-        warning: after `load`: what was wrong with last.pt, "" if nothing.
+        warning: after `load`: the problem with last.pt, "" if there is none.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -57,13 +57,13 @@ class Checkpoints:
         return folder
 
     def save_best(self, step: int, weights: dict[str, Any]) -> None:
-        """Write the weights of an evaluation whose score is the highest, or the one that counts."""
+        """Write the weights of an evaluation with the highest score so far, or of the last one."""
         folder = self._by_step / str(step)
         folder.mkdir(parents=True, exist_ok=True)
         save(folder / BEST, {"model": weights, "step": step})
 
     def commit(self, payload: dict[str, Any], state: State) -> None:
-        """Write the state of a run, unless it is the one that is committed."""
+        """Write the state of a run, unless it is already committed."""
         if self._committed == (state.step, state.evaluated_step):
             return
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -109,14 +109,14 @@ class Checkpoints:
         found = step_of(payload, self.best)
         if found != step:
             raise RunError(
-                f"{self.best} is of step {found}, the best evaluation of this run of step {step}; "
-                f"{self._begin_again()}"
+                f"{self.best} is of step {found}, but the best evaluation of this run is of step "
+                f"{step}; {self._begin_again()}"
             )
         weights: dict[str, Any] = payload["model"]
         return weights
 
     def tidy(self) -> None:
-        """Remove what only resuming needs, once nothing is left to train."""
+        """Remove the files that are only needed to resume, after training has ended."""
         self.previous.unlink(missing_ok=True)
         shutil.rmtree(self._by_step, ignore_errors=True)
 
@@ -130,7 +130,7 @@ class Checkpoints:
         try:
             state = State.of(payload)
         except TypeError as error:
-            raise InputError(f"{path} holds no state of a training.") from error
+            raise InputError(f"{path} does not hold the state of a training.") from error
         named = self._by_step / str(state.best_step) / BEST
         # Runs of before there was this folder have their best weights beside last.pt.
         best = named if named.exists() else self.best
@@ -148,25 +148,25 @@ class Checkpoints:
             payload, state = self._whole(self.previous)
         except InputError as error:
             raise RunError(
-                f"{reason}, and the checkpoint before it is no better ({self.previous.name}); "
+                f"{reason}, and the previous checkpoint ({self.previous.name}) is damaged too; "
                 f"{self._begin_again()}"
             ) from error
         if self.last.exists():
-            self.warning = f"{reason}; the run resumes from the checkpoint before it."
+            self.warning = f"{reason}; the run resumes from the previous checkpoint."
         _link(self.previous, self.last)
         return payload, state
 
     def _begin_again(self) -> str:
-        return f"remove {self.folder} and rerun the command to train the run from its start."
+        return f"remove {self.folder} and rerun the command to train the run from the start."
 
     def _publish(self, step: int) -> None:
-        """Let the names that others read refer to the files of the best step."""
+        """Link the public file names to the files of the best step."""
         for source in (self._by_step / str(step)).glob("*"):
             _link(source, self.folder / source.name)
 
 
 def _link(source: Path, target: Path) -> None:
-    """Make `target` another name of `source`, replacing what it was; never a moment without."""
+    """Atomically make `target` another name of `source`, replacing an older file."""
     if target.exists() and target.samefile(source):
         return
     temporary = target.with_name(f".{target.name}.partial")

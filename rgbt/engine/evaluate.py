@@ -1,4 +1,4 @@
-"""Predictions of a network over batches: no gradients, no logging."""
+"""Predict batches with a network, without gradients."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rgbt.requirements import record_of
 from rgbt.types import Batch, View
 
 FAINTEST = 1e-6
-"""Smallest sum of semantic scores that shares are taken of."""
+"""Smallest sum of semantic scores used as a denominator."""
 
 
 def class_maps(
@@ -34,7 +34,7 @@ def class_maps(
         model: a network in evaluation mode.
         batch: on the device, images in [0, 1].
         fabric: precision.
-        view: what is predicted from; None leaves it to the network.
+        view: input images of the prediction; None leaves the choice to the network.
         heads: which head predicts each image of the batch; () leaves it to the network.
     """
     with torch.inference_mode():
@@ -83,16 +83,16 @@ def label_scores(
         label_hw = batch.label.shape[-2:]
         if scores.shape[-2:] != label_hw:
             scores = F.interpolate(scores, size=label_hw, mode="bilinear", align_corners=False)
-        # One fast pass: a sum is not finite if any score is not. Only then is looked at which.
+        # One fast pass: a sum is not finite if any score is not. Only then each image is checked.
         if bool(scores.sum().isfinite()):
             return scores
         finite = scores.isfinite().flatten(1).all(1).tolist()
     for name, is_finite in zip(batch.name, finite, strict=True):
         if not is_finite:
             raise RunError(
-                f"image '{name}': the network's class scores are NaN or infinite, so that nothing "
-                "can be counted; use a checkpoint of an earlier step or other weights, or train "
-                "again with a lower optimizer.lr."
+                f"image '{name}': the network's class scores are NaN or infinite, so the image "
+                "cannot be counted. Use a checkpoint of an earlier step or other weights, or "
+                "train again with a lower optimizer.lr."
             )
     return scores
 

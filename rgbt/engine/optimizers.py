@@ -1,4 +1,4 @@
-"""Builders of optimizers, with the parameter groups of the releases."""
+"""Build optimizers with the parameter groups of the releases."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ NORMS = (nn.LayerNorm, nn.GroupNorm, nn.modules.batchnorm._BatchNorm)
 UNDECAYED_NAMES = ("relative_position_bias_table",)
 BIASES = ("bias", "in_proj_bias")
 Decay = Annotated[float, Interval(ge=0, le=100)]
-"""Of weights; times the learning rate it is what a step takes away."""
+"""Weight decay; a step subtracts it times the learning rate."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -140,7 +140,7 @@ class Adam:
 
 
 def _group(parameters: list[nn.Parameter], lr: float) -> dict[str, Any]:
-    """Parameters with what a schedule reads (`base_lr`) and what it writes."""
+    """A parameter group with the base rate (`base_lr`) that a schedule reads."""
     return {"params": parameters, "lr": lr, "base_lr": lr}
 
 
@@ -153,7 +153,7 @@ def parameter_groups(
     normalisations, `nn.Embedding` weights and `undecayed_names` are not.
 
     Args:
-        model: of parameters that are not trained, none is listed.
+        model: parameters that are not trained are left out.
         undecayed_names: last words of names.
         without: beginnings of names that are left out, for two optimizers that share a backbone
             and have a head each ("heads.target.").

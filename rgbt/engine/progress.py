@@ -1,4 +1,4 @@
-"""What a person sees while a run trains: one line with the loss, the speed and the time left."""
+"""The progress bar of a training: loss, speed and remaining time in one line."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from rgbt.ranges import NumSteps, NumStepsOrZero, Power, Share
 
 
 class Schedule(Protocol):
-    """What the loop asks a schedule."""
+    """The interface of a schedule."""
 
     def __call__(self, step: int, max_steps: int, steps_per_epoch: int) -> float:
         """Factor of the base learning rate at optimiser step `step` (0-based)."""
@@ -32,7 +32,7 @@ class Poly:
         power: 0.9 in both releases.
         per: what t counts.
         warmup_steps: steps over which the factor rises linearly from 1 / warmup_steps to 1; the
-            decay, counted from step 0, takes over after them (as in the temporal release).
+            decay, counted from step 0, follows (as in the temporal release).
     """
 
     power: Power
@@ -40,7 +40,7 @@ class Poly:
     warmup_steps: NumStepsOrZero
 
     def __call__(self, step: int, max_steps: int, steps_per_epoch: int) -> float:
-        """See `Schedule`."""
+        """Factor of the base learning rate at `step`."""
         done = step if self.per == "iteration" else step // steps_per_epoch
         decay = max(0.0, 1.0 - done / max_steps) ** self.power
         return (step + 1) / self.warmup_steps if step < self.warmup_steps else float(decay)
@@ -59,16 +59,16 @@ class ThesisPoly:
     power: Power
 
     def __call__(self, step: int, max_steps: int, steps_per_epoch: int) -> float:  # noqa: ARG002
-        """See `Schedule`."""
+        """Factor of the base learning rate at `step`."""
         return float((1.0 - (step + 1) / max_steps) ** self.power)
 
 
 @dataclass(frozen=True, kw_only=True)
 class LatePoly:
-    """Poly as the CMX and temporal releases run it: every rate is written after its step.
+    """Polynomial decay of the CMX and temporal releases, which set every rate after its step.
 
-    The first step goes at the full base rate. Step s, which is step i of epoch e (all from 0), sets
-    the rate of the step after it from a count t, in which an epoch of E steps is taken for C:
+    The first step uses the full base rate. Step s, which is step i of epoch e (all from 0), sets
+    the rate of the step after it from a count t, in which an epoch of E steps counts as C:
 
         t = C e + i,  T = C epochs,  W = C (epochs of warm-up)
         factor = t / W where t < W, else (1 - t / T) ** power
@@ -99,11 +99,11 @@ class LatePoly:
         if self.counted_steps < self.epoch_steps:
             raise InputError(
                 f"schedule.counted_steps={self.counted_steps} must be at least "
-                f"schedule.epoch_steps={self.epoch_steps}: see rgbt.engine.schedules.LatePoly."
+                f"schedule.epoch_steps={self.epoch_steps}; see rgbt.engine.schedules.LatePoly."
             )
 
     def __call__(self, step: int, max_steps: int, steps_per_epoch: int) -> float:  # noqa: ARG002
-        """See `Schedule`."""
+        """Factor of the base learning rate at `step`."""
         if step == 0:
             return 1.0
         done = step - 1
@@ -124,15 +124,15 @@ class Exponential:
 
     Attributes:
         factor: 0.95 in both releases' code; MFNet's released weights were trained with 0.94.
-        epoch_steps: length of an epoch in steps, where a release's list is longer than ours;
-            null: the list's own.
+        epoch_steps: length of an epoch in steps, where the list of a release is longer than that
+            of rgbt; null: the length of the list.
     """
 
     factor: Share
     epoch_steps: NumSteps | None
 
     def __call__(self, step: int, max_steps: int, steps_per_epoch: int) -> float:  # noqa: ARG002
-        """See `Schedule`."""
+        """Factor of the base learning rate at `step`."""
         return float(self.factor ** (step // (self.epoch_steps or steps_per_epoch)))
 
 
@@ -151,6 +151,6 @@ class Steps:
     every: Annotated[float, Interval(ge=1e-6, le=1)]
 
     def __call__(self, step: int, max_steps: int, steps_per_epoch: int) -> float:  # noqa: ARG002
-        """See `Schedule`."""
+        """Factor of the base learning rate at `step`."""
         # As a fraction: 0.3 of 608400 steps are 182520, and not the float below.
         return float(self.factor ** (step // (Fraction(str(self.every)) * max_steps)))

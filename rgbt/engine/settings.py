@@ -1,4 +1,4 @@
-"""Settings of the training loop, and of the recipes and scales that they come from."""
+"""Settings of the training loop, and the recipes and scales that provide them."""
 
 from __future__ import annotations
 
@@ -38,15 +38,14 @@ class TrainerSettings:
         checkpoint_every: steps between checkpoints; every evaluation writes one too.
         log_every: steps between lines in metrics.jsonl.
         accumulate: batches whose gradients are averaged into one optimiser step.
-        clip_norm: largest L2 norm of all gradients together; null leaves them as they are.
+        clip_norm: largest L2 norm of all gradients together; null disables clipping.
         precision: "32-true" or "bf16-mixed".
-        accelerator: "auto" takes a GPU where there is one.
-        threads: of the CPU's arithmetic, >= 1, whatever cores a machine has: the bits of a result
-            depend on it. Runs of before it had a number (null) took one per core.
-        selection_split: split whose mIoU picks the best checkpoint. Released: "test".
-        tested: what the test split is evaluated with: "best", the checkpoint with the highest mIoU
-            on the selection split, or "last", where that split says little (it holds no images
-            of the target domain).
+        accelerator: "auto" uses a GPU if there is one.
+        threads: of the CPU's arithmetic, >= 1, independent of the machine's cores: the bits of a
+            result depend on it. Older runs (null) used one thread per core.
+        selection_split: split whose mIoU selects the best checkpoint. Released: "test".
+        tested: checkpoint for the test split: "best", with the highest mIoU on the selection
+            split, or "last", if that split has no images of the target domain.
     """
 
     max_steps: NumSteps
@@ -64,11 +63,11 @@ class TrainerSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
-    """Published numbers in which methods and data sets differ; `scale=paper` takes them.
+    """Published numbers in which methods and data sets differ; `scale=paper` uses them.
 
     Attributes:
-        dataset: name of the data set that the sizes and steps are for; on another one a run at
-            `scale=paper` says so.
+        dataset: name of the data set for which the sizes and steps were published; a run at
+            `scale=paper` on another one prints a warning.
         batch_size: samples per process and step.
         max_steps: optimiser steps.
         eval_every: steps between evaluations.
@@ -80,7 +79,7 @@ class Recipe:
         clip_norm: largest gradient norm; null for none.
         warmup_steps: linear warm-up.
         demo_steps: optimiser steps at scale=demo.
-        demo_sizes: shortest edges at scale=demo, which takes nothing else from here.
+        demo_sizes: shortest edges at scale=demo, which uses only these two settings.
     """
 
     dataset: Text
@@ -100,9 +99,9 @@ class Recipe:
 
 @dataclass(frozen=True, kw_only=True)
 class Scale:
-    """How big an experiment is run: the sizes that other groups refer to as ``${scale.*}``.
+    """The size of an experiment: values that other groups refer to as ``${scale.*}``.
 
-    What is not listed is what `Recipe` says.
+    All other attributes are those of `Recipe`.
 
     Attributes:
         name: of its file.
@@ -116,7 +115,8 @@ class Scale:
         num_workers: loader processes.
         critic_width: channels of a discriminator's first convolution, where there is one.
         precision: see `TrainerSettings`.
-        pretrained: whether the recipe starts from weights of ImageNet; a run that does not says so.
+        pretrained: whether the recipe starts from ImageNet weights; a run without them prints a
+            warning.
         few_scenes: whether embedded data sets have a handful of scenes, for ``${scenes:...}``.
     """
 

@@ -1,4 +1,4 @@
-"""The threads of a CPU's arithmetic: a setting of the run, not of the machine."""
+"""Set the number of CPU threads, which is a setting of the run and not of the machine."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rgbt.checks import InputError
 
 
 def fix_threads(num_threads: int) -> None:
-    """Compute with this many threads, however many cores there are.
+    """Compute with this number of threads, independently of the number of cores.
 
     Sums are divided among the threads, and other parts round to other bits. OMP_NUM_THREADS,
     MKL_NUM_THREADS, MKL_DYNAMIC and a smaller set of cores (taskset, a cluster's job) have no
@@ -28,7 +28,8 @@ def fix_threads(num_threads: int) -> None:
     if is_limited or os.environ.get("OMP_DYNAMIC", "").strip().lower() == "true":
         name = "OMP_THREAD_LIMIT" if is_limited else "OMP_DYNAMIC"
         raise InputError(
-            f"{name}={os.environ[name]} lets OpenMP take fewer threads than trainer.threads="
-            f"{num_threads}, which the result depends on; unset it."
+            f"{name}={os.environ[name]} limits OpenMP to fewer threads than "
+            f"trainer.threads={num_threads}, and the result depends on the number of threads. "
+            f"Unset {name}."
         )
     torch.set_num_threads(num_threads)

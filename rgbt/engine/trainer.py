@@ -1,4 +1,4 @@
-"""The one training loop: for every phase of the scheme, backward, clip, step."""
+"""The training loop: backward, clip and step for every phase of the scheme."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ WAIT_SHARE = "wait_share"
 
 
 ADVICE = (
-    "The last checkpoint is kept; lower optimizer.lr, or use trainer.precision=32-true if it was "
-    "mixed."
+    "The last checkpoint is kept. Lower optimizer.lr, or use trainer.precision=32-true if the "
+    "precision was mixed."
 )
-"""What to do about numbers that are not finite."""
+"""Advice for numbers that are not finite."""
 
 
 class Loaded(Protocol):
-    """What a step is made from, before it is on the device."""
+    """The data of a step, before it is on the device."""
 
     @property
     def name(self) -> tuple[str, ...]:
@@ -54,7 +54,7 @@ class Loaded(Protocol):
 
 
 class Scheme(Protocol):
-    """What the loop asks a scheme."""
+    """The interface of a scheme for the loop."""
 
     def phases(self, batch: StepData, generator_of: GeneratorOf, /) -> Iterator[Phase]:
         """The backward passes of one step, in order."""
@@ -63,7 +63,7 @@ class Scheme(Protocol):
 
 @dataclass(kw_only=True, eq=False)
 class Trainer:
-    """Runs a scheme to its last step, evaluating and writing checkpoints on the way.
+    """Runs a scheme to its last step, with evaluations and checkpoints.
 
     Attributes:
         fabric: device, precision and gradient synchronisation.
@@ -97,7 +97,7 @@ class Trainer:
         self.checkpoints = Checkpoints(self.folder)
 
     def resume(self, state: State) -> bool:
-        """Take up everything from the last checkpoint into `state`; False if there is none.
+        """Restore everything from the last checkpoint into `state`; False if there is none.
 
         Raises:
             RunError: the checkpoints are damaged.
@@ -111,7 +111,10 @@ class Trainer:
         restore_weights(self.model, payload["model"], source)
         others, optimizers = payload.get("others", {}), payload.get("optimizers", {})
         if others.keys() != self.others.keys() or optimizers.keys() != self.optimizers.keys():
-            raise InputError(f"{source} is a checkpoint of other networks than those of this run.")
+            raise InputError(
+                f"{source} is a checkpoint of other networks than those of this run. Resume with "
+                "the code that wrote it, or train again in another runs_dir=..."
+            )
         for name, module in self.others.items():
             restore_weights(module, others[name], source)
         for name, optimizer in self.optimizers.items():
@@ -122,8 +125,8 @@ class Trainer:
     def fit(self, batches: Iterator[Loaded], state: State) -> None:
         """Train from ``state.step`` to the last step, keeping `state` up to date.
 
-        A signal that ends the command is answered after the step in progress, or at once during an
-        evaluation: the state is saved first.
+        A signal that ends the command is handled after the current step, or at once during an
+        evaluation; the state is saved first.
 
         Args:
             batches: training batches, starting at that step.
@@ -136,7 +139,7 @@ class Trainer:
         total = self.settings.max_steps
         with progress() as display, deferred():
             task = display.add_task("training", total=total, completed=state.step, note="")
-            if state.step:  # its evaluation may be what a signal came before
+            if state.step:  # a signal may have come before its evaluation
                 self._save_when_due(state)
             self.model.train()
             for step in range(state.step, total):
@@ -152,7 +155,7 @@ class Trainer:
                 self._save_when_due(state)
 
     def _save_when_due(self, state: State) -> None:
-        """Evaluate and save where this step is due; save and stop where a signal came."""
+        """Evaluate and save if this step is due; save and stop if a signal came."""
         is_last = state.step == self.settings.max_steps
         due = is_last or state.step % self.settings.eval_every == 0
         due = due and state.evaluated_step < state.step
@@ -183,7 +186,7 @@ class Trainer:
         self.checkpoints.commit(payload, state)
 
     def _step(self, step: int, batches: Iterator[Loaded], seed: int) -> dict[str, float]:
-        """One optimiser step of every phase; what to record of it."""
+        """One optimizer step of every phase; returns the values to record."""
         started = time.perf_counter()
         factor = self.schedule(step, self.settings.max_steps, self.steps_per_epoch)
         rates = {}

@@ -1,1 +1,1 @@
-"""Evaluations of a trained network: segmentation, consistency, corruptions, pseudo-labels."""
+"""Evaluate a trained network: segmentation, consistency, corruptions, pseudo-labels."""

@@ -1,4 +1,4 @@
-"""What ``rgbt.consistency`` leaves of one measurement: counts, a picture, values of the run."""
+"""Write the results of one measurement of ``rgbt.consistency``: counts, picture, run values."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class PairFiles:
     """The files of counts of pairs of one split, in the folder `out` or that of the network.
 
     Attributes:
-        suffixes: words that end their names; (): they are the run's own measurement.
+        suffixes: suffixes of their names; (): they are the run's own measurement.
 
     Raises:
         InputError: counts on second frames of another motion would be replaced.
@@ -52,7 +52,7 @@ class PairFiles:
         partition = partition_name("next", 1, frames_mark(opened.session, "next"))
         if path.is_file() and Counts.load(path).partition != partition:
             raise InputError(
-                f"{path} holds counts on second frames of another motion; name a folder for these "
+                f"{path} holds counts for second frames of another motion. Choose another folder "
                 "with out=..., or remove that file."
             )
 
@@ -70,7 +70,7 @@ class PairFiles:
             counts.save(paths[protocol])
         lines = [(f"counts, {protocol}", str(path)) for protocol, path in paths.items()]
         if not pairs.kept:
-            info("none of the images of the picture could be read; it was not drawn.")
+            info("no image of the picture could be read, so it was not drawn.")
             return lines
         # Named like the counts that it shows, those of the first protocol.
         first = next(iter(paths.values()))
@@ -94,6 +94,6 @@ def add_to_result(run: RunFolder, session: Session, split: str, table: Consisten
         return
     try:
         tracking_of(run, SyncOptions(run=run.path)).sync(run, status_of(run))
-    except Exception as error:  # any store may fail in its own way; the folder has everything
+    except Exception as error:  # the store may raise anything; the run folder has all results
         reason = (str(error).splitlines() or [""])[0]
-        info(f"MLflow was not updated ({reason}); rgbt sync run={run.path} updates it.")
+        info(f"MLflow was not updated ({reason}). Update it with: rgbt sync run={run.path}")

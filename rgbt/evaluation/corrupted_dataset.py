@@ -1,4 +1,4 @@
-"""A data set seen under a corruption, so that everything which reads one runs unchanged."""
+"""A data set wrapper that applies a corruption to every image."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from rgbt.types import Sample
 class CorruptedDataset(DatasetWrapper):
     """`source` under a corruption; a `rgbt.dataset.LabelledDataset`.
 
-    Names, labels and the fingerprint are those of the source: scores are of the same images. What
-    is drawn for an image follows from (seed, its name) alone, whatever is read before it.
+    Names, labels and the fingerprint are those of the source: scores refer to the same images.
+    Random draws for an image depend only on (seed, image name).
 
     Args:
-        severity: 0: samples are those of the source.
-        split: that is read; its order is the order of time.
+        severity: 0 returns the samples of the source.
+        split: the split to read, in the order of time.
 
     Raises:
         InputError: a severity out of range, an unknown or missing split.
@@ -68,12 +68,13 @@ class CorruptedDataset(DatasetWrapper):
                 )
                 raise InputError(
                     f"'{name}' ({own} pixels) cannot show the thermal image of '{other}' ({its} "
-                    "pixels); images of one split must have one size for frozen and delayed."
+                    "pixels). The corruptions frozen and delayed require images of one size in a "
+                    "split."
                 )
             return replace(sample, thermal=thermal)
 
         def rng_of(purpose: str) -> np.random.Generator:
-            # The word is part of the seed: another one draws other blocks.
+            # This word is part of the seed and must not change.
             return numpy_generator(self.seed, f"degradation {purpose} of {name}")
 
         return self.corruption(sample, self.severity, rng_of)
@@ -86,8 +87,8 @@ class CorruptedDataset(DatasetWrapper):
         """
         if self._shown and name not in self._shown:
             raise InputError(
-                f"'{name}' is not of split '{self.split}', whose order says which thermal image is "
-                "shown; read the split that was corrupted."
+                f"'{name}' is not in split '{self.split}', whose order determines the thermal "
+                "image. Read an image of that split."
             )
         return self._shown.get(name, name)
 
@@ -97,7 +98,7 @@ class CorruptedDataset(DatasetWrapper):
         return tuple(path for each in names for path in self.source.files(each))
 
     def decoding(self) -> dict[str, Any]:
-        """What decides what `read` makes of files: as the source's, and the corruption."""
+        """Settings that change what `read` returns: those of the source, and the corruption."""
         listed = hashlib.sha256("\n".join(self._names).encode()).hexdigest()
         return {
             **self.source.decoding(),
@@ -122,6 +123,6 @@ class CorruptedDataset(DatasetWrapper):
 
 
 def settings_of(corruption: Corruption) -> dict[str, Any]:
-    """What a corruption was built with, as values of JSON; the ladder is no part of it."""
+    """The settings of a corruption as JSON values, without its severities."""
     known = ("title", "unit", "severities")
     return {key: value for key, value in vars(corruption).items() if key not in known}

@@ -1,4 +1,4 @@
-"""A requested corruption: its file, the settings that were changed, the severity and the seed.
+"""Parse a requested corruption: its file, changed settings, severity and seed.
 
 ``corruption=NAME`` names a file of ``conf/corruption/``, ``corruption=NAME:IMAGE`` sets its `image`
 as well, and ``corruption=my.yaml`` names a file of your own; ``corruption.KEY=...`` changes a
@@ -29,7 +29,7 @@ from rgbt.spec.corruption_names import row_name
 
 NODE = "corruption"
 SEED = "seed"
-"""The one key below `NODE` that is no setting of a file: all files are drawn from it."""
+"""The only key below `NODE` that is not a setting of a file: the seed of all random draws."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class CorruptionRequest:
     """A corruption with a severity; 0: the images as they are.
 
     Attributes:
-        name: what files of counts call it without its changes, such as "noise_rgb".
+        name: its name in files of counts, without changes, such as "noise_rgb".
         changes: ``key=value`` words that differ from the file, as typed.
         seed: of what is drawn.
     """
@@ -50,7 +50,7 @@ class CorruptionRequest:
 
     @property
     def row(self) -> str:
-        """What all its severities share: "occluded", or "occluded_block-16" where changed."""
+        """The name that all its severities share: "occluded", or "occluded_block-16" if changed."""
         return self._with_changes(self.name)
 
     @property
@@ -89,15 +89,15 @@ class CorruptionRequest:
             unit = self.corruption.unit or "1 is the only one"
             known = ", ".join(f"{each:g}" for each in ladder)
             raise InputError(
-                f"severity={severity}: corruption={self.name} needs a number ({unit}), for example "
-                f"one of {known}."
+                f"severity={severity}: corruption={self.name} requires a number ({unit}), for "
+                f"example one of {known}."
             )
         if value:
             self.corruption.check(value)
         return replace(self, severity=value)
 
     def identity(self) -> dict[str, Any]:
-        """What decides how the images look, as values of JSON."""
+        """The settings that determine the images, as JSON values."""
         return {
             "degradation": self.name,  # the key that counts on disk are found by
             "kind": type(self.corruption).__name__,
@@ -207,14 +207,14 @@ def choose_corruptions(
         key = word.partition("=")[0]
         if len(names) > 1 and key != f"{NODE}.{SEED}":
             raise InputError(
-                f"'{key}' is a key of one corruption, but {len(names)} were requested; name that "
-                "one with corruptions=..."
+                f"'{key}' is a setting of a single corruption, but {len(names)} were requested. "
+                "Name one corruption with corruptions=..."
             )
     chosen = [choose_corruption(name, words, trust) for name in names]
     rows = [each.name for each in chosen]
     for row in rows:
         if rows.count(row) > 1:
-            raise InputError(f"corruptions: '{row}' is given twice; name each once.")
+            raise InputError(f"corruptions: '{row}' is given twice; name each corruption once.")
     return chosen
 
 
@@ -226,7 +226,7 @@ def split_overrides(overrides: Sequence[str]) -> tuple[list[str], list[str]]:
 
 def _node(path: Path, trust: Collection[str]) -> DictConfig:
     if not path.is_file():
-        raise InputError(f"{NODE}={path}: there is no such file.")
+        raise InputError(f"{NODE}={path}: the file does not exist.")
     # Below its key, so that sentences about it say corruption.block and not block.
     node = OmegaConf.create({NODE: load_config(path, trust)})[NODE]
     assert isinstance(node, DictConfig), "load_config returns a mapping"

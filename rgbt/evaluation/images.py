@@ -1,4 +1,4 @@
-"""Predictions of single images as pictures: a colour overlay and a PNG of class indices."""
+"""Write predictions of single images as colour overlays and PNGs of class indices."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def write_images(
             written += 1
             display.advance(task)
     for reason in list(images.skipped.values())[:1]:
-        info(f"{len(images.skipped)} image(s) left out; the first: {reason}")
+        info(f"{len(images.skipped)} image(s) skipped; the first: {reason}")
     for path in images.others[:1]:
         info(f"{len(images.others)} image(s) belong to no pair and were not read; first: {path}")
     return f"{written} images in {out.resolve()}"

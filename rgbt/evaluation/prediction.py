@@ -1,4 +1,4 @@
-"""What all evaluations of a network share: view, heads, predicted batches, counts by image."""
+"""Code shared by all evaluations of a network: view, heads, batches and counts per image."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ class Predictor:
     """Predicts batches with `model`, left in evaluation mode; each image by its head.
 
     Attributes:
-        view: what is predicted from.
+        view: input images of the prediction.
 
     Raises:
-        InputError: the network does not predict from the view of the request.
+        InputError: the network does not support the requested view.
     """
 
     def __init__(self, session: Session, model: nn.Module, request: EvaluationRequest) -> None:
@@ -48,9 +48,9 @@ class Predictor:
 
 
 def view_of(session: Session, view: View | None = None) -> View:
-    """What the network of a session predicts from: `view`.
+    """The view that the network of a session predicts from.
 
-    None: what its source domain is seen as; where that does not say, the network's first view.
+    None: the view of its source domain, or else the network's first view.
 
     Raises:
         InputError: the network does not predict from `view`.
@@ -92,7 +92,10 @@ def counts_of(
     """
     dataset, names = session.dataset, tuple(by_name)
     if not names:
-        raise InputError(f"split '{split}' of {dataset.name}: no image could be read.")
+        raise InputError(
+            f"split '{split}' of {dataset.name}: no image could be read. Check the files with "
+            "rgbt check."
+        )
     return Counts(
         counts=np.stack(list(by_name.values())).astype(np.int32),
         names=names,

@@ -1,7 +1,7 @@
-"""Pseudo-labels: what a trained network predicts for a split, kept where it is sure enough.
+"""Predict pseudo-labels for a split; pixels below a confidence threshold stay unlabelled.
 
-The folder is described in `rgbt.data.pseudo_labels`. Writing it can be stopped and taken up again:
-images whose files are there are not predicted a second time.
+The folder is described in `rgbt.data.pseudo_labels`. Writing can be interrupted and resumed:
+images whose files exist are not predicted again.
 """
 
 from __future__ import annotations
@@ -47,15 +47,15 @@ from rgbt.tracking.tables import TextTable, percent
 from rgbt.tracking.terminal import info
 from rgbt.types import IGNORE
 
-BEGUN = "pseudo_labels.begun.json"
-"""What a folder that is not finished was begun with."""
+UNFINISHED = "pseudo_labels.begun.json"
+"""File with the settings of a folder that is not finished."""
 
 LOCK = ".lock"
 
 
 @dataclass(frozen=True)
 class Labelling:
-    """How a prediction becomes labels.
+    """How predictions are converted to labels.
 
     Attributes:
         threshold: pixels whose confidence is below it get 255 instead of a class; in [0, 1].
@@ -99,7 +99,7 @@ def label_map_of(name: str) -> LabelMap | None:
 def write_pseudo_labels(
     session: Session, teacher: str, request: EvaluationRequest, labelling: Labelling, out: Path
 ) -> PseudoLabels:
-    """Predict a split with the network of `session` and write its sure pixels as labels.
+    """Predict a split with the network of `session` and write its confident pixels as labels.
 
     The confidence of a pixel is the largest of its class probabilities
     (`rgbt.engine.evaluate.probabilities`), with a label map that of the network's own class. A
@@ -117,8 +117,8 @@ def write_pseudo_labels(
         out: folder, made where it is missing.
 
     Raises:
-        InputError: settings that do not fit each other, a folder that holds something else or was
-            begun with other settings, an image that cannot be read (data.on_error=raise).
+        InputError: settings that do not fit each other, a folder with other content or with
+            pseudo-labels of other settings, an image that cannot be read (data.on_error=raise).
         RunError: the network's predictions are not finite.
     """
     assert request.corruption is None, "labels are predicted from clean images"
@@ -134,8 +134,8 @@ def write_pseudo_labels(
             if not (label_path(out, name).is_file() and confidence_path(out, name).is_file())
         )
         if not finished or set(missing) - set(PseudoLabels(out).manifest["skipped"]):
-            # First the one, then the other: a killed process leaves a folder that is known.
-            write_atomic(out / BEGUN, _text(settings))
+            # In this order, a killed process leaves a folder that can be resumed.
+            write_atomic(out / UNFINISHED, _text(settings))
             (out / MANIFEST).unlink(missing_ok=True)
             skipped = _predict(session, request, labelling, out, missing, len(names))
             _finish(out, settings, [name for name in names if name not in skipped], skipped)
@@ -143,7 +143,7 @@ def write_pseudo_labels(
 
 
 def summary(labels: PseudoLabels) -> TextTable:
-    """Which share of the pixels got which class, and how sure the teacher was of them."""
+    """Print the share of pixels of each class, and the teacher's confidence in them."""
     manifest = labels.manifest
     by_class = [manifest["by_class"][name] for name in labels.classes]
     rows = [
@@ -179,7 +179,7 @@ class _Subset(DatasetWrapper):
 def _settings(
     session: Session, teacher: str, request: EvaluationRequest, labelling: Labelling
 ) -> dict[str, Any]:
-    """The first part of the manifest: all that the files follow from."""
+    """The first part of the manifest: all settings that determine the files."""
     settings = {
         "format": FORMAT,
         "teacher": teacher,
@@ -210,20 +210,20 @@ def _network(spec: RunSpec) -> str:
 
 
 def _refuse_other_content(out: Path) -> None:
-    ours = (MANIFEST, BEGUN)
+    ours = (MANIFEST, UNFINISHED)
     if not out.is_dir() or any((out / name).exists() for name in ours):
         return
     others = sorted(path.name for path in out.iterdir() if not path.name.startswith("."))
     if others:
         raise InputError(
-            f"{out} holds {others[0]} and no pseudo-labels; name a new folder, so that nothing is "
-            "overwritten."
+            f"{out} holds {others[0]} and no pseudo-labels. Choose a new folder, so that nothing "
+            "is overwritten."
         )
 
 
 @contextmanager
 def _alone(out: Path) -> Iterator[None]:
-    """No other process writes to the folder meanwhile; leftovers of killed ones are removed."""
+    """Lock the folder for this process, and remove temporary files of killed processes."""
     with ExitStack() as locks:
         holder = locks.enter_context(holding(out / LOCK))
         if holder is not None:
@@ -236,19 +236,19 @@ def _alone(out: Path) -> Iterator[None]:
 
 
 def _is_finished(out: Path, settings: dict[str, Any]) -> bool:
-    """Whether all was written before; InputError where it was begun with other settings."""
+    """Whether all files exist; InputError if they were written with other settings."""
     finished = (out / MANIFEST).exists()
     if finished:
-        begun = PseudoLabels(out).manifest
-    elif (out / BEGUN).exists():
-        begun = read_json(out / BEGUN, dict[str, Any], "remove it and predict again")
+        settings_before = PseudoLabels(out).manifest
+    elif (out / UNFINISHED).exists():
+        settings_before = read_json(out / UNFINISHED, dict[str, Any], "remove it and predict again")
     else:
         return False
     for key, value in settings.items():
-        if key != "teacher" and begun.get(key) != value:
-            before, now = (str(each)[:60] for each in (begun.get(key), value))
+        if key != "teacher" and settings_before.get(key) != value:
+            before, now = (str(each)[:60] for each in (settings_before.get(key), value))
             raise InputError(
-                f"{out} was begun with pseudo-labels of another {key} ({before}, now {now}); name "
+                f"{out} holds pseudo-labels of another {key} ({before}, now {now}). Choose "
                 "another folder, or remove this one."
             )
     return finished
@@ -262,7 +262,7 @@ def _predict(
     missing: tuple[str, ...],
     total: int,
 ) -> dict[str, str]:
-    """Predict and write the missing images; why others could not be read, by name."""
+    """Predict and write the missing images; returns the errors of unreadable images by name."""
     if not missing:
         return {}
     label_map = labelling.label_map
@@ -321,7 +321,7 @@ def _finish(out: Path, settings: dict[str, Any], names: list[str], skipped: dict
         "digest": digest.hexdigest(),
     }
     write_atomic(out / MANIFEST, _text(settings | found))
-    (out / BEGUN).unlink(missing_ok=True)
+    (out / UNFINISHED).unlink(missing_ok=True)
 
 
 def _text(values: dict[str, Any]) -> bytes:

@@ -1,4 +1,4 @@
-"""What is evaluated: a trained network, and the request that every kind of evaluation takes."""
+"""The requests for an evaluation: a trained network, and what to evaluate."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from rgbt.types import VIEWS, View
 
 DEFAULT_VIEW = "default"
 BEST = "best"
-"""Values of the options `modality` and `checkpoint` that change nothing."""
+"""Default values of the options `modality` and `checkpoint`."""
 
 CHANGES = ("transform", "trainer.precision", "metric")
-"""Settings by which the same run gives other counts, or other scores of them."""
+"""Settings that change the counts or scores of the same run."""
 
 
 @dataclass(frozen=True)
 class NetworkRequest:
-    """Which trained network is evaluated, and what is changed of its configuration.
+    """A trained network with overrides of its configuration.
 
     Attributes:
         options: of the command.
@@ -41,7 +41,7 @@ class NetworkRequest:
 
     @property
     def suffixes(self) -> tuple[str, ...]:
-        """What names of files say of the checkpoint: nothing of the best."""
+        """The checkpoint in file names; nothing for the best."""
         return () if self.options.checkpoint == BEST else (self.options.checkpoint,)
 
     @property
@@ -50,7 +50,7 @@ class NetworkRequest:
         return parse_trust(self.options.trust)
 
     def check_comparable(self, out: Path | None) -> None:
-        """Refuse to keep counts made in another way among those of the run.
+        """Refuse to store counts with other settings beside those of the run.
 
         Raises:
             InputError: an override of `CHANGES`, and no folder of its own in `out`.
@@ -58,8 +58,8 @@ class NetworkRequest:
         changed = [word for word in self.overrides if word.lstrip("+").startswith(CHANGES)]
         if changed and self.options.run and not out:
             raise InputError(
-                f"{changed[0]} changes how the run is measured; name a folder for these counts "
-                "with out=..."
+                f"{changed[0]} changes how the run is measured; choose a separate folder for "
+                "these counts with out=..."
             )
 
     def open(self, label_map: LabelMap | None = None) -> TrainedNetwork:
@@ -76,7 +76,7 @@ class NetworkRequest:
 
 
 def other_images(dataset: LabelledDataset, marker: Mapping[str, Any] | None) -> tuple[str, ...]:
-    """Part of a file's name where a run is measured on images that it was not trained with.
+    """Part of a file name if a run is measured on another data set than it was trained on.
 
     `marker` is its ``dataset.json``; None: it has none.
     """
@@ -92,8 +92,8 @@ class EvaluationRequest:
 
     Attributes:
         split: name of the split.
-        view: what is predicted from; None: what the network is made for.
-        head: which of two heads predicts an image; None: as the run's configuration says.
+        view: input images; None: those that the network was designed for.
+        head: which of two heads predicts an image; None: that of the run's configuration.
         corruption: of the images; None: they are clean.
         keep: names of the images that are returned for pictures.
     """
@@ -112,7 +112,7 @@ class EvaluationRequest:
         head: str = AS_TRAINED,
         corruption: CorruptionRequest | None = None,
     ) -> EvaluationRequest:
-        """Of the options that commands have.
+        """Make a request from the options of a command.
 
         Raises:
             InputError: there is no such modality.

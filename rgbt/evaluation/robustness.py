@@ -1,4 +1,4 @@
-"""Counts of a network under every corruption: what is evaluated, kept, evaluated again, shown."""
+"""Evaluate a network under every corruption, reuse existing counts, and write the table."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ FEATURES: dict[View, str] = {
     "thermal": "thermal alone (features)",
     "rgb": "RGB alone (features)",
 }
-"""View -> what it is called beside "RGB removed (zeroed)": the network sees both images, and the
+"""View -> title next to "RGB removed (zeroed)": the network gets both images, and the
 features of one branch alone are decoded."""
 
 
@@ -50,12 +50,12 @@ SCORES = (MIOU, subset(DAY, MIOU), subset(NIGHT, MIOU))
 
 @dataclass(frozen=True)
 class Condition:
-    """What the network sees in one evaluation: clean images, one branch, or a corruption.
+    """The input of one evaluation: clean images, one branch, or a corruption.
 
     Attributes:
         file_stem: name of its files without extension.
         row: of the table: a corruption or a view, whose severities share it.
-        title: what people call the row.
+        title: title of the row.
         unit: of the severity; "" where it has none.
     """
 
@@ -78,7 +78,7 @@ class Measured:
 
 
 def conditions(session: Session, corruptions: Sequence[CorruptionRequest]) -> tuple[Condition, ...]:
-    """Clean images, single branches as far as the network decodes them, every severity."""
+    """Clean images, single branches if the network decodes them, and every severity."""
     view, known = view_of(session), record_of(session.model).views
     found = [Condition(CLEAN, CLEAN, CLEAN, "", 0.0, view)]
     for branch, title in FEATURES.items() if view == "rgbt" else ():
@@ -96,10 +96,10 @@ def conditions(session: Session, corruptions: Sequence[CorruptionRequest]) -> tu
 def measure(
     session: Session, split: str, corruptions: Sequence[CorruptionRequest], folder: Path
 ) -> tuple[Measured, ...]:
-    """Evaluate what is missing of a run's robustness; the clean images are first.
+    """Evaluate the missing conditions of a run's robustness, clean images first.
 
     Each corruption is evaluated at all severities of its ladder. In the folder of the counts
-    NAME.npz has a NAME.json, written after it, that says what made it.
+    NAME.npz has a NAME.json, written after it, that describes its inputs.
 
     Raises:
         InputError: a severity that does not fit the images, or a file that cannot be read.
@@ -129,7 +129,7 @@ def measure(
 
 
 def _counts(session: Session, condition: Condition, shared: dict[str, Any], folder: Path) -> Counts:
-    """Those in the folder if the same made them and they can be read, else new ones."""
+    """The counts in the folder if their inputs are the same, else new counts."""
     counts_file = folder / f"{condition.file_stem}.npz"
     made_file = folder / f"{condition.file_stem}.json"
     corruption = condition.corruption
@@ -152,7 +152,7 @@ def _counts(session: Session, condition: Condition, shared: dict[str, Any], fold
             split=shared["split"], view=condition.view, corruption=corruption
         )
         counts = evaluate(session, session.model, request).counts
-        # What says that the counts are of these weights must not outlive those of others.
+        # The description must not outlive the counts it belongs to.
         made_file.unlink(missing_ok=True)
         counts.save(counts_file)
     if known != made:
@@ -177,7 +177,7 @@ def _read_json(path: Path) -> Any:
 
 
 def counts_folder(opened: TrainedNetwork, network: NetworkRequest, split: str) -> Path:
-    """Folder of a split's counts: named plainly where the run is measured as it was trained."""
+    """Folder for the counts of a split; suffixes name changes from the training."""
     session = opened.session
     regions = [] if network.regions == AS_TRAINED else [session.regions.name]
     others = other_images(session.dataset, _read_json(opened.folder.parent / "dataset.json"))

@@ -1,4 +1,4 @@
-"""Predictions of a split, counted by image, region, label and class; tables of the counts."""
+"""Predict a split, count by image, region, label and class, and make tables of the counts."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from rgbt.tracking.terminal import result_view
 from rgbt.types import View
 
 NUM_PANELS = 6
-"""Images of the qualitative panel: as many by day as by night where the split holds both."""
+"""Images of the qualitative panel: the same number by day and by night if the split has both."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class EvaluationResult:
 
     Attributes:
         kept: examples for pictures.
-        skipped: names of unreadable files that were left out.
+        skipped: names of unreadable files that were skipped.
     """
 
     counts: Counts
@@ -126,7 +126,7 @@ def counts_path(
 def overview(
     opened: TrainedNetwork, request: EvaluationRequest, result: EvaluationResult, path: Path
 ) -> RenderableType:
-    """The tables of an evaluation, and where its counts are."""
+    """Print the tables of an evaluation and the path of its counts."""
     session, head, corruption = opened.session, request.head, request.corruption
     label = f"{opened.label} {session.dataset.name} {result.view}{f' {head} head' if head else ''}"
     label += f", {corruption.title}" if corruption else ""
@@ -134,7 +134,7 @@ def overview(
     heads = session.domains.heads_in_words(head or session.domains.tested_head)
     lines = [*([("heads", heads)] if heads else []), ("counts", str(path))]
     if result.skipped:
-        lines.append(("left out", f"{len(result.skipped)} images that cannot be read"))
+        lines.append(("skipped", f"{len(result.skipped)} images that cannot be read"))
     return result_view(tables, path.parent, lines)
 
 

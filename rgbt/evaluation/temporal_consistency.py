@@ -1,4 +1,4 @@
-"""Predictions of two frames of every scene, counted together: what TC and CA are derived from.
+"""Predict two frames of every scene and count them together, for TC and CA.
 
 The second frame is a virtual view of the first (frames=virtual), or a true one (frames=next).
 """
@@ -38,7 +38,7 @@ PROTOCOLS: dict[Frames, tuple[Protocol, ...]] = {
     "virtual": ("aligned", "released"),
     "next": ("next",),
 }
-"""What is counted of which second frames."""
+"""Protocols of counting for each kind of second frame."""
 
 
 class Compared(NamedTuple):
@@ -89,8 +89,8 @@ def count_pairs(
 ) -> Pairs:
     """Predict both frames of every scene of a split and count, with a progress bar.
 
-    Source: Temporal, Fig. 4 (aligned: the first prediction is brought into the second frame) and
-    its release (released: it is not). On true frames points are followed by their exact flow.
+    Source: Temporal, Fig. 4 (aligned: the first prediction is warped to the second frame) and its
+        release (released: it is not warped). On real second frames points follow their exact flow.
 
     Args:
         session: its `consistency` says which virtual views.
@@ -103,13 +103,13 @@ def count_pairs(
     """
     assert request.corruption is None, "pairs are counted of clean images"
     split = request.split
-    # What cannot be measured is refused before anything is drawn or predicted.
+    # Requests that cannot be measured are refused before anything is drawn or predicted.
     if frames == "next":
         NextFrames(session.dataset)
     elif not session.consistency.sets:
         raise InputError(
-            "consistency.sets is empty: no virtual views are named; name sets of angles, such as "
-            "consistency.sets=[released_1], or give consistency=views."
+            "consistency.sets is empty. Name sets of angles, such as "
+            "consistency.sets=[released_1], or choose consistency=views."
         )
     decode_ahead(session, split)
     predictor = Predictor(session, model, request)
@@ -193,14 +193,14 @@ def _next(session: Session, predictor: Predictor, split: str) -> Iterator[Scenes
         names = [() if each is None else each.name for each in (batch, later)]
         if names[0] != names[1]:
             raise InputError(
-                f"both frames of a scene must be listed in {split} and readable: "
-                f"{session.dataset.root} gives {', '.join(names[0]) or 'nothing more'}, "
-                f"{after.dataset.root} {', '.join(names[1]) or 'nothing more'}."
+                f"both frames of a scene must be listed in {split} and readable, but "
+                f"{session.dataset.root} has {', '.join(names[0]) or 'no further image'} where "
+                f"{after.dataset.root} has {', '.join(names[1]) or 'no further image'}."
             )
         if batch.label.shape != later.label.shape:
             sizes = [" x ".join(map(str, each.label.shape[1:])) for each in (batch, later)]
             raise InputError(
-                f"both frames of a scene must have one size, but '{names[0][0]}' has "
+                f"both frames of a scene must have the same size, but '{names[0][0]}' has "
                 f"{sizes[0]} pixels in {session.dataset.root} and {sizes[1]} in "
                 f"{after.dataset.root}."
             )
@@ -242,9 +242,9 @@ def _picture(image: Tensor) -> NDArray[np.uint8]:
 
 
 def frames_mark(session: Session, protocol: Protocol) -> str:
-    """Which second frames counts are of: "" for the published views, else six digits of others.
+    """Suffix for second frames: "" for the published views, else six digits of a digest.
 
-    True frames are told apart by their lists and files, so that those of another motion differ.
+    For real second frames it depends on lists and files, so that another motion differs.
     """
     if protocol == "next":
         return NextFrames(session.dataset).dataset.fingerprint()[:6]

@@ -1,1 +1,1 @@
-"""Reading and writing files: within budgets, in one rename, under a lock."""
+"""Read files within budgets, write them atomically, and lock them."""

@@ -1,4 +1,4 @@
-"""Files that are whole or absent, and locks that die with their process."""
+"""Write files atomically, and hold locks that end with their process."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LEFT_BEHIND = re.compile(
 without one are written by the holder of the run's lock alone."""
 
 STALE_S = 3600.0
-"""Age above which a temporary file is nobody's any more, whoever began it."""
+"""Age above which a temporary file is treated as abandoned."""
 
 _held: set[int] = set()
 """Descriptors of locks of this process; loader workers forked from it must not keep them."""
@@ -36,7 +36,7 @@ def write_atomic(path: Path, content: bytes) -> None:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
-    """A file to write, which takes the place of `path` when the block ends without an exception.
+    """A file to write, which replaces `path` when the block ends without an exception.
 
     Temporary name in the same folder, fsync, rename, fsync of the folder.
     """
@@ -88,7 +88,7 @@ def holding(path: Path, *, wait_s: float = 0.0) -> Iterator[str | None]:
     The operating system frees the lock when this process ends, however it ends.
 
     Args:
-        path: the lock's file; it says in words who holds it.
+        path: the lock's file; its text names the holder.
         wait_s: seconds to wait for a lock that another process holds, >= 0; `math.inf` for ever.
 
     Yields:
@@ -135,8 +135,8 @@ def _lock(descriptor: int, deadline: float) -> str | None:
 
 
 def _close_in_child() -> None:
-    # A forked loader worker outlives a killed parent by seconds; with the parent's descriptor it
-    # would keep the lock, and the command that continues the run would be refused.
+    # A forked loader worker outlives a killed parent by seconds. With the parent's descriptor it
+    # would keep the lock, and the command that resumes the run would be refused.
     for descriptor in _held:
         os.close(descriptor)
     _held.clear()

@@ -1,4 +1,4 @@
-"""How much of a file is read; JSON and arrays that are checked before they are used."""
+"""Limit how much of a file is read, and check JSON and arrays before use."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Budget:
-    """How much of one kind of file is read, so that none fills the memory.
+    """The limit on reading one kind of file, so that none fills the memory.
 
     Attributes:
         variable: environment variable that sets another limit.
@@ -47,8 +47,8 @@ class Budget:
         if amount > 1_000_000 * int(text):
             raise InputError(
                 f"{path} holds {amount / 1e6:,.0f} million {self.unit}, more than the limit of "
-                f"{text} million; if it is the file that you mean, set {self.variable}="
-                f"{-(-amount // 1_000_000)}."
+                f"{text} million. If it is the right file, set "
+                f"{self.variable}={-(-amount // 1_000_000)}."
             )
 
 
@@ -79,7 +79,7 @@ def read_bytes(path: Path, budget: Budget, advice: str = "") -> bytes:
     """
     status = path.stat()
     if not stat.S_ISREG(status.st_mode):
-        what = "a folder" if stat.S_ISDIR(status.st_mode) else "no regular file"
+        what = "a folder" if stat.S_ISDIR(status.st_mode) else "not a regular file"
         raise InputError(f"{path} is {what}, expected a file{advice and f'; {advice}'}.")
     budget.check(path, status.st_size)
     return path.read_bytes()
@@ -90,13 +90,13 @@ SEAL = "crc32"
 
 
 def sealed(value: Mapping[str, Any]) -> dict[str, Any]:
-    """`value` as JSON holds it, with its check sum as the last entry (`SEAL`)."""
+    """`value` as JSON, with its checksum as the last entry (`SEAL`)."""
     plain = json.loads(json.dumps(value))
     return {**plain, SEAL: _check_sum(plain)}
 
 
 def read_json(path: Path, form: Any, advice: str) -> Any:
-    """What a JSON file holds, of the type `form`, without its seal; see `parse_json`.
+    """The content of a JSON file as the type `form`, without its seal; see `parse_json`.
 
     Args:
         path: of the file, which exists.
@@ -116,10 +116,10 @@ def read_json(path: Path, form: Any, advice: str) -> Any:
 
 
 def parse_json(text: bytes | str, form: Any) -> Any:
-    """The value that `text` says.
+    """The value of a JSON text.
 
-    The seal of a mapping, and of each mapping of a list, is compared and removed. What has none is
-    of before there were any, so that it has no other keys than `form` names.
+    The seal of a mapping, and of each mapping of a list, is compared and removed. Older files have
+    no seal and only the keys of `form`.
 
     Raises:
         ValueError: no JSON in UTF-8, another type than `form`, or another check sum.
@@ -154,7 +154,7 @@ def _unseal(value: Any) -> bool:
     if not isinstance(value, dict) or SEAL not in value:
         return False
     if value.pop(SEAL) != _check_sum(value):
-        raise ValueError("its check sum is another one")
+        raise ValueError("it does not match its checksum")
     return True
 
 
@@ -190,14 +190,14 @@ def check_array(file: IO[bytes], size: int) -> tuple[str, tuple[int, ...]]:
     version = npy.read_magic(file)
     read = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}.get(version)
     if read is None:
-        raise ValueError(f"arrays of version {version} are not read")
+        raise ValueError(f"arrays of version {version} are not supported")
     try:
         shape, _, dtype = read(file)
     except (SyntaxError, TypeError, tokenize.TokenError, RecursionError) as error:
         raise ValueError("its header is damaged") from error
     if dtype.hasobject:
-        raise ValueError("it holds Python objects, which are not read")
+        raise ValueError("it holds Python objects, which are not supported")
     wanted = math.prod(shape) * dtype.itemsize
     if any(length < 0 for length in shape) or wanted != size - file.tell():
-        raise ValueError(f"its header announces {wanted} bytes, there are {size - file.tell()}")
+        raise ValueError(f"its header announces {wanted} bytes, but it has {size - file.tell()}")
     return dtype.kind, tuple(shape)

@@ -1,6 +1,6 @@
-"""YAML that somebody else may have written, read as plain data within a budget.
+"""Read YAML from untrusted sources as plain data within a budget.
 
-Nothing is built and nothing is resolved here: see `rgbt.config.stored_config` for that. The values
+Objects and interpolations are handled in `rgbt.config.stored_config`. The values
 are those that OmegaConf reads (``1e-3`` is a number, a repeated key is an error).
 """
 
@@ -54,7 +54,7 @@ def read_yaml(path: Path) -> Any:
         InputError: see `parse_yaml`; or the file is missing, not a regular file, or too large.
     """
     if not path.is_file():
-        raise InputError(f"{path}: there is no such file.")
+        raise InputError(f"the file {path} does not exist.")
     try:
         with path.open("rb") as file:
             content = file.read(MOST_BYTES + 1)
@@ -96,22 +96,22 @@ def _error(reason: str, node: yaml.Node) -> yaml.YAMLError:
 
 def _check_budget(text: str, source: str) -> None:
     if len(text) > MOST_BYTES:
-        raise InputError(f"{source} is larger than {MOST_BYTES:,} bytes; it is not read.")
+        raise InputError(f"{source} is larger than the limit of {MOST_BYTES:,} bytes.")
     nodes = depth = 0
     for event in yaml.parse(text, _Loader):
         if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None) is not None:
-            reason = "anchors and aliases (& and *) are not read; repeat the value"
+            reason = "anchors and aliases (& and *) are not supported; repeat the value"
             raise _refused(source, event, reason)
         if getattr(event, "tag", None) is not None:
-            raise _refused(source, event, f"the tag {ascii(event.tag)} is not read; remove it")
+            raise _refused(source, event, f"the tag {ascii(event.tag)} is not supported; remove it")
         nodes += isinstance(event, yaml.NodeEvent)
         depth += isinstance(event, yaml.CollectionStartEvent)
         depth -= isinstance(event, yaml.CollectionEndEvent)
         if nodes > MOST_NODES or depth > DEEPEST:
             limits = f"{MOST_NODES:,} values and {DEEPEST} levels"
-            raise _refused(source, event, f"more than {limits} are not read")
+            raise _refused(source, event, f"it exceeds the limit of {limits}")
         if isinstance(event, yaml.ScalarEvent) and len(event.value) > LONGEST:
-            reason = f"a value of more than {LONGEST:,} characters is not read"
+            reason = f"a value exceeds the limit of {LONGEST:,} characters"
             raise _refused(source, event, reason)
 
 

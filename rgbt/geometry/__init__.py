@@ -1,1 +1,1 @@
-"""Where pixels lie: padded sizes, and the views of a camera that turned (homography, warp)."""
+"""Geometry of pixels: padded sizes, and the views of a turned camera (homography, warp)."""

@@ -44,8 +44,8 @@ class Camera:
         if not inside:
             raise InputError(
                 f"camera: the principal point (cx={self.cx:g}, cy={self.cy:g}) lies outside an "
-                f"image of {self.height}x{self.width}, so these are intrinsics of another image "
-                f"size; set height and width to the size they were calibrated for."
+                f"image of {self.height}x{self.width}, so these are intrinsics for another image "
+                "size. Set height and width to the size of the calibration."
             )
 
     def matrix(self, image_hw: tuple[int, int]) -> Tensor:
@@ -63,9 +63,9 @@ class Camera:
         sy, sx = height / self.height, width / self.width
         if abs(sy * self.width - width) >= 1:
             raise InputError(
-                f"camera: expected images of {self.height}x{self.width} or that aspect, got "
-                f"{height}x{width}: these are intrinsics of another image size; give those of "
-                f"your camera (fx, fy, cx, cy, height, width)."
+                f"camera: expected images of {self.height}x{self.width} or of that aspect ratio, "
+                f"got {height}x{width}. The intrinsics are for another image size; set those of "
+                "your camera (fx, fy, cx, cy, height, width)."
             )
         cx, cy = (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5
         rows = [[self.fx * sx, 0.0, cx], [0.0, self.fy * sy, cy], [0.0, 0.0, 1.0]]

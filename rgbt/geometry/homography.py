@@ -1,4 +1,4 @@
-"""How the picture of a camera moves when the camera turns on the spot.
+"""Homographies of a camera that turns on the spot.
 
 The view of a rotated pinhole camera is a homography of the old one, whatever the scene: virtual
 views of Li et al., "Temporal Consistency for RGB-Thermal Data-based Semantic Scene

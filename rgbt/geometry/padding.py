@@ -1,4 +1,4 @@
-"""Sizes and padding that several parts must agree on."""
+"""Sizes and padding that several components share."""
 
 from __future__ import annotations
 

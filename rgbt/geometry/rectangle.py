@@ -1,4 +1,4 @@
-"""The axis-parallel rectangle of a turned view that is cut out: exact, or the release's corners.
+"""Compute the axis-parallel crop of a turned view: the largest one, or that of the release.
 
 Rectangles are (left, top, right, bottom) in pixel EDGES: pixel j covers [j - 0.5, j + 0.5], so a
 whole image is (-0.5, -0.5, W - 0.5, H - 0.5).
@@ -50,8 +50,8 @@ def check_rectangle(rectangle: Tensor, angles: Tensor) -> None:
     if bool(empty.any()):
         yaw, pitch, roll = angles[empty][0].tolist()
         raise InputError(
-            f"the angles yaw {yaw:g}, pitch {pitch:g}, roll {roll:g} degrees leave no valid "
-            f"rectangle of the view; choose smaller ranges of angles."
+            f"the angles yaw {yaw:g}, pitch {pitch:g}, roll {roll:g} degrees leave no rectangle "
+            "of the view without empty pixels; choose smaller ranges of angles."
         )
 
 

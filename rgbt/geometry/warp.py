@@ -1,8 +1,8 @@
-"""Images, labels and scores of a frame brought into a view of it: batched, on their device.
+"""Warp images, labels and scores of a frame to a view of it, in batches on their device.
 
 A pixel of the second frame shows a point of the canvas (the view before it is cut), by the
 rectangle, and this a point of the first frame, by the inverse homography. Points outside the
-first frame give 0, "no label" or whatever the caller asks for.
+first frame give 0, "no label" or the value that the caller chooses.
 """
 
 from __future__ import annotations

@@ -1,6 +1,5 @@
-"""What a prediction costs: set criterion, cross-entropy, self-distillation against a label; maximum
-squares, entropy and discriminators without one.
+"""Losses of predictions, with labels and without.
 
-Pure functions and frozen settings. No network, no optimiser and no generator of its own lives
-here; how passes and losses make a training step is `rgbt.schemes`.
+With labels: set criterion, cross-entropy, self-distillation. Without: maximum squares, entropy,
+adversarial. Losses are pure functions and frozen settings; `rgbt.schemes` combines them.
 """

@@ -1,4 +1,4 @@
-"""A network against a discriminator: what verdicts cost, and which map is judged."""
+"""Losses of a discriminator's verdicts, and the maps that it judges."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rgbt.checks import check_shape
 from rgbt.losses.overlap import single
 
 Judged = Literal["probabilities", "logits", "self_information"]
-"""What a discriminator sees of a prediction."""
+"""Input of a discriminator, derived from a prediction."""
 
 
 def least_squares(verdicts: Tensor, value: float) -> Tensor:
@@ -44,7 +44,7 @@ VERDICT_LOSSES: dict[str, Callable[[Tensor, float], Tensor]] = {
 
 
 def judged(logits: Tensor, how: Judged) -> Tensor:
-    """The map that a discriminator is shown.
+    """The input map of a discriminator.
 
         probabilities       p = softmax of the class scores    AdaptSegNet, thesis (J. Sun)
         logits              the class scores                   HeatNet

@@ -1,4 +1,4 @@
-"""A second set of class scores, taken from the middle of a network, trained along."""
+"""A loss of auxiliary class scores from the middle of a network."""
 
 from __future__ import annotations
 

@@ -55,8 +55,8 @@ class CrossEntropy:
         given = self.class_weights or (1.0,) * sizes["K"]
         if len(given) != sizes["K"]:
             raise InputError(
-                f"loss.class_weights holds {len(given)} numbers, the network has {sizes['K']} "
-                "classes; give one per class."
+                f"loss.class_weights has {len(given)} numbers, but the network has {sizes['K']} "
+                "classes; give one number per class."
             )
         weights = torch.tensor(given, device=output.logits.device)
         logits = output.logits.float()

@@ -1,6 +1,5 @@
 """Mask and dice loss of matched queries at points, for all layers and passes of a step at once.
 
-Part of the set criterion.
 Letters beyond `rgbt.types`: ``S`` sets, one per (layer, pass), layer-major; ``N`` points; ``G``
 targets of the batch: one per class present in an image, by image, then by class; ``R`` = S x G.
 """

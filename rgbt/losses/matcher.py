@@ -1,4 +1,4 @@
-"""Which query answers for which class of which image: costs on the device, assignment on the CPU.
+"""Assign queries to the classes of an image: costs on the device, assignment on the CPU.
 
 Part of the set criterion. All (layer, pass, image) problems of a step are solved together: their
 costs are computed where the predictions are and reach the CPU in one transfer.
@@ -30,7 +30,7 @@ CHUNK_BYTES = 16 * 2**20
 
 
 class Targets(NamedTuple):
-    """What the predictions of one batch are compared with.
+    """The targets of one batch.
 
     Attributes:
         label: (B, H, W) int64, padded with 255. Padded and ignored pixels belong to no class and
@@ -180,7 +180,9 @@ def assign(cost: Tensor, targets: Targets) -> Matches:
             f"label: expected 0 to {present_BK.shape[1] - 1} or {IGNORE}, got another value."
         )
     if not np.isfinite(cost_SBQK).all():
-        raise RunError("the matching cost is not finite, the predictions hold NaN or infinity.")
+        raise RunError(
+            "the matching cost is not finite, because the predictions hold NaN or infinity."
+        )
 
     image, label = np.nonzero(present_BK)
     query = np.full((len(cost_SBQK), len(image)), -1)

@@ -1,8 +1,7 @@
 """Soft overlaps: class probabilities with a label (Dice), and of two frames of one scene.
 
-Temporal, Eqs. 2 and 3. The prediction of the first frame is given as the second frame sees it: how
-it got there is the business of whoever warped it. Not here: the dice term of matched queries
-(`rgbt.losses.masks`).
+Temporal, Eqs. 2 and 3. The caller warps the prediction of the first frame to the second. Not here:
+the dice term of matched queries (`rgbt.losses.masks`).
 """
 
 from __future__ import annotations
@@ -74,7 +73,7 @@ def con(warped: Tensor, second: Tensor, valid: Tensor, form: Form) -> Tensor:
     In both forms, a class that neither frame predicts costs 1 (agreement of m classes of K costs
     1 - m / K) and agreement in doubt costs more than agreement without.
 
-    p and q (B, K, H, W): probabilities of the first frame, brought into the second, and of the
+    p and q (B, K, H, W): probabilities of the first frame, warped to the second, and of the
     second; `valid` (B, H, W) bool: pixels that count, labelled or not. () in [0, 1], float32 for
     half precision too; 1, with a gradient of 0, where no pixel is valid. It can be differentiated
     once. ValueError: shapes that do not fit.

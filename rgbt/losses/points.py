@@ -1,4 +1,4 @@
-"""Points at which masks are compared, instead of at every pixel: drawing, reading, keeping.
+"""Draw, sample and select the points at which masks are compared.
 
 Part of the set criterion. Points are (x, y) in [-1, 1], the coordinates of `grid_sample`: -1 and 1
 are the outer edges of the outermost pixels, so one point means the same place at every resolution.

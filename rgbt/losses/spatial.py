@@ -98,8 +98,8 @@ def weight_map(batch: Batch, padded_hw: tuple[int, int], settings: SpatialWeight
     """
     if batch.position is None:
         raise InputError(
-            "loss.spatial weights pixels by their place in the original image, which this "
-            "transform does not track; set transform.track_position=true or loss.spatial.alpha=0."
+            "loss.spatial weights pixels by their position in the original image, which this "
+            "transform does not track. Set transform.track_position=true or loss.spatial.alpha=0."
         )
     sizes = check_shape("position", batch.position, "B 2 H W", **{"2": 2})
     original = batch.original_hw.to(batch.position)

@@ -1,6 +1,6 @@
-"""What two frames of a scene cost together (Temporal, Eq. 4).
+"""The loss of two frames of a scene (Temporal, Eq. 4).
 
-How the second frame is made and how the first prediction is brought into it is not known here.
+The caller makes the second frame and warps the first prediction to it.
 """
 
 from __future__ import annotations
@@ -50,18 +50,18 @@ class TemporalLoss:
     def __post_init__(self) -> None:
         if self.second == "none" and self.beta:
             raise InputError(
-                f"loss.beta={self.beta:g} weighs nothing with loss.second=none; set loss.beta=0, "
+                f"loss.beta={self.beta:g} has no effect with loss.second=none; set loss.beta=0, "
                 "or choose loss.second=dice, con or con_acc."
             )
         if self.second != "none" and not self.beta:
             raise InputError(
-                f"loss.beta=0 leaves nothing of loss.second={self.second}; set loss.second=none, "
+                f"loss.second={self.second} has no effect with loss.beta=0; set loss.second=none, "
                 "or a loss.beta above 0."
             )
 
     @property
     def record(self) -> Record:
-        """What the loss of each frame requires, and a scheme of two frames."""
+        """The requirements of the loss of each frame, and a scheme of two frames."""
         of_frames = Requirement("scheme", "frames", 2)
         return Record(
             requires=(*record_of(self.segmentation).requires, of_frames),
@@ -82,8 +82,7 @@ class TemporalLoss:
         Args:
             first: frame 1: logits (B, K, H, W), label (B, H, W) int64 with 255 = ignore.
             second: frame 2, of the same sizes.
-            warped: (B, K, H, W) probabilities of frame 1, brought into frame 2; only where the
-            record
+            warped: (B, K, H, W) probabilities of frame 1, warped to frame 2; only where the record
                 says `reads_warped`. Whether a gradient goes through it is for the caller to decide.
             valid: (B, H, W) bool, pixels of frame 2 that frame 1 shows; others do not count in
                 "con" and "con_acc".

@@ -1,4 +1,4 @@
-"""Where there is no label: losses by which to be sure is cheap, and labels made of predictions."""
+"""Losses without labels, which reward confident predictions, and labels made of predictions."""
 
 from __future__ import annotations
 

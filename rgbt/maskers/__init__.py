@@ -1,4 +1,4 @@
-"""Which cells of RGB and of thermal are hidden in a training step.
+"""Maskers, which draw the hidden cells of RGB and thermal in a training step.
 
 `pattern` draws the cells of one mask, `pairing` says how the two masks relate, `masker` joins them
 into the one class that every file of conf/masker/ configures. Not here: the mask token (models).

@@ -1,4 +1,4 @@
-"""What a masker must be, and what it must return: for a user's own maskers."""
+"""Check that a user's own masker follows the interface of maskers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ CALL = {"__call__": ("image_hw", "centre_yx", "generator")}
 
 
 def check_masker(masker: object, image_hw: tuple[int, int], generator: torch.Generator) -> None:
-    """Draw one mask and refuse a masker that does not do what `rgbt.types.AnyMasker` says.
+    """Draw one mask, and refuse a masker that does not follow `rgbt.types.AnyMasker`.
 
     Args:
         masker: any object.
@@ -29,7 +29,7 @@ def check_masker(masker: object, image_hw: tuple[int, int], generator: torch.Gen
 
 
 def check_masks(masker: object, found: object, image_hw: tuple[int, int], count: int) -> None:
-    """Refuse what a masker returned for `count` crops of `image_hw` pixels; InputError as above."""
+    """Check the masks for `count` crops of `image_hw` pixels; InputError as above."""
     height, width = padded_hw(image_hw)
     returned = f"masker: {type(masker).__name__}.__call__ returned {described(found)}"
     expected = (

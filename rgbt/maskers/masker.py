@@ -1,4 +1,4 @@
-"""The masker: every variant is a file of conf/masker/ that configures this one class."""
+"""The masker class, which every file of conf/masker/ configures."""
 
 from __future__ import annotations
 
@@ -71,8 +71,8 @@ class Masker:
             1/3 each.
 
     Raises:
-        InputError: a setting that cannot take effect is not None, a needed one is None, or the
-            settings do not fit each other.
+        InputError: a setting without effect is not None, a required one is None, or the settings
+            do not fit each other.
     """
 
     sampler: Sampler
@@ -117,7 +117,7 @@ class Masker:
         return pattern.random_complementary(taken, shares, generator)
 
     def grid_hw(self, image_hw: tuple[int, int]) -> tuple[int, int]:
-        """(h, w) cells of a crop of `image_hw` pixels; cheap, to ask before a training starts.
+        """(h, w) cells of a crop of `image_hw` pixels; cheap enough for a check before training.
 
         Raises:
             InputError: the patch size does not divide the padded crop.
@@ -172,16 +172,15 @@ class Masker:
             if name == "sampler" or name in optional:
                 continue
             if name in needed and value is None:
-                raise InputError(f"masker.{name} needs a value with {variant}; it is null.")
+                raise InputError(f"masker.{name} requires a value with {variant}, but it is null.")
             if name not in needed and value is not None:
                 raise InputError(
-                    f"masker.{name} has no effect with {variant}; set masker.{name}=null "
-                    f"(it is {value})."
+                    f"masker.{name}={value} has no effect with {variant}; set masker.{name}=null."
                 )
         if self.sigma_height is not None and self.sigma_height < (self.patch_size or 1):
             raise InputError(
-                f"masker.sigma_height must hold one cell of masker.patch_size={self.patch_size} "
-                f"pixels or more, got {self.sigma_height}."
+                f"masker.sigma_height must be at least masker.patch_size={self.patch_size}, got "
+                f"{self.sigma_height}."
             )
         shares = self.pattern_probabilities
         if shares is not None and abs(sum(shares) - 1) > 1e-6:

@@ -1,4 +1,4 @@
-"""Which cells masks take, and how those of RGB and thermal relate: pure functions.
+"""Pure functions that draw the cells of a mask and combine masks of RGB and thermal.
 
 A mask is (B, h, w) bool, True = taken. Every function draws a whole batch on the device of its
 arguments.

@@ -31,7 +31,7 @@ GREY = 127
 
 
 class Sketch(NamedTuple):
-    """What the picture shows.
+    """The data of the picture.
 
     Attributes:
         names: B names of samples.
@@ -128,7 +128,8 @@ def main(config: DictConfig) -> int:
     path = Path(config.out or "")
     if path.suffix != ".png":
         raise InputError(
-            f"out must name the PNG to write, for example out=masks.png, got {config.out}."
+            "out must be the path of a PNG file to write, for example out=masks.png, got "
+            f"{config.out}."
         )
     masker: AnyMasker = build(config.masker)
     dataset, transform = build(config.dataset), build(config.transform)

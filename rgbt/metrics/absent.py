@@ -1,4 +1,4 @@
-"""Footnotes of a table by class: which classes are absent, and how they count in its means."""
+"""Write the footnotes of a class table: which classes are absent, and how means count them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def absent_notes(
     split: str,
     absent: Absent,
 ) -> tuple[str, ...]:
-    """Why means over classes are over fewer classes, or hold a 0 that no prediction earned.
+    """Footnotes about absent classes that change the means over classes.
 
     A class is absent where it is neither labelled nor predicted. One that is predicted although no
     label holds it has an IoU of 0 with either convention (see `rgbt.metrics.scores`).

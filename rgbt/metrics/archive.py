@@ -1,7 +1,7 @@
-"""One compressed file of arrays that says what it is: counts, pixel maps, statistics.
+"""Read and write compressed files of arrays that name their kind: counts, maps, statistics.
 
-A file is a zip archive of arrays in NumPy's format. Nothing is unpacked before the directory of the
-archive and the headers of the arrays say that they are what the kind of file holds, and how large.
+A file is a zip archive of arrays in NumPy's format. Nothing is unpacked before the directory of
+the archive and the headers of the arrays are checked against the kind of file.
 """
 
 from __future__ import annotations
@@ -84,9 +84,9 @@ class Archive:
                 allows, or another kind of file.
         """
         if not path.is_file():
-            raise InputError(f"there is no file of {self.what} '{path}'; {self.advice}.")
+            raise InputError(f"the file of {self.what} '{path}' does not exist; {self.advice}.")
         if not os.access(path, os.R_OK):
-            raise InputError(f"'{path}' may not be read; change its permissions.")
+            raise InputError(f"'{path}' cannot be read: permission denied; change its permissions.")
         with self.refusing(path), path.open("rb") as file:
             _check_directory(file)
             with zipfile.ZipFile(file) as archive:
@@ -94,7 +94,7 @@ class Archive:
 
     @contextmanager
     def refusing(self, path: Path) -> Iterator[None]:
-        """Turn what is raised on a damaged file into the sentence that names it and the advice."""
+        """Turn errors about a damaged file into an InputError with advice."""
         try:
             yield
         except InputError:
@@ -111,14 +111,14 @@ class Archive:
         mark = one_line(_array(archive, FORMAT)) if is_text else "none"
         if mark != self.mark:
             raise InputError(
-                f"'{path}' is no file of {self.what}: expected the mark '{self.mark}', got "
+                f"'{path}' is not a file of {self.what}: expected the mark '{self.mark}', got "
                 f"'{mark}'; {self.advice}."
             )
         self._check_members(headers)
         values = {name: _array(archive, name) for name in headers}
         stored = values.pop(DIGEST, None)
         if stored is not None and str(stored) != _digest(values):
-            raise ValueError("its digest is another one")
+            raise ValueError("its content does not match its digest")
         return values
 
     def _check_members(self, headers: Mapping[str, Header]) -> None:
@@ -143,15 +143,15 @@ class Archive:
 
 
 def _check_directory(file: IO[bytes]) -> None:
-    """Refuse what `zipfile` would read whole before it says how many entries there are."""
+    """Refuse directories that `zipfile` would read completely before counting their entries."""
     end = file.seek(0, os.SEEK_END)
     file.seek(max(0, end - END.size - ZIP64.size))
     tail = file.read()
     if len(tail) < END.size or not tail[-END.size :].startswith(b"PK\5\6"):
-        raise ValueError("it is no zip archive, or its end is missing")
+        raise ValueError("it is not a zip archive, or its end is missing")
     _, _, _, _, entries, size, _, comment = END.unpack(tail[-END.size :])
     if tail.startswith(ZIP64_MARK) or comment or entries > MOST_ENTRIES or size > MOST_DIRECTORY:
-        raise ValueError("its directory is not one of these files")
+        raise ValueError("its directory is not that of such a file")
 
 
 def _headers(archive: zipfile.ZipFile, path: Path) -> dict[str, Header]:
@@ -172,7 +172,7 @@ def _headers(archive: zipfile.ZipFile, path: Path) -> dict[str, Header]:
 def _array(archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
     with archive.open(f"{name}.npy") as member:
         array: NDArray[Any] = np.lib.format.read_array(member, allow_pickle=False)
-        member.read(1)  # the check sum is compared where a member ends
+        member.read(1)  # the checksum is compared at the end of a member
     return array
 
 

@@ -1,4 +1,4 @@
-"""Counts of (region, label, prediction) of one image by one histogram."""
+"""Count (region, label, prediction) of one image with one histogram."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class RegionCounter:
 
     def __init__(self, num_classes: int, regions: Regions) -> None:
         if not 1 <= num_classes <= 255:
-            raise ValueError(f"num_classes must lie in [1, 255], got {num_classes}.")
+            raise ValueError(f"num_classes must be between 1 and 255, got {num_classes}.")
         self.num_classes = num_classes
         self.regions = regions
         self._per_region = (num_classes + 1) * num_classes

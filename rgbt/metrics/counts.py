@@ -1,4 +1,4 @@
-"""Counts of a split: the file of a run that every score and table is recomputed from."""
+"""The counts of a split, from which every score and table can be computed again."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ class Counts:
         return self._take([index_of[name] for name in wanted])
 
     def parts(self) -> dict[str, Counts]:
-        """Day and night, as far as the data set tells them apart and the split holds both."""
+        """Day and night, if the data set distinguishes them and the split holds both."""
         if self.night is None or len(set(self.night)) < 2:
             return {}
         at_night = np.array(self.night)
@@ -165,8 +165,8 @@ def scored_classes(classes: Sequence[str], unscored: Collection[str]) -> NDArray
     scored = np.array([name not in unscored for name in classes], bool)
     if unknown or not scored.any():
         raise ValueError(
-            f"unscored: expected some of the classes {', '.join(classes)}, but not all of them, "
-            f"got {', '.join(unscored)}."
+            f"unscored: expected some, but not all, of the classes {', '.join(classes)}, got "
+            f"{', '.join(unscored)}."
         )
     return scored
 
@@ -181,8 +181,8 @@ def check_same_means(first: Counts, other: Counts) -> None:
         return
     left_out = [", ".join(each.unscored) or "no class" for each in (first, other)]
     raise InputError(
-        f"counts that leave {left_out[0]} out of means cannot be compared with counts that leave "
-        f"out {left_out[1]}; count both with the same dataset.unscored."
+        f"counts without {left_out[0]} in their means cannot be compared with counts without "
+        f"{left_out[1]}. Evaluate both with the same dataset.unscored."
     )
 
 
@@ -195,7 +195,7 @@ def convention(every: Iterable[Counts]) -> Absent:
     found = {counts.absent for counts in every}
     if len(found) > 1:
         raise InputError(
-            "the counts were made with both conventions for absent classes (released: they score "
-            "0; exclude: they are left out of means); choose absent=released or absent=exclude."
+            "the counts use different conventions for absent classes (released: they score 0; "
+            "exclude: they are left out of means). Choose absent=released or absent=exclude."
         )
     return found.pop()

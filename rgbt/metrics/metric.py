@@ -1,4 +1,4 @@
-"""The configured choice of regions and of how absent classes count: files of conf/metric/."""
+"""The partition of the image and the rule for absent classes, configured by conf/metric/."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Absent = Literal["released", "exclude"]
 
 @dataclass(frozen=True, kw_only=True)
 class Regions:
-    """A partition of the image, and how a class that a region lacks counts.
+    """A partition of the image, and the rule for classes that are absent in a region.
 
     Attributes:
         partition: "ring" nested rectangles, region 1 innermost; "vertical" strips from left to

@@ -1,9 +1,9 @@
-"""Scores by the names that tables and comparisons give them, from counts.
+"""Compute scores from counts by the names that tables and comparisons use.
 
 ``[day/ or night/]`` and then one of ``mIoU Var mAcc mPrecision mF1 pixel_accuracy``, ``region/<n>``
 (mIoU of region n), ``class/<name>`` (IoU), ``class/<name>/acc``, ``class/<name>/region/<n>``; of
 counts of pairs of frames (`rgbt.metrics.pairs`) ``TC CA CA_released`` and ``class/<name>/TC`` etc.
-Means are over the scored classes (`Counts.scored`); every class can be asked for by its name.
+Means are over the scored classes (`Counts.scored`); every single class is available by name.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def parse(metric: str) -> ParsedMetric:
     """Take a metric name apart.
 
     Raises:
-        InputError: it is none, with the nearest one.
+        InputError: it is not a metric name; the message contains the nearest one.
     """
     words = metric.split("/")
     part = words.pop(0) if words[0] in (names.DAY, names.NIGHT) else None
@@ -74,7 +74,7 @@ def parse(metric: str) -> ParsedMetric:
             return ParsedMetric(metric, part, "IoU", name, int(number))
     known = nearest("/".join(words), [*MEANS, names.VAR, *OF_PAIRS, *FORMS])
     raise InputError(
-        f"'{metric}' is not a metric; {known}; day/ or night/ may stand before each of them."
+        f"'{metric}' is not a metric; {known}; each may have the prefix day/ or night/."
     )
 
 
@@ -85,20 +85,20 @@ def value(metric: str, counts: Counts, absent: Absent) -> float:
 
     Raises:
         InputError: no such metric, class or region, a metric that such counts do not have, or
-            images that are not told apart.
+            images without a time of day.
     """
-    asked = parse(metric)
-    by_region = images_of(asked, counts).by_region()
-    return float(values(asked, by_region, counts, absent))
+    parsed = parse(metric)
+    by_region = images_of(parsed, counts).by_region()
+    return float(values(parsed, by_region, counts, absent))
 
 
 def values(
-    asked: ParsedMetric, by_region: Matrices, like: Counts, absent: Absent
+    parsed: ParsedMetric, by_region: Matrices, like: Counts, absent: Absent
 ) -> NDArray[np.float64]:
     """The score of many summed counts at once, e.g. one per resample.
 
     Args:
-        asked: the score; its part (day, night) has been taken by `images_of` before summing.
+        parsed: the score; its part (day, night) has been taken by `images_of` before summing.
         by_region: (..., R, K, K), summed over images.
         like: counts of the same classes, scored ones and partition; nothing else of it is used.
         absent: see `value`.
@@ -109,66 +109,66 @@ def values(
     Raises:
         InputError: no such class or region, or a metric that such counts do not have.
     """
-    check_kind(asked, like.partition)
-    if asked.score in OF_PAIRS:
-        by_class = 100.0 * OF_PAIRS[asked.score](by_region, absent)
-        if asked.class_name is None:
+    check_kind(parsed, like.partition)
+    if parsed.score in OF_PAIRS:
+        by_class = 100.0 * OF_PAIRS[parsed.score](by_region, absent)
+        if parsed.class_name is None:
             return class_mean(by_class, like.scored)
-        return _of_class(asked, by_class, like.classes)
-    if asked.score == names.VAR:
+        return _of_class(parsed, by_class, like.classes)
+    if parsed.score == names.VAR:
         return variance(miou(by_region, absent, like.scored))
-    if asked.region is None:
+    if parsed.region is None:
         matrices = by_region.sum(-3)
-    elif 1 <= asked.region <= by_region.shape[-3]:
-        matrices = by_region[..., asked.region - 1, :, :]
+    elif 1 <= parsed.region <= by_region.shape[-3]:
+        matrices = by_region[..., parsed.region - 1, :, :]
     else:
         raise InputError(
-            f"'{asked.metric}': the counts have the regions 1 to {by_region.shape[-3]}; use counts "
-            "of more regions (another file of conf/metric)."
+            f"'{parsed.metric}': the counts have the regions 1 to {by_region.shape[-3]}; use "
+            "counts of more regions (another file of conf/metric)."
         )
-    if asked.class_name is None:
-        return 100.0 * MEANS[asked.score](matrices, absent, like.scored)
-    score = recall if asked.score == "acc" else iou
-    return _of_class(asked, 100.0 * score(matrices, absent), like.classes)
+    if parsed.class_name is None:
+        return 100.0 * MEANS[parsed.score](matrices, absent, like.scored)
+    score = recall if parsed.score == "acc" else iou
+    return _of_class(parsed, 100.0 * score(matrices, absent), like.classes)
 
 
-def check_kind(asked: ParsedMetric, partition: str) -> None:
+def check_kind(parsed: ParsedMetric, partition: str) -> None:
     """Refuse a score of pairs of frames from counts of single ones, and the other way round.
 
     Raises:
         InputError: such counts do not have it.
     """
     of_pairs = pairs.protocol_of(partition) is not None
-    if of_pairs and asked.score not in OF_PAIRS:
+    if of_pairs and parsed.score not in OF_PAIRS:
         raise InputError(
-            f"'{asked.metric}' is a score of single frames, but these counts ({partition}, of "
-            "rgbt consistency run=...) are of pairs of frames; ask for "
-            f"{', '.join(OF_PAIRS)}, or name counts of single frames."
+            f"'{parsed.metric}' is a score of single frames, but these counts ({partition}, of "
+            f"rgbt consistency run=...) are of pairs of frames. Use {', '.join(OF_PAIRS)}, or "
+            "name counts of single frames."
         )
-    if not of_pairs and asked.score in OF_PAIRS:
+    if not of_pairs and parsed.score in OF_PAIRS:
         raise InputError(
-            f"'{asked.metric}' is a score of pairs of frames, but these counts ({partition}) are "
-            "of single frames; rgbt consistency run=... counts the pairs of a run."
+            f"'{parsed.metric}' is a score of pairs of frames, but these counts ({partition}) are "
+            "of single frames. Count pairs with rgbt consistency run=..."
         )
 
 
-def images_of(asked: ParsedMetric, counts: Counts) -> Counts:
+def images_of(parsed: ParsedMetric, counts: Counts) -> Counts:
     """The images that a metric is over: all, those of the day or those of the night.
 
     Raises:
-        InputError: the split does not hold both, the data set does not tell them apart, or such
+        InputError: the split does not hold both, the data set does not distinguish them, or such
             counts do not have the metric.
     """
-    check_kind(asked, counts.partition)
-    if asked.part is None:
+    check_kind(parsed, counts.partition)
+    if parsed.part is None:
         return counts
     parts = counts.parts()
-    if asked.part not in parts:
+    if parsed.part not in parts:
         raise InputError(
-            f"'{asked.metric}': split '{counts.split}' of the run's data set does not hold images "
-            "of day and of night that are told apart."
+            f"'{parsed.metric}': split '{counts.split}' of the run's data set does not contain "
+            "both images marked as day and images marked as night."
         )
-    return parts[asked.part]
+    return parts[parsed.part]
 
 
 def _is_number(text: str) -> bool:
@@ -176,12 +176,12 @@ def _is_number(text: str) -> bool:
 
 
 def _of_class(
-    asked: ParsedMetric, by_class: NDArray[np.float64], classes: tuple[str, ...]
+    parsed: ParsedMetric, by_class: NDArray[np.float64], classes: tuple[str, ...]
 ) -> NDArray[np.float64]:
     """(..., K) -> (...)."""
-    if asked.class_name not in classes:
+    if parsed.class_name not in classes:
         raise InputError(
-            f"'{asked.metric}': the data set of the run has no class '{asked.class_name}'; "
-            f"{nearest(str(asked.class_name), classes)}."
+            f"'{parsed.metric}': the data set of the run has no class '{parsed.class_name}'; "
+            f"{nearest(str(parsed.class_name), classes)}."
         )
-    return np.asarray(by_class[..., classes.index(asked.class_name)])
+    return np.asarray(by_class[..., classes.index(parsed.class_name)])

@@ -1,4 +1,4 @@
-"""Every metric name, once, and how a score is shown.
+"""Define every metric name once, and how a score is shown.
 
 Scores are fractions 0..1; `VAR` alone is in squared percent points.
 """

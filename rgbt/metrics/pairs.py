@@ -1,11 +1,11 @@
-"""Pairs of frames: temporal consistency (TC) and consistent accuracy (CA) from counts.
+"""Count pairs of frames, and compute temporal consistency (TC) and consistent accuracy (CA).
 
 Counts of pairs are ordinary `rgbt.metrics.counts.Counts` of shape (N, S (K + 1), K, K): entry
 ``[s (K + 1) + y, p1, p2]`` is the number of pixels that set s of second frames labels y (K: no
 class), and that are p1 in the prediction of the first and p2 in that of the second frame. Their
 partition, e.g. "aligned3", is the protocol and S:
 
-    "aligned":  the first prediction is brought into the second frame; pixels count that the first
+    "aligned": the first prediction is warped to the second frame; pixels count that the first
                 frame shows and that have a label (Temporal, Fig. 4).
     "released": the first prediction stays where it is, every pixel counts (Temporal release).
     "next":     as "aligned", between a frame and the one that was taken after it.
@@ -34,13 +34,13 @@ HEADLINES: dict[Protocol, tuple[str, str]] = {
     "released": (names.TC, names.CA_RELEASED),
     "next": (names.TC, names.CA),
 }
-"""The two scores that a protocol is known by: the paper's, and what its release computes."""
+"""The two main scores of a protocol: that of the paper, and that of its release."""
 
 Map: TypeAlias = "NDArray[np.integer] | Tensor"
 
 
 def partition_name(protocol: Protocol, sets: int, views: str = "") -> str:
-    """What counts of pairs carry as their partition: "aligned3".
+    """The partition name of counts of pairs: "aligned3".
 
     `views` are virtual views: "" the published ones, "aligned3-1c0ffe" has others.
     """
@@ -78,14 +78,14 @@ def pair_counts(
     Raises:
         ValueError: shapes differ, or a prediction that counts is no class.
     """
-    # Whoever derives scores alone, as tables and comparisons do, need not wait for PyTorch.
+    # Code that only derives scores, such as tables, does not need PyTorch.
     import torch
 
     from rgbt.metrics.confusion import LANES
 
     classes = num_classes
     if not 1 <= classes <= 255:
-        raise ValueError(f"num_classes must lie in [1, 255], got {classes}.")
+        raise ValueError(f"num_classes must be between 1 and 255, got {classes}.")
     first_HW, second_HW, label_HW = (
         torch.as_tensor(each).to(torch.uint8) for each in (first, second, label)
     )

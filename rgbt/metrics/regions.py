@@ -93,8 +93,8 @@ def _checked(region_map: RegionMap, regions: int) -> RegionMap:
     """`region_map`, read-only, if it holds every region."""
     if np.bincount(region_map.ravel(), minlength=regions).min() == 0:
         raise InputError(
-            f"metric.regions={regions} is more than an image of "
-            f"{region_map.shape[0]}x{region_map.shape[1]} pixels can be cut into; use fewer."
+            f"metric.regions={regions} is too many for an image of "
+            f"{region_map.shape[0]}x{region_map.shape[1]} pixels; use fewer regions."
         )
     region_map.flags.writeable = False
     return region_map

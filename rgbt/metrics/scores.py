@@ -1,4 +1,4 @@
-"""Scores from counts, and from nothing else.
+"""Compute all scores from counts.
 
 Counts are (..., K, K), rows = label, columns = prediction; leading dimensions (regions, images) are
 kept. Scores are fractions 0..1; variances are in squared percent points, as the papers print them.
@@ -128,8 +128,8 @@ def summary(counts: Counts, absent: Absent) -> dict[str, float]:
     """Every score that is followed over a run, by its name in `rgbt.metrics.names`.
 
     Over all images: means over the scored classes, variance over regions, mIoU of each region, IoU
-    of each class (unscored ones too); mIoU and variance again for day and for night where the data
-    set tells them apart.
+    of each class (unscored ones too); mIoU and variance again for day and for night if the data
+    set distinguishes them.
 
     Returns:
         name -> fraction, or squared percent points for the variance. NaN: nothing to score.

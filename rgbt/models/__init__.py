@@ -1,4 +1,4 @@
-"""Networks: two images and an optional pair of masks in, `Output(logits, aux)` out.
+"""Networks, which map two images and an optional pair of masks to `Output(logits, aux)`.
 
 One folder per family. A network never computes a loss, reads no file and draws no random number
 except from the generator it is handed. All are called alike; each `forward` says what it adds:

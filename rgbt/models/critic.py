@@ -1,4 +1,4 @@
-"""The discriminator of adversarial adaptation: which domain does this map come from?"""
+"""The discriminator of adversarial adaptation, which predicts the domain of a map."""
 
 from __future__ import annotations
 
@@ -68,8 +68,8 @@ class Critic(nn.Module):
         sizes = check_shape("map", x, "N C H W", C=self.in_channels)
         if min(sizes["H"], sizes["W"]) < STRIDE:
             raise InputError(
-                f"a discriminator judges maps of at least {STRIDE} x {STRIDE}, got {sizes['H']} x "
-                f"{sizes['W']}; use larger crops, or a discriminator on the class scores."
+                f"a discriminator requires maps of at least {STRIDE} x {STRIDE}, got {sizes['H']} "
+                f"x {sizes['W']}; use larger crops, or a discriminator on the class scores."
             )
         for conv in (self.conv1, self.conv2, self.conv3, self.conv4):
             x = F.leaky_relu(conv(x), 0.2)

@@ -1,7 +1,7 @@
-"""What a network is fed: channel order, normalisation, padding and hidden pixels, per release.
+"""Prepare the inputs of a network: channel order, normalisation, padding and hidden pixels.
 
-Weights are tied to the convention they were trained with: fed another way, a released network
-gives other numbers. `conf/model/inputs/` has one file per release.
+Weights require the convention of their training: with other inputs, a released network gives other
+results. `conf/model/inputs/` has one file per release.
 """
 
 from __future__ import annotations
@@ -64,8 +64,9 @@ class Inputs(nn.Module):
         super().__init__()
         if len(thermal_mean) not in (1, 3) or len(thermal_std) != len(thermal_mean):
             raise InputError(
-                "model.inputs: thermal_mean and thermal_std need one value, or three where thermal "
-                f"is repeated for three channels, got {len(thermal_mean)} and {len(thermal_std)}."
+                "model.inputs: thermal_mean and thermal_std must have one value, or three if "
+                f"thermal is repeated for three channels, got {len(thermal_mean)} and "
+                f"{len(thermal_std)}."
             )
         self.rgb_order = rgb_order
         self.thermal_scale = thermal_scale
@@ -140,7 +141,7 @@ def expand_cells(masks: MaskPair, count: int, image_hw: tuple[int, int], unit: i
 
 
 def only_view(views: tuple[View, ...], known: tuple[View, ...], network: str) -> View:
-    """The one view that is requested of a network without stacked views.
+    """The requested view of a network without stacked views.
 
     `views` as its `forward` got them (empty: the first of `known`), its views, and its name.
     InputError: more than one view, or one that it does not have.
@@ -149,7 +150,7 @@ def only_view(views: tuple[View, ...], known: tuple[View, ...], network: str) ->
     if len(requested) > 1 or requested[0] not in known:
         raise InputError(
             f"{network} predicts from {' or '.join(known)}, one at a time, but got "
-            f"{', '.join(requested)}; choose modality={known[0]}, or a network with several views "
+            f"{', '.join(requested)}. Choose modality={known[0]}, or a network with several views "
             "(model=mask2former_tiny)."
         )
     return requested[0]

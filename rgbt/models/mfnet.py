@@ -1,4 +1,4 @@
-"""MFNet: two small convolutional encoders, one per image, and a decoder that adds their features.
+"""The network MFNet: two small convolutional encoders and a decoder that adds their features.
 
 Parameter names are those of the authors' PyTorch release; "inf" (infrared) is the thermal encoder.
 """
@@ -23,7 +23,7 @@ LEAKY_SLOPE = 0.2
 
 
 class ConvUnit(nn.Module):
-    """3x3 convolution (dilated, padded alike), batch normalisation, and a leaky ReLU if asked."""
+    """3x3 convolution (dilated, padded alike), batch normalisation, and an optional leaky ReLU."""
 
     def __init__(
         self, in_channels: int, out_channels: int, *, dilation: int = 1, activation: bool = True

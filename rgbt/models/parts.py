@@ -1,4 +1,4 @@
-"""What networks share: random drops in training, from a given generator, and up blocks.
+"""Parts that networks share: random drops in training, from a given generator, and up blocks.
 
 The up blocks are the decoder of HeatNet and of the modified DeepLab.
 """
@@ -32,7 +32,7 @@ def keep_factors(
         ValueError: no generator.
     """
     if generator is None:
-        raise ValueError("training with random drops needs `generator`, got None.")
+        raise ValueError("training with random drops requires `generator`, got None.")
     probability = 1 - rates.view(-1, *(1 for _ in shape)).to(generator.device)
     draw = torch.rand(len(rates), *shape, generator=generator, device=generator.device)
     return ((draw < probability) / probability).to(device, non_blocking=True)

@@ -1,4 +1,4 @@
-"""HeatNet's PSPNet: a residual encoder per image, pyramid pooling, a decoder of three steps."""
+"""The network PSPNet of HeatNet: a residual encoder per image, pyramid pooling, a decoder."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ class PSPNet(nn.Module):
 
     @staticmethod
     def record_from(*, modalities: str, **_: object) -> Record:
-        """What it returns, and what it predicts from."""
+        """Output and views."""
         return Record(views=(VIEW_OF[modalities],), pretrained_parts=("feats.",))
 
     def forward(
@@ -110,7 +110,7 @@ class PSPNet(nn.Module):
 
         Returns:
             logits: (N, K, H, W).
-            aux: what discriminators may judge, besides the logits. With w = base_width, branches
+            aux: maps for discriminators, besides the logits. With w = base_width, branches
                 concatenated, sides H and W rounded up to multiples of 8 and then divided by s:
                 "layer4" (32 w, s = 8), "layer3" (16 w, s = 8), "layer2" (8 w per branch, s = 8),
                 "layer1" (4 w per branch, s = 4), "stem" (w per branch, s = 4).

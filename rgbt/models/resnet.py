@@ -1,7 +1,7 @@
-"""Residual stages with torchvision's parameter names, dilated where a segmentation network is.
+"""Residual stages with torchvision's parameter names and optional dilation.
 
-Published networks differ in where a block's stride and dilation sit; every such choice is an
-argument. Nothing here decides a whole network.
+Published networks differ in the position of a block's stride and dilation; every such choice is an
+argument.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""RTFNet: two ResNet encoders whose features are added, and a decoder of Upception blocks.
+"""The network RTFNet: two ResNet encoders with added features, and Upception blocks.
 
 Parameter names are the release's, so that its weights load as they are.
 """
@@ -131,7 +131,7 @@ class RTFNet(nn.Module):
 
     @staticmethod
     def record_from(*, thermal_stem: str, **_: object) -> Record:
-        """What it returns, what it predicts from, and what no file of ImageNet weights gives it."""
+        """Output, views, and the parameters that ImageNet weights do not cover."""
         reason = "drawn anew with model.thermal_stem=xavier"
         return Record(
             views=("rgbt",),

@@ -1,1 +1,1 @@
-"""The process: signals, and disks and memory that are full."""
+"""Handle signals, full disks and exhausted memory."""

@@ -1,4 +1,4 @@
-"""A disk that is full, or memory that is exhausted, as one sentence with what to do.
+"""Report a full disk or exhausted memory in one message with advice.
 
 Libraries report both in many ways: PyTorch hides a full disk behind a RuntimeError of its file
 writer, OpenCV has an error of its own for missing memory.
@@ -20,7 +20,7 @@ from rgbt.checks import InputError, RunError, one_line
 DISK = {
     errno.ENOSPC: "is full",
     errno.EDQUOT: "has no space left for this user (quota)",
-    errno.EROFS: "cannot be written, it is mounted read-only",
+    errno.EROFS: "is mounted read-only",
 }
 
 MEMORY = re.compile(
@@ -42,7 +42,7 @@ def reporting_exhaustion() -> Iterator[None]:
     """
     try:
         yield
-    except Exception as error:  # A border: all else is raised on.
+    except Exception as error:  # All other exceptions are raised again.
         sentence = _sentence(error)
         if sentence is None:
             raise
@@ -50,7 +50,7 @@ def reporting_exhaustion() -> Iterator[None]:
 
 
 def _sentence(error: BaseException) -> str | None:
-    """What ran out, if `error` or one that led to it says so."""
+    """The message about a full disk or exhausted memory, if `error` or its cause is one."""
     cause: BaseException | None = error
     while cause is not None:
         if isinstance(cause, OSError) and cause.errno in DISK:
@@ -77,7 +77,7 @@ def _disk_sentence(error: BaseException, cause: OSError) -> str:
         path = min(map(_existing, places), key=_free).resolve()
     free = f"{_free(path) / 1e6:.1f} MB free, after the unfinished file was removed"
     left = f"the disk of {path} {DISK[cause.errno or 0]} ({free})"
-    if isinstance(error, InputError):  # says itself what cannot be written, and what to set
+    if isinstance(error, InputError):  # its message names the file and the setting
         return f"{str(error).rstrip('.')}; {left}."
     return f"{left}; free some space, or name a folder on another disk; {RESUME}."
 

@@ -1,9 +1,10 @@
-"""Signals that end a command: answered at once, or between two steps of a training.
+"""Handle the signals that end a command, at once or between two training steps.
 
 Ctrl-C and SIGHUP (a terminal that is closed) and SIGTERM (a cluster that takes its machine away)
-raise `Stopped`. Inside `deferred` they are only noted, so that no step and no file is left half
-done; inside `at_once` within it they are answered again. Python drops what is raised while it frees
-an object (``__del__``, a callback of a weak reference): `Stopped` is then raised again soon after.
+raise `Stopped`. Inside `deferred` they are only noted, so that no step and no file stays
+incomplete; inside `at_once` within it they are handled at once again. Python drops what is raised
+while it frees an object (``__del__``, a callback of a weak reference): `Stopped` is then raised
+again soon after.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ SOON = 0.05
 
 
 class Stopped(KeyboardInterrupt):
-    """The first signal that ends a command, raised where nothing is half done.
+    """Raised for the first signal that ends a command, when no step or file is incomplete.
 
     Attributes:
         number: of the signal.
@@ -46,7 +47,7 @@ class Stopped(KeyboardInterrupt):
         return 128 + self.number
 
     def __str__(self) -> str:
-        saved = "" if self.step is None else f" at step {self.step}, which is saved"
+        saved = "" if self.step is None else f" at step {self.step}, and the checkpoint is saved"
         return f"{WORDS[signal.Signals(self.number)]}{saved}; rerun the command to resume."
 
 
@@ -64,7 +65,7 @@ _signals = _Signals()
 
 @contextmanager
 def answered() -> Iterator[None]:
-    """Answer the signals of `WORDS`, but for those that the process was started to ignore (nohup).
+    """Handle the signals of `WORDS`, except those that the process was started to ignore (nohup).
 
     Clusters signal a process more than once: the first one counts. A second Ctrl-C stops at once.
     """
@@ -73,7 +74,7 @@ def answered() -> Iterator[None]:
 
     def answer(number: int, frame: FrameType | None) -> None:
         del frame
-        if os.getpid() != process:  # a process forked from us: it has nothing to tidy up
+        if os.getpid() != process:  # a forked process has nothing to clean up
             os._exit(128 + number)
         if number == signal.SIGHUP:
             _leave(terminals)
@@ -165,7 +166,7 @@ def _raise_noted() -> None:
 
 
 def _leave(terminals: list[int]) -> None:
-    """What is written to a terminal that was closed is lost, and not an error."""
+    """Ignore output to a terminal that was closed."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     for stream in terminals:
         os.dup2(nowhere, stream)

@@ -1,4 +1,4 @@
-"""Adversarial adaptation: a network against a discriminator of its predictions' domain."""
+"""Adversarial adaptation with a discriminator that predicts the domain of the predictions."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ class Adversarial:
         domains: source and target.
         critic: D (see `rgbt.models.critic.Critic`).
         critic_optimizer: builder of its optimiser, named "critic" in phases.
-        judged: what the discriminator sees: class probabilities (thesis, AdaptSegNet), raw
+        judged: input of the discriminator: class probabilities (thesis, AdaptSegNet), raw
             scores (HeatNet), or weighted self-information (ADVENT).
         verdict_loss: d: "least_squares" (thesis, HeatNet), or "cross_entropy" with logits
             (AdaptSegNet, ADVENT).
         source_value: y_s. Thesis, AdaptSegNet, ADVENT: 0; HeatNet: 1.
         target_value: y_t. The other one.
         weight: of A. Thesis' code and HeatNet's best command: 0.01; AdaptSegNet, ADVENT: 0.001.
-        both_ways: whether the source, too, is to be taken for the other domain (HeatNet).
+        both_ways: whether the source is also trained to be classified as the target (HeatNet).
         weighed_by_confidence: whether w is not 1 (HeatNet); needs labels with confidence.
         halved: whether C is halved (AdaptSegNet, ADVENT).
         supervise_target: whether L_s of the target is computed. Thesis, Eq. 4: no; the code of its
@@ -88,13 +88,13 @@ class Adversarial:
         outside = min(source_value, target_value) < 0 or max(source_value, target_value) > 1
         if self.verdict_loss == "cross_entropy" and outside:
             raise InputError(
-                "scheme.source_value and scheme.target_value must lie in [0, 1] with "
+                "scheme.source_value and scheme.target_value must be between 0 and 1 with "
                 f"scheme.verdict_loss=cross_entropy, got {source_value:g} and {target_value:g}."
             )
         if source_value == target_value:
             raise InputError(
-                f"scheme.source_value and scheme.target_value are both {source_value:g}, so that "
-                "the discriminator has nothing to distinguish; choose two numbers, such as 0 and 1."
+                f"scheme.source_value and scheme.target_value are both {source_value:g}, but the "
+                "discriminator requires two different numbers, such as 0 and 1."
             )
         self.passes = Passes(
             model=self.model, loss=self.loss, domains=self.domains, gradients=self.gradients
@@ -142,7 +142,7 @@ class Adversarial:
     def _domain(
         self, name: str, batch: TwoDomains, generator_of: GeneratorOf, seen: dict[str, Tensor]
     ) -> dict[str, Tensor]:
-        """What a domain costs the network; the map that the discriminator judges goes to `seen`."""
+        """Loss parts of a domain; the input of the discriminator is appended to `seen`."""
         is_source = name == "source"
         own = batch.source if is_source else batch.target
         parts: dict[str, Tensor] = {}

@@ -1,4 +1,4 @@
-"""What the schemes of domain adaptation share: how a domain passes the network, what it costs."""
+"""Code shared by the schemes of domain adaptation: the pass of a domain and its loss."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rgbt.requirements import Record, Requirement
 from rgbt.types import Batch, GeneratorOf, Loss, Output, Phase, View
 
 Gradients = Literal["apart", "kept", "together"]
-"""What the optimisers of two heads step the parameters with that they share.
+"""The gradients with which the optimizers of two heads step their shared parameters.
 
     apart      each with the gradient of its own domain
     kept       the source's with its own, then the target's with both, the source's from before
@@ -25,11 +25,11 @@ source's was clipped to.
 
 
 class ViewAndHead(Protocol):
-    """How a domain passes the network (see `rgbt.data.domains.Domain`)."""
+    """View and head of a domain (see `rgbt.data.domains.Domain`)."""
 
     @property
     def view(self) -> View | None:
-        """What the network sees; None leaves it to the network."""
+        """Input images; None leaves the choice to the network."""
         ...
 
     @property
@@ -39,7 +39,7 @@ class ViewAndHead(Protocol):
 
 
 def options_of(domain: ViewAndHead) -> dict[str, Any]:
-    """Keyword arguments of the network for a domain; what is None is left to the network."""
+    """Keyword arguments of the network for a domain, without those that are None."""
     given = {"views": domain.view and (domain.view,), "head": domain.head}
     return {name: value for name, value in given.items() if value is not None}
 
@@ -59,7 +59,7 @@ class SourceAndTarget(Protocol):
 
 
 class Passes:
-    """The network as each domain passes it, and what that costs.
+    """The passes of both domains through the network, and their losses.
 
     Args:
         model: the network.
@@ -109,7 +109,7 @@ class Passes:
         )
 
     def output(self, name: str, batch: Batch, generator_of: GeneratorOf) -> Output:
-        """What the network returns for a batch of the domain "source" or "target"."""
+        """The output of the network for a batch of the domain "source" or "target"."""
         domain = self.source if name == "source" else self.target
         assert domain is not None, "a scheme of two domains has a target"
         generator = generator_of(f"{name} network")

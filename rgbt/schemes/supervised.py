@@ -1,4 +1,4 @@
-"""One pass, one loss."""
+"""Supervised training with one pass and one loss."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ class Supervised:
     Args:
         model: the network.
         loss: of its output and the labels.
-        masker: what it does not see.
-        domains: how the source is seen, and by which head.
+        masker: draws the hidden cells.
+        domains: view and head of the source.
     """
 
     record = Record(shows_views=True)

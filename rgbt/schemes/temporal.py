@@ -23,7 +23,7 @@ DenseLogits = Callable[[Output, tuple[int, int]], Tensor]
 
 
 class VirtualViews(Protocol):
-    """What draws the second frame (see `rgbt.transforms.virtual_view.VirtualView`)."""
+    """The interface of a view, which draws the second frame (`rgbt.transforms.virtual_view`)."""
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """(count, 3) angles."""
@@ -44,14 +44,14 @@ class VirtualViews(Protocol):
 
 @dataclass(kw_only=True, eq=False)
 class Temporal:
-    """Losses of a frame, of its virtual successor, and of how their predictions agree.
+    """Losses of a frame, of its virtual successor, and of the agreement of their predictions.
 
     Both frames go through the same weights. Where the network normalises over the batch they go
     one after the other, as released; else as one batch, which is the same function and faster.
 
-    Paper: the first prediction ("segmentation map") is brought into the second frame; whether
-        its gradient stops is left open.
-    Released: scores are brought there and normalised afterwards, and no gradient passes.
+    Paper: the first prediction ("segmentation map") is warped to the second frame; whether its
+        gradient stops is left open.
+    Released: scores are warped and normalised afterwards, and no gradient passes.
 
     Attributes:
         model: any network; one that returns masks of queries needs `dense_logits`.

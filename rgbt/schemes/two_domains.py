@@ -1,4 +1,4 @@
-"""Labels on one or both domains, or on the source and a loss without labels on the target."""
+"""Schemes for two domains: labels on both, or a loss without labels on the target."""
 
 from __future__ import annotations
 

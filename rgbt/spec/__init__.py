@@ -1,1 +1,1 @@
-"""What a run is: its specification, key, name and upstream runs."""
+"""Specification, key, name and upstream runs of a run."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 def row_name(corruption: str) -> str:
-    """What files of counts and rows of tables call a corruption.
+    """The name of a corruption in files of counts and rows of tables.
 
     Args:
         corruption: ``NAME`` or ``NAME:IMAGE`` with the image "rgb", "thermal" or "both", such as

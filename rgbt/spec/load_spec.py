@@ -1,4 +1,4 @@
-"""The specification of a finished run, made of its stored settings and what a user changes."""
+"""Make the specification of a finished run from its stored settings and a user's overrides."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CHANGEABLE = (
     *("dataset", "data", "metric", "consistency", "transform.test_short_edge"),
     *("trainer.accelerator", "trainer.threads", "trainer.precision"),
 )
-"""Settings of a finished run that may be changed: where images come from, how they are counted."""
+"""Settings of a finished run that may be changed: the source of the images and the counting."""
 
 
 def load_spec(settings: Mapping[str, Any], overrides: Sequence[str] = ()) -> RunSpec:
@@ -72,7 +72,7 @@ def _override(config: DictConfig, overrides: Sequence[str]) -> None:
     for key, _, path in changes:
         if not _is_changeable(path):
             raise InputError(
-                f"'{key}' cannot be changed of a finished run; {nearest(key, CHANGEABLE)}."
+                f"'{key}' of a finished run cannot be changed; {nearest(key, CHANGEABLE)}."
             )
     groups = [key for key, _, _ in changes if key in GROUPS]
     for group in groups:

@@ -1,4 +1,4 @@
-"""What a run is called: what varies comes first, then the experiment.
+"""Names and groups of runs: settings that vary come first, then the experiment.
 
 The group is a tag that all seeds of one configuration share. Users type it in commands, so its form
 is kept: "grbm sigma_div=2". The name is for people: "sigma_div=2 seed=1 · grbm".
@@ -30,7 +30,7 @@ VALUE_LENGTH = 32
 
 SILENT = ("experiment", "search", "runs_dir", "tracking", "dataset.root", "name", "seed", "fresh")
 BESIDE = ("tracking.", "consistency")
-"""What is measured beside is no part of the run, and neither are its trackers."""
+"""Extra measurements and trackers are not part of the run."""
 
 OUTSIDE_KEY = tuple(name for name, node in NODES.items() if not node.in_key)
 """Nodes whose keys never make a short key ambiguous: sizes, which the settings of the run repeat,
@@ -38,7 +38,7 @@ and what is no part of the run."""
 
 
 def describe(spec: RunSpec, extra_tags: Mapping[str, str] | None = None) -> Description:
-    """How the run is shown: "sigma_div=2 seed=1 · grbm", in the group "grbm sigma_div=2".
+    """Name and group of a run: "sigma_div=2 seed=1 · grbm", in the group "grbm sigma_div=2".
 
     Only what differs from the experiment is named. Of a point of a sweep, what is common to all
     points follows the experiment: "sigma_div=2 seed=1 · grbm max_steps=9". Keys are cut to

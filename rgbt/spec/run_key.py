@@ -1,4 +1,4 @@
-"""Digests that the key of a run is made of."""
+"""Digests from which the key of a run is computed."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ def manifest_of(key: str, folder: str) -> dict[str, Any]:
     if not path.is_file():
         raise InputError(
             f"{key}={folder}: expected given, none, experiment:NAME/best.pt, or a folder of "
-            f"pseudo-labels that is finished, but there is no {path}; write it with "
-            "rgbt predict ... pseudo_labels=true."
+            f"finished pseudo-labels, but {path} does not exist. Write pseudo-labels with rgbt "
+            "predict ... pseudo_labels=true."
         )
     manifest: dict[str, Any] = read_json(path, dict[str, Any], "remove it and predict again")
     if "digest" not in manifest:
-        raise InputError(f"{path} does not describe pseudo-labels; predict into another folder.")
+        raise InputError(f"{path} does not describe pseudo-labels; choose another folder.")
     return manifest

@@ -1,7 +1,6 @@
-"""One run, described completely: made once from the composed configuration.
+"""The complete description of one run, made once from the composed configuration.
 
-Whoever needs a setting gets it, or its object, from here; the configuration itself is passed on to
-nobody.
+Other code reads settings and objects from here and never the configuration itself.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ CheckpointFile = Literal["best.pt", "last.pt"]
 
 @dataclass(frozen=True)
 class Node:
-    """What the run key and the upstream runs take of a node of the configuration.
+    """How the run key and the upstream runs use a node of the configuration.
 
     Attributes:
         in_key: whether it is part of the run key.
@@ -50,7 +49,7 @@ class Node:
     shared: bool | tuple[str, ...] = False
 
     def key_settings(self, name: str, values: Mapping[str, Any]) -> dict[str, Any]:
-        """What of the node's canonical `values` the run key is made of, below its `name`."""
+        """The part of a node's canonical `values` that enters the run key, below its `name`."""
         if not self.in_key or values == self.added_as:
             return {}
         old = {key: value for key, value in self.added.items() if values.get(key) == value}
@@ -226,8 +225,8 @@ class RunSpec:
         path = path / "best.pt" if path.is_dir() else path
         if not path.is_file():
             raise InputError(
-                f"model.weights={named}: there is no file {path}; give a file of weights, or the "
-                "folder of a run."
+                f"model.weights={named}: the file {path} does not exist; give a file of weights, "
+                "or a run folder."
             )
         return path
 
@@ -255,7 +254,7 @@ class RunSpec:
         return dict(user_code(targets(self.plain).values()))
 
     def _content(self, key: str, value: str) -> str:
-        """What stands for a file, a folder or an upstream run in the key."""
+        """The digest or key that represents a file, a folder or an upstream run in the key."""
         dependency = self.dependency(key)
         if dependency is not None:
             return f"{dependency.run.key}/{dependency.checkpoint}"

@@ -1,8 +1,8 @@
-"""What a run uses of a user's own code: the modules of its targets, and what these import.
+"""Digest the user's own code in a run: the modules of its targets, and their imports.
 
-Part of the key of a run (`rgbt.spec.run_key`). Imports are read from the source, nothing is
-imported for it. A module that is loaded by a name made at run time, and a file that the code reads,
-cannot be seen.
+The digest is part of the run key (`rgbt.spec.run_key`). Imports are read from the source without
+importing anything. Modules whose names are computed at run time, and files that the code reads, are
+not detected.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ Used = tuple[str, str]
 
 
 _used_by: dict[str, tuple[Used, ...]] = {}
-"""What each module used when this process first read it."""
+"""Digests of the code of each module when this process first read it."""
 
 
 def user_code(targets: Iterable[str]) -> tuple[Used, ...]:
-    """What the objects of a configuration are made with, outside this package and torch.
+    """Digest the code of a configuration's objects outside this package and torch.
 
     Args:
         targets: values of `_target_`, such as "my_lab.losses.Boundary".
@@ -67,7 +67,7 @@ def loaded_modules() -> list[str]:
 
 
 def _follow(module: str) -> Iterator[Used]:
-    """What `user_code` gives for one module."""
+    """The part of `user_code` for one module."""
     place = _place(module)
     if place is not None and INSTALLED & set(Path(place[0] or "").parts):
         packages = metadata.packages_distributions().get(module.split(".")[0], ())

@@ -1,9 +1,9 @@
-"""From a composed configuration to the specification of its run and of those upstream of it.
+"""Make the specification of a run and of its upstream runs from a composed configuration.
 
-A run names an upstream run by its experiment: ``model.weights=experiment:NAME/last.pt`` starts from
-the end of that run (the stage before, or another task),
-``domains.target.labels=experiment:NAME/best.pt`` learns from what its network predicts. Both share
-seed, scale and data set (`rgbt.spec.run_spec.SHARED`): a run of seed 2 depends on runs of seed 2.
+A run names an upstream run by its experiment: ``model.weights=experiment:NAME/last.pt`` starts
+from the last checkpoint of that run; ``domains.target.labels=experiment:NAME/best.pt`` trains on
+the predictions of its network. Both runs share seed, scale and data set
+(`rgbt.spec.run_spec.SHARED`): a run of seed 2 depends on runs of seed 2.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def specify(
 
     Raises:
         InputError: an unknown key, a missing value, a value of a wrong type, an upstream
-            experiment that does not exist, or a circle of them.
+            experiment that does not exist, or a cycle of them.
     """
     check_keys(config)
     values: dict[str, Any] = {
@@ -84,7 +84,7 @@ def _dependencies(
             experiment, checkpoint = reference
             if experiment in downstream:
                 circle = " -> ".join((*downstream, experiment))
-                raise InputError(f"{key} makes a circle of upstream runs: {circle}.")
+                raise InputError(f"{key} makes a cycle of upstream runs: {circle}.")
             upstream = upstream_config(config, key, experiment)
             typed = [f"+experiment={experiment}", *_shared_overrides(overrides, key)]
             run = specify(upstream, typed, downstream=downstream)
@@ -107,8 +107,8 @@ def parse_reference(key: str, value: str | None) -> tuple[str, CheckpointFile] |
     known = available("experiment")
     if name not in known:
         raise InputError(
-            f"{key}={value}: there is no experiment '{name}'; {nearest(name, known)}. A run can be "
-            f"named by its folder too: runs/<key>/{checkpoint}.{own_folder_hint()}"
+            f"{key}={value}: there is no experiment '{name}'; {nearest(name, known)}. You can "
+            f"also name a run by its folder: runs/<key>/{checkpoint}.{own_folder_hint()}"
         )
     return name, cast(CheckpointFile, checkpoint)
 
@@ -142,7 +142,7 @@ def _composed(experiment: str, scale: str, _own: str) -> DictConfig:
 
 
 def _shared_overrides(overrides: Sequence[str], key: str) -> list[str]:
-    """Those of the typed overrides that the upstream run of the setting `key` takes over."""
+    """The typed overrides that the upstream run of the setting `key` shares."""
     groups = ("scale", "dataset", "metric", *(("model",) if key == WEIGHTS else ()))
     own = (WEIGHTS, "model.fresh", "seed", "runs_dir")
 

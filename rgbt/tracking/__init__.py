@@ -1,5 +1,5 @@
-"""What a run leaves behind: its folder, MLflow filled from that folder, pictures, terminal tables.
+"""Write the run folder, send it to MLflow, draw pictures, and print tables.
 
-The folder is the source of truth. MLflow is filled from it, also later; nothing here computes a
+The folder is the source of truth. MLflow is filled from it, also later. Nothing here computes a
 score or decides how a run continues.
 """

@@ -1,7 +1,7 @@
-"""CSV that a spreadsheet can open: no cell of text is taken for a formula.
+"""Write CSV files in which a spreadsheet treats no text as a formula.
 
-A label such as ``=HYPERLINK(...)`` would be executed there. Such cells get an apostrophe in front,
-which spreadsheets understand as "this is text"; reading takes it off again.
+A label such as ``=HYPERLINK(...)`` would be executed there. Such cells get a leading apostrophe,
+which spreadsheets read as "this is text"; reading removes it.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def read_csv(text: str) -> tuple[list[str], list[dict[str, Any]]]:
     """Header and lines of what `csv_text` wrote, cells as they were given to it, as text.
 
     Raises:
-        InputError: it is no CSV.
+        InputError: it is not CSV.
     """
     reader = csv.DictReader(io.StringIO(text))
     try:

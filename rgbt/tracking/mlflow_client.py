@@ -1,4 +1,4 @@
-"""The way to an MLflow store: quiet, quick to give up, safe when many processes start at once."""
+"""Connect to an MLflow store with short timeouts, safely for processes that start together."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ENVIRONMENT = {
     "MLFLOW_DISABLE_TELEMETRY": "true",
     "DO_NOT_TRACK": "true",
     "MLFLOW_LOGGING_LEVEL": "WARNING",
-    # A server that is gone must cost a training seconds, not the minutes of the defaults (7, 120).
+    # A lost server must delay a training by seconds, not by the minutes of the defaults (7, 120).
     "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1",
     "MLFLOW_HTTP_REQUEST_TIMEOUT": "10",
     "GIT_PYTHON_REFRESH": "quiet",
@@ -38,7 +38,7 @@ LOCK_WAIT_S = 60.0
 """Seconds to wait for another process: several that create the tables take seconds each."""
 
 QUIET_WAIT_S = 15.0
-"""Of these, seconds without a word."""
+"""Seconds of these before the waiting is reported."""
 
 EXPERIMENT_NOTE = """\
 One run per configuration and seed. **mIoU**, **Var**, **region/...**, **class/...** are of the last

@@ -1,4 +1,4 @@
-"""Where a person opens a store's pages: the server that runs, or the command that starts one."""
+"""Find the web pages of a store: the address of a running server, or the command to start one."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ANSWER_S = 1.0
 
 @dataclass(frozen=True)
 class Pages:
-    """Where the pages of a store are.
+    """The address of a store's pages.
 
     Attributes:
         address: "http://host:port", without a slash at the end.
@@ -67,7 +67,7 @@ def ui_command(uri: str, port: int | None = None) -> str:
 
 
 def python_command() -> str:
-    """How this interpreter is called from here: `make` uses one that is not on the path."""
+    """Command for this interpreter, which may not be on the path (`make` uses one in .venv)."""
     if shutil.which("python") == sys.executable:
         return "python"
     here, program = Path.cwd(), Path(sys.executable)

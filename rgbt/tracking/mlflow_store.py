@@ -1,7 +1,7 @@
-"""Trackers a run may be given: MLflow, filled from the run folder, or none.
+"""The trackers of a run: MLflow, filled from the run folder, or none.
 
-The run folder is the truth. What MLflow could not take while a run trained is sent later by
-``rgbt sync``.
+The run folder is the source of truth. ``rgbt sync`` later sends data that could not be sent during
+training.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from rgbt.tracking.run_folder import RunFolder
 from rgbt.tracking.tracker import Link, Status, Tracking
 
 PAUSE_S = 300.0
-"""Seconds a running training leaves a store alone after it failed."""
+"""Seconds that a training waits before it uses a failed store again."""
 
 
 class NoTracking(Tracking):
-    """Keeps the run folder alone; `rgbt sync` can send it later."""
+    """Writes only the run folder; `rgbt sync` can send it later."""
 
 
 class MlflowTracking(Tracking):
@@ -58,7 +58,7 @@ class MlflowTracking(Tracking):
         self._warned = False
 
     def start(self, folder: RunFolder, description: Description) -> None:
-        """Begin the MLflow run of `folder`, or continue the one it already has."""
+        """Start the MLflow run of `folder`, or continue its existing run."""
         self._folder = folder
         folder.describe(description)
         write_upload_state(folder, self._sent(folder))
@@ -131,7 +131,7 @@ class MlflowTracking(Tracking):
         except InputError as error:
             # A damaged file of the run: the store works, and the run repairs its log on resuming.
             sys.stderr.write(f"rgbt: not sent to MLflow: {error}\n")
-        except Exception as error:  # The one border: a dead tracker never stops a training.
+        except Exception as error:  # Catches everything: a dead tracker must never stop a training.
             self._quiet_until = time.monotonic() + PAUSE_S
             if self._warned:
                 return
@@ -139,8 +139,8 @@ class MlflowTracking(Tracking):
             reason = (str(error).splitlines() or [""])[0][:120]
             sys.stderr.write(
                 f"rgbt: MLflow at {without_passwords(self.uri)} cannot be used "
-                f"({type(error).__name__}: {without_passwords(reason)}). The run continues; "
-                f"`{sync_command(self._folder)}` sends it later.\n"
+                f"({type(error).__name__}: {without_passwords(reason)}). The run continues. To "
+                f"send it later: `{sync_command(self._folder)}`\n"
             )
 
 

@@ -1,7 +1,7 @@
-"""Fills one MLflow run from one run folder; called again, it sends only what is new.
+"""Fill one MLflow run from one run folder; later calls send only new data.
 
-What was sent is remembered in the folder's ``mlflow.json``: per kind of line the last step, so that
-a run which resumes at an earlier step and writes the same lines again does not send them twice.
+The folder's ``mlflow.json`` notes the last step that was sent per kind of line. A run that resumes
+at an earlier step therefore does not send the same lines twice.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ TABLE_FILE = "tables/iou.json"
 
 @dataclass
 class UploadState:
-    """What was uploaded of a run; kept in its folder as ``mlflow.json``.
+    """The record of uploaded data of a run, stored in its folder as ``mlflow.json``.
 
     Attributes:
         uri: the store, passwords hidden.
@@ -80,19 +80,19 @@ class UploadState:
 
 
 def read_upload_state(folder: RunFolder) -> UploadState | None:
-    """What was sent from this folder, or None if nothing ever was.
+    """The record of this folder, or None if nothing was sent.
 
     Raises:
         InputError: the file is damaged.
     """
     path = folder.path / "mlflow.json"
-    advice = "remove it: the MLflow run is then found by its key"
+    advice = "remove the file; the MLflow run is then identified by its key"
     found: UploadState | None = read_json(path, UploadState, advice) if path.exists() else None
     return found
 
 
 def write_upload_state(folder: RunFolder, sent: UploadState) -> None:
-    """Remember what was sent."""
+    """Write the record."""
     text = json.dumps(sealed(asdict(sent)), indent=1)
     write_atomic(folder.path / "mlflow.json", text.encode())
 
@@ -274,7 +274,7 @@ def _profile(tables: ResultTables, lines: list[MetricLine]) -> list[Any]:
 
 
 def artifact_table(tables: ResultTables) -> dict[str, list[Any]]:
-    """The result as MLflow's table view wants it.
+    """The result in the form that MLflow's table view requires.
 
     That view groups by the first column, which must be unique, and compares the second between
     runs; it shows few rows on a screen, so summaries come first.

@@ -1,6 +1,6 @@
-"""Saved views of MLflow's runs page: headline scores first, the rest folded.
+"""Saved views of MLflow's runs page, with headline scores first and other sections folded.
 
-Left alone, that page sorts chart sections by name and puts mIoU and Var last, below some forty
+By default that page sorts chart sections by name and puts mIoU and Var last, below some forty
 charts. A saved view is a tag of the experiment in a form that belongs to MLflow's pages (seen in
 3.17); a version that cannot read it shows its own layout instead.
 """

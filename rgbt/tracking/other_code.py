@@ -1,8 +1,8 @@
-"""Whether a run was made by the code that is here now.
+"""Detect whether a run was made by other code than the present code.
 
 The key of a run does not hold the code of this package: every change of it would hide all
-results. Instead each process notes what it ran (`rgbt.tracking.provenance`), and commands that
-show a result compare.
+results. Instead each process records its code (`rgbt.tracking.provenance`), and commands that show
+a result compare.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ COMMIT_LENGTH = 7
 
 
 def other_code(folder: Path) -> str | None:
-    """What made a run, if it was other code than that of this process; None if it was the same.
+    """A description of a run's code, if it differs from that of this process; else None.
 
     Compared is the digest of the package's source, so that changed documents and tests are no
     other code. Of runs that did not note it: the commit and the uncommitted changes. None as well
@@ -40,22 +40,22 @@ def other_code(folder: Path) -> str | None:
 
 
 def warn_of_result(folder: Path) -> None:
-    """Say so where a finished run was made by other code."""
+    """Report that a finished run was made by other code."""
     made_by = other_code(folder)
     if made_by is not None:
         info(
-            f"This result was made by other code ({made_by}); fresh=true trains again and keeps "
-            "the old run."
+            f"this result was made by other code ({made_by}). fresh=true trains the run again and "
+            "keeps the old result."
         )
 
 
 def warn_of_steps(folder: Path, step: int) -> None:
-    """Say so where a run that resumes at a step was trained by other code before."""
+    """Report that a run that resumes was trained by other code before."""
     made_by = other_code(folder)
     if made_by is not None:
         warn(
-            f"the first {step} steps were trained by other code ({made_by}); to train all "
-            f"steps by the present code, remove {folder} and rerun the command."
+            f"the first {step} steps were trained by other code ({made_by}). To train all steps "
+            f"with the present code, remove {folder} and rerun the command."
         )
 
 

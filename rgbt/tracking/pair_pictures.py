@@ -1,4 +1,4 @@
-"""Picture of pairs of frames: what a network says of each, and where it contradicts itself."""
+"""Draw pairs of frames with the prediction of each and the pixels where they differ."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ DIFFERS = (200, 30, 30)
 
 @dataclass(frozen=True)
 class PairExample:
-    """Two frames of a scene and what was predicted of them.
+    """Two frames of a scene and their predictions.
 
     Attributes:
         first_rgb: (H, W, 3) uint8, the first frame.

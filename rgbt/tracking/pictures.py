@@ -1,4 +1,4 @@
-"""Pictures of a run: qualitative panel, region heat map, label overlay.
+"""Draw the pictures of a run: qualitative panel, region heat map, label overlay.
 
 Data first (arrays and small frozen dataclasses), drawing after. Matplotlib is imported when
 something is drawn and never opens a window.
@@ -175,7 +175,7 @@ def _broken(name: str, letters: int) -> str:
 
 @dataclass(frozen=True)
 class RegionHeat:
-    """What the region heat map shows.
+    """The data of the region heat map.
 
     Attributes:
         region_map: (H, W) integers in 0..R-1, region of every pixel.
@@ -188,7 +188,7 @@ class RegionHeat:
 
 
 def region_values(heat: RegionHeat) -> NDArray[np.float64]:
-    """(H, W) IoU in percent of the region every pixel lies in.
+    """(H, W) IoU in percent of the region of every pixel.
 
     Raises:
         ValueError: the map names a region without an IoU.

@@ -1,4 +1,4 @@
-"""Where a number comes from: command, code, versions, machine. Works outside a git checkout."""
+"""Record command, code, versions and machine of a result, also outside a git checkout."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ DIFF_LIMIT = 2_000_000
 
 
 def provenance() -> dict[str, Any]:
-    """What is needed to say how this process's results were made.
+    """The record of how this process makes its results.
 
     Returns:
         ``started`` (ISO 8601, UTC), ``command`` (as typed, passwords hidden), ``cwd``, ``pid``,
@@ -82,7 +82,7 @@ KEYS = (
     r"(?<![\w.-])(?:[\w.-]*(?:password|passwd)|token|"
     r"(?:\w*_)?(?:(?:api|access)_?key|secret|(?:access|auth|session|tracking)_?token))"
 )
-"""Names of what gives access. A setting such as mask_token or num_tokens is none of them."""
+"""Names of credentials. A setting such as mask_token or num_tokens is none of them."""
 
 SECRETS = (
     # scheme://user:password@host. The password reaches to the last @, and may hold "/", as for
@@ -113,7 +113,7 @@ SECRETS = (
 
 
 def without_passwords(text: str) -> str:
-    """`text` with what gives access replaced by ``***``: it may be stored and shown.
+    """`text` with credentials replaced by ``***``, so that it may be stored and shown.
 
     Hidden are ``user:password@`` and ``token@`` of addresses, and the values of keys such as
     ``password=`` and ``token=``. Applied twice it gives the same.

@@ -1,7 +1,7 @@
-"""Finished runs that were replaced by another training of the same key (``fresh=true``).
+"""Keep finished runs that another training of the same key replaces (``fresh=true``).
 
-They are in ``<runs_dir>/replaced/<key>-<n>``: complete, opened by their folder (run=FOLDER), and
-no second seed for what looks at the runs of a folder.
+They move to ``<runs_dir>/replaced/<key>-<n>`` and can be opened by their folder (run=FOLDER).
+Commands that collect the runs of a folder do not count them as another seed.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def set_aside(folder: RunFolder) -> RunFolder | None:
         its new folder; None where the run is not finished, or not any more.
 
     Raises:
-        InputError: a process trains there.
+        InputError: a process is training there.
     """
     with folder.lock():
         if read_result(folder.path) is None:
@@ -47,7 +47,7 @@ def replace_finished(folder: RunFolder, tracking: Tracking) -> None:
         return
     tracking.start(kept, known)
     tracking.finish("FINISHED")
-    info(f"the finished run was moved to {kept.path}; run={kept.path} opens it.")
+    info(f"the finished run was moved to {kept.path}; open it with run={kept.path}.")
 
 
 def runs_dir_of(folder: RunFolder) -> Path:

@@ -1,7 +1,7 @@
-"""The JSON files of a run folder: which keys of which types each of them holds, and their readers.
+"""The types of the JSON files of a run folder, and their readers.
 
-A mapping is written with a check sum (`rgbt.files.budgets.sealed`), so that a damaged file is
-refused and gives no other value. Files of before there was one are read by their types alone.
+A mapping is written with a checksum (`rgbt.files.budgets.sealed`), so that a damaged file is
+refused. Older files without a checksum are checked by their types only.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""The run folder, complete in itself: everything that a table, a figure or MLflow needs later.
+"""Write the run folder, which holds everything that tables, figures and MLflow need later.
 
 ==================  ==============================================================================
 config.yaml         the resolved configuration
 provenance.json     a list: one entry per process that worked on the run (`provenance.py`)
 diff.patch          uncommitted changes of the code at the first of these, if there were any
-run.json            name, tags and parameters, as a tracker shall show them
+run.json            name, tags and parameters for trackers
 metrics.jsonl       one JSON object per line, see `MetricLine`; metrics.jsonl.damaged: as it was
                     before a run that resumed left damaged lines out
 counts_<split>.npz  integer counts that every score is derived from; counts_<split>_<view>.npz: of a
@@ -12,11 +12,11 @@ counts_<split>.npz  integer counts that every score is derived from; counts_<spl
 tables.json         the last region and class tables (`tables.py`)
 figures/*.png       pictures
 evaluations/*.npz   counts of later evaluations (`rgbt.evaluate`) and of pairs of frames
-evaluations/robustness/<split>/  counts of failing images, and what made them (`rgbt.robustness`)
+evaluations/robustness/<split>/  counts of corrupted images, and their inputs (`rgbt.robustness`)
 last.pt best.pt     checkpoints: to resume from, and the best by the selection split;
                     last_previous.pt, checkpoints/: while training (`rgbt.engine.committed`)
-dataset.json        which images the run was begun on (`rgbt.training.train`)
-lock mlflow.json    who trains here now; what MLflow has been sent
+dataset.json        the images that the run was started on (`rgbt.training.train`)
+lock mlflow.json    the process that trains here now; record of the data sent to MLflow
 result.json         written last, by rename: the run is finished exactly if it exists
 ==================  ==============================================================================
 """
@@ -63,7 +63,7 @@ class MetricLine:
 
 @dataclass(frozen=True)
 class Truncation:
-    """What `RunFolder.truncate_after` found.
+    """The result of `RunFolder.truncate_after`.
 
     Attributes:
         reached: last step of any line before, 0 without lines.
@@ -89,8 +89,7 @@ class RunFolder:
 
     @contextmanager
     def lock(self) -> Iterator[None]:
-        """Keep other processes from training in this folder; remove what a killed one left half
-        written.
+        """Lock this folder for training, and remove incomplete files of a killed process.
 
         Raises:
             InputError: another process does; the message names it and its machine.
@@ -98,13 +97,13 @@ class RunFolder:
         with self._locked() as holder:
             if holder is not None:
                 raise InputError(
-                    f"{self.path} is being trained by {holder}; wait for it, or stop it and rerun "
+                    f"{self.path} is being trained by {holder}. Wait for it, or stop it and rerun "
                     "the command to resume."
                 )
             yield
 
     def clean(self) -> None:
-        """Remove what a killed process left half written, unless another one trains here."""
+        """Remove incomplete files of a killed process, unless another process trains here."""
         with self._locked():
             pass
 
@@ -144,7 +143,7 @@ class RunFolder:
         return read_provenance(self.path / "provenance.json")
 
     def describe(self, description: Description) -> None:
-        """Write how a tracker shall show this run."""
+        """Write name, tags and parameters of this run for trackers."""
         self._write_json("run.json", sealed(vars(description)))
 
     def append(self, step: int, kind: Kind, values: Mapping[str, float]) -> None:
@@ -168,13 +167,13 @@ class RunFolder:
         found, damaged = self._read_lines()
         if damaged:
             raise InputError(
-                f"{self.path / 'metrics.jsonl'} is damaged ({damaged[0]}); delete the line to do "
-                "without it. A run that is not finished does so when it resumes."
+                f"{self.path / 'metrics.jsonl'} is damaged ({damaged[0]}). Delete the line; an "
+                "unfinished run deletes it when it resumes."
             )
         return found
 
     def truncate_after(self, step: int, evaluated_step: int | None = None) -> Truncation:
-        """Drop what a run that resumes at `step` will write again, and what cannot be read.
+        """Remove lines that a run resuming at `step` will write again, and unreadable lines.
 
         These are the lines beyond `step`, every "test" line (the last evaluation is repeated), a
         line cut short by a crash, and damaged or repeated lines. Where there are any of the last,
@@ -258,7 +257,9 @@ def runs_in(runs_dir: Path | str) -> list[RunFolder]:
     """
     root = Path(runs_dir)
     if not root.is_dir():
-        raise InputError(f"{root}: there is no such folder; runs_dir=... names the folder of runs.")
+        raise InputError(
+            f"the folder {root} does not exist; name the folder of runs with runs_dir=..."
+        )
     return [RunFolder(path.parent) for path in sorted(root.glob("*/run.json"))]
 
 
@@ -272,10 +273,11 @@ def find_run(run: str, runs_dir: Path) -> Path:
         if (folder / "config.yaml").is_file():
             return folder.resolve()
     for sent in sorted((*runs_dir.glob("*/mlflow.json"), *runs_dir.glob("replaced/*/mlflow.json"))):
-        with suppress(InputError):  # a damaged one names no run
+        with suppress(InputError):  # a damaged file does not identify a run
             if str(read_json(sent, dict[str, Any], "").get("run_id")) == run:
                 return sent.parent.resolve()
     raise InputError(
-        f"run={run}: neither a run folder (with a config.yaml), nor a key or an MLflow run id in "
-        f"{runs_dir.resolve()}; list that folder to see the runs, or name another with runs_dir=..."
+        f"run={run} is neither a run folder (with a config.yaml), nor a key or an MLflow run id "
+        f"in {runs_dir.resolve()}. List that folder to see the runs, or name another folder with "
+        "runs_dir=..."
     )

@@ -1,4 +1,4 @@
-"""A finished run, read from its folder: the one type for it in rgbt, sweeps and analysis.
+"""Read a finished run from its folder; rgbt, sweeps and analysis all use this type.
 
 `rgbt.tracking.run_folder.RunFolder` writes the folder of a run in progress.
 """
@@ -24,7 +24,7 @@ from rgbt.tracking.run_files import (
 )
 
 CHECKPOINT = "best.pt"
-"""The network that evaluations are made with; other machines do not get it."""
+"""The checkpoint of evaluations, which is not copied to other machines."""
 
 ALL_COUNTS = "counts_*.npz"
 """Pattern of the files of counts that a run ended with."""
@@ -32,7 +32,7 @@ ALL_COUNTS = "counts_*.npz"
 
 @dataclass(frozen=True)
 class RunResult:
-    """What a finished run has left. Every property reads the file anew.
+    """The results of a finished run. Every property reads its file again.
 
     Attributes:
         folder: the run folder, or a folder with copies of its files.
@@ -107,14 +107,14 @@ class RunResult:
         }
 
     def counts_path(self, split: str = "test") -> Path:
-        """Path of the counts that the run itself ended with."""
+        """Path of the counts of the run's final evaluation."""
         return self.folder / counts_name(split)
 
     def counts(self, path: str = "counts_test.npz") -> Counts:
         """Counts of an evaluation.
 
         Args:
-            path: of the file, relative to the run folder; default: what the run itself ended with.
+            path: of the file, relative to the run folder; default: the run's final evaluation.
 
         Raises:
             InputError: the file is missing or damaged.
@@ -147,6 +147,6 @@ class RunResult:
             return False
         try:
             counts = Counts.load(file)
-        except InputError:  # not readable: it is made again
+        except InputError:  # not readable: the evaluation is repeated
             return False
         return counts.dataset == self.dataset and counts.split == "test"

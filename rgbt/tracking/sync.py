@@ -1,7 +1,7 @@
-"""Sends run folders to MLflow: ``rgbt sync runs_dir=runs`` or ``run=runs/KEY``.
+"""Send run folders to MLflow: ``rgbt sync runs_dir=runs`` or ``run=runs/KEY``.
 
-Safe to repeat: only what a store does not have is sent. ``uri=``, ``artifact_uri=`` and
-``experiment=`` choose another store than the one the run was started with.
+The command can be repeated, because it only sends data that the store does not have. ``uri=``,
+``artifact_uri=`` and ``experiment=`` choose another store than that of the run.
 """
 
 from __future__ import annotations
@@ -29,21 +29,21 @@ EXPERIMENT = "rgbt"
 
 @dataclass(frozen=True)
 class Options:
-    """What is sent, and where."""
+    """Options of the command."""
 
-    run: Annotated[Path | None, Help("one run folder")] = None
-    runs_dir: Annotated[Path | None, Help("instead: a folder of runs, all of which are sent")] = (
+    run: Annotated[Path | None, Help("a single run folder")] = None
+    runs_dir: Annotated[
+        Path | None, Help("a folder of runs, all of which are sent; use it instead of run")
+    ] = None
+    uri: Annotated[str | None, Help("address of the store; default: that of the run")] = None
+    artifact_uri: Annotated[str | None, Help("address for the files; default: that of the run")] = (
         None
     )
-    uri: Annotated[
-        str | None, Help("of the store; default: the one that the run was started with")
-    ] = None
-    artifact_uri: Annotated[str | None, Help("where the files go; default: likewise")] = None
-    experiment: Annotated[str | None, Help("of MLflow; default: likewise")] = None
+    experiment: Annotated[str | None, Help("experiment of MLflow; default: that of the run")] = None
 
     def __post_init__(self) -> None:
         if (self.run is None) == (self.runs_dir is None):
-            raise InputError("give either run=<run folder> or runs_dir=<folder of runs>.")
+            raise InputError("expected either run=<run folder> or runs_dir=<folder of runs>.")
 
 
 def folders_of(options: Options) -> list[RunFolder]:
@@ -78,7 +78,8 @@ def tracking_of(folder: RunFolder, options: Options) -> MlflowTracking:
     for key, address in (("uri", uri), ("artifact_uri", artifact_uri)):
         if address is not None and HIDDEN in address:
             raise InputError(
-                f"{folder.path}: the password of {address} is not kept; give {key}=... with it."
+                f"{folder.path}: the password of {address} is not stored; give {key}=... with the "
+                "password."
             )
     return MlflowTracking(
         uri,
@@ -96,12 +97,12 @@ def status_of(folder: RunFolder) -> Status:
 
 
 def main(options: Options, overrides: list[str]) -> int:
-    """Send run folders to MLflow. Safe to repeat: only what a store does not have is sent."""
+    """Send run folders to MLflow. A repeated call sends only data that the store does not have."""
     del overrides  # none is heeded
     stores: dict[tuple[str, str], MlflowTracking] = {}
     failed = 0
     busy: dict[str, StoreBusyError] = {}
-    # What is wrong with one of many folders must not keep the others from being sent.
+    # An error in one of many folders must not prevent sending the others.
     raised: tuple[type[InputError], ...] = (InputError,) if options.run else ()
     for folder in folders_of(options):
         try:

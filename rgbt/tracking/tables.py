@@ -1,4 +1,4 @@
-"""The tables of a result as data, and as grids of text that terminal and MLflow both show.
+"""The tables of a result as data, and as grids of text for the terminal and MLflow.
 
 Nothing is computed here but percentages; the scores come from `rgbt.metrics.scores`.
 """
@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 ABSENT = "-"
-"""Shown for a score that does not exist, e.g. the IoU of a class that occurs nowhere."""
+"""Shown for an undefined score, e.g. the IoU of a class that occurs nowhere."""
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class RegionTable:
     """One row of a per-region table, as the papers print it.
 
     Attributes:
-        row_label: what the row stands for, e.g. "grbm (ours, seed 0)" or "GRBM (paper)".
+        row_label: method of the row, e.g. "grbm (ours, seed 0)" or "GRBM (paper)".
         region_ious: R mean IoUs, fractions; region 1 first.
         miou: mean IoU of the whole image (pooled over regions), fraction.
         variance: population variance over regions of the IoU in percent (squared percent points).
@@ -56,7 +56,7 @@ class ClassTable:
 
 @dataclass(frozen=True)
 class ConsistencyTable:
-    """How predictions of two frames of a scene agree, by class; fractions, NaN without pixels.
+    """Agreement of the predictions of two frames, by class; fractions, NaN without pixels.
 
     Attributes:
         names: K class names.
@@ -77,7 +77,7 @@ class ConsistencyTable:
 
 @dataclass(frozen=True)
 class ResultTables:
-    """Everything that is shown of one evaluation.
+    """All tables of one evaluation.
 
     Attributes:
         split: "val" or "test".
@@ -187,7 +187,7 @@ def consistency_grid(table: ConsistencyTable, title: str) -> TextTable:
 
 
 def result_grids(tables: ResultTables) -> tuple[TextTable, ...]:
-    """The tables that stand at the end of a run."""
+    """The tables that a run prints at its end."""
     where = f"{tables.split}, step {tables.step}"
     grids = (
         region_grid([tables.regions], f"IoU by region ({where})"),
@@ -200,7 +200,7 @@ def result_grids(tables: ResultTables) -> tuple[TextTable, ...]:
 
 
 def class_labels(classes: Sequence[str], unscored: Collection[str]) -> tuple[str, ...]:
-    """What classes are called in tables: "car", or "background (not in means)"."""
+    """Names of classes in tables: "car", or "background (not in means)"."""
     return tuple(f"{name} (not in means)" if name in unscored else name for name in classes)
 
 

@@ -1,4 +1,4 @@
-"""What commands print: messages on stderr, tables and paths on stdout.
+"""Print messages on stderr, and tables and paths on stdout.
 
 Tables are cut to the width of a terminal: labels are shortened, then columns folded; numbers and
 paths are never cut.

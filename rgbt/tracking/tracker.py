@@ -1,4 +1,4 @@
-"""What a run reports to its tracker (`rgbt.tracking.mlflow_store` has the ones to choose from)."""
+"""The interface of trackers (`rgbt.tracking.mlflow_store` has the implementations)."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ Link = tuple[str, str]
 
 
 class Tracking:
-    """Shows runs to people; this one keeps the run folder alone.
+    """Base class of trackers; this one does nothing beyond the run folder.
 
     No call raises because a store cannot be reached.
     """
 
     def start(self, folder: RunFolder, description: Description) -> None:
-        """Begin, or continue, the run of `folder`."""
+        """Start or continue the run of `folder`."""
         folder.describe(description)
 
     def update(self) -> None:
-        """Show what is new in the folder; called after every evaluation."""
+        """Send new data of the folder; called after every evaluation."""
 
     def finish(self, status: Status) -> None:
-        """End the run: it is finished, failed or was stopped (killed)."""
+        """Close the run as finished, failed or stopped (killed)."""
 
     def links(self) -> list[Link]:
-        """Where a person looks at the run."""
+        """Addresses of the run's pages."""
         return []

@@ -1,1 +1,1 @@
-"""The life of one run, and the pipeline of several."""
+"""Train one run, or a pipeline of a run and its upstream runs."""

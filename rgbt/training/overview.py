@@ -1,4 +1,4 @@
-"""What a command is about to work with, said on stderr before its first progress bar."""
+"""Describe data, device and network on stderr before the first progress bar of a command."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MILLION = 1e6
 
 
 def announce_training(setup: TrainingSetup, name: str, folder: Path) -> None:
-    """Say what is trained on what: device, network, images, steps and the run folder."""
+    """Print device, network, images, steps and run folder of a training."""
     session, trainer = setup.session, setup.session.trainer
     others = "".join(f", {key} {_millions(net)}" for key, net in setup.others.items())
     batch = session.loading.batch_size * trainer.accumulate
@@ -38,7 +38,7 @@ def announce_training(setup: TrainingSetup, name: str, folder: Path) -> None:
 
 
 def announce_network(network: TrainedNetwork) -> None:
-    """Say what predicts, in one line: device, network and checkpoint."""
+    """Print device, network and checkpoint of a prediction in one line."""
     session = network.session
     checkpoint = f"checkpoint of step {network.step}" if network.step else network.label
     _write(f"{device_line(session)}; {network_line(session)}; {checkpoint}")

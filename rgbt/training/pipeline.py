@@ -1,7 +1,7 @@
-"""A run and the runs upstream of it, in topological order.
+"""Train a run after its upstream runs, in topological order.
 
-Finished runs are used as they are, a run that another process trains is waited for, and an
-interrupted one is resumed.
+A finished upstream run is used as it is. An interrupted one is resumed, and the command waits for
+one that another process trains.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from rgbt.tracking.terminal import info, warn
 from rgbt.training.train import train
 
 POLL_S = 1.0
-"""Between two looks at a run that another process trains."""
+"""Interval between two checks of a run that another process trains."""
 
 
 def run_pipeline(run: RunSpec, extra_tags: Mapping[str, str]) -> None:
@@ -46,8 +46,8 @@ def run_pipeline(run: RunSpec, extra_tags: Mapping[str, str]) -> None:
         made_by = other_code(spec.folder) if spec.is_finished else None
         if made_by is not None:
             warn(
-                f"the upstream run {spec.folder} ({dependency.key}) was made by other "
-                f"code ({made_by}) and is used as it is; to train it again, run "
+                f"the upstream run {spec.folder} ({dependency.key}) was trained by other code "
+                f"({made_by}) and is used as it is. To train it again, run "
                 f"+experiment={spec.name} with fresh=true."
             )
     if run.is_finished and not run.fresh:
@@ -87,11 +87,13 @@ def _naming(spec: RunSpec, run: RunSpec) -> Iterator[None]:
     except InputError as error:
         if spec is run:
             raise
-        raise InputError(f"{spec.name}, which is upstream of {run.name}: {error}") from error
+        raise InputError(f"upstream run {spec.name} of {run.name}: {error}") from error
 
 
 def _train_upstream(spec: RunSpec, run: RunSpec) -> None:
-    info(f"{run.name} depends on {spec.name}, which is trained first: {spec.folder}")
+    info(
+        f"{run.name} depends on the upstream run {spec.name}, which is trained first: {spec.folder}"
+    )
     is_waiting = False
     while not spec.is_finished:
         if is_held(spec.folder / "lock"):

@@ -1,4 +1,4 @@
-"""One run from its configuration to its result, and everything it leaves in its folder."""
+"""Train one run, evaluate it, and write everything into its run folder."""
 
 from __future__ import annotations
 
@@ -51,11 +51,11 @@ from rgbt.training.overview import announce_training
 from rgbt.transforms.view_sets import ViewSets
 
 MUCH_WAITING = 0.3
-"""Share of a step spent waiting for images above which a sentence says so."""
+"""Share of a step spent waiting for images above which a warning is printed."""
 
 
 def train(spec: RunSpec, extra_tags: Mapping[str, str] | None = None) -> None:
-    """Train a run to its end, resuming where another process stopped, and show its result.
+    """Train a run to its end, or resume it, and print its result.
 
     Args:
         spec: the run; its upstream runs are finished.
@@ -66,7 +66,10 @@ def train(spec: RunSpec, extra_tags: Mapping[str, str] | None = None) -> None:
         RunError: the training failed.
     """
     if spec.out is not None:
-        raise InputError(f"out={spec.out}: a run is written to runs_dir=...; omit out=...")
+        raise InputError(
+            f"out={spec.out} has no effect here, because runs are written to runs_dir=...; omit "
+            "out=..."
+        )
     description = describe(spec, extra_tags)
     tracking: Tracking = spec.tracking.build()
     if spec.is_finished and not spec.fresh:
@@ -79,8 +82,8 @@ def train(spec: RunSpec, extra_tags: Mapping[str, str] | None = None) -> None:
         measured = [spec.folder / file_name("aligned", each, views.mark) for each in views.splits]
         if views.sets and not all(path.is_file() for path in measured):
             info(
-                "its consistency on these views and splits has not been measured; to add it: "
-                f"rgbt consistency run={folder.path} split=..."
+                "the consistency of this run has not been measured on these views and splits. To "
+                f"measure it: rgbt consistency run={folder.path} split=..."
             )
     else:
         # Everything is built before the folder is made: a wrong value leaves nothing behind.
@@ -102,7 +105,10 @@ def train(spec: RunSpec, extra_tags: Mapping[str, str] | None = None) -> None:
 def _show_again(folder: RunFolder, tracking: Tracking, requested: Description) -> None:
     known = read_description(folder.path)
     assert known is not None, "a finished run has its description"
-    info(f"{requested.name} is finished; showing its result. Another seed is another run: seed=1.")
+    info(
+        f"{requested.name} is already finished; its result follows. Use another seed for a new "
+        "run: seed=1."
+    )
     # A point of a grid may be the default of an experiment: the longer name says what it varies.
     lengths = [len(group_of(each.tags, each.params)) for each in (requested, known)]
     shown = requested if lengths[0] > lengths[1] else known
@@ -122,8 +128,8 @@ def _warn_of_other_files(folder: RunFolder, spec: RunSpec) -> None:
         return  # a result can be shown without its data
     if result is not None and result["dataset"] != now:
         info(
-            f"it was made on other files of the data set ({result['dataset'][:8]}, now "
-            f"{now[:8]}); to train on these: runs_dir=..., or dataset.name=..."
+            f"this run was trained on other files of the data set ({result['dataset'][:8]}, now "
+            f"{now[:8]}). To train on the present files, set runs_dir=... or dataset.name=..."
         )
 
 
@@ -195,9 +201,9 @@ class Run:
         before = read_marker(self.folder.path) or now
         if before["names"] != now["names"]:
             raise InputError(
-                f"{self.folder.path} was started on other images than the lists of "
-                f"{dataset.root} name; give the runs another folder (runs_dir=...), or the data "
-                "set another name (dataset.name=...)."
+                f"{self.folder.path} was started on other images than those listed in "
+                f"{dataset.root}. Choose another folder of runs (runs_dir=...) or another name of "
+                "the data set (dataset.name=...)."
             )
         if before["files"] != now["files"]:
             info(f"files of {dataset.root} have changed since this run was started.")
@@ -227,21 +233,20 @@ class Run:
         step = state.step
         before = self.folder.truncate_after(step, state.evaluated_step)
         if before.reached > step:
-            info(f"steps {step + 1} to {before.reached} were not saved before and are repeated.")
+            info(f"steps {step + 1} to {before.reached} were not saved and are repeated.")
         logged = [0, *(line.step for line in self.folder.lines() if line.kind == "train")]
         every = max([self.setup.session.trainer.log_every, *(np.diff(logged[-2:]).tolist())])
         if step - logged[-1] >= every:
             warn(
-                f"{self.folder.path / 'metrics.jsonl'} ends at step {logged[-1]}, the "
-                f"checkpoint is of step {step}; the lines between are missing, counts and "
+                f"{self.folder.path / 'metrics.jsonl'} ends at step {logged[-1]}, but the "
+                f"checkpoint is of step {step}. The lines in between are missing; counts and "
                 "checkpoint are not affected."
             )
         if before.damaged:
             more = f" and {len(before.damaged) - 1} more" if len(before.damaged) > 1 else ""
             warn(
-                f"{self.folder.path / 'metrics.jsonl'} was damaged "
-                f"({before.damaged[0]}{more}); "
-                "these lines are left out, metrics.jsonl.damaged holds the file as it was."
+                f"{self.folder.path / 'metrics.jsonl'} was damaged ({before.damaged[0]}{more}); "
+                "these lines are omitted, and metrics.jsonl.damaged holds the original file."
             )
 
     def _report_waiting(self, session: Session) -> None:
@@ -256,8 +261,8 @@ class Run:
                 "" if session.loading.cache else "data.cache=auto decodes every image once, and "
             )
             info(
-                f"{np.median(shares):.0%} of the time of a step was waiting for images; {cache}"
-                "data.num_workers=... gives more processes to reading them."
+                f"{np.median(shares):.0%} of the time of a step was spent waiting for images; "
+                f"{cache}data.num_workers=... reads them with more processes."
             )
 
     def _trainer(self, session: Session, state: State) -> Trainer:
@@ -301,7 +306,10 @@ class Run:
                 pairs = count_pairs(session, session.model, request, "virtual")
             except InputError as error:
                 # The training is done: an error of an extra evaluation must not lose it.
-                info(f"{error} Consistency is left out; rgbt consistency measures it later.")
+                info(
+                    f"{error} Consistency was not measured; measure it later with `rgbt "
+                    "consistency`."
+                )
                 continue
             for protocol, counts in pairs.counts.items():
                 path = self.folder.path / file_name(protocol, split, session.consistency.mark)
@@ -331,7 +339,7 @@ class Run:
         tables = replace(tables, classes=classes, consistency=pairs)
         self.folder.write_tables(tables)
         if not result.kept:
-            info("none of the images of the panel could be read; no pictures were drawn.")
+            info("no image of the panel could be read, so no pictures were drawn.")
             return
         draw_panel(result.kept, legend_of(session.dataset), self.folder.figure_path("panel"))
         heat = RegionHeat(

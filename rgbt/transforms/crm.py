@@ -1,6 +1,6 @@
 """The augmentation chain of CRM and SpatialSeg: resize, crop, colour, flip.
 
-What a configuration names. Results are not padded: networks pad images to a multiple of 32 with
+Results are not padded: networks pad images to a multiple of 32 with
 their mean colour, and losses pad labels with "ignore" (`rgbt.geometry.padding`).
 """
 
@@ -94,7 +94,7 @@ class CrmTransform:
         return Record(crop_hw=self.crop_hw, works_on_batches=self.dtype == np.uint8)
 
     def drawn(self, sample: Sample, rng: np.random.Generator) -> Drawn:
-        """What `train` would read and do, not done yet; the same draws."""
+        """The data and draws of `train`, not yet applied."""
         return Drawn.of(sample, *self._draw(sample, rng))
 
     def stack(self, drawn: Sequence[Drawn]) -> DrawnBatch:

@@ -1,4 +1,4 @@
-"""How an example is made of a sample and a view.
+"""Make an example of a sample and a view.
 
 Every transform has `train(sample, rng)`, for which all draws come from `rng`, and `test(sample)`;
 of a sample without a label, all pixels are ignored.

@@ -1,4 +1,4 @@
-"""Resize, crop and flip as one value, a `View`, that is drawn once and applied to every array.
+"""Resize, crop and flip as one `View` that is drawn once and applied to every array.
 
 Only the pixels that the view shows are computed. Photometric changes are in
 `rgbt.transforms.photometric`.

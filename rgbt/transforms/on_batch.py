@@ -49,7 +49,7 @@ class Axis(NamedTuple):
 
 @dataclass(frozen=True)
 class Drawn:
-    """What one example reads of its images, and what is to be done to it.
+    """The pixels that one example reads, and the changes to apply.
 
     Nothing is copied: the arrays are parts of those of the sample.
 
@@ -144,7 +144,7 @@ class DrawnBatch:
 
     @classmethod
     def of(cls, drawn: Sequence[Drawn], *, track_position: bool) -> DrawnBatch:
-        """Stack examples; InputError where their sizes differ, or some alone carry confidences."""
+        """Stack examples; InputError where their sizes differ, or only some carry confidences."""
         _check_alike(drawn)
         hw = tuple(max(each.label.shape[axis] for each in drawn) for axis in (0, 1))
         confidences = [each.confidence for each in drawn if each.confidence is not None]
@@ -288,12 +288,11 @@ def _check_alike(drawn: Sequence[Drawn]) -> None:
             raise InputError(
                 f"all images of one batch must have one size, got {one[0]}x{one[1]} "
                 f"('{first.name}') and {other[0]}x{other[1]} ('{each.name}'); choose "
-                "transform.crop_hw so that it fits into every resized image, or the sizes for this "
-                "data set (recipe=kp, ...)."
+                "transform.crop_hw so that it fits into every resized image, or choose the sizes "
+                "for this data set (recipe=kp, ...)."
             )
         if (first.confidence is None) != (each.confidence is None):
             raise InputError(
-                f"either all labels of one batch must carry confidences or none, but those of "
-                f"'{first.name}' and of '{each.name}' differ in that; write the pseudo-labels of "
-                "the whole split again."
+                f"all labels of one batch must carry confidences, or none, but '{first.name}' and "
+                f"'{each.name}' differ. Write the pseudo-labels of the whole split again."
             )

@@ -1,4 +1,4 @@
-"""Sets of angles for evaluation: a virtual view of every image of a split, always the same."""
+"""Fixed sets of angles for evaluation: one virtual view for every image of a split."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Split = Literal["val", "test"]
 
 
 class ViewSets:
-    """Which virtual views consistency is measured on (TC and CA), and of which splits.
+    """The virtual views and splits on which consistency (TC and CA) is measured.
 
     Source: Temporal, Table I: the mean over the same three sets of angles; the sets are those of
     its release. The k-th triple belongs to the k-th image of the split's list; a split with more
@@ -50,8 +50,8 @@ class ViewSets:
         self.splits = splits
         if sets and not splits:
             raise InputError(
-                "consistency.splits is empty, so that nothing of consistency.sets would be "
-                "measured; name val or test, or choose consistency=none."
+                "consistency.splits is empty, so consistency.sets would not be measured. Name val "
+                "or test, or choose consistency=none."
             )
         self._triples = [read_angles(name) for name in sets]
         for name, triples in zip(sets, self._triples, strict=True):
@@ -92,14 +92,14 @@ def read_angles(name: str) -> Tensor:
     path = published.get(name, Path(name).expanduser())
     if not path.is_file():
         raise InputError(
-            f"consistency.sets: '{name}' is no published set of angles and no file; "
+            f"consistency.sets: '{name}' is neither a published set of angles nor a file; "
             f"{nearest(name, published)}, or give a CSV file with the columns {HEADER}."
         )
     try:
         text = read_bytes(path, TEXT).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(
-            f"consistency.sets: {path} is no text in UTF-8; save it as a CSV file with the columns "
+            f"consistency.sets: {path} is not UTF-8 text; save it as a CSV file with the columns "
             f"{HEADER}."
         ) from error
     header, *lines = [line.replace(" ", "") for line in text.splitlines() if line.strip()] or [""]

@@ -37,7 +37,7 @@ BYTE = 255
 
 @dataclass(kw_only=True, eq=False)
 class VirtualView:
-    """Draws turns of the camera and brings images, labels and predictions into the new view.
+    """Draws turns of the camera, and warps images, labels and predictions to the new view.
 
     Paper: Temporal, Sec. III-B and Eq. 1: ``M = K Rz(roll) Ry(yaw) Rx(pitch) K^-1``, angles from
         closed intervals, cut to the largest inner rectangle, one interpolation.
@@ -193,6 +193,6 @@ class VirtualView:
             yaw, pitch, roll = turns[share.argmin()].tolist()
             raise InputError(
                 f"view: yaw {yaw:g}, pitch {pitch:g}, roll {roll:g} degrees leave a rectangle of "
-                f"{100 * float(share.min()):.2g} % of the frame, at least {100 * LEAST:g} % is "
-                "needed; choose smaller ranges of angles."
+                f"{100 * float(share.min()):.2g} % of the frame, but at least {100 * LEAST:g} % "
+                "is required. Choose smaller ranges of angles."
             )

@@ -82,8 +82,8 @@ def test_unreadable_files_can_be_excluded(call: Call, data: Path, tmp_path: Path
     ("arguments", "sentence"),
     [
         ("partition=rings", "did you mean 'ring'?"),
-        ("level=95", "level must lie in [0.5, 0.999], got 95."),
-        ("blocks=0", "blocks must lie in [1, 1e+06], got 0."),
+        ("level=95", "level must be between 0.5 and 0.999, got 95."),
+        ("blocks=0", "blocks must be between 1 and 1e+06, got 0."),
         ("metric=ring9", "'metric' has no effect here;"),
         ("partition=vertical aspect=released_3_4", "aspect=released_3_4 applies to rings"),
         ("split=trian", "dataset.splits has no split 'trian'; did you mean 'train'?"),

@@ -93,7 +93,10 @@ def test_difference_in_unscored_classes_only_is_none() -> None:
     assert scored.p_images < 0.05
 
 
-REFUSED = r"leave void out of means.*leave out no class; count both with the same dataset\.unscored"
+REFUSED = (
+    r"without void in their means .* without no class. Evaluate both with the same "
+    r"dataset\.unscored"
+)
 
 
 def test_means_over_different_classes_are_refused(tmp_path: Path) -> None:

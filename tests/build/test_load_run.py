@@ -41,5 +41,5 @@ def test_other_splits_are_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert warnings == [], "unknown, the same, a data set without name, no training images"
     load_run._warn_of_other_splits(tmp_path, other)
     (line,) = warnings
-    assert "training images may be evaluated" in line
+    assert "training images may be among the evaluated" in line
     assert "rig (/data/rig)" in line

@@ -18,7 +18,7 @@ from rgbt.checks import InputError
 from rgbt.config.compose import compose
 from rgbt.data.pseudo_labels import FORMAT
 from rgbt.evaluation.prediction import decode_ahead
-from rgbt.evaluation.pseudo_labels import BEGUN, Labelling, write_pseudo_labels
+from rgbt.evaluation.pseudo_labels import UNFINISHED, Labelling, write_pseudo_labels
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.requirements import Record
 from rgbt.spec.run_spec import RunSpec
@@ -76,7 +76,7 @@ def test_given_labels_that_the_data_set_does_not_have(composed: Composed, name: 
     spec = composed("sh_both", f"domains.{name}.split=train_night")
     with pytest.raises(InputError) as raised:
         set_up_training(spec)
-    assert f"domains.{name}.labels=given, but synth_freiburg has no labels of train_night" in str(
+    assert f"domains.{name}.labels=given, but synth_freiburg has no labels for train_night" in str(
         raised.value
     )
 
@@ -88,19 +88,19 @@ def test_images_without_labels_are_fine_where_none_are_read(composed: Composed) 
     assert dataset.read(dataset.names("train_night")[0]).label is None
 
 
-def test_test_images_in_training_are_told(
+def test_test_images_in_training_give_a_warning(
     composed: Composed, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    def told(*more: str) -> list[str]:
+    def warnings_of(*more: str) -> list[str]:
         capfd.readouterr()
         set_up_training(composed("sh_both", *more))
         return [line for line in capfd.readouterr().err.splitlines() if "test images" in line]
 
-    assert told() == []
+    assert warnings_of() == []
     # One of the two test images is of the day.
-    (line,) = told("domains.target.split=test_day")
+    (line,) = warnings_of("domains.target.split=test_day")
     assert "domains.target.split=test_day: 1 of its images are test images" in line
-    (line,) = told("domains.source.split=test")
+    (line,) = warnings_of("domains.source.split=test")
     assert "domains.source.split=test: 2 of its images are test images" in line
     # Without their labels they are the images of a target that is adapted to, and may be seen.
     set_up_training(
@@ -127,19 +127,20 @@ def test_pseudo_labels_of_another_split(
 ) -> None:
     folder = write_folder(composed("sh_both"), tmp_path / "night", "train_night")
     typed = ("sh_both", f"domains.target.labels={folder}")
-    sentence = f"domains.target.labels: {folder} has no pseudo-labels of 3 of the 3 images"
+    sentence = f"domains.target.labels: {folder} has no pseudo-labels for 3 of the 3 images"
     refused(call, words(*typed), sentence, tmp_path / "runs")
     # A file that is left out among others is none that the run goes without unasked ...
     folder = write_folder(composed("sh_both"), tmp_path / "day", "train_day")
     next(iter((folder / "labels").iterdir())).unlink()
     typed = ("sh_both", f"domains.target.labels={folder}")
-    with pytest.raises(InputError, match="no pseudo-labels of 1 of the 3 images of train_day"):
+    with pytest.raises(InputError, match="no pseudo-labels for 1 of the 3 images of train_day"):
         set_up_training(composed(*typed))
-    set_up_training(composed(*typed, "data.on_error=skip"))
+    found = set_up_training(composed(*typed, "data.on_error=skip")).datasets["target"]
+    assert len(found.labels.missing(found.names("train_day"))) == 1
     # ... and without any there is nothing to learn from.
     for path in (folder / "labels").iterdir():
         path.unlink()
-    with pytest.raises(InputError, match="no pseudo-labels of 3 of the 3 images of train_day"):
+    with pytest.raises(InputError, match="no pseudo-labels for 3 of the 3 images of train_day"):
         set_up_training(composed(*typed, "data.on_error=skip"))
 
 
@@ -147,7 +148,7 @@ def test_pseudo_labels_of_which_none_was_kept(
     call: Call, composed: Composed, words: Callable[..., list[str]], tmp_path: Path
 ) -> None:
     folder = write_folder(composed("sh_both"), tmp_path / "none", "train_day", kept=0)
-    sentence = "holds no label of any pixel, its threshold of 0.9 was above every confidence"
+    sentence = "does not label any pixel, because its threshold of 0.9 was above every confidence"
     typed = ("sh_both", f"domains.target.labels={folder}")
     refused(call, words(*typed), sentence, tmp_path / "runs")
 
@@ -167,19 +168,24 @@ def test_predicted_labels_of_other_files(
     spec = composed("multi_head_night_stage1")
     labels = finished_teacher(spec) / "pseudo_labels" / "train_night_thermal_best"
     write_folder(spec, labels, "train_night", fingerprint="of other files")
-    sentence = f"{labels} was predicted on other files of synth_freiburg than those of"
+    sentence = f"{labels} was predicted on other files of synth_freiburg than those in"
     refused(call, words("multi_head_night_stage1"), sentence, tmp_path / "runs")
     write_folder(spec, labels, "train_night")
-    set_up_training(spec)
+    assert set_up_training(spec).datasets["target"].labels.folder == labels
     write_folder(spec, labels, "train_night", fingerprint="of other files")
     typed = (f"domains.target.labels={labels}", "domains.target.teacher_view=null")
-    set_up_training(composed("multi_head_night_stage1", *typed))
+    again = set_up_training(composed("multi_head_night_stage1", *typed))
+    assert again.datasets["target"].labels.manifest["fingerprint"] == "of other files"
 
 
 def test_validate_view_of_the_teacher_passes(composed: Composed) -> None:
     for view in ("thermal", "null"):
-        validate(composed("multi_head_night_stage1", f"domains.target.teacher_view={view}"))
-    validate(composed("multi_head_night_stage1", "domains.target.confidence=true"))
+        spec = composed("multi_head_night_stage1", f"domains.target.teacher_view={view}")
+        validate(spec)
+        assert not spec.folder.exists()
+    spec = composed("multi_head_night_stage1", "domains.target.confidence=true")
+    validate(spec)
+    assert not spec.folder.exists()
 
 
 # ---- the folder -----------------------------------------------------------------------------
@@ -199,7 +205,7 @@ def test_another_range_of_thermal_counts_is_another_input(
     other = "dataset.thermal_range=[21800,25000]"
     with pytest.raises(InputError, match=r"pseudo-labels of another network \("):
         written(other)
-    (tmp_path / "out" / "pseudo_labels.json").rename(tmp_path / "out" / BEGUN)
+    (tmp_path / "out" / "pseudo_labels.json").rename(tmp_path / "out" / UNFINISHED)
     with pytest.raises(InputError, match=r"pseudo-labels of another network \("):
         written(other)
     assert written().digest == first.digest
@@ -220,9 +226,9 @@ def cached(data: Path, tmp_path: Path) -> RunSpec:
 def test_all_that_is_read_is_decoded_before_the_first_step(
     cached: RunSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """So that a disk that is full, or may not be written, is told before anything is trained."""
+    """A full or read-only disk is reported before anything is trained."""
     validate(cached)
-    assert not (tmp_path / "cache").exists(), "a rehearsal leaves nothing behind"
+    assert not (tmp_path / "cache").exists(), "a validation writes nothing"
     setup = set_up_training(cached)
     decode_ahead(setup.session, *setup.read_splits())
     dataset: Any = setup.session.dataset

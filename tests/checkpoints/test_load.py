@@ -96,8 +96,8 @@ def test_incomplete_and_altered_files(tmp_path: Path, layout: str) -> None:
     assert "\n" not in report.sentence()
     less = OrderedDict((key, value) for key, value in tensors.items() if key != name)
     spoiled = {
-        "of the network not in the file": less,
-        "1 entry of the file without a place": tensors | {f"{name.split('.')[0]}.extra": X},
+        "of the network missing from the file": less,
+        "1 entry of the file unknown to the network": tensors | {f"{name.split('.')[0]}.extra": X},
         "file 3 x 5 x 7, network ": tensors | {name: torch.zeros(3, 5, 7)},
         "file int64, network float32": tensors | {name: tensors[name].long()},
     }
@@ -122,7 +122,7 @@ REFUSED: list[tuple[str, Callable[[], Any], tuple[str, ...], str]] = [
         *("rtfnet_tiny", lambda: resnet_file(101, prefix="Scale.", counters=False), ()),
         "it fits model=deeplabv2 model/inputs=caffe",
     ),
-    ("rtfnet_tiny", lambda: {"w": X}, (), "in no layout known here"),
+    ("rtfnet_tiny", lambda: {"w": X}, (), "in an unknown layout"),
     (
         *("cmx_tiny", lambda: mit_file((32, 64, 160, 256), (2, 2, 2, 2)), ()),
         "; the file fits model=cmx_b0.",
@@ -162,7 +162,7 @@ def test_another_number_of_classes(tmp_path: Path, yaml: str) -> None:
     path = saved(tmp_path, like(network(yaml, 9).state_dict(), prefix))
     model = network(yaml, 5)
     said = refused(model, path)
-    assert "only what depends on the number of classes (the file has 9) differs" in said
+    assert "Only parts that depend on the number of classes (the file has 9) differ" in said
     assert f"'model.fresh=[{part}]'" in said
 
     before = {key: value.clone() for key, value in model.state_dict().items()}
@@ -194,7 +194,7 @@ def test_stages_that_are_one_in_the_network_and_two_in_the_file(tmp_path: Path) 
     apart, shared = network("mask2former_tiny"), network("mask2former_tiny", share_start=2)
     path = saved(tmp_path, {f"network.{k}": v for k, v in apart.state_dict().items()})
     said = refused(shared, path)
-    assert "one tensor there and differ in the file" in said
+    assert "share one tensor in the network but differ in the file" in said
     assert "model.share_start=4" in said
 
     other = network("mask2former_tiny", share_start=2)
@@ -217,7 +217,7 @@ def test_the_sentence_of_a_load(tmp_path: Path) -> None:
     assert "not part of the ImageNet network" in report.sentence()
     assert "float16 converted" in report.sentence()
     assert model.state_dict()["encoder_rgb_bn1.weight"].dtype == torch.float32
-    assert "left over in the file: 2 (ImageNet's classifier)" in report.sentence()
+    assert "unused entries of the file: 2 (ImageNet's classifier)" in report.sentence()
 
 
 class Mine(nn.Module):
@@ -246,9 +246,9 @@ def test_networks_from_elsewhere_take_files_of_their_own(tmp_path: Path) -> None
     said = refused(
         model, saved(tmp_path, {"model": {"layer.weight": torch.zeros(3, 2)}, "step": 1})
     )
-    assert "1 entry of the network not in the file (layer.bias)" in said
+    assert "1 entry of the network missing from the file (layer.bias)" in said
     said = refused(model, saved(tmp_path, resnet_file(18)))
-    assert "Mine, which is none of the networks of rgbt.models" in said
+    assert "other parameter names than Mine" in said
 
 
 def test_a_class_derived_from_a_network_takes_its_files(tmp_path: Path) -> None:

@@ -109,7 +109,7 @@ def test_storages_that_are_views_of_others(tmp_path: Path) -> None:
     content = path.read_bytes()
     assert content.count(b"K\x05Ntq") == 1
     path.write_bytes(content.replace(b"K\x05Ntq", b"K\x05X\x01\0\0\0vK\x02K\x03\x87tq"))
-    with pytest.raises(InputError, match="cut short"):
+    with pytest.raises(InputError, match="truncated"):
         read(path)  # the tensor has five numbers, the view three
     replaced = path.read_bytes().replace(b"K\x05\x85q", b"K\x03\x85q")
     path.write_bytes(replaced)
@@ -230,9 +230,9 @@ def test_nothing_in_a_file_runs(tmp_path: Path, way: str, container: str) -> Non
     with pytest.raises(InputError) as error:
         read(path)
     if container == "array":
-        assert "an array of something else than plain numbers" in sentence(error)
+        assert "an array whose elements are not plain numbers" in sentence(error)
     else:
-        assert re.search(rf"asks for \w+(\.\w+)*{name}, which would run code", sentence(error))
+        assert re.search(rf"refers to \w+(\.\w+)*{name}, which would execute code", sentence(error))
     assert not marker.exists()
 
 
@@ -268,13 +268,13 @@ RAW = {
     ),
     "the state of a stand-in's class": (
         b"\x80\x02cargparse\nNamespace\nN}U\x01xU\x01ys\x86b.",
-        "cut short",
+        "truncated",
     ),
     "a call of a stand-in's object": (
         b"\x80\x02cargparse\nNamespace\n)\x81U\x01x\x85R.",
-        "cut short",
+        "truncated",
     ),
-    "a call of text": (b"\x80\x02U\x02os)R.", "cut short"),
+    "a call of text": (b"\x80\x02U\x02os)R.", "truncated"),
     "system looked up and called": (
         b"\x80\x02c__builtin__\ngetattr\ncos\n__dict__\nU\x06system\x86RU\x0ctouch MARKER\x85R.",
         "__builtin__.getattr",
@@ -290,30 +290,30 @@ RAW = {
         b"\x80\x04\x8c\x05torch\x8c\x17serialization.os.system\x93\x8c\x0ctouch MARKER\x85R.",
         "torch.serialization.os.system",
     ),
-    "a name that is no text": (b"\x80\x04]\x8c\x06system\x93.", "cut short"),
-    "registered class": (b"\x80\x02\x82\xf1U\x0ctouch MARKER\x85R.", "cut short"),
+    "a name that is no text": (b"\x80\x04]\x8c\x06system\x93.", "truncated"),
+    "registered class": (b"\x80\x02\x82\xf1U\x0ctouch MARKER\x85R.", "truncated"),
     "state of a function": (
         b"\x80\x02ctorch._utils\n_rebuild_tensor_v2\nN}U\x08__code__U\x01xs\x86b.",
-        "cut short",
+        "truncated",
     ),
-    "state of a list": (b"\x80\x02]}U\x01xU\x01ysb.", "cut short"),
+    "state of a list": (b"\x80\x02]}U\x01xU\x01ysb.", "truncated"),
     "known name that may not be called": (
         b"\x80\x02ctorch\nFloatStorage\nK\x05\x85R.",
         "FloatStorage",
     ),
-    "something outside": (b"\x80\x02U\x01xQ.", "cut short"),
-    "buffer outside": (b"\x80\x05\x97.", "cut short"),
-    "memory without end": (b"\x80\x04\x8e\xff\xff\xff\xff\xff\xff\xff\x7fx.", "cut short"),
+    "something outside": (b"\x80\x02U\x01xQ.", "truncated"),
+    "buffer outside": (b"\x80\x05\x97.", "truncated"),
+    "memory without end": (b"\x80\x04\x8e\xff\xff\xff\xff\xff\xff\xff\x7fx.", "truncated"),
     "memo far away": (b"\x80\x02Nr\xff\xff\xff\x7f.", "holds a NoneType"),
-    "many bytes": (b"\x80\x02cbuiltins\nbytearray\nJ\xff\xff\xff\x7f\x85R.", "cut short"),
-    "call with keywords": (b"\x80\x04cargparse\nNamespace\n)}\x92.", "cut short"),
-    "state of a storage's class": (b"\x80\x02ctorch\nFloatStorage\n}b.", "cut short"),
+    "many bytes": (b"\x80\x02cbuiltins\nbytearray\nJ\xff\xff\xff\x7f\x85R.", "truncated"),
+    "call with keywords": (b"\x80\x04cargparse\nNamespace\n)}\x92.", "truncated"),
+    "state of a storage's class": (b"\x80\x02ctorch\nFloatStorage\n}b.", "truncated"),
     "element of a tensor": (
         b"\x80\x02cnumpy.core.multiarray\n_reconstruct\n)RK\x00K\x01s.",
-        "cut short",
+        "truncated",
     ),
-    "bytes without end": (b"\x80\x05\x96" + b"\xff" * 7 + b"\x00.", "cut short"),
-    "unhashable key": (b"\x80\x02}]U\x01xs.", "cut short"),
+    "bytes without end": (b"\x80\x05\x96" + b"\xff" * 7 + b"\x00.", "truncated"),
+    "unhashable key": (b"\x80\x02}]U\x01xs.", "truncated"),
 }
 
 
@@ -350,7 +350,7 @@ KEYS = {
 
 @pytest.mark.parametrize("way", KEYS)
 def test_a_key_whose_hash_would_take_for_ever(tmp_path: Path, way: str) -> None:
-    with pytest.raises(InputError, match="cut short"):
+    with pytest.raises(InputError, match="truncated"):
         read(written(tmp_path / "file.pkl", b"\x80\x04" + KEYS[way]))
 
 
@@ -362,7 +362,7 @@ def copies(times: int) -> bytes:
 
 def test_a_small_file_that_would_take_much_memory(tmp_path: Path) -> None:
     path = written(tmp_path / "greedy.pkl", copies(2000))
-    with pytest.raises(InputError, match="far more memory than it has bytes") as refused:
+    with pytest.raises(InputError, match="far more memory than its size") as refused:
         read(path)
     sentence(refused)
     nested: Any = "x"
@@ -425,7 +425,7 @@ def test_what_holds_no_tensors_by_name(tmp_path: Path) -> None:
         "its keys are: epoch": {"epoch": 3},
         "its keys are: none": {},
         "under state_dict and model": {"model": state(), "state_dict": state()},
-        "asks for torch.nn.modules.linear.Linear": torch.nn.Linear(1, 1),
+        "refers to torch.nn.modules.linear.Linear": torch.nn.Linear(1, 1),
     }
     for said, content in cases.items():
         with pytest.raises(InputError) as error:
@@ -485,7 +485,7 @@ def test_tensors_outside_their_storage(tmp_path: Path) -> None:
     ]:
         assert content.count(before) == 1
         path.write_bytes(content.replace(before, after))
-        with pytest.raises(InputError, match="cut short"):
+        with pytest.raises(InputError, match="truncated"):
             read(path)
 
 
@@ -501,5 +501,5 @@ def test_storages_longer_than_their_entry(tmp_path: Path, count: int) -> None:
                 b"K\x05\x85q", number + b"\x85q"
             )
             archive.writestr(name, longer if name.endswith("data.pkl") else content)
-    with pytest.raises(InputError, match="cut short"):
+    with pytest.raises(InputError, match="truncated"):
         read(path)

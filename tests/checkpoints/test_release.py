@@ -178,23 +178,29 @@ def test_an_export_says_what_it_is(tmp_path: Path) -> None:
         save(tmp_path / layout, layout, "cmx", model.state_dict(), NOTE)
         assert read(tmp_path / layout).note == NOTE
         report = load_weights(model, tmp_path / layout)
-        assert report.facts.remarks == ("exported from 0123 best, fed as its note says",)
+        assert report.facts.remarks == ("exported from 0123 best, with the inputs of its note",)
 
 
 def test_what_cannot_be_written(tmp_path: Path) -> None:
     state = {"a": torch.zeros(1)}
     cases = {
-        ("released", "deeplabv2"): "no release of DeepLab v2",
-        ("released", ""): "no release of this network",
-        ("released_temporal", "mfnet"): "the temporal release's CMX; this network is MFNet",
-        ("onnx", "cmx"): "'onnx' is not a choice; known: released, released_temporal, safetensors",
+        ("released", "deeplabv2"): "no released format exists for DeepLab v2",
+        ("released", ""): "no released format exists for this network",
+        (
+            "released_temporal",
+            "mfnet",
+        ): "for CMX of the temporal release, but this network is MFNet",
+        (
+            "onnx",
+            "cmx",
+        ): "'onnx' is not a valid choice; known: released, released_temporal, safetensors",
     }
     for (layout, of), said in cases.items():
         with pytest.raises(InputError) as error:
             save(tmp_path / "file", layout, of, state, {})
         assert said in sentence(error)
     (tmp_path / "file").write_text("dear")
-    with pytest.raises(InputError, match="exists already"):
+    with pytest.raises(InputError, match="already exists"):
         save(tmp_path / "file", "safetensors", "cmx", state, {})
     assert (tmp_path / "file").read_text() == "dear"
     assert [each.name for each in tmp_path.iterdir()] == ["file"]

@@ -42,7 +42,8 @@ def test_every_option_of_every_group_passes_the_check(
     group: str, option: str, default: DictConfig
 ) -> None:
     if group == "scale":  # sets nodes of all groups
-        specify(compose(f"scale={option}", "dataset.root=unused", "dataset=mfnet"))
+        spec = specify(compose(f"scale={option}", "dataset.root=unused", "dataset=mfnet"))
+        assert spec.plain["scale"]["name"] == option
         return
     made = option.startswith("synth")
     needed = {} if group != "dataset" or made else {"root": "unused"}
@@ -52,9 +53,10 @@ def test_every_option_of_every_group_passes_the_check(
     usual = default[group]
     try:
         default[group] = chosen[group]
-        Component.from_node(default[group], group)
+        component = Component.from_node(default[group], group)
     finally:
         default[group] = usual
+    assert component.target == component.plain["_target_"] == chosen[group]["_target_"]
 
 
 def test_paper_scale_is_the_released_recipe() -> None:

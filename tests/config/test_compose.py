@@ -47,7 +47,7 @@ def test_by_scale_unknown_scale_says_to_choose(own: Path) -> None:
     words = ["+experiment=mfnet", "scale=middle", word(own)]
     with pytest.raises(InputError) as caught, composing(words):
         compose(words)
-    assert "names files for these scales alone: {demo:mfnet_tiny,paper:mfnet}" in str(caught.value)
+    assert "supports only these scales: {demo:mfnet_tiny,paper:mfnet}" in str(caught.value)
 
 
 def test_available_lists_the_search_path_of_the_command(own: Path) -> None:
@@ -67,7 +67,7 @@ def test_compose_reads_folders_of_the_environment(
     assert compose(["+experiment=own_stage"]).name == "own_stage"
 
 
-def test_upstream_run_is_found_on_the_search_path(own: Path) -> None:
+def test_upstream_experiment_on_the_search_path_is_used(own: Path) -> None:
     with searching([word(own)]):
         config = compose(["+experiment=sh_adversarial"])
         value = "experiment:own_stage/last.pt"

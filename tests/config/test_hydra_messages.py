@@ -18,17 +18,17 @@ from rgbt.config.hydra_messages import check_words
         (("experiment=grbm",), "'experiment=grbm' needs a plus: +experiment=grbm."),
         (("debug=smoke",), "'debug=smoke' needs a plus: +debug=smoke."),
         (("search=grbm",), "'search=grbm' needs a plus: +search=grbm."),
-        (("+dataset=mfnet",), "'+dataset=mfnet' is written without plus: dataset=mfnet."),
+        (("+dataset=mfnet",), "remove the plus from '+dataset=mfnet': dataset=mfnet."),
         (
             ("+experiment=grbm", "+experiment=crm"),
-            "+experiment= may be given once; leave one of them out.",
+            "+experiment= is given more than once; remove all but one.",
         ),
-        (("experiment",), "'experiment' is no override; expected +experiment=NAME."),
-        (("crm_kp",), "'crm_kp' is no override; expected +experiment=crm_kp."),
-        (("nothing",), "'nothing' is no override; expected key=value"),
-        (("seed=0,1",), "'seed=0,1' names several values, which is a grid: add -m"),
+        (("experiment",), "'experiment' is not a valid override; expected +experiment=NAME."),
+        (("crm_kp",), "'crm_kp' is not a valid override; expected +experiment=crm_kp."),
+        (("nothing",), "'nothing' is not a valid override; expected key=value"),
+        (("seed=0,1",), "'seed=0,1' holds several values. Add -m to run a grid"),
         (("lr=1",), "'lr' is not a key of the configuration; did you mean optimizer.lr?"),
-        (("dataset.root=/x",), "name the data set in that folder: dataset=mfnet (or"),
+        (("dataset.root=/x",), "Choose the data set that the folder contains: dataset=mfnet (or"),
         (("dataset.num_trian=1",), "did you mean 'num_train'?"),
     ],
 )
@@ -42,11 +42,20 @@ def test_word_that_hydra_refuses_says_what_to_type(words: tuple[str, ...], sente
 @pytest.mark.parametrize(
     ("word", "sentence"),
     [
-        ("--experiment", "'--experiment' is no option; a setting is written as +experiment=..."),
-        ("--seed=1", "'--seed=1' is no option; a setting is written as seed=1."),
-        ("seed=[0, 1]", "'seed=[0, 1]': a run has one seed; several are a grid: -m seed=0,1."),
-        ("hydra.searchpath=[file:///no/where]", "there is no folder /no/where; name an existing"),
-        ("hydra.searchpath=[/no/where]", "there is no folder /no/where; name an existing"),
+        ("--experiment", "'--experiment' is not an option; write settings as +experiment=..."),
+        ("--seed=1", "'--seed=1' is not an option; write settings as seed=1."),
+        (
+            "seed=[0, 1]",
+            "'seed=[0, 1]': a run has one seed; for several runs use a grid: -m seed=0,1.",
+        ),
+        (
+            "hydra.searchpath=[file:///no/where]",
+            "the folder /no/where does not exist; give the absolute path",
+        ),
+        (
+            "hydra.searchpath=[/no/where]",
+            "the folder /no/where does not exist; give the absolute path",
+        ),
     ],
 )
 def test_word_that_hydra_would_misread_is_refused(word: str, sentence: str) -> None:
@@ -78,5 +87,5 @@ def test_lists_are_read_in_one_way(text: str, expected: list[str]) -> None:
 
 @pytest.mark.parametrize("text", ["", "a,", ",a", "a,,b", "[]", "[a,]"])
 def test_empty_entries_are_refused(text: str) -> None:
-    with pytest.raises(InputError, match="expected runs, with commas between them"):
+    with pytest.raises(InputError, match="expected runs, separated by commas"):
         split_list(text, "runs")

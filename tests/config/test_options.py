@@ -64,9 +64,9 @@ MISTAKES = {
     "gpus=[0,x]": 'must be a whole number, got "x"',
     "": "'run' has no value; give one with run=...",
     "run": "'run': expected key=value; did you mean 'run'?",
-    "--run=x": "'--run' is no option of this command; did you mean 'run'?",
-    "spilt=val": "'spilt' is no option of this command; did you mean 'split'?",
-    "datset=mfnet": "'datset' is no option of this command; did you mean 'dataset'?",
+    "--run=x": "'--run' is not an option of this command; did you mean 'run'?",
+    "spilt=val": "'spilt' is not an option of this command; did you mean 'split'?",
+    "datset=mfnet": "'datset' is not an option of this command; did you mean 'dataset'?",
     "max_steps=3": "did you mean trainer.max_steps",
 }
 

@@ -225,19 +225,22 @@ def noise(*severities: float) -> Noise:
 @pytest.mark.parametrize(
     ("make", "sentence"),
     [
-        (lambda: Occluded(image="rgb", block=8, severities=(0.5, 2.0)), r"in \[0, 1\], got 2"),
-        (lambda: Occluded(image="rgb", block=8, severities=()), r"rise from above 0 .*got \[\]"),
-        (lambda: noise(8.0, 8.0), r"must rise from above 0"),
+        (lambda: Occluded(image="rgb", block=8, severities=(0.5, 2.0)), r"between 0 and 1, got 2"),
+        (
+            lambda: Occluded(image="rgb", block=8, severities=()),
+            r"rising numbers above 0 .*got \[\]",
+        ),
+        (lambda: noise(8.0, 8.0), r"must be rising numbers above 0"),
         (lambda: noise(0.0, 8.0), r"0 is the clean image"),
-        (lambda: noise(-8.0, 8.0), r"must rise from above 0"),
-        (lambda: noise(300.0), r"grey levels\) must lie in \[0, 255\]"),
-        (lambda: Blur(image="rgb", severities=(121.0,)), r"sigma .* lie in \[0, 120\]"),
-        (lambda: Misregistered(severities=(241.0,)), r"pixels\) must lie in \[0, 240\]"),
+        (lambda: noise(-8.0, 8.0), r"must be rising numbers above 0"),
+        (lambda: noise(300.0), r"grey levels\) must be between 0 and 255"),
+        (lambda: Blur(image="rgb", severities=(121.0,)), r"sigma .* be between 0 and 120"),
+        (lambda: Misregistered(severities=(241.0,)), r"pixels\) must be between 0 and 240"),
         (lambda: Removed(image="rgb").check(0.5), r"can only be 1, got 0.5"),
         (lambda: noise(8.0).check(float("nan")), r"got nan"),
     ],
 )
-def test_bad_settings_are_told(make: Callable[[], object], sentence: str) -> None:
+def test_bad_settings_are_refused(make: Callable[[], object], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         make()
 
@@ -245,5 +248,7 @@ def test_bad_settings_are_told(make: Callable[[], object], sentence: str) -> Non
 def test_a_severity_that_changes_nothing_of_a_small_image_is_refused() -> None:
     with pytest.raises(InputError, match=r"half a pixel of an image of 24 rows; .* at least 10"):
         Misregistered(severities=(4.0,))(sample(hw=(24, 32)), 4.0, rng_of())
-    with pytest.raises(InputError, match=r"share of 0.1 of 1 x 2 blocks is none; .* least 0.25"):
+    with pytest.raises(
+        InputError, match=r"share of 0.1 of 1 x 2 blocks hides no block; .* least 0.25"
+    ):
         occluded(block=480)(sample(), 0.1, rng_of())

@@ -57,7 +57,7 @@ def test_the_command_writes_a_picture(call: Call, write_mfnet: WriteMFNet, tmp_p
     assert cv2.imread(str(out)).shape[1] > 500
     code, _, err = call(entry, "name=00003D", *where)
     assert code == 2
-    assert "split 'test' has no such sample; did you mean" in err
+    assert "split 'test' has no sample of this name; did you mean" in err
 
 
 @pytest.mark.parametrize(

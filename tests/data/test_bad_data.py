@@ -115,10 +115,10 @@ def change_values(path: Path, _: Path) -> None:
 DAMAGES: dict[str, tuple[Callable[[Path, Path], None], str]] = {
     "missing": (move, "is missing"),
     "empty": (partial(fill, content=b""), "the file is empty|cannot be read as an array"),
-    "cut short": (cut, "the file is (cut short|damaged or no)|cannot be read as an array"),
-    "no image": (partial(fill, content=b"<html>404</html>"), "the file is damaged or no"),
+    "cut short": (cut, "the file is (truncated|damaged or not)|cannot be read as an array"),
+    "no image": (partial(fill, content=b"<html>404</html>"), "the file is damaged or not"),
     "a folder": (make_folder, "is a folder, expected a file"),
-    "a pipe": (make_pipe, "is no regular file, expected a file"),
+    "a pipe": (make_pipe, "is not a regular file, expected a file"),
     "a link that leads out": (partial(move, link="kept"), "leads out of dataset.root, to .*kept;"),
     "a link to nowhere": (partial(move, link="gone"), "is missing: it is a link to .*/gone, where"),
     "another depth": (change_depth, "expected 8 bits|of 16 bits|whole numbers|got 8 bits"),
@@ -152,7 +152,7 @@ def damaged(path: Path, what: str, outside: Path) -> Iterator[None]:
         path.write_bytes(whole)
 
 
-def assert_told(sentence: str, what: str, path: Path, name: str) -> None:
+def assert_names_the_problem(sentence: str, what: str, path: Path, name: str) -> None:
     """One sentence says what is wrong, and with which file or sample."""
     assert re.search(DAMAGES[what][1], sentence), (what, sentence)
     assert str(path) in sentence or f"'{name}'" in sentence, sentence
@@ -176,7 +176,7 @@ def test_check_reports_each_problem_in_one_line(kind: str, tmp_path: Path, outsi
             problems = check_dataset(make(root), num_threads=1).problems
         told = [line for line in problems if line not in sound]
         assert len(told) == 1, (what, path, told)
-        assert_told(told[0], what, path, name)
+        assert_names_the_problem(told[0], what, path, name)
         done.add(what)
     assert done == set(DAMAGES)
     assert check_dataset(make(root)).problems == sound
@@ -211,7 +211,7 @@ def test_the_loader_stops_or_goes_on(kind: str, split: str, tmp_path: Path, outs
         with damaged(path, what, outside):
             with pytest.raises(InputError) as told:
                 loaded(dataset, split, "raise")
-            assert_told(str(told.value), what, path, name)
+            assert_names_the_problem(str(told.value), what, path, name)
             if len(names) > 1:
                 found, skipped = loaded(dataset, split, "skip")
                 assert set(found) == set(names) - {name}

@@ -645,7 +645,7 @@ def test_former_command_warns_and_works(
     assert not ended.value.code
     done = capsys.readouterr()
     assert "into the image cache" in done.out
-    assert "use python -m rgbt.data.cache" in done.err
+    assert "was renamed to rgbt.data.cache" in done.err
 
 
 def test_command_refuses_setting_without_effect(case: Case) -> None:

@@ -62,8 +62,8 @@ def heads(source: str | None, target: str | None, **changes: Any) -> dict[str, A
         (heads(None, None, target_is="view"), "domains.target_is=view with 0 heads"),
         (heads(None, None, target_is="night"), "domains.target_is=night with 0 heads"),
         (heads("a", "a", target_is="night"), "domains.target_is=night with 1 heads"),
-        (heads(None, None, tested_head="source"), "tested_head=source chooses between two heads"),
-        (heads("a", "a", tested_head="source"), "tested_head=source chooses between two heads"),
+        (heads(None, None, tested_head="source"), "tested_head=source requires two heads"),
+        (heads("a", "a", tested_head="source"), "tested_head=source requires two heads"),
         (heads("a", "b", target_is="view"), "target_is=view"),
         (
             {
@@ -97,7 +97,7 @@ def test_the_only_head_predicts_everything(view: View, night: bool | None) -> No
     assert domains(target=domain()).head_of(view, night, "own") is None
     assert domains(source=domain(head="a")).head_of(view, night, "own") == "a"
     for asked in ("source", "target"):
-        with pytest.raises(InputError, match=f"head={asked} chooses between the heads"):
+        with pytest.raises(InputError, match=f"head={asked} selects one of two heads"):
             domains(target=domain()).head_of(view, night, asked)
 
 
@@ -114,13 +114,13 @@ def test_the_head_of_a_night() -> None:
     for view in ("rgb", "thermal", "rgbt"):
         assert found.head_of(view, True, "own") == "dark"
         assert found.head_of(view, False, "own") == "day"
-        with pytest.raises(InputError, match="does not say which images were taken at night"):
+        with pytest.raises(InputError, match="does not state which images were taken at night"):
             found.head_of(view, None, "own")
 
 
 @pytest.mark.parametrize("target_is", ["view", "night"])
 @pytest.mark.parametrize("night", [True, False, None])
-def test_one_head_for_all_where_asked(target_is: str, night: bool | None) -> None:
+def test_requested_head_predicts_all_images(target_is: str, night: bool | None) -> None:
     found = two(target_is, tested_head="source")
     for view in ("rgb", "thermal"):
         assert found.head_of(view, night, "source") == "day"

@@ -22,7 +22,7 @@ from rgbt.data.files import (
 from rgbt.data.integrity import is_there, read_names, read_whole, within
 from rgbt.data.labels import read_label
 
-SKIP = "use data.on_error=skip to leave it out"
+SKIP = "skip unreadable files with data.on_error=skip"
 
 
 def chunk(kind: bytes, data: bytes) -> bytes:
@@ -64,8 +64,8 @@ def test_a_png_that_is_cut_short(path: Path) -> None:
     for size in (len(whole) // 2, len(whole) - 12, len(whole) - 1):
         path.write_bytes(whole[:size])
         assert refused(path) == (
-            f"{path} cannot be decoded, the file is cut short (its end is missing after {size} "
-            f"bytes, as after an interrupted copy); replace it, or {SKIP}."
+            f"{path} cannot be decoded, because the file is truncated (its end is missing after "
+            f"{size} bytes, as after an interrupted copy); replace it, or {SKIP}."
         )
     path.write_bytes(whole + b"\0" * 5000)  # as a card reader leaves it
     np.testing.assert_array_equal(decode(path), image)
@@ -80,7 +80,7 @@ def test_a_jpeg_that_is_cut_short(path: Path, thumbnail: bool) -> None:
         whole = whole[:2] + b"\xff\xe1" + struct.pack(">H", len(small) + 2) + small + whole[2:]
     for size in (3, 30, len(whole) - 500, len(whole) - 2, len(whole) - 1):
         path.write_bytes(whole[:size])
-        assert "cut short" in refused(path)
+        assert "truncated" in refused(path)
     path.write_bytes(whole)
     image = decode(path)
     assert image.shape == (32, 40, 3)
@@ -95,7 +95,7 @@ def test_other_formats_that_are_cut_short(tmp_path: Path) -> None:
     path.write_bytes(whole)
     np.testing.assert_array_equal(decode(path), image)
     path.write_bytes(whole[: len(whole) // 2])
-    assert "the file is damaged or no image" in refused(path)
+    assert "the file is damaged or not an image" in refused(path)
 
 
 def test_what_is_no_file(path: Path) -> None:
@@ -104,12 +104,12 @@ def test_what_is_no_file(path: Path) -> None:
     assert refused(path) == f"{path} is a folder, expected a file; replace it, or {SKIP}."
     path.rmdir()
     os.mkfifo(path)  # opening it would wait for ever
-    assert "is no regular file" in refused(path)
+    assert "is not a regular file" in refused(path)
     path.unlink()
     path.write_bytes(b"")
     assert "the file is empty" in refused(path)
     path.write_bytes(b"no image")
-    assert "the file is damaged or no image" in refused(path)
+    assert "the file is damaged or not an image" in refused(path)
     path.write_bytes(png_bytes(2**30, 2**30, depth=8, colours=0))
     assert "pixels, more than the limit of 100 million" in refused(path)
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IEND", b""))
@@ -120,8 +120,8 @@ def test_what_is_no_file(path: Path) -> None:
 def test_links(path: Path, tmp_path: Path) -> None:
     path.symlink_to(tmp_path / "gone" / "y.png")
     assert refused(path) == (
-        f"{path} is missing: it is a link to {tmp_path / 'gone' / 'y.png'}, where nothing is; "
-        f"restore that file, or {SKIP}."
+        f"{path} is missing: it is a link to {tmp_path / 'gone' / 'y.png'}, which does not "
+        f"exist; restore that file, or {SKIP}."
     )
     assert is_there(path)
     assert not is_there(tmp_path / "z.png")
@@ -140,7 +140,7 @@ def test_permission(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for method in ("read_bytes", "stat"):
         with monkeypatch.context() as patch:
             patch.setattr(Path, method, deny)
-            assert "may not be read, permission is denied; allow it (chmod a+r" in refused(path)
+            assert "cannot be read: permission denied; allow access (chmod a+r" in refused(path)
     monkeypatch.setattr(Path, "lstat", deny)
     assert is_there(path)
 
@@ -201,11 +201,13 @@ def test_indices_of_a_palette(path: Path) -> None:
 def test_labels_whose_values_would_change(path: Path) -> None:
     path.write_bytes(png_bytes(3, 1, depth=1, colours=0, rows=bytes([0, 0b10100000])))
     assert decode(path).tolist() == [[255, 0, 255]]  # which would be ignored
-    with pytest.raises(InputError, match="as they were written, got a PNG of 1 bit; save labels"):
+    with pytest.raises(
+        InputError, match="unchanged class indices, got a PNG of 1 bit; save labels"
+    ):
         read_label(path, 2)
     path.write_bytes(jpeg_bytes())
     for read in (read_indices, read_colours):
-        with pytest.raises(InputError, match="as they were written, got a JPEG, which changes"):
+        with pytest.raises(InputError, match="expected unchanged .*, got a JPEG, which changes"):
             read(path)
 
 
@@ -256,9 +258,7 @@ def test_lists(tmp_path: Path) -> None:
     assert read_names(path, "dataset.splits.train") == ("00001D", "00002N")
     for wrong in ("00001D\n".encode("utf-16"), b"\x89PNG\r\n\x1a\n\0\0", b"a\0b\n"):
         path.write_bytes(wrong)
-        with pytest.raises(
-            InputError, match=r"^dataset.splits.train: .* is not a text in UTF-8; give"
-        ):
+        with pytest.raises(InputError, match=r"^dataset.splits.train: .* is not UTF-8 text; give"):
             read_names(path, "dataset.splits.train")
     path.write_text(" \n\n")
     with pytest.raises(InputError, match=r"the list '.*train.txt' is empty; expected one name"):
@@ -284,8 +284,8 @@ def test_too_large_image_is_refused_before_decoding(path: Path) -> None:
     path.write_bytes(bomb(30_000, 30_000))
     tracemalloc.start()
     assert refused(path) == (
-        f"{path} holds 900 million pixels, more than the limit of 100 million; if it is the file "
-        "that you mean, set RGBT_MAX_MEGAPIXELS=900."
+        f"{path} holds 900 million pixels, more than the limit of 100 million. If it is the "
+        "right file, set RGBT_MAX_MEGAPIXELS=900."
     )
     assert tracemalloc.get_traced_memory()[1] < 1e6
     tracemalloc.stop()
@@ -308,7 +308,7 @@ def test_png_with_wrong_check_sum_is_refused(path: Path) -> None:
     path.write_bytes(whole[:33] + text + whole[33:])
     np.testing.assert_array_equal(decode(path), image)
     path.write_bytes(whole[:33] + text.replace(b"\0a", b"\0b") + whole[33:])
-    assert "damaged (a check sum of the PNG is another one)" in refused(path)
+    assert "damaged (a checksum of the PNG does not match)" in refused(path)
 
 
 def test_file_above_limit_is_not_read(path: Path) -> None:

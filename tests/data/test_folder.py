@@ -99,7 +99,7 @@ def test_thermal_of_eight_bits(root: Path) -> None:
     np.testing.assert_array_equal(stretched, level * 5)
     said = refused(lambda: dataset.read("val_1"))
     assert said.startswith(f"{root / 'val/ir/1_ir.tif'}: expected 8 bits per pixel, got uint16")
-    assert "need dataset.thermal_range=[low, high]" in said
+    assert "require dataset.thermal_range=[low, high]" in said
     said = refused(lambda: folder(root).read("train_1"))
     assert "dataset.thermal_range=[20000, 24000], got 8 bits; use the original file" in said
 
@@ -113,7 +113,7 @@ def test_thermal_of_real_numbers(root: Path) -> None:
     celsius[2, 3:5] = (np.nan, np.inf)
     write_tiff(path, celsius)
     assert refused(lambda: dataset.read("train_1")).startswith(
-        f"{path}: 2 thermal values are NaN or infinite; write a temperature there"
+        f"{path}: 2 thermal values are NaN or infinite; replace them with a temperature"
     )
 
 
@@ -152,7 +152,7 @@ def test_packed_files(tmp_path: Path) -> None:
     )
     assert len(check_dataset(stretched).problems) == 3  # most values are clipped
     write_png(tmp_path / "train" / "7.png", image[..., :3])
-    assert "got 3; use the original file, or give dataset.thermal its own pattern" in refused(
+    assert "got 3; use the original file, or give dataset.thermal a separate pattern" in refused(
         lambda: dataset.read("train_7")
     )
 
@@ -183,7 +183,7 @@ def test_unlabelled(root: Path) -> None:
     nothing = folder(root, label=None)
     assert nothing.read("test_1").label is None
     assert len(nothing.files("test_1")) == 2
-    assert "dataset.unlabelled: 'vall' is not a choice" in refused(
+    assert "dataset.unlabelled: 'vall' is not a valid choice" in refused(
         lambda: folder(root, unlabelled=("vall",))
     )
 
@@ -298,8 +298,8 @@ def test_day_and_night(sound: Path) -> None:
     dataset = folder(sound, night="t*_[23]")
     assert dataset.nights(("train_1", "train_2", "val_2")) == (False, True, False)
     assert refused(lambda: folder(sound, night="*nite*")) == (
-        "dataset.night: none of 6 names matches '*nite*', the first is 'test_1'; correct it, or "
-        "set it to null."
+        "dataset.night: none of 6 names matches '*nite*'; the first name is 'test_1'. Correct the "
+        "pattern, or set it to null."
     )
 
 
@@ -308,7 +308,7 @@ def test_day_and_night(sound: Path) -> None:
     [
         ({"num_classes": 4}, "num_classes is 4 but dataset.classes has 3"),
         ({"palette": ((0, 0, 0),)}, "num_classes is 3 but dataset.palette has 1"),
-        ({"unscored": ("cars",)}, "dataset.unscored: 'cars' is not a choice"),
+        ({"unscored": ("cars",)}, "dataset.unscored: 'cars' is not a valid choice"),
         ({"classes": ("car", "person", "car")}, "dataset.classes: 'car' occurs twice"),
         ({"thermal_range": (5, 5)}, r"dataset.thermal_range: .* low < high, .* got \[5, 5\]"),
         ({"thermal_range": (5, float("nan"))}, r"dataset.thermal_range: .* got \[5, nan\]"),
@@ -352,7 +352,7 @@ def test_a_sound_data_set(sound: Path) -> None:
     assert (report.splits[0].num_day, report.splits[0].num_night) == (2, 1)
     assert report.notes[0].startswith(
         "split train: 0.00% of the thermal pixels are 0, 0.00% lie below and 0.00% above "
-        "dataset.thermal_range=[20000, 24000]; the others run from "
+        "dataset.thermal_range=[20000, 24000]; the others range from "
     )
 
 
@@ -366,10 +366,10 @@ def test_each_problem_is_one_line(root: Path) -> None:
         f"folder ({root}) has no frame called 'lost_1': there is no such RGB image "
         "(dataset.rgb='{part}/rgb/{name}.png'); restore it, or remove the name from the list.",
         "split train lists 'train_1' 2 times.",
-        "splits train and val share 1 names, the first is 'val_1'.",
-        f"2 files belong to no image of a split, the first is {root}/test/ir/2_ir.tif.",
+        "splits train and val share 1 names; the first is 'val_1'.",
+        f"2 files belong to no image of a split; the first is {root}/test/ir/2_ir.tif.",
     ]
-    assert report.notes[0] == "3 frames are in no split, the first is 'extra_1'."
+    assert report.notes[0] == "3 frames are in no split; the first is 'extra_1'."
     # Two splits that are said to be one are no mistake.
     same = folder(root, folders={"train": "train", "val": "val", "test": "val"})
     assert not any("share" in line for line in check_dataset(same).problems)
@@ -383,8 +383,8 @@ def test_a_range_that_misses_the_values(root: Path) -> None:
     report = check_dataset(folder(root))
     assert list(report.problems) == [
         "split val: 100.00% of the thermal values other than 0 lie outside "
-        "dataset.thermal_range=[20000, 24000] and become black or white; they run from 29000 to "
-        "30000, choose a range among them."
+        "dataset.thermal_range=[20000, 24000] and become black or white. They range from 29000 "
+        "to 30000; choose a range among them."
     ]
     half = counts.copy()
     half[1:, :4] = 22000  # 20 of 40: not more than half

@@ -46,20 +46,21 @@ PLAIN = {key: text.replace("{split}", "{part}") for key, text in PATTERNS.items(
         ({"rgb": "/rgb/{name}.png"}, "dataset.rgb: expected a path below dataset.root"),
         ({"rgb": "../{name}.png"}, "dataset.rgb: .* without '..'"),
         ({"rgb": "rgb//{name}.png"}, "dataset.rgb: .* doubled slashes"),
-        ({"rgb": ""}, "dataset.rgb: expected a path below dataset.root"),
         ({"rgb": "rgb/{name.png"}, "dataset.rgb: expected words in braces"),
         ({"rgb": "rgb/{}.png"}, "dataset.rgb: expected words in braces"),
-        ({"rgb": "rgb/{1}.png"}, "dataset.rgb: expected words in braces"),
-        ({"rgb": "rgb/{sequence}{name}.png"}, "dataset.rgb: .* with something between"),
-        ({"rgb": "rgb/1.png"}, "dataset.rgb: .* is one file; write {name}"),
-        ({"rgb": "rgb/{frame}.png"}, "dataset.rgb: .* has frame but no name; write {name}"),
+        ({"rgb": "rgb/{sequence}{name}.png"}, "dataset.rgb: .* with other text between"),
+        (
+            {"rgb": "rgb/1.png"},
+            "dataset.rgb: .* is a single file; replace the names of frames with {name}",
+        ),
+        ({"rgb": "rgb/{frame}.png"}, "dataset.rgb: .* has the word frame but no name; replace"),
         (
             {"rgb": "{split}/colour/{name}.png"},
-            "nothing matches 'colour', test holds ir, mask",
+            "nothing matches 'colour'; test holds ir, mask",
         ),
-        ({"rgb": "{split}/rgb/{name}.jpg"}, "nothing matches '{name}.jpg', rgb holds 1.png, 2.png"),
+        ({"rgb": "{split}/rgb/{name}.jpg"}, "nothing matches '{name}.jpg'; rgb holds 1.png, 2.png"),
         ({"thermal": "{split}/ir/{name}.tif"}, "dataset.thermal: .* but ir holds 1_ir.tif, 2_ir"),
-        ({"thermal": "{scene}/ir/{name}.tif"}, "needs {scene}, which dataset.rgb"),
+        ({"thermal": "{scene}/ir/{name}.tif"}, "uses {scene}, which dataset.rgb"),
         ({"label": "{split}/labels/{name}.png"}, "dataset.label: .*labels holds nothing"),
         ({"label": "test/mask/{name}.png"}, "'test_1' and 'train_1' would share .*test/mask/1.png"),
         ({"label": "{split}/mask/{name}.JPG"}, "are JPEG files, which change values"),
@@ -68,10 +69,10 @@ PLAIN = {key: text.replace("{split}", "{part}") for key, text in PATTERNS.items(
             {"lists": {"train": "a.txt"}, "shares": {"train": 1.0}, **PLAIN},
             "dataset.lists and dataset.shares both define",
         ),
-        (PLAIN, "nothing defines the splits; write {split} in dataset.rgb"),
-        ({"folders": {"train": "train"}, **PLAIN}, "nothing defines the splits"),
-        ({"shares_seed": 1}, "dataset.shares_seed and dataset.block are for dataset.shares"),
-        ({"block": 3}, "dataset.shares_seed and dataset.block are for dataset.shares"),
+        (PLAIN, "no setting defines the splits. Write {split} in dataset.rgb"),
+        ({"folders": {"train": "train"}, **PLAIN}, "no setting defines the splits"),
+        ({"shares_seed": 1}, "dataset.shares_seed and dataset.block require dataset.shares"),
+        ({"block": 3}, "dataset.shares_seed and dataset.block require dataset.shares"),
     ],
 )
 def test_wrong_descriptions_are_refused(sound: Path, keys: dict[str, Any], said: str) -> None:
@@ -121,7 +122,7 @@ def test_folder_without_permission_is_refused(sound: Path, monkeypatch: pytest.M
 
     monkeypatch.setattr("rgbt.data.folder.pattern.os.listdir", deny)
     assert refused(lambda: folder(sound)) == (
-        f"{sound} may not be listed, permission is denied; allow it (chmod a+rx)."
+        f"{sound} cannot be listed: permission denied; allow access (chmod a+rx)."
     )
 
 
@@ -135,9 +136,9 @@ def test_splits_by_folder(sound: Path) -> None:
     assert not missing.has("train")
     assert missing.has("test")
     assert refused(lambda: missing.names("train")) == (
-        "dataset.folders: split 'train' is empty, dataset.rgb='{split}/rgb/{name}.png' has no file "
-        "with 'training' for {split}; it has test, train, val: name one of them in "
-        "dataset.folders, {train: ...}."
+        "dataset.folders: split 'train' is empty, because dataset.rgb='{split}/rgb/{name}.png' "
+        "has no file with 'training' for {split}. Existing values: test, train, val. Set one of "
+        "them in dataset.folders, {train: ...}."
     )
     for ask in (dataset.names, dataset.has):
         said = refused(lambda ask=ask: ask("tset"))
@@ -171,8 +172,8 @@ def test_bare_names_in_a_list(root: Path) -> None:
         f"folder ({root}) has no frame called '1': there is no such RGB image"
     )
     assert refused(lambda: listed(root, "frame_1 label_1", "x").names("train")) == (
-        f"dataset.lists.train: none of the 2 lines of {root}/list.txt is a frame: the first is "
-        "'frame_1 label_1', expected names such as 'test_1' or paths such as 'test/rgb/1.png'."
+        f"dataset.lists.train: none of the 2 lines of {root}/list.txt is a frame. The first is "
+        "'frame_1 label_1'; expected names such as 'test_1' or paths such as 'test/rgb/1.png'."
     )
 
 
@@ -243,8 +244,8 @@ def test_shares_in_a_folder(root: Path) -> None:
 @pytest.mark.parametrize(
     ("keys", "said"),
     [
-        ({"shares": {"train": 0.5, "val": 0.4}}, "expected shares above 0 that are 1 together"),
-        ({"shares": {"train": 1.5, "val": -0.5}}, "expected shares above 0 that are 1 together"),
+        ({"shares": {"train": 0.5, "val": 0.4}}, "expected shares above 0 that add up to 1"),
+        ({"shares": {"train": 1.5, "val": -0.5}}, "expected shares above 0 that add up to 1"),
         ({"shares": {"train": float("nan"), "val": 1.0}}, "expected shares above 0"),
         ({}, "3 splits are to be drawn from 1 sequence(s), .* give dataset.block"),
         ({"block": 10}, "3 splits are to be drawn from 2 block(s)"),

@@ -249,8 +249,8 @@ def test_labels_of_another_shape_are_refused(root: Path, hw: tuple[int, int]) ->
     with pytest.raises(InputError) as caught:
         dataset.read("seq_00_day_00_1570_0000")
     assert str(caught.value) == (
-        f"{path} is {hw[0]}x{hw[1]} pixels and its frame 13x26, which is another aspect "
-        "ratio; use the label of the whole frame."
+        f"{path} has {hw[0]}x{hw[1]} pixels but its frame 13x26, which is another aspect "
+        "ratio. Use the label of the whole frame."
     )
 
 
@@ -288,7 +288,7 @@ def test_fingerprint(root: Path, tmp_path: Path) -> None:
 
 
 def test_wrong_roots(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"dataset.root: there is no folder '/nowhere'"):
+    with pytest.raises(InputError, match=r"dataset.root: the folder '/nowhere' does not exist"):
         Freiburg("/nowhere")
     with pytest.raises(InputError, match="holds neither the folder train nor test"):
         Freiburg(str(tmp_path))
@@ -303,7 +303,7 @@ def test_wrong_roots(tmp_path: Path) -> None:
         ({"thermal_range": (23700, 21800)}, r"dataset.thermal_range: expected counts 0 <= low"),
         ({"thermal_range": (0, 65536)}, r"got \[0, 65536\]"),
         ({"ignored_test": ("ignored",)}, "dataset.ignored_test: 'ignored' .* mean 'ignore'"),
-        ({"unscored": ("void",)}, "dataset.unscored: 'void' is not a choice"),
+        ({"unscored": ("void",)}, "dataset.unscored: 'void' is not a valid choice"),
         ({"num_classes": 13}, "num_classes is 13 but dataset.classes has 14"),
     ],
 )
@@ -356,7 +356,8 @@ def test_the_share_of_clipped_counts(root: Path) -> None:
     assert split.thermal == (3 * 198, 3 * 18, 3 * 5, 3 * 2, 21799, 23701)
     assert (
         "split train_night: 9.09% of the thermal pixels are 0, 2.53% lie below and 1.01% above "
-        "dataset.thermal_range=[21800, 23700]; the others run from 21799 to 23701." in report.notes
+        "dataset.thermal_range=[21800, 23700]; the others range from 21799 to 23701."
+        in report.notes
     )
     assert not any("split train:" in note or "split test:" in note for note in report.notes)
 
@@ -376,8 +377,8 @@ def test_check_finds_each_problem_once(root: Path) -> None:
     # A frame of training under the same stamp as one for testing; its thermal lacks the zero.
     files.write_training(root, "seq_00_day/01", "1579_009")
     assert list(check_dataset(reader(root)).problems) == [
-        f"2 files belong to no image of a split, the first is {val.thermal}.",
-        "splits test_day and train_day share 1 frames by their time stamps, the first is "
+        f"2 files belong to no image of a split; the first is {val.thermal}.",
+        "splits test_day and train_day share 1 frames by their time stamps; the first is "
         "'test_day_1579_0090', which is 'seq_00_day_01_1579_009'.",
     ]
 

@@ -84,7 +84,7 @@ def test_reads_the_layout_of_ms_uda(tmp_path: Path) -> None:
     )
     report = check_dataset(dataset)
     assert report.problems == ()
-    assert report.notes[0].startswith("no list is read: all labels on disk are divided")
+    assert report.notes[0].startswith("no list is used: all labels on disk are divided")
     assert dataset.title == "KP in the layout of MS-UDA, splits from set numbers"
     (root / "val_day_rgb.txt").write_text("set00_V000_visible_I00050.png\n")
     (root / "val_night_th.txt").write_text("set09_V000_lwir_I00184.png\n")
@@ -128,7 +128,9 @@ def test_source_of_the_splits(root: Path) -> None:
     assert KP(str(root), lists="files").lists == "files"
     with pytest.raises(InputError, match=r"dataset.splits.train: there is no list '\S+mine.txt'"):
         KP(str(root), splits={"train": "mine.txt"}).names("train")
-    with pytest.raises(InputError, match=r"splits names lists but dataset.lists=sets reads none"):
+    with pytest.raises(
+        InputError, match=r"splits names lists, but dataset.lists=sets does not use lists"
+    ):
         KP(str(root), splits={"train": "mine.txt"}, lists="sets")
 
 
@@ -274,11 +276,11 @@ def test_check_of_a_sound_copy(root: Path) -> None:
     }
     assert report.notes[0] == "splits are read from the lists train.txt, val.txt, test.txt."
     assert (
-        "split train has 2 day and 1 night images, the official list has 261 and 238 (499 in all)."
-        in report.notes
+        "split train has 2 day and 1 night images, but the official list has 261 and 238 (499 in "
+        "total)." in report.notes
     )
     assert len(report.notes) == 5
-    assert report.notes[-1].startswith("images are 16x24, the original ones 512x640")
+    assert report.notes[-1].startswith("images are 16x24, but the original images are 512x640")
     assert dataset.title == "KP in the layout of the CRM release, splits from list files"
     assert len(check_dataset(KP(str(root), name="own")).notes) == 1
 
@@ -309,14 +311,14 @@ def test_check_finds_each_problem_once(root: Path) -> None:
     for text in (
         f"split val lists '{VAL[0]}' 2 times.",
         f"split val_day lists '{VAL[0]}' 2 times.",
-        f"splits train and test share 1 names, the first is '{TRAIN[1]}'.",
-        f"splits train_day and train_night share 1 names, the first is '{TRAIN[2]}'.",
+        f"splits train and test share 1 names; the first is '{TRAIN[1]}'.",
+        f"splits train_day and train_night share 1 names; the first is '{TRAIN[2]}'.",
         f"split train_day lists '{TRAIN[2]}', which is a night image.",
-        "split train is not train_day and train_night together: 1 names are in one of them alone, "
-        f"the first is '{TRAIN[1]}'.",
-        "1 labels have names without a set, the first is '00001D.png'.",
-        f"1 files belong to no image of a split, the first is {root}/labels/{TEST[3]}.png.",
-        f"splits train and test_day share 1 names, the first is '{TRAIN[1]}'.",
+        "split train is not the union of train_day and train_night: 1 names are missing on one "
+        f"side; the first is '{TRAIN[1]}'.",
+        "1 labels have names without a set; the first is '00001D.png'.",
+        f"1 files belong to no image of a split; the first is {root}/labels/{TEST[3]}.png.",
+        f"splits train and test_day share 1 names; the first is '{TRAIN[1]}'.",
     ):
         assert sum(text in problem for problem in found) == 1, text
     assert len(found) == 9

@@ -240,7 +240,9 @@ def test_skip_with_nothing_left(dataset: MFNet) -> None:
 @pytest.mark.parametrize("cache", ["", " ", "none", "None", "null", "false", False])
 def test_invalid_cache_folder_is_refused(cache: object) -> None:
     """They would be folders where the command was typed."""
-    sentence = rf"^data\.cache: {cache!r} is not a folder; expected auto or a folder \(\./NAME .*"
+    sentence = (
+        rf"^data\.cache: {cache!r} is not a folder; expected auto or a folder \(write \./NAME .*"
+    )
     with pytest.raises(InputError, match=sentence):
         settings(cache=cache)
     for known in (None, "auto", "./none", "/fast/disk"):
@@ -250,7 +252,7 @@ def test_invalid_cache_folder_is_refused(cache: object) -> None:
 @pytest.mark.parametrize(
     ("workers", "ahead", "gpu"), [(0, None, True), (2, 5, True), (2, 5, False)]
 )
-def test_what_the_loader_is_asked_for(
+def test_arguments_of_the_loader(
     dataset: MFNet, monkeypatch: pytest.MonkeyPatch, workers: int, ahead: int | None, gpu: bool
 ) -> None:
     """Batches ahead of the one that is used, and pinned where there is a GPU to copy them to."""

@@ -55,7 +55,7 @@ def test_known_pixel(tmp_path: Path, png) -> None:
     assert sample.label.tolist() == [[8, 8, 8], [8, 8, 8]]
 
 
-def test_layout_is_found_or_as_configured(write_mfnet, expected_pair, png) -> None:
+def test_layout_is_detected_or_as_configured(write_mfnet, expected_pair, png) -> None:
     root = write_mfnet({"train": ["00001D"]}, layout="folders")
     with pytest.raises(InputError, match=r"does not hold the folders images\+labels"):
         MFNet(str(root), layout="packed")
@@ -88,7 +88,7 @@ def test_day_and_night(write_mfnet) -> None:
     names = ("00001D", "00001N", "00001D_flip", "00001N_flip")
     assert dataset.nights(names) == (False, True, False, True)
     assert dataset.nights(("frame7",)) is None
-    with pytest.raises(InputError, match="'frame7' has no time of day"):
+    with pytest.raises(InputError, match="'frame7' does not state a time of day"):
         dataset.nights((*names, "frame7"))
 
 
@@ -151,14 +151,14 @@ def test_check_finds_each_problem_once(write_mfnet, expected_pair, png, capsys) 
     found = problems(root)
     for text in (
         "labels/00011D.png is missing",
-        "split train: 'odd' is not five digits and D or N",
+        "split train: 'odd' is not five digits followed by D or N",
         "split val lists '00003N' 2 times",
         "split val lists 1 mirrored copies",
-        "splits train and val share 1 names, the first is '00003N'",
+        "splits train and val share 1 names; the first is '00003N'",
         "split test_day lists '00002N', which is a night image",
         "split test_night lists '00004D', which is a day image",
         "splits test_day and test_night share 1 names",
-        "3 files belong to no image of a split, the first is",
+        "3 files belong to no image of a split; the first is",
     ):
         assert sum(text in problem for problem in found) == 1, text
     assert len(found) == 9
@@ -190,8 +190,8 @@ def test_check_notes_numbers_and_sizes(write_mfnet) -> None:
     write_mfnet({"val": ["00005N"]}, hw=(12, 16))
     report = check_dataset(MFNet(str(root)))
     assert (
-        "split train has 1 day and 1 night images, the official list has 410 and 374 (784 in all)."
-        in report.notes
+        "split train has 1 day and 1 night images, but the official list has 410 and 374 (784 in "
+        "total)." in report.notes
     )
     assert any("differ in size (12x16, 24x32)" in note for note in report.notes)
     own = check_dataset(MFNet(str(root), name="own"))
@@ -222,7 +222,10 @@ def test_check_of_another_class_is_refused() -> None:
 def test_check_of_real_pairs(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(SHARED / "mfnet200", test="val.txt") == 0
     output = capsys.readouterr().out
-    assert "split train has 50 day and 50 night images, the official list has 410 and 374" in output
+    assert (
+        "split train has 50 day and 50 night images, but the official list has 410 and 374"
+        in output
+    )
     guardrail = next(line for line in output.splitlines() if "guardrail" in line)
     assert "(7)" in guardrail  # in training, and absent from validation
     assert "0.000% (0)" in guardrail

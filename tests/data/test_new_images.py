@@ -116,7 +116,7 @@ def test_no_pair_is_refused_with_folder_content(tmp_path: Path) -> None:
             ("rgb/1.jpg would be ", "ir/1_ir.tif, but ", "/ir holds other_ir.tif. Expected"),
         ),
         (("rgb/1.bmp", "rgb/1.tif", "ir/1_ir.tif"), ("would both be called '1'",)),
-        (("rgb/1.bmp", "ir/1_ir.png", "ir/1_ir.bmp"), ("may both be the thermal image of one",)),
+        (("rgb/1.bmp", "ir/1_ir.png", "ir/1_ir.bmp"), ("could both be the thermal image of one",)),
     ):
         sentence = why(*files)
         assert all(word in sentence for word in words), sentence

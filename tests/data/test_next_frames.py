@@ -134,7 +134,7 @@ SPOILED: dict[str, tuple[bytes | None, str]] = {
     "above the image": (saved(moved((0, 0), (-1, 0))), "leads out of the first frame of 6x8"),
     "below the image": (saved(moved((5, 7), (0.6, 0))), "leads out of the first frame"),
     "missing": (None, "is missing"),
-    "cut short": (saved(still())[:100], "cannot be read"),
+    "truncated": (saved(still())[:100], "cannot be read"),
     "empty": (b"", "cannot be read"),
     "pickled": (saved(np.array([{}], object)), "cannot be read"),
     "archive": (saved(still(), np.savez), "flow"),

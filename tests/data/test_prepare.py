@@ -164,9 +164,9 @@ def twice(source: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (without_pair, r"2 files that lists name .* images/00002N.png, of .*train"),
+        (without_pair, r"2 listed files .* images/00002N.png, of .*train"),
         (without_lists, r"source: there is none of train\.txt, .*lists=\.\.\."),
-        (with_outside_line, "2 files that lists name are not in"),
+        (with_outside_line, "2 listed files are not in"),
         (twice, r"several times \(a/, b/\)"),
         (shutil.rmtree, "source: there is no file or folder"),
     ],
@@ -180,7 +180,7 @@ def test_incomplete_mfnet_is_refused(
     assert not out.exists(), "nothing is begun"
 
 
-def test_data_set_is_found_three_folders_deep(mfnet: Path, tmp_path: Path, out: Path) -> None:
+def test_data_set_three_folders_deep_is_prepared(mfnet: Path, tmp_path: Path, out: Path) -> None:
     shutil.move(mfnet, tmp_path / "a" / "b" / "c" / "d")
     assert call("mfnet", tmp_path / "a", out) == 0
     refused("does not hold the folders train", "pst900", tmp_path / "a", tmp_path / "other")
@@ -419,7 +419,7 @@ def test_repeated_command_compares_every_byte(
     mfnet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], out: Path
 ) -> None:
     label = mfnet / "labels" / "00002N.png"
-    write_stored(label, 1)
+    write_uncompressed(label, 1)
     assert call("mfnet", mfnet, out) == 0
     text = capsys.readouterr().out
     assert "0 problem(s)" in text
@@ -428,15 +428,15 @@ def test_repeated_command_compares_every_byte(
     (out / "notes.txt").write_text("mine")
     before, length = state(out), label.stat().st_size
     assert call("mfnet", mfnet, out) == 0
-    write_stored(label, 2)
+    write_uncompressed(label, 2)
     assert label.stat().st_size == length
-    refused(r"differs .* in 1 files, the first is .*labels/00002N", "mfnet", mfnet, out)
+    refused(r"differs .* in 1 files; the first is .*labels/00002N", "mfnet", mfnet, out)
     (out / "images" / "00001D.png").unlink()
     refused("differs .* in 2 files", "mfnet", mfnet, out)
     assert {path: before[path] for path in files_in(out)} == state(out)
 
 
-def write_stored(path: Path, value: int) -> None:
+def write_uncompressed(path: Path, value: int) -> None:
     """A label of one class whose length does not depend on it: PNG without compression."""
     label = np.full((6, 8), value, np.uint8)
     assert cv2.imwrite(str(path), label, [cv2.IMWRITE_PNG_COMPRESSION, 0])
@@ -451,7 +451,7 @@ def test_other_files_in_out_are_refused(tmp_path: Path, out: Path) -> None:
     for kind in ("rgb", "thermal", "labels"):
         (source / "train" / kind / f"{pst900_files.TRAIN[0]}.png").unlink()
     before = state(out)
-    refused(r"^out: .* in 3 files, the first is .*train/labels/", "pst900", source, out)
+    refused(r"^out: .* in 3 files; the first is .*train/labels/", "pst900", source, out)
     assert state(out) == before
 
 
@@ -486,7 +486,7 @@ def test_too_small_disk_is_refused(
     monkeypatch.setattr(
         copying.shutil, "disk_usage", lambda path: usage._replace(free=copying.SPARE)
     )
-    refused(r"GB are to be copied to .* has 0\.02 GB left", "mfnet", mfnet, out)
+    refused(r"GB must be copied to .* has 0\.02 GB left", "mfnet", mfnet, out)
     assert list(tmp_path.glob("*out*")) == []
     monkeypatch.undo()
 
@@ -576,7 +576,7 @@ def test_damaged_archives(mfnet: Path, tmp_path: Path, out: Path) -> None:
 
 
 def test_arguments_without_effect_are_refused(mfnet: Path, tmp_path: Path, out: Path) -> None:
-    refused(r"dataset: 'mfnt' is not a choice; did you mean 'mfnet'", "mfnt", mfnet, out)
+    refused(r"dataset: 'mfnt' is not a valid choice; did you mean 'mfnet'", "mfnt", mfnet, out)
     refused(r"labels has no effect for dataset=mfnet", "mfnet", mfnet, out, labels=mfnet)
     refused(r"lists has no effect for dataset=pst900", "pst900", mfnet, out, lists=mfnet)
     with pytest.raises(InputError, match=r"'sources' has no effect here; did you mean 'source'"):

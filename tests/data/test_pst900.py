@@ -115,7 +115,7 @@ def test_wrong_roots_are_refused(root: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="give the folder into which the archive was unpacked"):
         PST900(str(tmp_path / "empty" / "deep"))
     flat = write_lists(tmp_path / "a" / "flat", {"all": TRAIN})
-    with pytest.raises(InputError, match=r"neither train.txt nor test.txt says which image"):
+    with pytest.raises(InputError, match=r"neither train.txt nor test.txt. Write these lists"):
         PST900(str(flat))
 
 
@@ -152,13 +152,13 @@ def test_check_notes(root: Path) -> None:
     found = notes(root)
     for start, note in zip(
         (
-            "split val is the test part, as in the CRM release: a checkpoint chosen on it",
+            "split val is the test part, as in the CRM release, so the best checkpoint is selected",
             "split test has 1 of bag 21, 1 of bag 25; the archive has 40 of bag 21, 59 of bag 22,",
-            "split train has 3 images, the archive has 597.",
-            "split test has 2 images, the archive has 288.",
-            "images are 9x16, the original ones 720x1280: scores of resized",
-            "split train: 11.11% of the thermal pixels are 0, which those without a measurement "
-            "are; the others run from 3 to 200.",
+            "split train has 3 images, but the archive has 597.",
+            "split test has 2 images, but the archive has 288.",
+            "images are 9x16, but the original images are 720x1280. Scores on resized",
+            "split train: 11.11% of the thermal pixels are 0, which marks pixels without a "
+            "measurement; the others range from 3 to 200.",
             "split test: 100.00% of the thermal pixels are 0",
         ),
         found,
@@ -196,8 +196,8 @@ def test_check_finds_each_problem_once(root: Path, tmp_path: Path) -> None:
     assert dataset.read(TRAIN[2]).name == TRAIN[2]
     for text in (
         f"both train and test have an image called '{TRAIN[0]}'",
-        f"splits train and test share 1 names, the first is '{TRAIN[0]}'.",
-        f"3 files belong to no image of a split, the first is {root}/train/labels/{TRAIN[1]}.png.",
+        f"splits train and test share 1 names; the first is '{TRAIN[0]}'.",
+        f"3 files belong to no image of a split; the first is {root}/train/labels/{TRAIN[1]}.png.",
     ):
         assert sum(text in line for line in check_dataset(dataset).problems) == 1, text
     assert len(check_dataset(dataset).problems) == 3
@@ -205,5 +205,5 @@ def test_check_finds_each_problem_once(root: Path, tmp_path: Path) -> None:
     write_triple(flat, "1_bag2_x")
     assert check_dataset(PST900(str(flat))).problems == (
         f"split test lists '{TEST[0]}' 2 times.",
-        f"3 files belong to no image of a split, the first is {flat}/labels/1_bag2_x.png.",
+        f"3 files belong to no image of a split; the first is {flat}/labels/1_bag2_x.png.",
     )

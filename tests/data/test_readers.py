@@ -75,7 +75,7 @@ def test_reader_reaches_a_worker_and_refuses_other_splits(kind: str, tmp_path: P
 
 @pytest.mark.parametrize("reader", READERS.values())
 def test_wrong_roots_and_numbers_are_refused(reader: type[FileDataset], tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="there is no folder '/nowhere'"):
+    with pytest.raises(InputError, match="the folder '/nowhere' does not exist"):
         reader("/nowhere")
     with pytest.raises(InputError, match=r"dataset\.(root|num_classes)"):
         reader(str(tmp_path))

@@ -132,11 +132,11 @@ def last_two(folder: Path) -> bytes:
 
 
 @pytest.mark.parametrize("how", ["damaged", "missing", "best"])
-def test_the_state_before_takes_the_place_of_a_damaged_one(tmp_path: Path, how: str) -> None:
+def test_damaged_state_is_replaced_by_the_previous_one(tmp_path: Path, how: str) -> None:
     whole, folder = last_two(tmp_path), tmp_path / "run"
     if how == "best":  # of step 4, as the state before is: there is nothing to fall back to
         damage(folder / "best.pt")
-        with pytest.raises(RunError, match=r"4/best\.pt cannot be read.*no better.*remove"):
+        with pytest.raises(RunError, match=r"4/best\.pt cannot be read.*damaged too.*remove"):
             Checkpoints(folder).load()
         return
     if how == "damaged":
@@ -171,7 +171,9 @@ def test_two_damaged_states_are_one_sentence(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     damage(folder / "last.pt")
     damage(folder / "last_previous.pt")
-    with pytest.raises(RunError, match=r"last\.pt cannot be read.*before it is no better.*remove"):
+    with pytest.raises(
+        RunError, match=r"last\.pt cannot be read.*previous checkpoint .* is damaged too.*remove"
+    ):
         Checkpoints(folder).load()
 
 
@@ -196,6 +198,7 @@ def test_files_are_copied_where_there_are_no_links(
 
     monkeypatch.setattr(os, "link", refuse)
     agree(tmp_path, run(tmp_path, RISING))
+    assert (tmp_path / "best.pt").stat().st_nlink == 1, "a copy and not a link"
 
 
 def test_a_run_of_before_resumes(tmp_path: Path) -> None:
@@ -215,5 +218,7 @@ def test_a_run_of_before_resumes(tmp_path: Path) -> None:
 def test_weights_of_another_step_are_refused(tmp_path: Path) -> None:
     run(tmp_path, RISING)
     assert Checkpoints(tmp_path).load_best(4)
-    with pytest.raises(RunError, match=r"is of step 4, the best evaluation of this run of step 2"):
+    with pytest.raises(
+        RunError, match=r"is of step 4, but the best evaluation of this run is of step 2"
+    ):
         Checkpoints(tmp_path).load_best(2)

@@ -41,7 +41,7 @@ def test_fix_threads_refuses_what_would_take_fewer(
 ) -> None:
     monkeypatch.setenv(name, value)
     if is_refused:
-        with pytest.raises(InputError, match=rf"{name}={value} .*trainer.threads=2.*unset it"):
+        with pytest.raises(InputError, match=rf"{name}={value} .*trainer.threads=2.*Unset"):
             fix_threads(2)
     else:
         fix_threads(2)

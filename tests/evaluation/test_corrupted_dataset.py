@@ -35,7 +35,9 @@ def shown(data: CorruptedDataset, names: Sequence[str]) -> list[str]:
         (DELAYED, 4, [0, 0, 0, 0, 0, 1, 2]),
     ],
 )
-def test_late_thermal_is_of_earlier_frame(kind: OfTime, severity: int, expected: list[int]) -> None:
+def test_late_thermal_is_that_of_a_previous_frame(
+    kind: OfTime, severity: int, expected: list[int]
+) -> None:
     names = tuple(f"{number:02d}" for number in range(7))
     data = CorruptedDataset(Recorded(names, by_night=False), kind, severity, split="test")
     assert shown(data, names) == [names[number] for number in expected]
@@ -121,9 +123,9 @@ def test_settings_leave_out_the_ladder() -> None:
 @pytest.mark.parametrize(
     ("kind", "severity", "sentence"),
     [
-        (NOISE, 256, "must lie in"),
-        (NOISE, -1, "must lie in"),
-        (FROZEN, 1, "1 is no corruption; give 2 or more"),
+        (NOISE, 256, "must be between"),
+        (NOISE, -1, "must be between"),
+        (FROZEN, 1, "1 changes nothing; give 2 or more"),
         (FROZEN, 2.5, "counts frames: expected 1, 2, 3"),
         (DELAYED, float("inf"), "counts frames"),
         (DELAYED, float("nan"), "counts frames"),
@@ -141,7 +143,7 @@ def test_frames_of_two_sizes_are_refused() -> None:
     data = CorruptedDataset(Recorded(sizes={"00003D": (60, 80)}), DELAYED, 1, split="test")
     with pytest.raises(InputError, match=r"'00004D' \(120x160 pixels\) .* '00003D' \(60x80 pixels"):
         data.read("00004D")
-    with pytest.raises(InputError, match="'00009D' is not of split 'test', whose order says"):
+    with pytest.raises(InputError, match="'00009D' is not in split 'test', whose order determines"):
         data.read("00009D")
     # Corruptions of pixels need no order.
     assert CorruptedDataset(Recorded(), NOISE, 8, split="test").read("00009D").name == "00009D"

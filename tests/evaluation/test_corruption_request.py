@@ -121,11 +121,16 @@ def test_identity_of_a_request() -> None:
     ("name", "words", "severity", "sentence"),
     [
         ("occludd", [], "0.5", "did you mean 'occluded'"),
-        ("occluded", [], "", "severity=: corruption=occluded needs a number .share of blocks., "),
+        (
+            "occluded",
+            [],
+            "",
+            "severity=: corruption=occluded requires a number .share of blocks., ",
+        ),
         ("occluded", [], "half", "for example one of 0.1, 0.25, 0.5, 0.75"),
-        ("occluded", [], "nan", "needs a number"),
-        ("occluded", [], "2", "must lie in"),
-        ("removed:rgb", [], "0.5", "can only be 1"),
+        ("occluded", [], "nan", "requires a number"),
+        ("occluded", [], "2", "must be between"),
+        ("removed:rgb", [], "0.5", "must be 1"),
         ("removed", [], "1", "'corruption.image' has no value"),
         ("removed:both", [], "1", "'corruption.image'"),
         ("frozen:rgb", [], "2", "'corruption.image' is not a setting of"),
@@ -133,7 +138,7 @@ def test_identity_of_a_request() -> None:
         ("occluded", ["corruption.block=big"], "0.5", "'corruption.block'"),
         ("occluded", ["corruption.block=["], "0.5", "corruption.block cannot be read as YAML"),
         ("occluded", ["corruption.seed=x"], "0.5", "whole number of at least 0"),
-        ("noise", ["corruption.severities=[4,2]"], "3", "must rise from above 0"),
+        ("noise", ["corruption.severities=[4,2]"], "3", "must be rising numbers above 0"),
     ],
 )
 def test_bad_request_is_refused(name: str, words: list[str], severity: str, sentence: str) -> None:
@@ -149,5 +154,7 @@ def test_choose_corruptions() -> None:
         choose_corruptions("blur,froze", [])
     with pytest.raises(InputError, match="'blur' is given twice"):
         choose_corruptions("blur,blur:both", [])
-    with pytest.raises(InputError, match="'corruption.block' is a key of one corruption, but 14"):
+    with pytest.raises(
+        InputError, match="'corruption.block' is a setting of a single corruption, but 14"
+    ):
         choose_corruptions("all", ["corruption.block=8"])

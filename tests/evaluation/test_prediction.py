@@ -57,7 +57,7 @@ def test_view_of_defaults_to_the_source_domain(view: str | None, seen: str) -> N
     session = session_of({"view": view})
     assert view_of(session) == view_of(session, None) == seen
     assert view_of(session, "thermal") == "thermal"
-    with pytest.raises(InputError, match="modality: 'rgbt' is not a choice"):
+    with pytest.raises(InputError, match="modality: 'rgbt' is not a valid choice"):
         view_of(session, "rgbt")
 
 
@@ -76,7 +76,7 @@ def test_heads_of_unlisted_images() -> None:
     for requested, head in (("source", "day"), ("target", "dark")):
         assert heads_of(session, "rgb", requested)(("mine", "night")) == (head, head)
     assert session.dataset.calls == 0
-    with pytest.raises(InputError, match=r"night, so no head can be chosen; set head=source"):
+    with pytest.raises(InputError, match=r"night, so no head can be selected. Set head=source"):
         heads_of(session, "rgb")(("mine",))
     alone = session_of({"view": "rgb"})
     assert heads_of(alone, "rgb")(("mine", "yours")) == (None, None)
@@ -140,7 +140,12 @@ def test_decode_ahead_decodes_the_requested_splits(
         dataset.read("00004N")
 
 
-def test_decode_ahead_without_cache_reads_nothing(write_mfnet) -> None:
+def test_decode_ahead_without_cache_reads_nothing(
+    write_mfnet, capsys: pytest.CaptureFixture[str]
+) -> None:
     dataset = MFNet(str(write_mfnet({"train": ["00001D"]})))
     (dataset.root / "images" / "00001D.png").unlink()
     decode_ahead(SimpleNamespace(dataset=dataset), "train")
+    assert capsys.readouterr().err == "", "no progress bar"
+    with pytest.raises(InputError, match="00001D.png is missing"):
+        dataset.read("00001D")

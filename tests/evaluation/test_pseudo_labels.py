@@ -170,7 +170,7 @@ def test_threshold_zero_keeps_all_and_one_out_of_range_is_refused(
     written(session, tmp_path / "all", threshold=0)
     assert np.array_equal(image(tmp_path / "all" / "labels" / f"{NAMES[0]}.png"), WHERE)
     for wrong in (-0.1, 1.1):
-        with pytest.raises(InputError, match=r"threshold must lie in \[0, 1\]"):
+        with pytest.raises(InputError, match=r"threshold must be between 0 and 1"):
             written(session, tmp_path / "never", threshold=wrong)
 
 
@@ -220,7 +220,7 @@ def two_heads(tested_head: str) -> Domains:
         ("own", "target", "target", 2, 2),
     ],
 )
-def test_the_head_that_is_asked_predicts_and_is_written_down(  # noqa: PLR0913 - a case and places
+def test_requested_head_predicts_and_is_recorded(  # noqa: PLR0913 - a case and places
     session: Session,
     tmp_path: Path,
     tested: str,
@@ -248,9 +248,7 @@ def test_the_view_and_the_mode_of_the_network(session: Session, tmp_path: Path) 
     assert np.array_equal(image(tmp_path / "out" / "labels" / f"{NAMES[2]}.png"), WHERE + 2)
 
 
-def test_classes_are_mapped_after_the_most_probable_is_found(
-    session: Session, tmp_path: Path
-) -> None:
+def test_classes_are_mapped_after_the_argmax(session: Session, tmp_path: Path) -> None:
     # 0 and 3 become bump. Where 3 is predicted with 0.3, both together have 0.3 + 0.7 / 8.
     label_map = LabelMap(
         num_source=9, targets=CLASSES, groups={"bump": (0, 3), "car": (1, 2, 4, 5, 6, 7, 8)}
@@ -346,7 +344,7 @@ def test_other_settings_are_refused(session: Session, root: Path, tmp_path: Path
         "label_map (None, now": {"label_map": other_ids},
     }
     for said, changes in others.items():
-        with pytest.raises(InputError, match="was begun with pseudo-labels of another") as raised:
+        with pytest.raises(InputError, match="holds pseudo-labels of another") as raised:
             written(session, out, **changes)
         assert said in str(raised.value)
     session.model.shift.data += 1
@@ -447,7 +445,7 @@ def test_masks_of_queries_give_shares(session: Session, batch: Any) -> None:
     assert nothing.max() == 0
 
 
-def test_heads_are_asked_by_image(session: Session, batch: Any) -> None:
+def test_each_image_is_predicted_by_its_head(session: Session, batch: Any) -> None:
     full = next(batch).to("cpu")
     found = probabilities(Heads(), full, session.fabric, heads=("day", "dark"))
     assert found.argmax(1)[:, 0, 0].tolist() == [1, 2]

@@ -132,7 +132,7 @@ def test_a_diamond_has_the_rectangle_of_half_its_size() -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_nothing_larger_is_found_by_looking(seed: int) -> None:
+def test_no_rectangle_of_a_grid_search_is_larger(seed: int) -> None:
     views = random_views(10, seed)
     found = inner_rectangle(views, HW, "largest")
     for h, rectangle in zip(views, found, strict=True):
@@ -140,7 +140,7 @@ def test_nothing_larger_is_found_by_looking(seed: int) -> None:
         assert float(area(rectangle)) == pytest.approx(searched(h, HW), rel=1e-6)
 
 
-def test_nothing_larger_is_found_in_wild_views() -> None:
+def test_no_rectangle_is_larger_in_extreme_views() -> None:
     """Turns far beyond the paper's, and frames of other shapes."""
     for seed, hw in enumerate([(48, 64), (100, 30), (37, 211)]):
         generator = torch.Generator().manual_seed(seed)

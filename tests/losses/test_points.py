@@ -14,7 +14,7 @@ def source(seed: int = 0) -> Points:
 
 
 @pytest.mark.parametrize("count", [1, 3, 64])
-def test_draws_do_not_depend_on_how_many_sets_are_asked_for(count: int) -> None:
+def test_draws_do_not_depend_on_the_number_of_sets(count: int) -> None:
     together = source().loss(5, 3, count)
     one_by_one = source()
     pieces = [one_by_one.loss(n, 3, count) for n in (1, 3, 1)]

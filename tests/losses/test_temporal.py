@@ -197,10 +197,10 @@ class Recorded:
             self.frames.append(frame)
         self.warped = logits[2].softmax(1)
 
-    def deviation(self, key: str, found: Any) -> float:
+    def deviation(self, key: str, values: Any) -> float:
         """Largest difference from what is stored."""
         key = f"temporal_loss.{self.name}.{key}"
-        value = np.asarray(found)
+        value = np.asarray(values)
         if self.about[key]["stored"] == "sampled":
             count = self.about[key]["count"]
             value = value.ravel()[self.fill.sample_positions(key, value.size, count)]
@@ -241,11 +241,15 @@ def test_printed_numbers_of_a_small_case() -> None:
     first, second = (Frame(Output(scores, {}), batch, scores) for scores in logits)
     valid = torch.ones(1, 2, 3, dtype=torch.bool)
 
-    def found(which: str, form: str) -> dict[str, Tensor]:
+    def loss_parts(which: str, form: str) -> dict[str, Tensor]:
         loss = loss_of(second=which, form=form)
         return loss(first, second, first.logits.softmax(1), valid, NOTHING)
 
-    released = found("dice", "released") | found("con", "released") | found("con_acc", "released")
+    released = (
+        loss_parts("dice", "released")
+        | loss_parts("con", "released")
+        | loss_parts("con_acc", "released")
+    )
     expected = {
         "cross_entropy_1": 2.288202,
         "cross_entropy_2": 2.019732,
@@ -255,7 +259,7 @@ def test_printed_numbers_of_a_small_case() -> None:
         "con_acc": 0.325286,
     }
     assert {key: part.item() for key, part in released.items()} == pytest.approx(expected, abs=1e-6)
-    paper = found("con", "paper") | found("con_acc", "paper")
+    paper = loss_parts("con", "paper") | loss_parts("con_acc", "paper")
     assert paper["con"].item() == pytest.approx(0.892285, abs=1e-6)
     assert paper["con_acc"].item() == pytest.approx(0.992046, abs=1e-6)
     p = first.logits.softmax(1)

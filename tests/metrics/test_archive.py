@@ -45,7 +45,9 @@ def test_other_kinds_are_refused(tmp_path) -> None:
 def test_a_file_that_may_not_be_read_is_said(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     KIND.save(tmp_path / "a.npz", {})
     monkeypatch.setattr(os, "access", lambda path, mode: mode != os.R_OK)  # root may read anything
-    with pytest.raises(InputError, match="may not be read; change its permissions"):
+    with pytest.raises(
+        InputError, match="cannot be read: permission denied; change its permissions"
+    ):
         KIND.load(tmp_path / "a.npz")
 
 
@@ -93,11 +95,13 @@ def rewritten(path, change) -> None:
         (lambda a: {**a, "more": np.zeros(3)}, "'more' has the unexpected shape"),
         (lambda a: {**a, "names": np.arange(2)}, "'names' has the unexpected shape"),
         (lambda a: {k: v for k, v in a.items() if k != "night"}, "'night' is missing"),
-        (lambda a: {**a, "counts": a["counts"] + 1}, "its digest is another one"),
-        (lambda a: {**a, "unscored": np.array(["0", "1", "2"])}, "its digest is another one"),
+        (lambda a: {**a, "counts": a["counts"] + 1}, "its content does not match its digest"),
+        (lambda a: {**a, "unscored": np.array(["0", "1", "2"])}, (
+            "its content does not match its digest"
+)),
         (lambda a: {**{k: v for k, v in a.items() if k != "digest"}, "unscored": np.array(["x"])},
          "unscored: expected some of the classes"),
-        (lambda a: a | {f"n{i}": np.zeros(1) for i in range(40)}, "its directory is not one of"),
+        (lambda a: a | {f"n{i}": np.zeros(1) for i in range(40)}, "its directory is not that of"),
     ],
 )  # fmt: skip
 def test_another_content_than_the_kind_has_is_refused(tmp_path, change, reason) -> None:
@@ -116,7 +120,7 @@ def test_a_header_that_announces_more_than_there_is_allocates_nothing(tmp_path) 
     with zipfile.ZipFile(path) as old, zipfile.ZipFile(tmp_path / "d.npz", "w") as new:
         for name in old.namelist():
             new.writestr(name, content.getvalue() if name == "counts.npy" else old.read(name))
-    with pytest.raises(InputError, match="header announces 324000000 bytes, there are 0"):
+    with pytest.raises(InputError, match="header announces 324000000 bytes, but it has 0"):
         Counts.load(tmp_path / "d.npz")
 
 

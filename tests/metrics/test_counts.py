@@ -43,7 +43,7 @@ def test_sums_over_images_and_regions() -> None:
     assert counts.whole().dtype == np.int64
 
 
-def test_sums_do_not_overflow_the_stored_type() -> None:
+def test_sums_do_not_overflow_the_type_of_the_file() -> None:
     counts = example()
     huge = Counts(**{**vars(counts), "counts": np.full((3, 5, 2, 2), 2**30, np.int32)})
     assert huge.whole()[0, 0] == 15 * 2**30

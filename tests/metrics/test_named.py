@@ -81,9 +81,9 @@ def test_values_of_pairs_by_hand(metric: str, absent, expected: float) -> None:
     [
         ("class/carr", False, True, "no class 'carr'; did you mean 'car'"),
         ("region/3", False, True, "the counts have the regions 1 to 2"),
-        ("night/mIoU", False, False, "told apart"),
+        ("night/mIoU", False, False, "marked as day"),
         ("class/carr/TC", True, True, "no class 'carr'; did you mean 'car'"),
-        ("night/TC", True, False, "told apart"),
+        ("night/TC", True, False, "marked as day"),
         *((each, True, True, "score of single frames.*aligned2, of rgbt consistency")
           for each in ("mIoU", "Var", "class/car/acc", "class/car/region/2", "night/mIoU")),
         *((each, False, True, "score of pairs.*ring2.*rgbt consistency run=")

@@ -275,7 +275,7 @@ def test_counts_keep_their_convention_and_are_not_mixed(tmp_path: Path) -> None:
     ARCHIVE.save(path, {key: value for key, value in values.items() if key != "absent"})
     assert Counts.load(path).absent == "released"
     assert convention(both[1:]) == "exclude"
-    with pytest.raises(InputError, match="choose absent=released or absent=exclude"):
+    with pytest.raises(InputError, match="Choose absent=released or absent=exclude"):
         convention(both)
     with pytest.raises(ValueError, match="expected released or exclude, got 'zero'"):
         counts_of(absent="zero")

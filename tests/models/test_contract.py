@@ -218,45 +218,21 @@ def test_state_dicts_have_as_many_entries_as_released(yaml: str, entries: int) -
 @pytest.mark.parametrize(
     ("yaml", "shapes"),
     [
-        (
-            "mfnet",
-            {
-                "conv1_inf.conv.weight": (16, 1, 3, 3),
-                "conv2_2_rgb.bn.running_var": (48,),
-                "conv4_inf.conv1_left.conv.weight": (18, 16, 3, 3),
-                "conv5_rgb.conv3_right.conv.weight": (48, 96, 3, 3),
-                "decode4.conv.weight": (64, 132, 3, 3),
-                "decode1.conv.bias": (9,),
-            },
-        ),
+        ("mfnet", {"conv1_inf.conv.weight": (16, 1, 3, 3), "decode1.conv.bias": (9,)}),
         (
             "rtfnet_50",
             {
-                "encoder_thermal_conv1.weight": (64, 1, 7, 7),
-                "encoder_thermal_bn1.running_var": (64,),
-                "encoder_rgb_layer1.0.downsample.0.weight": (256, 64, 1, 1),
                 "encoder_thermal_layer4.2.conv3.weight": (2048, 512, 1, 1),
-                "deconv1.0.conv1.weight": (2048, 2048, 1, 1),
-                "deconv1.1.conv3.weight": (1024, 1024, 2, 2),
                 "deconv5.1.upsample.0.weight": (128, 9, 2, 2),
-                "deconv5.1.upsample.1.bias": (9,),
             },
         ),
         (
             "cmx_b0",
             {
-                "backbone.extra_patch_embed1.proj.weight": (32, 3, 7, 7),
-                "backbone.block1.0.attn.sr.weight": (32, 32, 8, 8),
                 "backbone.extra_block4.1.attn.kv.weight": (512, 256),
-                "backbone.block2.0.mlp.dwconv.dwconv.weight": (256, 1, 3, 3),
-                "backbone.norm3.bias": (160,),
-                "backbone.FRMs.0.channel_weights.mlp.2.weight": (64, 128),
                 "backbone.FRMs.3.spatial_weights.mlp.0.weight": (256, 512, 1, 1),
                 "backbone.FFMs.1.cross.cross_attn.kv2.weight": (128, 64),
-                "backbone.FFMs.2.channel_emb.channel_embed.4.running_mean": (160,),
                 "decode_head.linear_c4.proj.weight": (512, 256),
-                "decode_head.linear_fuse.0.weight": (512, 2048, 1, 1),
-                "decode_head.linear_pred.bias": (9,),
             },
         ),
     ],

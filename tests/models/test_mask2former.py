@@ -181,7 +181,7 @@ def test_cells_that_do_not_divide_are_named(grid: tuple[int, int]) -> None:
 
 
 @pytest.mark.parametrize("fp32", [True, False])
-def test_autocast_keeps_the_pixel_decoder_in_single_precision_if_asked(fp32: bool) -> None:
+def test_autocast_keeps_the_pixel_decoder_in_single_precision_on_request(fp32: bool) -> None:
     net = nano(pixel_decoder_fp32=fp32).train()
     seen: list[torch.dtype] = []
     net.sem_seg_head.pixel_decoder.layer_1.register_forward_hook(

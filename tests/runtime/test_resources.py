@@ -153,7 +153,9 @@ def test_an_image_that_does_not_fit_into_memory_is_not_called_damaged(
     limit = pages * resource.getpagesize() + 50 * 2**20
     resource.setrlimit(resource.RLIMIT_AS, (limit, before[1]))
     try:
-        with pytest.raises(MemoryError, match=r"a.png cannot be decoded, its pixels do not fit"):
+        with pytest.raises(
+            MemoryError, match=r"a.png cannot be decoded, because its pixels do not fit"
+        ):
             decode(path)
     finally:
         resource.setrlimit(resource.RLIMIT_AS, before)

@@ -151,13 +151,13 @@ def test_clusters_signal_more_than_once(tmp_path: Path, number: signal.Signals) 
 
 
 def test_an_error_after_a_signal_is_its_consequence() -> None:
-    def failing() -> None:
+    def raising() -> None:
         with deferred():
             send(signal.SIGTERM)
             raise RuntimeError("DataLoader worker exited unexpectedly")
 
     with pytest.raises(Stopped):
-        failing()
+        raising()
 
 
 def test_a_signal_between_two_evaluations_is_raised_at_the_next() -> None:

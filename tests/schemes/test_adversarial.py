@@ -344,9 +344,9 @@ NETWORK = network(False)
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "no probability": (
         {"verdict_loss": "cross_entropy", "target_value": -1.0},
-        r"must lie in .0, 1. with scheme.verdict_loss=cross_entropy, got 0 and -1",
+        r"must be between 0 and 1 with scheme.verdict_loss=cross_entropy, got 0 and -1",
     ),
-    "equal values": ({"target_value": 0.0}, "are both 0, so that the discriminator has nothing"),
+    "equal values": ({"target_value": 0.0}, "are both 0, but the discriminator requires"),
 }
 
 

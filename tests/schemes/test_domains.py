@@ -123,13 +123,13 @@ def test_accumulated_phases_equal_the_mean_of_both_batches(tmp_path: Path) -> No
         assert_same(model, values)
 
 
-def test_the_network_is_asked_for_view_and_head() -> None:
+def test_view_and_head_are_passed_to_the_network() -> None:
     model = network(True)
     list(labelled(model, True, "apart").phases(next(pairs()).to("cpu"), generator_of))
     assert model.calls == [(("rgb",), "day", True), (("thermal",), "dark", True)]
 
 
-def test_a_view_that_is_left_to_the_network_is_not_asked_for() -> None:
+def test_null_view_is_not_passed_to_the_network() -> None:
     model = network(False)
     scheme = labelled(model, False, "apart", view=None)
     list(scheme.phases(next(pairs()).to("cpu"), generator_of))

@@ -149,7 +149,7 @@ def test_circle_of_two_experiments_is_refused() -> None:
     words = ["+experiment=sh_adversarial", "model.weights=experiment:heatnet_rgb_only/last.pt"]
     words += ["domains.target.labels=experiment:sh_adversarial/best.pt"]
     with pytest.raises(
-        InputError, match="circle of upstream runs: sh_adversarial -> sh_adversarial"
+        InputError, match="cycle of upstream runs: sh_adversarial -> sh_adversarial"
     ):
         specify(composed(words), words)
 

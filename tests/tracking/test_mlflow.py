@@ -159,7 +159,7 @@ def unnoted(runs_dir: Path, name: str) -> RunFolder:
 @pytest.mark.parametrize(
     ("name", "content"), [('it\'s \\ "unnoted"', None), ("unnoted", ""), ("other", '{"uri": 3')]
 )
-def test_a_run_whose_id_was_not_noted_is_found_by_its_key(
+def test_run_without_noted_id_is_identified_by_its_key(
     runs_dir: Path,
     name: str,
     content: str | None,
@@ -347,7 +347,8 @@ def test_a_damaged_log_and_a_held_lock_do_not_halt_a_run(
         assert said.count("waiting for process") == 2, "at the start and at the end"
         assert said.count("cannot be used") == 1
         assert re.search(r"StoreBusyError: process \d+ on .* has held ", said)
-        assert f"rgbt.tracking.sync run={folder.path}` sends it later" in said
+        assert "To send it later: `" in said
+        assert f"rgbt.tracking.sync run={folder.path}`" in said
         # A sync of many runs waits once.
         assert code_of(sync.entry, [f"runs_dir={tmp_path}"]) == 1
         said = capsys.readouterr().err
@@ -421,9 +422,9 @@ def test_artifact_table_has_unique_first_column_and_summaries_first() -> None:
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        ([], "give either run=<run folder> or runs_dir=<folder of runs>"),
-        (["run=a", "runs_dir=b"], "give either run="),
-        (["runs_dir=/nowhere"], "no such folder"),
+        ([], "expected either run=<run folder> or runs_dir=<folder of runs>"),
+        (["run=a", "runs_dir=b"], "expected either run="),
+        (["runs_dir=/nowhere"], "does not exist"),
         (["run=/nowhere"], "not a run folder"),
     ],
 )
@@ -483,7 +484,7 @@ def test_a_password_that_is_not_kept_must_be_given(
 ) -> None:
     folder = RunFolder(tmp_path / "run")
     write_upload_state(folder, state)
-    with pytest.raises(InputError, match=rf"give {key}=\.\.\. with it"):
+    with pytest.raises(InputError, match=rf"give {key}=\.\.\. with the password"):
         sync.tracking_of(folder, sync.Options(run=folder.path))
     given = sync.Options(run=folder.path, **{key: "sftp://u:pw@h/files"})
     assert sync.tracking_of(folder, given).experiment == "e"

@@ -91,10 +91,10 @@ def test_warnings_say_what_made_it_and_what_to_type(
     warn_of_result(folder)
     warn_of_steps(folder, 40)
     assert capsys.readouterr().err == (
-        f"rgbt: This result was made by other code ({SAID}); fresh=true trains again and keeps "
-        "the old run.\n"
-        f"rgbt: warning: the first 40 steps were trained by other code ({SAID}); to train all "
-        f"steps by the present code, remove {folder} and rerun the command.\n"
+        f"rgbt: this result was made by other code ({SAID}). fresh=true trains the run "
+        "again and keeps the old result.\n"
+        f"rgbt: warning: the first 40 steps were trained by other code ({SAID}). To train all "
+        f"steps with the present code, remove {folder} and rerun the command.\n"
     )
     same = made_by(tmp_path / "same", NOW)
     warn_of_result(same)

@@ -102,7 +102,10 @@ def logged(tmp_path: Path) -> tuple[RunFolder, list[bytes]]:
     ("damage", "reason"),
     [
         (lambda a, b, c, d: [a, b[:30], b"\n", c, d], "line 2: Expecting property"),
-        (lambda a, b, c, d: [a, b.replace(b"0.05", b"0.07"), c, d], "line 2: its check sum is an"),
+        (
+            lambda a, b, c, d: [a, b.replace(b"0.05", b"0.07"), c, d],
+            "line 2: it does not match its checksum",
+        ),
         (lambda a, b, c, d: [a, b"\xff\n", c, d], "line 2: 'utf-8' codec"),
         (lambda a, b, c, d: [a, b'{"step": 20}\n', c, d], "line 2: kind: Field required"),
         (lambda a, b, c, d: [a, b, b, c, d], "line 3: step 20 comes after 20"),
@@ -247,7 +250,7 @@ def test_damaged_file_and_missing_folder_are_refused(
     path.write_text('{"skipped": [' + '"a", ' * 300_000 + '"a"]}')
     with pytest.raises(InputError, match="set RGBT_MAX_JSON_MB=2"):
         read_result(tmp_path)
-    with pytest.raises(InputError, match="no such folder"):
+    with pytest.raises(InputError, match="does not exist"):
         runs_in(tmp_path / "missing")
 
 

@@ -115,7 +115,7 @@ def test_labels_that_differ_still_do() -> None:
         ("95 % over images", False),
     ],
 )
-def test_words_are_told_from_numbers_keys_and_paths(cell: str, expected: bool) -> None:
+def test_words_are_distinguished_from_numbers_keys_and_paths(cell: str, expected: bool) -> None:
     assert is_text(cell) is expected
 
 

@@ -145,7 +145,7 @@ def test_pipeline_invalid_run_trains_nothing(run: Pipeline, name: str) -> None:
     training = Training(invalid=(name,))
     with pytest.raises(InputError) as raised:
         run("multi_head_night", training=training)
-    upstream_of = f"{name}, which is upstream of multi_head_night: "
+    upstream_of = f"upstream run {name} of multi_head_night: "
     assert (
         str(raised.value) == ("" if name == "multi_head_night" else upstream_of) + "does not fit."
     )
@@ -159,7 +159,7 @@ def test_pipeline_failed_upstream_run_ends_it(run: Pipeline, error: BaseExceptio
     with pytest.raises(type(error)) as raised:
         run("sh_adversarial", training=Training(refused=[error]))
     if isinstance(error, InputError):
-        assert str(raised.value) == "sh_source, which is upstream of sh_adversarial: no file."
+        assert str(raised.value) == "upstream run sh_source of sh_adversarial: no file."
 
 
 def test_upstream_run_is_named_as_a_run_of_its_own() -> None:
@@ -223,7 +223,10 @@ def test_run_reports_ignored_pretrained_and_takes_tags_of_the_environment(
     for experiment in ("sh_adversarial", "heatnet"):
         code, _, err = call(main, f"+experiment={experiment}", f"pretrained={file}")
         assert code == 0, err
-        ignored = f"rgbt: pretrained={file} is ignored: heatnet does not start from it.\n"
+        ignored = (
+            f"rgbt: pretrained={file} is ignored: the experiment heatnet does not use ImageNet "
+            "weights.\n"
+        )
         assert err == (ignored if experiment == "heatnet" else "")
     assert runs == [("sh_adversarial", {"row": "1"}), ("heatnet", {"row": "1"})]
 

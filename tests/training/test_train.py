@@ -15,7 +15,7 @@ from rgbt.tracking.run_folder import RunFolder
 from rgbt.training.train import Run, _show_again
 
 
-def told(
+def stderr_of(
     capsys: pytest.CaptureFixture[str], lines: list[tuple[str, dict[str, float]]], cache: str | None
 ) -> str:
     """What a run with these lines in its log says of waiting."""
@@ -34,16 +34,16 @@ def steps(*shares: float) -> list[tuple[str, dict[str, float]]]:
 
 def test_much_waiting_is_reported_with_what_helps(capsys: pytest.CaptureFixture[str]) -> None:
     # The median of 0.1, 0.5 and 0.9: one slow step, as the first always is, says nothing.
-    said = told(capsys, steps(0.9, 0.1, 0.5), None)
-    assert "50% of the time of a step was waiting for images; data.cache=auto" in said
-    said = told(capsys, steps(0.9, 0.1, 0.5), "auto")
+    said = stderr_of(capsys, steps(0.9, 0.1, 0.5), None)
+    assert "50% of the time of a step was spent waiting for images; data.cache=auto" in said
+    said = stderr_of(capsys, steps(0.9, 0.1, 0.5), "auto")
     assert "50%" in said
     assert "data.cache" not in said
     # Lines of before it was measured, and of no step.
     earlier = [("train", {"loss": 1.0}), ("val", {"wait_share": 0.9})]
-    assert "31%" in told(capsys, [*earlier, *steps(0.31)], None)
+    assert "31%" in stderr_of(capsys, [*earlier, *steps(0.31)], None)
     for lines in (steps(0.3, 0.3), steps(0.99, 0.1, 0.2), [], earlier):
-        assert told(capsys, lines, None) == ""
+        assert stderr_of(capsys, lines, None) == ""
 
 
 @pytest.mark.parametrize(
@@ -102,7 +102,7 @@ def test_steps_that_were_not_saved_are_named_on_resuming(
     prepared: Any = SimpleNamespace(session=SimpleNamespace(trainer=SimpleNamespace(log_every=1)))
     for saved, said in (
         (5, ""),
-        (2, "rgbt: steps 3 to 5 were not saved before and are repeated.\n"),
+        (2, "rgbt: steps 3 to 5 were not saved and are repeated.\n"),
     ):
         state = State(seed=0, step=saved, evaluated_step=saved)
         Run(prepared, folder, nothing, nothing)._truncate(state)

@@ -89,7 +89,7 @@ def test_labels_may_be_missing_and_carry_confidences() -> None:
     sure = [sample(number, confident=True) for number in range(3)]
     assert_equal(one_by_one(made, sure, 1), together(made, sure, 1))
     mixed = [sample(0), sample(1, confident=True)]
-    with pytest.raises(InputError, match="either all labels of one batch"):
+    with pytest.raises(InputError, match="all labels of one batch"):
         together(made, mixed, 0)
 
 

@@ -120,7 +120,7 @@ BROKEN = {
     "no number": (b"yaw,pitch,roll\n1,2,nan\n", "expected yaw,pitch,roll .* got '1,2,nan'"),
     "endless": (b"yaw,pitch,roll\n0,0,0\ninf,2,3\n", "expected yaw,pitch,roll .* got 'inf,2,3'"),
     "too steep": (b"yaw,pitch,roll\n0,0,0\n80,2,3\n", "yaw 80, pitch 2, roll 3 degrees leave no"),
-    "no text": (b"\xff\xfe\x00\x01" * 9, "consistency.sets"),
+    "is not UTF-8 text": (b"\xff\xfe\x00\x01" * 9, "consistency.sets"),
     "another encoding": ("yaw,pitch,roll\n1,2,3\n".encode("utf-16"), "consistency.sets"),
 }
 
@@ -143,5 +143,5 @@ def test_sets_without_a_split_to_measure_are_refused() -> None:
 def test_unknown_sets_are_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="'released_4' is no published set .*did you mean"):
         sets("released_4")
-    with pytest.raises(InputError, match="is no published set of angles and no file"):
+    with pytest.raises(InputError, match="is neither a published set of angles nor a file"):
         sets(str(tmp_path))

@@ -296,7 +296,7 @@ def test_released_images_are_whole_bytes_and_those_of_the_paper_are_not(make: An
 
 LITTLE = (
     r"view: yaw -?[0-9.]+, pitch -?[0-9.]+, roll -?[0-9.]+ degrees leave a rectangle of [0-9.]+ % "
-    r"of the frame, at least 10 % is needed; choose smaller ranges"
+    r"of the frame, but at least 10 % is required. Choose smaller ranges"
 )
 
 
@@ -305,10 +305,23 @@ LITTLE = (
     [
         ({"angles": "integer", "yaw": (-0.5, 3.0)}, "view.yaw must be .* whole degrees"),
         ({"angles": "integer", "yaw": (3.0, 3.0)}, "view.yaw must be .* low < high"),
-        ({"yaw": (-50.0, 50.0)}, "yaw -50, pitch -10, roll .* degrees leave no valid rectangle"),
-        ({"yaw": (-50.0, 50.0), "mode": "translation"}, "leave no valid rectangle"),
-        ({"yaw": (-50.0, 50.0), "mode": "rotation"}, "leave no valid rectangle"),
-        ({"yaw": (55.0, 60.0), "mode": "rotation"}, "yaw 55, .* degrees leave no valid rectangle"),
+        (
+            {"yaw": (-50.0, 50.0)},
+            "yaw -50, pitch -10, roll .* degrees leave no rectangle of the view without empty "
+            "pixels",
+        ),
+        (
+            {"yaw": (-50.0, 50.0), "mode": "translation"},
+            "leave no rectangle of the view without empty pixels",
+        ),
+        (
+            {"yaw": (-50.0, 50.0), "mode": "rotation"},
+            "leave no rectangle of the view without empty pixels",
+        ),
+        (
+            {"yaw": (55.0, 60.0), "mode": "rotation"},
+            "yaw 55, .* degrees leave no rectangle of the view without empty pixels",
+        ),
         ({"yaw": (-44.0, 44.0)}, LITTLE),
         ({"yaw": (-44.0, 44.0), "mode": "rotation"}, LITTLE),
         ({"yaw": (0.0, 44.0), "rectangle": "corners"}, LITTLE),

@@ -1,1 +1,1 @@
-"""The image cache: images are decoded once and then read from memory-mapped files."""
+"""Cache decoded images in memory-mapped files."""

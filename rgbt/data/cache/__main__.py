@@ -1,4 +1,4 @@
-"""Command that fills the image cache, or removes it.
+"""The command ``rgbt cache``, which fills or removes the image cache.
 
 rgbt cache dataset=mfnet dataset.root=... cache=auto    # fill it, show the size
 rgbt cache dataset=mfnet dataset.root=... remove=true   # and remove it
@@ -47,16 +47,16 @@ def progress_bars() -> Iterator[OnProgress]:
 
 @dataclass(frozen=True)
 class Options:
-    """Of the cache."""
+    """Options of the command."""
 
-    cache: Annotated[str, Help("auto, or the folder that holds caches")] = "auto"
+    cache: Annotated[str, Help("auto, or the folder for caches")] = "auto"
     remove: Annotated[
-        bool, Help("true: remove the cache, and those of former states of the same data set")
+        bool, Help("true: remove the cache of the data set and those of its former states")
     ] = False
 
 
 def main(options: Options, overrides: list[str]) -> int:
-    """Decode every split of a data set into the image cache and show its size, or remove it.
+    """Write every split of a data set to the image cache and print its size, or remove it.
 
     Overrides choose the data set: dataset=mfnet dataset.root=/data/MFNet
     """

@@ -3,7 +3,8 @@
 Decoding a PNG of 480x640 pixels takes ten milliseconds; a view of the map takes almost no time, and
 a crop of it reads only its own pages. Nothing is augmented here.
 
-A cache is a sub-folder, named by the data set and a hash of all that decides what is decoded:
+A cache is a sub-folder, named by the data set and a hash of everything that changes the decoded
+images:
 
     about.json   class, decoding settings, fingerprint and version, and the root then
     *.frames     `rgbt.data.cache.sample_map`, one per call that found names in no other file
@@ -54,9 +55,9 @@ FORMAT = 3
 ABOUT, LOCK = "about.json", "lock"
 
 NO_FOLDERS = ("", "none", "null", "true", "false", "yes", "no", "on", "off")
-"""Words that are not accepted as the name of a folder."""
+"""Words that are refused as the name of a folder."""
 
-WAYS_OUT = "or decode at every step with data.cache=null."
+WAYS_OUT = "or disable the cache with data.cache=null."
 
 
 def _silent(what: str, done: int, total: int) -> None:
@@ -77,8 +78,8 @@ def check_cache(key: str, cache: object) -> None:
         return
     if not isinstance(cache, str) or cache.strip().lower() in NO_FOLDERS:
         raise InputError(
-            f"{key}: {cache!r} is not a folder; expected auto or a folder (./NAME if that is its "
-            f"name), or omit {key}."
+            f"{key}: {cache!r} is not a folder; expected auto or a folder (write ./NAME for a "
+            f"folder of that name). Omit {key} to use no cache."
         )
 
 
@@ -105,7 +106,7 @@ class CachedDataset(DatasetWrapper):
 
     The cache keeps length, times and CRC-32 of each file of a sample. If only the times differ the
     bytes are compared, so a copy of the data set elsewhere uses the same cache. A file of the cache
-    in which a sample has changed, or which is damaged, is written anew as a whole.
+    with a changed sample, or a damaged one, is written again as a whole.
 
     Args:
         dataset: is decoded; its samples must not carry confidences.
@@ -123,7 +124,7 @@ class CachedDataset(DatasetWrapper):
     def ensure(self, names: tuple[str, ...], on_progress: OnProgress = _silent) -> None:
         """Decode those of `names` that are missing, changed or damaged, and use the cache for all.
 
-        A sample that cannot be decoded is left out; the next call tries again.
+        A sample that cannot be decoded is skipped; the next call tries again.
 
         Args:
             names: of any splits.
@@ -266,12 +267,12 @@ class CachedDataset(DatasetWrapper):
         return NewSample(replace(sample, name=name), sources)
 
     def _warn_of_others(self, cache: Path, about: dict[str, Any]) -> None:
-        """Say once, when a cache is begun, that those of former states use space."""
+        """Report once, before a new cache is written, that those of former states use space."""
         others = [path for path in _caches_like(self.folder, about) if path != cache]
         if others and not (cache / ABOUT).is_file():
             LOG.warning(
-                "%s has changed: %s is filled anew, and %s is kept; "
-                "rgbt cache ... remove=true removes such caches.",
+                "%s has changed, so %s is filled again and %s is kept. `rgbt cache ... "
+                "remove=true` removes old caches.",
                 *(self.name, cache, others[-1]),
             )
 
@@ -285,8 +286,8 @@ def _check_sample(sample: Sample) -> None:
         if image is not None and (image.dtype != np.uint8 or image.shape != shape):
             raise InputError(
                 f"'{sample.name}': {what} must be uint8 of shape {shape}, like the thermal image, "
-                f"got {image.dtype} {image.shape}; correct the data set, or read without the "
-                "cache (data.cache=null)."
+                f"got {image.dtype} {image.shape}; correct the data set, or disable the cache "
+                "(data.cache=null)."
             )
 
 
@@ -333,7 +334,7 @@ def gigabytes(num_bytes: int) -> str:
 
 @contextmanager
 def _alone(cache: Path) -> Iterator[None]:
-    """No other process writes to the cache meanwhile, unless its disk has no locks."""
+    """Lock the cache against other writers, if its disk supports locks."""
     with ExitStack() as locks:
         with suppress(OSError):  # no locks: two processes may do the same work
             writer = holder_of(cache / LOCK)

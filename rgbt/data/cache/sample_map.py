@@ -1,8 +1,8 @@
-"""One file of decoded samples that is mapped into memory, with an index; part of `rgbt.data.cache`.
+"""Write and read one memory-mapped file of decoded samples with an index.
 
     samples           one after the other, each begins at a multiple of 64 bytes:
                       rgb (H, W, 3), thermal (H, W), label (H, W) if it has one; uint8
-    index             JSON with a check sum: time of writing, and one `Record` per sample
+    index             JSON with a checksum: time of writing, and one `Record` per sample
     end, 20 bytes     "rgbtdec3", length and CRC-32 of the index
 
 A file is complete or absent: it is written under another name, flushed and renamed.
@@ -43,9 +43,9 @@ OnProgress = Callable[[str, int, int], object]
 
 
 FileState = tuple[int, int, int, int, int]
-"""What identifies the content of a file: bytes (-1: missing), time of the last change of its bytes
-and of the file (nanoseconds; copies may keep the former, only the system sets the latter), inode,
-CRC-32. The CRC distinguishes a copy from a change where times or inode differ."""
+"""State that identifies the content of a file: bytes (-1: missing), time of the last change of its
+bytes and of the file (nanoseconds; copies may keep the former, only the system sets the latter),
+inode, CRC-32. The CRC distinguishes a copy from a change where times or inode differ."""
 
 MISSING = (-1, 0, 0, 0, 0)
 
@@ -199,7 +199,7 @@ class SampleMap:
     def is_intact(self, num_threads: int, on_progress: OnProgress) -> bool:
         """Whether the bytes are those that were written.
 
-        Check sums are compared if the file has been changed or copied since, which its time says.
+        Checksums are compared if the time of the file shows a change or a copy.
         """
         if self.path.stat().st_mtime == self._written_s:
             return True

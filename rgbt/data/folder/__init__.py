@@ -1,1 +1,1 @@
-"""A user's own RGB-thermal data, described by one YAML file."""
+"""Read a user's own RGB-thermal data, described by one YAML file."""

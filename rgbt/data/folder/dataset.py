@@ -1,7 +1,7 @@
-"""A user's own RGB-thermal data, described by one YAML file: paths, splits, label values.
+"""Read a user's own RGB-thermal data, described by one YAML file.
 
-A reader only: it maps values to classes and to grey levels as the configuration says, never resizes
-or aligns, and refuses what it cannot read exactly. docs/datasets.md has a worked example.
+The file gives paths, splits and label values. The reader never resizes or aligns images, and it
+refuses files that it cannot read exactly. docs/tutorials/own-data-set.md has an example.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class Folder(FileDataset):
         thermal_range: Range | None = None,
         night: Text | None = None,
     ) -> None:
-        folder = existing_root(root, f"that dataset.rgb='{rgb}' begins in")
+        folder = existing_root(root, f"that dataset.rgb='{rgb}' starts from")
         if palette is None:
             own = {word: each_colour(colour)[0] for word, colour in (colours or {}).items()}
             generated = zip(classes, painted(num_classes), strict=False)
@@ -108,9 +108,10 @@ class Folder(FileDataset):
         self.images = PairReader(
             layouts=(PairPattern(rgb, thermal, label),),
             thermal_range=thermal_range,
-            advice="grey levels have 8 bits in one channel or three equal ones, other values need "
-            "dataset.thermal_range=[low, high], the values that become black and white",
-            packed_advice="give dataset.thermal its own pattern",
+            advice="grey levels must have 8 bits in one channel or in three equal channels; "
+            "other values require dataset.thermal_range=[low, high], the values that "
+            "become black and white",
+            packed_advice="give dataset.thermal a separate pattern",
             rgb_advice="dataset.thermal with the same pattern reads a fourth channel as thermal",
         )
         self.frames: Mapping[str, FolderFrame] = find_frames(self.root, self.patterns)
@@ -140,7 +141,7 @@ class Folder(FileDataset):
         return tuple(fnmatchcase(name, self.night) for name in names)
 
     def fingerprint(self) -> str:
-        """SHA-256 in hexadecimal over `hash_of_files` and the meaning of label values."""
+        """SHA-256 in hexadecimal over `hash_of_files` and the map of label values."""
         listed = {
             split: tuple(name for name in self.names(split) if name in self.frames)
             if self.has(split)
@@ -168,7 +169,7 @@ class Folder(FileDataset):
         listed = set().union(*lists.values())
         unlisted = [name for name in self.frames if name not in listed]
         return [
-            f"{len(unlisted)} frames are in no split, the first is '{name}'."
+            f"{len(unlisted)} frames are in no split; the first is '{name}'."
             for name in unlisted[:1]
         ]
 
@@ -190,13 +191,13 @@ class Folder(FileDataset):
         if len(keys) > 1 or (in_path and keys not in ([], ["dataset.folders"])):
             braces = [f"{{{SPLIT}}} in dataset.rgb"] if in_path else []
             raise InputError(
-                f"dataset: {' and '.join([*keys, *braces])} both define the splits; keep one "
-                f"(a folder with another meaning needs another word, such as {{part}})."
+                f"dataset: {' and '.join([*keys, *braces])} both define the splits; keep one of "
+                "them. (Use another word, such as {part}, for a folder that is not a split.)"
             )
         if shares is None and draw != (0, None):
             raise InputError(
-                "dataset.shares_seed and dataset.block are for dataset.shares, which is null; give "
-                "shares, or omit both."
+                "dataset.shares_seed and dataset.block require dataset.shares, which is null. Set "
+                "dataset.shares, or omit both."
             )
         if shares is not None:
             return ByShare(self.frames, shares, *draw)
@@ -204,8 +205,8 @@ class Folder(FileDataset):
             return ByList(self.root, lists, frames=self.frames)
         if not in_path:
             raise InputError(
-                f"dataset: nothing defines the splits; write {{{SPLIT}}} in dataset.rgb instead of "
-                "train, val and test, or give dataset.lists or dataset.shares."
+                f"dataset: no setting defines the splits. Write {{{SPLIT}}} in dataset.rgb "
+                "instead of train, val and test, or set dataset.lists or dataset.shares."
             )
         return ByFolder(self.frames, self.patterns.rgb, FOLDERS if folders is None else folders)
 
@@ -215,6 +216,7 @@ class Folder(FileDataset):
             check_partners(self.patterns.label, labelled, self.root)
         if self.night is not None and not any(self.nights(tuple(self.frames)) or ()):
             raise InputError(
-                f"dataset.night: none of {len(self.frames)} names matches '{self.night}', the "
-                f"first is '{next(iter(self.frames))}'; correct it, or set it to null."
+                f"dataset.night: none of {len(self.frames)} names matches '{self.night}'; the "
+                f"first name is '{next(iter(self.frames))}'. Correct the pattern, or set it to "
+                "null."
             )

@@ -1,4 +1,4 @@
-"""The files of each frame of a folder, by the patterns of paths; nothing is opened here."""
+"""Find the files of each frame of a folder by patterns of paths, without opening them."""
 
 from __future__ import annotations
 
@@ -62,15 +62,15 @@ def patterns_of(rgb: str, thermal: str, label: str | None) -> Patterns:
     found = Patterns.of(rgb, thermal, label)
     if NAME not in found.rgb.words:
         raise InputError(
-            f"dataset.rgb: '{rgb}' has {', '.join(found.rgb.words)} but no {NAME}; write "
-            f"{{{NAME}}} instead of the names of frames."
+            f"dataset.rgb: '{rgb}' has the word {', '.join(found.rgb.words)} but no {NAME}; "
+            f"replace the names of frames with {{{NAME}}}."
         )
     for pattern in [each for each in found if each is not None]:
         for word in pattern.words:
             if word not in found.rgb.words:
                 raise InputError(
-                    f"{pattern.key}: '{pattern.text}' needs {{{word}}}, which dataset.rgb='{rgb}' "
-                    f"does not have; {nearest(word, found.rgb.words)}."
+                    f"{pattern.key}: '{pattern.text}' uses {{{word}}}, which dataset.rgb='{rgb}' "
+                    f"does not contain; {nearest(word, found.rgb.words)}."
                 )
     if label is not None and label.lower().endswith((".jpg", ".jpeg")):
         raise InputError(

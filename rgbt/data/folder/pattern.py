@@ -1,7 +1,4 @@
-"""Patterns of paths such as "{split}/rgb/{name}.png", and the files that match them.
-
-Part of `rgbt.data.folder`; nothing is opened here.
-"""
+"""Parse patterns of paths such as "{split}/rgb/{name}.png", and find the files that match."""
 
 from __future__ import annotations
 
@@ -60,12 +57,12 @@ class Pattern:
             )
         if re.search(r"[{}]", re.sub(r"\{[^\W\d]\w*\}", "", text)) or "}{" in text:
             raise InputError(
-                f"{key}: expected words in braces, such as {{name}}, with something between each "
-                f"two of them, got '{text}'."
+                f"{key}: expected words in braces, such as {{name}}, with other text between two "
+                f"of them, got '{text}'."
             )
         if not self.words:
             raise InputError(
-                f"{key}: '{text}' is one file; write {{{NAME}}} instead of the names of frames, "
+                f"{key}: '{text}' is a single file; replace the names of frames with {{{NAME}}}, "
                 f"such as rgb/{{{NAME}}}.png."
             )
 
@@ -96,7 +93,7 @@ class Pattern:
         else:
             return "it matches"
         folder = reached[0].path
-        return f"in {folder} nothing matches '{piece}', {folder.name} holds {what_is_in(folder)}"
+        return f"in {folder} nothing matches '{piece}'; {folder.name} holds {what_is_in(folder)}"
 
 
 def what_is_in(folder: Path) -> str:
@@ -163,5 +160,5 @@ def _listed(folder: Path) -> list[str]:
         return []
     except PermissionError:
         raise InputError(
-            f"{folder} may not be listed, permission is denied; allow it (chmod a+rx)."
+            f"{folder} cannot be listed: permission denied; allow access (chmod a+rx)."
         ) from None

@@ -1,7 +1,4 @@
-"""Three rules that divide the frames of a folder into splits: by path, by list, by random shares.
-
-Part of `rgbt.data.folder`.
-"""
+"""Divide the frames of a folder into splits by path, by list or by random shares."""
 
 from __future__ import annotations
 
@@ -73,9 +70,10 @@ class ByFolder:
         if not names:
             known = sorted({frame.values[SPLIT] for frame in self.frames.values()})
             raise InputError(
-                f"dataset.folders: split '{split}' is empty, dataset.rgb='{self.pattern.text}' has "
-                f"no file with '{self.folders[split]}' for {{{SPLIT}}}; it has {', '.join(known)}: "
-                f"name one of them in dataset.folders, {{{split}: ...}}."
+                f"dataset.folders: split '{split}' is empty, because "
+                f"dataset.rgb='{self.pattern.text}' has no file with '{self.folders[split]}' for "
+                f"{{{SPLIT}}}. Existing values: {', '.join(known)}. Set one of them in "
+                f"dataset.folders, {{{split}: ...}}."
             )
         return names
 
@@ -116,14 +114,14 @@ class ByList:
     def names(self, split: str) -> tuple[str, ...]:
         """Names in the order of the list.
 
-        A line that is no frame stays as it is, so that reading it says so; InputError if none
-        is, or there is no such list.
+        A line without a frame is kept, so that reading it raises the error. InputError if no line
+        is a frame, or if the list does not exist.
         """
         path, key = self._path(split), f"{self.key}.{split}"
         if not is_there(path):
             raise InputError(
-                f"{key}: there is no list '{path}'; write it (one name per line), or name another "
-                f"one with {key}=..."
+                f"{key}: the list '{path}' does not exist; write it (one name per line), or name "
+                f"another list with {key}=..."
             )
         lines = read_names(path, key)
         if not self.frames:
@@ -132,8 +130,8 @@ class ByList:
         names = tuple(forms.get(line) or forms.get(_stem(line)) or line for line in lines)
         if set(names).isdisjoint(self.frames):
             raise InputError(
-                f"{key}: none of the {len(lines)} lines of {path} is a frame: the first is "
-                f"'{lines[0]}', expected names such as '{next(iter(self.frames))}' or paths such "
+                f"{key}: none of the {len(lines)} lines of {path} is a frame. The first is "
+                f"'{lines[0]}'; expected names such as '{next(iter(self.frames))}' or paths such "
                 f"as '{_below(self.root, next(iter(self.frames.values())))}'."
             )
         return names
@@ -157,7 +155,7 @@ class ByList:
 
 @dataclass(frozen=True)
 class ByShare:
-    """Splits are drawn with a seed of their own; consecutive frames are drawn together.
+    """Splits are drawn at random with `seed`; consecutive frames are drawn together.
 
     The unit of the draw is one {sequence}, or the whole folder if the pattern has no such word,
     divided into blocks of `block` frames. In the order drawn, each unit is added to the split that
@@ -184,23 +182,23 @@ class ByShare:
             abs(sum(self.shares.values()) - 1) > 1e-6
         ):
             raise InputError(
-                "dataset.shares: expected shares above 0 that are 1 together, such as {train: 0.8, "
+                "dataset.shares: expected shares above 0 that add up to 1, such as {train: 0.8, "
                 f"val: 0.1, test: 0.1}}, got {self.shares}."
             )
         units = self.units
         if len(units) < len(self.shares):
             raise InputError(
                 f"dataset.shares: {len(self.shares)} splits are to be drawn from {len(units)} "
-                f"{'sequence' if self.block is None else 'block'}(s), and neighbouring frames stay "
-                "together; give dataset.block, the number of neighbours that do (seconds of a "
-                "drive, not single frames), or fewer splits."
+                f"{'sequence' if self.block is None else 'block'}(s), and neighbouring frames "
+                "stay together. Set dataset.block, the number of consecutive frames that stay "
+                "together (some seconds of a drive), or use fewer splits."
             )
         empty = [split for split in self.shares if not self.drawn[split]]
         if empty:
             raise InputError(
-                f"dataset.shares: split '{empty[0]}' gets no frame, as {len(units)} units of up to "
-                f"{max(map(len, units))} frames stay together; give a smaller dataset.block, a "
-                "larger share, or another dataset.shares_seed."
+                f"dataset.shares: split '{empty[0]}' gets no frame, because {len(units)} units of "
+                f"up to {max(map(len, units))} frames stay together. Set a smaller dataset.block, "
+                "a larger share, or another dataset.shares_seed."
             )
 
     @property

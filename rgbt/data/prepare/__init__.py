@@ -1,1 +1,1 @@
-"""Prepares the files of a data set from a download: ``rgbt prepare``."""
+"""Prepare the files of a data set from a download: ``rgbt prepare``."""

@@ -1,4 +1,4 @@
-"""Command that copies the needed files of an official download, then checks them.
+"""The command ``rgbt prepare``, which copies the files of an official download and checks them.
 
     rgbt prepare dataset=mfnet    source=ir_seg_dataset.zip      out=/data/MFNet
     rgbt prepare dataset=pst900   source=PST900_RGBT_Dataset.zip out=/data/PST900
@@ -32,24 +32,27 @@ OPTIONAL = ("labels", "lists")
 
 @dataclass(frozen=True)
 class Options:
-    """What to prepare, and where."""
+    """Options of the command."""
 
-    dataset: Annotated[str, Help("mfnet, pst900, kp or freiburg")]
+    dataset: Annotated[str, Help("data set: mfnet, pst900, kp or freiburg")]
     source: Annotated[
         Path,
         Help(
-            "the download: a zip archive, or the folder into which it was unpacked; for kp the "
-            "folder of KAIST, for freiburg the folder with train.zip and test.zip"
+            "download: a zip archive, or the folder into which it was unpacked. For kp the folder "
+            "of KAIST; for freiburg the folder with train.zip and test.zip"
         ),
     ]
-    out: Annotated[Path, Help("a new folder outside the download")]
+    out: Annotated[Path, Help("new folder outside the download")]
     labels: Annotated[
         Path | None,
-        Help("kp: folder or archive of the labels of MS-UDA, if the source has none"),
+        Help("kp: folder or archive with the labels of MS-UDA, if the source has none"),
     ] = None
     lists: Annotated[
         Path | None,
-        Help("mfnet and kp: folder of lists, used instead of those of the download or set numbers"),
+        Help(
+            "mfnet and kp: folder of split lists to use instead of those of the download or the "
+            "set numbers"
+        ),
     ] = None
 
     @property
@@ -60,7 +63,7 @@ class Options:
 
 
 def main(options: Options, overrides: list[str]) -> int:
-    """Copy the needed files of a download to a new folder and check them."""
+    """Copy the required files of a download to a new folder and check them."""
     del overrides  # none has an effect
     name, out, paths = options.dataset, options.out, options.paths
     check_choice("dataset", name, PREPARATIONS)

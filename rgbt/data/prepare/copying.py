@@ -1,4 +1,4 @@
-"""Writes planned files into a temporary folder, which gets its name when it is complete.
+"""Write planned files to a temporary folder, which is renamed when it is complete.
 
 Part of `rgbt.data.prepare`.
 """
@@ -18,7 +18,7 @@ from rgbt.checks import InputError
 from rgbt.data.prepare.download import SourceFile
 
 PLAN = ".prepare.json"
-"""File in the new folder that says what it was made from."""
+"""File in the new folder that describes its source."""
 
 SPARE = 2**24
 """Bytes that must stay free on the disk."""
@@ -57,7 +57,7 @@ def check_out(out: Path, sources: tuple[Path, ...]) -> None:
     for source in sources:
         if out.resolve().is_relative_to(source.resolve()):
             raise InputError(
-                f"out: {out} is inside {source}, which is only read; name a folder outside it."
+                f"out: {out} is inside {source}, which must not change. Choose a folder outside it."
             )
 
 
@@ -67,7 +67,7 @@ def copy(
     """Make `out` of `items`, which have different targets, or compare it with them.
 
     Files are written into a temporary folder beside `out`, which is renamed when all of them are
-    complete. What an interrupted command left there is removed.
+    complete. Files of an interrupted command are removed.
 
     Args:
         items: files to write.
@@ -94,7 +94,7 @@ def copy(
     except OSError as error:
         raise InputError(
             f"out: cannot write {error.filename or out} ({error.strerror or error}); free some "
-            "space, or name a writable folder."
+            "space, or choose a writable folder."
         ) from error
 
 
@@ -116,8 +116,8 @@ def _compare(items: list[Item], out: Path, advance: Callable[[int], object]) -> 
     ]
     if others:
         raise InputError(
-            f"out: {out} is not empty and differs from the download in {len(others)} files, the "
-            f"first is {min(others)}; remove the folder, or name another one."
+            f"out: {out} is not empty and differs from the download in {len(others)} files; the "
+            f"first is {min(others)}. Remove the folder, or choose another one."
         )
 
 
@@ -137,7 +137,7 @@ def _temporary(out: Path) -> Iterator[Path]:
         yield folder
     except BlockingIOError as error:
         raise InputError(
-            f"out: another process is preparing {out}; wait for it, or name another folder."
+            f"out: another process is preparing {out}; wait for it, or choose another folder."
         ) from error
     except BaseException:
         shutil.rmtree(folder)
@@ -150,8 +150,8 @@ def _check_space(items: list[Item], folder: Path) -> None:
     needed, free = sum(item.size for item in items) + SPARE, shutil.disk_usage(folder).free
     if needed > free:
         raise InputError(
-            f"out: {needed / 1e9:.2f} GB are to be copied to {folder.parent}, but its disk has "
-            f"{free / 1e9:.2f} GB left; free some space, or name a folder on another disk."
+            f"out: {needed / 1e9:.2f} GB must be copied to {folder.parent}, but its disk has "
+            f"{free / 1e9:.2f} GB left. Free some space, or choose a folder on another disk."
         )
 
 
@@ -164,6 +164,6 @@ def _write(item: Item, path: Path) -> None:
             size += len(chunk)
     if size != item.size:
         raise InputError(
-            f"{item.content!s} holds {size} bytes but {item.size} were listed; is it still "
-            "being downloaded? Repeat the command when it is complete."
+            f"{item.content!s} holds {size} bytes but {item.size} were listed. If the download is "
+            "still in progress, rerun the command when it is complete."
         )

@@ -1,4 +1,4 @@
-"""Files of a download, in folders or in zip archives; they are only read.
+"""Read the files of a download, in folders or in zip archives.
 
 Part of `rgbt.data.prepare`.
 """
@@ -54,7 +54,7 @@ class SourceFile:
                     yield chunk
         except BROKEN as error:
             raise InputError(
-                f"{self} cannot be read ({error}); allow it, or download the file again."
+                f"{self} cannot be read ({error}); allow access, or download the file again."
             ) from error
 
     def lines(self) -> tuple[str, ...]:
@@ -101,8 +101,8 @@ class SourceFiles:
             self._add_archive(path, "")
         else:
             raise InputError(
-                f"{key}: there is no file or folder '{path}'; give the downloaded archive, or the "
-                "folder into which it was unpacked."
+                f"{key}: '{path}' does not exist; give the downloaded archive, or the folder into "
+                "which it was unpacked."
             )
         self.entries = dict(sorted(self._found.items()))
 
@@ -122,8 +122,8 @@ class SourceFiles:
 
         def stop(error: OSError) -> None:
             raise InputError(
-                f"{self.key}: {error.filename} cannot be listed ({error.strerror}); allow it, or "
-                "give another folder."
+                f"{self.key}: {error.filename} cannot be listed ({error.strerror}); allow access, "
+                "or give another folder."
             ) from error
 
         packed = []
@@ -157,7 +157,7 @@ class SourceFiles:
             if path.startswith("/") or ":" in path.partition("/")[0] or ".." in path.split("/"):
                 raise InputError(
                     f"{self.key}: {file} holds '{member.filename}', which is outside the folder "
-                    "into which it is unpacked; this is not the original archive, download it "
+                    "into which it is unpacked. This is not the original archive; download it "
                     "again."
                 )
             if member.flag_bits & ENCRYPTED:

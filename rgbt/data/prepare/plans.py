@@ -1,4 +1,4 @@
-"""How a data set is prepared from a download: which files are needed, and their new paths.
+"""Plan which files of a download a data set requires, and their new paths.
 
 Part of `rgbt.data.prepare`.
 """
@@ -77,8 +77,8 @@ def plan_mfnet(download: Download) -> list[Item]:
     missing = [path for path in wanted if base + path not in entries]
     if missing:
         raise InputError(
-            f"source: {len(missing)} files that lists name are not in {download.source.path}; the "
-            f"first is {base}{missing[0]}, of {names[wanted[missing[0]]]}. Download the rest, or "
+            f"source: {len(missing)} listed files are not in {download.source.path}; the first is "
+            f"{base}{missing[0]}, of {names[wanted[missing[0]]]}. Download the missing files, or "
             "give shorter lists with lists=..."
         )
     items = [Item(path, entries[base + path]) for path in wanted]
@@ -186,7 +186,7 @@ def plan_kp(download: Download) -> list[Item]:
     if without:
         raise InputError(
             f"lists: {len(without)} names have no label in "
-            f"{(download.labels or download.source).path}, the first is {without[0]}; give all "
+            f"{(download.labels or download.source).path}, the first is {without[0]}. Give all "
             "labels, or shorter lists."
         )
     return [
@@ -204,13 +204,13 @@ def _kp_labels(source: SourceFiles) -> dict[str, SourceFile]:
         name = PurePosixPath(path).stem
         if kp.NAME.fullmatch(name) is None:
             raise InputError(
-                f"{source.key}: {source.entries[path]} is not {kp.FORM}; move it away."
+                f"{source.key}: {source.entries[path]} is not {kp.FORM}; move it out of the folder."
             )
         _add_once(found, name, source.entries[path])
     if not found:
         raise InputError(
-            f"{source.key}: there is no label such as set00_V000_I00050.png in {source.path}; "
-            "KAIST itself has none, give those of MS-UDA with labels=..."
+            f"{source.key}: there is no label such as set00_V000_I00050.png in {source.path}. "
+            "KAIST itself has no labels; give those of MS-UDA with labels=..."
         )
     return found
 
@@ -236,8 +236,8 @@ def _kp_images(source: SourceFiles, names: tuple[str, ...]) -> list[Item]:
     missing = [str(path) for path in targets.values() if str(path) not in found]
     if missing:
         raise InputError(
-            f"source: {len(missing)} of the {len(targets)} images that belong to labels are not in "
-            f"{source.path}, the first is {missing[0].partition('/')[2]}; download the rest of "
+            f"source: {len(missing)} of the {len(targets)} images with labels are not in "
+            f"{source.path}; the first is {missing[0].partition('/')[2]}; download the rest of "
             "KAIST (set00 to set11), or give fewer labels."
         )
     return [Item(target, entry) for target, entry in found.items()]
@@ -253,8 +253,8 @@ def _lists_in(download: Download, base: str, splits: Mapping[str, str]) -> dict[
     }
     if not found:
         raise InputError(
-            f"{source.key}: there is none of {', '.join(splits.values())} in "
-            f"{source.path / base}; give the folder that holds these lists with lists=..."
+            f"{source.key}: {source.path / base} contains none of the lists "
+            f"{', '.join(splits.values())}; give the folder of the lists with lists=..."
         )
     return found
 
@@ -288,13 +288,13 @@ def _base_of(source: SourceFiles, layouts: list[set[str]], what: str) -> str:
     best = [base for base in fitting if base.count("/") == fitting[0].count("/")]
     if not best:
         raise InputError(
-            f"source: {source.path} does not hold the folders {what}, nor does one of the folders "
-            "in it; give the downloaded archive, or the folder into which it was unpacked."
+            f"source: {source.path} does not contain the folders {what}, and neither do its "
+            "folders; give the downloaded archive, or the folder into which it was unpacked."
         )
     if len(best) > 1:
         raise InputError(
-            f"source: {source.path} holds {what} several times ({', '.join(best)}); give one of "
-            "these folders."
+            f"source: {source.path} contains {what} several times ({', '.join(best)}); give one "
+            "of these folders."
         )
     return best[0]
 

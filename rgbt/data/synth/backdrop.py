@@ -1,4 +1,4 @@
-"""What is unlabelled: buildings, trees, hedges, lamps, poles, signs. Shapes only, no placement."""
+"""Shapes of unlabelled objects: buildings, trees, hedges, lamps, poles, signs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Folders of data sets that are written once and found again."""
+"""Write the folder of a generated data set once, and reuse it."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def written_once(
 
     Args:
         name: of the data set; begins the name of the folder, which a hash of the plan ends.
-        plan: all that its bytes follow from; kept in it as plan.json.
+        plan: all settings that determine its bytes; stored in it as plan.json.
         cache_dir: folder that holds written data sets; None: `default_cache`.
         write: fills the empty folder that it is given.
 
@@ -54,8 +54,8 @@ def written_once(
             _publish(made, folder)
     except OSError as error:
         raise InputError(
-            f"dataset.cache_dir: cannot write {folder} ({error.strerror or error}); "
-            "name a folder that can be written."
+            f"dataset.cache_dir: cannot write {folder} ({error.strerror or error}); choose a "
+            "writable folder."
         ) from error
     return folder
 

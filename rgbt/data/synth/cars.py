@@ -1,4 +1,4 @@
-"""Cars of four kinds, from a side profile. Shapes only, no placement."""
+"""Shapes of four kinds of cars, made from a side profile."""
 
 from __future__ import annotations
 

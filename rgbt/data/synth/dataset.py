@@ -1,4 +1,4 @@
-"""The data set `synth`: scenes in MFNet's layout, written on first use and read like MFNet.
+"""The data set `synth`, in MFNet's layout, written on first use and read like MFNet.
 
 images/00012D.png   four channels R, G, B, thermal       labels/00012D.png   class ids
 train.txt val.txt test.txt test_day.txt test_night.txt   one name per line
@@ -63,8 +63,8 @@ def synth(  # noqa: PLR0913 - each is a key of the configuration
     """
     if ego_forward_m is None and ego_yaw_deg != 0:
         raise InputError(
-            f"dataset.ego_yaw_deg is {ego_yaw_deg:g} but no second frame is requested; "
-            "set dataset.ego_forward_m too (0 to turn on the spot)."
+            f"dataset.ego_yaw_deg is {ego_yaw_deg:g}, but no second frame is requested. Set "
+            "dataset.ego_forward_m too (0 turns on the spot)."
         )
     motion = None if ego_forward_m is None else EgoMotion(ego_forward_m, ego_yaw_deg)
     numbers = {"num_train": num_train, "num_val": num_val, "num_test": num_test}

@@ -1,4 +1,4 @@
-"""All flat parts of a scene as arrays, in world coordinates and drawing order."""
+"""Collect all flat parts of a scene as arrays, in world coordinates and drawing order."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The knobs of the scene generator. Each one is independent: none changes the draws of another."""
+"""The factors of the scene generator; no factor changes the random draws of another."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Gain = Annotated[float, Interval(ge=0, le=20)]
 
 @dataclass(frozen=True, kw_only=True)
 class SceneFactors:
-    """What a scene is made of; a study varies one of these while holding the rest.
+    """The factors of a scene; a study varies one of them and keeps the others fixed.
 
     Attributes:
         height: image height in pixels.
@@ -71,7 +71,7 @@ YawDegrees = Annotated[float, Interval(ge=-15, le=15)]
 
 @dataclass(frozen=True)
 class EgoMotion:
-    """What the camera does between two consecutive frames: first it turns, then it drives ahead.
+    """Motion of the camera between two consecutive frames: first it turns, then it drives ahead.
 
     Attributes:
         forward_m: metres along the new viewing direction, on the ground plane.

@@ -1,12 +1,12 @@
-"""The data set `synth_freiburg`: scenes in the form of Freiburg Thermal, read by its own reader.
+"""The data set `synth_freiburg`, in the layout of Freiburg Thermal and read by its reader.
 
 train/SEQUENCE/PIECE/{fl_rgb,fl_ir_aligned,fl_rgb_labels}/..._STAMP.png, no labels at night
 test/{day,night}/{ImagesRGB,ImagesIR}/STAMP_{rgb,ir}.png, SegmentationClass/STAMP_rgb.npy
 
-With what is odd about the archives: thermal images are counts of 16 bits that end in slanted black
-margins, because the thermal camera sees less than the RGB camera; labels of one sequence have
-another size than its frames; test folders are spelt in two ways, and stamps there end in another 0
-or not; test labels are arrays.
+The files have the irregularities of the archives: thermal images are counts of 16 bits that end in
+slanted black margins, because the thermal camera sees less than the RGB camera; labels of one
+sequence have another size than its frames; test folders are spelt in two ways, and stamps there
+end in another 0 or not; test labels are arrays.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The standing classes: cones, car stops, guardrails, bumps. Shapes only, no placement."""
+"""Shapes of the classes of street furniture: cones, car stops, guardrails, bumps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Near groups and single objects of each class: how they stand in a street."""
+"""Place near groups and single objects of each class in a street."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The data set `synth_kp`: scenes as the CRM release lays out KP, read by its own reader.
+"""The data set `synth_kp`, in the layout of KP in the CRM release and read by its reader.
 
 images/setXX/VYYY/{visible,lwir}/IZZZZZ.jpg   three channels each, those of lwir equal
 labels/setXX_VYYY_IZZZZZ.png                  class ids, 19 for void

@@ -1,4 +1,4 @@
-"""Places the labelled objects: near groups, small far objects, guardrails and bumps."""
+"""Place the labelled objects: near groups, small far objects, guardrails and bumps."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def place_objects(seed: int, index: int, road: Road, factors: SceneFactors) -> l
 
 
 def _without_collisions(placed: list[Placed]) -> list[Placed]:
-    """Leave out what stands inside a car, or a car inside something; the earlier one stays."""
+    """Remove objects that overlap a car; of two objects the earlier one stays."""
     kept: list[Placed] = []
     taken: list[tuple[float, float, float, float, bool]] = []
     for thing in placed:

@@ -1,4 +1,4 @@
-"""Day or night, sun, sky and lamps of one scene, for the RGB and the thermal image alike.
+"""Draw time of day, sun, sky and lamps of one scene, for the RGB and the thermal image.
 
 Lamps light by night: the own headlights, street lamps, oncoming cars, vending machines.
 """
@@ -22,7 +22,7 @@ _GOLDEN = 0.6180339887
 
 
 class Light(NamedTuple):
-    """What shines.
+    """The light sources of a scene.
 
     Attributes:
         is_night: night.

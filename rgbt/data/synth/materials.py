@@ -1,4 +1,4 @@
-"""What surfaces are made of: colour, temperature, texture, glow, and class in other data sets.
+"""The table of materials: colour, temperature, texture, glow, and class in other data sets.
 
 Temperatures are degrees above the air: by day (sun-warmed), by night, and what running adds
 (an engine, a body). They are plausible, not measured.

@@ -1,4 +1,4 @@
-"""Persons and bikes, with or without a rider. Shapes only, no placement."""
+"""Shapes of persons and bikes, with or without a rider."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where things stand: the record of one placed object, and the numbers it is drawn from."""
+"""The record of one placed object, and the random numbers it is drawn from."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ _ROW_WIDTH = 14
 def draw_rows(seed: int, index: int, pool: str, num: int) -> list[Row]:
     """Numbers for the first `num` objects of the pool `pool` in scene `index`.
 
-    Rows are drawn one after the other, so that asking for more leaves the first ones as they were.
+    Rows are drawn one after the other, so that the first rows do not depend on their number.
     """
     rows: list[Row] = (
         numpy_generator(seed, f"synth/{pool}", index).random((num, _ROW_WIDTH)).tolist()

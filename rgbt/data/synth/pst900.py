@@ -1,4 +1,4 @@
-"""The data set `synth_pst900`: scenes as the PST900 archive has its images, read by its own reader.
+"""The data set `synth_pst900`, in the layout of the PST900 archive and read by its reader.
 
 {train,test}/{rgb,thermal,labels}/NAME.png, NAME as in 58_bag21_rect_rgb_frame0000000440
 """
@@ -51,10 +51,10 @@ def synth_pst900(  # noqa: PLR0913 - each is a key of the configuration
 ) -> PST900:
     """The data set with these factors, generated on first use.
 
-    These are streets and no tunnels. They stand in for the files and for how rare the four objects
-    are (about 1 % of the pixels each, as backpack and survivor are there; the other two are rarer):
-    traffic cones for fire extinguishers, car stops for backpacks, bumps for hand drills, persons
-    for survivors. What is learnt on them says nothing of PST900.
+    These are streets and not tunnels. They imitate the files and the rarity of the four objects
+    (about 1 % of the pixels each, as backpack and survivor in PST900; the other two are rarer
+    there): traffic cones for fire extinguishers, car stops for backpacks, bumps for hand drills,
+    persons for survivors. Results on them say nothing about PST900.
 
     Args and errors as of `rgbt.data.synth.dataset.synth`, without a second frame, and `val_bags` of
     `rgbt.data.pst900.PST900`; () makes "val" the test part, as in the releases, and leaves the

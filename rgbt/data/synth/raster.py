@@ -1,4 +1,4 @@
-"""Draws facets into a map of facet numbers, from which label, depth, colour and heat all follow.
+"""Draw facets into a map of facet numbers, from which label, depth, colour and heat are derived.
 
 One map is drawn at twice the image size. Labels and depth are read at pixel centres, so they are
 exact; colours are averaged around them (`average`), so edges are smooth.

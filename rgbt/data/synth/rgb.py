@@ -1,4 +1,4 @@
-"""The RGB image: sun or lamps on coloured surfaces, sky, haze, glow, and the camera's own noise."""
+"""Render the RGB image: sun or lamps on coloured surfaces, sky, haze, glow and camera noise."""
 
 from __future__ import annotations
 

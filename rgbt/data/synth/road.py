@@ -1,4 +1,4 @@
-"""The road: its course, and everything painted or raised on the ground, as strips of quads."""
+"""Draw the road: its course, and markings and kerbs on the ground, as strips of quads."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One scene from factors to images: places, draws, lights, and the second frame after a motion."""
+"""Render one scene from its factors, and the second frame after a motion."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Places what is unlabelled: buildings, walls, trees, lamps, poles, signs, horizon."""
+"""Place the unlabelled objects: buildings, walls, trees, lamps, poles, signs, horizon."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Shapes as lists of flat, convex parts with a material, and the helpers that build them.
+"""Represent shapes as lists of flat, convex parts with a material, with helpers to build them.
 
 Local coordinates: x right, y up, z ahead (away from the camera for yaw 0), metres, standing on
 y = 0.
-What the single objects look like is in `cars`, `people`, `furniture`, `backdrop`.
+The shapes of single objects are in `cars`, `people`, `furniture`, `backdrop`.
 """
 
 from __future__ import annotations

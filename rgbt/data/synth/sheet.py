@@ -1,4 +1,4 @@
-"""A contact sheet of scenes: ``rgbt scenes out=sheet.png [key=value ...]``.
+"""Draw a contact sheet of scenes: ``rgbt scenes out=sheet.png [key=value ...]``.
 
 Rows RGB, thermal, label by day, then the same scenes by night.
 """
@@ -34,10 +34,10 @@ COLOURS = np.array(
 
 @dataclass(frozen=True)
 class Options(SceneFactors):
-    """Of the sheet, beside the factors of a scene."""
+    """Options of the sheet, in addition to the factors of a scene."""
 
-    out: Annotated[Path, Help("picture to write, in an existing folder")] = Path("sheet.png")
-    seed: Annotated[Seed, Help("of the data set")] = 0
+    out: Annotated[Path, Help("picture file to write, in an existing folder")] = Path("sheet.png")
+    seed: Annotated[Seed, Help("seed of the data set")] = 0
     first: Annotated[int, Interval(ge=0, le=99_999), Help("index of the first scene")] = 0
     columns: Annotated[int, Interval(ge=1, le=100), Help("scenes per row")] = 5
     zoom: Annotated[int, Interval(ge=1, le=16), Help("enlargement")] = 2
@@ -76,7 +76,9 @@ def main(options: Options, overrides: list[str]) -> int:
         **{each.name: getattr(options, each.name) for each in fields(SceneFactors)}
     )
     if not options.out.parent.is_dir():
-        raise InputError(f"out={options.out} cannot be written; name a PNG in an existing folder.")
+        raise InputError(
+            f"out={options.out} cannot be written; name a PNG file in an existing folder."
+        )
     sheet = contact_sheet(options.seed, options.first, factors, options.columns, options.zoom)
     encoded = cv2.imencode(options.out.suffix, sheet[..., ::-1])[1]
     options.out.write_bytes(encoded.tobytes())

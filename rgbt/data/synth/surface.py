@@ -1,4 +1,4 @@
-"""What each pixel shows before any light, for RGB and thermal alike: place, texture, shadow."""
+"""Compute position, texture and shadow of each pixel before lighting, for RGB and thermal."""
 
 from __future__ import annotations
 

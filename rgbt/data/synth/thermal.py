@@ -1,4 +1,4 @@
-"""The thermal image: temperatures of what is seen, blurred, drifting and noisy.
+"""Render the thermal image: temperatures with blur, drift and noise.
 
 It follows the materials, not the classes: an engine differs from a door, a parked car is as cold as
 the street, a warm outlet shines like a person.

@@ -1,6 +1,6 @@
-"""Writes scenes in the layout of a data set, in parallel where it is worth it.
+"""Write scenes in the layout of a data set, with several processes if there are many.
 
-What the layouts are is in `dataset` (MFNet), `kp`, `pst900` and `freiburg`.
+The layouts are defined in `dataset` (MFNet), `kp`, `pst900` and `freiburg`.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ FRAMES = "next"
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """What a written data set consists of; equal plans give equal files.
+    """The plan of a written data set; equal plans give equal files.
 
     Attributes:
         seed: of the data set.

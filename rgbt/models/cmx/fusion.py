@@ -1,4 +1,4 @@
-"""Between the streams: rectification (FRM) at every stage, and fusion (FFM) for the decoder.
+"""Modules between the streams: rectification (FRM) at every stage, fusion (FFM) for the decoder.
 
 Maps are (N, H, W, C); x1 is RGB, x2 thermal.
 """

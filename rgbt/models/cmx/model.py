@@ -1,4 +1,4 @@
-"""CMX: the two streams, what happens between them, and the decoder put together."""
+"""The network CMX: two streams, the modules between them, and the decoder."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ class CMX(nn.Module):
         depths: blocks per stage.
         num_heads: heads per stage, of attention and of fusion.
         sr_ratios: how many times smaller per side the map is that a stage attends to.
-        mlp_ratio: width of a block's feed-forward network over the block's.
+        mlp_ratio: width of a block's feed-forward network divided by the width of the block.
         decoder_dim: E, channels of the decoder.
         drop_path_rate: stochastic depth of the last block, 0 at the first, in [0, 1).
         drop_path_stage2: "ramp": rates rise from block to block, as in MiT.   Released:
@@ -137,8 +137,8 @@ class CMX(nn.Module):
         shape = MitShape(embed_dims, depths, num_heads, sr_ratios, mlp_ratio)
         if min(int(dim * mlp_ratio) for dim in embed_dims) < 1:
             raise InputError(
-                f"model.mlp_ratio={mlp_ratio:g} leaves no channel of model.embed_dims="
-                f"{list(embed_dims)}; choose a larger ratio, such as 4."
+                f"model.mlp_ratio={mlp_ratio:g} gives 0 channels with "
+                f"model.embed_dims={list(embed_dims)}; choose a larger ratio, such as 4."
             )
         check_heads(embed_dims, num_heads)
         self.num_classes = num_classes
@@ -185,9 +185,9 @@ class CMX(nn.Module):
         image_hw = rgb.shape[2], rgb.shape[3]
         if min(image_hw) < self.shortest_side:
             raise InputError(
-                f"CMX with model.sr_ratios as they are needs images of at least "
-                f"{self.shortest_side} pixels per side, got {image_hw[0]} x {image_hw[1]}; "
-                "use larger images or crops, or smaller sr_ratios."
+                f"CMX with these model.sr_ratios requires images of at least {self.shortest_side} "
+                f"pixels per side, got {image_hw[0]} x {image_hw[1]}; use larger images or crops, "
+                "or smaller model.sr_ratios."
             )
         fused = self.backbone(images, generator)
         quarter = self.decode_head(fused, generator)

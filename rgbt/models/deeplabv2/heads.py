@@ -20,7 +20,7 @@ Rates = Annotated[tuple[Annotated[int, Interval(ge=1, le=1024)], ...], Len(1, 64
 
 @dataclass(frozen=True)
 class HeadShape:
-    """What every head of a network has in common.
+    """The settings that all heads of a network share.
 
     Attributes:
         in_channels: of the features.
@@ -44,16 +44,16 @@ class HeadShape:
     def __post_init__(self) -> None:
         summed = set(self.summed_rates)
         if len(set(self.rates)) < len(self.rates):
-            raise InputError(f"model.rates needs different dilations, got {self.rates}.")
+            raise InputError(f"model.rates must be different dilations, got {self.rates}.")
         if not summed <= set(self.rates) or len(summed) < len(self.summed_rates):
             raise InputError(
-                f"model.summed_rates must name some of model.rates {self.rates}, each once, "
-                f"got {self.summed_rates}."
+                f"model.summed_rates must be some of model.rates {self.rates}, each once, got "
+                f"{self.summed_rates}."
             )
         if self.decoder == "basic" and any(self.dropout):
             raise InputError(
-                "model.dropout drops channels of a modified decoder; with model.decoder=basic it "
-                f"must be [0.0, 0.0], got {self.dropout}."
+                "model.dropout requires a modified decoder; with model.decoder=basic it must be "
+                f"[0.0, 0.0], got {self.dropout}."
             )
 
     @property

@@ -1,4 +1,4 @@
-"""DeepLab v2: one image in, class scores of one of its heads out."""
+"""The network DeepLab v2, which predicts class scores of one image with one of its heads."""
 
 from __future__ import annotations
 
@@ -127,8 +127,8 @@ class DeepLabV2(nn.Module):
         usable = all(name.isidentifier() and not hasattr(nn.ModuleDict, name) for name in heads)
         if len(set(heads)) < len(heads) or not usable:
             raise InputError(
-                "model.heads needs different names made of letters, such as [main] or "
-                f"[source, target], got {list(heads)}."
+                "model.heads must be different names made of letters, such as [main] or [source, "
+                f"target], got {list(heads)}."
             )
         if inputs.thermal_channels != 3:
             raise InputError(
@@ -137,8 +137,8 @@ class DeepLabV2(nn.Module):
             )
         if ceil_mode and decoder != "basic":
             raise InputError(
-                f"model.decoder={decoder} enlarges 8 times, which comes back to the size of the "
-                "image only with model.ceil_mode=false."
+                f"model.decoder={decoder} enlarges 8 times, which gives the size of the image "
+                "only with model.ceil_mode=false; set it."
             )
         self.record = self.record_from(heads=heads, auxiliary=auxiliary)
         self.num_classes = num_classes
@@ -157,7 +157,7 @@ class DeepLabV2(nn.Module):
 
     @staticmethod
     def record_from(*, heads: tuple[str, ...], auxiliary: bool, **_: object) -> Record:
-        """What it returns, what it predicts from; of several heads, the domains train each."""
+        """Output, views and heads; of several heads, the domains train each."""
         return Record(
             requires=(Requirement("domains", "heads", heads),) if len(heads) > 1 else (),
             views=("rgb", "thermal"),

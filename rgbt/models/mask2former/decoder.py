@@ -1,4 +1,4 @@
-"""Masked transformer decoder: queries read the image where their own mask says they are."""
+"""The masked transformer decoder, in which a query attends to the pixels of its own mask."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rgbt.models.mask2former.pixel_decoder import NUM_LEVELS, PixelPyramid, sine
 
 
 class Predictions(NamedTuple):
-    """Predictions of the untouched queries and after each layer.
+    """Predictions of the initial queries and after each layer.
 
     Attributes:
         class_logits: (L, B, Q, K + 1), last column = no object.

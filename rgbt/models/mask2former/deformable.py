@@ -49,7 +49,7 @@ def pixel_scale(levels: Levels, device: torch.device) -> Tensor:
 
 
 class DeformableAttention(nn.Module):
-    """Every token averages a few bilinear samples of each level, at places it chooses itself.
+    """Every token averages a few bilinear samples of each level, at predicted positions.
 
         out_q = W_o sum_j a_qj  value(reference_q + offset_qj),   sum_j a_qj = 1 per head
 

@@ -1,4 +1,4 @@
-"""RGB-T Mask2Former: backbone, pixel decoder and query decoder put together."""
+"""The network RGB-T Mask2Former: backbone, pixel decoder and query decoder."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Mask2Former(nn.Module):
         depths: blocks per stage.
         num_heads: attention heads per stage.
         window_size: side of an attention window, in tokens.
-        mlp_ratio: width of a block's MLP over the block's.
+        mlp_ratio: width of a block's MLP divided by the width of the block.
         drop_path_rate: stochastic depth of a branch's last block, 0 at the first, in [0, 1).
         share_start: stages from this index on (0..4) are the same in both branches; 4 = none.
         fusion: "max" or "add" of the two branches.
@@ -163,7 +163,7 @@ class Mask2Former(nn.Module):
         for view in views:
             check_choice("view", view, VIEWS)
         if self.training and self.drop_path_rate > 0 and generator is None:
-            raise ValueError("training with drop_path_rate > 0 needs `generator`, got None.")
+            raise ValueError("training with drop_path_rate > 0 requires `generator`, got None.")
         image_hw = rgb.shape[2], rgb.shape[3]
         full_hw = padded_hw(image_hw)
         images = self.inputs(rgb, thermal, multiple=STRIDE)

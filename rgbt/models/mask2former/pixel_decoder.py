@@ -18,7 +18,7 @@ NUM_LEVELS = 3
 
 
 class PixelPyramid(NamedTuple):
-    """What the pixel decoder returns.
+    """The output of the pixel decoder.
 
     Mask features are W f + b with the last 1 x 1 convolution (W, b). They are handed on as the
     three factors: e (W f + b) = (e W) f + e b costs less, for fewer embeddings e than pixels.

@@ -55,7 +55,7 @@ def relative_index(window: int) -> Tensor:
 
 @lru_cache(maxsize=64)
 def shift_mask(hw: tuple[int, int], window: int, shift: int, device: torch.device) -> Tensor:
-    """What is added to attention scores so that tokens brought together by the roll stay apart.
+    """Mask added to attention scores to separate tokens that the roll made neighbours.
 
     Source: Swin Transformer, Sec. 3.2, "Efficient batch computation for shifted configuration".
 

@@ -202,7 +202,7 @@ def test_keys_of_figures_are_keys_of_the_command() -> None:
         ("spatialseg/fig2", ["methods=a:x,a:y"], "two entries are called 'a'"),
         ("spatialseg/fig2", ["methods=a:"], "expected label:place, got 'a:'"),
         ("spatialseg/fig5", ["statistics=no.npz"], "no file of statistics"),
-        ("spatialseg/fig1", ["maps=no.npz"], "no file of pixel maps 'no.npz'"),
+        ("spatialseg/fig1", ["maps=no.npz"], "the file of pixel maps 'no.npz' does not exist"),
     ],
 )
 def test_bad_input_is_one_sentence(call: Call, figure: str, words: list[str], word: str) -> None:

@@ -68,7 +68,7 @@ def test_saved_and_loaded_are_equal(tmp_path: Path) -> None:
 
 
 def test_other_files_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="there is no file of pixel maps"):
+    with pytest.raises(InputError, match="the file of pixel maps"):
         PixelMaps.load(tmp_path / "none.npz")
     (tmp_path / "text.npz").write_text("text")
     with pytest.raises(InputError, match="not a readable file of pixel maps"):

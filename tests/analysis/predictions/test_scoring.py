@@ -170,5 +170,5 @@ def test_images_of_different_sizes_have_counts_but_no_map(tiny: MFNet, write: Wr
 
 @pytest.mark.parametrize("wrong", [{"form": "color"}, {"missing": "leave"}, {"resize": "linear"}])
 def test_unknown_choices_are_refused(wrong) -> None:
-    with pytest.raises(InputError, match="is not a choice"):
+    with pytest.raises(InputError, match="is not a valid choice"):
         ScoringOptions(**wrong)

@@ -108,11 +108,11 @@ def test_laplacian_is_the_mean_over_images() -> None:
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda s: derive.region_laplacian(s, "depth"), "modality: 'depth' is not a choice"),
-        (lambda s: derive.region_snr(s, "rgb", "dusk"), "part: 'dusk' is not a choice"),
+        (lambda s: derive.region_laplacian(s, "depth"), "modality: 'depth' is not a valid choice"),
+        (lambda s: derive.region_snr(s, "rgb", "dusk"), "part: 'dusk' is not a valid choice"),
         (
             lambda s: derive.region_snr(s, "rgb", estimator="mad"),
-            "estimator: .mad. is not a choice",
+            "estimator: .mad. is not a valid choice",
         ),
         (lambda s: derive.region_snr(s, "rgb", average="median"), "average: 'median'"),
     ],

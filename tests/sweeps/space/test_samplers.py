@@ -127,7 +127,7 @@ def test_seeds_differ_and_are_reproducible() -> None:
     ("build", "kind", "options", "word"),
     [
         (build_sampler, "tpee", {}, "'tpe'"),
-        (build_sampler, "qmc", {}, "not a choice"),
+        (build_sampler, "qmc", {}, "not a valid choice"),
         (build_sampler, "tpe", {"n_startup": 3}, "'n_startup_trials'"),
         (build_sampler, "tpe", {"seed": "x"}, "sampler.seed"),
         (build_sampler, "tpe", {"gamma": 3}, "sampler.gamma"),

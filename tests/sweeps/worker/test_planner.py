@@ -97,7 +97,7 @@ def test_the_data_set_is_named_by_its_files(planner: Planner, data: Path) -> Non
         ("masker=grid", "there is no masker 'grid'"),
         ("trainer.max_steps=many", "trainer.max_steps"),
         ("+masker.sigma=1", "'masker.sigma' is not a setting"),
-        ("masker", "'masker' is no override"),
+        ("masker", "'masker' is not a valid override"),
         ("dataset.root=/nowhere/to/be/found", "/nowhere/to/be/found"),
     ],
 )
