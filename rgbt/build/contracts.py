@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from rgbt.checks import InputError, check_members, described
 from rgbt.requirements import record_of
-from rgbt.types import IGNORE, Batch, GeneratorOf, Output, Phase, Sample
+from rgbt.types import IGNORE, GeneratorOf, Output, Phase, Sample
 
 DATASET = (
     *("root", "name", "num_classes", "classes", "palette", "unscored", "splits"),
@@ -28,7 +28,11 @@ DATASET_CALLS = {
     **{"files": ("name",), "nights": ("names",), "fingerprint": (), "decoding": ()},
 }
 MODEL_CALLS = {"forward": ("rgb", "thermal", "masks", "views=", "generator=")}
-LOSS_CALLS = {"__call__": ("output", "batch", "generator")}
+LOSS_CALLS = {
+    1: {"__call__": ("output", "batch", "generator")},
+    2: {"__call__": ("first", "second", "warped", "valid", "generator")},
+}
+"""By the number of frames that the record of a loss says it takes."""
 SCHEME_CALLS = {"phases": ("batch", "generator_of")}
 TRANSFORM_CALLS = {"train": ("sample", "rng"), "test": ("sample",)}
 EXAMPLE = ("rgb", "thermal", "label", "centre_yx", "position", "original_hw", "name", "confidence")
@@ -190,7 +194,8 @@ class CheckedLoss:
     """A wrapper of a user's loss that checks the first returned value against `Loss`."""
 
     def __init__(self, loss: Any) -> None:
-        check_members("loss", loss, (), LOSS_CALLS)
+        self._frames = record_of(loss).frames
+        check_members("loss", loss, (), LOSS_CALLS[self._frames])
         self._loss = loss
         self._is_checked = False
 
@@ -199,12 +204,12 @@ class CheckedLoss:
             raise AttributeError(key)
         return getattr(self._loss, key)
 
-    def __call__(self, output: Output, batch: Batch, generator: torch.Generator) -> Any:
+    def __call__(self, *arguments: Any) -> Any:
         """Call the loss; check what the first call returns."""
-        found = self._loss(output, batch, generator)
+        found = self._loss(*arguments)
         if not self._is_checked:
             name = getattr(self._loss, "__name__", f"{type(self._loss).__name__}.__call__")
-            _check_parts(f"loss: {name} returned", found, dims=1)
+            _check_parts(f"loss: {name} returned", found, dims=int(self._frames == 1))
             self._is_checked = True
         return found
 

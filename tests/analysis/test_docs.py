@@ -1,4 +1,4 @@
-"""The worked examples of docs/analysis.md run, one after the other, and print what they promise."""
+"""The worked examples of three how-to pages run, page by page, and print what they promise."""
 
 from __future__ import annotations
 
@@ -7,21 +7,22 @@ from pathlib import Path
 
 import pytest
 
-DOCS = Path(__file__).resolve().parents[2] / "docs" / "analysis.md"
+HOW_TO = Path(__file__).resolve().parents[2] / "docs" / "how-to"
+PAGES = ("analyse-a-data-set", "score-predictions", "compare-methods")
 
 
-def examples() -> list[str]:
-    return re.findall(r"^```python\n(.*?)^```", DOCS.read_text(), re.MULTILINE | re.DOTALL)
+def examples(page: str) -> str:
+    text = (HOW_TO / f"{page}.md").read_text()
+    return "\n".join(re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL))
 
 
 def test_examples_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    shared: dict[str, object] = {}
     printed = []
-    for code in examples():
-        exec(compile(code, str(DOCS), "exec"), shared)
+    for page in PAGES:
+        exec(compile(examples(page), page, "exec"), {})
         printed.append(capsys.readouterr().out)
     statistics, scores, comparison = printed
     assert len(re.findall(r"0\.\d+", statistics.splitlines()[0])) == 9

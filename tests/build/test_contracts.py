@@ -13,6 +13,7 @@ import torch
 from torch import nn
 
 from rgbt.build import contracts
+from rgbt.checks import InputError
 from rgbt.data.mfnet import MFNet
 from rgbt.maskers.contract import check_masker
 from rgbt.requirements import Record, record_of
@@ -205,3 +206,18 @@ def test_loss_passes_its_attributes_on() -> None:
     assert record_of(loss).weighs_confidence
     assert record_of(contracts.CheckedLoss(lambda output, batch, generator: {})) == Record()
     assert loss(None, None, None)["a"].shape == (1,)
+
+
+def test_loss_between_two_frames_is_called_with_both() -> None:
+    class Loss:
+        record = Record(frames=2)
+
+        def __init__(self, value: torch.Tensor) -> None:
+            self.value = value
+
+        def __call__(self, first, second, warped, valid, generator):
+            return {"a": self.value}
+
+    assert contracts.CheckedLoss(Loss(VALUE))(*[None] * 5)["a"] is VALUE
+    with pytest.raises(InputError, match=r"'a': Tensor \(1,\) float32; expected .* scalars"):
+        contracts.CheckedLoss(Loss(VALUE[None]))(*[None] * 5)

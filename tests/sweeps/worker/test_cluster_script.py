@@ -1,4 +1,4 @@
-"""The array script of docs/cluster.md, run with stand-ins for its driver and for SLURM."""
+"""The array script of the how-to page on clusters, run with stand-ins for its driver and SLURM."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "cluster.md"
+DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "how-to" / "cluster-and-slurm.md"
 PYTHON = """#!/bin/bash
 echo "$@" > $STATE/command
 trap 'echo told >> $STATE/driver; exit 143' TERM
@@ -23,7 +23,7 @@ while true; do sleep 0.05; done
 
 @pytest.fixture
 def script(tmp_path: Path) -> Path:
-    (text,) = re.findall(r"```bash\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
+    (text,) = re.findall(r"```bash\n(#!/bin/bash\n.*?)```", DOCUMENT.read_text(), re.DOTALL)
     (tmp_path / "rgbt.sbatch").write_text(text.replace("/shared/you/rgbt", str(tmp_path)))
     programs = tmp_path / ".venv" / "bin"
     programs.mkdir(parents=True)
@@ -67,7 +67,7 @@ def test_the_driver_is_stopped_before_the_task_ends(
 
 
 def test_its_keys_are_those_of_the_sweeper() -> None:
-    conf = DOCUMENT.parents[1] / "conf" / "hydra" / "sweeper" / "study.yaml"
+    conf = DOCUMENT.parents[2] / "conf" / "hydra" / "sweeper" / "study.yaml"
     known = set(re.findall(r"^(\w+):", conf.read_text(), re.MULTILINE))
     used = set(re.findall(r"hydra\.sweeper\.(\w+)", DOCUMENT.read_text()))
     assert used
