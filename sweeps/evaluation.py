@@ -9,7 +9,7 @@ from rgbt.metrics.pairs import Protocol, file_name
 from rgbt.spec.corruption_names import row_name
 
 Head = Literal["as trained", "own", "source", "target"]
-"""Which head of a network predicts: that of an image's own domain, or one domain's for all."""
+"""The head that predicts: that of the domain of each image, or that of one domain for all."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class ExtraEvaluation:
         frames: protocol of pairs of frames, see `rgbt.metrics.pairs`; None: single frames.
         head: see `Head`; of single frames alone.
         corruption: of the images, NAME or NAME:IMAGE with a file of ``conf/corruption``; None:
-            clean, as the run's own.
+            clean, as the evaluation that the run makes itself.
         severity: of the corruption; None: the only one that it has.
     """
 

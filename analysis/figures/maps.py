@@ -106,7 +106,7 @@ def make_regions(given: FigureInput) -> Figure:
 def iou_heat(maps: PixelMaps, regions: Regions, *, beside_part: bool = False) -> HeatMap:
     """Pixel-level IoU, mean over classes (Fig. 1a).
 
-    The map itself leaves classes out that never occur at a pixel, see
+    The map itself excludes classes that never occur at a pixel, see
     `analysis.predictions.maps.iou_map`.
 
     Args:

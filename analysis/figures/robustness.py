@@ -244,7 +244,7 @@ def numbers(data: Sequence[Panel]) -> dict[str, str]:
     header = (ROW, "severity", "unit", "method", "seeds", "mIoU", "sd")
     lines: list[tuple[object, ...]] = [(*header, "relative", "relative_sd")]
     rows = []
-    # The clean images stand in every panel, and once in the table.
+    # The clean images are in every panel, and once in the table.
     places = [(p, at) for n, p in enumerate(data) for at in range(min(n, 1), len(p.severities))]
     for panel, place in places:
         said = (panel.title, f"{panel.severities[place]:g}")

@@ -64,7 +64,7 @@ def part_grid(table: ScoreTable) -> TextTable:
             cells += [replace(cell, region=region) for region in numbers]
             label = f"{images} ({num_images}){_ending(absent, conventions)}"
             scores = [table.scores[each] for each in cells]
-            # The intervals of regions stand in their own table; here they would be too wide.
+            # The intervals of regions have a separate table; here they would be too wide.
             shown = [*map(_with_interval, scores[:2]), *(number(each.value) for each in scores[2:])]
             rows.append((label, *shown))
     return TextTable(f"{_title(table)}: all images, day and night", header, tuple(rows))

@@ -1,4 +1,4 @@
-"""Examples of the masks that the runs were trained with, small enough to lie inside the page."""
+"""Examples of the masks that the runs were trained with, small enough to be part of the page."""
 
 from __future__ import annotations
 

@@ -194,7 +194,7 @@ def _html(markdown: str) -> Markup:
 
 
 def embedded(plain: Any) -> str:
-    """JSON that may stand inside a script element.
+    """JSON that is safe inside a script element.
 
     Only ASCII, so that neither U+2028 nor half of a surrogate pair is in the file; no ``<``, so
     that no text can end the element. A number that is not finite becomes null, as JSON has none.

@@ -31,7 +31,7 @@ def run_records(singles: Sequence[Group]) -> dict[str, Any]:
     """The runs by key, their configurations stored by what differs.
 
     Args:
-        singles: every run as a group of its own.
+        singles: every run as a separate group.
 
     Returns:
         ``runs``, and ``common_config`` with each key's most frequent value; in each run ``config``

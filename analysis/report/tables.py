@@ -247,7 +247,7 @@ def _command(recorded: RecordedTable) -> str:
 
 
 def _waiting(name: str, table: Table) -> TableEntry:
-    """A table that nobody has run."""
+    """A table without runs."""
     return _laid_out(
         name,
         table,

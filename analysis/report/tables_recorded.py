@@ -159,7 +159,7 @@ class CountsSource:
 
 @dataclass(frozen=True)
 class _Outcome:
-    """What became of a cell's run, as `sweeps.table.scoring` reads it."""
+    """The outcome of a cell's run, as `sweeps.table.scoring` reads it."""
 
     state: str
     reason: str = ""
@@ -210,7 +210,7 @@ class RescoredTable:
         try:
             counts = run.counts(counts_path(column, table))
             return value(metric_of(column, row), counts, table.absent or counts.absent)
-        except InputError:  # the reason stands in the cell
+        except InputError:  # the cell shows the reason
             return None
 
     def _sides(self, column: Column) -> list[Column]:
@@ -263,7 +263,7 @@ def score_again(
 def _by_seed(
     keys: Sequence[str], seeds: Sequence[int], runs: Mapping[str, ReportRun]
 ) -> dict[int, _Outcome]:
-    """What became of every seed of a row; a run that is not here stands for a seed without one."""
+    """The outcome of every seed of a row; a seed without a run here has an empty outcome."""
     outcomes = {seed: _Outcome("failed", "not finished") for seed in seeds}
     here = {seed: key for key in keys if key in runs and (seed := runs[key].entry.seed) is not None}
     outcomes |= {seed: _Outcome("finished", results=(runs[key],)) for seed, key in here.items()}

@@ -291,7 +291,7 @@ class Group:
 
 
 def groups_of(runs: Iterable[RunEntry], *, single: bool = False) -> list[Group]:
-    """The runs by group in the order of their first ones; `single`: each for itself."""
+    """The runs by group in the order of their first ones; `single`: each run is a group."""
     found: dict[tuple[Any, ...], list[RunEntry]] = {}
     for run in runs:
         name = run.name if single else run.group or run.experiment or run.name

@@ -38,7 +38,7 @@ MAX_HEADLINES = 5
 """Of a table; those after them are left out of its figure."""
 
 SHIFT = 0.13
-"""How far published markers stand beside ours, in rows or columns."""
+"""Shift of published markers beside ours, in rows or columns."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Series:
     sds: Sequence[float]
 
     def known(self) -> list[float]:
-        """The values that there are."""
+        """The finite values."""
         return [mean for mean in self.means if not math.isnan(mean)]
 
 

@@ -29,7 +29,7 @@ class Column:
     Attributes:
         name: as in the rows' `values`.
         metric: a name of `rgbt.metrics.names`, or class/<name>/acc, class/<name>/region/<n>;
-            ``{key}`` stands for that entry of the row's settings.
+            ``{key}`` is replaced by that entry of the row's settings.
         minus: (a, b): column a minus column b.
         mean: mean of two or more other columns of the row, e.g. of day and night.
         parameters: millions of parameters of the row's network, counted without any run and always

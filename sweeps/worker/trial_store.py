@@ -235,7 +235,7 @@ class TrialStore:
         """Running trials whose driver is dead.
 
         Args:
-            executing: numbers of this driver's trials; any other of its own was lost when the
+            executing: numbers of this driver's trials; any other of its trials was lost when the
                 storage failed during a claim.
         """
         for trial in self.trials():

@@ -86,7 +86,7 @@ def test_group_names_are_shown_whole(call: Call, tmp_path: Path, name: str):
         counts.save(make_run(runs, key, group, 0) / "counts_test.npz")
     code, out, err = call(entry, f"a={name}", "b=crm", f"runs_dir={runs}", *FAST)
     assert (code, err) == (0, "")
-    assert f"crm less {name}: 40 single images" in out
+    assert f"crm minus {name}: 40 single images" in out
     assert f"than that of {name} (" in out
     assert name in next(line for line in out.splitlines() if "difference" in line)
 

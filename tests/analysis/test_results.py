@@ -132,12 +132,12 @@ def test_ambiguous_folder_of_scores_is_refused(tmp_path: Path, names: tuple[str,
 @pytest.mark.parametrize(
     ("text", "options", "word"),
     [
-        ("aab0", {}, "'aab0' is no run folder.*crm scale=demo"),
-        ("/no/such/folder", {}, "is no run folder"),
-        ("mlflow-none", {}, "is no run folder"),
+        ("aab0", {}, "'aab0' is not a run folder.*crm scale=demo"),
+        ("/no/such/folder", {}, "is not a run folder"),
+        ("mlflow-none", {}, "is not a run folder"),
         ("crm scale=dem", {}, "did you mean 'crm scale=demo'"),
-        (f"{LONG}1", {}, "is no run folder"),
-        ("abc", {"runs_dir": "none"}, "'abc' is no run folder"),
+        (f"{LONG}1", {}, "is not a run folder"),
+        ("abc", {"runs_dir": "none"}, "'abc' is not a run folder"),
         ("crm", {"runs_dir": "none"}, r"neither a run \(config.yaml\) nor counts .*rgbt score"),
         ("none.npz", {}, "there is no file of counts"),
         ("images.npz", {}, "is no file of counts"),
@@ -172,7 +172,7 @@ def test_damaged_run_stops_nothing_else(runs: Path, capsys: pytest.CaptureFixtur
         (broken / name).write_text(text)
     assert len(open_counts("other method.npz", runs)) == 1
     assert CRM in groups_in(runs)
-    with pytest.raises(InputError, match="is no run folder"):
+    with pytest.raises(InputError, match="is not a run folder"):
         open_counts("mlflow-nobody", runs)
     open_counts("aaa9", runs)
     assert "is not finished" in capsys.readouterr().err

@@ -130,7 +130,7 @@ SAID = {
         "(c) rings (inside to outside)",
     ),
     "spatialseg/fig8": ("RGB", "thermal", "ground truth", "00011N", "car stop"),
-    "temporal/fig5": ("virtual views, first frame brought into the second",),
+    "temporal/fig5": ("virtual views, first frame warped into the second",),
     "crm/fig5": ("square", "16 x 16 pixels", "thermal"),
     "multihead/fig3": ("entropy minimisation", "maximum squares", "gradient magnitude"),
 }
@@ -187,7 +187,7 @@ def test_keys_of_figures_are_keys_of_the_command() -> None:
         ("crm/fig5", [], "needs dataset=..."),
         ("temporal/fig5", [], "needs runs=..., runs, groups or files of counts"),
         ("robustness", [], "needs runs=..., runs or groups"),
-        ("regions/heat", ["runs=nowhere"], "'nowhere' is no run folder"),
+        ("regions/heat", ["runs=nowhere"], "'nowhere' is not a run folder"),
         ("regions/heat", ["frames=next"], "'frames' has no effect on figure="),
         ("regions/heat", ["size=big"], "size must be HEIGHTxWIDTH"),
         ("regions/heat", ["size=4097x640"], "16 to 4096 pixels each"),

@@ -374,7 +374,7 @@ def test_unreadable_table_file_is_reported(
     (tmp_path / "tables" / "own" / "t.yaml").write_text("paper: [")
     monkeypatch.chdir(tmp_path)
     found = collected(runs_dir)
-    assert found.remarks[0].startswith("Table 'own/t' is left out: ")
+    assert found.remarks[0].startswith("Table 'own/t' is omitted: ")
 
 
 def test_an_empty_experiment_makes_a_page_of_published_tables(runs_dir: Path) -> None:

@@ -140,9 +140,9 @@ def test_auto_uses_the_longest_block_that_gives_enough_blocks():
         (
             [*mfnet(20), "final"],
             "sequence",
-            "blocks=sequence: names such as '00001D' tell no neigh",
+            "blocks=sequence: names such as '00001D' show no neigh",
         ),
-        ([*mfnet(20), "final"], 5, "blocks=5: names such as '00001D' tell no neigh"),
+        ([*mfnet(20), "final"], 5, "blocks=5: names such as '00001D' show no neigh"),
         ([f"{c}_{n}" for n, c in enumerate("abcdefghijklm")], 5, "show no neighbouring frames"),
         (mfnet(100), 20, "blocks=20: 100 images make 5 blocks of up to 20"),
         (mfnet(100) + mfnet(100, "N"), "sequence", "200 images make 2 sequences"),

@@ -74,7 +74,7 @@ def test_intervals_are_entries_of_a_space() -> None:
     [
         ("seed=range(3,1)", "'seed=range(3,1)' has no values"),
         ("model=glob(nothing*)", "has no values"),
-        ("a=tag(lgo,interval(1,2))", "tag 'lgo' means nothing; did you mean 'log'?"),
+        ("a=tag(lgo,interval(1,2))", "tag 'lgo' is unknown; did you mean 'log'?"),
         ("a=tag(log,choice(1,2))", "only interval() has tags"),
     ],
 )

@@ -58,7 +58,7 @@ def test_ranges_arrive_as_written() -> None:
         ({**FLOAT, "log": "yes"}, "log must be true or false, got 'yes'"),
         ({**FLOAT, "step": 0.5}, "step and log: true exclude each other"),
         ({"type": "int", "low": 0, "high": 4, "step": 0}, "step must be positive, got 0"),
-        ({"type": "int", "low": 0, "high": 4, "step": 3}, "no whole number of steps of 3"),
+        ({"type": "int", "low": 0, "high": 4, "step": 3}, "not a whole number of steps of 3"),
         ({"type": "categorical"}, "at least one value, got None"),
         ({"type": "categorical", "choices": []}, "at least one value, got []"),
         ({"type": "categorical", "choices": [1, 2.5, True]}, "choices contain True twice"),

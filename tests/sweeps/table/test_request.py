@@ -109,7 +109,7 @@ def test_seeds(text: str, seeds: tuple[int, ...]) -> None:
 
 @pytest.mark.parametrize("text", ["0", "", "a", "1,1", "-2", "1.5", "1,"])
 def test_no_seeds(text: str) -> None:
-    with pytest.raises(InputError, match="how many"):
+    with pytest.raises(InputError, match="expected a number of seeds"):
         seeds_of(text)
 
 

@@ -311,7 +311,7 @@ def test_running_trial_remote_run_cannot_be_evaluated(
     finish(tmp_path / "copy")
     bench = Bench(tmp_path, evaluated(evaluations=(RING,)))
     monkeypatch.setattr(bench.runs, "find", lambda key, dataset: RunResult(tmp_path / "copy", "7"))
-    with pytest.raises(TrialError, match="made on another machine: .*thermal, ring9"):
+    with pytest.raises(TrialError, match="trained on another machine: .*thermal, ring9"):
         bench.run()
     assert bench.executor.calls == []
 
