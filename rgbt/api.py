@@ -258,7 +258,7 @@ def load_run(
         InputError: no such run, a class in its configuration that is neither part of rgbt nor
             trusted, or overrides that do not fit.
 
-    Example:
+    Examples:
         >>> run = rgbt.load_run("runs/a281d3f80222")
         >>> round(run.scores()["mIoU"], 2)
         48.75
@@ -281,7 +281,7 @@ def results(runs_dir: str | Path = "runs") -> Results:
     Raises:
         InputError: there is no such folder.
 
-    Example:
+    Examples:
         >>> rgbt.results("runs").to_pandas()[["name", "mIoU", "Var"]]
     """
     stored = [RunResult(run.path) for run in runs_in(runs_dir)]
