@@ -112,8 +112,8 @@ class Run:
         """Every score that follows from `counts`, by name (`rgbt.metrics.names`).
 
         Returns:
-            "mIoU", "Var", "mAcc", ..., "region/1", ..., "class/car", ..., "day/mIoU", ...: percent;
-            "Var" and names that end with it in squared percent points.
+            percent by name, such as "mIoU", "region/1", "class/car" and "day/mIoU"; "Var" is in
+            squared percent points.
 
         Raises:
             InputError: as `counts`.
@@ -147,8 +147,8 @@ class Run:
                 run's configuration says.
 
         Returns:
-            (H, W) uint8, indices of ``run.dataset.classes``; of images that are cut, the size of
-            the cut.
+            (H, W) uint8, indices of ``run.dataset.classes``; smaller than the file where the data
+            set cuts its images.
 
         Raises:
             InputError: images of other types, shapes or values; a run without checkpoint; a
@@ -258,9 +258,9 @@ def load_run(
         InputError: no such run, a class in its configuration that is neither part of rgbt nor
             trusted, or overrides that do not fit.
 
-    Example:
+    Examples:
         >>> run = rgbt.load_run("runs/a281d3f80222")
-        >>> run.scores()["mIoU"]
+        >>> round(run.scores()["mIoU"], 2)
         48.75
     """
     check_choice("checkpoint", checkpoint, CHECKPOINTS)
@@ -281,7 +281,7 @@ def results(runs_dir: str | Path = "runs") -> Results:
     Raises:
         InputError: there is no such folder.
 
-    Example:
+    Examples:
         >>> rgbt.results("runs").to_pandas()[["name", "mIoU", "Var"]]
     """
     stored = [RunResult(run.path) for run in runs_in(runs_dir)]
