@@ -1,11 +1,11 @@
-"""A user masker, network and experiment from outside this repository, as documented."""
+"""Components from outside this repository: a view, and mistakes in the parts of the tutorials.
+
+`tests/docs` follows the tutorials themselves.
+"""
 
 from __future__ import annotations
 
-import json
-import re
-import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,8 @@ from rgbt.randomness import numpy_generator
 from rgbt.spec.specify import specify
 from tests.commands import SPLITS, Call, assert_one_sentence, losses, only_run, short, train
 from tests.conftest import write_data
+from tests.docs.blocks import ROOT, Page
+from tests.docs.reader_folder import reading_in, write_titled
 
 VIEW = '''
 from dataclasses import replace
@@ -79,100 +81,91 @@ def test_user_second_frame_is_used_in_training(
     assert_one_sentence(err, "did you mean 'columns'?")
 
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "extending.md"
-
-
-def written(root: Path) -> Path:
-    """The files of the page, by the name in the first line of each block, and some data."""
-    for text in re.findall(r"```(?:python|yaml)\n(.*?)```", PAGE.read_text(), re.DOTALL):
-        name, _, body = text.removeprefix("# ").partition("\n")
-        path = root / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("a") as file:
-            file.write(body)
-    rng = numpy_generator(0, "arrays")
-    for split in ("train", "val", "test"):
-        (root / "data" / split).mkdir(parents=True)
-        for name in "ab":
-            rgb = rng.integers(0, 256, (40, 64, 3), np.uint8)
-            thermal, label = rng.integers(0, 256, (40, 64), np.uint8), np.zeros((40, 64), np.uint8)
-            label[:20] = 2
-            np.savez(root / "data" / split / name, rgb=rgb, thermal=thermal, label=label)
-    return root
+SMOKE = ("+debug=smoke", "tracking=none", "trainer.accelerator=cpu", "trainer.threads=1")
 
 
 @pytest.fixture
-def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A folder with what the page says, on Python's path."""
-    monkeypatch.syspath_prepend(str(tmp_path))
-    yield written(tmp_path)
-    sys.modules.pop("my_lab", None)
+def lab(tmp_path: Path) -> Iterator[Callable[[str], Path]]:
+    """Writes the files of a tutorial to an empty folder, which is searched for them."""
 
+    def write(name: str) -> Path:
+        for block in Page.read(ROOT / "docs" / "tutorials" / name).blocks:
+            if block.title:
+                write_titled(block, tmp_path)
+        return tmp_path
 
-def words_of(lab: Path) -> list[str]:
-    return [
-        *("+experiment=mine", "+debug=smoke", f"dataset.root={lab / 'data'}"),
-        *(f"hydra.searchpath=[file://{lab / 'conf'}]", f"runs_dir={lab / 'runs'}"),
-        *("tracking=none", "trainer.accelerator=cpu", "trainer.threads=1"),
-    ]
-
-
-def test_the_page_runs(lab: Path, call: Call) -> None:
-    from rgbt import evaluate, predict
-    from rgbt.maskers import sketch
-    from rgbt.run import main
-
-    code, _, err = call(main, *words_of(lab))
-    assert code == 0, err
-    run = only_run(lab / "runs")
-    assert json.loads((run / "result.json").read_text())["name"].endswith(" · mine")
-    assert {"loss/clean_focal", "loss/masked_focal"} <= losses(run)[0].keys()
-    code, _, err = call(sketch.main, *words_of(lab), f"out={lab / 'masks.png'}")
-    assert code == 0, err
-    assert (lab / "masks.png").is_file()
-    words = (f"run={run}", f"corruption={lab / 'haze.yaml'}", "severity=0.5", "trust=my_lab")
-    code, _, err = call(evaluate.entry, *words)
-    assert code == 0, err
-    words = (f"run={run}", "input=test", f"out={lab / 'out'}", "trust=my_lab")
-    code, _, err = call(predict.entry, *words)
-    assert code == 0, err
-    code, _, err = call(predict.entry, *words, f"input={lab}")
-    assert code == 2
-    assert_one_sentence(
-        err, "Arrays does not declare how to read new images. Name one of its splits"
-    )
-
-
-FOCAL = '{"focal": ((1 - (-each).exp()) ** self.gamma * each).mean()[None]}'
+    with reading_in(tmp_path) as variables:
+        variables.setenv("RGBT_CONF", str(tmp_path / "conf"))
+        yield write
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "sentence"),
+    ("page", "words", "old", "new", "sentence"),
     [
         (
+            "own-masker.md",
+            ("+experiment=halves",),
             "height // self.cell",
             "height // 7",
-            "masker: Halves.__call__ returned MaskPair: rgb is Tensor (1, 9, 2) bool; expected "
-            "MaskPair(rgb, thermal), each bool (1, h, w), True = hidden, h and w dividing 64 and "
-            "64: a crop of 40x64 pixels is padded to 64x64 before cells are cut.",
+            "masker: Halves.__call__ returned MaskPair: rgb is Tensor (1, 18, 5) bool; expected "
+            "MaskPair(rgb, thermal), each bool (1, h, w), True = hidden, h and w dividing 128 and "
+            "160: a crop of 120x160 pixels is padded to 128x160 before cells are cut.",
         ),
-        (FOCAL, "each.mean()", "loss: Focal.__call__ returned Tensor () float32; expected a dict"),
+        (
+            "own-loss.md",
+            ("+experiment=mfnet_lovasz",),
+            'return {\n            "cross_entropy"',
+            'return cross_entropy\n        return {\n            "cross_entropy"',
+            "loss: CrossEntropyAndLovasz.__call__ returned Tensor () float32; expected a dict",
+        ),
     ],
 )
-def test_a_wrong_part_is_one_sentence_of_the_command(
-    lab: Path, call: Call, old: str, new: str, sentence: str
+def test_wrong_part_is_reported_in_one_sentence(
+    lab: Callable[[str], Path],
+    call: Call,
+    page: str,
+    words: tuple[str, ...],
+    old: str,
+    new: str,
+    sentence: str,
 ) -> None:
     from rgbt.run import main
 
-    text = (lab / "my_lab.py").read_text()
-    assert old in text
-    (lab / "my_lab.py").write_text(text.replace(old, new))
-    code, _, err = call(main, *words_of(lab))
+    module = lab(page) / "my_lab.py"
+    text = module.read_text()
+    assert old in text, f"docs/tutorials/{page} has changed: {old}"
+    module.write_text(text.replace(old, new))
+    code, _, err = call(main, *words, *SMOKE)
     assert code == 2, err
     assert_one_sentence(err, sentence)
 
 
-def test_misspelt_key_of_a_user_file_is_named(lab: Path) -> None:
-    config = compose([*words_of(lab), "masker.cell=4", "+masker.cel=4"])
+def test_misspelt_key_of_own_masker_is_named(lab: Callable[[str], Path]) -> None:
+    lab("own-masker.md")
+    config = compose(["+experiment=halves", "masker.cell=4", "+masker.cel=4"])
     with pytest.raises(InputError, match=r"'masker.cel' is not a setting of my_lab.Halves; did"):
         specify(config)
+
+
+def test_data_set_without_new_images_is_reported(lab: Callable[[str], Path], call: Call) -> None:
+    from rgbt import predict
+    from rgbt.run import main
+
+    folder = lab("own-data-set.md")
+    rng = numpy_generator(0, "arrays")
+    for split in ("train", "val", "test"):
+        (folder / "data/arrays" / split).mkdir(parents=True)
+        for name in "ab":
+            rgb = rng.integers(0, 256, (40, 64, 3), np.uint8)
+            thermal, label = rng.integers(0, 256, (40, 64), np.uint8), np.zeros((40, 64), np.uint8)
+            label[:20] = 2
+            path = folder / "data/arrays" / split / name
+            np.savez(path, rgb=rgb, thermal=thermal, label=label)
+    code, _, err = call(main, "+experiment=mfnet", "dataset=arrays", *SMOKE)
+    assert code == 0, err
+    words = (f"run={only_run(folder / 'runs')}", "out=out", "trust=my_lab")
+    code, _, err = call(predict.entry, *words, f"input={folder}")
+    assert code == 2
+    assert_one_sentence(
+        err, "Arrays does not declare how new images are read; name one of its splits"
+    )
