@@ -90,9 +90,9 @@ def losses(folder: Path) -> list[dict[str, float]]:
 
 
 def assert_one_sentence(err: str, sentence: str) -> None:
-    told = [line for line in err.splitlines() if line.startswith("rgbt: ")]
-    assert len(told) == 1, err
-    assert sentence in told[0]
+    messages = [line for line in err.splitlines() if line.startswith("rgbt: ")]
+    assert len(messages) == 1, err
+    assert sentence in messages[0]
     assert "Traceback" not in err
 
 

@@ -104,7 +104,7 @@ def png() -> Callable[[Path, np.ndarray], None]:
 
 @pytest.fixture
 def pictures() -> None:
-    """Asked for by a test that looks at the pictures of a run; others go without."""
+    """Requested by a test that reads the pictures of a run; other tests draw none."""
 
 
 @pytest.fixture

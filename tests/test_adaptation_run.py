@@ -176,7 +176,7 @@ def test_night_images_are_predicted_by_the_targets_head(
     source = evaluated(without_head(folder, "source", tmp_path / "source")).counts
     assert only_road(source[day])
     assert np.array_equal(source[night], whole[night])
-    # And as asked.
+    # And with the requested head.
     assert only_road(evaluated(tmp_path / "target", "head=target").counts)
     assert not only_road(evaluated(tmp_path / "target", "head=source").counts[night])
     assert np.array_equal(evaluated(folder, "head=own").counts, whole)

@@ -172,9 +172,9 @@ def test_bash_completes_behind_the_last_word_break(
 ) -> None:
     (tmp_path / "rgbt").write_text(f'#!/bin/sh\ncd {ROOT}; exec {sys.executable} -m rgbt "$@"\n')
     (tmp_path / "rgbt").chmod(0o755)
-    asked = f"COMP_LINE='{line}' COMP_POINT={len(line)}; _rgbt"
+    typed = f"COMP_LINE='{line}' COMP_POINT={len(line)}; _rgbt"
     shown = "printf '%s\\n' \"${COMPREPLY[@]}\""
     path = {**os.environ, "PATH": f"{tmp_path}:{os.environ['PATH']}"}
-    command = ["bash", "-c", f"{BASH}\n{asked}\n{shown}"]
+    command = ["bash", "-c", f"{BASH}\n{typed}\n{shown}"]
     done = subprocess.run(command, env=path, capture_output=True, text=True, check=True)
     assert done.stdout.split("\n")[:-1] == replies

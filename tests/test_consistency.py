@@ -275,8 +275,14 @@ def test_consistency_of_split_checkpoint_and_modality_have_files(
     call: Call, trained: Trained, tmp_path: Path
 ) -> None:
     folder, out = trained("+experiment=crm", *short(1)), tmp_path / "out"
-    asked = ("modality=default", "modality=rgb", "modality=thermal", "checkpoint=last", "split=val")
-    for word in asked:
+    requested = (
+        "modality=default",
+        "modality=rgb",
+        "modality=thermal",
+        "checkpoint=last",
+        "split=val",
+    )
+    for word in requested:
         measure(call, f"run={folder}", f"out={out}", word)
     ends = ("test", "test_rgb", "test_thermal", "test_last", "val")
     expected = {f"consistency_{p}_{end}.npz" for p in ("aligned", "released") for end in ends}
@@ -352,7 +358,7 @@ def test_consistency_counts_are_kept_where_no_picture_can_be_drawn(
 
 
 @pytest.mark.parametrize(
-    ("measured", "asked", "told"),
+    ("measured", "requested", "reported"),
     [
         (("consistency=none",), (), True),
         (("consistency=none",), ("consistency=none",), False),
@@ -360,7 +366,7 @@ def test_consistency_counts_are_kept_where_no_picture_can_be_drawn(
         ((), ("consistency.splits=[val,test]",), True),
         ((), ("consistency.sets=[released_1]",), True),
     ],
-    ids=["nothing measured", "nothing asked", "measured", "another split", "other views"],
+    ids=["nothing measured", "nothing requested", "measured", "another split", "other views"],
 )
 def test_finished_run_reports_missing_measurements(
     call: Call,
@@ -368,15 +374,15 @@ def test_finished_run_reports_missing_measurements(
     data: Path,
     tmp_path: Path,
     measured: tuple[str, ...],
-    asked: tuple[str, ...],
-    told: bool,
+    requested: tuple[str, ...],
+    reported: bool,
 ) -> None:
     folder = copied(trained, tmp_path, *measured)
     before, known = sorted(folder.rglob("*")), read(folder, "run.json")
-    code, _, err = train(call, data, folder.parent, *TEMPORAL, *asked)
+    code, _, err = train(call, data, folder.parent, *TEMPORAL, *requested)
     assert code == 0, err
     lines = [line for line in err.splitlines() if "has not been measured" in line]
-    assert len(lines) == told
+    assert len(lines) == reported
     assert all(f"rgbt consistency run={folder} split=..." in line for line in lines)
     assert sorted(folder.rglob("*")) == before
     assert read(folder, "run.json") == known

@@ -339,7 +339,7 @@ def follow(path: Path) -> Any:
     return plain(MetricsReader(path.parent).new_lines())
 
 
-def found(path: Path) -> Any:
+def result_of(path: Path) -> Any:
     from rgbt.tracking.run_result import RunResult
 
     run = RunResult(path.parent)
@@ -509,7 +509,7 @@ KINDS = {
         Kind("metrics.jsonl of a resumed run", in_run("metrics.jsonl"), resume, part_of),
         Kind("metrics.jsonl of a sweep", in_run("metrics.jsonl"), follow, part_of_some),
         Kind("result.json", in_run("result.json"), by("read_result")),
-        Kind("result.json of a sweep", in_run("result.json"), found),
+        Kind("result.json of a sweep", in_run("result.json"), result_of),
         Kind("run.json", in_run("run.json"), by("read_description")),
         Kind("tables.json", in_run("tables.json"), by("read_tables")),
         Kind("provenance.json", in_run("provenance.json"), read_provenance),

@@ -167,5 +167,5 @@ def test_data_set_without_new_images_is_reported(lab: Callable[[str], Path], cal
     code, _, err = call(predict.entry, *words, f"input={folder}")
     assert code == 2
     assert_one_sentence(
-        err, "Arrays does not declare how new images are read; name one of its splits"
+        err, "Arrays does not declare how to read new images. Name one of its splits"
     )

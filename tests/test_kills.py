@@ -42,7 +42,7 @@ TIMES = ("images_per_s", "wait_share", "peak_memory_mib")
 
 @dataclass
 class Training:
-    """One command, given again and again."""
+    """One command that is rerun after every kill."""
 
     place: Path
     root: Path

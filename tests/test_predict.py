@@ -27,8 +27,8 @@ def image(path: Path) -> np.ndarray:
 @pytest.mark.slow
 def test_pseudo_labels_of_a_run(call: Call, trained: Trained, tmp_path: Path) -> None:
     folder, out = trained(*ONE), tmp_path / "pseudo"
-    asked = (f"run={folder}", "input=train", f"out={out}", "pseudo_labels=true")
-    code, said, err = call(PREDICT, *asked)
+    requested = (f"run={folder}", "input=train", f"out={out}", "pseudo_labels=true")
+    code, said, err = call(PREDICT, *requested)
     assert code == 0, err
     table = said[said.index("8 images of mfnet train, every pixel") :]
     assert "unlabeled" in said
@@ -48,10 +48,10 @@ def test_pseudo_labels_of_a_run(call: Call, trained: Trained, tmp_path: Path) ->
         assert confidence.min() >= 65535 // 9
 
     before = (out / "pseudo_labels.json").read_bytes()
-    code, again, _ = call(PREDICT, *asked)
+    code, again, _ = call(PREDICT, *requested)
     assert (code, again) == (0, table)
     assert (out / "pseudo_labels.json").read_bytes() == before
-    code, _, err = call(PREDICT, *asked, "threshold=0.9")
+    code, _, err = call(PREDICT, *requested, "threshold=0.9")
     assert code == 2
     assert_one_sentence(err, "holds pseudo-labels of another threshold (0.0, now 0.9)")
 

@@ -1,4 +1,4 @@
-"""Recipes by data set: the released sizes and steps, and warnings for another data set."""
+"""Sizes and steps by data set: the released numbers, and the warnings for other data sets."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def test_an_experiment_on_another_data_set_trains_and_counts(
     assert counts.classes[-1] in out
 
 
-# ---- what is told ---------------------------------------------------------------------------
+# ---- warnings -------------------------------------------------------------------------------
 
 PUBLISHED = {
     **{"recipe": "mfnet", "data": "mfnet", "scale": "paper", "val": ("a",), "picked": "val"},

@@ -171,7 +171,7 @@ def _mapped(hsv: Image, channel: int, table: NDArray[np.uint8]) -> Image:
 
 
 def _rgb_of(hsv: Image) -> Image:
-    """HSV to RGB by OpenCV, the same for a pixel wherever it lies in a row.
+    """HSV to RGB by OpenCV, with a result that does not depend on the position in a row.
 
     OpenCV 5 truncates in its vector code and rounds in what is left of a row of 8-bit pixels, so
     that a pixel would depend on the width of the image and on the processor. One long row of a

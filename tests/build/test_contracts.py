@@ -1,4 +1,4 @@
-"""Parts of one's own that do not do what they must: one sentence each."""
+"""A user's own components that do not follow the interfaces are refused with one message."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from rgbt.checks import InputError
 from tests.models import golden
 
 PROTOTYPES: dict[str, nn.Module] = {}
-"""Networks that were asked for before; composing a configuration takes longer than copying."""
+"""Networks that were requested before; composing a configuration takes longer than copying."""
 
 DTYPES = {"float32": torch.float32, "int64": torch.int64}
 

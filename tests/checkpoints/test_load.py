@@ -116,7 +116,7 @@ def windows_of(side: int) -> Tensors:
 
 
 REFUSED: list[tuple[str, Callable[[], Any], tuple[str, ...], str]] = [
-    # network, content of the file, parts that are fresh, what is said
+    # network, content of the file, parts that are fresh, message
     ("mask2former_tiny", cmx_file, (), "CMX checkpoint (MiT-B0, 9 classes); it fits model=cmx_b0"),
     (
         *("rtfnet_tiny", lambda: resnet_file(101, prefix="Scale.", counters=False), ()),

@@ -71,7 +71,7 @@ def listed(root: Path, *lines: str, **keys: Any) -> Folder:
 
 def refused(make: Callable[[], object]) -> str:
     """The one sentence of the InputError that `make` raises."""
-    with pytest.raises(InputError) as told:
+    with pytest.raises(InputError) as caught:
         make()
-    assert "\n" not in str(told.value)
-    return str(told.value)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)

@@ -373,7 +373,7 @@ def test_process_killed_at_any_step_leaves_valid_cache(
     process.join(60)
     assert process.exitcode == -signal.SIGKILL
     assert case.files() == []
-    assert len(list(case.cache.glob("*/.*"))) == 1, "what it had begun"
+    assert len(list(case.cache.glob("*/.*"))) == 1, "what it had started"
     check_equal(case.opened(), case.source)
     assert list(case.cache.glob("*/.*")) == []
 
@@ -529,12 +529,12 @@ def test_unsupported_sample_is_refused_and_others_kept(case: Case, change: str) 
     check_equal(case.opened(source), source, ("a", "c", "d"))
 
 
-@pytest.mark.parametrize("begun", [False, True])
+@pytest.mark.parametrize("started", [False, True])
 def test_name_without_files_raises_message_of_data_set(
-    case: Case, monkeypatch: pytest.MonkeyPatch, begun: bool
+    case: Case, monkeypatch: pytest.MonkeyPatch, started: bool
 ) -> None:
     """PST900 refuses a name of both parts, and says so for its files too."""
-    if begun:  # the frame is in the cache
+    if started:  # the frame is in the cache
         case.opened()
     real = case.source.files
 

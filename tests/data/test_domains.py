@@ -1,4 +1,4 @@
-"""Domains: what cannot be told apart is refused, and which head predicts which image."""
+"""Domains: heads that cannot be distinguished are refused, and which head predicts an image."""
 
 from __future__ import annotations
 
@@ -96,9 +96,9 @@ def test_names_and_heads() -> None:
 def test_the_only_head_predicts_everything(view: View, night: bool | None) -> None:
     assert domains(target=domain()).head_of(view, night, "own") is None
     assert domains(source=domain(head="a")).head_of(view, night, "own") == "a"
-    for asked in ("source", "target"):
-        with pytest.raises(InputError, match=f"head={asked} selects one of two heads"):
-            domains(target=domain()).head_of(view, night, asked)
+    for requested in ("source", "target"):
+        with pytest.raises(InputError, match=f"head={requested} selects one of two heads"):
+            domains(target=domain()).head_of(view, night, requested)
 
 
 def test_the_head_of_a_view() -> None:
@@ -137,7 +137,7 @@ def test_requested_head_predicts_all_images(target_is: str, night: bool | None) 
     ids=["view", "night", "tested with one"],
 )
 def test_heads_in_words_names_heads(found: Domains, own: str) -> None:
-    """As asked, not as configured: the caller knows whether another one was asked for."""
+    """The requested head is returned, not the configured one."""
     assert found.heads_in_words("own") == own
     assert found.heads_in_words("source") == "day for all images"
     assert found.heads_in_words("target") == "dark for all images"
@@ -154,5 +154,5 @@ def test_heads_in_words_names_heads(found: Domains, own: str) -> None:
     ids=["none", "one", "two domains", "one of two domains"],
 )
 def test_heads_in_words_is_empty_for_one_head(found: Domains) -> None:
-    for asked in ("own", "source", "target"):
-        assert found.heads_in_words(asked) == ""
+    for requested in ("own", "source", "target"):
+        assert found.heads_in_words(requested) == ""

@@ -168,7 +168,7 @@ def test_within(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for path in (root / "images" / "3.png", root / "other" / "1.png"):
         with pytest.raises(InputError, match=rf"^{path} leads out of dataset.root, to {outside}"):
             within(path, root)
-    # Nothing is there: that it is missing is said where it is opened.
+    # Nothing is there: the missing file is reported where it is opened.
     assert within(root / ".." / "nothing.png", root)
     (root / "images" / "4.png").symlink_to(outside / "gone.png")
     assert within(root / "images" / "4.png", root)

@@ -207,7 +207,7 @@ def test_label_values(root: Path) -> None:
     assert "label value 9 (2 pixels, most frequent of 2 unknown ones) is neither" in refused(
         lambda: dataset.label("train_1")
     )
-    # 255 may be a class, where it is said.
+    # 255 may be a class if the configuration says so.
     whole = folder(root, ids={**ids, 255: "person", 9: "car", 30: "car"}, ignored=(7,))
     found = whole.label("train_1")
     assert found is not None
@@ -370,7 +370,7 @@ def test_each_problem_is_one_line(root: Path) -> None:
         f"2 files belong to no image of a split; the first is {root}/test/ir/2_ir.tif.",
     ]
     assert report.notes[0] == "3 frames are in no split; the first is 'extra_1'."
-    # Two splits that are said to be one are no mistake.
+    # Two splits that are declared as one are valid.
     same = folder(root, folders={"train": "train", "val": "val", "test": "val"})
     assert not any("share" in line for line in check_dataset(same).problems)
 

@@ -232,7 +232,7 @@ def test_label_of_other_size_is_resized(root: Path, hw: tuple[int, int]) -> None
     label = files.contents("label", hw)[2]
     write_png(path_of(dataset, "seq_00_day_00_1570_0000", "label"), label)
     np.save(path_of(dataset, "test_day_1578_0080", "label"), label.astype(np.int16))
-    # The middle of pixel x of n lies in pixel (x + 0.5) m / n, rounded down, of m.
+    # The middle of pixel x of n is in pixel (x + 0.5) m / n, rounded down, of m.
     rows, columns = (
         np.floor((np.arange(n) + 0.5) * m / n).astype(int)
         for n, m in zip(files.HW, hw, strict=True)

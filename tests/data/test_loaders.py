@@ -256,18 +256,18 @@ def test_arguments_of_the_loader(
     dataset: MFNet, monkeypatch: pytest.MonkeyPatch, workers: int, ahead: int | None, gpu: bool
 ) -> None:
     """Batches ahead of the one that is used, and pinned where there is a GPU to copy them to."""
-    asked: dict[str, object] = {}
+    requested: dict[str, object] = {}
 
     def loader(reader: object, **words: object) -> list[object]:
-        asked.update(words)
+        requested.update(words)
         return []
 
     monkeypatch.setattr(loaders, "DataLoader", loader)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: gpu)
     changed = settings(num_workers=workers, prefetch=5)
     assert list(eval_batches(dataset, "val", crm(), changed)) == []
-    assert (asked["num_workers"], asked["prefetch_factor"]) == (workers, ahead)
-    assert asked["pin_memory"] is gpu
+    assert (requested["num_workers"], requested["prefetch_factor"]) == (workers, ahead)
+    assert requested["pin_memory"] is gpu
 
 
 @pytest.mark.parametrize("augment", ["loader", "device"])
@@ -337,9 +337,9 @@ def test_full_shared_memory_before_start_is_reported(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(loaders.multiprocessing, "Lock", refuse)
-    with pytest.raises(InputError, match=r"/dev/shm .*num_workers=0") as told:
+    with pytest.raises(InputError, match=r"/dev/shm .*num_workers=0") as caught:
         train_batches(dataset, "train", crm(), settings(num_workers=2), 0, range(2))
-    assert told.value.__suppress_context__, "told once, not as a full disk as well"
+    assert caught.value.__suppress_context__, "caught once, not as a full disk as well"
 
 
 def test_killed_worker_is_reported(dataset: MFNet, monkeypatch: pytest.MonkeyPatch) -> None:

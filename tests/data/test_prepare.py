@@ -177,7 +177,7 @@ def test_incomplete_mfnet_is_refused(
     change(mfnet)
     with pytest.raises(InputError, match=said):
         call("mfnet", mfnet, out)
-    assert not out.exists(), "nothing is begun"
+    assert not out.exists(), "nothing was written"
 
 
 def test_data_set_three_folders_deep_is_prepared(mfnet: Path, tmp_path: Path, out: Path) -> None:

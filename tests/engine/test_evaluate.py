@@ -18,7 +18,7 @@ HEADS = ("day", "night", "dusk")
 
 
 class Heads(nn.Module):
-    """Scores that tell image, view and head; remembers what it was asked."""
+    """Scores that show image, view and head; records its arguments."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -68,10 +68,10 @@ def test_mixed_heads_equal_every_image_alone(
     images, heads = batch(), tuple(HEADS[index] for index in chosen)
     found = class_scores(model, images, view, heads)
     assert len(model.calls) == len(set(heads))
-    asked: dict[str, Any] = {} if view is None else {"views": (view,)}
+    requested: dict[str, Any] = {} if view is None else {"views": (view,)}
     for index, head in enumerate(heads):
         rgb, thermal = images.rgb[index : index + 1], images.thermal[index : index + 1]
-        alone = model(rgb, thermal, head=head, **asked).logits[0]
+        alone = model(rgb, thermal, head=head, **requested).logits[0]
         torch.testing.assert_close(found[index], alone, atol=1e-6, rtol=1e-5)
     classes = class_maps(model, images, Fabric(accelerator="cpu", devices=1), view, heads)
     assert (classes.shape, classes.dtype) == ((7, 12, 16), torch.uint8)

@@ -211,7 +211,7 @@ def two_heads(tested_head: str) -> Domains:
 
 
 @pytest.mark.parametrize(
-    ("tested", "asked", "said", "by_day", "at_night"),
+    ("tested", "requested", "said", "by_day", "at_night"),
     [
         ("own", None, "own", 1, 2),
         ("source", None, "source", 1, 1),
@@ -224,13 +224,13 @@ def test_requested_head_predicts_and_is_recorded(  # noqa: PLR0913 - a case and 
     session: Session,
     tmp_path: Path,
     tested: str,
-    asked: str | None,
+    requested: str | None,
     said: str,
     by_day: int,
     at_night: int,
 ) -> None:
     session = replace(session, model=Heads(), domains=two_heads(tested))
-    found = written(session, tmp_path / "out", view="rgbt", threshold=0, head=asked)
+    found = written(session, tmp_path / "out", view="rgbt", threshold=0, head=requested)
     assert found.manifest["head"] == said
     for name, expected in zip(NAMES, (by_day, at_night, by_day), strict=True):
         assert np.unique(image(tmp_path / "out" / "labels" / f"{name}.png")).tolist() == [expected]

@@ -155,7 +155,7 @@ def stripes() -> np.ndarray:
 
 
 class Bands(Decoder):
-    """Two classes, told apart at the middle of their grey levels."""
+    """Two classes, divided at the middle of their grey levels."""
 
     def forward(self, rgb: Tensor, thermal: Tensor, *, views: tuple[str, ...] = ()) -> Output:
         classes = 8 * (thermal[:, 0] > 4 * 28 / 255).long()
@@ -254,8 +254,8 @@ def test_each_protocol_has_the_accuracy_that_it_is_known_by() -> None:
             split="test",
         )
 
-    asked: list[Protocol] = ["aligned", "released", "next"]
-    table = consistency_table({each: counts(f"{each}1") for each in asked}, "exclude")
+    requested: list[Protocol] = ["aligned", "released", "next"]
+    table = consistency_table({each: counts(f"{each}1") for each in requested}, "exclude")
     # Road: 7, 4 and 6 pixels by the first, the second and the label; 4 by all, 7 by any.
     # Car: 3, 6 and 4; 3 by all, 6 by any. Released: sum of the three less twice what all share.
     exact, released = (4 / 7, 3 / 6), (4 / (17 - 8), 3 / (13 - 6))
@@ -264,11 +264,11 @@ def test_each_protocol_has_the_accuracy_that_it_is_known_by() -> None:
     assert table.mean_ca["aligned"] == pytest.approx(sum(exact) / 2)
     assert table.mean_ca["released"] == pytest.approx(sum(released) / 2)
     # Of two predictions: 4 of 7 + 4 - 4 pixels, and 3 of 3 + 6 - 3.
-    for protocol in asked:
+    for protocol in requested:
         assert table.tc[protocol] == pytest.approx((4 / 7, 3 / 6))
     assert table.names == ("road", "car")
 
-    left_out = {each: replace(counts(f"{each}1"), unscored=("car",)) for each in asked}
+    left_out = {each: replace(counts(f"{each}1"), unscored=("car",)) for each in requested}
     fewer = consistency_table(left_out, "exclude")
     assert (fewer.names, fewer.unscored) == (("road", "car"), ("car",))
     assert (fewer.tc, fewer.ca) == (table.tc, table.ca)

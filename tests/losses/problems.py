@@ -21,7 +21,7 @@ def seeded(seed: int = 0) -> torch.Generator:
 
 
 def recorded_losses(group: str) -> tuple[Any, dict[str, Any], dict[str, Any], Any]:
-    """Rule of the numbers, recipes of a group, what is said of the outputs, stored arrays."""
+    """Rule of the numbers, recipes of a group, description of the outputs, stored arrays."""
     facts = json.loads((FOLDER / "losses.json").read_text())
     arrays = np.load(FOLDER / "losses.npz")
     return fill_rule(), facts["recipes"][group], facts["outputs"], arrays

@@ -143,7 +143,7 @@ def test_cell_middles_remove_the_lean_of_half_a_cell() -> None:
 
 
 def test_tracked_anchor_follows_the_centre_of_each_sample() -> None:
-    # 5 % of 20 cells is one cell, and so narrow a Gaussian leaves only the one it stands on.
+    # 5 % of 20 cells is one cell, and so narrow a Gaussian leaves only the cell at its centre.
     found = at_pixels([[0, 0], [70, 200], [239, 319]], ratio=0.05)
     assert found == [[0, 0, 0], [1, 1, 3], [2, 3, 4]]
     # Pixel 63 lies beside the edge between cells 0 and 1: their middles are nearest.

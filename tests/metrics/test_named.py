@@ -116,12 +116,12 @@ def test_unknown_metrics_are_refused(metric: str) -> None:
     + ["TC", "CA", "CA_released", "class/car/CA", "night/TC"],
 )
 def test_many_sums_at_once_are_each_alone(metric: str) -> None:
-    asked = parse(metric)
-    counts = pairs_of() if asked.score in OF_PAIRS else counts_of()
-    by_region = images_of(asked, counts).by_region()
+    requested = parse(metric)
+    counts = pairs_of() if requested.score in OF_PAIRS else counts_of()
+    by_region = images_of(requested, counts).by_region()
     many = np.stack([by_region, 3 * by_region, by_region[..., ::-1]])[:, None]
-    found = values(asked, many, counts, "released")
+    found = values(requested, many, counts, "released")
     assert found.shape == (3, 1)
-    alone = [values(asked, each[0], counts, "released") for each in many]
+    alone = [values(requested, each[0], counts, "released") for each in many]
     np.testing.assert_allclose(found[:, 0], alone)
     np.testing.assert_allclose(found[0], value(metric, counts, "released"))

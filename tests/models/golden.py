@@ -35,7 +35,7 @@ requires_golden = pytest.mark.skipif(
 
 @dataclass(frozen=True)
 class Golden:
-    """One recorded network: what is said about it, the arrays, and the rule of the weights."""
+    """One recorded network: its description, the arrays, and the rule of the weights."""
 
     facts: dict[str, Any]
     arrays: dict[str, np.ndarray]

@@ -265,8 +265,8 @@ class Normalised(Linear):
         super().__init__(heads)
         self.norm = nn.BatchNorm2d(3)
 
-    def forward(self, rgb: Tensor, thermal: Tensor, masks: None = None, **asked: Any) -> Any:
-        return super().forward(self.norm(rgb), thermal, masks, **asked)
+    def forward(self, rgb: Tensor, thermal: Tensor, masks: None = None, **requested: Any) -> Any:
+        return super().forward(self.norm(rgb), thermal, masks, **requested)
 
 
 def states(module: nn.Module) -> dict[str, Tensor]:
@@ -357,20 +357,20 @@ def test_what_does_not_fit_is_refused(changes: dict[str, Any], sentence: str) ->
 
 
 def test_every_pass_of_a_step_asks_for_a_generator_of_its_own() -> None:
-    asked: list[str] = []
+    requested: list[str] = []
 
     def noting(purpose: str) -> torch.Generator:
-        asked.append(purpose)
+        requested.append(purpose)
         return generator_of(purpose)
 
     settings = {**HEATNET, "alternates": False}
     scheme = scheme_of(network(True), True, **settings)
     list(scheme.phases(next(pairs(confidence=True)).to("cpu"), noting))
-    assert asked == ["source network", "source loss", "target network", "target loss"]
-    asked.clear()
+    assert requested == ["source network", "source loss", "target network", "target loss"]
+    requested.clear()
     list(scheme_of(network(False)).phases(next(pairs()).to("cpu"), noting))
-    assert asked == ["source network", "source loss", "target network"]
-    asked.clear()
+    assert requested == ["source network", "source loss", "target network"]
+    requested.clear()
     judging = scheme_of(network(True), True, **HEATNET)  # the discriminator's step
     list(judging.phases(next(pairs(confidence=True)).to("cpu"), noting))
-    assert asked == ["source network", "target network"]
+    assert requested == ["source network", "target network"]

@@ -141,9 +141,9 @@ def test_the_network_draws_from_the_generator_of_its_pass() -> None:
     drawn: dict[str, Tensor] = {}
 
     class Drawing(Linear):
-        def forward(self, *images: Tensor, **asked: Any) -> Any:
-            drawn[f"{asked['head']} network"] = torch.rand(4, generator=asked["generator"])
-            return super().forward(*images, **asked)
+        def forward(self, *images: Tensor, **requested: Any) -> Any:
+            drawn[f"{requested['head']} network"] = torch.rand(4, generator=requested["generator"])
+            return super().forward(*images, **requested)
 
     def loss(output: Any, batch: Any, generator: torch.Generator) -> dict[str, Tensor]:
         drawn[f"{batch.name[0]} loss"] = torch.rand(4, generator=generator)

@@ -151,15 +151,15 @@ def test_second_frame_is_the_view_of_the_first() -> None:
 
 @pytest.mark.parametrize("norm", [nn.BatchNorm2d(6), nn.Identity()], ids=["apart", "joint"])
 def test_every_part_of_a_step_asks_for_its_own_generator_once(norm: nn.Module) -> None:
-    asked: list[str] = []
+    requested: list[str] = []
 
     def noting(purpose: str) -> torch.Generator:
-        asked.append(purpose)
+        requested.append(purpose)
         return generator_of(purpose)
 
     (_,) = scheme(Net(norm)).phases(batch(), noting)
     # The same words for every run: they decide the numbers that are drawn.
-    assert sorted(asked) == ["loss", "stochastic depth", "virtual view"]
+    assert sorted(requested) == ["loss", "stochastic depth", "virtual view"]
 
 
 class Half:

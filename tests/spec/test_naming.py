@@ -83,7 +83,7 @@ def test_references_and_quotes_are_shown_as_their_value(grbm: RunSpec) -> None:
     assert shown(grbm, "recipe.dataset='my data'")[0] == "recipe.dataset=my data seed=0 · grbm"
 
 
-def stored(group: str, config: RunSpec) -> str:
+def group_of_older_run(group: str, config: RunSpec) -> str:
     """The group that is read of a run of `config` made before."""
     params = describe(config).params
     old = Description("", {"rgbt.group": group}, params)
@@ -93,9 +93,15 @@ def stored(group: str, config: RunSpec) -> str:
 def test_runs_made_before_are_in_the_groups_of_new_ones(
     grbm: RunSpec, adversarial: RunSpec
 ) -> None:
-    assert stored("grbm patch_size=${px:64} lr=0.1", grbm) == "grbm patch_size=32 lr=0.1"
-    assert stored("grbm sizes=[1, 2] masker=irm", grbm) == "grbm sizes=[1, 2] masker=irm"
+    assert (
+        group_of_older_run("grbm patch_size=${px:64} lr=0.1", grbm) == "grbm patch_size=32 lr=0.1"
+    )
+    assert (
+        group_of_older_run("grbm sizes=[1, 2] masker=irm", grbm) == "grbm sizes=[1, 2] masker=irm"
+    )
     rate = adversarial.optimizer.plain["lr"]
-    assert stored(f"x lr={rate}", adversarial) == f"x optimizer.lr={rate}"
-    assert stored("x lr=77", adversarial) == "x lr=77", "no setting of it has that value"
+    assert group_of_older_run(f"x lr={rate}", adversarial) == f"x optimizer.lr={rate}"
+    assert group_of_older_run("x lr=77", adversarial) == "x lr=77", (
+        "no setting of it has that value"
+    )
     assert group_of({}, {}) == ""

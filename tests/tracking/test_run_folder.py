@@ -120,9 +120,9 @@ def test_damaged_lines_are_refused_and_a_run_that_resumes_leaves_them_out(
     path = tmp_path / "metrics.jsonl"
     path.write_bytes(b"".join(damage(*lines)))
     damaged = path.read_bytes()
-    with pytest.raises(InputError, match=r"metrics.jsonl is damaged \(line") as told:
+    with pytest.raises(InputError, match=r"metrics.jsonl is damaged \(line") as caught:
         folder.lines()
-    assert reason in str(told.value)
+    assert reason in str(caught.value)
     assert folder.truncate_after(30).damaged[0].startswith(reason)
     kept = folder.lines()
     assert kept in (whole[:3], [whole[0], whole[2]])

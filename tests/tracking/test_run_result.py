@@ -1,4 +1,4 @@
-"""A finished run: what is read from its folder, and what is said where a file is missing."""
+"""A finished run: what is read from its folder, and the messages for missing files."""
 
 from __future__ import annotations
 

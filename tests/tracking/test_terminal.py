@@ -42,7 +42,7 @@ def test_no_line_of_a_table_is_longer_than_the_terminal_and_no_number_is_cut(wid
     for number in NUMBERS:
         assert "\n".join(shown).count(number) == 2
     for part in fitted(GRID, width):
-        assert len({row[0] for row in part.rows}) == 2, "rows can be told apart"
+        assert len({row[0] for row in part.rows}) == 2, "the labels of rows differ"
 
 
 def test_a_table_that_fits_is_not_changed() -> None:

@@ -1,4 +1,4 @@
-"""What is said before the first progress bar."""
+"""The lines before the first progress bar."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a run tells of itself, without a run."""
+"""Messages and descriptions of a run, without a run."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ def test_a_finished_run_keeps_its_name_unless_the_new_one_says_more(
 ) -> None:
     folder = RunFolder(tmp_path)
     folder.describe(Description(name, {"rgbt.group": "grbm sigma_div=2", "row": "a"}, {}))
-    asked = Description("seed=0 · a longer name than before", {"rgbt.group": group}, {})
-    _show_again(folder, NoTracking(), asked)
+    typed = Description("seed=0 · a longer name than before", {"rgbt.group": group}, {})
+    _show_again(folder, NoTracking(), typed)
     kept = read_description(folder.path)
     assert kept is not None
     assert (kept.name, kept.tags["row"]) == (name, "a")

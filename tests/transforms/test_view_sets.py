@@ -1,4 +1,4 @@
-"""The published sets of angles, and files of one's own."""
+"""The published sets of angles, and a user's own files."""
 
 from __future__ import annotations
 

@@ -121,7 +121,7 @@ def camera_of(factors: SceneFactors) -> SynthCamera:
 
 
 def flow_between(depth_HW: Floats, source: SynthCamera, target: SynthCamera) -> Floats:
-    """Where each pixel of `source` lies in `target`, for a scene in which nothing else moves.
+    """Displacement of each pixel of `source` to its position in `target`, for a static scene.
 
         p' = K (R' R^T K^-1 p z + R' (C - C')) / z',   flow = p' - p
 
