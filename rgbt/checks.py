@@ -49,7 +49,7 @@ def nearest(word: str, known: Iterable[str]) -> str:
 def split_list(text: str, what: str) -> list[str]:
     """The entries of a list as people type it: "a,b", "[a, b]", also one entry alone.
 
-    Example:
+    Examples:
         >>> split_list("[crm, grbm sizes=[240,480]]", "runs")
         ['crm', 'grbm sizes=[240,480]']
 
@@ -92,7 +92,7 @@ def not_finite(tensors: Mapping[str, Tensor]) -> list[str]:
 def check_shape(name: str, tensor: Tensor, letters: str, **sizes: int) -> dict[str, int]:
     """Sizes of `tensor` by letter, raising where rank or a known size differs.
 
-    Example:
+    Examples:
         >>> check_shape("label", torch.zeros(2, 4, 6), "B H W", B=2)["W"]
         6
 

@@ -70,7 +70,7 @@ FRACTIONS = {MIOU, MACC, MPRECISION, MF1, PIXEL_ACCURACY}
 def in_percent(name: str, value: float) -> float:
     """A score in percent with all its digits; Var and what is no score keep their unit.
 
-    Example:
+    Examples:
         >>> in_percent("day/mIoU", 0.5), in_percent("Var", 12.5), in_percent("loss", 0.5)
         (50.0, 12.5, 0.5)
     """
