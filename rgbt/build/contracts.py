@@ -28,7 +28,7 @@ DATASET_CALLS = {
     **{"files": ("name",), "nights": ("names",), "fingerprint": (), "decoding": ()},
 }
 MODEL_CALLS = {"forward": ("rgb", "thermal", "masks", "views=", "generator=")}
-LOSS_CALLS = {
+LOSS_CALLS: dict[int, dict[str, tuple[str, ...]]] = {
     1: {"__call__": ("output", "batch", "generator")},
     2: {"__call__": ("first", "second", "warped", "valid", "generator")},
 }
