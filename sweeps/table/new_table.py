@@ -30,8 +30,8 @@ LOG_FROM = 8.0
 
 HEAD = """\
 # {title}
-# Run:  rgbt reproduce table={name} seeds=3 workers=2
-# Look: rgbt reproduce table={name} seeds=3 dry_run=true
+# Run:     rgbt reproduce table={name} seeds=3 workers=2
+# Preview: rgbt reproduce table={name} seeds=3 dry_run=true
 # A row is the command `rgbt run +experiment=<experiment> <overrides>`. You can add, change and
 # remove rows: finished runs are reused, only missing runs are started.
 """

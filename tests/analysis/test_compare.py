@@ -96,7 +96,7 @@ def test_equal_names_get_distinct_labels(call: Call, tmp_path: Path):
         (tmp_path / folder).mkdir()
         counts.save(tmp_path / folder / "counts_test.npz")
         counts.save(tmp_path / folder / "mine.npz")
-    for name, said in (("mine", "b: mine less a: mine"), ("counts_test", "y less x")):
+    for name, said in (("mine", "b: mine minus a: mine"), ("counts_test", "y minus x")):
         arguments = (f"{side}={tmp_path}/{f}/{name}.npz" for side, f in zip("ab", "xy"))
         code, out, _ = call(entry, *arguments, *FAST)
         assert code == 0

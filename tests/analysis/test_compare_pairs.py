@@ -46,7 +46,7 @@ def test_difference_in_tc_has_its_interval_over_images_and_seeds(
     words = (f"runs_dir={runs}", "a=plain", "b=temporal", *FAST, "frames=aligned")
     code, out, err = call(entry, *words, f"out={tmp_path}")
     assert (code, err) == (0, "")
-    assert "temporal less plain: 40 single images, aligned3" in out
+    assert "temporal minus plain: 40 single images, aligned3" in out
     assert "The TC of temporal is " in out
     assert "over 2 trainings each and 40 images" in out
     rows = list(csv.DictReader((tmp_path / "comparison.csv").open()))

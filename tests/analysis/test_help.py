@@ -23,7 +23,7 @@ def test_help_waits_for_no_heavy_library() -> None:
     done = subprocess.run(words, capture_output=True, text=True, check=True)
     assert done.stdout.strip().endswith("[]")
     for line in (
-        "  missing     images without a prediction: refuse, or leave_out",
+        "  missing      images without a prediction: refuse, or leave_out",
         "rgbt score [option=value ...]",
     ):
         assert line in done.stdout

@@ -114,7 +114,7 @@ def test_compare_takes_corrupted_images(call: Call, runs: Path) -> None:
     code, out, err = call(entry, "a=k2", "b=k0", "corruption=noise", "severity=16", *where)
     assert code == 0, err
     # 40 against 35 on noisy images (80 against 75 on clean ones).
-    assert "crm (noise 16) less none (noise 16)" in out
+    assert "crm (noise 16) minus none (noise 16)" in out
     assert "35.00" in out
     assert "40.00" in out
     code, out, err = call(entry, "a=k2", "b=k0", "corruption=rgb_removed", *where)

@@ -192,7 +192,7 @@ def test_all_tables_are_listed_and_only_listed(call: Call, place: Path, driven: 
     [
         (("table=my/smal",), "did you mean 'my/small'"),
         (("table=my/small", "scale=papr"), "did you mean 'paper'"),
-        (("table=my/small", "seeds=x"), "how many"),
+        (("table=my/small", "seeds=x"), "number of seeds"),
         (("table=my/small", "workers=0"), "workers' must be a whole number from 1"),
         (("table=my/small", "workers=two"), "'workers'"),
         (("table=my/small", "retry=all"), "'retry'"),

@@ -257,7 +257,7 @@ def test_maps_of_another_split_are_refused(call: Call, made: Path, figure: str) 
     words = (f"figure={figure}", "out=f.svg", f"maps={made / 'a'}", "split=val")
     code, _, err = call(entry, *words)
     assert code == 2
-    assert "is of split 'test' already" in " ".join(err.split())
+    assert "has split 'test'" in " ".join(err.split())
 
 
 def test_commas_in_brackets_belong_to_the_name(call: Call, made: Path, tmp_path: Path) -> None:

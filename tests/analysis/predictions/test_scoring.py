@@ -156,7 +156,7 @@ def test_the_nearest_pixel_is_nearest_by_centres(tiny: MFNet, write: Write) -> N
 def test_the_first_bad_file_of_the_split_is_named(tiny: MFNet, write: Write) -> None:
     bad = write({name: np.full((4, 4), 7) for name in PREDICTIONS})
     for _ in range(3):
-        with pytest.raises(InputError, match=r"00001D\.png: value 7 is no class"):
+        with pytest.raises(InputError, match=r"00001D\.png: value 7 is not a class"):
             score_folder(bad, tiny, "test", STRIPS)
 
 
