@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from rgbt.build.load_run import CHECKPOINTS, TrainedNetwork, open_run, stored_settings
+from rgbt.build.load_run import CHECKPOINTS, TrainedNetwork, open_run, trusted_settings
 from rgbt.checks import InputError, check_choice
 from rgbt.config.stored_config import parse_trust, read_settings
 from rgbt.data.domains import TestedHead
@@ -271,7 +271,7 @@ def load_run(
         )
     modules = parse_trust(trust)
     folder = find_run(str(run), Path(runs_dir))
-    load_spec(stored_settings(folder, modules), overrides)  # refused now, and not when it predicts
+    load_spec(trusted_settings(folder, modules), overrides)  # refused now, and not when it predicts
     return Run(RunResult(folder), tuple(overrides), checkpoint, modules)
 
 

@@ -145,13 +145,23 @@ def test_bad_input_is_one_sentence(
     assert "\n" not in str(raised.value)
 
 
-def test_own_classes_are_refused_before_anything_is_built(run: rgbt.Run, tmp_path: Path) -> None:
-    folder = tmp_path / "runs" / "abc"
-    folder.mkdir(parents=True)
-    text = (run.folder / "config.yaml").read_text()
-    (folder / "config.yaml").write_text(text.replace("rgbt.losses.", "my_lab.losses."))
-    with pytest.raises(InputError, match=r"names my_lab\.losses.* add trust=my_lab\.losses"):
+def test_own_classes_are_refused_until_their_module_is_trusted(
+    run: rgbt.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "abc"
+    shutil.copytree(run.folder, folder)
+    text = (folder / "config.yaml").read_text()
+    assert "rgbt.losses.set_criterion.SetCriterion" in text
+    own = text.replace("rgbt.losses.set_criterion.SetCriterion", "api_lab.MyLoss")
+    (folder / "config.yaml").write_text(own)
+    with pytest.raises(InputError, match=r"names api_lab\.MyLoss.* add trust=api_lab\."):
         rgbt.load_run(folder)
+    (tmp_path / "api_lab.py").write_text(
+        "from rgbt.losses.set_criterion import SetCriterion\n\n\nclass MyLoss(SetCriterion): ...\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    trusted = rgbt.load_run(folder, trust="api_lab")
+    np.testing.assert_array_equal(trusted.predict(RGB, THERMAL), run.predict(RGB, THERMAL))
 
 
 def test_unfinished_run_says_what_is_missing(run: rgbt.Run, tmp_path: Path) -> None:

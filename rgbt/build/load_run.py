@@ -85,7 +85,7 @@ def open_trained(
     return TrainedNetwork(session, 0, runs_dir / "evaluations" / name, path.name)
 
 
-def stored_settings(folder: Path, trust: Collection[str] = ()) -> dict[str, Any]:
+def trusted_settings(folder: Path, trust: Collection[str] = ()) -> dict[str, Any]:
     """The configuration of a run, whose objects may be built.
 
     Raises:
@@ -116,7 +116,7 @@ def open_run(
         InputError: a target that is not trusted, overrides that do not fit, no checkpoint, other
             classes than trained.
     """
-    trained_with = stored_settings(folder, trust)
+    trained_with = trusted_settings(folder, trust)
     spec = load_spec(trained_with, overrides)
     _warn_of_other_code(folder, trained_with)
     check_choice("checkpoint", checkpoint, CHECKPOINTS)

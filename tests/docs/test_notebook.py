@@ -1,7 +1,8 @@
-"""The notebook of the tutorials: its cells run in order, and its stored outputs are fit to be read.
+"""The notebook of the tutorials: its cells run in order, and its outputs can be shown.
 
 The cells run in this process and not in a Jupyter kernel: they are plain Python, and a kernel would
-cost five more packages and several seconds.
+cost five more packages and several seconds. To renew the outputs: ``RGBT_RUNS_DIR=runs jupyter
+execute --inplace docs/tutorials/notebook.ipynb``, with the full-size runs that it names.
 """
 
 from __future__ import annotations
@@ -76,13 +77,13 @@ def test_every_cell_of_the_notebook_runs(
     assert by_class.shape == (9, 6)
 
 
-def test_stored_outputs_are_complete_and_private(cells: list[dict[str, Any]]) -> None:
+def test_outputs_of_the_notebook_are_complete_and_private(cells: list[dict[str, Any]]) -> None:
     code = [cell for cell in cells if cell["cell_type"] == "code"]
     assert [cell["execution_count"] for cell in code] == list(range(1, len(code) + 1))
     outputs = [output for cell in code for output in cell["outputs"]]
     assert sum("image/png" in output.get("data", {}) for output in outputs) == 2
     kinds = {output["output_type"] for output in outputs}
-    assert kinds <= {"display_data", "execute_result"}, "warnings and messages are no result"
+    assert kinds <= {"display_data", "execute_result"}, "no warnings and messages"
     assert NOTEBOOK.stat().st_size < LARGEST
     assert not re.search(r"(?<![\w./])/(home|root|tmp|work|Users)/", NOTEBOOK.read_text())
 
