@@ -72,9 +72,8 @@ def page_texts(data: ReportData, networks: Sequence[NetworkEntry]) -> dict[str, 
     filters = (views.fixed, views.plural, views.duration, wrapped, command_lines)
     environment.filters |= {each.__name__: each for each in filters}
     papers = _papers(data)
-    tables = {
-        page: [view for view in table_views(data) if _page_of(view) == page] for page in papers
-    }
+    views_by_name = sorted(table_views(data), key=lambda view: (view.entry.name, view.id))
+    tables = {page: [v for v in views_by_name if _page_of(v) == page] for page in papers}
     shared = {"data": data, "papers": papers, "heading": heading, "letters": views.letters}
 
     def page(template: str, **more: object) -> str:
@@ -175,7 +174,6 @@ def _origin(data: ReportData, finished: Sequence[RunEntry]) -> str:
         ("data sets, by fingerprint", _listed(sets)),
         *((name, _listed(found)) for name, found in versions.items()),
         ("hardware", _listed(run.hardware for run in finished)),
-        ("computing time, sum over runs", views.duration(sum(r.seconds or 0 for r in finished))),
     ]
     return markdown_table(["what", "value"], rows, (0, 1))
 
@@ -222,11 +220,10 @@ def _group_table(groups: Sequence[Group]) -> str:
                 + (f" ± {fixed(sd)}" if views.is_number(sd := group.sds.get(name)) else "")
                 for name in (names.MIOU, names.VAR)
             ),
-            views.duration(group.seconds),
         ]
         for group in groups
     ]
-    header = ["method", "scale", "seeds", "mIoU", "Var", "time of a run"]
+    header = ["method", "scale", "seeds", "mIoU", "Var"]
     return markdown_table(header, shown, (0, 1, 2))
 
 
