@@ -19,7 +19,7 @@ from rgbt.config.completion import OF_HYDRA
 from rgbt.config.options import types_of
 from rgbt.config.plain_command import COMMANDS, CommandGroup
 from tests.docs.blocks import Block, Page, PageError
-from tests.docs.command_lines import FILES, HELP, PYTHON, SETUP
+from tests.docs.command_lines import FILES, HELP, SETUP
 from tests.docs.reader_folder import expanded, export, forget_modules, write_titled
 from tests.docs.shell import Line, is_compound, lines_of, without_runs
 
@@ -112,7 +112,7 @@ class Reader:
             self.variables.syspath_prepend(str(self.folder))
         elif line.program == "rgbt" and line.alone:
             self._command(line, shown)
-        elif line.program in FILES | PYTHON or not line.alone:
+        elif line.program in FILES or not line.alone:
             number = int(line.place.rpartition(":")[2]) - block.line
             text = block.text.splitlines()[number - 1 :]
             last = next(n for n, each in enumerate(text) if not each.endswith("\\"))
