@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from rgbt import __version__
 from rgbt.__main__ import help_text, main
 from rgbt.config.completion import BASH, OF_HYDRA, SCRIPTS, candidates
 from rgbt.config.plain_command import COMMANDS
@@ -53,6 +54,12 @@ def test_help_lists_every_command_and_its_module_exists() -> None:
         assert len(f"  {name:<13}{entry.about}") <= 80
         text = (ROOT / f"{entry.module.replace('.', '/')}.py").read_text()
         assert 'if __name__ == "__main__"' in text, entry.module
+
+
+def test_version_is_shown_without_torch(tmp_path: Path) -> None:
+    code = "import sys, rgbt.__main__ as m; sys.argv = ['rgbt', '--version']\ntry: m.main()\n"
+    code += "except SystemExit: print(sorted({'torch', 'hydra', 'omegaconf'} & set(sys.modules)))"
+    assert python(tmp_path, "-c", code).stdout == f"rgbt {__version__}\n[]\n"
 
 
 def test_help_loads_neither_torch_nor_hydra(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from tests.docs.reader_folder import export, reading_in, write_titled
 from tests.docs.shell import Line, is_compound, lines_of
 
 LANGUAGES = {"bash", "python", "yaml", "text"}
-NOT_RUN = {"json", "toml", "bibtex", "latex", "html", "csv", "diff", "markdown", "jinja"}
+NOT_RUN = {"json", "toml", "bibtex", "latex", "html", "csv", "diff", "markdown", "jinja", "math"}
 CODE_COLUMNS = 100
 """Lines of code have fewer characters."""
 
@@ -59,7 +59,7 @@ def layout(page: Page) -> Iterator[str]:
             yield f"{page.name}:{number}: Git hosts do not show admonitions; write prose"
     for block in page.blocks:
         for number, line in enumerate(block.text.splitlines(), 1):
-            if len(line) >= CODE_COLUMNS:
+            if len(line) >= CODE_COLUMNS and block.language != "math":
                 yield (
                     f"{block.place(number)}: {len(line)} characters of code; expected fewer than "
                     f"{CODE_COLUMNS}"
@@ -150,7 +150,7 @@ def _bash(block: Block, folder: Path, variables: pytest.MonkeyPatch) -> Iterator
         yield str(error)
         return
     for line in lines:
-        problem = _of_line(line, block.needs or ("a shell" if is_compound(block) else ""))
+        problem = _of_line(line, block.needs, script=bool(block.title) or is_compound(block))
         # A page may show a mistake with the sentence that answers it.
         if problem and not (block.shown and block.shown in problem):
             yield problem
@@ -158,10 +158,10 @@ def _bash(block: Block, folder: Path, variables: pytest.MonkeyPatch) -> Iterator
             export(line, folder, variables)
 
 
-def _of_line(line: Line, needs: str) -> str:
+def _of_line(line: Line, needs: str, *, script: bool) -> str:
     with patch.dict(os.environ, line.variables):
         try:
-            check_line(line, needs)
+            check_line(line, needs, script=script)
         except PageError as error:
             return str(error)
     return ""

@@ -27,7 +27,21 @@ HELP = ("-h", "--help", "--version")
 NOT_COMPOSED = ("corruption.", "weights.", "hydra.searchpath=")
 """Words that are no overrides of one configuration: what a command reads by itself."""
 
-FILES = {"cd", "mkdir", "cp", "mv", "cat", "ls", "rm", "head", "tail", "find", "echo", "touch"}
+FILES = {
+    "python",
+    "cd",
+    "mkdir",
+    "cp",
+    "mv",
+    "cat",
+    "ls",
+    "rm",
+    "head",
+    "tail",
+    "find",
+    "echo",
+    "touch",
+}
 FILES |= {
     "umask",
     "wc",
@@ -42,7 +56,19 @@ FILES |= {
     "test",
     "tree",
 }
-SETUP = {"pip", "git", "source", "make", "conda", "uv", "sudo", "curl", "deactivate", "eval"}
+SETUP = {
+    "pip",
+    "pip3",
+    "git",
+    "source",
+    "make",
+    "conda",
+    "uv",
+    "sudo",
+    "curl",
+    "deactivate",
+    "eval",
+}
 SERVERS = {
     "initdb",
     "mlflow",
@@ -56,17 +82,17 @@ SERVERS = {
 }
 SERVERS |= {"psql", "createdb", "createuser", "pg_ctl", "initdb", "docker", "rsync", "scp", "kill"}
 SERVERS |= {"nvidia-smi", "sinfo", "scontrol", "sleep", "xdg-open", "open", "jupyter", "nohup"}
-PYTHON = {"python", "python3", ".venv/bin/python"}
 LOCAL_DATA = re.compile(r"(^|[=:\[,'\"])/data/")
 composed: set[tuple[str, ...]] = set()
 
 
-def check_line(line: Line, needs: str) -> None:
+def check_line(line: Line, needs: str, *, script: bool = False) -> None:
     """Refuse a command line that the program would refuse.
 
     Args:
         line: of a block of bash.
         needs: what its block is marked to need; "": nothing.
+        script: whether it is part of a script, which may use any command of the shell.
 
     Raises:
         PageError: with the reason.
@@ -81,13 +107,13 @@ def check_line(line: Line, needs: str) -> None:
             raise PageError(line.place, str(error)) from error
     elif program == "make":
         _check_targets(line)
-    elif program not in FILES | SETUP | SERVERS | PYTHON:
+    elif program not in FILES | SETUP | SERVERS and not script:
         raise PageError(
             line.place,
             f"'{program}' is not a command that pages may use; a block of output is ```text, and "
             "another command is added to the lists of tests/docs/command_lines.py",
         )
-    if needs:
+    if needs or script:
         return
     if program in SERVERS:
         raise PageError(line.place, f"'{program}' cannot run in a test; {_mark('PostgreSQL')}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import multiprocessing.forkserver
 import os
 import sys
 from collections.abc import Iterator
@@ -46,6 +47,7 @@ def expanded(text: str, folder: Path) -> str:
 
 def set_variable(name: str, value: str, patch: pytest.MonkeyPatch) -> None:
     patch.setenv(name, value)
+    stop_fork_server()
     if name == "PYTHONPATH":
         for path in filter(None, value.split(os.pathsep)):
             if path not in sys.path:
@@ -57,6 +59,7 @@ def set_variable(name: str, value: str, patch: pytest.MonkeyPatch) -> None:
 @contextmanager
 def reading_in(folder: Path) -> Iterator[pytest.MonkeyPatch]:
     """Work in `folder` with variables of its own; modules imported from there are forgotten."""
+    stop_fork_server()
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         patch.syspath_prepend(str(folder))
@@ -77,3 +80,8 @@ def forget_modules(folder: Path) -> None:
         origin = getattr(module, "__file__", None)
         if origin and Path(origin).is_relative_to(folder):
             del sys.modules[name]
+
+
+def stop_fork_server() -> None:
+    """Let the next grid start a server of its own: the server keeps the variables of its start."""
+    multiprocessing.forkserver._forkserver._stop()

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import importlib
+import io
 import os
 import shutil
 import subprocess
 import sys
 import traceback
 from collections.abc import Callable
+from contextlib import redirect_stdout
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,10 +18,10 @@ from typing import Any
 import pytest
 
 from rgbt.config.completion import OF_HYDRA
-from rgbt.config.options import types_of
-from rgbt.config.plain_command import COMMANDS, CommandGroup
+from rgbt.config.plain_command import COMMANDS
 from tests.docs.blocks import Block, Page, PageError
-from tests.docs.command_lines import FILES, HELP, PYTHON, SETUP
+from tests.docs.command_lines import FILES, HELP, SETUP
+from tests.docs.printed import difference
 from tests.docs.reader_folder import expanded, export, forget_modules, write_titled
 from tests.docs.shell import Line, is_compound, lines_of, without_runs
 
@@ -30,6 +32,9 @@ SMOKE = ("+debug=smoke", "trainer.accelerator=cpu", "trainer.threads=1")
 
 ENOUGH = "dataset.num_test=12"
 """Images without which no two methods are compared; of a page that compares."""
+
+RESAMPLING = ("compare", "score", "spatial")
+"""Commands whose intervals need fewer resamples here."""
 
 COMPARING = ("rgbt compare", "rgbt figures", "compare(")
 
@@ -89,10 +94,16 @@ class Reader:
 
     def _python(self, block: Block) -> None:
         text = "\n" * block.line + self._with_run(block.text, block.place())
+        printed = io.StringIO()
         try:
-            exec(compile(text, self.page.name, "exec"), self.names)
+            with redirect_stdout(printed):
+                exec(compile(text, self.page.name, "exec"), self.names)
         except (Exception, SystemExit) as error:
             raise PageError(block.place(), traceback.format_exc(limit=-3)) from error
+        differs = difference(block.answer, printed.getvalue()) if block.answer else ""
+        # Scores of a training are other ones here: it has two steps.
+        if differs and not Path("runs").exists():
+            raise PageError(block.place(), differs)
         self.ran += 1
 
     def _bash(self, block: Block) -> None:
@@ -112,7 +123,7 @@ class Reader:
             self.variables.syspath_prepend(str(self.folder))
         elif line.program == "rgbt" and line.alone:
             self._command(line, shown)
-        elif line.program in FILES | PYTHON or not line.alone:
+        elif line.program in FILES or not line.alone:
             number = int(line.place.rpartition(":")[2]) - block.line
             text = block.text.splitlines()[number - 1 :]
             last = next(n for n, each in enumerate(text) if not each.endswith("\\"))
@@ -132,7 +143,7 @@ class Reader:
         for variable, value in line.variables.items():
             self.variables.setenv(variable, expanded(value, self.folder))
         rest = [_group_names(word) for word in rest]
-        code, out, err = self.call(entry, *self._small(name, rest, entry))
+        code, out, err = self.call(entry, *self._small(name, rest))
         forget_modules(self.folder)
         for variable in line.variables:
             self.variables.delenv(variable)
@@ -144,7 +155,7 @@ class Reader:
             raise PageError(line.place, f"{typed}: exit code {code}{expected}\n{ending}")
         self.ran += 1
 
-    def _small(self, name: str, words: list[str], entry: Any) -> list[str]:
+    def _small(self, name: str, words: list[str]) -> list[str]:
         """The words of a command, with the sizes of a smoke test."""
         is_table = name == "reproduce" and words[:1] != ["new"]
         if name == "run" or (is_table and "dry_run=true" not in words):
@@ -160,8 +171,7 @@ class Reader:
                 words.append("hydra.sweeper.trials=2")
         if is_table:
             words = ["seeds=1" if word.startswith("seeds=") else word for word in words]
-        options = None if name in OF_HYDRA or isinstance(entry, CommandGroup) else entry.options
-        if options and "resamples" in types_of(options):
+        if name in RESAMPLING:
             words = [
                 *(word for word in words if not word.startswith("resamples=")),
                 "resamples=100",

@@ -9,11 +9,12 @@ from dataclasses import dataclass
 
 from tests.docs.blocks import Block, PageError
 
-COMPOUND = re.compile(r"^\s*(for|while|if|case|until)\b|<<")
+COMPOUND = re.compile(r"^\s*(for|while|if|case|until|trap)\b|<<|^\s*\w+\(\) *\{")
 SEPARATORS = {"|", "||", "&&", ";", "&", "2>&1"}
 REDIRECTIONS = {">", ">>", "<", "2>", "&>"}
 ASSIGNMENT = re.compile(r"[A-Za-z_]\w*=")
-PYTHON = re.compile(r"(\.venv/bin/)?python3?")
+PYTHON = re.compile(r"python(3(\.\d+)?)?")
+VENV = re.compile(r"^\.venv/bin/")
 PLACEHOLDER = re.compile(r"<[^<>]+>|\.\.\.")
 
 MODULES = re.compile(r"(rgbt|sweeps|analysis)(\.\w+)*")
@@ -54,8 +55,10 @@ def without_runs(text: str, folder: str = "runs/0123456789ab") -> str:
 
 
 def is_compound(block: Block) -> bool:
-    """Whether a block holds loops or here-documents, which a shell runs as a whole."""
-    return any(COMPOUND.search(line) for line in block.text.splitlines())
+    """Whether a block is a script, with loops, functions or here-documents, run as a whole."""
+    return block.text.startswith("#!") or any(
+        COMPOUND.search(line) for line in block.text.splitlines()
+    )
 
 
 def statements(block: Block) -> Iterator[tuple[int, str]]:
@@ -127,10 +130,11 @@ def _line(place: str, words: list[str], alone: bool) -> Line:
         is_srun = words.pop(0) == "srun"
         while is_srun and words and words[0].startswith("-"):
             words.pop(0)
-    if words and re.fullmatch(r"(\.venv/bin/)?rgbt", words[0]):
-        words[0] = "rgbt"
-    elif len(words) > 2 and PYTHON.fullmatch(words[0]) and words[1] == "-m":
+    words[:1] = [VENV.sub("", word) for word in words[:1]]
+    if len(words) > 2 and PYTHON.fullmatch(words[0]) and words[1] == "-m":
         words = _module(words)
+    if words and PYTHON.fullmatch(words[0]):
+        words[0] = "python"
     if words and words[0].startswith("$"):  # a program in a folder that a variable names
         words[0] = words[0].rpartition("/")[2]
     return Line(place, tuple(words), variables, alone)

@@ -9,6 +9,7 @@ import pytest
 
 from tests.docs.blocks import Page, PageError
 from tests.docs.check_page import problems_of
+from tests.docs.printed import difference
 
 
 def page(text: str, folder: Path | None = None) -> Page:
@@ -180,6 +181,10 @@ def test_page_is_followed_in_order(follow: Callable[..., int]) -> None:
         (bash("rgbt scenes out=nowhere/sheet.png"), "page.md:4: rgbt scenes out=nowhere/sheet.png"),
         (bash("cat nothing.txt"), "page.md:4: exit code 1: cat: nothing.txt"),
         ("~~~python\nassert 1 == 2\n~~~\n", "page.md:3: Traceback"),
+        (
+            "~~~python\nprint('mIoU', 2.5)\n~~~\n~~~text\nmIoU 3.5\n~~~\n",
+            "page.md:3: the page shows '3.5' as word 2, the block prints '2.5'",
+        ),
         (bash("for n in 1 2; do rgbt run seed=$n; done"), "page.md:3: a training in a loop"),
         (
             bash("rgbt scenes out=nowhere/x.png") + "\n~~~text\nrgbt: another mistake\n~~~\n",
@@ -204,3 +209,19 @@ def test_newest_run_stands_for_the_key(follow: Callable[..., int]) -> None:
         "rgbt compare a=grbm b='grbm sigma_div=3'",
     )
     assert follow(page(text)) == 4
+
+
+@pytest.mark.parametrize(
+    ("shown", "printed", "is_equal"),
+    [
+        ("mIoU 61.30\n58.99 to 63.18", "mIoU 61.31 58.99\nto 63.18", True),
+        ("mIoU 61.30", "mIoU 63.30", False),
+        ("a b", "a c", False),
+        ("a", "a b", False),
+        ("a\n...", "a b", True),
+        ("a b", "a", False),
+        ("(0.333, 12)", "(0.3333, 12)", True),
+    ],
+)
+def test_printed_words_are_compared(shown: str, printed: str, is_equal: bool) -> None:
+    assert (difference(shown, printed) == "") is is_equal
