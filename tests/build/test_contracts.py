@@ -139,7 +139,10 @@ REFUSED: list[tuple[Callable[[], Any], str]] = [
     (lambda: passed(Output(torch.zeros(2, 5, 2, 3), {})), "logits Tensor (2, 5, 2, 3) float32"),
     (lambda: passed(Output(None, {})), "returned logits None; expected"),
     (lambda: passed(Output(RGB, {}), auxiliary=True), "aux without `aux_logits`"),
-    (lambda: contracts.watch_model(nn.Linear(1, 1), 5), "Linear.forward is called as forward(rgb,"),
+    (
+        lambda: contracts.watch_model(nn.Linear(1, 1), 5),
+        "Linear.forward must accept the call forward(rgb,",
+    ),
     (lambda: compared(VALUE), "loss: focal returned Tensor () float32; expected a dictionary of"),
     (lambda: compared({"a": 1.0}), "'a': float 1.0; expected"),
     (lambda: compared({"a": VALUE}), "'a': Tensor () float32; expected"),

@@ -84,7 +84,7 @@ def test_empty_splits_are_one_sentence(tmp_path: Path) -> None:
             r"split 'train_night' of freiburg is empty: expected train/seq_\*_night/.*",
         ),
         ("test", r"split 'test' .* unpack the archive 'test' there\."),
-        ("train", r"every day sequence is in dataset.val_sequences, remove one of them\."),
+        ("train", r"every day sequence is in dataset.val_sequences; remove one of them\."),
     ):
         assert not dataset.has(split)
         with pytest.raises(InputError, match=said):

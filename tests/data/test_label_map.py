@@ -41,7 +41,7 @@ def test_other_networks_and_data_sets_are_refused() -> None:
     label_map.check(2, TARGETS, "streets")
     with pytest.raises(InputError, match=r"network with 2 classes, but model.num_classes is 9"):
         label_map.check(9, TARGETS, "streets")
-    with pytest.raises(InputError, match=r"leads to the classes road, car, but streets has sky"):
+    with pytest.raises(InputError, match=r"maps to the classes road, car, but streets has sky"):
         label_map.check(2, ("sky",), "streets")
     # The same names under other ids are other classes.
     with pytest.raises(InputError, match=r"classes road, car, but streets has car, road"):

@@ -243,7 +243,7 @@ def test_unscored_are_some_of_the_classes(unscored) -> None:
 def test_means_over_different_classes_are_not_compared() -> None:
     check_same_means(counts_of(unscored=("void", "car")), counts_of(unscored=("car", "void")))
     with pytest.raises(
-        InputError, match=r"leave void out.*leave out no class; .*dataset\.unscored"
+        InputError, match=r"without void in .* without no class\. .*dataset\.unscored"
     ):
         check_same_means(counts_of(), counts_of(unscored=()))
 
