@@ -228,7 +228,7 @@ def cut_short(data: Path) -> str:
 
 def no_test_list(data: Path) -> str:
     (data / "test.txt").unlink()
-    return "there is no list"
+    return "test.txt' does not exist"
 
 
 @pytest.mark.parametrize("spoil", [label_of_nine, three_channels, cut_short, no_test_list])
@@ -318,7 +318,7 @@ OF_A_RUN = {
             ("degradations=blur", "'degradations' was renamed to 'corruptions'"),
             ("corruptions=blurr", "did you mean 'blur'"),
             ("metric.absent=exclude", "changes how the run is measured"),
-            ("run=a,b out=x", "out= is the folder of one run, but run= names 2"),
+            ("run=a,b out=x", "out= is the folder for a single run, but run= names 2"),
         ],
     ),
 }

@@ -152,7 +152,10 @@ REFUSED: list[tuple[Callable[[], Any], str]] = [
     (lambda: yielded(Phase(("main",), {"a": VALUE})), "phases returned Phase; expected to yield"),
     (lambda: yielded([{"a": VALUE}]), "phases yielded dict with a; expected Phase("),
     (lambda: yielded([Phase("main", {"a": VALUE})]), "phases yielded Phase; expected Phase("),
-    (lambda: yielded([Phase(("mian",), {"a": VALUE})]), "of the optimizer 'mian'; expected names"),
+    (
+        lambda: yielded([Phase(("mian",), {"a": VALUE})]),
+        "with the optimizer 'mian'; expected one of",
+    ),
     (lambda: yielded([Phase(("main",), {"a": VALUE[None]})]), "'a': Tensor (1,) float32; expected"),
     (
         lambda: contracts.CheckedScheme(SimpleNamespace(), ()),

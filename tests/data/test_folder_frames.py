@@ -156,8 +156,8 @@ def test_lines_of_a_list(root: Path, tmp_path: Path) -> None:
     assert dataset.has("train")
     assert not dataset.has("val")
     assert refused(lambda: dataset.names("val")) == (
-        f"dataset.lists.val: there is no list '{root}/val.txt'; write it (one name per line), or "
-        "name another one with dataset.lists.val=..."
+        f"dataset.lists.val: the list '{root}/val.txt' does not exist; write it (one name per "
+        "line), or name another list with dataset.lists.val=..."
     )
     (tmp_path / "mine.txt").write_text("test_1\n")
     dataset = listed(root, "train_1", lists={"train": str(tmp_path / "mine.txt")})

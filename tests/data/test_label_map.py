@@ -23,7 +23,10 @@ def test_ids_are_mapped_one_by_one() -> None:
 @pytest.mark.parametrize(
     ("groups", "said"),
     [
-        ({"car": (0, 1), "rode": (2, 3)}, "'rode' is no class of label_map.targets; did you mean"),
+        (
+            {"car": (0, 1), "rode": (2, 3)},
+            "'rode' is not a class of label_map.targets; did you mean",
+        ),
         ({"car": (0, 1), "road": (3,)}, "every id from 0 to 3 once, but 2 is not mapped"),
         ({"car": (0, 1, 2), "road": (2, 3)}, "but 2 is mapped twice"),
         ({"car": (0, 1, 2), "road": (3, 4)}, "but 4 is unknown"),
