@@ -133,7 +133,7 @@ PUBLISHED = {
         ({"scale": "demo", "data": "kp", "weights": None}, []),
         ({"weights": None, "parts": ()}, []),
         ({"data": "mine", "recipe": "mine"}, []),
-        ({"data": "pst900"}, ["those for mfnet, not", "choose recipe=pst900, or set recipe."]),
+        ({"data": "pst900"}, ["published for mfnet, not", "choose recipe=pst900, or set recipe."]),
         (
             {"data": "mine", "recipe": "kp"},
             ["published for kp, not for mine; set recipe.train_sizes"],

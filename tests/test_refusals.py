@@ -228,7 +228,7 @@ def cut_short(data: Path) -> str:
 
 def no_test_list(data: Path) -> str:
     (data / "test.txt").unlink()
-    return "there is no list"
+    return "test.txt' does not exist"
 
 
 @pytest.mark.parametrize("spoil", [label_of_nine, three_channels, cut_short, no_test_list])
@@ -269,7 +269,7 @@ OF_A_RUN = {
             ("model=mask2former_swin_t", "'model' cannot be changed"),
             ("data.eval_batch_size=[1", "data.eval_batch_size cannot be read as YAML"),
             ("head=source", "head=source selects one of two heads"),
-            ("degradation=noise", "'degradation' is called 'corruption' now"),
+            ("degradation=noise", "'degradation' was renamed to 'corruption'"),
             ("severity=1", "'severity' has no effect without corruption="),
             ("corruption.block=1", "'corruption.block' has no effect without corruption="),
             ("corruption=noise", "requires a number (grey levels (std))"),
@@ -315,10 +315,10 @@ OF_A_RUN = {
     robustness.entry: (
         CRM,
         [
-            ("degradations=blur", "'degradations' is called 'corruptions' now"),
+            ("degradations=blur", "'degradations' was renamed to 'corruptions'"),
             ("corruptions=blurr", "did you mean 'blur'"),
             ("metric.absent=exclude", "changes how the run is measured"),
-            ("run=a,b out=x", "out= is the folder of one run, but run= names 2"),
+            ("run=a,b out=x", "out= is the folder for a single run, but run= names 2"),
         ],
     ),
 }
@@ -354,7 +354,7 @@ def test_request_without_a_run_is_one_sentence(
     assert_one_sentence(err, "'run' has no value")
     code, _, err = call(entry, "run=nowhere", f"runs_dir={tmp_path}")
     assert code == 2
-    assert_one_sentence(err, "run=nowhere: neither a run folder")
+    assert_one_sentence(err, "run=nowhere is neither a run folder")
 
 
 def test_run_without_checkpoint_is_refused(call: Call, trained: Trained, tmp_path: Path) -> None:

@@ -225,7 +225,7 @@ def test_run_is_not_matched_by_part_of_a_name(tmp_path: Path) -> None:
     (folder / "config.yaml").write_text("")
     (folder / "mlflow.json").write_text('{"run_id": "f00", "experiment": "rgbt"}')
     assert find_run("f00", tmp_path) == find_run("abc", tmp_path) == folder
-    with pytest.raises(InputError, match="run=rgbt: neither"):
+    with pytest.raises(InputError, match="run=rgbt is neither"):
         find_run("rgbt", tmp_path)
 
 

@@ -121,7 +121,7 @@ def test_networks_with_random_parts_are_not_scored(
     assert "does not hold all parameters of the network, and the others would be random" in err
     code, _, err = call(EVALUATE, *named, "checkpoint=last")
     assert code == 2
-    assert_one_sentence(err, "checkpoint=last is one of a run")
+    assert_one_sentence(err, "checkpoint=last selects a checkpoint of a run")
     code, _, err = train(call, data, tmp_path, "+experiment=mfnet", "model.fresh=[decode1]")
     assert code == 2
     assert_one_sentence(err, "or omit model.fresh")
@@ -143,7 +143,7 @@ def test_a_network_of_one_image_is_scored_from_it(call: Call, data: Path, tmp_pa
 def test_weights_that_are_not_there_are_named(call: Call, data: Path, tmp_path: Path) -> None:
     code, _, err = train(call, data, tmp_path, "+experiment=mfnet", "model.weights=nowhere.pth")
     assert code == 2
-    assert_one_sentence(err, "there is no file nowhere.pth")
+    assert_one_sentence(err, "the file nowhere.pth does not exist")
     code, _, err = call(EVALUATE, "model=mfnet_tiny", f"dataset.root={data}")
     assert code == 2
     assert_one_sentence(err, "'run' has no value")

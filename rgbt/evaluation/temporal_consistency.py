@@ -90,7 +90,7 @@ def count_pairs(
     """Predict both frames of every scene of a split and count, with a progress bar.
 
     Source: Temporal, Fig. 4 (aligned: the first prediction is warped to the second frame) and its
-        release (released: it is not warped). On real second frames points follow their exact flow.
+    release (released: it is not warped). On real second frames points follow their exact flow.
 
     Args:
         session: its `consistency` says which virtual views.

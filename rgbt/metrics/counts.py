@@ -181,8 +181,8 @@ def check_same_means(first: Counts, other: Counts) -> None:
         return
     left_out = [", ".join(each.unscored) or "no class" for each in (first, other)]
     raise InputError(
-        f"counts without {left_out[0]} in their means cannot be compared with counts without "
-        f"{left_out[1]}. Evaluate both with the same dataset.unscored."
+        f"counts whose means leave out {left_out[0]} cannot be compared with counts whose means "
+        f"leave out {left_out[1]}. Evaluate both with the same dataset.unscored."
     )
 
 

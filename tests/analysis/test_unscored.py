@@ -94,7 +94,7 @@ def test_difference_in_unscored_classes_only_is_none() -> None:
 
 
 REFUSED = (
-    r"without void in their means .* without no class. Evaluate both with the same "
+    r"leave out void cannot be compared .* leave out no class. Evaluate both with the same "
     r"dataset\.unscored"
 )
 
@@ -200,7 +200,7 @@ def test_pixel_maps_exclude_the_class(tmp_path: Path) -> None:
     assert maps.iou_heat(made, strips(2, "ring")).whole == pytest.approx((1 / 4 + 1 / 2 + 0) / 3)
     made.save(tmp_path / "maps.npz")
     assert PixelMaps.load(tmp_path / "maps.npz").unscored == ("void",)
-    with pytest.raises(ValueError, match="some of the classes"):
+    with pytest.raises(ValueError, match="some, but not all, of the classes"):
         replace(made, unscored=("sky",))
 
 

@@ -140,7 +140,10 @@ REFUSED: list[tuple[Callable[[], Any], str]] = [
     (lambda: passed(Output(torch.zeros(2, 5, 2, 3), {})), "logits Tensor (2, 5, 2, 3) float32"),
     (lambda: passed(Output(None, {})), "returned logits None; expected"),
     (lambda: passed(Output(RGB, {}), auxiliary=True), "aux without `aux_logits`"),
-    (lambda: contracts.watch_model(nn.Linear(1, 1), 5), "Linear.forward is called as forward(rgb,"),
+    (
+        lambda: contracts.watch_model(nn.Linear(1, 1), 5),
+        "Linear.forward must accept the call forward(rgb,",
+    ),
     (lambda: compared(VALUE), "loss: focal returned Tensor () float32; expected a dictionary of"),
     (lambda: compared({"a": 1.0}), "'a': float 1.0; expected"),
     (lambda: compared({"a": VALUE}), "'a': Tensor () float32; expected"),
@@ -150,7 +153,10 @@ REFUSED: list[tuple[Callable[[], Any], str]] = [
     (lambda: yielded(Phase(("main",), {"a": VALUE})), "phases returned Phase; expected to yield"),
     (lambda: yielded([{"a": VALUE}]), "phases yielded dict with a; expected Phase("),
     (lambda: yielded([Phase("main", {"a": VALUE})]), "phases yielded Phase; expected Phase("),
-    (lambda: yielded([Phase(("mian",), {"a": VALUE})]), "of the optimizer 'mian'; expected names"),
+    (
+        lambda: yielded([Phase(("mian",), {"a": VALUE})]),
+        "with the optimizer 'mian'; expected one of",
+    ),
     (lambda: yielded([Phase(("main",), {"a": VALUE[None]})]), "'a': Tensor (1,) float32; expected"),
     (
         lambda: contracts.CheckedScheme(SimpleNamespace(), ()),

@@ -150,5 +150,5 @@ def test_users_component_with_record_is_a_choice(
 )
 def test_record_of_component_with_former_attribute_is_refused(name: str, key: str) -> None:
     component = type("Mine", (), {name: True})()
-    with pytest.raises(InputError, match=rf"Mine\.{name} is not read; .*Record\({key}=\.\.\.\)"):
+    with pytest.raises(InputError, match=rf"Mine\.{name} is ignored; .*Record\({key}=\.\.\.\)"):
         record_of(component)

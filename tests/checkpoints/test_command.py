@@ -71,7 +71,7 @@ def test_inspect_for_a_network_that_does_not_fit(tmp_path: Path, call: Call) -> 
     assert "DIFFERENT" in out
     code, _, err = call(entry, "inspect", str(path), "model=mfnet_tiny")
     assert code == 2
-    assert "is no file for MFNet" in err
+    assert "cannot be loaded into MFNet" in err
 
 
 def test_inspect_a_part_that_is_named_fresh(tmp_path: Path, call: Call) -> None:
@@ -140,7 +140,7 @@ def test_export_and_inspect(run: Path, tmp_path: Path, call: Call) -> None:
         ((), "expected a command"),
         (("inspct",), "did you mean 'inspect'?"),
         (("inspect",), "'file' has no value"),
-        (("inspect", "missing.pth"), "there is no such file"),
+        (("inspect", "missing.pth"), "missing.pth does not exist"),
         (("export", "run=x"), "'format' has no value"),
         (("export", "run=x", "format=released", "out=y"), "run=x"),
         (("export", "run=x", "format=released", "out=y", "modl=z"), "'modl' has no effect here"),

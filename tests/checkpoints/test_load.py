@@ -125,13 +125,13 @@ REFUSED: list[tuple[str, Callable[[], Any], tuple[str, ...], str]] = [
     ("rtfnet_tiny", lambda: {"w": X}, (), "in an unknown layout"),
     (
         *("cmx_tiny", lambda: mit_file((32, 64, 160, 256), (2, 2, 2, 2)), ()),
-        "; the file fits model=cmx_b0.",
+        ". The file fits model=cmx_b0.",
     ),
     ("mask2former_tiny", lambda: windows_of(7), (), "windows of 7 x 7 tokens"),
     ("mask2former_tiny", lambda: windows_of(12), (), "windows of 12 x 12 tokens"),
     (
         *("mfnet_tiny", lambda: {"model": network("cmx_tiny").state_dict(), "step": 240}, ()),
-        "is no file for MFNet: checkpoint of a run, CMX",
+        "CMX) cannot be loaded into MFNet",
     ),
     ("mfnet_tiny", lambda: {"a": X}, ("decod1",), "no part 'decod1' (did you mean 'decode1'?)"),
     ("mfnet_tiny", lambda: {"a": X}, ("decode",), "no part 'decode'"),  # not a whole word

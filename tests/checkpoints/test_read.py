@@ -410,7 +410,7 @@ def test_missing_files_folders_and_archives(tmp_path: Path) -> None:
             copy.writestr(entry.filename, source.read(entry), zipfile.ZIP_DEFLATED)
     torch.jit.save(torch.jit.script(torch.nn.Linear(1, 1)), str(tmp_path / "program.pt"))
     said = {
-        **{"none.pth": "there is no such file", ".": "is a folder", "tar.pth": "tar archive"},
+        **{"none.pth": "does not exist", ".": "is a folder", "tar.pth": "tar archive"},
         **{"zip.pth": "zip archive", "again.pth": "compression", "program.pt": "TorchScript"},
     }
     for name, word in said.items():

@@ -162,7 +162,7 @@ def test_nothing_in_a_checkpoint_runs(tmp_path: Path, name: str) -> None:
         load_checkpoint(tmp_path / name)
     sentence(refused)
     if name == "last.pt":
-        with pytest.raises(RunError, match=r"asks for posix\.system.*remove .* and rerun"):
+        with pytest.raises(RunError, match=r"refers to posix\.system.*remove .* and rerun"):
             Checkpoints(tmp_path).load()
     assert not marker.exists()
 
@@ -202,7 +202,7 @@ def test_a_name_in_a_file_cannot_write_to_the_terminal(tmp_path: Path) -> None:
     pickled = b"\x80\x02c\x1b[2Jposix\nsystem\n)R."
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("archive/data.pkl", pickled)
-    with pytest.raises(InputError, match=r"asks for \\x1b\[2Jposix\.system") as refused:
+    with pytest.raises(InputError, match=r"refers to \\x1b\[2Jposix\.system") as refused:
         load_checkpoint(path)
     sentence(refused)
 

@@ -236,7 +236,7 @@ def noise(*severities: float) -> Noise:
         (lambda: noise(300.0), r"grey levels\) must be between 0 and 255"),
         (lambda: Blur(image="rgb", severities=(121.0,)), r"sigma .* be between 0 and 120"),
         (lambda: Misregistered(severities=(241.0,)), r"pixels\) must be between 0 and 240"),
-        (lambda: Removed(image="rgb").check(0.5), r"can only be 1, got 0.5"),
+        (lambda: Removed(image="rgb").check(0.5), r"must be 1, got 0.5"),
         (lambda: noise(8.0).check(float("nan")), r"got nan"),
     ],
 )

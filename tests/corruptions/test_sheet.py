@@ -63,7 +63,7 @@ def test_the_command_writes_a_picture(call: Call, write_mfnet: WriteMFNet, tmp_p
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["out=x.pdf"], "out must name the picture to write, .png or .jpg, got 'x.pdf'"),
+        (["out=x.pdf"], "out must be the path of a picture to write, .png or .jpg, got 'x.pdf'"),
         (["out=x.png", "corruptions=nois"], "did you mean 'noise"),
     ],
 )

@@ -119,8 +119,11 @@ DAMAGES: dict[str, tuple[Callable[[Path, Path], None], str]] = {
     "no image": (partial(fill, content=b"<html>404</html>"), "the file is damaged or not"),
     "a folder": (make_folder, "is a folder, expected a file"),
     "a pipe": (make_pipe, "is not a regular file, expected a file"),
-    "a link that leads out": (partial(move, link="kept"), "leads out of dataset.root, to .*kept;"),
-    "a link to nowhere": (partial(move, link="gone"), "is missing: it is a link to .*/gone, where"),
+    "a link that leads out": (partial(move, link="kept"), "leads out of dataset.root, to .*kept."),
+    "a link to nowhere": (
+        partial(move, link="gone"),
+        "is missing: it is a link to .*/gone, which does not exist",
+    ),
     "another depth": (change_depth, "expected 8 bits|of 16 bits|whole numbers|got 8 bits"),
     "another size": (change_size, r"is \d+x\d+ pixels but|which is another aspect ratio"),
     "an unknown value": (change_values, "label value 77 "),

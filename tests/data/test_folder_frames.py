@@ -156,8 +156,8 @@ def test_lines_of_a_list(root: Path, tmp_path: Path) -> None:
     assert dataset.has("train")
     assert not dataset.has("val")
     assert refused(lambda: dataset.names("val")) == (
-        f"dataset.lists.val: there is no list '{root}/val.txt'; write it (one name per line), or "
-        "name another one with dataset.lists.val=..."
+        f"dataset.lists.val: the list '{root}/val.txt' does not exist; write it (one name per "
+        "line), or name another list with dataset.lists.val=..."
     )
     (tmp_path / "mine.txt").write_text("test_1\n")
     dataset = listed(root, "train_1", lists={"train": str(tmp_path / "mine.txt")})
@@ -247,11 +247,11 @@ def test_shares_in_a_folder(root: Path) -> None:
         ({"shares": {"train": 0.5, "val": 0.4}}, "expected shares above 0 that add up to 1"),
         ({"shares": {"train": 1.5, "val": -0.5}}, "expected shares above 0 that add up to 1"),
         ({"shares": {"train": float("nan"), "val": 1.0}}, "expected shares above 0"),
-        ({}, "3 splits are to be drawn from 1 sequence(s), .* give dataset.block"),
+        ({}, "3 splits are to be drawn from 1 sequence(s), .* Set dataset.block"),
         ({"block": 10}, "3 splits are to be drawn from 2 block(s)"),
         (
             {"block": 4, "shares": {"train": 0.9, "val": 0.05, "test": 0.05}},
-            "gets no frame, as 5 units of up to 4 frames stay together",
+            "gets no frame, because 5 units of up to 4 frames stay together",
         ),
     ],
 )

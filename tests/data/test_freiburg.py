@@ -55,7 +55,7 @@ def test_night_is_what_the_path_says(root: Path) -> None:
 @pytest.mark.parametrize("folder", ["seq_05_dusk", "seq_05_day_and_night"])
 def test_a_sequence_of_no_time_is_refused(root: Path, folder: str) -> None:
     (root / "train" / folder / "00").mkdir(parents=True)
-    with pytest.raises(InputError, match=rf"{folder}: expected a name of a sequence with day"):
+    with pytest.raises(InputError, match=rf"{folder}: expected the name of a sequence with day"):
         reader(root).names("test")
 
 
@@ -84,7 +84,7 @@ def test_empty_splits_are_one_sentence(tmp_path: Path) -> None:
             r"split 'train_night' of freiburg is empty: expected train/seq_\*_night/.*",
         ),
         ("test", r"split 'test' .* unpack the archive 'test' there\."),
-        ("train", r"every day sequence is in dataset.val_sequences, remove one of them\."),
+        ("train", r"every day sequence is in dataset.val_sequences; remove one of them\."),
     ):
         assert not dataset.has(split)
         with pytest.raises(InputError, match=said):

@@ -126,7 +126,9 @@ def test_source_of_the_splits(root: Path) -> None:
         (root / f"{split}.txt").unlink()
     assert KP(str(root)).lists == "sets"
     assert KP(str(root), lists="files").lists == "files"
-    with pytest.raises(InputError, match=r"dataset.splits.train: there is no list '\S+mine.txt'"):
+    with pytest.raises(
+        InputError, match=r"dataset.splits.train: the list '\S+mine.txt' does not exist"
+    ):
         KP(str(root), splits={"train": "mine.txt"}).names("train")
     with pytest.raises(
         InputError, match=r"splits names lists, but dataset.lists=sets does not use lists"
@@ -155,7 +157,7 @@ def test_split_is_union_of_day_and_night(tmp_path: Path) -> None:
     assert dataset.names("test") == TEST  # sorted
     assert dataset.names("test_day") == TEST[1::-1]  # as listed
     assert not dataset.has("train")
-    with pytest.raises(InputError, match=r"there is no list '\S+/train.txt'; .*lists=sets"):
+    with pytest.raises(InputError, match=r"the list '\S+/train.txt' does not exist; .*lists=sets"):
         dataset.names("train")
 
 
@@ -328,7 +330,7 @@ def test_check_of_missing_and_shared_lists(root: Path) -> None:
     (root / "test.txt").unlink()
     report = check_dataset(KP(str(root)))
     assert len(report.problems) == 2
-    assert report.problems[0].startswith("dataset.splits.test: there is no list")
+    assert report.problems[0].startswith("dataset.splits.test: the list")
     assert report.problems[1].startswith("4 files belong to no image of a split")
     splits = {"train": "train.txt", "val": "val.txt", "val_day": "val_day.txt", "test": "val.txt"}
     report = check_dataset(KP(str(root), splits=splits))

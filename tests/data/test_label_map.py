@@ -23,7 +23,10 @@ def test_ids_are_mapped_one_by_one() -> None:
 @pytest.mark.parametrize(
     ("groups", "said"),
     [
-        ({"car": (0, 1), "rode": (2, 3)}, "'rode' is no class of label_map.targets; did you mean"),
+        (
+            {"car": (0, 1), "rode": (2, 3)},
+            "'rode' is not a class of label_map.targets; did you mean",
+        ),
         ({"car": (0, 1), "road": (3,)}, "every id from 0 to 3 once, but 2 is not mapped"),
         ({"car": (0, 1, 2), "road": (2, 3)}, "but 2 is mapped twice"),
         ({"car": (0, 1, 2), "road": (3, 4)}, "but 4 is unknown"),
@@ -41,7 +44,7 @@ def test_other_networks_and_data_sets_are_refused() -> None:
     label_map.check(2, TARGETS, "streets")
     with pytest.raises(InputError, match=r"network with 2 classes, but model.num_classes is 9"):
         label_map.check(9, TARGETS, "streets")
-    with pytest.raises(InputError, match=r"leads to the classes road, car, but streets has sky"):
+    with pytest.raises(InputError, match=r"maps to the classes road, car, but streets has sky"):
         label_map.check(2, ("sky",), "streets")
     # The same names under other ids are other classes.
     with pytest.raises(InputError, match=r"classes road, car, but streets has car, road"):

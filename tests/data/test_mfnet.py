@@ -79,7 +79,7 @@ def test_lists(write_mfnet) -> None:
     dataset = MFNet(str(root), splits={"train": "train.txt", "val": "train.txt", "test": "no.txt"})
     assert dataset.names("train") == dataset.names("val") == ("00003N", "00001D")
     assert not dataset.has("test")
-    with pytest.raises(InputError, match=r"dataset.splits.test: there is no list .*no.txt"):
+    with pytest.raises(InputError, match=r"dataset.splits.test: the list .*no.txt' does not exist"):
         dataset.names("test")
 
 

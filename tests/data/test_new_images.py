@@ -110,7 +110,7 @@ def test_no_pair_is_refused_with_folder_content(tmp_path: Path) -> None:
         return refused(lambda: find_pairs(root, MINE, "harbour"))
 
     for files, words in (
-        (("1.png", "2.png"), ("holds 1.png, 2.png. Expected were the files of harbour (RGB {",)),
+        (("1.png", "2.png"), ("holds 1.png, 2.png. Expected the files of harbour (RGB {",)),
         (
             ("rgb/1.jpg", "ir/other_ir.tif"),
             ("rgb/1.jpg would be ", "ir/1_ir.tif, but ", "/ir holds other_ir.tif. Expected"),

@@ -103,7 +103,7 @@ def test_a_part_that_is_missing(tmp_path: Path) -> None:
     assert report.notes[0].startswith("split 'val' of pst900 is empty: expected test/rgb/*.png in")
     flat = PST900(str(write_lists(tmp_path / "flat", {"train": TRAIN})))
     assert not flat.has("test")
-    with pytest.raises(InputError, match=r"there is no list '.*test.txt'"):
+    with pytest.raises(InputError, match=r"the list '.*test.txt' does not exist"):
         flat.names("test")
 
 

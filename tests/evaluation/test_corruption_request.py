@@ -101,7 +101,7 @@ def test_own_file(tmp_path: Path) -> None:
     path.write_text("a: [\n")
     with pytest.raises(InputError, match=r"hazy.yaml cannot be read as YAML"):
         choose_corruption(str(path))
-    with pytest.raises(InputError, match="there is no such file"):
+    with pytest.raises(InputError, match="the file does not exist"):
         choose_corruption(str(tmp_path / "no.yaml"))
 
 

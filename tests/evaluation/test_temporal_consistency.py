@@ -431,7 +431,7 @@ def fewer_names(root: Path, name: str) -> str:
 
 def no_list(root: Path, name: str) -> str:
     (root / "next" / "test.txt").unlink()
-    return "there is no list"
+    return "the list .* does not exist"
 
 
 def no_image(root: Path, name: str) -> str:

@@ -78,7 +78,7 @@ def test_lengths_must_agree() -> None:
 
 
 def test_a_file_that_is_not_one_is_refused_in_a_sentence(tmp_path) -> None:
-    with pytest.raises(InputError, match="there is no file"):
+    with pytest.raises(InputError, match="the file of counts .* does not exist"):
         Counts.load(tmp_path / "none.npz")
     text, empty = tmp_path / "text.npz", tmp_path / "empty.npz"
     text.write_text("not counts")

@@ -66,7 +66,7 @@ def of_a_named_file() -> BaseException:
         (full, "is full ("),
         (hidden, "is full ("),
         (of_a_named_file, f"the disk of {Path.cwd()} has no space left for this user (quota) ("),
-        (lambda: OSError(errno.EROFS, "Read-only file system"), "it is mounted read-only ("),
+        (lambda: OSError(errno.EROFS, "Read-only file system"), "is mounted read-only ("),
     ],
 )
 def test_a_full_disk_is_one_sentence(call: Call, tmp_path: Path, error, words: str) -> None:

@@ -56,7 +56,9 @@ def test_the_step_in_progress_is_finished_and_saved(
     whole, log = train(tmp_path / "whole")
     whole.fit(batches(0), State(seed=7))
     first, first_log = train(tmp_path / "run")
-    with pytest.raises(Stopped, match=f"at step {step + 1}, which is saved; rerun") as stop:
+    with pytest.raises(
+        Stopped, match=f"at step {step + 1}, and the checkpoint is saved; rerun"
+    ) as stop:
         first.fit(sending(number, step), State(seed=7))
     assert (stop.value.step, stop.value.code) == (step + 1, 128 + number)
     second, second_log = train(tmp_path / "run")

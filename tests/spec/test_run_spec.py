@@ -124,7 +124,7 @@ def test_key_damaged_pseudo_labels_are_refused(tmp_path: Path, text: str) -> Non
 
 
 REFUSED = {
-    "no folder": ("domains.target.labels=/no/such", "there is no /no/such/pseudo_labels.json"),
+    "no folder": ("domains.target.labels=/no/such", "/no/such/pseudo_labels.json does not exist"),
     "no checkpoint": ("model.weights=experiment:sh_source", "expected experiment:NAME/best.pt"),
     "other checkpoint": (
         "model.weights=experiment:sh_source/first.pt",

@@ -141,7 +141,7 @@ def test_sets_without_a_split_to_measure_are_refused() -> None:
 
 
 def test_unknown_sets_are_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="'released_4' is no published set .*did you mean"):
+    with pytest.raises(InputError, match="'released_4' is neither a published set .*did you mean"):
         sets("released_4")
     with pytest.raises(InputError, match="is neither a published set of angles nor a file"):
         sets(str(tmp_path))
