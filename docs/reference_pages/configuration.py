@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import yaml
 
 from reference_pages.docstrings import description, parameters
-from reference_pages.guides import guides, link
+from reference_pages.guides import about, link
 from reference_pages.markdown import block, code, page, table
 from rgbt.config.component import RUN_SETTINGS, constructor, setting_types
 from rgbt.config.compose import conf_dir
@@ -102,7 +102,7 @@ def index_page() -> str:
     rows = [
         [
             f"[`{group}`]({_from_configuration(group)})",
-            guides("groups")[group].about if group in guides("groups") else "",
+            about(group),
             code(chosen.get(group, "")),
             link("groups", group, 2),
         ]
@@ -144,7 +144,7 @@ def group_page(group: str) -> str:
     choose = f"Choose a file with `{group}=NAME`"
     return page(
         f"# `{group}`",
-        guides("groups")[group].about if group in guides("groups") else "",
+        about(group),
         f"{choose}; the default is `{default}`." if default else f"{choose}.",
         "The column *Default* shows the value of the default file, or of the file in brackets.",
         f"Guide: {link('groups', group, 2)}" if link("groups", group, 2) else "",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal
 
 import yaml
 
@@ -12,31 +12,21 @@ DOCS = Path(__file__).resolve().parents[1]
 Kind = Literal["groups", "commands", "experiments"]
 
 
-class Guide(NamedTuple):
-    """What one entry says.
-
-    Attributes:
-        page: path of the page from docs/.
-        about: one sentence; "" where the code says what it is.
-    """
-
-    page: str
-    about: str = ""
-
-
 @cache
-def guides(kind: Kind) -> dict[str, Guide]:
-    """Entries of one kind, by name."""
-    entries = yaml.safe_load((DOCS / "guides.yaml").read_text())[kind]
-    return {name: Guide(each["page"], each.get("about", "")) for name, each in entries.items()}
+def guides() -> dict[str, dict[str, Any]]:
+    """Content of the file: the page of each name, by kind."""
+    return dict(yaml.safe_load((DOCS / "guides.yaml").read_text()))
+
+
+def about(group: str) -> str:
+    """What a group sets, in one sentence; "" without an entry."""
+    return str(guides()["about"].get(group, ""))
 
 
 def link(kind: Kind, name: str, depth: int) -> str:
     """A link to the page of an entry, from a page `depth` folders below docs/; "" without one."""
-    guide = guides(kind).get(name)
-    if guide is None:
-        return ""
-    return f"[{title(guide.page)}]({'../' * depth}{guide.page})"
+    page = guides()[kind].get(name)
+    return f"[{title(page)}]({'../' * depth}{page})" if page else ""
 
 
 @cache

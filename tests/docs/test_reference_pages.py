@@ -29,6 +29,12 @@ def test_every_folder_of_the_configuration_has_a_page(pages: dict[str, str]) -> 
             assert path.read_text().strip() in text
 
 
+def test_every_group_says_what_it_sets(pages: dict[str, str]) -> None:
+    rows = [line for line in pages["reference/configuration/index.md"].splitlines() if "](" in line]
+    assert len(rows) == len({path.parent for path in ROOT.glob("conf/*/**/*.yaml")})
+    assert not [row for row in rows if not row.split("|")[2].strip()]
+
+
 def test_the_page_of_a_group_has_keys_types_defaults_and_meanings(pages: dict[str, str]) -> None:
     text = pages["reference/configuration/masker.md"]
     (row,) = (line for line in text.splitlines() if line.startswith("| `ratio` |"))

@@ -52,6 +52,8 @@ def problems_of(lines: Iterator[tuple[str, str]], *, page: bool) -> list[str]:
 def of_page(page: Page) -> Iterator[tuple[str, str]]:
     """Lines of prose, without code, targets of links and tags."""
     for number, line in page.prose():
+        if line.startswith(":::"):  # a name of the Python API
+            continue
         yield f"{page.name}:{number}", LINK_TARGET.sub("]", INLINE_CODE.sub("", line))
 
 
