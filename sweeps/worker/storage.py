@@ -176,7 +176,7 @@ def open_study(
     for fixed, what in FIXED.items():
         if fixed in known and known[fixed] != wanted.get(fixed):
             raise InputError(
-                f"the study '{name}' already exists, with {what}; choose another name: "
+                f"a study '{name}' with {what} already exists; choose another name: "
                 "hydra.sweeper.study=..."
             )
     for key, value in wanted.items():

@@ -85,7 +85,7 @@ def test_search_with_other_identity_is_refused(wanted: Search, ends: list[str], 
         "objectives": {},
     }
     kept = {"objectives": (Objective("val/Var", "minimize"),)} if other == "objectives" else {}
-    with pytest.raises(InputError, match="the study 's' already exists, with"):
+    with pytest.raises(InputError, match="a study 's' with"):
         search(replace(wanted, **changed[other]), settings(**kept))
 
 
