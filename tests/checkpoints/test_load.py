@@ -117,7 +117,12 @@ def windows_of(side: int) -> Tensors:
 
 REFUSED: list[tuple[str, Callable[[], Any], tuple[str, ...], str]] = [
     # network, content of the file, parts that are fresh, message
-    ("mask2former_tiny", cmx_file, (), "CMX checkpoint (MiT-B0, 9 classes); it fits model=cmx_b0"),
+    (
+        "mask2former_tiny",
+        cmx_file,
+        (),
+        "cannot be loaded into RGB-T Mask2Former; it fits model=cmx_b0",
+    ),
     (
         *("rtfnet_tiny", lambda: resnet_file(101, prefix="Scale.", counters=False), ()),
         "it fits model=deeplabv2 model/inputs=caffe",
@@ -131,7 +136,7 @@ REFUSED: list[tuple[str, Callable[[], Any], tuple[str, ...], str]] = [
     ("mask2former_tiny", lambda: windows_of(12), (), "windows of 12 x 12 tokens"),
     (
         *("mfnet_tiny", lambda: {"model": network("cmx_tiny").state_dict(), "step": 240}, ()),
-        "CMX) cannot be loaded into MFNet",
+        "CMX (9 classes)) cannot be loaded into MFNet",
     ),
     ("mfnet_tiny", lambda: {"a": X}, ("decod1",), "no part 'decod1' (did you mean 'decode1'?)"),
     ("mfnet_tiny", lambda: {"a": X}, ("decode",), "no part 'decode'"),  # not a whole word

@@ -381,11 +381,11 @@ def test_an_array_of_many_names_is_copied_once(tmp_path: Path) -> None:
 
 OTHERS = {
     "empty": (b"", "is empty"),
-    "text": (b"weights are on the shared drive\n", "no file of weights"),
+    "text": (b"weights are on the shared drive\n", "not a file of weights"),
     "web page": (b"\n<!DOCTYPE html><html>quota exceeded</html>", "web page"),
     "LFS pointer": (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "Git LFS"),
     "gzip": (b"\x1f\x8b\x08\x00" + bytes(20), "compressed"),
-    "zeros": (bytes(1000), "no file of weights"),
+    "zeros": (bytes(1000), "not a file of weights"),
 }
 
 

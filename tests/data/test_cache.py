@@ -644,7 +644,7 @@ def test_former_command_warns_and_works(
         runpy.run_module("rgbt.data.decoded", run_name="__main__")
     assert not ended.value.code
     done = capsys.readouterr()
-    assert "into the image cache" in done.out
+    assert "to the image cache" in done.out
     assert "was renamed to rgbt.data.cache" in done.err
 
 

@@ -90,7 +90,8 @@ def test_empty_splits_are_one_sentence(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=said):
             dataset.names(split)
     with pytest.raises(
-        InputError, match=r"'val' .* is empty: .* it is \[\], name existing day sequences"
+        InputError,
+        match=r"'val' .* is empty: .* dataset.val_sequences is \[\]; name existing day sequences",
     ):
         reader(tmp_path, val_sequences=()).names("val")
     with pytest.raises(InputError, match="no split 'tran'; did you mean 'train'"):
@@ -222,7 +223,7 @@ def test_whole_frames_and_crops_that_reach_out(root: Path) -> None:
     for crop in ((0, 14, 0, 26), (0, 13, 5, 27)):
         with pytest.raises(InputError, match=r"the frame is 13x26 pixels but dataset.crop=\[0, 1"):
             reader(root, crop=crop).read(name)
-    with pytest.raises(InputError, match=r"frame is 13x26 .* reaches to row 645 and column 1640;"):
+    with pytest.raises(InputError, match=r"frame is 13x26 .* reaches to row 645 and column 1640."):
         Freiburg(str(root)).read(name)
 
 
@@ -290,7 +291,7 @@ def test_fingerprint(root: Path, tmp_path: Path) -> None:
 def test_wrong_roots(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"dataset.root: the folder '/nowhere' does not exist"):
         Freiburg("/nowhere")
-    with pytest.raises(InputError, match="holds neither the folder train nor test"):
+    with pytest.raises(InputError, match="holds neither the folder train nor the folder test"):
         Freiburg(str(tmp_path))
 
 

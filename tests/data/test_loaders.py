@@ -154,7 +154,7 @@ def test_sizes_that_differ(dataset: MFNet, expected_pair, png) -> None:
     batches = list(eval_batches(dataset, "val", crm(), settings(eval_batch_size=1)))
     assert len(batches) == 5
     transform = crm(sizes=None, crop_hw=None)
-    with pytest.raises(InputError, match="choose transform.crop_hw"):
+    with pytest.raises(InputError, match="choose a transform.crop_hw"):
         list(train_batches(dataset, "train", transform, settings(), 0, range(2)))
 
 

@@ -131,8 +131,8 @@ def saved(flow: np.ndarray, write: Callable[..., None] = np.save) -> bytes:
 SPOILED: dict[str, tuple[bytes | None, str]] = {
     "too small": (saved(still()[:, :7]), "must be an array of 6 x 8 x 2 .* got 6 x 7 x 2"),
     "one channel": (saved(still()[..., 0]), "must be an array of 6 x 8 x 2"),
-    "above the image": (saved(moved((0, 0), (-1, 0))), "leads out of the first frame of 6x8"),
-    "below the image": (saved(moved((5, 7), (0.6, 0))), "leads out of the first frame"),
+    "above the image": (saved(moved((0, 0), (-1, 0))), "points outside the first frame of 6x8"),
+    "below the image": (saved(moved((5, 7), (0.6, 0))), "points outside the first frame"),
     "missing": (None, "is missing"),
     "truncated": (saved(still())[:100], "cannot be read"),
     "empty": (b"", "cannot be read"),

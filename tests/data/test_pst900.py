@@ -125,7 +125,7 @@ def test_thermal_counts_are_refused(root: Path) -> None:
     for image, said in (
         (np.full(HW, 30000, np.uint16), "expected 8 bits .*, got uint16; .* thermal_raw holds"),
         (contents("x")[0], r"three equal ones, got 3 channels that differ by up to"),
-        (np.dstack([level] * 4), r"three equal ones, got 4 channels; the folder thermal"),
+        (np.dstack([level] * 4), r"three equal ones, got 4 channels; use the folder thermal"),
     ):
         write_png(path, image)
         with pytest.raises(InputError, match=said):
