@@ -42,7 +42,7 @@ def test_find_returns_finished_runs_only(runs: RunStore) -> None:
 
 def test_find_run_on_other_data_raises(runs: RunStore) -> None:
     finish(runs.runs_dir / "a", dataset="another-fingerprint")
-    with pytest.raises(RunError, match=r"a was made on other files .*another-, now fingerpr"):
+    with pytest.raises(RunError, match=r"a was trained on other files .*another-, now fingerpr"):
         runs.find("a", DATASET)
 
 
