@@ -22,7 +22,9 @@ from analysis.report.store import RunFiles
 from analysis.report.views import table_views
 from analysis.uncertainty import Resampling, compare
 from rgbt.config.compose import available
-from rgbt.tracking.run_files import counts_name
+from rgbt.metrics.pairs import file_name
+from rgbt.spec.corruption_names import row_name
+from sweeps.table.cells import OWN_COUNTS
 from sweeps.table.load_table import PUBLISHED, load_table
 from tests.analysis.report.pages import report, run_entry, table_entry
 from tests.analysis.report.stores import counts_of
@@ -31,6 +33,7 @@ from tests.commands import Call
 
 ROOT = Path(__file__).resolve().parents[3]
 RESAMPLES = 200
+BRANCHES = ("rgb", "thermal")
 SIZES = tuple(
     NetworkEntry(each, tuple(float(len(model)) for model in each.models))
     for each in load_results_file().networks
@@ -259,6 +262,20 @@ def test_results_file_names_what_exists() -> None:
         assert all(address.startswith("https://") for _, address in network.weights)
 
 
+def test_results_file_counts_are_named_as_runs_store_them() -> None:
+    folder = "evaluations/robustness/test"
+    known = {
+        OWN_COUNTS: "",
+        file_name("aligned", "test"): "frames=aligned",
+        **{f"{folder}/features-{each}.npz": f"corruption=features-{each}" for each in BRANCHES},
+        **{
+            f"{folder}/{row_name(f'removed:{each}')}-1.npz": f"corruption=removed:{each}"
+            for each in BRANCHES
+        },
+    }
+    assert {each.counts: each.options for each in load_results_file().contrasts} == known
+
+
 def test_network_entries_parameters_are_those_of_the_built_network(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -293,4 +310,3 @@ def test_command_markdown_writes_the_pages_and_leaves_others(
         f"{name}.md" for name in load_results_file().papers
     }
     assert (out / "measurements.md").read_text() == "by hand"
-    assert counts_name("test") == "counts_test.npz"
