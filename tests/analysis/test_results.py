@@ -139,7 +139,7 @@ def test_folder_of_scores_that_leaves_a_choice_is_refused(tmp_path: Path, names:
         (f"{LONG}1", {}, "is no run folder"),
         ("abc", {"runs_dir": "none"}, "'abc' is no run folder"),
         ("crm", {"runs_dir": "none"}, r"neither a run \(config.yaml\) nor counts .*rgbt score"),
-        ("none.npz", {}, "there is no file of counts"),
+        ("none.npz", {}, "the file of counts"),
         ("images.npz", {}, "is no file of counts"),
         ("", {}, "expected runs, files of counts or a group"),
         ("aaa0,,aaa1", {}, "expected runs, files of counts or a group"),
