@@ -64,7 +64,7 @@ class Camera:
         if abs(sy * self.width - width) >= 1:
             raise InputError(
                 f"camera: expected images of {self.height}x{self.width} or of that aspect ratio, "
-                f"got {height}x{width}. The intrinsics are for another image size; set those of "
+                f"got {height}x{width}. These are intrinsics for another image size; set those of "
                 "your camera (fx, fy, cx, cy, height, width)."
             )
         cx, cy = (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5

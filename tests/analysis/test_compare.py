@@ -178,7 +178,7 @@ def test_missing_images_are_refused_or_excluded(call: Call, tmp_path: Path):
     ("arguments", "word"),
     [
         (["metrics=mIuo"], "did you mean 'mIoU'?"),
-        (["metrics="], "expected metrics, with commas"),
+        (["metrics="], "expected metrics, separated by commas"),
         (["metrics=region/9"], "the counts have the regions 1 to 2"),
         (["metrics=class/cat"], "did you mean 'car'?"),
         (["metrics=night/mIoU"], "does not contain both images marked as day"),
@@ -201,7 +201,7 @@ def test_missing_images_are_refused_or_excluded(call: Call, tmp_path: Path):
         (["a={0}/crm.npz,{0}/crm.npz"], "twice; one training counts once"),
         (["b=crn"], "did you mean 'crm'?"),
         (["b={}/empty"], "contains neither a run (config.yaml) nor counts"),
-        (["b={}/none.npz"], "there is no file of counts"),
+        (["b={}/none.npz"], "the file of counts"),
         (["b="], "'b' has no value; give a run, a file of counts, or a group of runs. Groups in"),
         (["b="], ": crm."),
         (["b=crm,"], "expected runs, files of counts or a group"),

@@ -315,7 +315,7 @@ def test_confidences_are_stacked_for_all_or_none(dataset: MFNet) -> None:
     assert found.shape == batch(0.25, 0.75).label.shape
     assert found.flatten(1).unique(dim=1).tolist() == [[0.25], [0.75]]
     assert batch(None, None).confidence is None
-    message = f"those of '{NAMES[1]}' do and those of '{NAMES[0]}' do not"
+    message = f"Those of '{NAMES[1]}' do and those of '{NAMES[0]}' do not"
     with pytest.raises(InputError, match=message):
         batch(None, 0.75)
 

@@ -441,7 +441,7 @@ def no_image(root: Path, name: str) -> str:
 
 def flow_out_of_the_image(root: Path, name: str) -> str:
     np.save(root / "next" / "flow" / f"{name}.npy", np.full((*HW, 2), 99, np.float32))
-    return "leads out of the first frame"
+    return "points outside the first frame"
 
 
 @pytest.mark.parametrize(

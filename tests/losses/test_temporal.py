@@ -140,7 +140,7 @@ def test_passes_are_summed(frames: Any) -> None:
     ("changes", "message"),
     [
         ({"second": "none"}, r"^loss\.beta=1 .* loss\.second=none; set loss\.beta=0"),
-        ({"beta": 0.0}, r"^loss\.beta=0 .* loss\.second=con; set loss\.second=none"),
+        ({"beta": 0.0}, r"^loss\.second=con .* loss\.beta=0; set loss\.second=none"),
     ],
 )
 def test_settings_that_do_not_fit(changes: dict[str, Any], message: str) -> None:

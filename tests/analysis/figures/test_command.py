@@ -201,7 +201,7 @@ def test_keys_of_figures_are_keys_of_the_command() -> None:
         ("multihead/fig3", ["metric=ring9"], "'metric' has no effect on"),
         ("spatialseg/fig2", ["methods=a:x,a:y"], "two entries are called 'a'"),
         ("spatialseg/fig2", ["methods=a:"], "expected label:place, got 'a:'"),
-        ("spatialseg/fig5", ["statistics=no.npz"], "no file of statistics"),
+        ("spatialseg/fig5", ["statistics=no.npz"], "the file of statistics"),
         ("spatialseg/fig1", ["maps=no.npz"], "the file of pixel maps 'no.npz' does not exist"),
     ],
 )
@@ -233,7 +233,7 @@ def test_bad_input_is_one_sentence(call: Call, figure: str, words: list[str], wo
             "does not contain counts_vertical3.npz (it contains counts_h",
         ),
         ("spatialseg/fig1", ["metric=vertical5"], "no centre and no edge"),
-        ("spatialseg/fig3", ["methods=A:x,B:y"], "there is no file of counts"),
+        ("spatialseg/fig3", ["methods=A:x,B:y"], "the file of counts"),
         ("spatialseg/fig3", ["methods=A:{0}/a,B:{0}/b"], "shows one method, got 2"),
         ("regions/profile", ["runs={}/a/pairs.npz"], "'region/1' is a score of single"),
         ("regions/profile", ["split=val"], "counts_ring5.npz is of split 'test', not of split=val"),

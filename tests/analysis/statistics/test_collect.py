@@ -137,7 +137,7 @@ def test_file_round_trip(tmp_path: Path, night: bool) -> None:
 
 def test_other_files_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "statistics.npz"
-    with pytest.raises(InputError, match="there is no file of statistics"):
+    with pytest.raises(InputError, match="the file of statistics"):
         SpatialStatistics.load(path)
     path.write_bytes(b"nothing")
     with pytest.raises(InputError, match="is not a readable file of statistics"):
