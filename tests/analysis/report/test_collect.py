@@ -16,6 +16,7 @@ import pytest
 from analysis.report import page, tables
 from analysis.report.collect import collect
 from analysis.report.data import CellEntry, ReportData, RunEntry, TableEntry
+from analysis.report.markdown import page_texts
 from analysis.report.store import read_store
 from analysis.uncertainty import Resampling, compare, estimate
 from rgbt.checks import InputError
@@ -143,6 +144,7 @@ def test_run_shows_its_provenance(data: ReportData) -> None:
     assert run.repeat == "python -m rgbt.run +experiment=grbm scale=paper seed=1"
     assert run.command.startswith("/opt/venv/bin/python -m rgbt.run")
     assert run.host == "desk: EPYC, 2 cores"
+    assert run.hardware == "EPYC, 2 cores"
     assert run.started == "2026-01-02T00:00:00+00:00"
     assert run.status == "FINISHED"
     assert run.studies == ("search/two",)
@@ -151,6 +153,19 @@ def test_run_shows_its_provenance(data: ReportData) -> None:
     assert run.config["masker.sigma_div"] == "4.0"
     assert run.config["masker.ratio"] == "null"
     assert run.config["tracking.uri"] == "postgresql://me:***@host/db"
+
+
+def test_results_pages_compare_groups_and_hide_folders(data: ReportData, runs_dir: Path) -> None:
+    measured = {each.metric: each for each in data.contrasts if each.values}
+    assert set(measured) == {"mIoU", "Var"}
+    assert measured["mIoU"].scale == "paper"
+    assert measured["mIoU"].seeds == (3, 3)
+    pages = page_texts(data, ())
+    table = pages["own.md"]
+    cell = table_of(data, "own/t").cells[0][0]
+    assert f"| ours | 3 | {cell.mean:.2f} ± {cell.sd:.2f} |" in table
+    assert "(paper scale, trainer.max_steps=9)" in table
+    assert str(runs_dir) not in "".join(pages.values())
 
 
 def test_passwords_are_nowhere(data: ReportData) -> None:
