@@ -44,7 +44,7 @@ class Nothing:
 MISSING: list[tuple[Requirement, str]] = [
     (
         Requirement("loss", "frames", 2),
-        "Asking requires frames=2 of the loss, Nothing provides frames=1; choose "
+        "Asking requires frames=2 of the loss, but Nothing provides frames=1; choose "
         "loss=temporal_paper, temporal_released.",
     ),
     (
@@ -80,7 +80,7 @@ def test_other_data_set_is_never_a_choice(monkeypatch: pytest.MonkeyPatch) -> No
     data = Nothing()
     data.record = Record(num_classes=9)  # type: ignore[attr-defined]
     assert sentence({"asking": Asking(required), "dataset": data}) == (
-        "Asking with loss.num_classes=5 requires num_classes=5 of the dataset, Nothing provides "
+        "Asking with loss.num_classes=5 requires num_classes=5 of the dataset, but Nothing provides "
         "num_classes=9; change loss.num_classes."
     )
 
