@@ -80,8 +80,8 @@ def test_other_data_set_is_never_a_choice(monkeypatch: pytest.MonkeyPatch) -> No
     data = Nothing()
     data.record = Record(num_classes=9)  # type: ignore[attr-defined]
     assert sentence({"asking": Asking(required), "dataset": data}) == (
-        "Asking with loss.num_classes=5 requires num_classes=5 of the dataset, but Nothing provides "
-        "num_classes=9; change loss.num_classes."
+        "Asking with loss.num_classes=5 requires num_classes=5 of the dataset, but Nothing "
+        "provides num_classes=9; change loss.num_classes."
     )
 
 
