@@ -65,6 +65,15 @@ def test_missing_capability_names_the_choices(requirement: Requirement, words: s
     assert words in sentence({"asking": Asking(requirement), requirement.node: Nothing()})
 
 
+def test_loss_without_record_requires_class_scores() -> None:
+    class Masks:
+        record = Record(outputs="masks")
+
+    found = sentence({"loss": Nothing(), "model": Masks()})
+    assert "Nothing requires outputs=scores of the model, but Masks provides outputs=masks" in found
+    check_requirements({"loss": Nothing(), "model": Nothing()}, PLAIN)
+
+
 def test_capability_that_no_record_states_is_not_compared() -> None:
     required = Requirement("dataset", "num_classes", 5, "loss.num_classes=5")
     check_requirements({"asking": Asking(required), "dataset": Asking()}, PLAIN)
