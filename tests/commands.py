@@ -92,7 +92,7 @@ def losses(folder: Path) -> list[dict[str, float]]:
 def assert_one_sentence(err: str, sentence: str) -> None:
     messages = [line for line in err.splitlines() if line.startswith("rgbt: ")]
     assert len(messages) == 1, err
-    assert sentence in messages[0]
+    assert sentence in messages[0], messages[0]
     assert "Traceback" not in err
 
 

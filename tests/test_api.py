@@ -128,13 +128,19 @@ def _of_split(scores: dict[str, float], split: str) -> dict[str, float]:
         (lambda run: run.predict(RGB, "thermal.png"), "got str.* the paths of both files"),
         (lambda run: run.predict("no.png", "no.png"), r"no\.png is missing"),
         (lambda run: run.predict(RGB, THERMAL, modality="depth"), "modality: 'depth' is not a"),
-        (lambda run: run.predict(RGB, THERMAL, head="day"), "head: 'day' is not a choice"),
+        (lambda run: run.predict(RGB, THERMAL, head="day"), "head: 'day' is not a valid choice"),
         (lambda run: run.counts("tset"), "test, val, but not of 'tset'; .*rgbt evaluate run=/"),
-        (lambda run: rgbt.load_run("none", runs_dir=run.folder), "run=none: neither a run folder"),
+        (
+            lambda run: rgbt.load_run("none", runs_dir=run.folder),
+            "run=none is neither a run folder",
+        ),
         (lambda run: rgbt.load_run(run.folder, checkpoint="first"), "checkpoint: 'first' is not"),
         (lambda run: rgbt.load_run(run.folder, "data.cache=auto"), "expected a list of overrides"),
-        (lambda run: rgbt.load_run(run.folder, ["model=mfnet"]), "'model' cannot be changed"),
-        (lambda run: rgbt.results(run.folder / "none"), "there is no such folder"),
+        (
+            lambda run: rgbt.load_run(run.folder, ["model=mfnet"]),
+            "'model' of a finished run cannot be changed",
+        ),
+        (lambda run: rgbt.results(run.folder / "none"), "none does not exist"),
     ],
 )
 def test_bad_input_is_one_sentence(

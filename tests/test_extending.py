@@ -107,7 +107,7 @@ def lab(tmp_path: Path) -> Iterator[Callable[[str], Path]]:
             ("+experiment=halves",),
             "height // self.cell",
             "height // 7",
-            "masker: Halves.__call__ returned MaskPair: rgb is Tensor (1, 18, 5) bool; expected "
+            "masker: Halves.__call__ returned MaskPair: rgb is Tensor (1, 18, 10) bool; expected "
             "MaskPair(rgb, thermal), each bool (1, h, w), True = hidden, h and w dividing 128 and "
             "160: a crop of 120x160 pixels is padded to 128x160 before cells are cut.",
         ),

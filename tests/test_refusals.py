@@ -263,10 +263,10 @@ OF_A_RUN = {
             ("modality=infrared", "modality: 'infrared' is not a valid choice"),
             ("split=tset", "no split 'tset'"),
             ("checkpoint=first", "'checkpoint' must be 'best' or 'last'"),
-            ("model.num_queries=3", "'model.num_queries' cannot be changed"),
+            ("model.num_queries=3", "'model.num_queries' of a finished run cannot be changed"),
             ("data.batch_siz=1", "did you mean 'data.batch_size'?"),
             ("scale=paper", "'scale' of a finished run cannot be changed"),
-            ("model=mask2former_swin_t", "'model' cannot be changed"),
+            ("model=mask2former_swin_t", "'model' of a finished run cannot be changed"),
             ("data.eval_batch_size=[1", "data.eval_batch_size cannot be read as YAML"),
             ("head=source", "head=source selects one of two heads"),
             ("degradation=noise", "'degradation' was renamed to 'corruption'"),
@@ -290,7 +290,7 @@ OF_A_RUN = {
                 "input=val pseudo_labels=true threshold=2",
                 "threshold must be between 0 and 1, got 2",
             ),
-            ("input=pictures pseudo_labels=true", "name one of"),
+            ("input=pictures pseudo_labels=true", "as input, one of"),
             ("input=val pseudo_labels=true label_map=x", "there is no label_map 'x'"),
             ("input=val head=target", "head=target selects one of two heads"),
         ],
@@ -362,4 +362,4 @@ def test_run_without_checkpoint_is_refused(call: Call, trained: Trained, tmp_pat
     (folder / "best.pt").unlink()
     code, _, err = call(evaluate.entry, f"run={folder}")
     assert code == 2
-    assert_one_sentence(err, "has no best.pt: the run has not reached its first evaluation")
+    assert_one_sentence(err, "has no best.pt, because the run has not reached its first evaluation")

@@ -18,6 +18,12 @@ MOST_CHOICES = 6
 """Names that a message lists of one group."""
 
 
+WITHOUT_RECORD = {"loss": Record(requires=(Requirement("model", "outputs", "scores"),))}
+"""Record of a component that states none, where it is not the general one, by node.
+
+A user's loss that reads the class scores of a network without any would end in a traceback.
+"""
+
 Failure = tuple[str, Requirement]
 """A requirement that is not met, after the key of the component that has it."""
 
@@ -36,7 +42,7 @@ def check_requirements(components: Mapping[str, Any], plain: Mapping[str, Any]) 
     Raises:
         InputError: the first requirement that is not met, with the files of ``conf/`` that help.
     """
-    records = {node: record_of(component) for node, component in components.items()}
+    records = {node: _record(node, component) for node, component in components.items()}
     failures = list(_failures(records))
     if not failures:
         return
@@ -54,6 +60,11 @@ def check_requirements(components: Mapping[str, Any], plain: Mapping[str, Any]) 
         f"{_name(components[wanted.node])} provides {wanted.key}={_shown(provided)}; "
         f"{', or '.join(advice) or f'change {node} or {wanted.node}'}."
     )
+
+
+def _record(node: str, component: Any) -> Record:
+    record = record_of(component)
+    return record if hasattr(component, "record") else WITHOUT_RECORD.get(node, record)
 
 
 def _failures(records: Mapping[str, Record]) -> Iterator[Failure]:

@@ -42,5 +42,8 @@ def manifest_of(key: str, folder: str) -> dict[str, Any]:
         )
     manifest: dict[str, Any] = read_json(path, dict[str, Any], "remove it and predict again")
     if "digest" not in manifest:
-        raise InputError(f"{path} does not describe pseudo-labels; choose another folder.")
+        raise InputError(
+            f"{path} does not describe pseudo-labels; choose a folder that "
+            "rgbt predict ... pseudo_labels=true has written."
+        )
     return manifest

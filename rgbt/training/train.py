@@ -106,8 +106,8 @@ def _show_again(folder: RunFolder, tracking: Tracking, requested: Description) -
     known = read_description(folder.path)
     assert known is not None, "a finished run has its description"
     info(
-        f"{requested.name} is already finished; its result follows. Use another seed for a new "
-        "run: seed=1."
+        f"{requested.name} is already finished; its result follows. For a new run, choose "
+        "another value of seed=..."
     )
     # A point of a grid may be the default of an experiment: the longer name says what it varies.
     lengths = [len(group_of(each.tags, each.params)) for each in (requested, known)]

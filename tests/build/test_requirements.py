@@ -44,7 +44,7 @@ class Nothing:
 MISSING: list[tuple[Requirement, str]] = [
     (
         Requirement("loss", "frames", 2),
-        "Asking requires frames=2 of the loss, Nothing provides frames=1; choose "
+        "Asking requires frames=2 of the loss, but Nothing provides frames=1; choose "
         "loss=temporal_paper, temporal_released.",
     ),
     (
@@ -65,6 +65,15 @@ def test_missing_capability_names_the_choices(requirement: Requirement, words: s
     assert words in sentence({"asking": Asking(requirement), requirement.node: Nothing()})
 
 
+def test_loss_without_record_requires_class_scores() -> None:
+    class Masks:
+        record = Record(outputs="masks")
+
+    found = sentence({"loss": Nothing(), "model": Masks()})
+    assert "Nothing requires outputs=scores of the model, but Masks provides outputs=masks" in found
+    check_requirements({"loss": Nothing(), "model": Nothing()}, PLAIN)
+
+
 def test_capability_that_no_record_states_is_not_compared() -> None:
     required = Requirement("dataset", "num_classes", 5, "loss.num_classes=5")
     check_requirements({"asking": Asking(required), "dataset": Asking()}, PLAIN)
@@ -80,8 +89,8 @@ def test_other_data_set_is_never_a_choice(monkeypatch: pytest.MonkeyPatch) -> No
     data = Nothing()
     data.record = Record(num_classes=9)  # type: ignore[attr-defined]
     assert sentence({"asking": Asking(required), "dataset": data}) == (
-        "Asking with loss.num_classes=5 requires num_classes=5 of the dataset, Nothing provides "
-        "num_classes=9; change loss.num_classes."
+        "Asking with loss.num_classes=5 requires num_classes=5 of the dataset, but Nothing "
+        "provides num_classes=9; change loss.num_classes."
     )
 
 

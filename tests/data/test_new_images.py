@@ -187,7 +187,7 @@ def test_arrays_of_unclear_or_wrong_values_are_refused() -> None:
     assert "expected a thermal image of 16 bits" in refused(
         lambda: of_arrays(counts, RGB, COUNTS.astype(np.float32))
     )
-    assert "does not declare how new images are read" in refused(
+    assert "does not declare how to read new images" in refused(
         lambda: of_arrays(SimpleNamespace(splits=("test",)), RGB, COUNTS)
     )
 

@@ -53,7 +53,7 @@ def test_an_experiment_shows_its_command_and_what_it_expects(pages: dict[str, st
     for path in (ROOT / "conf" / "experiment").glob("*.yaml"):
         assert f"\n## {path.stem}\n" in text
     grbm = text.partition("\n## grbm\n")[2].partition("\n## ")[0]
-    assert "rgbt.run +experiment=grbm" in grbm
+    assert "rgbt run +experiment=grbm" in grbm
     assert "**Expect**: 61.79 mIoU" in grbm
 
 

@@ -43,7 +43,7 @@ def test_every_file_of_this_project_fits_the_budget_four_times() -> None:
         ("- " * 60_000 + "a", "levels"),
         ("[" + "a," * 300_000 + "]", "values and 50 levels"),
         ("a: " + "x" * 20_000, "a value exceeds the limit of 10,000 characters"),
-        ("a: " + "x" * 2_000_000, "larger than 1,000,000 bytes"),
+        ("a: " + "x" * 2_000_000, "larger than the limit of 1,000,000 bytes"),
         ("a: !!python/object/apply:os.system [touch x]", "the tag 'tag:yaml.org,2002:python"),
         ("a: " + "9" * 5000, "digits"),
         ("a: 0x" + "f" * 100, "an integer of more than 64 bits"),

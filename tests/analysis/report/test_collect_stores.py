@@ -58,5 +58,5 @@ def test_replaced_runs_are_excluded(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     for entries in ("table_entries", "study_entries", "mask_pictures", "difference_entries"):
         monkeypatch.setattr(collecting, entries, lambda *_: ())
     tracking = MlflowTracking("sqlite:///x", artifact_uri=None, experiment="r", runs_dir="x")
-    data = collecting.collect(tracking, tmp_path, 1, "", (), lambda things, _: list(things))
+    data = collecting.collect(tracking, tmp_path, 100, "", (), lambda things, _: list(things))
     assert [run.run_id for run in data.runs] == ["new"]

@@ -77,5 +77,5 @@ def test_the_command_writes_once(
     written = (tmp_path / "tables/my/ablation.yaml").read_text()
     code, _, err = call(entry, *words)
     assert code == 2
-    assert_one_sentence(err, "exists already")
+    assert_one_sentence(err, "already exists")
     assert (tmp_path / "tables/my/ablation.yaml").read_text() == written
