@@ -11,6 +11,8 @@ from tests.docs.blocks import Page, PageError
 from tests.docs.check_page import problems_of
 from tests.docs.printed import difference
 
+pytestmark = pytest.mark.docs
+
 
 def page(text: str, folder: Path | None = None) -> Page:
     """A page as the test writes it; ~~~ stands for the three backticks."""

@@ -13,6 +13,8 @@ import pytest
 from tests.docs.blocks import Page, pages, tutorials_of_own_parts
 from tests.docs.check_page import problems_of
 
+pytestmark = pytest.mark.docs
+
 
 @pytest.mark.parametrize("page", pages(), ids=lambda page: page.name)
 def test_page_is_well_formed_and_its_commands_exist(page: Page, tmp_path: Path) -> None:

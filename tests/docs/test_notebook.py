@@ -21,6 +21,8 @@ from rgbt.run import main
 from tests.commands import short, without_pictures, words_of
 from tests.conftest import write_data
 
+pytestmark = pytest.mark.docs
+
 NOTEBOOK = Path(__file__).resolve().parents[2] / "docs" / "tutorials" / "notebook.ipynb"
 SPLITS = {
     "train": ["00001D", "00002N"],

@@ -8,6 +8,8 @@ import pytest
 
 from tests.docs.blocks import Page, pages
 
+pytestmark = pytest.mark.docs
+
 WITH_BLOCKS = [
     page
     for page in pages()

@@ -8,6 +8,8 @@ import pytest
 
 from rgbt.config.plain_command import COMMANDS
 
+pytestmark = pytest.mark.docs
+
 ROOT = Path(__file__).resolve().parents[2]
 
 

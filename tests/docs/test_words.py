@@ -17,6 +17,8 @@ from rgbt.config.options import help_text
 from rgbt.config.plain_command import COMMANDS, CommandGroup, PlainCommand
 from tests.docs.blocks import INLINE_CODE, ROOT, Page, pages
 
+pytestmark = pytest.mark.docs
+
 LINK_TARGET = re.compile(r"\]\([^)]*\)|<[^<>]+>|https?://\S+")
 
 
