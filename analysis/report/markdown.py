@@ -18,13 +18,12 @@ from analysis.report.markdown_tables import (
     order_text,
 )
 from analysis.report.networks import NetworkEntry
+from analysis.report.page import STATIC, write_files
 from analysis.report.results_file import Paper, load_results_file
 from analysis.report.views import DASH, Group, TableView, fixed, groups_of, table_views
 from rgbt.checks import InputError
-from rgbt.files.atomic import write_atomic
 from rgbt.metrics import names
 
-STATIC = Path(__file__).with_name("static")
 WIDTH = 100
 DIGEST = 12
 
@@ -45,15 +44,7 @@ def write_pages(data: ReportData, networks: Sequence[NetworkEntry], out: Path) -
     Raises:
         InputError: the folder cannot be made or written.
     """
-    pages = page_texts(data, networks)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        for name, text in pages.items():
-            write_atomic(out / name, text.encode(errors="xmlcharrefreplace"))
-    except OSError as error:
-        reason = error.strerror or error
-        raise InputError(f"out={out}: {reason}; give a folder that can be written.") from error
-    return [out / name for name in pages]
+    return write_files(page_texts(data, networks), out)
 
 
 def page_texts(data: ReportData, networks: Sequence[NetworkEntry]) -> dict[str, str]:
@@ -71,8 +62,9 @@ def page_texts(data: ReportData, networks: Sequence[NetworkEntry]) -> dict[str, 
     )
     filters = (views.fixed, views.plural, views.duration, wrapped, command_lines)
     environment.filters |= {each.__name__: each for each in filters}
-    papers = _papers(data)
-    views_by_name = sorted(table_views(data), key=lambda view: (view.entry.name, view.id))
+    found = table_views(data)
+    papers = _papers(found)
+    views_by_name = sorted(found, key=lambda view: (view.entry.name, view.id))
     tables = {page: [v for v in views_by_name if _page_of(v) == page] for page in papers}
     shared = {"data": data, "papers": papers, "heading": heading, "letters": views.letters}
 
@@ -119,10 +111,10 @@ def without_paths(text: str) -> str:
     return ABSOLUTE.sub(r".../\1", text)
 
 
-def _papers(data: ReportData) -> dict[str, Paper]:
+def _papers(tables: Iterable[TableView]) -> dict[str, Paper]:
     """Pages of tables: the papers', then folders of the user's tables."""
     known = dict(load_results_file().papers)
-    for view in table_views(data):
+    for view in tables:
         name = _page_of(view)
         if not PAGE_NAME.fullmatch(name) or name in ("index", "networks", "measurements"):
             raise InputError(

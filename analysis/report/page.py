@@ -54,16 +54,29 @@ def write_page(data: ReportData, out: Path) -> Path:
         InputError: the folder cannot be made or written.
         ValueError: a picture that is not inside the data.
     """
-    page = out / "index.html"
-    text = page_text(data)
+    (page,) = write_files({"index.html": page_text(data)}, out)
+    return page
+
+
+def write_files(texts: Mapping[str, str], out: Path) -> list[Path]:
+    """Write texts by the names of their files; existing files of these names are replaced.
+
+    Args:
+        texts: by file name.
+        out: folder, made where it is missing.
+
+    Raises:
+        InputError: the folder cannot be made or written.
+    """
     try:
         out.mkdir(parents=True, exist_ok=True)
-        # Half of a surrogate pair in a text of the store is no UTF-8.
-        write_atomic(page, text.encode(errors="xmlcharrefreplace"))
+        for name, text in texts.items():
+            # Half of a surrogate pair in a text of the store is no UTF-8.
+            write_atomic(out / name, text.encode(errors="xmlcharrefreplace"))
     except OSError as error:
         reason = error.strerror or error
         raise InputError(f"out={out}: {reason}; give a folder that can be written.") from error
-    return page
+    return [out / name for name in texts]
 
 
 def page_text(data: ReportData) -> str:
