@@ -20,4 +20,4 @@ WITH_BLOCKS = [
 @pytest.mark.slow
 @pytest.mark.parametrize("page", WITH_BLOCKS, ids=lambda page: page.name)
 def test_page_can_be_followed(page: Page, follow: Callable[..., int]) -> None:
-    follow(page)
+    assert follow(page) > 0
