@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Literal
 from rgbt.checks import InputError
 from rgbt.metrics.pairs import Protocol
 from sweeps.evaluation import Head
+from sweeps.table.claim import Claim
 
 Origin = Literal[
     "own_method",
@@ -19,6 +20,9 @@ Origin = Literal[
     "imported_inferred",
     "mixed",
 ]
+Form = Literal["paper", "released"]
+"""What a row is run as: as the paper's text describes it, or as its release made it."""
+
 STRICT: dict[str, Any] = {"extra": "forbid", "allow_inf_nan": False}
 
 
@@ -85,6 +89,25 @@ class Factor:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ReleasedForm:
+    """How the release makes a row; what is None is as in the paper's form.
+
+    Attributes:
+        experiment: instead of `Row.experiment`.
+        overrides: instead of `Row.overrides`.
+        at: instead of `Row.at`.
+        remarks: what the release does differently, one sentence each.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
+
+    experiment: str | None = None
+    overrides: tuple[str, ...] | None = None
+    at: Mapping[str, tuple[str, ...]] | None = None
+    remarks: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
 class Row:
     """One row.
 
@@ -96,6 +119,11 @@ class Row:
         experiment: a file of ``conf/experiment``; None: shown as published only.
         overrides: of `python -m rgbt.run`, at every scale.
         at: further overrides by scale; they win over all others of the row.
+        released: how the release makes the row; None: the same way, as far as known.
+        same_as: label of an earlier row that may be the same run, e.g. where one small network
+            stands for two backbones at scale=demo.
+        network: overrides that describe the row's network for an evaluation with a file of weights;
+            (): those of `experiment`, if there is one.
         x: where the row lies on the axis of `Table.factor`.
         needs: missing part of the project without which the row cannot be run.
         without: columns that the row's network has no score for; columns computed from them are
@@ -114,6 +142,9 @@ class Row:
     experiment: str | None = None
     overrides: tuple[str, ...] = ()
     at: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    released: ReleasedForm | None = None
+    same_as: str | None = None
+    network: tuple[str, ...] = ()
     x: float | None = None
     needs: str | None = None
     without: tuple[str, ...] = ()
@@ -139,6 +170,8 @@ class Table:
         needs: missing part of the project without which no row can be run.
         columns: in order.
         factor: x axis of the figure; None: no figure over a factor.
+        forms: one sentence per form that says what the rows are run as.
+        claims: what the paper says about the table.
         remarks: footnotes of the whole table, one sentence each.
         rows: in order.
     """
@@ -156,6 +189,8 @@ class Table:
     needs: str | None = None
     columns: tuple[Column, ...]
     factor: Factor | None = None
+    forms: Mapping[Form, str] = field(default_factory=dict)
+    claims: tuple[Claim, ...] = ()
     remarks: tuple[str, ...] = ()
     rows: tuple[Row, ...]
 
@@ -176,7 +211,7 @@ class Table:
             left_out |= {each.name for each in self.columns if left_out & set(each.sources)}
         return tuple(column for column in self.columns if column.name not in left_out)
 
-    def overrides(self, row: Row, scale: str) -> tuple[str, ...]:
+    def overrides(self, row: Row, scale: str, form: Form = "paper") -> tuple[str, ...]:
         """Overrides of `python -m rgbt.run` that make the row, beside ``scale=...`` itself.
 
         Raises:
@@ -184,5 +219,9 @@ class Table:
         """
         if row.experiment is None:
             raise InputError(f"row '{row.label}' has no experiment; it is shown as published only.")
-        shared, own = self.at.get(scale, ()), row.at.get(scale, ())
-        return (f"+experiment={row.experiment}", *shared, *row.overrides, *own)
+        chosen = row.released if form == "released" and row.released else ReleasedForm()
+        overrides = row.overrides if chosen.overrides is None else chosen.overrides
+        at = row.at if chosen.at is None else chosen.at
+        experiment = chosen.experiment or row.experiment
+        shared, own = self.at.get(scale, ()), at.get(scale, ())
+        return (f"+experiment={experiment}", *shared, *overrides, *own)

@@ -1,0 +1,83 @@
+"""What a paper says about its table, as a contrast of rows with an expected direction."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+Expected = Literal["higher", "lower", "similar"]
+Combine = Literal["all", "most", "any", "mean"]
+
+OTHERS = "others"
+"""In `Claim.against`: every other row of the table that has a score or a printed value."""
+
+PREVIOUS = "previous"
+"""In `Claim.against`: the row before in `Claim.rows`."""
+
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Claim:
+    """One statement of a paper about its own table.
+
+    It is a set of contrasts: each row of `rows` minus each row of `against`, in each column. A
+    contrast without `against` is the score itself, or with `minus_column` the difference of two
+    scores of one row. With both it is the difference of two differences: the centre gains more than
+    the edge.
+
+    Attributes:
+        name: unique in the table.
+        says: the statement in our words, one sentence.
+        source: place in the paper, e.g. "Sec. IV-C, third paragraph".
+        rows: labels of the rows that the statement is about; with against: previous, in order.
+        against: labels of the rows that they are compared with; "others" or "previous" alone.
+        columns: names of columns.
+        minus_column: a column that is subtracted from each of `columns`.
+        expected: of each contrast. "similar" needs `at_most`.
+        at_least: smallest size of the difference that the statement means, >= 0.
+        at_most: largest size, e.g. of a "small improvement".
+        combine: "all": each contrast is as expected; "most": more than half of them; "any": one of
+            them; "mean": their mean is.
+        remarks: one sentence each, e.g. why the direction is a reading of ours.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid", "allow_inf_nan": False}
+
+    name: str
+    says: str
+    source: str
+    rows: tuple[str, ...]
+    against: tuple[str, ...] = ()
+    columns: tuple[str, ...]
+    minus_column: str | None = None
+    expected: Expected
+    at_least: float = 0.0
+    at_most: float | None = None
+    combine: Combine = "all"
+    remarks: tuple[str, ...] = ()
+
+    @property
+    def range(self) -> Range:
+        """Open range of a contrast that is as expected."""
+        most = math.inf if self.at_most is None else self.at_most
+        if self.expected == "similar":
+            return -most, most
+        return (self.at_least, most) if self.expected == "higher" else (-most, -self.at_least)
+
+    def pairs(self, labels: Sequence[str]) -> Iterator[tuple[str, str | None]]:
+        """(row, row that is subtracted or None) of every contrast of a column.
+
+        Args:
+            labels: rows that `OTHERS` stands for.
+        """
+        if self.against == (PREVIOUS,):
+            yield from zip(self.rows[1:], self.rows[:-1], strict=True)
+            return
+        against = tuple(labels) if self.against == (OTHERS,) else self.against
+        for row in self.rows:
+            if not against:
+                yield row, None
+            yield from ((row, other) for other in against if other != row)
