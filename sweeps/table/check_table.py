@@ -159,10 +159,15 @@ def _check_row(row: Row, table: Table, where: str) -> None:
     for column in table.columns:
         for key in re.findall(r"{(\w+)}", column.metric or ""):
             check_choice(f"{where}, '{key}' of metric {column.metric}", key, row.settings)
-    if row.x is not None and table.factor is None:
+    if row.x is not None:
+        _check_x(row.x, table, where)
+
+
+def _check_x(x: float, table: Table, where: str) -> None:
+    if table.factor is None:
         raise InputError(f"{where}: 'x' has no effect without the table's 'factor'; add a factor.")
-    if row.x is not None and table.factor is not None and table.factor.axis == "log" and row.x <= 0:
-        raise InputError(f"{where}: 'x' must be > 0 on a log axis, got {row.x:g}.")
+    if table.factor.axis == "log" and x <= 0:
+        raise InputError(f"{where}: 'x' must be > 0 on a log axis, got {x:g}.")
 
 
 def _check_released(row: Row, released: ReleasedForm, where: str) -> None:
