@@ -5,13 +5,14 @@ Rerun the command to resume. Any number of machines may run it at the same time.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from rgbt.checks import InputError, check_choice, nearest
+from annotated_types import Interval
+
+from rgbt.checks import InputError
 from rgbt.config.command import composing
 from rgbt.config.common_options import RunsDir
 from rgbt.config.component import Component
@@ -20,15 +21,16 @@ from rgbt.config.plain_command import CommandGroup, PlainCommand
 from rgbt.metrics.names import MIOU
 from sweeps.settings import SweepSettings
 from sweeps.table.new_table import NewOptions, new
-from sweeps.table.request import TableRequest, seeds_of
+from sweeps.table.request import seeds_of
 
 if TYPE_CHECKING:
+    from sweeps.table_plan import TablePlan
+    from sweeps.worker.run_store import RunStore
     from sweeps.worker.trial_sources import Outcome
 
 ALL = "all"
+UNTIL_DECIDED = "until_decided"
 NEW = PlainCommand(NewOptions, new, name="rgbt reproduce new")
-WEIGHTS = "weights."
-"""weights.mask2former_swin_b=FILE: for the rows that name this network."""
 
 
 @dataclass(frozen=True)
@@ -42,8 +44,25 @@ class Options:
             "table, with dry_run=true"
         ),
     ]
-    seeds: Annotated[str, Help("number of seeds (3: seeds 0, 1, 2), or a list: 0,4,7")] = "1"
+    seeds: Annotated[
+        str,
+        Help(
+            "number of seeds (3: seeds 0, 1, 2), a list (0,4,7), or until_decided: start with 3 "
+            "and add paired seeds to the rows of undecided claims, up to max_seeds"
+        ),
+    ] = "1"
+    max_seeds: Annotated[
+        int, Interval(ge=3, le=1000), Help("most seeds of a row with seeds=until_decided")
+    ] = 20
     scale: Annotated[str, Help("demo (minutes, embedded data) or paper (published sizes)")] = "demo"
+    form: Annotated[
+        Literal["paper", "released", "both"],
+        Help(
+            "paper: rows as the text describes them; released: as their release made them, where "
+            "it is known; both: both, and the difference"
+        ),
+    ] = "paper"
+    rows: Annotated[str, Help("run some rows only: rows=A,H; default: all")] = ""
     dry_run: Annotated[
         bool, Help("true: show the runs of the cells, their states and the time left; run nothing")
     ] = False
@@ -92,17 +111,21 @@ class Options:
     ] = field(default_factory=dict)
 
 
-OF_THE_TABLE = ("table", "seeds", "scale", "runs_dir", "out", "fresh")
+OF_THE_TABLE = (
+    *("table", "seeds", "max_seeds", "scale", "form", "rows", "runs_dir", "out", "fresh"),
+)
 """Options that are no settings of execution."""
 
 
 def main(options: Options, overrides: list[str]) -> int:
     """Run the missing runs of a table and print our values beside the published ones.
 
-    The table is a published one or your own. Words with other keys are overrides of every row:
-    dataset.root=/data/MFNet tracking.uri=http://host:5000. weights.mask2former_swin_b=FILE sets the
-    initial weights of all rows with that network. conf/hydra/sweeper/study.yaml explains the
-    options of execution.
+    The table is a published one or your own. It ends with a verdict on each claim of its paper.
+    Words with other keys are overrides of every row: dataset.root=/data/MFNet
+    tracking.uri=http://host:5000. pretrained.mask2former_swin_b=FILE sets the initial weights of
+    all rows with that network. weights.CMX=FILE evaluates the network of row CMX with a file of
+    weights; predictions.CMX=FOLDER counts its predicted label images. Neither is trained.
+    conf/hydra/sweeper/study.yaml explains the options of execution.
 
     To write your own table:
     rgbt reproduce new table=my/ablation experiment=grbm masker.sigma_div=1,2,4
@@ -110,7 +133,7 @@ def main(options: Options, overrides: list[str]) -> int:
     from rgbt.config.compose import compose
     from sweeps.rendering.publish import publish_table
     from sweeps.table.load_table import table_names
-    from sweeps.worker.point_list import PointList, preview_points, run_points
+    from sweeps.worker.point_list import preview_points, run_points
     from sweeps.worker.run_store import open_run_store
 
     settings = settings_of(options)
@@ -121,49 +144,44 @@ def main(options: Options, overrides: list[str]) -> int:
     if options.table == ALL and not settings.dry_run:
         raise InputError("table=all requires dry_run=true; run one table at a time.")
     tables = table_names() if options.table == ALL else [options.table]
-    requests = [request_of(name, options, extra) for name in tables]
     base = (*readable_paths([f"runs_dir={options.runs_dir}"]), *tracker)
     with composing(base):
         config = compose([*base, f"fresh={str(options.fresh).lower()}"])
         Component.from_node(config.tracking)
     runs = open_run_store(config)
-    lists = [
-        PointList(
-            study=f"table/{wanted.name}",
-            title=f"{wanted.name} scale={wanted.scale}",
-            kind="list",
-            points=tuple(wanted.points()),
-            runs=runs,
-            base=base,
-        )
-        for wanted in requests
-    ]
+    plans = plans_of(tables, options, extra, runs, base)
     if settings.dry_run:
-        previews = [preview_points(points, settings) for points in lists]
-        _show(options.table, list(zip(requests, previews, strict=True)), settings.workers)
+        previews = [preview_points(plan.points, settings) for plan in plans]
+        _show(options.table, list(zip(plans, previews, strict=True)), settings.workers)
         return 0
-    (wanted,), (points,) = requests, lists
-    outcomes = run_points(points, settings) if points.points else []
+    (plan,) = plans
+    wanted = plan.request
+    plan.evaluate_external(runs.runs_dir)
+    outcomes = run_points(plan.points, settings) if plan.points.points else []
     out = options.out or options.runs_dir / "tables" / f"{wanted.name}_{wanted.variant}"
-    return publish_table(wanted, outcomes, out, runs.tracking)
+    return publish_table(plan.judge, wanted, outcomes, plan.external, out, runs.tracking)
 
 
 def _show(
-    table: str, previews: Sequence[tuple[TableRequest, Sequence[Outcome]]], workers: int
+    table: str, previews: Sequence[tuple[TablePlan, Sequence[Outcome]]], workers: int
 ) -> None:
     """Print the preview of one table, or one line for each of all."""
     from rich.text import Text
 
     from rgbt.tracking.terminal import print_rich, rich_table
-    from sweeps.rendering.preview import cells_grid, summary, tables_grid
+    from sweeps.rendering.preview import cells_grid, most_line, summary, tables_grid
 
     if table == ALL:
-        print_rich(rich_table(tables_grid(previews, workers)))
+        requests = [(plan.request, outcomes) for plan, outcomes in previews]
+        print_rich(rich_table(tables_grid(requests, workers)))
         return
-    ((wanted, outcomes),) = previews
+    ((plan, outcomes),) = previews
     if outcomes:
-        print_rich(rich_table(cells_grid(wanted, outcomes)))
-    print_rich(Text("\n".join(summary(wanted, outcomes, workers))))
+        print_rich(rich_table(cells_grid(plan.request, outcomes)))
+    lines = summary(plan.request, outcomes, workers)
+    if plan.until_decided is not None:
+        lines.append(most_line(len(plan.until_decided.most_runs()), outcomes, workers))
+    print_rich(Text("\n".join(lines)))
 
 
 def settings_of(options: Options) -> SweepSettings:
@@ -208,39 +226,44 @@ def _check_override(word: str) -> None:
         )
 
 
-def request_of(name: str, options: Options, extra: tuple[str, ...]) -> TableRequest:
-    """The table called `name` at the scale and with the seeds that were given.
+def plans_of(
+    names: Sequence[str],
+    options: Options,
+    extra: Sequence[str],
+    runs: RunStore,
+    base: Sequence[str],
+) -> list[TablePlan]:
+    """The tables as they are run.
 
     Raises:
-        InputError: no such table, scale or metric; no seeds.
+        InputError: no such table, row, scale or metric; no seeds; overrides that mix rows up.
     """
-    from rgbt.config.compose import available
-    from sweeps.table.load_table import load_table
-    from sweeps.table.scoring import check_metrics
-    from sweeps.worker.storage import NAME
+    from sweeps.table.make_request import TableWords, make_request, read_named
+    from sweeps.table.rows import check_rows
+    from sweeps.table_plan import TablePlan
+    from sweeps.verdicts.forms import both_forms
+    from sweeps.verdicts.until_decided import START
 
-    check_choice("scale", options.scale, available("scale"))
-    table = load_table(name)
-    if name.endswith((".yaml", ".yml")):
-        name = f"{table.paper}/{Path(name).stem}"
-    check_metrics(table)
-    if not re.fullmatch(NAME, name):
-        raise InputError(
-            f"table={name}: MLflow allows only letters, digits, spaces and _ - . : / alone; "
-            "rename the file."
+    adds = options.seeds == UNTIL_DECIDED
+    seeds = tuple(range(START)) if adds else seeds_of(options.seeds)
+    plans = []
+    for each in names:
+        name, table = read_named(each)
+        is_both = options.form == "both"
+        words = TableWords(
+            seeds=seeds,
+            scale=options.scale,
+            form="paper" if options.form == "both" else options.form,
+            rows=options.rows,
+            overrides=extra,
+            others=("form=both",) if is_both else (),
+            until_decided=adds,
         )
-    seeds = seeds_of(options.seeds)
-    files = [word.removeprefix(WEIGHTS) for word in extra if word.startswith(WEIGHTS)]
-    weights = {word.partition("=")[0]: word.partition("=")[2] for word in files}
-    others = tuple(word for word in extra if not word.startswith(WEIGHTS))
-    wanted = TableRequest(name, table, options.scale, seeds, others, weights)
-    for model in weights:
-        if model not in wanted.models():
-            raise InputError(
-                f"{WEIGHTS}{model}: no row of {name} uses that network at "
-                f"scale={wanted.scale}; {nearest(model, wanted.models())}."
-            )
-    return wanted
+        request, rows = make_request(name, both_forms(table) if is_both else table, words)
+        check_rows(request)
+        most = options.max_seeds if adds else None
+        plans.append(TablePlan.of(request, rows, runs, base, most))
+    return plans
 
 
 entry = CommandGroup(__doc__, {"new": NEW}, default=PlainCommand(Options, main))

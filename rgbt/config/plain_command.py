@@ -40,6 +40,7 @@ COMMANDS = {
     "reproduce": Entry(
         "sweeps.reproduce", "run a published table or your own; new: write your own"
     ),
+    "claims": Entry("sweeps.claims", "print the claims of the papers with their verdicts"),
     "study": Entry("sweeps.study", "report a grid or a search, also while it runs"),
     "report": Entry(
         "analysis.report.__main__", "write one page with everything in the MLflow store"

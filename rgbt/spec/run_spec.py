@@ -6,7 +6,7 @@ Other code reads settings and objects from here and never the configuration itse
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -247,6 +247,18 @@ class RunSpec:
         """Whether this run, or one upstream of it, starts from the file `pretrained`."""
         return self.weights == self.pretrained or any(
             each.run.uses_pretrained for each in self.dependencies
+        )
+
+    def with_seed(self, seed: int) -> RunSpec:
+        """The same run with another seed; its upstream runs have that seed too."""
+        words = [word for word in self.overrides if not word.startswith("seed=")]
+        upstream = (replace(each, run=each.run.with_seed(seed)) for each in self.dependencies)
+        return replace(
+            self,
+            seed=seed,
+            overrides=(*words, f"seed={seed}"),
+            plain={**self.plain, "seed": seed},
+            dependencies=tuple(upstream),
         )
 
     def own_code(self) -> dict[str, str]:

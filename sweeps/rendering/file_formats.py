@@ -10,12 +10,12 @@ from sweeps.rendering.rendered_table import RenderedTable, TextCell
 from sweeps.table.cells import TableCell
 from sweeps.table.scoring import ScoredTable, published
 
-LEGEND = "Bold: best, underlined: second best."
+LEGEND = "Bold: shown to be the best of our rows, underlined: the second best."
 
 CSV_HEADER = (
     *("table", "row", "column", "mean", "sd", "n", "published", "difference", "reason", "runs"),
 )
-NOT_IN_PAPERS = ("difference", "order")
+NOT_IN_PAPERS = ("difference",)
 """Kinds of lines that a table in a paper does not have."""
 
 LATEX_SPECIAL = {
@@ -48,10 +48,7 @@ def markdown(rendered: RenderedTable) -> str:
 
 
 def latex(rendered: RenderedTable) -> str:
-    """A LaTeX table that needs the package booktabs: ours and published, best bold.
-
-    The differences and the comparison of orders are left to the other forms.
-    """
+    """A LaTeX table that needs the package booktabs: ours and published, without differences."""
 
     def shown(text: TextCell) -> str:
         command = ("", r"\textbf", r"\underline")[text.rank]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from collections import Counter
 from collections.abc import Sequence
+from statistics import median
 
 from rgbt.tracking.tables import ABSENT, TextTable
 from sweeps.table.request import SCALE, TableRequest
@@ -72,6 +73,17 @@ def summary(request: TableRequest, outcomes: Sequence[Outcome], workers: int) ->
         if column.parameters:
             lines.append(f"Column '{column.name}' is counted at scale={SCALE}, without any run.")
     return lines
+
+
+def most_line(most: int, outcomes: Sequence[Outcome], workers: int) -> str:
+    """What `seeds=until_decided` may cost beyond the runs that are listed."""
+    further = most - len(outcomes)
+    seconds = [outcome.seconds for outcome in outcomes if outcome.seconds is not None]
+    time = f", {duration(further * median(seconds) / workers)}" if seconds else ""
+    return (
+        f"Until all claims are decided: at most {further} further runs{time}; rows of decided "
+        "claims get no more."
+    )
 
 
 def _evaluations(request: TableRequest, outcomes: Sequence[Outcome]) -> list[str]:

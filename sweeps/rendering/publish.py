@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rgbt.files.atomic import write_atomic
-from rgbt.tracking.terminal import info, line_width, path_lines, print_rich
+from rgbt.tracking.tables import TextTable
+from rgbt.tracking.terminal import info, line_width, path_lines, print_rich, rich_table
+from sweeps.rendering.claims import claims_csv, claims_grid, claims_markdown, counted
 from sweeps.rendering.figure import draw_table
 from sweeps.rendering.file_formats import latex, markdown, tidy_csv
 from sweeps.rendering.rendered_table import RenderedTable, render_table
 from sweeps.rendering.terminal import terminal
 from sweeps.report.records import record
-from sweeps.table.cells import NO_VALUE
+from sweeps.table.cells import NO_VALUE, CellRun
 from sweeps.table.request import TableRequest, parameter_cells
 from sweeps.table.scoring import ScoredTable, score
+from sweeps.verdicts.forms import forms_grid
+from sweeps.verdicts.judge import CellRunId, JudgedClaim, TableJudge
 from sweeps.worker.point_list import other_code_line
 from sweeps.worker.trial_sources import Outcome
 
@@ -25,21 +29,57 @@ if TYPE_CHECKING:
     from rgbt.tracking.tracker import Tracking
 
 
+@dataclass(frozen=True, kw_only=True)
+class Findings:
+    """What the finished runs of a table say beside its values.
+
+    Attributes:
+        claims: judged.
+        forms: differences of the forms as text; None where one form was run.
+    """
+
+    claims: Sequence[JudgedClaim] = ()
+    forms: TextTable | None = None
+
+
 def publish_table(
-    request: TableRequest, outcomes: Sequence[Outcome], out: Path, tracking: Tracking
+    judge: TableJudge,
+    request: TableRequest,
+    outcomes: Sequence[Outcome],
+    external: Mapping[CellRunId, CellRun],
+    out: Path,
+    tracking: Tracking,
 ) -> int:
-    """Print the table, write its files into `out`, record it in MLflow.
+    """Print the table and its claims, write its files into `out`, record it in MLflow.
+
+    Args:
+        judge: of the table.
+        request: the table.
+        outcomes: of its points.
+        external: runs of rows that are not trained.
+        out: folder of the files.
+        tracking: the tracker.
 
     Returns:
         1 where a cell failed or has no value, or the files could not be written; else 0.
     """
-    runs, sizes = request.runs(outcomes), parameter_cells(request)
-    scored = score(request.name, request.table, runs, scale=request.scale, sizes=sizes)
+    runs: dict[CellRunId, CellRun] = {**request.runs(outcomes), **external}
+    sizes = parameter_cells(request)
+    scored = replace(
+        score(request.name, request.table, runs, scale=request.scale, sizes=sizes),
+        form=request.form,
+        marks=judge.marks(runs),
+    )
+    findings = Findings(claims=judge.claims(runs), forms=forms_grid(judge, runs))
     rendered = render_table(scored, request.typed_overrides())
     print_rich(terminal(rendered, plain=not sys.stdout.isatty(), width=line_width()))
+    if findings.forms is not None:
+        print_rich(rich_table(findings.forms))
+    if findings.claims:
+        print_rich(rich_table(claims_grid(findings.claims, counted(findings.claims))))
     failed = _report_missing(scored, outcomes)
     try:
-        files = write_files(scored, rendered, out)
+        files = write_files(scored, rendered, findings, out)
     except OSError as error:
         info(f"{error.filename or out}: {error.strerror or error}; the files were not written.")
         return 1
@@ -48,27 +88,32 @@ def publish_table(
         name=f"{request.name} {request.variant}",
         kind="table",
         files=files,
-        metrics=metrics(scored, outcomes),
+        metrics=metrics(findings.claims, outcomes),
         tags={
             "rgbt.table": request.name,
             "rgbt.scale": request.scale,
-            "rgbt.seeds": ", ".join(map(str, request.seeds)),
+            "rgbt.form": request.form,
+            "rgbt.seeds": ", ".join(map(str, scored.seeds)),
         },
-        note=markdown(rendered),
+        note=_whole_markdown(rendered, findings),
     )
     links = [("files", f"{out}/ ({', '.join(path.name for path in files)})"), *links]
     print_rich(path_lines(links))
     return 1 if failed else 0
 
 
-def write_files(scored: ScoredTable, rendered: RenderedTable, out: Path) -> list[Path]:
-    """Write the table in every form, and its figure where there is something to draw."""
+def write_files(
+    scored: ScoredTable, rendered: RenderedTable, findings: Findings, out: Path
+) -> list[Path]:
+    """Write the table in every format, its claims, and its figure if there is one to draw."""
     out.mkdir(parents=True, exist_ok=True)
     texts = {
-        "table.md": markdown(rendered),
+        "table.md": _whole_markdown(rendered, findings),
         "table.csv": tidy_csv(scored),
         "table.tex": latex(rendered),
     }
+    if findings.claims:
+        texts["claims.csv"] = claims_csv(findings.claims)
     for name, text in texts.items():
         write_atomic(out / name, text.encode())
     figure = out / "figure.png"
@@ -76,12 +121,19 @@ def write_files(scored: ScoredTable, rendered: RenderedTable, out: Path) -> list
     return [*(out / name for name in texts), *([figure] if drawn else [])]
 
 
-def metrics(scored: ScoredTable, outcomes: Sequence[Outcome]) -> dict[str, float]:
-    """Numbers of the table's run in MLflow: runs by state, and how well the orders agree."""
+def _whole_markdown(rendered: RenderedTable, findings: Findings) -> str:
+    parts = [markdown(rendered)]
+    parts += [] if findings.forms is None else [findings.forms.to_markdown()]
+    parts += [claims_markdown(findings.claims)] if findings.claims else []
+    return "\n".join(parts)
+
+
+def metrics(claims: Sequence[JudgedClaim], outcomes: Sequence[Outcome]) -> dict[str, float]:
+    """Numbers of the table's run in MLflow: runs by state, claims by verdict."""
     states = [outcome.state for outcome in outcomes]
+    words = [claim.word.replace(" ", "_") for claim in claims]
     counts = {f"runs/{state}": float(states.count(state)) for state in ("finished", "failed")}
-    rhos = {f"order/{name}": order.rho for name, order in scored.orders.items()}
-    return counts | {name: rho for name, rho in rhos.items() if math.isfinite(rho)}
+    return counts | {f"claims/{word}": float(words.count(word)) for word in sorted(set(words))}
 
 
 def _report_missing(scored: ScoredTable, outcomes: Sequence[Outcome]) -> bool:

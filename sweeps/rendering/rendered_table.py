@@ -11,7 +11,7 @@ from rgbt.tracking.tables import number
 from sweeps.table.cells import NO_VALUE, is_counted, is_of_runs, metric_of
 from sweeps.table.request import SCALE
 from sweeps.table.scoring import ScoredTable, published
-from sweeps.table.table import Column, Row
+from sweeps.table.table import Column, Form, Row
 
 MAX_ON_ONE_LINE = 3
 """Most columns with ours, published and difference on one line; more columns use several lines."""
@@ -25,13 +25,14 @@ BESIDE_OURS = ("published", "difference")
 DASH = "-"
 DOUBTFUL = "The printed value does not agree with the others of its row."
 DEMO = (
-    "scale=demo: data and network are small; compare the order of the rows with the paper, not the "
-    "values."
+    "scale=demo: data and network are small; compare the verdicts of the claims with the paper, "
+    "not the values."
 )
-ORDER = (
-    "rho: Spearman's rank correlation between our means and the published values over n rows; "
-    "+1: the same order."
-)
+FORMS: dict[Form, str] = {
+    "paper": "Form: every row is run as the text of the paper describes it.",
+    "released": "Form: no row of this table has a released form that differs from the text.",
+}
+"""Of tables that say nothing about their forms."""
 NOT_PRINTED = "Not in the paper."
 PARAMETERS = f"Parameters are counted at scale={SCALE}, without any run and without discriminators."
 
@@ -43,7 +44,7 @@ class TextCell:
     Attributes:
         text: without marks.
         spread: standard deviation, or "".
-        rank: 1 best of the column, 2 second best, 0 neither.
+        rank: 1 shown to be the best of the column, 2 the second best, 0 neither.
         notes: numbers of its footnotes.
     """
 
@@ -60,7 +61,7 @@ class TextCell:
 
 @dataclass(frozen=True)
 class TableLine:
-    """One line: "ours", "sd", "published", "difference" or "all" of a row; "order" below all."""
+    """One line: "ours", "sd", "published", "difference" or "all" of a row."""
 
     kind: str
     label: TextCell
@@ -96,7 +97,7 @@ def render_table(scored: ScoredTable, extra: Sequence[str] = ()) -> RenderedTabl
     table, builder = scored.table, _LineBuilder(scored)
     title_notes = builder.notes(table.needs and f"Cannot be run yet: {table.needs}", *table.remarks)
     header = builder.header()
-    lines = [line for row in table.rows for line in builder.row(row)] + builder.order()
+    lines = [line for row in table.rows for line in builder.row(row)]
     return RenderedTable(
         title=TextCell(f"{table.paper}, {table.number}: {table.caption}", notes=title_notes),
         header=header,
@@ -114,13 +115,13 @@ def _remarks(scored: ScoredTable, extra: Sequence[str]) -> list[str]:
     remarks = [f"Published: {table.data}; {table.unit}."] if printed else []
     if scored.seeds:
         many = len(scored.seeds) > 1
-        seeds = ", ".join(map(str, scored.seeds))
+        seeds = _listed(scored.seeds)
         spread = "mean ± standard deviation (n - 1) over" if many else "of"
         remarks.append(f"Ours: scale={scored.scale}, {spread} seed{'s' * many} {seeds}.")
+    if scored.cells and printed:
+        remarks.append(table.forms.get(scored.form, FORMS[scored.form]))
     if any((row.label, c.name) in scored.cells for row in table.rows for c in sizes):
         remarks.append(PARAMETERS)
-    if any(order.rows for order in scored.orders.values()):
-        remarks.append(ORDER)
     if scored.seeds and scored.scale == "demo" and printed:
         remarks.append(DEMO)
     if extra:
@@ -208,23 +209,6 @@ class _LineBuilder:
                 lines.append(TableLine(kind, TextCell() if lines else label, fields))
         return lines
 
-    def order(self) -> list[TableLine]:
-        """The lines that compare the order of the rows with the paper's."""
-        orders = [self.scored.orders[column.name] for column in self.columns]
-        if not any(order.rows for order in orders):
-            return []
-        rhos = [TextCell(_signed(order.rho)) for order in orders]
-        rows = [TextCell(str(order.rows)) for order in orders]
-        if not self.on_one_line:
-            rho, n = (TextCell("rho"), TextCell(), *rhos), (TextCell("n"), TextCell(), *rows)
-            labels = TextCell("order of rows"), TextCell()
-        else:
-            nothing = [TextCell()] * len(BESIDE_OURS)
-            rho = (TextCell(), *self._beside(rhos, nothing))
-            n = (TextCell(), *self._beside(rows, nothing))
-            labels = TextCell("order of rows: rho"), TextCell("n")
-        return [TableLine("order", labels[0], rho), TableLine("order", labels[1], n)]
-
     def _same_runs(self, row: Row) -> str | None:
         """A note on an equal row: at scale=demo networks of all sizes are one."""
         keys = self._keys(row)
@@ -257,7 +241,7 @@ class _LineBuilder:
         if math.isnan(cell.mean):
             return TextCell(DASH if cell.mark == NO_VALUE else cell.mark, notes=notes)
         spread = "" if math.isnan(cell.sd) or self.sd_apart else f"{cell.sd:.2f}"
-        rank = self.scored.ranks_ours.get(cell_id, 0)
+        rank = self.scored.marks.get(cell_id, 0)
         return TextCell(f"{cell.mean:.2f}", spread, rank, notes)
 
     def _sd(self, row: Row, column: Column) -> TextCell:
@@ -269,11 +253,17 @@ class _LineBuilder:
         if printed is None:
             return TextCell(DASH)
         doubts = (row.remarks or (DOUBTFUL,)) if column.name in row.doubtful else ()
-        rank = self.scored.ranks_published.get((row.label, column.name), 0)
-        return TextCell(f"{printed:.{self.decimals}f}", rank=rank, notes=self.notes(*doubts))
+        return TextCell(f"{printed:.{self.decimals}f}", notes=self.notes(*doubts))
 
     def _difference(self, row: Row, column: Column) -> TextCell:
         return TextCell(_signed(self.scored.difference(row, column)))
+
+
+def _listed(seeds: Sequence[int]) -> str:
+    """Numbers in order: "0, 4, 7", or "0 to 19" where none between them is missing."""
+    if len(seeds) > 3 and seeds[-1] - seeds[0] == len(seeds) - 1:
+        return f"{seeds[0]} to {seeds[-1]}"
+    return ", ".join(map(str, seeds))
 
 
 def _signed(value: float) -> str:

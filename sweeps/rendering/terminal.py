@@ -20,7 +20,10 @@ GAP = 2
 WIDE = WITH_SD + 2
 """Columns, those of words and seeds counted, above which names are broken into several lines."""
 
-LEGENDS = ("Bold: best, underlined: second best.", "*: best, _: second best.")
+LEGENDS = (
+    "Bold: shown to be the best of our rows, underlined: the second best.",
+    "*: shown to be the best of our rows, _: the second best.",
+)
 
 
 def terminal(rendered: RenderedTable, *, plain: bool = False, width: int = WIDTH) -> RichText:

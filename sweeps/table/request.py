@@ -16,7 +16,7 @@ from rgbt.config.options import readable_paths
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Point
 from sweeps.table.cells import NO_VALUE, CellId, TableCell, evaluation_of, is_counted
-from sweeps.table.table import Table
+from sweeps.table.table import Form, Row, Table
 
 if TYPE_CHECKING:
     from sweeps.worker.trial_sources import Outcome
@@ -31,6 +31,13 @@ networks."""
 TAG = "rgbt.table/"
 """Prefix of the tag that names a run's row: rgbt.table/spatialseg/table3 = "Ny/4"."""
 
+PRETRAINED = "pretrained."
+"""pretrained.mask2former_swin_b=FILE: initial weights of the rows that train this network."""
+
+UNTIL_DECIDED = "rgbt.until_decided/"
+"""Prefix of the tag of runs whose number depends on what earlier ones have shown: intervals of
+their table must be valid at any time."""
+
 SEPARATOR = " | "
 TAG_LENGTH = 5000
 
@@ -40,10 +47,17 @@ class TableRequest:
     """A table to compute.
 
     Attributes:
+        table: with the rows that are shown; see `sweeps.table.rows.select_rows`.
         scale: "demo" or "paper".
         seeds: of every row.
         extra: overrides that win over those of the rows.
-        weights: files of weights by the name of the network, for tables of several backbones.
+        pretrained: files of initial weights by the name of the network, for tables of several
+            backbones.
+        form: what the rows are run as.
+        evaluated: labels of rows that are evaluated and not trained, see
+            `sweeps.table.external.external_rows`.
+        typed: further options that make it another table, as they were typed.
+        until_decided: whether seeds are added until claims are decided, which runs record.
     """
 
     name: str
@@ -51,14 +65,18 @@ class TableRequest:
     scale: str
     seeds: tuple[int, ...]
     extra: tuple[str, ...] = ()
-    weights: Mapping[str, str] = field(default_factory=dict)
+    pretrained: Mapping[str, str] = field(default_factory=dict)
+    form: Form = "paper"
+    evaluated: tuple[str, ...] = ()
+    typed: tuple[str, ...] = ()
+    until_decided: bool = False
 
     def overrides(self, label: str, seed: int) -> tuple[str, ...]:
         """Overrides of the run of row `label` with that seed."""
         (row,) = (row for row in self.table.rows if row.label == label)
-        experiment, *others = self.table.overrides(row, self.scale)
+        experiment, *others = self.table.overrides(row, self.scale, self.form)
         scale = () if self.scale == DEFAULT_SCALE else (f"scale={self.scale}",)
-        file = self.weights.get(_model_of(others) or "")
+        file = self.pretrained.get(_model_of(others) or "")
         weights = () if file is None else readable_paths([f"model.weights={file}"])
         return (experiment, *scale, *others, *self.extra, *weights, f"seed={seed}")
 
@@ -69,19 +87,27 @@ class TableRequest:
         """
         if not any(map(is_counted, self.table.columns)):
             return []
-        rows = self.table.runnable_rows
-        return [(row.label, seed) for seed in self.seeds for row in rows]
+        return [(row.label, seed) for seed in self.seeds for row in self.trained_rows]
 
-    def points(self) -> list[Point]:
-        """The points; rows with equal overrides share one."""
+    @property
+    def trained_rows(self) -> list[Row]:
+        """The rows whose network is trained: those that can be run and are not evaluated."""
+        return [row for row in self.table.runnable_rows if row.label not in self.evaluated]
+
+    def points(self, row_seeds: Sequence[tuple[str, int]] | None = None) -> list[Point]:
+        """The points of some rows and seeds, by default of all.
+
+        Rows with equal overrides share one point.
+        """
         sharing: dict[tuple[str, ...], list[str]] = {}
-        for label, seed in self.row_seeds():
+        for label, seed in self.row_seeds() if row_seeds is None else row_seeds:
             sharing.setdefault(self.overrides(label, seed), []).append(label)
         points = []
         for overrides, labels in sharing.items():
             more = f" (and {len(labels) - 1} more)" if len(labels) > 1 else ""
             label = f"{labels[0]}{more} {overrides[-1]}"
             tags = {TAG + self.name: SEPARATOR.join(labels)[:TAG_LENGTH]}
+            tags |= {UNTIL_DECIDED + self.name: "true"} if self.until_decided else {}
             evaluations = self.evaluations(labels)
             points.append(Point(label, overrides, tags=tags, evaluations=evaluations))
         return points
@@ -98,29 +124,43 @@ class TableRequest:
     def runs(self, outcomes: Sequence[Outcome]) -> Mapping[tuple[str, int], Outcome]:
         """The outcome of every row and seed."""
         by_overrides = {outcome.point.overrides: outcome for outcome in outcomes}
-        return {run: by_overrides[self.overrides(*run)] for run in self.row_seeds()}
+        runs = {}
+        for row in self.trained_rows:
+            for seed in sorted({seed_of(overrides) for overrides in by_overrides}):
+                outcome = by_overrides.get(self.overrides(row.label, seed))
+                if outcome is not None:
+                    runs[row.label, seed] = outcome
+        return runs
 
     def typed_overrides(self) -> tuple[str, ...]:
         """Further overrides, as they were typed."""
-        return (*self.extra, *(f"weights.{model}={file}" for model, file in self.weights.items()))
+        files = (f"{PRETRAINED}{model}={file}" for model, file in self.pretrained.items())
+        return (*self.extra, *files)
 
     @property
     def variant(self) -> str:
-        """The scale; with a short hash where further overrides make it another table."""
-        shown = [word for word in self.typed_overrides() if not word.startswith("dataset.root=")]
+        """The scale and the form; with a short hash where other words make it another table."""
+        typed = (*self.typed_overrides(), *self.typed)
+        shown = [word for word in typed if not word.startswith("dataset.root=")]
         digest = hashlib.sha256("\n".join(sorted(shown)).encode()).hexdigest()[:6]
-        return f"{self.scale}-{digest}" if shown else self.scale
+        form = "" if self.form == "paper" else f"-{self.form}"
+        return f"{self.scale}{form}-{digest}" if shown else f"{self.scale}{form}"
 
     def models(self) -> set[str]:
         """Networks (`model=...`) of the rows."""
         rows = self.table.runnable_rows
-        models = (_model_of(self.table.overrides(row, self.scale)) for row in rows)
+        models = (_model_of(self.table.overrides(row, self.scale, self.form)) for row in rows)
         return {model for model in models if model is not None}
 
 
 def _model_of(overrides: Sequence[str]) -> str | None:
     named = [word.partition("=")[2] for word in overrides if word.startswith("model=")]
     return named[-1] if named else None
+
+
+def seed_of(overrides: Sequence[str]) -> int:
+    """The seed of the overrides of a row, which end with it."""
+    return int(overrides[-1].removeprefix("seed="))
 
 
 def seeds_of(text: str) -> tuple[int, ...]:
@@ -153,7 +193,7 @@ def parameter_cells(request: TableRequest) -> dict[CellId, TableCell]:
     """
     table = request.table
     columns = [column for column in table.columns if column.parameters]
-    at_paper = replace(request, scale=SCALE, weights={})
+    at_paper = replace(request, scale=SCALE, pretrained={})
     counted: dict[tuple[str, ...], TableCell] = {}
     cells: dict[CellId, TableCell] = {}
     for row in table.runnable_rows if columns else ():

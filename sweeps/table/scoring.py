@@ -9,27 +9,11 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from rgbt.metrics.named import parse
 from sweeps.table.cells import CellId, CellRun, TableCell, is_counted, metric_of, row_cells
-from sweeps.table.table import Column, Row, Table
-
-MIN_ROWS = 3
-"""Fewest rows whose order is compared: two rows agree or not by chance."""
-
-
-@dataclass(frozen=True)
-class Order:
-    """Whether the rows have the printed order: Spearman's rank correlation.
-
-    Attributes:
-        rho: -1..1; NaN for fewer than `MIN_ROWS` rows, or where all values are equal.
-        rows: number of rows with a value of ours and a printed one.
-    """
-
-    rho: float
-    rows: int
+from sweeps.table.table import Column, Form, Row, Table
 
 
 @dataclass(frozen=True)
@@ -40,10 +24,10 @@ class ScoredTable:
         name: e.g. "spatialseg/table3".
         scale: "demo" or "paper".
         cells: only rows that were run, and columns of parameters.
-        orders: by name of the column.
-        ranks_ours: 1 best, 2 second best of the column among our means.
-        ranks_published: the same among the printed values.
         commits: git commit -> number of runs made by it.
+        form: what the rows were run as.
+        marks: 1 for a row that is shown to be the best of the column, 2 for the second best; see
+            `sweeps.verdicts.judge.TableJudge.marks`.
     """
 
     name: str
@@ -51,10 +35,9 @@ class ScoredTable:
     scale: str
     seeds: tuple[int, ...]
     cells: Mapping[CellId, TableCell]
-    orders: Mapping[str, Order]
-    ranks_ours: Mapping[CellId, int]
-    ranks_published: Mapping[CellId, int]
     commits: Mapping[str, int]
+    form: Form = "paper"
+    marks: Mapping[CellId, int] = field(default_factory=dict)
 
     def difference(self, row: Row, column: Column) -> float:
         """Ours less the printed value; NaN where one of them is missing."""
@@ -98,62 +81,20 @@ def score(
         scale: "demo" or "paper".
         sizes: cells of the columns of parameters, see `sweeps.table.request.parameter_cells`.
     """
-    seeds = sorted({seed for _, seed in runs})
+    seeds = sorted({seed for _, seed in runs})  # a row without seeds has a negative one
     ran = {label for label, _ in runs}
     cells: dict[CellId, TableCell] = {}
     for row in table.rows:
         if row.label in ran:
             outcomes = {seed: runs[row.label, seed] for seed in seeds if (row.label, seed) in runs}
             cells |= row_cells(table, row, outcomes)
-    # A mean over fewer seeds is shown, but has no rank and no part in the order of the rows.
-    whole = {cell_id: cell for cell_id, cell in cells.items() if cell.seeds == len(seeds)}
     cells |= sizes or {}
-    whole |= sizes or {}
-    pairs = (((row.label, c.name), published(row, c)) for row in table.rows for c in table.columns)
-    printed = {cell_id: value for cell_id, value in pairs if value is not None}
     made_by = {run.key: run.commit for outcome in runs.values() for run in outcome.results}
     return ScoredTable(
         name=name,
         table=table,
         scale=scale,
-        seeds=tuple(seeds),
+        seeds=tuple(seed for seed in seeds if seed >= 0),
         cells=cells,
-        orders={column.name: _order(table, column, whole) for column in table.columns},
-        ranks_ours=_ranks(table, {cell_id: cell.mean for cell_id, cell in whole.items()}),
-        ranks_published=_ranks(table, printed),
         commits=Counter(commit for commit in made_by.values() if commit is not None),
     )
-
-
-def _ranks(table: Table, values: Mapping[CellId, float]) -> dict[CellId, int]:
-    """1 and 2 for the best and second best of every column.
-
-    Values that are equal as shown share a rank. Where all are equal none has one.
-    """
-    ranks: dict[CellId, int] = {}
-    for column in table.columns:
-        shown = {
-            cell_id: round(value, 2)
-            for cell_id, value in values.items()
-            if cell_id[1] == column.name and not math.isnan(value)
-        }
-        if column.best == "none" or len(set(shown.values())) < 2:
-            continue
-        best = sorted(set(shown.values()), reverse=column.best == "highest")[:2]
-        ranks |= {cell_id: best.index(each) + 1 for cell_id, each in shown.items() if each in best}
-    return ranks
-
-
-def _order(table: Table, column: Column, cells: Mapping[CellId, TableCell]) -> Order:
-    pairs = []
-    for row in table.rows:
-        cell, printed = cells.get((row.label, column.name)), published(row, column)
-        if cell is not None and printed is not None and not math.isnan(cell.mean):
-            pairs.append((cell.mean, printed))
-    constant = any(len(set(side)) < 2 for side in zip(*pairs, strict=True))
-    if len(pairs) < MIN_ROWS or constant:
-        return Order(math.nan, len(pairs))
-    from scipy.stats import spearmanr
-
-    ours, theirs = zip(*pairs, strict=True)
-    return Order(float(spearmanr(ours, theirs).statistic), len(pairs))

@@ -39,6 +39,7 @@ class PointList:
         runs: finished runs; the points' overrides name the same folder.
         base: overrides that all have.
         distributions: of the parameters of a grid, by name.
+        more: further points, from the outcomes until now; asked for when no point is waiting.
     """
 
     study: str
@@ -48,6 +49,7 @@ class PointList:
     runs: RunStore
     base: tuple[str, ...] = ()
     distributions: Mapping[str, Any] | None = None
+    more: Callable[[Sequence[Outcome]], Sequence[Point]] | None = None
 
 
 def other_code_line(outcomes: Sequence[Outcome]) -> str:
@@ -98,43 +100,66 @@ def run_points(points: PointList, settings: SweepSettings) -> list[Outcome]:
     plans = list(planned.plans.values())
     source = ListSource(plans, store, runs, settings, points.distributions or {})
 
+    def outcomes() -> list[Outcome]:
+        trials = store.by_key()
+        return planned.outcomes(lambda plan: source.status(plan, trials))
+
     def num_done() -> int:
         return sum(status.state in ("finished", "failed") for status in source.statuses())
 
     view = ProgressView(points.title, len(source.plans), settings.workers, num_done)
+
+    def more() -> list[PlannedPoint]:
+        added = planned.add(points.more(outcomes())) if points.more else []
+        if added:
+            view.added([plan.point.label for plan in added])
+        return added
+
+    source.more = more
     drive(view, source, store, runs, settings)
-    trials = store.by_key()
-    return planned.outcomes(lambda plan: source.status(plan, trials))
+    return outcomes()
 
 
 class _PlannedPoints:
     """The points of a list, planned; those with a wrong configuration have failed."""
 
     def __init__(self, points: PointList) -> None:
-        planner = Planner(points.base)
-        self.points = points.points
+        self._planner = Planner(points.base)
+        self._study = points.study
+        self.points: list[Point] = []
         self.plans: dict[int, PlannedPoint] = {}
         self.errors: dict[int, str] = {}
-        for index, point in enumerate(self.points):
-            try:
-                self.plans[index] = planner.plan(point)
-            except InputError as error:
-                self.errors[index] = str(error)
+        self.add(points.points)
         if self.errors and not self.plans:
             # An error of every point is one of the command and not of a point.
             raise InputError(next(iter(self.errors.values())))
+
+    def add(self, points: Sequence[Point]) -> list[PlannedPoint]:
+        """Plan further points; returns those without an error."""
+        first = len(self.points)
+        self.points += points
+        for index, point in enumerate(points, start=first):
+            try:
+                self.plans[index] = self._planner.plan(point)
+            except InputError as error:
+                self.errors[index] = str(error)
+        self._describe()
+        return [plan for index, plan in self.plans.items() if index >= first]
+
+    def _describe(self) -> None:
+        """Give every plan its tags, its colour and the keys that vary."""
         # Points of the same run in other words (1 and 1.0) get the tags of all of them. Every run
         # gets its own colour, and the keys that vary, which begin its name.
         varied = " ".join(varied_keys(self.points))
         tags: dict[str, dict[str, list[str]]] = {}
-        for plan in self.plans.values():
+        for index, plan in self.plans.items():
             own = tags.setdefault(plan.key, {})
-            for name, value in plan.point.tags.items():
+            for name, value in self.points[index].tags.items():
                 values = own.setdefault(name, [])
                 values += [] if value in values else [value]
         for index, plan in self.plans.items():
             merged = {name: " | ".join(each) for name, each in tags[plan.key].items()}
-            merged |= {VARIED: varied, COLOUR: colour(points.study, list(tags).index(plan.key))}
+            merged |= {VARIED: varied, COLOUR: colour(self._study, list(tags).index(plan.key))}
             self.plans[index] = replace(plan, point=replace(plan.point, tags=merged))
 
     def outcomes(self, status_of: Callable[[PlannedPoint], Outcome]) -> list[Outcome]:

@@ -79,6 +79,11 @@ class ProgressView:
         if how != "finished" or self._live is None:
             self._say(text)
 
+    def added(self, labels: Sequence[str]) -> None:
+        """Show that points were added."""
+        self.total = None if self.total is None else self.total + len(labels)
+        self._say(f"added    {', '.join(labels)}")
+
     def rejected(self, label: str, reason: str) -> None:
         """Show that the configuration of a point is wrong."""
         self._ended["failed"] += 1

@@ -122,6 +122,7 @@ class ListSource:
         points: planned; of equal keys the last one counts.
         settings: `retries` and `retry` count here.
         distributions: of the parameters of a grid, by name.
+        more: further points, from the outcomes until now; called when no point is waiting.
     """
 
     points: InitVar[Sequence[PlannedPoint]]
@@ -129,6 +130,7 @@ class ListSource:
     runs: RunStore
     settings: SweepSettings
     distributions: Mapping[str, Any]
+    more: Callable[[], Sequence[PlannedPoint]] = tuple
     requeues: bool = field(default=False, init=False)
     rejected: int = field(default=0, init=False)
 
@@ -141,6 +143,15 @@ class ListSource:
 
     def next(self) -> ClaimedTrial | None:
         """See `TrialSource.next`."""
+        claimed = self._claim()
+        if claimed is None:
+            further = {plan.key: plan for plan in self.more()}
+            if further.keys() - self.plans.keys():
+                self.plans = {**further, **self.plans}
+                return self._claim()
+        return claimed
+
+    def _claim(self) -> ClaimedTrial | None:
         by_key = self.store.by_key()
         for plan in self.plans.values():
             if self.status(plan, by_key).state != "waiting":

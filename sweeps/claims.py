@@ -1,0 +1,119 @@
+"""Print all claims of the papers with their verdicts: ``rgbt claims``.
+
+Nothing is run: the verdicts come from the finished runs in the folder of runs.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from rgbt.config.common_options import RunsDir
+from rgbt.config.options import Help, readable_paths
+from rgbt.config.plain_command import PlainCommand
+
+if TYPE_CHECKING:
+    from sweeps.table.request import TableRequest
+    from sweeps.verdicts.judge import JudgedClaim
+
+ALL = "all"
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of ``rgbt claims``."""
+
+    table: Annotated[
+        str, Help("claims of one table, such as spatialseg/table3; all: of every table")
+    ] = ALL
+    scale: Annotated[str, Help("scale of the runs: demo or paper")] = "demo"
+    form: Annotated[
+        Literal["paper", "released"], Help("form of the rows, as of rgbt reproduce")
+    ] = "paper"
+    runs_dir: RunsDir = Path("runs")
+    out: Annotated[
+        Path | None, Help("output folder of claims.md and claims.csv; default: only printed")
+    ] = None
+
+
+def main(options: Options, overrides: list[str]) -> int:
+    """Print every claim of the papers: holds, contradicted, undecided, or not run.
+
+    Overrides are those of the runs: dataset.root=/data/MFNet. Claims about data sets alone, such as
+    those on noise and sharpness, are decided by `rgbt spatial`.
+    """
+    from rich.text import Text
+
+    from rgbt.files.atomic import write_atomic
+    from rgbt.tracking.terminal import path_lines, print_rich, rich_table
+    from sweeps.rendering.claims import claims_csv, claims_grid, claims_markdown, counted
+
+    judged = judge_all(options, overrides)
+    print_rich(rich_table(claims_grid(judged, counted(judged), tables=True)))
+    print_rich(Text(by_paper(judged)))
+    if options.out is not None:
+        options.out.mkdir(parents=True, exist_ok=True)
+        text = f"# Claims of the papers\n\n{counted(judged)}\n\n{claims_markdown(judged)}"
+        write_atomic(options.out / "claims.md", text.encode())
+        write_atomic(options.out / "claims.csv", claims_csv(judged).encode())
+        print_rich(path_lines([("claims", str(options.out / "claims.md"))]))
+    return 0
+
+
+def judge_all(options: Options, overrides: Sequence[str]) -> list[JudgedClaim]:
+    """The claims of the requested tables, judged by the finished runs.
+
+    Raises:
+        InputError: no such table, scale or folder of runs.
+    """
+    from rich.console import Console
+    from rich.progress import track
+
+    from sweeps.table.load_table import PUBLISHED, table_names
+    from sweeps.table.make_request import TableWords, make_request, read_named
+    from sweeps.verdicts.stored import finished_by_seed
+
+    names = table_names(PUBLISHED / "none") if options.table == ALL else [options.table]
+    finished = finished_by_seed(options.runs_dir)
+    extra = [*readable_paths([f"runs_dir={options.runs_dir}"]), *overrides]
+    words = TableWords(seeds=(0,), scale=options.scale, form=options.form, overrides=extra)
+    judged: list[JudgedClaim] = []
+    for each in track(names, "judging", console=Console(stderr=True), transient=True):
+        name, table = read_named(each)
+        if table.claims:
+            request, _ = make_request(name, table, words)
+            judged += judge_stored(request, options.runs_dir, finished)
+    return judged
+
+
+def judge_stored(
+    request: TableRequest, runs_dir: Path, finished: dict[int, set[str]]
+) -> list[JudgedClaim]:
+    """The claims of one table, judged by the finished runs of a folder."""
+    from sweeps.verdicts.judge import TableJudge
+    from sweeps.verdicts.stored import rule_of, stored_runs
+
+    runs = stored_runs(request, runs_dir, finished) if finished else {}
+    judge = TableJudge(request.name, request.table, rule_of(request, runs))
+    return judge.claims(runs)
+
+
+def by_paper(judged: Sequence[JudgedClaim]) -> str:
+    """How many claims each paper makes, and of how many its printed numbers agree."""
+    papers = Counter(each.table.partition("/")[0] for each in judged)
+    agree = Counter(each.table.partition("/")[0] for each in judged if each.as_printed)
+    apart = Counter(each.table.partition("/")[0] for each in judged if each.as_printed is False)
+    return "\n".join(
+        f"{paper}: {count} claims; its printed values agree with {agree[paper]}, do not agree with "
+        f"{apart[paper]}."
+        for paper, count in papers.items()
+    )
+
+
+entry = PlainCommand(Options, main)
+
+if __name__ == "__main__":
+    entry()

@@ -1,0 +1,171 @@
+"""Rows of a request: the selected ones, and the refusal of overrides that mix rows up."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from itertools import combinations
+from typing import Any
+
+from rgbt.checks import InputError, nearest, split_list
+from rgbt.spec.run_spec import NOT_IN_KEY, WEIGHTS, RunSpec
+from sweeps.table.cells import is_counted, metric_of
+from sweeps.table.claim import OTHERS, PREVIOUS
+from sweeps.table.request import TableRequest
+from sweeps.table.table import Row, Table
+from sweeps.worker.planner import specify_run
+
+SUBJECTS = ("dataset", "domains", "transform", "masker", "model", "loss", "scheme")
+"""Nodes of the configuration that a row can be about. The others say how long and on what it is
+run, which a user may change for all rows: recipe, trainer, optimizer, schedule."""
+
+
+def select_rows(table: Table, text: str) -> Table:
+    """The table with the rows of ``rows=A,H`` alone, and with the claims about them.
+
+    Raises:
+        InputError: a name that no row has, or several.
+    """
+    labels = [row.label for row in table.rows]
+    chosen = {find_label(word, labels, "rows=") for word in split_list(text, "rows")}
+    rows = tuple(
+        row if row.same_as in chosen else replace(row, same_as=None)
+        for row in table.rows
+        if row.label in chosen
+    )
+
+    def is_left(names: Sequence[str]) -> bool:
+        return names == (PREVIOUS,) or set(names) <= chosen
+
+    # "Better than all others" is another statement where some of the others are missing.
+    claims = [each for each in table.claims if is_left(each.rows) and is_left(each.against)]
+    complete = len(rows) == len(table.rows)
+    kept = tuple(table.claims if complete else claims)
+    assert all(OTHERS not in each.against for each in kept) or complete
+    return replace(table, rows=rows, claims=kept)
+
+
+def find_label(word: str, labels: Sequence[str], what: str) -> str:
+    """The label that a user means: as it is, in other case, without brackets, or its beginning.
+
+    Args:
+        word: as typed.
+        labels: of all rows.
+        what: option that the word belongs to, for messages.
+
+    Raises:
+        InputError: no label, or several.
+    """
+    for form in (str, _plain):
+        same = [label for label in labels if form(label) == form(word)]
+        if len(same) == 1:
+            return same[0]
+    begun = [label for label in labels if _plain(label).startswith(_plain(word))]
+    if len(begun) == 1:
+        return begun[0]
+    if begun:
+        listed = ", ".join(f"'{label}'" for label in begun)
+        raise InputError(f"{what}{word}: several rows begin so ({listed}); write one in full.")
+    raise InputError(f"{what}{word}: the table has no such row; {nearest(word, labels)}.")
+
+
+def _plain(label: str) -> str:
+    return "".join(letter for letter in label.lower() if letter.isalnum() or letter in "/.+*")
+
+
+def check_rows(request: TableRequest) -> None:
+    """Refuse overrides that change what rows are about, and rows that are the same run unawares.
+
+    Raises:
+        InputError: in one sentence, with the rows.
+    """
+    _check_clashes(request)
+    _check_equal_runs(request)
+
+
+def _check_clashes(request: TableRequest) -> None:
+    words = [word for word in request.extra if _key(word).partition(".")[0] in SUBJECTS]
+    if not words:
+        return
+    as_published = replace(request, extra=(), pretrained={})
+    for (first, a), (second, b) in combinations(_specified(as_published), 2):
+        varied = _varied(a, b)
+        for word in words:
+            key = _key(word)
+            if any(_is_inside(each, key) or _is_inside(key, each) for each in varied):
+                raise InputError(
+                    f"'{word}' would replace what the rows '{first}' and '{second}' of "
+                    f"{request.name} differ in; choose the rows that it is for with rows=..."
+                )
+
+
+def _check_equal_runs(request: TableRequest) -> None:
+    """Rows with the same metrics have runs of their own, unless the table says otherwise."""
+    rows = {row.label: row for row in request.table.rows}
+    seen: dict[tuple[Any, ...], str] = {}
+    for label, spec in _specified(request):
+        row = rows[label]
+        metrics = [metric_of(each, row) for each in request.table.columns if is_counted(each)]
+        same = seen.setdefault((spec.key, *metrics), label)
+        if same != label and not _are_declared(rows, same, label):
+            raise InputError(
+                f"the rows '{same}' and '{label}' of {request.name} would be the same run "
+                f"({spec.key}) at scale={request.scale}, form={request.form}; remove the override "
+                f"that makes them equal, or write same_as: {same} in the table."
+            )
+
+
+def _are_declared(rows: Mapping[str, Row], first: str, second: str) -> bool:
+    """Whether `second` names `first` with `same_as`, directly or by a row between."""
+    return first in _chain(rows, second) or bool(
+        set(_chain(rows, second)) & set(_chain(rows, first))
+    )
+
+
+def _chain(rows: Mapping[str, Row], label: str) -> Iterator[str]:
+    row = rows.get(label)
+    while row is not None and row.same_as is not None:
+        yield row.same_as
+        row = rows.get(row.same_as)
+
+
+def _specified(request: TableRequest) -> Iterator[tuple[str, RunSpec]]:
+    """The trained rows with their specifications; those that cannot be composed fail later."""
+    for row in request.trained_rows:
+        try:
+            yield row.label, specify_run(request.overrides(row.label, 0))
+        except InputError:
+            continue
+
+
+def _varied(a: RunSpec, b: RunSpec) -> set[str]:
+    """Dotted keys of `SUBJECTS` in which two runs differ; paths and initial weights aside."""
+    first, second = (
+        dict(_flat({name: each.components[name].plain for name in SUBJECTS})) for each in (a, b)
+    )
+    nothing = object()
+    keys = {*first, *second}
+    return {
+        key
+        for key in keys
+        if first.get(key, nothing) != second.get(key, nothing)
+        and key != WEIGHTS
+        and not any(_is_inside(key, out) for out in NOT_IN_KEY)
+    }
+
+
+def _flat(plain: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, each in plain.items():
+        if isinstance(each, Mapping):
+            yield from _flat(each, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", each
+
+
+def _key(word: str) -> str:
+    """The dotted key of an override: "+model/inputs@model=x" is "model.inputs"."""
+    return word.lstrip("+~").partition("=")[0].partition("@")[0].replace("/", ".")
+
+
+def _is_inside(key: str, other: str) -> bool:
+    return key == other or key.startswith(f"{other}.")

@@ -1,0 +1,101 @@
+"""Both forms of a table at once: as the paper's text describes it, and as its release made it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+
+from analysis.uncertainty.verdicts import decide
+
+from rgbt.checks import InputError
+from rgbt.metrics import names
+from rgbt.tracking.tables import ABSENT, TextTable
+from sweeps.table.cells import CellRun, is_counted
+from sweeps.table.claim import Claim
+from sweeps.table.table import Column, Row, Table
+from sweeps.verdicts.contrasts import Contrast
+from sweeps.verdicts.judge import CellRunId, TableJudge
+
+RELEASED = ", released"
+"""Ending of the label of a row in its released form, beside the row of the paper's form."""
+
+HEADLINES = (names.MIOU, names.VAR, names.TC, names.CA, names.CA_RELEASED)
+"""Scores whose differences are shown where a table has them; else those of all columns."""
+
+HIGHER = Claim(name="form", says="", source="", rows=(), columns=(), expected="higher").range
+WORDS = {"holds": "released is higher", "contradicted": "released is lower"}
+HEADER = ("row, column", "released - paper", "95 % interval", "seeds", "shown")
+TITLE = "Difference of the forms"
+
+
+def both_forms(table: Table) -> Table:
+    """The table with a further row below each one that the release makes in another way.
+
+    Claims are left out: they are about the rows of one form.
+
+    Raises:
+        InputError: no row has a released form of its own.
+    """
+    rows = [each for row in table.rows for each in _forms_of(row)]
+    if len(rows) == len(table.rows):
+        raise InputError(
+            f"form=both: no row of {table.paper}, {table.number} has a released form of its own; "
+            "use form=paper."
+        )
+    return replace(table, rows=tuple(rows), claims=())
+
+
+def _forms_of(row: Row) -> Iterator[Row]:
+    yield row
+    released = row.released
+    if released is not None:
+        yield replace(
+            row,
+            label=f"{row.label}{RELEASED}",
+            experiment=released.experiment or row.experiment,
+            overrides=row.overrides if released.overrides is None else released.overrides,
+            at=row.at if released.at is None else released.at,
+            released=None,
+            same_as=row.label,
+            x=None,
+            remarks=released.remarks,
+            doubtful=(),
+        )
+
+
+def forms_grid(judge: TableJudge, runs: Mapping[CellRunId, CellRun]) -> TextTable | None:
+    """One line per row and score: released minus paper, paired by seed, with its interval.
+
+    Returns:
+        None where the table has one form.
+    """
+    labels = {row.label for row in judge.table.rows}
+    both = [label for label in labels if f"{label}{RELEASED}" in labels]
+    rows = [
+        _line(judge, Contrast(f"{row.label}{RELEASED}", row.label, column.name), runs)
+        for row in judge.table.rows
+        if row.label in both
+        for column in _headlines(judge.table)
+    ]
+    return TextTable(TITLE, HEADER, tuple(rows)) if rows else None
+
+
+def _line(
+    judge: TableJudge, contrast: Contrast, runs: Mapping[CellRunId, CellRun]
+) -> tuple[str, ...]:
+    name = f"{contrast.other}, {contrast.column}"
+    try:
+        found = decide([judge.evidence([(1.0, contrast)], runs)], HIGHER, judge.rule, "all")
+    except InputError as error:
+        return name, ABSENT, ABSENT, "0", str(error)
+    interval = found.interval
+    shown = ABSENT if interval is None else f"[{interval.low:+.2f}, {interval.high:+.2f}]"
+    word = WORDS.get(found.kind, "not shown")
+    return name, f"{found.estimate:+.2f}", shown, str(found.seeds), word
+
+
+def _headlines(table: Table) -> list[Column]:
+    counted = [column for column in table.columns if is_counted(column)]
+    parts = ("", f"{names.DAY}/", f"{names.NIGHT}/")
+    headlines = {part + score for part in parts for score in HEADLINES}
+    return [column for column in counted if column.metric in headlines] or counted

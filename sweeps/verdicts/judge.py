@@ -1,0 +1,277 @@
+"""Judges the claims of a table by its finished runs, and marks the rows that are shown to be best.
+
+A contrast is formed for each seed that all its rows have, because the runs of one seed share their
+initial weights and the order of their data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from statistics import fmean
+
+from analysis.uncertainty.contrasts import Evidence, Resampler, Term
+from analysis.uncertainty.verdicts import FixedSeeds, Rule, Verdict, decide
+
+from analysis.uncertainty import Resampling
+from rgbt.checks import InputError
+from rgbt.metrics.counts import Counts
+from sweeps.table.cells import CellId, CellRun, ScoredRun, counts_path, is_counted, metric_of
+from sweeps.table.claim import Claim
+from sweeps.table.table import Table
+from sweeps.verdicts.contrasts import Contrast, base_scores, contrasts_of, printed_value
+
+RESAMPLES = 2_000
+"""Of the images: enough for a standard error, which is known to 2 % then."""
+
+CellRunId = tuple[str, int]
+"""(label of the row, seed); the seed of a row that was not trained here is `FIXED`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class JudgedClaim:
+    """A claim with its verdict.
+
+    Attributes:
+        table: its name, e.g. "spatialseg/table3".
+        verdict: None where no contrast could be computed.
+        contrast: the one whose numbers the verdict shows; of a mean, the claim itself.
+        printed: the same contrast of the printed values; None where one is missing.
+        as_printed: whether the printed values agree with the claim; None: some are missing.
+        missing: labels of rows without a score, in the order of the table.
+        reason: why there is no verdict, or why it is undecided; one sentence, or "".
+    """
+
+    table: str
+    claim: Claim
+    verdict: Verdict | None
+    contrast: str
+    printed: float | None
+    as_printed: bool | None
+    missing: tuple[str, ...] = ()
+    reason: str = ""
+
+    @property
+    def word(self) -> str:
+        """The kind of the verdict: "holds", "contradicted", "undecided"; or "not run"."""
+        return "not run" if self.verdict is None else self.verdict.kind
+
+
+@dataclass
+class TableJudge:
+    """Judges claims of one table; keeps counts and resampled scores between calls.
+
+    Attributes:
+        name: of the table.
+        rule: when a claim is decided.
+        settings: of the resampling of images.
+    """
+
+    name: str
+    table: Table
+    rule: Rule = field(default_factory=FixedSeeds)
+    settings: Resampling = field(default_factory=lambda: Resampling(resamples=RESAMPLES))
+
+    def __post_init__(self) -> None:
+        self._rows = {row.label: row for row in self.table.rows}
+        self._resampler = Resampler(self.settings)
+        self._counts: dict[tuple[str, str], Counts] = {}
+
+    def claims(self, runs: Mapping[CellRunId, CellRun]) -> list[JudgedClaim]:
+        """Every claim of the table, judged by the finished ones of `runs`."""
+        return [self.judge(claim, runs) for claim in self.table.claims]
+
+    def judge(self, claim: Claim, runs: Mapping[CellRunId, CellRun]) -> JudgedClaim:
+        """One claim; a contrast without scores leaves a claim about all of them undecided."""
+        contrasts = contrasts_of(claim, self.table)
+        printed = [printed_value(each, self.table) for each in contrasts]
+        known: list[int] = []
+        evidences: list[Evidence] = []
+        reasons: dict[str, None] = {}
+        if claim.combine == "mean":
+            weights = [(1 / len(contrasts), each) for each in contrasts]
+            groups = [weights]
+        else:
+            groups = [[(1.0, each)] for each in contrasts]
+        for index, group in enumerate(groups):
+            try:
+                evidences.append(self.evidence(group, runs))
+                known.append(index)
+            except InputError as error:
+                reasons[str(error)] = None
+        missing = self._missing(contrasts, runs)
+        agrees = _as_printed(claim, printed)
+        if not evidences:
+            return JudgedClaim(
+                table=self.name,
+                claim=claim,
+                verdict=None,
+                contrast=contrasts[0].label,
+                printed=_mean(printed) if claim.combine == "mean" else printed[0],
+                as_printed=agrees,
+                missing=missing,
+                reason=next(iter(reasons), ""),
+            )
+        verdict = decide(evidences, claim.range, self.rule, claim.combine)
+        shown = known[verdict.decisive]
+        is_partial = len(evidences) < len(groups)
+        if is_partial:
+            verdict = _of_a_part(verdict, claim, next(iter(reasons)))
+        mean = claim.combine == "mean"
+        return JudgedClaim(
+            table=self.name,
+            claim=claim,
+            verdict=verdict,
+            contrast=f"mean of {len(contrasts)} contrasts" if mean else contrasts[shown].label,
+            printed=_mean(printed) if mean else printed[shown],
+            as_printed=agrees,
+            missing=missing,
+            reason=verdict.reason,
+        )
+
+    def evidence(
+        self, contrasts: Sequence[tuple[float, Contrast]], runs: Mapping[CellRunId, CellRun]
+    ) -> Evidence:
+        """What finished runs say about a weighted sum of contrasts.
+
+        Raises:
+            InputError: a row without a finished run, or counts that cannot be compared.
+        """
+        terms = [
+            term
+            for weight, contrast in contrasts
+            for part, row, column in contrast.cells()
+            for term in self._terms(weight * part, row, column, runs)
+        ]
+        return self._resampler.evidence(terms)
+
+    def marks(self, runs: Mapping[CellRunId, CellRun]) -> dict[CellId, int]:
+        """Rank 1 of a row that is shown to be better than all others of a column; 2 the next.
+
+        A row is shown to be better where the interval of its difference to each other row excludes
+        0. Rows of the same runs share a mark. Nothing is marked with fewer than two seeds.
+        """
+        marks: dict[CellId, int] = {}
+        for column in self.table.columns:
+            if column.best == "none" or not (is_counted(column) or column.sources):
+                continue
+            left = self._labels(column.name, runs)
+            for rank in (1, 2):
+                best = self._best(column.name, column.best == "highest", left, runs)
+                if not best:
+                    break
+                marks |= {(label, column.name): rank for label in best}
+                left = [label for label in left if label not in best]
+        return marks
+
+    def _best(
+        self, column: str, highest: bool, labels: Sequence[str], runs: Mapping[CellRunId, CellRun]
+    ) -> list[str]:
+        """The row, and others of the same runs, that is shown to be better than all of `labels`."""
+        means: dict[str, float] = {}
+        for label in labels:
+            try:
+                found = self.evidence([(1.0, Contrast(label, None, column))], runs)
+            except InputError:
+                continue
+            means[label] = fmean(found.values)
+        if len(means) < 2:
+            return []
+        best = (max if highest else min)(means, key=lambda label: means[label])
+        same = [label for label in means if _keys(label, runs) == _keys(best, runs)]
+        others = [Contrast(best, label, column) for label in means if label not in same]
+        if not others:
+            return []
+        wanted = Claim(
+            name="best",
+            says="",
+            source="",
+            rows=(best,),
+            columns=(column,),
+            expected="higher" if highest else "lower",
+        ).range
+        try:
+            shown = [self.evidence([(1.0, each)], runs) for each in others]
+        except InputError:
+            return []
+        return same if decide(shown, wanted, self.rule, "all").kind == "holds" else []
+
+    def _labels(self, column: str, runs: Mapping[CellRunId, CellRun]) -> list[str]:
+        present = dict.fromkeys(label for label, _ in runs)
+        names = {label: self.table.columns_of(self._rows[label]) for label in present}
+        return [label for label in present if column in {each.name for each in names[label]}]
+
+    def _terms(
+        self, weight: float, label: str, name: str, runs: Mapping[CellRunId, CellRun]
+    ) -> Iterable[Term]:
+        row = self._rows[label]
+        if name not in {column.name for column in self.table.columns_of(row)}:
+            raise InputError(f"row '{label}' has no score '{name}'.")
+        finished = {
+            seed: run.results[0]
+            for (each, seed), run in runs.items()
+            if each == label and run.state == "finished" and run.results
+        }
+        if not finished:
+            raise InputError(f"row '{label}' has no finished run.")
+        for part, column in base_scores(self.table, row, name):
+            if not is_counted(column):
+                raise InputError(f"column '{column.name}' is not a score of images.")
+            path = counts_path(column, self.table)
+            yield Term(
+                weight=weight * part,
+                metric=metric_of(column, row),
+                counts={seed: self._loaded(run.key, path, run) for seed, run in finished.items()},
+                keys={seed: f"{run.key}/{path}" for seed, run in finished.items()},
+            )
+
+    def _loaded(self, key: str, path: str, run: ScoredRun) -> Counts:
+        if (key, path) not in self._counts:
+            try:
+                self._counts[key, path] = run.counts(path)
+            except OSError as error:
+                raise InputError(f"run {key}: {error}") from error
+        return self._counts[key, path]
+
+    def _missing(
+        self, contrasts: Sequence[Contrast], runs: Mapping[CellRunId, CellRun]
+    ) -> tuple[str, ...]:
+        """Rows of the contrasts without a finished run."""
+        needed = {label for each in contrasts for label in each.rows}
+        finished = {label for (label, _), run in runs.items() if run.state == "finished"}
+        return tuple(label for label in self._rows if label in needed - finished)
+
+
+def _keys(label: str, runs: Mapping[CellRunId, CellRun]) -> frozenset[str]:
+    """Keys of the finished runs of a row."""
+    found = (run for (each, _), run in runs.items() if each == label)
+    return frozenset(result.key for run in found for result in run.results)
+
+
+def _as_printed(claim: Claim, printed: Sequence[float | None]) -> bool | None:
+    """Whether the printed values agree with the claim; None where some are missing."""
+    values = [value for value in printed if value is not None]
+    if len(values) < len(printed):
+        return None
+    low, high = claim.range
+    if claim.combine == "mean":
+        return low < fmean(values) < high
+    inside = sum(low < value < high for value in values)
+    least = {"all": len(values), "most": len(values) // 2 + 1, "any": 1}[claim.combine]
+    return inside >= least
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return fmean(known) if len(known) == len(values) else None
+
+
+def _of_a_part(verdict: Verdict, claim: Claim, reason: str) -> Verdict:
+    """The verdict of a claim of which some contrasts have no scores.
+
+    "all" cannot hold and "any" cannot be contradicted without them; "most" stays open.
+    """
+    stands = {"all": "contradicted", "any": "holds"}.get(claim.combine)
+    if verdict.kind == stands:
+        return verdict
+    return replace(verdict, kind="undecided", reason=f"Some rows have no score: {reason}")

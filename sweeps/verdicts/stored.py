@@ -1,0 +1,72 @@
+"""Finished runs of a table's rows in a folder of runs, found without running anything."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from analysis.uncertainty.verdicts import AnyTime, FixedSeeds, Rule
+from rgbt.checks import InputError
+from rgbt.tracking.run_folder import runs_in
+from rgbt.tracking.run_result import RunResult
+from sweeps.table.request import UNTIL_DECIDED, TableRequest
+from sweeps.verdicts.judge import CellRunId
+from sweeps.worker.planner import specify_run
+
+SEED = "rgbt.seed"
+
+
+@dataclass(frozen=True)
+class StoredRun:
+    """A finished run, as `sweeps.table.cells.CellRun`."""
+
+    results: tuple[RunResult, ...]
+    state: str = "finished"
+    reason: str = ""
+
+
+def finished_by_seed(runs_dir: Path) -> dict[int, set[str]]:
+    """Keys of the finished runs of a folder by their seed; damaged runs are left out.
+
+    Raises:
+        InputError: there is no such folder.
+    """
+    found: dict[int, set[str]] = {}
+    for folder in runs_in(runs_dir):
+        run = RunResult(folder.path)
+        with suppress(InputError, ValueError, TypeError):
+            if run.is_finished:
+                found.setdefault(int(run.tags[SEED]), set()).add(run.key)
+    return found
+
+
+def stored_runs(
+    request: TableRequest, runs_dir: Path, finished: Mapping[int, Collection[str]]
+) -> dict[CellRunId, StoredRun]:
+    """The finished runs of every row; rows that cannot be composed have none.
+
+    Args:
+        request: the table; its seeds do not matter.
+        runs_dir: the folder of runs.
+        finished: see `finished_by_seed`.
+    """
+    runs: dict[CellRunId, StoredRun] = {}
+    for row in request.trained_rows:
+        try:
+            spec = specify_run(request.overrides(row.label, 0))
+            keys = {seed: spec.with_seed(seed).key for seed in finished}
+        except InputError:
+            continue
+        for seed, key in sorted(keys.items()):
+            if key in finished[seed]:
+                runs[row.label, seed] = StoredRun((RunResult(runs_dir / key),))
+    return runs
+
+
+def rule_of(request: TableRequest, runs: Mapping[CellRunId, StoredRun]) -> Rule:
+    """The rule that the runs allow: valid at any time where their number was decided by results."""
+    tag = UNTIL_DECIDED + request.name
+    tagged = any(tag in result.tags for run in runs.values() for result in run.results)
+    return AnyTime() if tagged else FixedSeeds()
