@@ -19,7 +19,7 @@ from sweeps.rendering.terminal import terminal
 from sweeps.report.records import record
 from sweeps.table.cells import NO_VALUE, CellRun
 from sweeps.table.request import TableRequest, parameter_cells
-from sweeps.table.scoring import ScoredTable, score
+from sweeps.table.scoring import ScoredTable, score, size_marks
 from sweeps.verdicts.forms import forms_grid
 from sweeps.verdicts.judge import CellRunId, JudgedClaim, TableJudge
 from sweeps.worker.point_list import other_code_line
@@ -68,7 +68,7 @@ def publish_table(
     scored = replace(
         score(request.name, request.table, runs, scale=request.scale, sizes=sizes),
         form=request.form,
-        marks=judge.marks(runs),
+        marks=judge.marks(runs) | size_marks(request.table, sizes),
     )
     findings = Findings(claims=judge.claims(runs), forms=forms_grid(judge, runs))
     rendered = render_table(scored, request.typed_overrides())

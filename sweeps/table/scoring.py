@@ -98,3 +98,21 @@ def score(
         cells=cells,
         commits=Counter(commit for commit in made_by.values() if commit is not None),
     )
+
+
+def size_marks(table: Table, sizes: Mapping[CellId, TableCell]) -> dict[CellId, int]:
+    """Marks of columns that are counted without a run and so are exact: 1 best, 2 second best.
+
+    Sizes that are equal as shown share a mark. Where all are equal none has one.
+    """
+    marks: dict[CellId, int] = {}
+    for column in table.columns:
+        values = {
+            cell_id: round(cell.mean, 2)
+            for cell_id, cell in sizes.items()
+            if cell_id[1] == column.name and not math.isnan(cell.mean)
+        }
+        best = sorted(set(values.values()), reverse=column.best == "highest")[:2]
+        if column.best != "none" and len(best) == 2:
+            marks |= {each: best.index(v) + 1 for each, v in values.items() if v in best}
+    return marks

@@ -12,7 +12,7 @@ from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import Protocol, partition_name
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Point
-from sweeps.table.cells import OWN_COUNTS
+from sweeps.table.cells import OWN_COUNTS, CellId
 from sweeps.table.scoring import ScoredTable, score
 from sweeps.table.table import Column, Row, Table
 from sweeps.worker.trial_sources import Outcome
@@ -101,10 +101,13 @@ class Made:
         )
         return table(rows, **self.others)
 
-    def scored(self) -> ScoredTable:
-        runs = {
+    def runs(self) -> dict[tuple[str, int], Outcome]:
+        return {
             (label, seed): outcome(f"{label}{seed}", right(share))
             for label, (shares, _) in self.rows.items()
             for seed, share in enumerate(shares)
         }
-        return score("own/made", self.table(), runs, scale="demo")
+
+    def scored(self, marks: Mapping[CellId, int] | None = None) -> ScoredTable:
+        found = score("own/made", self.table(), self.runs(), scale="demo")
+        return replace(found, marks=marks or {})

@@ -4,13 +4,14 @@ import csv
 import io
 import math
 import re
+from dataclasses import replace
 from typing import Any
 
 import pytest
 from rich.text import Text as RichText
 
 from sweeps.rendering.file_formats import latex, markdown, tidy_csv
-from sweeps.rendering.rendered_table import DEMO, PARAMETERS, render_table
+from sweeps.rendering.rendered_table import DEMO, FORMS, PARAMETERS, render_table
 from sweeps.rendering.terminal import terminal
 from sweeps.table.cells import TableCell
 from sweeps.table.scoring import ScoredTable, score
@@ -37,20 +38,29 @@ def words(scored: ScoredTable) -> list[list[str]]:
 
 
 def test_terminal_few_columns_are_on_one_line() -> None:
-    shown = words(Made(ROWS).scored())
+    shown = words(Made(ROWS).scored({("b", "acc"): 1, ("a_1", "acc"): 2}))
     assert shown[0] == ["own,", "TABLE", "I:", "Rows"]
     assert shown[1] == ["seeds", "acc", "published", "difference"]
-    assert shown[3] == ["a_1", "3", "_50.00", "±", "10.00", "_48.0", "+2.00"]
+    assert shown[3] == ["a_1", "3", "_50.00", "±", "10.00", "48.0", "+2.00"]
     assert shown[4] == ["b", "3", "*70.00", "±", "10.00", "47.5", "+22.50"]
-    assert shown[5] == ["theirs", "-", "*50.0", "-"]
+    assert shown[5] == ["theirs", "-", "50.0", "-"]
 
 
-def test_terminal_shows_order_of_rows_and_remarks_below() -> None:
+def test_terminal_shows_remarks_below() -> None:
     shown = lines(Made({"a": ((1,), 1.0), "b": ((2,), 3.0), "c": ((3,), 2.0)}).scored())
-    assert re.fullmatch(r"order of rows: rho +\+0.50", shown[6])
-    assert re.fullmatch(r"n +3", shown[7])
-    assert shown[9:11] == ["Published: somewhere; percent.", "Ours: scale=demo, of seed 0."]
+    assert shown[7:10] == [
+        *("Published: somewhere; percent.", "Ours: scale=demo, of seed 0."),
+        FORMS["paper"],
+    ]
     assert DEMO in shown
+
+
+def test_terminal_names_the_form_and_many_seeds() -> None:
+    forms = {"released": "The rows use the masks of the release."}
+    made = Made({"a": (tuple(range(5)), 1.0)}, {"forms": forms}).scored()
+    assert "Ours: scale=demo, mean ± standard deviation (n - 1) over seeds 0 to 4." in lines(made)
+    assert FORMS["paper"] in lines(made)
+    assert forms["released"] in lines(replace(made, form="released"))
 
 
 def test_unprinted_column_has_no_published_cell() -> None:
@@ -66,9 +76,7 @@ def test_unprinted_column_has_no_published_cell() -> None:
     scored = score("t", table(rows, columns), runs, scale="demo")
     shown = words(scored)
     assert shown[1] == ["seeds", "acc", "published", "difference", "own[1]"]
-    assert shown[3] == ["a", "1", "*3.00", "*48.5", "-45.50", "*3.00"]
-    assert shown[6] == ["order", "of", "rows:", "rho", "+1.00", "-"]
-    assert shown[7] == ["n", "3", "0"]
+    assert shown[3] == ["a", "1", "3.00", "48.5", "-45.50", "3.00"]
     assert "[1] Not in the paper." in lines(scored)
     body = [line for line in latex(render_table(scored)).splitlines() if line.endswith(r"\\")]
     assert {line.count(" & ") for line in body} == {5}

@@ -9,7 +9,7 @@ import pytest
 from rgbt.checks import InputError
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.table.cells import TableCell
-from sweeps.table.scoring import ScoredTable, check_metrics, published, score
+from sweeps.table.scoring import ScoredTable, check_metrics, published, score, size_marks
 from sweeps.table.table import Column, Row
 from tests.sweeps.tabled import Made, counts_of, failed, outcome, pairs_of, right, table
 
@@ -39,44 +39,6 @@ def test_score_mean_sd_and_difference_by_hand() -> None:
     assert found.difference(row, column) == 2.0
     assert (found.seeds, cell.reason) == ((0, 1, 2), "")
     assert math.isnan(Made({"a": ((40,), None)}).scored().cells["a", "acc"].sd)
-
-
-@pytest.mark.parametrize(
-    ("best", "ours"),
-    [("highest", {"b": 1, "c": 2}), ("lowest", {"a": 1, "c": 2}), ("none", {})],
-)
-def test_score_ranks_follow_direction(best: Any, ours: dict[str, int]) -> None:
-    rows = {"a": ((40,), 9.0), "b": ((60,), 8.0), "c": ((50,), 7.0)}
-    column = Column(name="acc", metric="pixel_accuracy", best=best)
-    found = Made(rows, {"columns": (column,)}).scored()
-    assert found.ranks_ours == {(label, "acc"): rank for label, rank in ours.items()}
-    if best == "highest":
-        assert found.ranks_published == {("a", "acc"): 1, ("b", "acc"): 2}
-
-
-def test_score_ties_share_rank_and_equal_columns_have_none() -> None:
-    tied = Made({"a": ((60,), 5.0), "b": ((60,), 5.0), "c": ((50,), 5.0)}).scored()
-    assert tied.ranks_ours == {("a", "acc"): 1, ("b", "acc"): 1, ("c", "acc"): 2}
-    assert tied.ranks_published == {}
-
-
-@pytest.mark.parametrize(
-    ("printed", "ours", "rho"),
-    [
-        # ranks of ours 1 2 3 4, printed 1 3 2 4: rho = 1 - 6 * 2 / (4 * 15) = 0.8
-        ((10.0, 30.0, 20.0, 40.0, None), (1, 2, 3, 4, 5), 0.8),
-        ((10.0, 30.0), (1, 2), math.nan),
-        ((10.0, 30.0, 20.0), (1, 1, 1), math.nan),
-        ((None,), (1,), math.nan),
-    ],
-)
-def test_score_order_is_rank_correlation(
-    printed: tuple[float | None, ...], ours: tuple[int, ...], rho: float
-) -> None:
-    rows = {str(n): ((mine,), theirs) for n, (mine, theirs) in enumerate(zip(ours, printed))}
-    order = Made(rows).scored().orders["acc"]
-    assert order.rho == pytest.approx(rho, nan_ok=True)
-    assert order.rows == sum(value is not None for value in printed)
 
 
 def test_score_derived_columns_are_per_seed() -> None:
@@ -155,7 +117,7 @@ def test_score_regions_of_table_and_placeholders() -> None:
     assert found.cells["car", "R2"].mean == pytest.approx(80.0)
 
 
-def test_score_sizes_have_ranks_without_seeds() -> None:
+def test_score_sizes_have_marks_without_seeds() -> None:
     size = Column(name="size", parameters=True, best="lowest")
     rows = tuple(
         Row(label=label, experiment="crm", values={"size": printed})
@@ -168,9 +130,14 @@ def test_score_sizes_have_ranks_without_seeds() -> None:
     found = score("t", table(rows, (ACC, size)), BOTH, scale="demo", sizes=sizes)
     assert found.cells["a", "acc"].seeds == 2
     assert found.cells["b", "size"].mean == 44.56
-    assert found.ranks_ours == {("b", "size"): 1, ("c", "size"): 2}
+    assert size_marks(found.table, sizes) == {("b", "size"): 1, ("c", "size"): 2}
+    shared = sizes | {("c", "size"): TableCell(44.56, math.nan, 0)}
+    assert size_marks(found.table, shared) == {
+        **{("b", "size"): 1, ("c", "size"): 1, ("a", "size"): 2}
+    }
+    equal = {each: TableCell(1.0, math.nan, 0) for each in sizes}
+    assert size_marks(found.table, equal) == {}
     assert found.difference(rows[0], size) == pytest.approx(-0.04)
-    assert (found.orders["size"].rho, found.orders["size"].rows) == (pytest.approx(1.0), 3)
     assert scored((size,), {}, rows).cells == {}
 
 
@@ -204,9 +171,6 @@ def test_score_protocols_have_separate_counts() -> None:
     assert means["b", "CA"] == pytest.approx(100 * 8 / (8 + 10 + 10 - 2 * 8) / 2)
     assert means["a", "TC aligned"] == pytest.approx(80.0)
     assert means["c", "TC aligned"] == 100.0
-    assert found.orders["TC"].rho == pytest.approx(-0.5)  # ours 2 3 1 for 1 2 3
-    assert found.orders["TC aligned"].rows == 0
-    assert found.ranks_ours["c", "TC aligned"] == 1
     assert math.isnan(found.difference(rows[0], columns[3]))
 
 
