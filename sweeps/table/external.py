@@ -1,0 +1,134 @@
+"""Rows of a table that are evaluated and not trained: files of weights, folders of predictions.
+
+The command line names them as ``weights.LABEL=FILE`` and ``predictions.LABEL=FOLDER``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+from rgbt.checks import InputError, nearest
+from rgbt.config.compose import available
+from rgbt.config.options import with_home
+from sweeps.table.table import Row, Table
+
+Kind = Literal["weights", "predictions"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+
+
+@dataclass(frozen=True)
+class ExternalRow:
+    """A row whose counts are made from a path of the user.
+
+    Attributes:
+        label: of the row, as in the table.
+        kind: "weights": a file that the row's network is evaluated with; "predictions": a folder of
+            predicted label images.
+        path: of the file or folder, absolute.
+    """
+
+    label: str
+    kind: Kind
+    path: Path
+
+
+def external_rows(words: Sequence[str], table: Table) -> tuple[list[ExternalRow], list[str]]:
+    """Separate the words about external rows from the overrides.
+
+    A LABEL is that of a row, in upper or lower case. It may omit parentheses ("A" for "(A)") and,
+    where one row remains, words after the first ("CMX" or "CMX-B2" for "CMX (MiT-B2)").
+
+    Args:
+        words: overrides as typed.
+        table: with the rows that are named.
+
+    Returns:
+        the external rows in the order of the table, and all other words.
+
+    Raises:
+        InputError: no such row or several, a row that is named twice or has no network for
+            weights, or a path that does not exist.
+    """
+    found: dict[str, ExternalRow] = {}
+    others = []
+    for word in words:
+        kind = next((each for each in KINDS if word.startswith(f"{each}.")), None)
+        if kind is None:
+            others.append(word)
+            continue
+        row = _external_row(word, kind, table)
+        if row.label in found:
+            raise InputError(
+                f"'{word}': row '{row.label}' already has {found[row.label].kind} "
+                f"({found[row.label].path}); remove one of the two."
+            )
+        found[row.label] = row
+    return [found[row.label] for row in table.rows if row.label in found], others
+
+
+def _external_row(word: str, kind: Kind, table: Table) -> ExternalRow:
+    row, text = _named_row(word, kind, table)
+    if kind == "weights" and not row.network and row.experiment is None:
+        raise InputError(
+            f"'{word}': row '{row.label}' has no network that weights can be loaded into; give its "
+            f"predictions with {KINDS[1]}.{row.label}=FOLDER."
+        )
+    path = Path(with_home(text)).absolute()
+    if not text or not (path.is_file() if kind == "weights" else path.is_dir()):
+        wanted = "file of weights" if kind == "weights" else "folder of predicted label images"
+        raise InputError(f"'{word}': '{text}' is not a {wanted}; give the path of one.")
+    return ExternalRow(row.label, kind, path)
+
+
+def _named_row(word: str, kind: Kind, table: Table) -> tuple[Row, str]:
+    """The row that a word names, and the text after its label; a label may hold "="."""
+    rest = word.removeprefix(f"{kind}.")
+    if "=" not in rest:
+        example = "FILE" if kind == "weights" else "FOLDER"
+        raise InputError(f"'{word}': expected {kind}.LABEL={example}.")
+    cuts = [match.start() for match in re.finditer("=", rest)]
+    for cut in cuts:
+        rows = rows_called(rest[:cut], table)
+        if rows:
+            break
+    else:
+        cut = cuts[0]
+    name = rest[:cut]
+    labels = [row.label for row in table.rows]
+    if not rows:
+        hint = ""
+        if kind == "weights" and name in available("model"):
+            hint = f" Initial weights of trained rows are given with pretrained.{name}=FILE."
+        raise InputError(f"'{word}': the table has no row '{name}'; {nearest(name, labels)}.{hint}")
+    if len(rows) > 1:
+        several = ", ".join(f"'{row.label}'" for row in rows)
+        raise InputError(f"'{word}': '{name}' may be any of the rows {several}; name one of them.")
+    return rows[0], rest[cut + 1 :]
+
+
+def rows_called(name: str, table: Table) -> list[Row]:
+    """Rows that `name` may mean: those that agree with it in the strictest of several ways."""
+    ways = (
+        lambda label: label == name,
+        lambda label: _plain(label) == _plain(name),
+        lambda label: _plain(re.sub(r"[()]", "", label)) == _plain(name),
+        lambda label: _plain(re.sub(r"\([^)]*\)", "", label)) == _plain(name),
+        lambda label: _abbreviates(name, label),
+    )
+    found = ([row for row in table.rows if agrees(row.label)] for agrees in ways)
+    return next(filter(None, found), [])
+
+
+def _plain(text: str) -> str:
+    return " ".join(text.casefold().split())
+
+
+def _abbreviates(name: str, label: str) -> bool:
+    """Whether the words of `name` are words of `label` in their order, the first one included."""
+    short, words = (re.findall(r"[^\W_]+", text.casefold()) for text in (name, label))
+    rest = iter(words)
+    return bool(short) and short[:1] == words[:1] and all(word in rest for word in short)
