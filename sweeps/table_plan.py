@@ -8,14 +8,13 @@ from pathlib import Path
 
 from analysis.uncertainty.contrasts import FIXED
 from analysis.uncertainty.verdicts import AnyTime, FixedSeeds
-
 from rgbt.checks import InputError
 from sweeps.table.cells import CellRun
 from sweeps.table.external import ExternalRow
+from sweeps.table.external_runs import run_external
 from sweeps.table.request import TableRequest
 from sweeps.verdicts.judge import CellRunId, TableJudge
 from sweeps.verdicts.until_decided import SeedsUntilDecided
-from sweeps.worker.external_runs import run_external
 from sweeps.worker.point_list import PointList
 from sweeps.worker.run_store import RunStore
 

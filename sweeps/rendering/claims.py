@@ -84,18 +84,19 @@ def claims_csv(judged: Sequence[JudgedClaim]) -> str:
     """One line per claim; columns: `CSV_HEADER`, empty where there is no value."""
     rows: list[tuple[object, ...]] = [CSV_HEADER]
     for each in judged:
-        found, claim = each.verdict, each.claim
-        interval = None if found is None else found.interval
-        rows.append(
-            (
-                *(each.table, claim.name, claim.source, claim.says, each.word, each.contrast),
-                *(_plain(found and found.estimate), _plain(interval and interval.low)),
-                *(_plain(interval and interval.high), found.covers if found else ""),
-                *(_plain(each.printed), "" if each.as_printed is None else each.as_printed),
-                *(_plain(found and found.smallest), found.seeds if found else 0),
-                *(_plain(found and found.seeds_needed), " | ".join(each.missing), each.reason),
+        claim = each.claim
+        about = (each.table, claim.name, claim.source, claim.says, each.word, each.contrast)
+        printed = (_plain(each.printed), "" if each.as_printed is None else each.as_printed)
+        numbers = ("", "", "", "", *printed, "", 0, "")
+        if each.verdict is not None:
+            found = each.verdict
+            interval = found.interval
+            ends = ("", "") if interval is None else (_plain(interval.low), _plain(interval.high))
+            numbers = (
+                *(_plain(found.estimate), *ends, found.covers, *printed),
+                *(_plain(found.smallest), found.seeds, _plain(found.seeds_needed)),
             )
-        )
+        rows.append((*about, *numbers, " | ".join(each.missing), each.reason))
     return csv_text(rows)
 
 

@@ -3,7 +3,6 @@ from __future__ import annotations
 import csv
 import io
 import math
-import re
 from dataclasses import replace
 from typing import Any
 
@@ -14,10 +13,11 @@ from sweeps.rendering.file_formats import latex, markdown, tidy_csv
 from sweeps.rendering.rendered_table import DEMO, FORMS, PARAMETERS, render_table
 from sweeps.rendering.terminal import terminal
 from sweeps.table.cells import TableCell
-from sweeps.table.scoring import ScoredTable, score
+from sweeps.table.scoring import ScoredTable, score, size_marks
 from sweeps.table.table import Column, Row
 from tests.sweeps.tabled import Made, failed, outcome, right, table
 
+MARKS = {("b", "acc"): 1, ("a_1", "acc"): 2}
 ROWS = {"a_1": ((40, 50, 60), 48.0), "b": ((60, 70, 80), 47.5), "theirs": ((), 50.0)}
 WIDE = tuple(Column(name=f"name_{n}", metric="pixel_accuracy") for n in range(13))
 STACKED = WIDE[:4]
@@ -38,7 +38,7 @@ def words(scored: ScoredTable) -> list[list[str]]:
 
 
 def test_terminal_few_columns_are_on_one_line() -> None:
-    shown = words(Made(ROWS).scored({("b", "acc"): 1, ("a_1", "acc"): 2}))
+    shown = words(Made(ROWS).scored(MARKS))
     assert shown[0] == ["own,", "TABLE", "I:", "Rows"]
     assert shown[1] == ["seeds", "acc", "published", "difference"]
     assert shown[3] == ["a_1", "3", "_50.00", "±", "10.00", "48.0", "+2.00"]
@@ -126,11 +126,11 @@ def test_terminal_aligns_numbers_behind_footnotes() -> None:
 
 
 def test_terminal_styles_best_where_shown() -> None:
-    text = terminal(render_table(Made(ROWS).scored()), plain=False)
+    text = terminal(render_table(Made(ROWS).scored(MARKS)), plain=False)
     styled = {text.plain[span.start : span.end]: span.style for span in text.spans}
     assert isinstance(text, RichText)
-    assert (styled["70.00"], styled["48.0"]) == ("bold", "underline")
-    assert "Bold: best, underlined: second best." in text.plain
+    assert (styled["70.00"], styled["50.00"]) == ("bold", "underline")
+    assert "Bold: shown to be the best of our rows, underlined: the second best." in text.plain
 
 
 def test_render_table_numbers_and_shares_footnotes() -> None:
@@ -173,33 +173,35 @@ def test_render_table_of_sizes_has_no_seeds() -> None:
         for label, printed in (("a", 54.4), ("b", 44.6))
     )
     counted = {(r.label, "size"): TableCell(m, math.nan, 0) for r, m in zip(rows, (54.361, 44.56))}
-    scored = score("own/t", table(rows, (size,)), {}, scale="demo", sizes=counted)
+    made = table(rows, (size,))
+    scored = score("own/t", made, {}, scale="demo", sizes=counted)
+    scored = replace(scored, marks=size_marks(made, counted))
     shown = words(scored)
-    assert shown[3] == ["a", "_54.36", "_54.4", "-0.04"]
-    assert shown[4] == ["b", "*44.56", "*44.6", "-0.04"]
+    assert shown[3] == ["a", "_54.36", "54.4", "-0.04"]
+    assert shown[4] == ["b", "*44.56", "44.6", "-0.04"]
     assert PARAMETERS in lines(scored)
     assert not any("scale=demo" in line for line in lines(scored))
-    assert r"a &  & \underline{54.36} & \underline{54.4} & -0.04 \\" in latex(render_table(scored))
-    assert "| b |  | **44.56** | **44.6** | -0.04 |" in markdown(render_table(scored))
+    assert r"a &  & \underline{54.36} & 54.4 & -0.04 \\" in latex(render_table(scored))
+    assert "| b |  | **44.56** | 44.6 | -0.04 |" in markdown(render_table(scored))
     first, _ = csv.DictReader(io.StringIO(tidy_csv(scored)))
     assert (first["mean"], first["sd"], first["n"], first["runs"]) == ("54.361", "", "0", "")
 
 
 def test_markdown_read_back() -> None:
-    text = markdown(render_table(Made(ROWS).scored()))
+    text = markdown(render_table(Made(ROWS).scored(MARKS)))
     rows = [
         [cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines()[2:7]
     ]
     assert rows[0] == ["", "seeds", "acc", "published", "difference"]
-    assert rows[2] == ["a_1", "3", "<u>50.00 ± 10.00</u>", "<u>48.0</u>", "+2.00"]
+    assert rows[2] == ["a_1", "3", "<u>50.00 ± 10.00</u>", "48.0", "+2.00"]
     assert rows[3][2] == "**70.00 ± 10.00**"
-    assert "- Bold: best, underlined: second best." in text
+    assert "- Bold: shown to be the best of our rows, underlined: the second best." in text
 
 
 def test_latex_escapes_and_omits_differences() -> None:
-    text = latex(render_table(Made(ROWS).scored()))
+    text = latex(render_table(Made(ROWS).scored(MARKS)))
     assert r"\begin{tabular}{lrrrr}" in text
-    assert r"a\_1 & 3 & \underline{50.00 $\pm$ 10.00} & \underline{48.0} & +2.00 \\" in text
+    assert r"a\_1 & 3 & \underline{50.00 $\pm$ 10.00} & 48.0 & +2.00 \\" in text
     assert r"\textbf{70.00 $\pm$ 10.00}" in text
     stacked = latex(render_table(wide(STACKED, caption=r"50% of A_b \ {c}")))
     assert r"50\% of A\_b \textbackslash{} \{c\}" in stacked
