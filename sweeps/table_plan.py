@@ -11,7 +11,7 @@ from analysis.uncertainty.verdicts import AnyTime, FixedSeeds
 from rgbt.checks import InputError
 from sweeps.table.cells import CellRun
 from sweeps.table.external import ExternalRow
-from sweeps.table.external_runs import run_external
+from sweeps.table.external_runs import check_external, run_external
 from sweeps.table.request import TableRequest
 from sweeps.verdicts.judge import CellRunId, TableJudge
 from sweeps.verdicts.until_decided import SeedsUntilDecided
@@ -103,4 +103,5 @@ class TablePlan:
             base=self.points.base,
             runs_dir=runs_dir,
         )
+        check_external(runs)
         self.external.update({(label, FIXED): run for label, run in runs.items()})
