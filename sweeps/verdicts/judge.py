@@ -10,10 +10,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from statistics import fmean
 
+from analysis.uncertainty import Resampling
 from analysis.uncertainty.contrasts import Evidence, Resampler, Term
 from analysis.uncertainty.verdicts import FixedSeeds, Rule, Verdict, decide
-
-from analysis.uncertainty import Resampling
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from sweeps.table.cells import CellId, CellRun, ScoredRun, counts_path, is_counted, metric_of
@@ -64,17 +63,18 @@ class TableJudge:
     Attributes:
         name: of the table.
         rule: when a claim is decided.
-        settings: of the resampling of images.
+        resamples: of the images.
     """
 
     name: str
     table: Table
     rule: Rule = field(default_factory=FixedSeeds)
-    settings: Resampling = field(default_factory=lambda: Resampling(resamples=RESAMPLES))
+    resamples: int = RESAMPLES
 
     def __post_init__(self) -> None:
         self._rows = {row.label: row for row in self.table.rows}
-        self._resampler = Resampler(self.settings)
+        settings = Resampling(resamples=self.resamples, absent=self.table.absent)
+        self._resampler = Resampler(settings)
         self._counts: dict[tuple[str, str], Counts] = {}
 
     def claims(self, runs: Mapping[CellRunId, CellRun]) -> list[JudgedClaim]:

@@ -1,0 +1,160 @@
+"""A table at smoke size whose finished runs hold planted outcomes: true, false, undecidable."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from sweeps.claims import entry as claims
+from sweeps.reproduce import entry as reproduce
+from sweeps.table.request import UNTIL_DECIDED
+from sweeps.worker.planner import Planner
+from tests.commands import Call, assert_one_sentence
+from tests.sweeps.verdicts.planted import accuracy
+
+TABLE = """\
+paper: my
+number: planted
+caption: outcomes that are known
+data: nothing
+columns:
+  - {name: acc, metric: pixel_accuracy}
+claims:
+  - {name: true_one, says: High is above low., source: Sec. I, rows: [high], against: [low],
+     columns: [acc], expected: higher}
+  - {name: false_one, says: Low is above same., source: Sec. II, rows: [low], against: [same],
+     columns: [acc], expected: higher}
+  - {name: small_one, says: Same is above high., source: Sec. III, rows: [same], against: [high],
+     columns: [acc], expected: higher}
+  - {name: absent_one, says: Theirs is below low., source: Sec. IV, rows: [theirs], against: [low],
+     columns: [acc], expected: lower}
+rows:
+  - {label: low, experiment: baseline, values: {acc: 50.0}}
+  - {label: high, experiment: baseline, overrides: [masker=crm], values: {acc: 60.0}}
+  - {label: same, experiment: baseline, overrides: [masker=irm], values: {acc: 61.0}}
+  - {label: theirs, values: {acc: 40.0}}
+"""
+SHARES = {"masker=none": (50, 51, 49), "masker=crm": (60, 61, 59), "masker=irm": (60, 60, 60)}
+SMOKE = "+debug=smoke"
+
+
+def plant(runs_dir: Path, tags: dict[str, str] | None = None) -> None:
+    """Finished runs of every row with seeds 0 to 2."""
+    planner = Planner((f"runs_dir={runs_dir}",))
+    for masker, shares in SHARES.items():
+        row = () if masker == "masker=none" else (masker,)
+        for seed, share in enumerate(shares):
+            words = ("+experiment=baseline", *row, SMOKE, f"seed={seed}")
+            run = planner.plan_run((f"runs_dir={runs_dir}", *words))
+            folder = runs_dir / run.key
+            folder.mkdir(parents=True)
+            described = {"name": run.key, "tags": {"rgbt.seed": str(seed), **(tags or {})}}
+            (folder / "run.json").write_text(json.dumps({**described, "params": {}}))
+            replace(accuracy(share, seed), dataset=run.dataset).save(folder / "counts_test.npz")
+            (folder / "result.json").write_text(json.dumps({"dataset": run.dataset}))
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "tables" / "my").mkdir(parents=True)
+    (tmp_path / "tables" / "my" / "planted.yaml").write_text(TABLE)
+    return tmp_path
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+WORDS = ["holds", "contradicted", "undecided", "not run"]
+
+
+def test_reproduce_ends_with_a_verdict_per_claim(call: Call, place: Path) -> None:
+    plant(place / "runs")
+    words = ("table=my/planted", "seeds=3", "tracking=none", "out=here", SMOKE)
+    code, out, _ = call(reproduce, *words)
+    assert code == 0
+    assert "4 claims: 1 holds, 1 contradicted, 1 undecided, 1 not run." in out
+    found = rows_of(place / "here" / "claims.csv")
+    assert [row["verdict"] for row in found] == WORDS
+    assert [row["as_printed"] for row in found] == ["True", "False", "True", "True"]
+    assert found[3]["missing"] == "theirs"
+    text = (place / "here" / "table.md").read_text()
+    assert "- `true_one`, **holds**: High is above low. (Sec. I) The printed values agree." in text
+    marked = [line for line in text.splitlines() if "**" in line and line.startswith("| ")]
+    assert not marked, "high and same cannot be told apart, so that no row is the best"
+
+
+def test_claims_reads_the_store(call: Call, place: Path) -> None:
+    plant(place / "runs")
+    code, out, err = call(claims, "table=my/planted", "out=there", SMOKE)
+    assert code == 0, err
+    assert "4 claims: 1 holds, 1 contradicted, 1 undecided, 1 not run." in out
+    assert "my: 4 claims; its printed values agree with 3, do not agree with 1." in out
+    assert [row["verdict"] for row in rows_of(place / "there" / "claims.csv")] == WORDS
+    assert "(Sec. III)" in (place / "there" / "claims.md").read_text()
+    code, out, _ = call(claims, "table=my/planted")
+    assert (code, "4 claims: 4 not run." in out) == (0, True), "at full size nothing was run"
+
+
+def test_seeds_that_were_added_are_judged_at_any_time(call: Call, place: Path) -> None:
+    plant(place / "runs", {f"{UNTIL_DECIDED}my/planted": "true"})
+    _, out, _ = call(claims, "table=my/planted", SMOKE)
+    assert "4 claims: 3 undecided, 1 not run." in out
+
+
+def test_dry_run_says_what_deciding_may_cost(call: Call, place: Path) -> None:
+    plant(place / "runs")
+    words = ("table=my/planted", "seeds=until_decided", "max_seeds=5", "tracking=none", SMOKE)
+    code, out, _ = call(reproduce, *words, "dry_run=true")
+    assert code == 0
+    assert "9 runs: 9 finished." in out
+    assert "at most 6 further runs" in out
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("rows: [high]", "rows: [hihg]", "claim 'true_one', rows: .*did you mean 'high'"),
+        ("against: [same]", "against: [sane]", "claim 'false_one', against: .* 'same'"),
+        ("columns: [acc], expected: lower", "columns: [mIoU], expected: lower", "'absent_one'"),
+        ("name: true_one", "name: false_one", "'false_one' is used twice"),
+        ("says: High is above low., ", "", "claim 'true_one': 'says' has no value"),
+        ("rows: [high], against: [low]", "rows: [high], against: [high]", "nothing to compare"),
+        ("expected: lower", "expected: similar", "needs at_most"),
+    ],
+)
+def test_claim_that_does_not_fit_its_table(
+    call: Call, place: Path, old: str, new: str, told: str
+) -> None:
+    text = TABLE.replace("\n     columns", " columns")
+    assert old in text
+    (place / "tables" / "my" / "planted.yaml").write_text(text.replace(old, new, 1))
+    code, _, err = call(reproduce, "table=my/planted", "tracking=none")
+    assert code == 2
+    assert_one_sentence(err, "planted.yaml")
+    import re
+
+    assert re.search(told, err), err
+
+
+def test_words_that_do_not_fit(call: Call, place: Path) -> None:
+    for words, told in (
+        (("seeds=until_decided", "rows=low"), "has no claims with these rows"),
+        (("form=both",), "no row of my, planted has a released form"),
+        (("rows=lowest",), "did you mean 'low'"),
+        (("form=relased",), "form"),
+        (("max_seeds=1",), "max_seeds"),
+        (("masker=none",), "would replace what the rows"),
+    ):
+        code, _, err = call(reproduce, "table=my/planted", "tracking=none", *words)
+        assert code == 2, words
+        assert_one_sentence(err, told)
+    code, _, err = call(claims, "table=my/planted", "runs_dir=nowhere")
+    assert code == 2
+    assert_one_sentence(err, "nowhere does not exist")

@@ -1,0 +1,81 @@
+from __future__ import annotations
+
+import pytest
+
+from sweeps.table.claim import Claim
+from sweeps.table.table import Column, Row
+from sweeps.verdicts.contrasts import Contrast, base_scores, contrasts_of, printed_value
+from tests.sweeps.tabled import table
+
+COLUMNS = (
+    Column(name="inner", metric="region/1"),
+    Column(name="outer", metric="region/2"),
+    Column(name="gap", minus=("inner", "outer")),
+    Column(name="mean", mean=("inner", "outer")),
+    Column(name="twice", minus=("gap", "mean")),
+)
+ROWS = (
+    Row(label="a", experiment="crm", values={"inner": 10.0, "outer": 30.0}),
+    Row(label="b", experiment="crm", values={"inner": 15.0, "outer": 31.0}),
+    Row(label="c", values={"inner": 12.0, "outer": None}),
+    Row(label="d"),
+)
+TABLE = table(ROWS, COLUMNS)
+
+
+def claim(**others: object) -> Claim:
+    given = {"name": "c", "says": "", "source": "", "rows": ("b",), "columns": ("inner",)}
+    return Claim(**{**given, "expected": "higher", **others})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("others", "labels"),
+    [
+        ({"against": ("a",)}, ["b - a, inner"]),
+        ({"against": ("others",)}, ["b - a, inner", "b - c, inner"]),
+        ({"rows": ("a", "b", "c"), "against": ("previous",)}, ["b - a, inner", "c - b, inner"]),
+        ({"rows": ("a", "b"), "against": ("a", "b")}, ["a - b, inner", "b - a, inner"]),
+        ({"columns": ("inner", "outer")}, ["b, inner", "b, outer"]),
+        ({"minus_column": "outer"}, ["b, inner - outer"]),
+        ({"against": ("a",), "minus_column": "outer"}, ["b - a, inner - outer"]),
+    ],
+)
+def test_contrasts_of_a_claim(others: dict[str, object], labels: list[str]) -> None:
+    assert [each.label for each in contrasts_of(claim(**others), TABLE)] == labels
+
+
+@pytest.mark.parametrize(
+    ("contrast", "value"),
+    [
+        (Contrast("b", "a", "inner"), 5.0),
+        (Contrast("b", None, "inner", "outer"), -16.0),
+        (Contrast("b", "a", "inner", "outer"), 5.0 - 1.0),
+        (Contrast("c", "a", "outer"), None),
+        (Contrast("d", "a", "inner"), None),
+    ],
+)
+def test_printed_value_of_a_contrast(contrast: Contrast, value: float | None) -> None:
+    assert printed_value(contrast, TABLE) == value
+
+
+def test_derived_columns_are_sums_of_scores() -> None:
+    """twice = (inner - outer) - (inner + outer) / 2."""
+    weights: dict[str, float] = {}
+    for weight, column in base_scores(TABLE, ROWS[0], "twice"):
+        weights[column.name] = weights.get(column.name, 0.0) + weight
+    assert weights == {"inner": 0.5, "outer": -1.5}
+    assert [column.name for _, column in base_scores(TABLE, ROWS[0], "outer")] == ["outer"]
+
+
+@pytest.mark.parametrize(
+    ("others", "wanted"),
+    [
+        ({}, (0.0, float("inf"))),
+        ({"at_least": 2.0, "at_most": 3.0}, (2.0, 3.0)),
+        ({"expected": "lower", "at_least": 2.0}, (-float("inf"), -2.0)),
+        ({"expected": "lower", "at_most": 2.0}, (-2.0, -0.0)),
+        ({"expected": "similar", "at_most": 0.5}, (-0.5, 0.5)),
+    ],
+)
+def test_range_of_a_claim(others: dict[str, object], wanted: tuple[float, float]) -> None:
+    assert claim(**others).range == wanted

@@ -1,0 +1,160 @@
+"""Claims with planted outcomes: true, false, and too small to tell."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+
+from analysis.uncertainty.contrasts import FIXED
+from analysis.uncertainty.verdicts import AnyTime, FixedSeeds
+from sweeps.table.claim import Claim
+from sweeps.table.table import Column, Row, Table
+from sweeps.verdicts.judge import CellRunId, JudgedClaim, TableJudge
+from sweeps.worker.trial_sources import Outcome
+from tests.sweeps.tabled import failed, outcome, table
+from tests.sweeps.verdicts.planted import accuracy, planted
+
+SHARES = {"low": (50.0, 51.0, 49.0), "high": (60.0, 61.5, 59.0), "same": (60.5, 60.0, 60.5)}
+"""Accuracies in percent by seed."""
+
+PRINTED = {"low": 50.0, "high": 49.0, "same": 50.5}
+ACC = Column(name="acc", metric="pixel_accuracy")
+
+
+def claim(name: str = "c", **others: Any) -> Claim:
+    given = {"says": "A sentence.", "source": "Sec. I", "columns": ("acc",), "expected": "higher"}
+    return Claim(name=name, **{**given, **others})
+
+
+def of(*claims: Claim, rows: tuple[str, ...] = tuple(SHARES), **others: Any) -> Table:
+    made = tuple(
+        Row(label=label, experiment="crm", values={"acc": PRINTED[label]} if printed else {})
+        for label in rows
+        if (printed := label in PRINTED) or True
+    )
+    return table(made, (ACC,), claims=claims, **others)
+
+
+def judge(one: Claim, runs: dict[CellRunId, Outcome] | None = None, **others: Any) -> JudgedClaim:
+    runs = planted(SHARES) if runs is None else runs
+    return TableJudge("own/t", of(one, **others), resamples=200).judge(one, runs)
+
+
+def test_true_false_and_undecidable_claims_come_out_so() -> None:
+    claims = (
+        claim("true", rows=("high",), against=("low",)),
+        claim("false", rows=("low",), against=("same",)),
+        claim("small", rows=("same",), against=("high",)),
+    )
+    made = TableJudge("own/t", of(*claims), resamples=200)
+    found = made.claims(planted(SHARES))  # type: ignore[arg-type]
+    assert [each.word for each in found] == ["holds", "contradicted", "undecided"]
+    assert [each.as_printed for each in found] == [False, False, True]
+    true, _, small = (each.verdict for each in found)
+    assert true is not None
+    assert small is not None
+    assert true.estimate == pytest.approx(10.2, abs=1.0)
+    assert true.seeds == 3
+    assert small.interval is not None
+    assert small.interval.low < 0 < small.interval.high
+    assert small.smallest > abs(small.estimate)
+    assert small.seeds_needed > 3
+    assert found[2].reason
+
+
+def test_paired_seeds_cancel_what_both_rows_share() -> None:
+    """Seeds differ by 20 points, the rows of each seed by 2."""
+    runs = planted({"low": (40.0, 60.0, 50.0, 55.0), "high": (42.0, 62.0, 52.0, 57.0)})
+    found = judge(claim(rows=("high",), against=("low",)), runs)
+    assert found.word == "holds"
+
+
+def test_best_of_all_needs_every_other_row() -> None:
+    best = claim(rows=("high",), against=("others",))
+    shares = {**SHARES, "same": (55.0, 55.5, 54.0)}
+    assert judge(best, planted(shares)).word == "holds"
+    partly = planted({label: shares[label] for label in ("low", "high")})
+    found = judge(best, partly)
+    assert (found.word, found.missing) == ("undecided", ("same",))
+    assert found.reason == "Some rows have no score: row 'same' has no finished run."
+    worse = {**SHARES, "high": (40.0, 41.0, 39.0)}
+    refuted = judge(best, planted({label: worse[label] for label in ("low", "high")}))
+    assert (refuted.word, refuted.missing) == ("contradicted", ("same",))
+
+
+def test_claim_without_runs_is_not_run() -> None:
+    found = judge(claim(rows=("high",), against=("low",)), {})
+    assert (found.word, found.verdict, found.printed) == ("not run", None, -1.0)
+    assert found.missing == ("low", "high")
+    assert found.reason == "row 'high' has no finished run."
+    lost = {("high", 0): failed("broke"), ("low", 0): outcome("k", accuracy(50))}
+    assert judge(claim(rows=("high",), against=("low",)), lost).word == "not run"
+
+
+def test_one_seed_decides_nothing() -> None:
+    found = judge(claim(rows=("high",), against=("low",)), planted({"low": (50,), "high": (60,)}))
+    assert found.word == "undecided"
+    assert found.verdict is not None
+    assert (found.verdict.covers, found.verdict.seeds) == ("images", 1)
+    assert math.isnan(found.verdict.seeds_needed)
+
+
+def test_predictions_without_seeds_are_compared_with_every_seed() -> None:
+    runs: dict[CellRunId, Outcome] = {
+        **planted({"high": SHARES["high"]}),
+        ("low", FIXED): outcome("file", accuracy(50.0, 7)),
+    }
+    found = judge(claim(rows=("high",), against=("low",)), runs)
+    assert found.word == "holds"
+    assert found.verdict is not None
+    assert found.verdict.seeds == 3
+
+
+def test_mean_and_any_combine_contrasts() -> None:
+    two = {"rows": ("high", "low"), "against": ("same",)}
+    shares = {**SHARES, "high": (70.0, 71.0, 69.0)}
+    assert judge(claim(**two, combine="any"), planted(shares)).word == "holds"
+    assert judge(claim(**two), planted(shares)).word == "contradicted"
+    mean = judge(claim(**two, combine="mean", at_most=5.0, expected="similar"), planted(shares))
+    assert mean.word == "holds"
+    assert mean.contrast == "mean of 2 contrasts"
+    assert mean.printed == pytest.approx((49.0 + 50.0) / 2 - 50.5)
+
+
+def test_any_time_rule_needs_more_seeds() -> None:
+    one = claim(rows=("high",), against=("low",))
+    words = [
+        TableJudge("own/t", of(one), rule, resamples=200)
+        .judge(one, planted(SHARES))  # type: ignore[arg-type]
+        .word
+        for rule in (FixedSeeds(), AnyTime())
+    ]
+    assert words == ["holds", "undecided"]
+
+
+@pytest.mark.parametrize(
+    ("best", "marks"),
+    [("highest", {"high": 1, "mid": 2}), ("lowest", {"low": 1, "mid": 2}), ("none", {})],
+)
+def test_best_row_is_marked_where_it_is_shown(best: Any, marks: dict[str, int]) -> None:
+    column = Column(name="acc", metric="pixel_accuracy", best=best)
+    rows = tuple(Row(label=label, experiment="crm") for label in ("low", "mid", "high"))
+    shares = {"low": (50.0, 51.0, 49.0), "mid": (70.0, 71.0, 70.5), "high": (90.0, 91.0, 90.0)}
+    made = table(rows, (column,))
+    found = TableJudge("own/t", made, resamples=200)
+    given = planted(shares)
+    assert found.marks(given) == {(label, "acc"): rank for label, rank in marks.items()}  # type: ignore[arg-type]
+    noisy = planted({**shares, "high": (90.0, 60.0, 70.0), "low": (50.0, 80.0, 70.0)})
+    assert TableJudge("own/t", made, resamples=200).marks(noisy) == {}  # type: ignore[arg-type]
+    single = {run: each for run, each in given.items() if run[1] == 0}
+    assert found.marks(single) == {}  # type: ignore[arg-type]
+
+
+def test_rows_of_the_same_runs_share_a_mark() -> None:
+    runs = planted({"low": (50.0, 51.0, 49.0), "high": (60.0, 61.0, 60.0)})
+    runs |= {("again", seed): run for (label, seed), run in list(runs.items()) if label == "high"}
+    rows = tuple(Row(label=label, experiment="crm") for label in ("low", "high", "again"))
+    found = TableJudge("own/t", table(rows, (ACC,)), resamples=200).marks(runs)  # type: ignore[arg-type]
+    assert found == {("high", "acc"): 1, ("again", "acc"): 1}
