@@ -215,7 +215,7 @@ def read_label(path: Path) -> Any:
 
 
 def read_prediction(path: Path) -> Any:
-    from analysis.predictions.images import PredictionReader
+    from rgbt.data.prediction_images import PredictionReader
 
     palette = tuple((n, 2 * n, 3 * n) for n in range(5))
     return plain(PredictionReader(tuple("abcde"), palette, "index").read(path))

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from analysis.bar import progress
 from analysis.figures import style
 from analysis.figures.inputs import FigureInput
-from analysis.predictions.images import PredictionReader
 from analysis.predictions.scoring import ScoringOptions, score_folder
 from rgbt.checks import InputError
+from rgbt.data.prediction_images import PredictionReader
 from rgbt.metrics.confusion import RegionCounter
 from rgbt.metrics.counts import Counts, scored_classes
 from rgbt.metrics.metric import Regions

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from analysis.bar import in_threads
 from analysis.predictions.folder import Missing, PredictionFiles, find
-from analysis.predictions.images import Array, Format, PredictionReader, check_one_kind
 from analysis.predictions.maps import MapSum, PixelMaps
 from rgbt.checks import InputError, check_choice
+from rgbt.data.prediction_images import Array, Format, PredictionReader, check_one_kind
 from rgbt.dataset import LabelledDataset
 from rgbt.metrics.confusion import RegionCounter
 from rgbt.metrics.counts import Counts
@@ -36,7 +36,7 @@ class ScoringOptions:
     Attributes:
         partitions: how the image is cut; all are counted in the same pass.
         regions: R of each partition.
-        form: see `analysis.predictions.images.PredictionReader`.
+        form: see `rgbt.data.prediction_images.PredictionReader`.
         missing: "refuse", or "leave_out" to count only the images that have a prediction.
         resize: "refuse" predictions of another size than the label, or take for every pixel of the
             label the "nearest" one of the prediction (by pixel centres).

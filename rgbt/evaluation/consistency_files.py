@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
 from rgbt.build.load_run import TrainedNetwork
 from rgbt.build.session import Session
 from rgbt.checks import InputError
+from rgbt.dataset import LabelledDataset
+from rgbt.evaluation.pair_frames import Frames, frames_mark
 from rgbt.evaluation.request import EvaluationRequest, NetworkRequest, other_images
 from rgbt.evaluation.segmentation import legend_of
-from rgbt.evaluation.temporal_consistency import Frames, Pairs, consistency_values, frames_mark
+from rgbt.evaluation.temporal_consistency import Pairs, consistency_values
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import Protocol, file_name, partition_name
 from rgbt.tracking.mlflow_upload import read_upload_state
@@ -64,19 +67,32 @@ class PairFiles:
 
     def write(self, pairs: Pairs) -> list[tuple[str, str]]:
         """Write counts and picture; (what, path) of each."""
-        self._folder.mkdir(parents=True, exist_ok=True)
         paths = {protocol: self.path(protocol) for protocol in pairs.counts}
-        for protocol, counts in reversed(pairs.counts.items()):
-            counts.save(paths[protocol])
-        lines = [(f"counts, {protocol}", str(path)) for protocol, path in paths.items()]
-        if not pairs.kept:
-            info("no image of the picture could be read, so it was not drawn.")
-            return lines
-        # Named like the counts that it shows, those of the first protocol.
-        first = next(iter(paths.values()))
-        picture = first.with_name(first.stem.replace("consistency_", "pairs_") + ".png")
-        draw_pairs(pairs.kept, legend_of(self._session.dataset), picture)
-        return [*lines, ("picture", str(picture))]
+        return write_pairs(pairs, paths, self._session.dataset)
+
+
+def write_pairs(
+    pairs: Pairs, paths: Mapping[Protocol, Path], dataset: LabelledDataset
+) -> list[tuple[str, str]]:
+    """Write counts and picture; (what, path) of each.
+
+    Args:
+        pairs: counts and scenes for the picture.
+        paths: files of the counts, all in one folder, which is made if needed.
+        dataset: its classes and colours.
+    """
+    # Named like the counts that it shows, those of the first protocol.
+    first = next(iter(paths.values()))
+    first.parent.mkdir(parents=True, exist_ok=True)
+    for protocol, counts in reversed(pairs.counts.items()):
+        counts.save(paths[protocol])
+    lines = [(f"counts, {protocol}", str(path)) for protocol, path in paths.items()]
+    if not pairs.kept:
+        info("no image of the picture could be read, so it was not drawn.")
+        return lines
+    picture = first.with_name(first.stem.replace("consistency_", "pairs_") + ".png")
+    draw_pairs(pairs.kept, legend_of(dataset), picture)
+    return [*lines, ("picture", str(picture))]
 
 
 def add_to_result(run: RunFolder, session: Session, split: str, table: ConsistencyTable) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,12 +15,40 @@ from rgbt.build.session import Session
 from rgbt.checks import InputError, check_choice
 from rgbt.data.cache.dataset import cached_layer
 from rgbt.data.domains import TestedHead
+from rgbt.data.loaders import LoaderSettings
+from rgbt.dataset import LabelledDataset
 from rgbt.engine.evaluate import class_maps, probabilities
 from rgbt.engine.progress import progress
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.metrics.counts import Counts
+from rgbt.metrics.metric import Regions
 from rgbt.requirements import record_of
+from rgbt.transforms.view_sets import ViewSets
 from rgbt.types import Batch, View
+
+
+class EvaluationData(Protocol):
+    """Images and how they are counted; a `Session` has all of it and a network too."""
+
+    @property
+    def dataset(self) -> LabelledDataset:
+        """Names, images and labels."""
+
+    @property
+    def transform(self) -> Any:
+        """Makes examples of samples, see `rgbt.data.batches.Transform`."""
+
+    @property
+    def loading(self) -> LoaderSettings:
+        """Batch sizes and workers."""
+
+    @property
+    def regions(self) -> Regions:
+        """Partition of the image and the rule for absent classes."""
+
+    @property
+    def consistency(self) -> ViewSets:
+        """Virtual views for TC and CA."""
 
 
 class Predictor:
@@ -83,14 +112,14 @@ def heads_of(
 
 
 def counts_of(
-    session: Session, split: str, by_name: Mapping[str, NDArray[np.int64]], partition: str
+    data: EvaluationData, split: str, by_name: Mapping[str, NDArray[np.int64]], partition: str
 ) -> Counts:
     """The counts (R, K, K) of each image as those of a split.
 
     Raises:
         InputError: there is none, because no image could be read.
     """
-    dataset, names = session.dataset, tuple(by_name)
+    dataset, names = data.dataset, tuple(by_name)
     if not names:
         raise InputError(
             f"split '{split}' of {dataset.name}: no image could be read. Check the files with "
@@ -105,7 +134,7 @@ def counts_of(
         dataset=dataset.fingerprint(),
         split=split,
         unscored=dataset.unscored,
-        absent=session.regions.absent,
+        absent=data.regions.absent,
     )
 
 

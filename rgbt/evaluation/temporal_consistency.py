@@ -7,8 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from itertools import zip_longest
-from typing import Literal, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -17,28 +16,28 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.build.session import Session
-from rgbt.checks import InputError
-from rgbt.data.loaders import eval_batches
 from rgbt.data.next_frames import NextFrames
 from rgbt.engine.progress import progress
-from rgbt.evaluation.prediction import Predictor, counts_of, decode_ahead
+from rgbt.evaluation.pair_frames import (
+    PROTOCOLS,
+    Frames,
+    check_frames,
+    frames_mark,
+    next_frames,
+    virtual_frames,
+)
+from rgbt.evaluation.prediction import EvaluationData, Predictor, counts_of, decode_ahead
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.named import OF_PAIRS
 from rgbt.metrics.names import CA, TC, consistency
-from rgbt.metrics.pairs import HEADLINES, Protocol, pair_counts, partition_name
+from rgbt.metrics.pairs import HEADLINES, pair_counts, partition_name
+from rgbt.metrics.pairs import Protocol as PairProtocol
 from rgbt.metrics.scores import class_mean
 from rgbt.tracking.pair_pictures import PairExample
 from rgbt.tracking.tables import ConsistencyTable
 from rgbt.types import IGNORE, Batch
-
-Frames = Literal["virtual", "next"]
-PROTOCOLS: dict[Frames, tuple[Protocol, ...]] = {
-    "virtual": ("aligned", "released"),
-    "next": ("next",),
-}
-"""Protocols of counting for each kind of second frame."""
 
 
 class Compared(NamedTuple):
@@ -70,7 +69,7 @@ class Scenes(NamedTuple):
     """
 
     names: tuple[str, ...]
-    compared: dict[Protocol, Compared]
+    compared: dict[PairProtocol, Compared]
     images: tuple[Tensor, Tensor]
     first: Tensor
     number: int = 0
@@ -80,8 +79,38 @@ class Scenes(NamedTuple):
 class Pairs:
     """Counts of pairs by protocol (`rgbt.metrics.pairs`), and scenes for pictures."""
 
-    counts: dict[Protocol, Counts]
+    counts: dict[PairProtocol, Counts]
     kept: tuple[PairExample, ...]
+
+
+class PairPredictor(Protocol):
+    """Class maps (B, H', W') uint8 of both frames, at the size of their labels."""
+
+    @property
+    def device(self) -> torch.device:
+        """Where batches are expected."""
+
+    def first(self, batch: Batch) -> Tensor:
+        """Of first frames."""
+
+    def second(self, batch: Batch, number: int) -> Tensor:
+        """Of second frames; `number` of the set of views, from 0."""
+
+
+class NetworkPairs:
+    """Both frames predicted by a network, left in evaluation mode."""
+
+    def __init__(self, session: Session, model: nn.Module, request: EvaluationRequest) -> None:
+        self._predictor = Predictor(session, model, request)
+        self.device = session.fabric.device
+
+    def first(self, batch: Batch) -> Tensor:
+        """See `PairPredictor`."""
+        return self._predictor.classes(batch)
+
+    def second(self, batch: Batch, number: int) -> Tensor:  # noqa: ARG002 - the same for all views
+        """See `PairPredictor`."""
+        return self._predictor.classes(batch)
 
 
 def count_pairs(
@@ -102,26 +131,36 @@ def count_pairs(
         InputError: no sets of views, no second frames, or no image that can be read.
     """
     assert request.corruption is None, "pairs are counted of clean images"
-    split = request.split
     # Requests that cannot be measured are refused before anything is drawn or predicted.
-    if frames == "next":
-        NextFrames(session.dataset)
-    elif not session.consistency.sets:
-        raise InputError(
-            "consistency.sets is empty. Name sets of angles, such as "
-            "consistency.sets=[released_1], or choose consistency=views."
-        )
-    decode_ahead(session, split)
-    predictor = Predictor(session, model, request)
-    found: dict[Protocol, dict[str, CountsBySet]] = {each: {} for each in PROTOCOLS[frames]}
+    check_frames(session, frames)
+    decode_ahead(session, request.split)
+    return count_predicted(session, NetworkPairs(session, model, request), request, frames)
+
+
+def count_predicted(
+    data: EvaluationData, predictor: PairPredictor, request: EvaluationRequest, frames: Frames
+) -> Pairs:
+    """Count the predictions of both frames of every scene, with a progress bar.
+
+    Args:
+        data: images, labels and views.
+        predictor: class maps of both frames.
+        request: split, and the scenes to return for pictures.
+        frames: what the second frames are.
+
+    Raises:
+        InputError: an image or a prediction cannot be read.
+    """
+    split = request.split
+    found: dict[PairProtocol, dict[str, CountsBySet]] = {each: {} for each in PROTOCOLS[frames]}
     kept: dict[str, PairExample] = {}
     scenes_of = _virtual if frames == "virtual" else _next
     with progress() as display:
-        total = len(session.dataset.names(split))
+        total = len(data.dataset.names(split))
         task = display.add_task(f"{split} pairs", total=total, note="images")
-        for scenes in scenes_of(session, predictor, split):
+        for scenes in scenes_of(data, predictor, split):
             for protocol, maps in scenes.compared.items():
-                _count(scenes, maps, len(session.dataset.classes), found[protocol])
+                _count(scenes, maps, len(data.dataset.classes), found[protocol])
             wanted = [name for name in scenes.names if name in request.keep and name not in kept]
             kept |= {name: _example(scenes, name, PROTOCOLS[frames][0]) for name in wanted}
             display.update(task, completed=len(found[PROTOCOLS[frames][0]]))
@@ -132,8 +171,8 @@ def count_pairs(
             for name, by_set in by_name.items()
         }
         sets = max(map(len, by_name.values()), default=0)
-        partition = partition_name(protocol, sets, frames_mark(session, protocol))
-        counts[protocol] = counts_of(session, split, joined, partition)
+        partition = partition_name(protocol, sets, frames_mark(data, protocol))
+        counts[protocol] = counts_of(data, split, joined, partition)
     return Pairs(counts, tuple(kept.values()))
 
 
@@ -147,65 +186,28 @@ def _count(scenes: Scenes, maps: Compared, num_classes: int, found: dict[str, Co
         found.setdefault(name, {})[scenes.number] = counts
 
 
-def _virtual(session: Session, predictor: Predictor, split: str) -> Iterator[Scenes]:
-    """Every batch with each set of views in turn."""
-    names = session.dataset.names(split)
-    # A name that the list holds twice has the views of its first position.
-    position = dict(zip(reversed(names), reversed(range(len(names))), strict=True))
-    for batch in eval_batches(session.dataset, split, session.transform, session.loading):
-        moved = batch.to(session.fabric.device)
-        first = predictor.classes(moved)
-        indices = [position[name] for name in batch.name]
-        for number in range(len(session.consistency.sets)):
-            angles = session.consistency.angles(number, indices).to(first.device)
-            yield _turned(session, predictor, moved, first, angles)._replace(number=number)
+def _virtual(data: EvaluationData, predictor: PairPredictor, split: str) -> Iterator[Scenes]:
+    first = torch.empty(0)
+    for frames in virtual_frames(data, split, predictor.device):
+        if frames.number == 0:
+            first = predictor.first(frames.batch)
+        second = predictor.second(frames.second, frames.number)
+        label = frames.second.label
+        at_label = frames.warp.resized((first.shape[1], first.shape[2]))
+        valid = at_label.inside() & (label != IGNORE)
+        compared: dict[PairProtocol, Compared] = {
+            "aligned": Compared(at_label.nearest(first, 0), second, label, valid),
+            # As released: the first prediction stays where it is, and every pixel counts.
+            "released": Compared(first, second, label, None),
+        }
+        images = (frames.batch.rgb, frames.second.rgb)
+        yield Scenes(frames.batch.name, compared, images, first, frames.number)
 
 
-def _turned(
-    session: Session, predictor: Predictor, batch: Batch, first: Tensor, angles: Tensor
-) -> Scenes:
-    """The scenes of a batch with virtual second frames; `first` is the prediction of the first."""
-    views = session.consistency.view
-    try:
-        warp = views.warp(angles, (batch.rgb.shape[2], batch.rgb.shape[3]))
-    except InputError as error:
-        raise InputError(f"consistency.view, image '{batch.name[0]}': {error}") from error
-    turned = views.batch(batch, warp)
-    second = predictor.classes(turned)
-    at_label = warp.resized((first.shape[1], first.shape[2]))
-    valid = at_label.inside() & (turned.label != IGNORE)
-    compared: dict[Protocol, Compared] = {
-        "aligned": Compared(at_label.nearest(first, 0), second, turned.label, valid),
-        # As released: the first prediction stays where it is, and every pixel counts.
-        "released": Compared(first, second, turned.label, None),
-    }
-    return Scenes(batch.name, compared, (batch.rgb, turned.rgb), first)
-
-
-def _next(session: Session, predictor: Predictor, split: str) -> Iterator[Scenes]:
-    after = NextFrames(session.dataset)
-    settings, transform = session.loading, session.transform
-    pairs = zip_longest(
-        eval_batches(session.dataset, split, transform, settings),
-        eval_batches(after.dataset, split, transform, settings),
-    )
-    for batch, later in pairs:
-        names = [() if each is None else each.name for each in (batch, later)]
-        if names[0] != names[1]:
-            raise InputError(
-                f"both frames of a scene must be listed in {split} and readable, but "
-                f"{session.dataset.root} has {', '.join(names[0]) or 'no further image'} where "
-                f"{after.dataset.root} has {', '.join(names[1]) or 'no further image'}."
-            )
-        if batch.label.shape != later.label.shape:
-            sizes = [" x ".join(map(str, each.label.shape[1:])) for each in (batch, later)]
-            raise InputError(
-                f"both frames of a scene must have the same size, but '{names[0][0]}' has "
-                f"{sizes[0]} pixels in {session.dataset.root} and {sizes[1]} in "
-                f"{after.dataset.root}."
-            )
-        moved = [each.to(session.fabric.device) for each in (batch, later)]
-        first, second = (predictor.classes(each).cpu() for each in moved)
+def _next(data: EvaluationData, predictor: PairPredictor, split: str) -> Iterator[Scenes]:
+    after = NextFrames(data.dataset)
+    for batch, later in next_frames(data, after, split, predictor.device):
+        first, second = predictor.first(batch).cpu(), predictor.second(later, 0).cpu()
         # The first prediction at the pixels of the second frame, and where it was seen.
         height, width = first.shape[1:]
         sources = [np.stack(after.source(name, (height, width))) for name in batch.name]
@@ -213,11 +215,12 @@ def _next(session: Session, predictor: Predictor, split: str) -> Iterator[Scenes
         seen = rows >= 0
         flat = (rows * width + columns).clamp(min=0).flatten(1)
         followed = first.flatten(1).gather(1, flat).view_as(first)
-        maps = Compared(followed, second, later.label, seen & (later.label != IGNORE))
-        yield Scenes(batch.name, {"next": maps}, (moved[0].rgb, moved[1].rgb), first)
+        label = later.label.cpu()
+        maps = Compared(followed, second, label, seen & (label != IGNORE))
+        yield Scenes(batch.name, {"next": maps}, (batch.rgb, later.rgb), first)
 
 
-def _example(scenes: Scenes, name: str, protocol: Protocol) -> PairExample:
+def _example(scenes: Scenes, name: str, protocol: PairProtocol) -> PairExample:
     maps, number = scenes.compared[protocol], scenes.names.index(name)
     label_hw = (scenes.first.shape[1], scenes.first.shape[2])
     first_rgb, second_rgb = (
@@ -241,17 +244,7 @@ def _picture(image: Tensor) -> NDArray[np.uint8]:
     return (255 * image).round().to(torch.uint8).permute(1, 2, 0).cpu().numpy()
 
 
-def frames_mark(session: Session, protocol: Protocol) -> str:
-    """Suffix for second frames: "" for the published views, else six digits of a digest.
-
-    For real second frames it depends on lists and files, so that another motion differs.
-    """
-    if protocol == "next":
-        return NextFrames(session.dataset).dataset.fingerprint()[:6]
-    return session.consistency.mark
-
-
-def consistency_table(found: Mapping[Protocol, Counts], absent: Absent) -> ConsistencyTable:
+def consistency_table(found: Mapping[PairProtocol, Counts], absent: Absent) -> ConsistencyTable:
     """TC and CA of every class and protocol; means over the scored classes."""
     like = next(iter(found.values()))
     scores = {

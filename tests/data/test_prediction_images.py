@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from analysis.predictions.images import Format, PredictionReader, check_one_kind, read_header
 from rgbt.checks import InputError
+from rgbt.data.prediction_images import Format, PredictionReader, check_one_kind, read_header
 
 CLASSES = ("ground", "car", "person")
 PALETTE = ((0, 0, 0), (64, 0, 128), (64, 64, 0))
