@@ -156,5 +156,9 @@ def test_rows_of_the_same_runs_share_a_mark() -> None:
     runs = planted({"low": (50.0, 51.0, 49.0), "high": (60.0, 61.0, 60.0)})
     runs |= {("again", seed): run for (label, seed), run in list(runs.items()) if label == "high"}
     rows = tuple(Row(label=label, experiment="crm") for label in ("low", "high", "again"))
-    found = TableJudge("own/t", table(rows, (ACC,)), resamples=200).marks(runs)  # type: ignore[arg-type]
-    assert found == {("high", "acc"): 1, ("again", "acc"): 1}
+    one = claim(rows=("high",), against=("again",))
+    made = TableJudge("own/t", table(rows, (ACC,), claims=(one,)), resamples=200)
+    assert made.marks(runs) == {("high", "acc"): 1, ("again", "acc"): 1}  # type: ignore[arg-type]
+    found = made.judge(one, runs)  # type: ignore[arg-type]
+    assert found.word == "not run"
+    assert found.reason == "rows 'high' and 'again' are the same runs at this scale."
