@@ -12,7 +12,7 @@ import pytest
 from rgbt.config.compose import flatten
 from rgbt.spec.run_spec import RunSpec
 from sweeps.table.load_table import load_table, table_names
-from sweeps.table.request import million_parameters
+from sweeps.table.request import TableRequest, million_parameters
 from sweeps.table.table import Form
 from sweeps.worker.planner import specify_run
 from tests.sweeps.composed import specified
@@ -329,6 +329,15 @@ def test_network_for_weights_is_the_published_one(network: tuple[str, ...]) -> N
         assert (inputs["rgb_order"], run.model.plain["decoder_norm_eps_eval"]) == ("bgr", 1e-5)
     else:
         assert inputs["rgb_mean"] == [0.0 if "rtfnet" in model else 127.5] * 3
+
+
+def test_rows_of_several_networks_name_theirs_for_initial_weights() -> None:
+    """weights.cmx_b2=FILE reaches the rows of that network at scale=paper."""
+    found = {
+        number: TableRequest("t", TABLES[f"temporal/table{number}"], "paper", (0,)).models()
+        for number in (4, 5)
+    }
+    assert found == {4: {"cmx_b2", "cmx_b4", "rtfnet_152"}, 5: {"rtfnet_50", "rtfnet_152"}}
 
 
 @pytest.mark.parametrize("name", TABLES)
