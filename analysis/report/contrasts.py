@@ -97,46 +97,6 @@ def _same_seeds(*sides: Sequence[ReportRun]) -> list[list[ReportRun]]:
     common = set.intersection(*map(set, by_seed))
     shared = sorted(seed for seed in common if seed is not None)
     if not shared:
-        missing = contrast.method if reference else contrast.reference
-        yield from (replace(each, verdict=f"Not run: {missing}.") for each in blank)
-    for settings in sorted(shared):
-        sides = reference[settings], method[settings]
-        at_scale = [replace(each, scale=settings[0]) for each in blank]
-        try:
-            a, b = ([run.counts(contrast.counts) for run in side] for side in _same_seeds(*sides))
-            as_run = replace(resampling, absent=sides[0][0].absent)
-            found = compare(a, b, list(contrast.expected), as_run, paired=True)
-        except InputError as error:
-            yield from (replace(each, verdict=f"Not measured: {error}") for each in at_scale)
-            continue
-        pairs = zip(at_scale, found.differences, strict=True)
-        yield from (_measured(entry, each, found) for entry, each in pairs)
-
-
-def _blank(contrast: Contrast, metric: str) -> ContrastEntry:
-    words = [f"a={contrast.reference}", f"b={contrast.method}", f"metrics={metric}"]
-    words += contrast.options.split()
-    return ContrastEntry(
-        question=contrast.question,
-        source=contrast.source,
-        reference=contrast.reference,
-        method=contrast.method,
-        metric=metric,
-        expected=contrast.expected[metric],
-        verdict="",
-        command=shlex.join(["rgbt", "compare", *words]),
-    )
-
-
-def _same_seeds(*sides: Sequence[ReportRun]) -> list[list[ReportRun]]:
-    """The runs of the seeds that both sides have: these share initial weights and data order.
-
-    Raises:
-        InputError: there is no such seed.
-    """
-    by_seed = [{run.entry.seed: run for run in side} for side in sides]
-    shared = sorted(set.intersection(*(set(runs) - {None} for runs in by_seed)), key=str)
-    if not shared:
         seeds = (", ".join(map(str, runs)) for runs in by_seed)
         raise InputError(f"the runs have no seed in common: {' and '.join(seeds)}.")
     return [[runs[seed] for seed in shared] for runs in by_seed]

@@ -23,8 +23,8 @@ PRECISION = 0.25
 """Precision of the prior over the effect size: its standard deviation is ``1 / sqrt(0.25) = 2``.
 
 Differences that a table of few seeds can show are of about two standard deviations. At an alpha of
-0.025 these need 7.1 seeds on average with 0.1 and 0.25, 7.4 with 0.5 and 7.9 with 1. Differences of
-one standard deviation need 16.8, 15.9, 15.6 and 15.6 (`tests/benchmarks/simulate_claims.py`)."""
+0.025 these need 7.1 seeds on average with 0.1 and 0.25, 7.3 with 0.5 and 7.9 with 1. Differences of
+one standard deviation need 16.7, 15.8, 15.5 and 15.5 (`tests/benchmarks/simulate_claims.py`)."""
 
 
 def e_value(t: float, count: int, precision: float = PRECISION) -> float:

@@ -46,8 +46,9 @@ class AnyTime:
     """Rule for seeds that are added until the verdict is clear.
 
     Seeds: a confidence sequence, see `analysis.uncertainty.sequence`. Images: Student's interval.
-    Each has half of the error rate, and the squares of their half widths add up. In quadrature at
-    the full rate, up to 7.5 % of sequences missed a difference at a level of 95 %.
+    Each has half of the error rate, and the squares of their half widths add up. At a level of
+    95 %, at most 4.8 % of simulated sequences ever missed the truth (2 to 3,000 seeds). With the
+    whole error rate for each it was up to 9.8 %.
 
     Attributes:
         level: confidence level of the whole sequence of intervals.
@@ -233,10 +234,10 @@ class _Claim:
 
     def seeds_needed(self) -> float:
         """See `Verdict.seeds_needed`; more seeds never make an interval wider."""
-        counts = range(2, MOST_SEEDS + 1)
-        place = bisect_left(counts, True, key=lambda seeds: self.kind(seeds) != "undecided")
-        if place < len(counts):
-            return float(counts[place])
+        if self.kind(MOST_SEEDS) != "undecided":
+            counts = range(2, MOST_SEEDS)
+            found = bisect_left(counts, True, key=lambda seeds: self.kind(seeds) != "undecided")
+            return float(2 + found)
         unknown = any(
             each.images is None or (each.seeds and math.isnan(each.sd)) for each in self.contrasts
         )

@@ -49,7 +49,7 @@ def verdicts(tables: int) -> Iterator[Sequence[str]]:
             given = (rates(tables, sign * EFFECT, ratio, outcome, rule) for sign in (1, -1, 0))
             several = "-"
             if outcome is until_decided:
-                several = f"{100 * any_wrong(tables // 2, 10, ratio, rule):.1f}"
+                several = f"{100 * any_wrong(tables // 5, 10, ratio, rule):.1f}"
             yield name, f"{ratio:g}", *map(str, given), several
 
 
