@@ -6,7 +6,7 @@ The command line names them as ``weights.LABEL=FILE`` and ``predictions.LABEL=FO
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
@@ -90,14 +90,7 @@ def _named_row(word: str, kind: Kind, table: Table) -> tuple[Row, str]:
     if "=" not in rest:
         example = "FILE" if kind == "weights" else "FOLDER"
         raise InputError(f"'{word}': expected {kind}.LABEL={example}.")
-    cuts = [match.start() for match in re.finditer("=", rest)]
-    for cut in cuts:
-        rows = rows_called(rest[:cut], table)
-        if rows:
-            break
-    else:
-        cut = cuts[0]
-    name = rest[:cut]
+    name, rows = _rows_called(rest, table)
     labels = [row.label for row in table.rows]
     if not rows:
         hint = ""
@@ -107,20 +100,21 @@ def _named_row(word: str, kind: Kind, table: Table) -> tuple[Row, str]:
     if len(rows) > 1:
         several = ", ".join(f"'{row.label}'" for row in rows)
         raise InputError(f"'{word}': '{name}' may be any of the rows {several}; name one of them.")
-    return rows[0], rest[cut + 1 :]
+    return rows[0], rest[len(name) + 1 :]
 
 
-def rows_called(name: str, table: Table) -> list[Row]:
-    """Rows that `name` may mean: those that agree with it in the strictest of several ways."""
-    ways = (
-        lambda label: label == name,
-        lambda label: _plain(label) == _plain(name),
-        lambda label: _plain(re.sub(r"[()]", "", label)) == _plain(name),
-        lambda label: _plain(re.sub(r"\([^)]*\)", "", label)) == _plain(name),
-        lambda label: _abbreviates(name, label),
-    )
-    found = ([row for row in table.rows if agrees(row.label)] for agrees in ways)
-    return next(filter(None, found), [])
+def _rows_called(rest: str, table: Table) -> tuple[str, list[Row]]:
+    """The name in front of an equals sign of LABEL=PATH, and the rows that it may mean.
+
+    These are the rows that agree with it in the strictest of several ways; [] for none.
+    """
+    cuts = [match.start() for match in re.finditer("=", rest)]
+    for agrees in WAYS:
+        for cut in cuts:
+            rows = [row for row in table.rows if agrees(rest[:cut], row.label)]
+            if rows:
+                return rest[:cut], rows
+    return rest[: cuts[0]], []
 
 
 def _plain(text: str) -> str:
@@ -132,3 +126,13 @@ def _abbreviates(name: str, label: str) -> bool:
     short, words = (re.findall(r"[^\W_]+", text.casefold()) for text in (name, label))
     rest = iter(words)
     return bool(short) and short[:1] == words[:1] and all(word in rest for word in short)
+
+
+WAYS: tuple[Callable[[str, str], bool], ...] = (
+    lambda name, label: name == label,
+    lambda name, label: _plain(name) == _plain(label),
+    lambda name, label: _plain(name) == _plain(re.sub(r"[()]", "", label)),
+    lambda name, label: _plain(name) == _plain(re.sub(r"\([^)]*\)", "", label)),
+    _abbreviates,
+)
+"""How a name agrees with a label, the strictest way first."""

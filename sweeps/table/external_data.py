@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, TypedDict
 
 import hydra
@@ -13,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from rgbt.config.command import composing
 from rgbt.config.component import build
-from rgbt.config.compose import compose, flatten, own_hydra
+from rgbt.config.compose import compose, flatten, own_folders, own_hydra
 from rgbt.metrics.metric import Regions
 from sweeps.table.table import Form, Table
 
@@ -54,13 +55,17 @@ class TableData:
     files: Mapping[str, str]
     fingerprint: str
 
+    def values(self, group: str) -> dict[str, Any]:
+        """Plain values of a group by dotted key."""
+        return _leaves(self.config[group])
+
     def words(self, group: str, scale: str) -> list[str]:
         """Overrides of the whole group in a command that composes at `scale`."""
         chosen = f"{group}={self.files[group]}"
-        default = _leaves(compose([f"scale={scale}", chosen])[group])
+        default = _default(scale, group, self.files[group], own_folders())
         changed = {
             key: value
-            for key, value in _leaves(self.config[group]).items()
+            for key, value in self.values(group).items()
             if key not in default or default[key] != value
         }
         new = {key: "" if key in default else "+" for key in changed}
@@ -93,6 +98,12 @@ def data_of(table: Table, settings: Settings) -> TableData:
         files = {group: str(config.hydra.runtime.choices[group]) for group in GROUPS}
         dataset: Any = build(config.dataset)
     return TableData(config, files, str(dataset.fingerprint()))
+
+
+@cache
+def _default(scale: str, group: str, file: str, _own: str) -> dict[str, Any]:
+    """Values of a file of a group; cached, because Hydra takes a third of a second."""
+    return _leaves(compose([f"scale={scale}", f"{group}={file}"])[group])
 
 
 def _leaves(node: DictConfig) -> dict[str, Any]:

@@ -115,7 +115,7 @@ class ExternalSource:
             "overrides": [
                 without_passwords(word) for word in self.words if not word.startswith(starts)
             ],
-            "metric": self.data.words("metric", "paper"),
+            "metric": self.data.values("metric"),
         }
 
 
