@@ -1,10 +1,12 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from rgbt.checks import InputError
 from sweeps.evaluation import ExtraEvaluation
-from sweeps.reproduce import Options, request_of
+from sweeps.table.make_request import TableWords, make_request, read_named
 from sweeps.table.request import TableRequest, seeds_of
 from sweeps.table.table import Column, Row
 from sweeps.worker.trial_sources import Outcome
@@ -113,15 +115,50 @@ def test_no_seeds(text: str) -> None:
         seeds_of(text)
 
 
-def test_rows_of_different_networks_use_separate_weights() -> None:
-    options = Options(table="spatialseg/table7", scale="paper")
-    given = ("weights.mask2former_swin_t=/w/t=1.pth", "weights.mask2former_swin_b=b.pth", "x=1")
-    wanted = request_of(options.table, options, given)
+def test_rows_of_different_networks_start_from_separate_files() -> None:
+    given = (
+        *("pretrained.mask2former_swin_t=/w/t=1.pth", "pretrained.mask2former_swin_b=b.pth"),
+        "x=1",
+    )
+    name, published = read_named("spatialseg/table7")
+    words = TableWords(seeds=(0,), scale="paper", overrides=given)
+    wanted, external = make_request(name, published, words)
+    assert external == []
     assert wanted.overrides("Ours (Swin-T)", 0)[-3:] == (
         *("x=1", "model.weights='/w/t=1.pth'", "seed=0"),
     )
     assert "model.weights=b.pth" in wanted.overrides("Ours (Swin-B)", 0)
     assert not [word for word in wanted.overrides("Ours (Swin-S)", 0) if "weights" in word]
     assert wanted.typed_overrides() == ("x=1", *given[:2])
+    misspelt = replace(words, overrides=("pretrained.mask2former_swinb=x",))
     with pytest.raises(InputError, match="did you mean 'mask2former_swin_b'"):
-        request_of(options.table, options, ("weights.mask2former_swinb=x",))
+        make_request(name, published, misspelt)
+
+
+def test_form_and_rows_make_another_table() -> None:
+    name, published = read_named("spatialseg/table3")
+    plain = TableWords(seeds=(0,), scale="demo")
+    some = replace(plain, rows="Ny/4,Ny/8")
+    released = replace(plain, form="released")
+    made = [make_request(name, published, each)[0] for each in (plain, some, released)]
+    variants = [each.variant for each in made]
+    assert variants[0] == "demo"
+    assert variants[1].startswith("demo-")
+    assert variants[2] == "demo-released"
+    assert [len(each.points()) for each in made] == [7, 2, 7]
+    assert made[0].overrides("Ny/4", 0)[0] == "+experiment=grbm"
+    assert made[2].overrides("Ny/4", 0)[0] == "+experiment=grbm_released"
+
+
+def test_seeds_of_rows_may_differ() -> None:
+    asked = wanted()
+    points = asked.points([("other", 5), ("small", 7), ("large", 7)])
+    assert [point.overrides[-1] for point in points] == ["seed=5", "seed=7"]
+    outcomes = [Outcome(point, "failed", point.label) for point in points]
+    assert sorted(asked.runs(outcomes)) == [("large", 7), ("other", 5), ("small", 7)]
+
+
+def test_evaluated_rows_are_not_trained() -> None:
+    asked = replace(wanted(), evaluated=("other",))
+    assert {label for label, _ in asked.row_seeds()} == {"small", "large"}
+    assert len(asked.points()) == 2
