@@ -15,7 +15,7 @@ from sweeps import attributes as names
 from sweeps.report.study_data import read
 from sweeps.settings import Objective, SweepSettings
 from sweeps.space.space import Parameter, as_overrides, suggest
-from sweeps.verdicts.best_point import ScoreFile
+from sweeps.verdicts.best_point import ScoreFile, fewest_seeds
 from sweeps.worker.planner import specify_run
 from sweeps.worker.trial_sources import short_override
 
@@ -119,7 +119,7 @@ def check_confirmable(settings: SweepSettings, parameters: Sequence[Parameter]) 
     """Refuse what cannot be confirmed, before the search starts.
 
     Raises:
-        InputError: no end of the search, or a search over seeds.
+        InputError: no end of the search, too few seeds, or a search over seeds.
     """
     if not settings.confirm.best:
         return
@@ -127,6 +127,13 @@ def check_confirmable(settings: SweepSettings, parameters: Sequence[Parameter]) 
         raise InputError(
             "hydra.sweeper.confirm compares the best points after the last trial; set the number "
             "of trials with hydra.sweeper.trials=40."
+        )
+    best, most = settings.confirm.best, settings.confirm.max_seeds
+    fewest = fewest_seeds(best)
+    if most < fewest:
+        raise InputError(
+            f"hydra.sweeper.confirm.max_seeds={most} is too small: fewer than {fewest} seeds never "
+            f"show which of {best} points is the best. Set max_seeds={fewest} or more."
         )
     if SEED in {parameter.key for parameter in parameters}:
         raise InputError(

@@ -22,9 +22,9 @@ from sweeps.point import Point
 from sweeps.rendering.confirmation import Confirmed, confirmation_grid
 from sweeps.report.study_data import confirmed_study
 from sweeps.settings import Objective, SweepSettings
-from sweeps.verdicts.best_point import BestPointJudge, Race
+from sweeps.verdicts.best_point import BestPointJudge, Race, fewest_seeds
 from sweeps.verdicts.judge import CellRunId
-from sweeps.verdicts.until_decided import START, PairedSeeds
+from sweeps.verdicts.until_decided import PairedSeeds
 from sweeps.worker.point_list import PointList, run_points
 from sweeps.worker.progress import duration
 from sweeps.worker.run_store import RunStore
@@ -61,9 +61,11 @@ class Confirmation:
         }
 
     def points(self, wanted: Sequence[CellRunId] | None = None) -> list[Point]:
-        """Points of some candidates and seeds; by default the first `START` seeds of all."""
+        """Points of some candidates and seeds; by default all of those without which
+        nothing can be decided.
+        """
         if wanted is None:
-            first = self.candidates.seeds[:START]
+            first = self.candidates.seeds[: fewest_seeds(len(self.candidates.points))]
             wanted = [(each.label, seed) for seed in first for each in self.candidates.points]
         study = confirmed_study(self.search.study_name)
         by_label = {each.label: each for each in self.candidates.points}
@@ -97,7 +99,7 @@ class Confirmation:
         runs = self._runs(outcomes)
         found = self._race(runs)
         self._write(outcomes, found, is_over=False)
-        if isinstance(found, Race):
+        if isinstance(found, Race) and not found.obstacle:
             failed = {label for (label, _), run in runs.items() if run.state == "failed"}
             left = [label for label in found.open if label not in failed]
             if len(left) > 1:
@@ -181,7 +183,8 @@ def preview_line(study: optuna.Study | None, settings: SweepSettings, runs: RunS
     left = max(0, best * most - done)
     time = f", {duration(left * median(seconds) / settings.workers)}" if seconds else ""
     before = f" ({done} are finished)" if done else ""
+    fewest = min(fewest_seeds(best), most)
     return (
-        f"The {best} best points would then be compared with {START} to {most} further seeds each: "
-        f"at most {left} further runs{time}{before}."
+        f"The {best} best points would then be compared with {fewest} to {most} further seeds "
+        f"each: at most {left} further runs{time}{before}."
     )

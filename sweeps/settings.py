@@ -81,7 +81,7 @@ class Confirm:
     __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
 
     best: Annotated[int, Interval(ge=0, le=100)]
-    max_seeds: Annotated[int, Interval(ge=3, le=1000)]
+    max_seeds: Annotated[int, Interval(ge=4, le=1000)]
 
     def __post_init__(self) -> None:
         if self.best == 1:

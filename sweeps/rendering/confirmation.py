@@ -71,9 +71,8 @@ def confirmation_grid(confirmed: Confirmed, runs: Mapping[CellRunId, Outcome]) -
         for label in _order(confirmed, scores, race)
     ]
     interval = "interval" if race is None else f"{100 * race.level:.4g} % interval"
-    first = confirmed.objectives[0]
     header = (
-        *("point", f"{first} in the search", "further seeds", *metrics, "difference"),
+        *("point", "in the search", "further seeds", *metrics, "difference"),
         *(interval, "result", "would decide"),
     )
     title = f"Confirmation of the best {len(confirmed.found)} of {confirmed.trials} trials"
@@ -97,10 +96,13 @@ def conclusion(confirmed: Confirmed) -> str:
             f"Not confirmed: of {failed[0].label}, {failed[0].reason} "
             "(hydra.sweeper.retries=1 retries it)."
         )
+    if race.obstacle:
+        return f"Not confirmed: {race.obstacle[0].lower()}{race.obstacle[1:]}"
     left = ", ".join(number_of(label) for label in race.open)
+    reason = race.contenders[0].reason if race.contenders else ""
     return (
         f"Not confirmed: {len(confirmed.seeds)} seeds do not show which of {left} is the best. "
-        "Choose any of them, or set a larger hydra.sweeper.confirm.max_seeds."
+        f"{reason} Choose any of them, or set a larger hydra.sweeper.confirm.max_seeds."
     )
 
 
@@ -171,8 +173,8 @@ def _notes(confirmed: Confirmed, race: Race | None, metrics: Sequence[str]) -> t
     seeds = f"{confirmed.seeds[0]} to {confirmed.seeds[-1]}"
     notes = [conclusion(confirmed)]
     notes.append(
-        f"Means are over further seeds, {seeds} at most, which the search has not used. The values "
-        "in the search are too good, because it chose the best of many."
+        f"Means are over further seeds ({seeds} at most), which the search has not used. The "
+        "values in the search are too good, because it chose the best of many."
     )
     if race is not None:
         notes.append(

@@ -13,10 +13,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import count
 from statistics import fmean
 
 from analysis.uncertainty import Resampling
 from analysis.uncertainty.contrasts import Resampler, Term
+from analysis.uncertainty.sequence import half_width
 from analysis.uncertainty.verdicts import AnyTime, Verdict, decide
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
@@ -25,6 +27,22 @@ from sweeps.verdicts.judge import RESAMPLES, CellRunId
 
 ERROR_RATE = 0.025
 """Bound of the share of searches whose best point is called worse than another one."""
+
+
+def level_of(points: int) -> float:
+    """Level of the interval of every pair of `points` points.
+
+    The best point is compared with each other one, and each comparison may call it worse: one-sided
+    error rates that add up to `ERROR_RATE`.
+    """
+    return 1 - 2 * ERROR_RATE / (points - 1)
+
+
+def fewest_seeds(points: int) -> int:
+    """Smallest number of seeds that can decide anything about `points` points, two or more."""
+    alpha = (1 - level_of(points)) / 2
+    return next(n for n in count(2) if math.isfinite(half_width(1.0, n, alpha)))
+
 
 Finished = Mapping[str, Mapping[int, ScoredRun]]
 """Label -> seed -> finished run."""
@@ -87,6 +105,19 @@ class Race:
         """Whether the leader is shown to be the best."""
         return self.open == [self.leader]
 
+    @property
+    def contenders(self) -> list[Verdict]:
+        """Differences to the leader of the points that are not shown to be worse."""
+        left = (each.difference for each in self.standings if not each.worse_than)
+        return [difference for difference in left if difference is not None]
+
+    @property
+    def obstacle(self) -> str:
+        """Why no number of seeds decides it, in a sentence, or ""."""
+        fewest = fewest_seeds(len(self.standings))
+        enough = [each for each in self.contenders if each.seeds >= fewest]
+        return next((each.reason for each in enough if each.interval is None), "")
+
 
 @dataclass
 class BestPointJudge:
@@ -105,9 +136,7 @@ class BestPointJudge:
     def __post_init__(self) -> None:
         self._resampler = Resampler(self.settings)
         self._counts: dict[tuple[str, str], Counts] = {}
-        # The best point is compared with each other point, and each comparison may call it worse:
-        # one-sided error rates that add up to ERROR_RATE.
-        self._rule = AnyTime(level=1 - 2 * ERROR_RATE / (len(self.files) - 1))
+        self._rule = AnyTime(level=level_of(len(self.files)))
 
     def race(self, runs: Mapping[CellRunId, CellRun]) -> Race:
         """The standings by the finished ones of `runs`.
