@@ -1,4 +1,4 @@
-"""Error rates of the confirmation of a search: ``python -m tests.benchmarks.simulate_confirmation``.
+"""Error rates of a confirmed search: ``python -m tests.benchmarks.simulate_confirmation``.
 
 Three points with scores of unit standard deviation over seeds; images without error. 5 to 10
 seeds, of points that are not shown to be worse than another one.
