@@ -86,7 +86,7 @@ class Confirm:
     def __post_init__(self) -> None:
         if self.best == 1:
             raise InputError(
-                "hydra.sweeper.confirm.best=1: expected 2 or more points, which are compared with "
+                "best=1: expected 2 or more points, which are compared with "
                 "each other, or 0 for none."
             )
 

@@ -77,7 +77,7 @@ def objective(metric: str, **more: Any) -> dict[str, Any]:
         ({"workers": 0}, "workers' must be a whole number from 1 to 1024 .*, got 0"),
         ({"workers": "two"}, "hydra.sweeper.workers"),
         ({"workers": 1.5}, "hydra.sweeper.workers"),
-        ({"confirm": {"best": 1, "max_seeds": 9}}, "confirm.best=1: expected 2 or more points"),
+        ({"confirm": {"best": 1, "max_seeds": 9}}, "best=1: expected 2 or more points"),
         ({"confirm": {"best": 3, "max_seeds": 3}}, "max_seeds' must be a whole number from 4 to"),
         ({"confirm": {"best": 3, "seeds": 9}}, "confirm"),
         ({"retries": -1}, "retries' must be a whole number from 0"),
