@@ -47,12 +47,12 @@ class Options:
     seeds: Annotated[
         str,
         Help(
-            "number of seeds (3: seeds 0, 1, 2), a list (0,4,7), or until_decided: start with 3 "
+            "number of seeds (3: seeds 0, 1, 2), a list (0,4,7), or until_decided: start with 4 "
             "and add paired seeds to the rows of undecided claims, up to max_seeds"
         ),
     ] = "1"
     max_seeds: Annotated[
-        int, Interval(ge=3, le=1000), Help("most seeds of a row with seeds=until_decided")
+        int, Interval(ge=4, le=1000), Help("most seeds of a row with seeds=until_decided")
     ] = 20
     scale: Annotated[str, Help("demo (minutes, embedded data) or paper (published sizes)")] = "demo"
     form: Annotated[

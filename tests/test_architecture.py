@@ -66,7 +66,8 @@ ROOMS = {
     "space": set(),
     "report": set(),
     "table": {"worker"},
-    "rendering": {"table", "worker", "report"},
+    "verdicts": {"table", "worker"},
+    "rendering": {"table", "worker", "report", "verdicts"},
 }
 """Folders of sweeps, and which others each of them knows."""
 

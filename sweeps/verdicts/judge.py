@@ -37,7 +37,8 @@ class JudgedClaim:
         contrast: the one whose numbers the verdict shows; of a mean, the claim itself.
         printed: the same contrast of the printed values; None where one is missing.
         as_printed: whether the printed values agree with the claim; None: some are missing.
-        missing: labels of rows without a score, in the order of the table.
+        missing: labels of rows without a finished run, in the order of the table.
+        complete: whether every contrast of it could be computed.
         reason: why there is no verdict, or why it is undecided; one sentence, or "".
     """
 
@@ -48,6 +49,7 @@ class JudgedClaim:
     printed: float | None
     as_printed: bool | None
     missing: tuple[str, ...] = ()
+    complete: bool = False
     reason: str = ""
 
     @property
@@ -126,6 +128,7 @@ class TableJudge:
             printed=_mean(printed) if mean else printed[shown],
             as_printed=agrees,
             missing=missing,
+            complete=not is_partial,
             reason=verdict.reason,
         )
 

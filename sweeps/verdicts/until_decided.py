@@ -6,7 +6,7 @@ run that two of them want is done once. The rule must be valid at any time it is
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from sweeps.point import Point
@@ -16,8 +16,55 @@ from sweeps.verdicts.contrasts import contrasts_of
 from sweeps.verdicts.judge import CellRunId, JudgedClaim, TableJudge
 from sweeps.worker.trial_sources import Outcome
 
-START = 3
-"""Seeds of every row before the claims are judged for the first time."""
+START = 4
+"""Seeds of every row before the claims are judged for the first time: with fewer, an interval that
+is valid at any time is infinite."""
+
+
+@dataclass
+class PairedSeeds:
+    """Chooses the next seed of rows that are compared with each other.
+
+    Attributes:
+        seeds: those that a row may get, in order.
+    """
+
+    seeds: Sequence[int]
+    _seen: frozenset[CellRunId] | None = field(default=None, init=False)
+
+    def further(
+        self,
+        runs: Mapping[CellRunId, CellRun],
+        open_groups: Callable[[], Iterable[Sequence[str]]],
+    ) -> list[CellRunId]:
+        """The lowest seed that some rows of a group lack, for each of them; of every open group.
+
+        A group gets a seed while at most one of its seeds is unfinished: no worker is idle, and
+        few runs are made that turn out to be unnecessary. A group with a failed run gets no seeds.
+
+        Args:
+            runs: all that are planned, in any state.
+            open_groups: labels of rows that need further seeds; called if a run has finished since
+                the last call.
+        """
+        finished = frozenset(each for each, run in runs.items() if run.state == "finished")
+        if finished == self._seen:
+            return []
+        self._seen = finished
+        failed = {label for (label, _), run in runs.items() if run.state == "failed"}
+        groups = [labels for labels in open_groups() if not failed.intersection(labels)]
+        wanted = {each: None for labels in groups for each in self._next(labels, runs)}
+        return list(wanted)
+
+    def _next(self, labels: Sequence[str], runs: Mapping[CellRunId, CellRun]) -> list[CellRunId]:
+        own = {each: run for each, run in runs.items() if each[0] in labels}
+        if len({seed for (_, seed), run in own.items() if run.state != "finished"}) > 1:
+            return []
+        for seed in self.seeds:
+            lacking = [(label, seed) for label in labels if (label, seed) not in own]
+            if lacking:
+                return lacking
+        return []
 
 
 @dataclass
@@ -34,34 +81,20 @@ class SeedsUntilDecided:
     judge: TableJudge
     max_seeds: int
     external: Mapping[CellRunId, CellRun] = field(default_factory=dict)
-    _seen: frozenset[CellRunId] | None = field(default=None, init=False)
+
+    def __post_init__(self) -> None:
+        self._seeds = PairedSeeds(range(self.max_seeds))
 
     def __call__(self, outcomes: Sequence[Outcome]) -> list[Point]:
         """The next seed of the rows of every undecided claim; [] where nothing has changed.
-
-        Called again before a further run is finished, it adds nothing: claims are never more than
-        one seed ahead of what is known.
 
         Args:
             outcomes: of all points until now.
         """
         runs = self.request.runs(outcomes)
-        finished = frozenset(each for each, run in runs.items() if run.state == "finished")
-        if finished == self._seen:
-            return []
-        self._seen = finished
-        failed = {label for (label, _), run in runs.items() if run.state == "failed"}
-        planned = {row.label: set[int]() for row in self.request.trained_rows}
-        for label, seed in runs:
-            planned[label].add(seed)
-        wanted: dict[CellRunId, None] = {}
-        judged = self.judge.claims({**runs, **self.external})
-        for each in filter(_is_open, judged):
-            labels = self._trained(each)
-            if labels and not failed.intersection(labels):
-                wanted |= dict.fromkeys(self._next(labels, planned))
+        wanted = self._seeds.further(runs, lambda: self._open(runs))
         have = {outcome.point.overrides for outcome in outcomes}
-        return [each for each in self.request.points(list(wanted)) if each.overrides not in have]
+        return [each for each in self.request.points(wanted) if each.overrides not in have]
 
     def most_runs(self) -> list[Point]:
         """Every point that may be run: `max_seeds` of rows of claims, `START` of others."""
@@ -79,21 +112,18 @@ class SeedsUntilDecided:
             ]
         )
 
+    def _open(self, runs: Mapping[CellRunId, CellRun]) -> list[list[str]]:
+        """Labels of the trained rows of every claim that further seeds may decide."""
+        judged = self.judge.claims({**runs, **self.external})
+        return [labels for each in judged if _is_open(each) and (labels := self._trained(each))]
+
     def _trained(self, judged: JudgedClaim) -> list[str]:
         """Labels of the trained rows of a claim."""
         contrasts = contrasts_of(judged.claim, self.request.table)
         named = {label for each in contrasts for label in each.rows}
         return [row.label for row in self.request.trained_rows if row.label in named]
 
-    def _next(self, labels: Sequence[str], planned: Mapping[str, set[int]]) -> list[CellRunId]:
-        """The lowest seed that some of the rows lack, for each of them."""
-        for seed in range(self.max_seeds):
-            lacking = [label for label in labels if seed not in planned[label]]
-            if lacking:
-                return [(label, seed) for label in lacking]
-        return []
-
 
 def _is_open(judged: JudgedClaim) -> bool:
-    """Whether further seeds may decide a claim: there are scores, and no rows are missing."""
-    return judged.word == "undecided" and not judged.missing
+    """Whether further seeds may decide a claim: every contrast of it has scores."""
+    return judged.word == "undecided" and judged.complete

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import TypeVar
 
@@ -16,11 +17,11 @@ from rgbt.tracking.provenance import without_passwords
 from rgbt.tracking.replaced_runs import replace_finished
 from rgbt.tracking.run_files import read_description
 from rgbt.tracking.run_folder import RunFolder
-from rgbt.tracking.run_result import RunResult
+from rgbt.tracking.run_result import ALL_COUNTS, RunResult
 from rgbt.tracking.terminal import info
 from rgbt.tracking.tracker import Status, Tracking
 
-FETCHED_FILES = ("result.json", "counts_test.npz", "provenance.json", "evaluations")
+FETCHED_FILES = ("result.json", ALL_COUNTS, "provenance.json", "evaluations")
 FETCHED = ".fetched"
 """Folder inside the folder of runs: copies of runs that other machines made, from MLflow."""
 
@@ -162,11 +163,11 @@ def store_exists(tracking: MlflowTracking) -> bool:
     return scheme != "sqlite" or Path(path).exists()
 
 
-def _download(tracking: MlflowTracking, result: RunResult, names: Sequence[str]) -> None:
+def _download(tracking: MlflowTracking, result: RunResult, patterns: Sequence[str]) -> None:
     client = tracking.store().client
-    artifacts = {item.path for item in client.list_artifacts(result.run_id)}
-    for name in names:
-        if name in artifacts:
+    artifacts = [item.path for item in client.list_artifacts(result.run_id)]
+    for name in artifacts:
+        if any(fnmatch(name, pattern) for pattern in patterns):
             client.download_artifacts(result.run_id, name, str(result.folder))
 
 

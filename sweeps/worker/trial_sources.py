@@ -144,12 +144,17 @@ class ListSource:
     def next(self) -> ClaimedTrial | None:
         """See `TrialSource.next`."""
         claimed = self._claim()
-        if claimed is None:
-            further = {plan.key: plan for plan in self.more()}
-            if further.keys() - self.plans.keys():
-                self.plans = {**further, **self.plans}
-                return self._claim()
+        # Points that were added before this command was stopped are finished: others follow them.
+        while claimed is None and self._add():
+            claimed = self._claim()
         return claimed
+
+    def _add(self) -> bool:
+        """Add further points; whether there are any."""
+        further = {plan.key: plan for plan in self.more()}
+        is_new = bool(further.keys() - self.plans.keys())
+        self.plans = {**further, **self.plans}
+        return is_new
 
     def _claim(self) -> ClaimedTrial | None:
         by_key = self.store.by_key()

@@ -22,7 +22,7 @@ from rgbt.tracking.run_files import Description, counts_name
 from rgbt.tracking.run_folder import RunFolder
 from sweeps import attributes as names
 from sweeps.point import Point
-from sweeps.settings import Objective, SweepSettings
+from sweeps.settings import Confirm, Objective, SweepSettings
 from sweeps.space.samplers import build_sampler
 from sweeps.space.space import parse_space
 from sweeps.worker import driver as drivers
@@ -56,6 +56,7 @@ def settings(**changes: Any) -> SweepSettings:
         "objectives": (Objective("test/mIoU", "maximize"),),
         "sampler": {"kind": "random", "seed": 0},
         "replicates": 1,
+        "confirm": Confirm(best=0, max_seeds=10),
     }
     return SweepSettings(**{**plain, **changes})
 

@@ -14,7 +14,7 @@ from sweeps.reproduce import entry as reproduce
 from sweeps.table.request import UNTIL_DECIDED
 from sweeps.worker.planner import Planner
 from tests.commands import Call, assert_one_sentence
-from tests.sweeps.verdicts.planted import accuracy
+from tests.sweeps.verdicts.accuracies import accuracy
 
 TABLE = """\
 paper: my
@@ -113,8 +113,8 @@ def test_dry_run_says_what_deciding_may_cost(call: Call, place: Path) -> None:
     words = ("table=my/planted", "seeds=until_decided", "max_seeds=5", "tracking=none", SMOKE)
     code, out, _ = call(reproduce, *words, "dry_run=true")
     assert code == 0
-    assert "9 runs: 9 finished." in out
-    assert "at most 6 further runs" in out
+    assert "12 runs: 9 finished, 3 waiting." in out
+    assert "at most 3 further runs" in out
 
 
 @pytest.mark.parametrize(

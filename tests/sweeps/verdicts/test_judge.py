@@ -14,7 +14,7 @@ from sweeps.table.table import Column, Row, Table
 from sweeps.verdicts.judge import CellRunId, JudgedClaim, TableJudge
 from sweeps.worker.trial_sources import Outcome
 from tests.sweeps.tabled import failed, outcome, table
-from tests.sweeps.verdicts.planted import accuracy, planted
+from tests.sweeps.verdicts.accuracies import accuracy, planted
 
 SHARES = {"low": (50.0, 51.0, 49.0), "high": (60.0, 61.5, 59.0), "same": (60.5, 60.0, 60.5)}
 """Accuracies in percent by seed."""

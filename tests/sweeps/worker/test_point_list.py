@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,12 +15,30 @@ from rgbt.spec.naming import VARIED
 from rgbt.tracking.provenance import code
 from rgbt.tracking.run_result import RunResult
 from sweeps.point import COLOUR, Point, colour
+from sweeps.worker import driver as drivers
 from sweeps.worker import point_list
 from sweeps.worker.planner import PlannedPoint
-from sweeps.worker.point_list import PointList, estimated_seconds, other_code_line, preview_points
+from sweeps.worker.point_list import (
+    PointList,
+    estimated_seconds,
+    other_code_line,
+    preview_points,
+    run_points,
+)
 from sweeps.worker.run_store import RunStore
 from sweeps.worker.trial_sources import Outcome
-from tests.sweeps.fakes import finish, plan_of, settings
+from tests.sweeps.fakes import (
+    FakeExecutor,
+    FakePlanner,
+    fail,
+    finish,
+    only,
+    plan_of,
+    quick,
+    settings,
+)
+
+__all__ = ["quick"]
 
 
 def made(folder: Path, seconds: float) -> Outcome:
@@ -108,3 +127,51 @@ def test_estimated_seconds_ignores_trained_points(tmp_path: Path) -> None:
     assert [each.is_trained for each in (trained, waiting)] == [True, False]
     assert estimated_seconds([trained, waiting], 1) == 40.0
     assert estimated_seconds([trained], 1) == 0.0
+
+
+@pytest.fixture
+def executor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quick: None) -> FakeExecutor:
+    """Runs the processes of `run_points`."""
+    del quick
+    made = FakeExecutor(tmp_path)
+    monkeypatch.setattr(drivers, "LocalExecutor", lambda workers: made)
+    monkeypatch.setattr(point_list, "Planner", lambda base: FakePlanner())
+    return made
+
+
+def growing(tmp_path: Path, last: int) -> PointList:
+    """A list of x=0, to which x=1, ... `last` are added, each when all others are finished."""
+
+    def more(outcomes: Sequence[Outcome]) -> list[Point]:
+        x = len(outcomes)
+        done = all(outcome.state == "finished" for outcome in outcomes)
+        return [Point(f"x={x}", (f"x={x}",))] if done and x <= last else []
+
+    return replace(wanted(tmp_path, Point("x=0", ("x=0",))), more=more)
+
+
+def test_run_points_runs_added_points_and_returns_their_outcomes(
+    tmp_path: Path, executor: FakeExecutor
+) -> None:
+    outcomes = run_points(growing(tmp_path, 3), settings())
+    assert [outcome.point.label for outcome in outcomes] == [f"x={x}" for x in range(4)]
+    assert {outcome.state for outcome in outcomes} == {"finished"}
+    assert executor.started() == [(f"x={x}",) for x in range(4)]
+
+
+def test_run_points_resumed_continues_behind_the_added_points(
+    tmp_path: Path, executor: FakeExecutor
+) -> None:
+    run_points(growing(tmp_path, 2), settings())
+    again = run_points(growing(tmp_path, 4), settings())
+    assert [outcome.state for outcome in again] == ["finished"] * 5
+    assert executor.started()[3:] == [("x=3",), ("x=4",)], "nothing is run twice"
+
+
+def test_run_points_failed_added_point_ends_the_list(
+    tmp_path: Path, executor: FakeExecutor
+) -> None:
+    executor.behaviour = only("x=1", fail)
+    outcomes = run_points(growing(tmp_path, 3), settings())
+    assert [outcome.state for outcome in outcomes] == ["finished", "failed"]
+    assert outcomes[1].reason == "ValueError: a bad day"

@@ -216,3 +216,64 @@ def test_pruning_callback_keeps_var_and_skips_two_objectives(tmp_path: Path) -> 
     assert desk.store.trials()[0].intermediate_values == {2: 9.0}
     both = search_desk(tmp_path, objectives=(Objective("val/mIoU", "maximize"), var), trials=1)
     assert taken(both).report is None
+
+
+def in_turn(desk: Desk, points: list[PlannedPoint]) -> list[int]:
+    """Let `more` of a desk add the next of `points` when all known ones are finished."""
+    calls: list[int] = []
+    source = desk.driver.source
+    assert isinstance(source, ListSource)
+
+    def more() -> list[PlannedPoint]:
+        calls.append(len(source.plans))
+        done = all(outcome.state == "finished" for outcome in source.statuses())
+        return points[len(source.plans) : len(source.plans) + 1] if done else []
+
+    source.more = more
+    return calls
+
+
+def test_list_source_adds_points_when_none_is_waiting(tmp_path: Path) -> None:
+    every = plans(3)
+    desk = list_desk(tmp_path, every[:2])
+    calls = in_turn(desk, every)
+    first, second = taken(desk), taken(desk)
+    assert calls == [], "points are waiting"
+    done(desk, first)
+    assert desk.driver.source.next() is None
+    done(desk, second)
+    added = taken(desk)
+    assert added.plan.point.label == "x=2"
+    done(desk, added)
+    assert desk.driver.source.next() is None
+    assert is_exhausted(desk, wait=True)
+
+
+def test_list_source_resumed_adds_all_finished_points_at_once(tmp_path: Path) -> None:
+    every = plans(5)
+    storage = memory()
+    before = list_desk(tmp_path, every[:1], storage=storage)
+    in_turn(before, every[:4])
+    while task := before.driver.source.next():
+        done(before, task)
+    assert len(before.store.trials()) == 4
+    again = list_desk(tmp_path, every[:1], storage=storage)
+    in_turn(again, every)
+    assert taken(again).plan.point.label == "x=4", "three points were added and finished before"
+
+
+def test_list_source_points_that_two_drivers_add_are_run_once(tmp_path: Path) -> None:
+    storage, every = memory(), plans(2)
+    desks = [list_desk(tmp_path, every[:1], storage=storage, owner=owner) for owner in (None, DEAD)]
+    first = taken(desks[0])
+    for desk in desks:
+        in_turn(desk, every)
+    assert desks[1].driver.source.next() is None
+    done(desks[0], first)
+    added = taken(desks[0])
+    assert desks[1].driver.source.next() is None, "the other driver runs the added point"
+    assert not is_exhausted(desks[1], wait=True)
+    done(desks[0], added)
+    assert desks[1].driver.source.next() is None
+    assert is_exhausted(desks[1], wait=True)
+    assert len(desks[0].store.trials()) == 2

@@ -1,0 +1,180 @@
+"""Seeds are added to the rows of undecided claims, and to no others."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import pytest
+
+from analysis.uncertainty import Resampling
+from analysis.uncertainty.verdicts import AnyTime
+from sweeps.point import Point
+from sweeps.table.claim import Claim
+from sweeps.table.request import TableRequest, seed_of
+from sweeps.table.table import Row
+from sweeps.verdicts.judge import TableJudge
+from sweeps.verdicts.until_decided import START, PairedSeeds, SeedsUntilDecided
+from sweeps.worker.trial_sources import Outcome
+from tests.sweeps.tabled import table
+from tests.sweeps.verdicts.planted import in_state, planted_outcome
+
+MEANS = {"ours": 80.0, "base": 60.0, "twin": 60.0, "other": 50.0}
+"""Of two rows with one mean, neither is better."""
+
+MAX = 6
+DECIDED = 4
+"""Seeds after which a clear claim is decided: no interval at any time has fewer."""
+
+
+def claim(name: str, row: str, against: str) -> Claim:
+    return Claim(
+        name=name,
+        says="One is better.",
+        source="Sec. I",
+        rows=(row,),
+        against=(against,),
+        columns=("acc",),
+        expected="higher",
+    )
+
+
+TRUE, FALSE = claim("true", "ours", "base"), claim("false", "base", "ours")
+OPEN = claim("open", "twin", "base")
+
+
+def adding(*claims: Claim, max_seeds: int = MAX) -> SeedsUntilDecided:
+    rows = tuple(Row(label=label, experiment="crm", overrides=(f"row={label}",)) for label in MEANS)
+    request = TableRequest(
+        "own/t", table(rows, claims=claims), "demo", tuple(range(START)), until_decided=True
+    )
+    quick = Resampling(resamples=200)
+    judge = TableJudge("own/t", request.table, AnyTime(), quick)
+    return SeedsUntilDecided(request, judge, max_seeds)
+
+
+def row_of(point: Point) -> str:
+    (word,) = (word for word in point.overrides if word.startswith("row="))
+    return word.removeprefix("row=")
+
+
+def finished(points: Sequence[Point]) -> list[Outcome]:
+    return [
+        planted_outcome(point, MEANS[row_of(point)], row_of(point), seed_of(point.overrides))
+        for point in points
+    ]
+
+
+def seeds(outcomes: Sequence[Outcome]) -> dict[str, int]:
+    return dict(Counter(row_of(outcome.point) for outcome in outcomes))
+
+
+def complete(
+    until: SeedsUntilDecided,
+    before: Sequence[Outcome] = (),
+    finish: Callable[[Sequence[Point]], list[Outcome]] = finished,
+) -> list[Outcome]:
+    """All outcomes, with every added point run."""
+    outcomes = list(before) or finish(until.request.points())
+    while further := until(outcomes):
+        outcomes += finish(further)
+    return outcomes
+
+
+def test_rows_of_decided_claims_get_no_more_seeds() -> None:
+    expected = {"ours": DECIDED, "base": DECIDED, "twin": START, "other": START}
+    assert seeds(complete(adding(TRUE, FALSE))) == expected
+
+
+def test_rows_of_undecided_claims_get_seeds_up_to_the_largest_number() -> None:
+    until = adding(TRUE, OPEN)
+    outcomes = complete(until)
+    assert seeds(outcomes) == {"ours": DECIDED, "base": MAX, "twin": MAX, "other": START}
+    (judged,) = (
+        each
+        for each in until.judge.claims(until.request.runs(outcomes))
+        if each.claim.name == "open"
+    )
+    assert (judged.word, judged.verdict and judged.verdict.seeds) == ("undecided", MAX)
+    assert len(until.most_runs()) == 3 * MAX + START, "the row without a claim needs no more"
+    assert {each.overrides for each in outcomes_points(outcomes)} <= {
+        each.overrides for each in until.most_runs()
+    }
+
+
+def outcomes_points(outcomes: Sequence[Outcome]) -> list[Point]:
+    return [outcome.point for outcome in outcomes]
+
+
+def test_table_without_claims_gets_no_further_seeds() -> None:
+    assert seeds(complete(adding())) == dict.fromkeys(MEANS, START)
+
+
+def test_added_points_are_of_one_seed_and_name_the_rule() -> None:
+    until = adding(OPEN)
+    further = until(finished(until.request.points()))
+    assert [(row_of(each), seed_of(each.overrides)) for each in further] == [
+        ("base", START),
+        ("twin", START),
+    ]
+    assert all("rgbt.until_decided/own/t" in each.tags for each in further)
+
+
+def test_second_call_without_a_further_result_adds_nothing() -> None:
+    until = adding(OPEN)
+    outcomes = finished(until.request.points())
+    further = until(outcomes)
+    assert further
+    waiting = [*outcomes, *(Outcome(point, "running") for point in further)]
+    assert until(waiting) == []
+
+
+def test_resumed_command_adds_the_same_seeds() -> None:
+    until = adding(OPEN)
+    outcomes = complete(until)
+    half = [each for each in outcomes if seed_of(each.point.overrides) <= START]
+    assert outcomes_points(complete(adding(OPEN), half)) == outcomes_points(outcomes)
+    from_start = [each for each in outcomes if seed_of(each.point.overrides) < START]
+    assert seeds(complete(adding(OPEN), from_start)) == seeds(outcomes)
+
+
+def test_at_most_two_seeds_of_a_claim_are_unfinished() -> None:
+    until = adding(OPEN)
+    outcomes = finished(until.request.points())
+    further = until(outcomes)
+    first, second = finished(further)
+    outcomes += [first, *in_state([second], "running")]
+    ahead = until(outcomes)
+    assert {seed_of(each.overrides) for each in ahead} == {START + 1}, "a slot is not left idle"
+    one, other = finished(ahead)
+    outcomes += [one, *in_state([other], "running")]
+    assert until(outcomes) == [], "two seeds of the claim are unfinished"
+
+
+def test_claim_with_a_failed_row_is_not_extended() -> None:
+    def failing(points: Sequence[Point]) -> list[Outcome]:
+        made = finished(points)
+        return [
+            Outcome(each.point, "failed", "no memory") if row_of(each.point) == "twin" else each
+            for each in made
+        ]
+
+    assert seeds(complete(adding(OPEN), finish=failing)) == dict.fromkeys(MEANS, START)
+
+    def later(points: Sequence[Point]) -> list[Outcome]:
+        return failing(points) if seed_of(points[0].overrides) > START else finished(points)
+
+    assert seeds(complete(adding(OPEN), finish=later))["twin"] == START + 2
+
+
+@pytest.mark.parametrize("state", ["running", "waiting"])
+def test_paired_seeds_skip_seeds_that_are_planned(state: Any) -> None:
+    runs = {("a", seed): Outcome(Point("a", ()), "finished") for seed in (4, 5)}
+    runs |= {
+        ("b", 4): Outcome(Point("b", ()), "finished"),
+        ("b", 5): Outcome(Point("b", ()), state),
+    }
+    paired = PairedSeeds(range(4, 8))
+    assert paired.further(runs, lambda: [["a", "b"]]) == [("a", 6), ("b", 6)]
+    assert PairedSeeds(range(4, 6)).further(runs, lambda: [["a", "b"]]) == []
