@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 
-from analysis.uncertainty import Resampling
 from analysis.uncertainty.verdicts import AnyTime
 from sweeps.point import Point
 from sweeps.table.claim import Claim
@@ -49,7 +48,7 @@ def adding(*claims: Claim, max_seeds: int = MAX) -> SeedsUntilDecided:
     request = TableRequest(
         "own/t", table(rows, claims=claims), "demo", tuple(range(START)), until_decided=True
     )
-    quick = Resampling(resamples=200)
+    quick = 200
     judge = TableJudge("own/t", request.table, AnyTime(), quick)
     return SeedsUntilDecided(request, judge, max_seeds)
 
