@@ -239,7 +239,7 @@ def _opened(options: Options) -> list[tuple[NamedCounts, ...]]:
 def _counts(
     opened: Sequence[tuple[NamedCounts, ...]], missing: str
 ) -> tuple[list[Counts], list[Counts]]:
-    from analysis.uncertainty.images import common
+    from analysis.uncertainty.same_images import common
     from rgbt.tracking.terminal import info
 
     methods = [[named.counts for named in each] for each in opened]

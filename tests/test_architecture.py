@@ -58,7 +58,8 @@ def is_command(text: str) -> bool:
 
 
 SWEEPS_MAY = BASE | {"config", "spec", "metrics", "tracking"}
-"""What of rgbt the sweeps may import: they call its commands and read what these leave."""
+"""What of rgbt the sweeps may import: they call its commands and read what these leave. Of the
+analysis they may import `analysis.uncertainty` alone, which decides claims."""
 
 ROOMS = {
     "worker": {"space"},
@@ -76,7 +77,8 @@ def test_sweeps_imports_only_allowed_modules(path: Path) -> None:
     room = inside.parts[0] if len(inside.parts) > 1 else None
     for name in imports(ast.parse(path.read_text())):
         package, *rest = name.split(".")
-        assert package not in ("analysis", "tests"), f"{inside} imports {name}"
+        assert package != "tests", f"{inside} imports {name}"
+        assert package != "analysis" or rest[:1] == ["uncertainty"], f"{inside} imports {name}"
         if package == "rgbt" and rest:
             assert rest[0] in SWEEPS_MAY, f"{inside} imports {name}"
         if package == "sweeps" and room and rest and rest[0] in ROOMS and rest[0] != room:
@@ -111,6 +113,8 @@ def test_analysis_imports_no_network(path: Path) -> None:
         assert package != "tests", f"{inside} imports {name}"
         if package == "rgbt" and rest:
             assert rest[0] in ANALYSIS_MAY, f"{inside} imports {name}"
+        # The sweeps import it, for the verdicts of claims.
+        assert inside.parts[0] != "uncertainty" or package != "sweeps", f"{inside} imports {name}"
         if package == "sweeps" and rest:
             known = any(name == each or name.startswith(f"{each}.") for each in PUBLISHED)
             assert known or name in PARENTS, f"{inside} imports {name}"

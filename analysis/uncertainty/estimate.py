@@ -117,9 +117,15 @@ def estimate_of(
 
 
 def image_spread(images: CommonImages, resampled: Values) -> Spread:
-    """Standard error over the draw of the images.
+    """Standard error over the draw of the images, see `block_spread`."""
+    return block_spread(resampled, images.blocks.count)
 
-    Drawing B blocks from B blocks gives their mean ``sqrt((B - 1) / B)`` of its standard error.
+
+def block_spread(resampled: Values, count: int) -> Spread:
+    """Standard error of a score from scores of `count` blocks drawn anew.
+
+    Drawing B blocks from B blocks gives their mean ``sqrt((B - 1) / B)`` of its standard error. The
+    same holds for B blocks with images of the metric among more blocks: where all are drawn, the
+    number of those B that are drawn varies by as much as makes up for it.
     """
-    count = images.blocks.count
     return Spread(float(np.nanstd(resampled)) * math.sqrt(count / (count - 1)), count - 1)

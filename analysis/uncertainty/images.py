@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.uncertainty.blocks import FEWEST, ImageBlocks, make_blocks
+from analysis.uncertainty.same_images import aligned
 from analysis.uncertainty.settings import Resampling
 from rgbt.checks import InputError
 from rgbt.metrics import names
-from rgbt.metrics.counts import Counts, check_same_means, convention
+from rgbt.metrics.counts import Counts, convention
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.named import ParsedMetric, images_of, parse, values
 from rgbt.metrics.pairs import protocol_of
@@ -64,6 +65,13 @@ class CommonImages:
     blocks: ImageBlocks
     settings: Resampling
     absent: Absent
+
+    def in_blocks(self, blocks: ImageBlocks) -> CommonImages:
+        """The same images, summed inside `blocks`; so far each image is a block."""
+        order = np.argsort(blocks.index, kind="stable")
+        starts = np.searchsorted(blocks.index[order], np.arange(blocks.count))
+        summed = (np.add.reduceat(each[:, order], starts, axis=1) for each in self.methods)
+        return replace(self, methods=tuple(summed), blocks=blocks)
 
     def drawn(self, parsed: Sequence[ParsedMetric]) -> list[ResampledScores]:
         """The scores of every method, as they are and with images drawn anew or left out."""
@@ -140,7 +148,7 @@ def prepare(
             that part; blocks that cannot be made.
     """
     like = methods[0][0]
-    alike = [[_like(like, counts) for counts in seeds] for seeds in methods]
+    alike = [[aligned(like, counts) for counts in seeds] for seeds in methods]
     parts = [[images_of(metric, counts) for counts in seeds] for seeds in alike]
     first = parts[0][0]
     regions, classes = first.counts.shape[1], len(first.classes)
@@ -161,10 +169,7 @@ def prepare(
         blocks = make_blocks(first.names, settings.blocks, _influence(single))
     except InputError as error:
         raise InputError(f"{metric.part}: {error}" if metric.part else str(error)) from None
-    order = np.argsort(blocks.index, kind="stable")
-    starts = np.searchsorted(blocks.index[order], np.arange(blocks.count))
-    summed = (np.add.reduceat(each[:, order], starts, axis=1) for each in single.methods)
-    return replace(single, methods=tuple(summed), blocks=blocks)
+    return single.in_blocks(blocks)
 
 
 WATCHED = (parse(names.MIOU), parse(names.PIXEL_ACCURACY))
@@ -179,83 +184,15 @@ def _influence(single: CommonImages) -> Scores:
     """(L, N) how much each image moves the scores of every method, and their difference."""
     if single.settings.blocks != "auto":
         return np.empty((0, single.images))
-    moved = single.without_each(
-        WATCHED if protocol_of(single.like.partition) is None else WATCHED_PAIRS
-    )
+    moved = influence(single)
     series = [*moved, *([moved[1] - moved[0]] if len(moved) > 1 else [])]
     return np.asarray(np.nan_to_num(np.concatenate(series)), np.float64)
 
 
-def _like(first: Counts, other: Counts) -> Counts:
-    if other.classes != first.classes:
-        raise InputError(
-            f"counts of the classes {', '.join(first.classes)} cannot be compared with counts of "
-            f"{', '.join(other.classes)}; score both on one data set."
-        )
-    check_same_means(first, other)
-    if other.partition != first.partition:
-        of_pairs = protocol_of(first.partition) or protocol_of(other.partition)
-        how = "rgbt evaluate regions=..., rgbt score partition=..."
-        if of_pairs and protocol_of(first.partition) == protocol_of(other.partition):
-            raise InputError(
-                f"counts of {first.partition} and of {other.partition} are of different second "
-                "frames (other angles, camera or motion); measure both on the same with "
-                "rgbt.consistency."
-            )
-        raise InputError(
-            f"counts by {first.partition} cannot be compared with counts by {other.partition}; "
-            f"count both by one partition ({'rgbt consistency frames=...' if of_pairs else how})."
-        )
-    if set(other.names) != set(first.names):
-        if not set(other.names) & set(first.names):
-            raise InputError(
-                f"the counts are of different images: such as '{first.names[0]}' (split "
-                f"'{first.split}') and '{other.names[0]}' (split '{other.split}'); score both on "
-                "one split of one data set."
-            )
-        only = sorted(set(first.names) ^ set(other.names))
-        raise InputError(
-            f"the counts are not of the same images: {len(first.names)} of split '{first.split}' "
-            f"against {len(other.names)} of split '{other.split}', '{only[0]}' is in only one; "
-            "score both on one split, or set missing=leave_out to compare the common images."
-        )
-    same = other if other.names == first.names else other.select(first.names)
-    if None not in (first.night, same.night) and first.night != same.night:
-        raise InputError(
-            "the counts do not agree about which images were taken at night; score both on one "
-            "data set."
-        )
-    # Of pairs of frames the label is no row of the matrices but says which matrix it is.
-    within = -1 if protocol_of(first.partition) is None else (-2, -1)
-    labelled = [
-        each.counts.sum(within, dtype=np.int64).reshape(len(each.names), -1)
-        for each in (first, same)
-    ]
-    unequal = np.flatnonzero((labelled[0] != labelled[1]).any(1))
-    if len(unequal):
-        raise InputError(
-            f"'{first.names[unequal[0]]}' has different labels in the two counts "
-            f"({len(unequal)} images do); score both on the same labels at the same size."
-        )
-    return same
-
-
-def common(methods: Sequence[Sequence[Counts]]) -> list[list[Counts]]:
-    """The counts of the images that all of them hold, in the order of the first.
-
-    Raises:
-        InputError: no image is in all of them.
-    """
-    every = [counts for seeds in methods for counts in seeds]
-    shared = set(every[0].names).intersection(*(counts.names for counts in every))
-    kept = [name for name in every[0].names if name in shared]
-    if not kept:
-        splits = ", ".join(dict.fromkeys(f"'{counts.split}'" for counts in every))
-        raise InputError(
-            f"no image is in all counts, which are of {splits} with names such as "
-            f"'{every[0].names[0]}' and '{every[-1].names[0]}'; score all on one split."
-        )
-    return [[counts.select(kept) for counts in seeds] for seeds in methods]
+def influence(single: CommonImages) -> list[Scores]:
+    """Per method (L, N): the watched scores without each image; NaN: nothing to score."""
+    of_pairs = protocol_of(single.like.partition) is not None
+    return single.without_each(WATCHED_PAIRS if of_pairs else WATCHED)
 
 
 def _chunks(total: int) -> Iterator[slice]:

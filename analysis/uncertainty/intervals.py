@@ -148,9 +148,9 @@ def widest(level: float, *spreads: Spread) -> Spread:
 
 def student(value: float, spread: Spread, level: float) -> Interval:
     """``value -+ t error``."""
-    from scipy.stats import t
+    from scipy.special import stdtrit  # what `scipy.stats.t.ppf` calls, 50 times faster
 
-    half = float(t.ppf((1 + level) / 2, spread.freedom)) * spread.error
+    half = float(stdtrit(spread.freedom, (1 + level) / 2)) * spread.error
     return Interval(value - half, value + half)
 
 

@@ -10,7 +10,8 @@ import pytest
 
 from analysis.uncertainty import Resampling
 from analysis.uncertainty import images as room
-from analysis.uncertainty.images import CommonImages, _influence, common, prepare
+from analysis.uncertainty.images import CommonImages, _influence, prepare
+from analysis.uncertainty.same_images import common
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import parse, value

@@ -1,0 +1,121 @@
+"""Whether counts are of the same images and labels, and the same counts in one order."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from rgbt.checks import InputError
+from rgbt.metrics.counts import Counts, check_same_means
+from rgbt.metrics.pairs import protocol_of
+
+
+def aligned(first: Counts, other: Counts) -> Counts:
+    """`other` with its images in the order of `first`.
+
+    Raises:
+        InputError: other images, classes, scored classes, regions or labels.
+    """
+    _check_classes(first, other)
+    if other.partition != first.partition:
+        of_pairs = protocol_of(first.partition) or protocol_of(other.partition)
+        how = "rgbt evaluate regions=..., rgbt score partition=..."
+        if of_pairs and protocol_of(first.partition) == protocol_of(other.partition):
+            raise InputError(
+                f"counts of {first.partition} and of {other.partition} are of different second "
+                "frames (other angles, camera or motion); measure both on the same with "
+                "rgbt.consistency."
+            )
+        raise InputError(
+            f"counts by {first.partition} cannot be compared with counts by {other.partition}; "
+            f"count both by one partition ({'rgbt consistency frames=...' if of_pairs else how})."
+        )
+    return _in_order(first, other)
+
+
+def aligned_images(first: Counts, other: Counts) -> Counts:
+    """As `aligned`, but the regions may differ, and one may be of pairs of frames.
+
+    Labels are compared where both are of single frames (over the whole image where the regions
+    differ) or both of the same pairs.
+
+    Raises:
+        InputError: other images, classes, scored classes or labels.
+    """
+    _check_classes(first, other)
+    return _in_order(first, other)
+
+
+def common(methods: Sequence[Sequence[Counts]]) -> list[list[Counts]]:
+    """The counts of the images that all of them hold, in the order of the first.
+
+    Raises:
+        InputError: no image is in all of them.
+    """
+    every = [counts for seeds in methods for counts in seeds]
+    shared = set(every[0].names).intersection(*(counts.names for counts in every))
+    kept = [name for name in every[0].names if name in shared]
+    if not kept:
+        splits = ", ".join(dict.fromkeys(f"'{counts.split}'" for counts in every))
+        raise InputError(
+            f"no image is in all counts, which are of {splits} with names such as "
+            f"'{every[0].names[0]}' and '{every[-1].names[0]}'; score all on one split."
+        )
+    return [[counts.select(kept) for counts in seeds] for seeds in methods]
+
+
+def _check_classes(first: Counts, other: Counts) -> None:
+    if other.classes != first.classes:
+        raise InputError(
+            f"counts of the classes {', '.join(first.classes)} cannot be compared with counts of "
+            f"{', '.join(other.classes)}; score both on one data set."
+        )
+    check_same_means(first, other)
+
+
+def _in_order(first: Counts, other: Counts) -> Counts:
+    if set(other.names) != set(first.names):
+        if not set(other.names) & set(first.names):
+            raise InputError(
+                f"the counts are of different images: such as '{first.names[0]}' (split "
+                f"'{first.split}') and '{other.names[0]}' (split '{other.split}'); score both on "
+                "one split of one data set."
+            )
+        only = sorted(set(first.names) ^ set(other.names))
+        raise InputError(
+            f"the counts are not of the same images: {len(first.names)} of split '{first.split}' "
+            f"against {len(other.names)} of split '{other.split}', '{only[0]}' is in only one; "
+            "score both on one split, or set missing=leave_out to compare the common images."
+        )
+    same = other if other.names == first.names else other.select(first.names)
+    if None not in (first.night, same.night) and first.night != same.night:
+        raise InputError(
+            "the counts do not agree about which images were taken at night; score both on one "
+            "data set."
+        )
+    _check_labels(first, same)
+    return same
+
+
+def _check_labels(first: Counts, same: Counts) -> None:
+    """Compare the labelled pixels of every image, by region where both have the same regions."""
+    pairs = [protocol_of(each.partition) for each in (first, same)]
+    within: tuple[int, ...] = (-1,)
+    if first.partition == same.partition:
+        # Of pairs of frames the label is no row of the matrices but says which matrix it is.
+        within = (-1,) if pairs[0] is None else (-2, -1)
+    elif pairs == [None, None]:
+        within = (1, -1)
+    else:
+        return
+    labelled = [
+        each.counts.sum(within, dtype=np.int64).reshape(len(each.names), -1)
+        for each in (first, same)
+    ]
+    unequal = np.flatnonzero((labelled[0] != labelled[1]).any(1))
+    if len(unequal):
+        raise InputError(
+            f"'{first.names[unequal[0]]}' has different labels in the two counts "
+            f"({len(unequal)} images do); score both on the same labels at the same size."
+        )

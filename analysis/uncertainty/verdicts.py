@@ -1,0 +1,279 @@
+"""Verdicts about contrasts: holds, contradicted, or undecided with the number of seeds needed."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+
+from analysis.uncertainty.contrasts import Evidence
+from analysis.uncertainty.intervals import Interval, Spread, student, together, widest
+from analysis.uncertainty.sequence import half_width
+
+Combine = Literal["all", "most", "any", "mean"]
+Kind = Literal["holds", "contradicted", "undecided"]
+Covers = Literal["images and seeds", "images", "none"]
+
+MOST_SEEDS = 1000
+"""Largest number of seeds that is searched for `Verdict.seeds_needed`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FixedSeeds:
+    """Rule for a number of seeds that was chosen before any result was known.
+
+    The interval is that of `analysis.uncertainty.compare` for paired trainings: Student over images
+    and seeds, never narrower than over seeds alone.
+
+    Attributes:
+        level: confidence level of the interval.
+    """
+
+    level: float = 0.95
+
+    def half(self, trainings: Spread, images: Spread, level: float) -> float:
+        """Half of the width of the interval; degrees of freedom of `trainings`: n - 1."""
+        whole = together(images, trainings)
+        return student(0.0, widest(level, whole, trainings), level).half
+
+
+@dataclass(frozen=True, kw_only=True)
+class AnyTime:
+    """Rule for seeds that are added until the verdict is clear.
+
+    Seeds: a confidence sequence, see `analysis.uncertainty.sequence`. Images: Student's interval.
+    Each has half of the error rate, and the squares of their half widths add up. In quadrature at
+    the full rate, up to 7.5 % of sequences missed a difference at a level of 95 %.
+
+    Attributes:
+        level: confidence level of the whole sequence of intervals.
+    """
+
+    level: float = 0.95
+
+    def half(self, trainings: Spread, images: Spread, level: float) -> float:
+        """As in `FixedSeeds`; infinite where the seeds are too few for a confidence sequence."""
+        alpha = (1 - level) / 2
+        count = round(trainings.freedom) + 1
+        of_seeds = half_width(trainings.error * math.sqrt(count), count, alpha)
+        return math.hypot(of_seeds, student(0.0, images, 1 - alpha).half)
+
+
+Rule = FixedSeeds | AnyTime
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """What the data say about one claim.
+
+    The numbers are of one contrast, `decisive`. With several contrasts the level of its interval
+    is corrected for their number, see `decide`.
+
+    Attributes:
+        estimate: the contrast, mean over paired seeds.
+        interval: of the contrast; None where images or seeds are too few for one.
+        covers: what was drawn anew: the trainings of fixed terms are not.
+        smallest: smallest difference that these seeds and images could have shown, half of the
+            width of the interval; NaN without an interval.
+        seeds: number of paired seeds used; 0 where all terms are fixed.
+        seeds_needed: total number of paired seeds with which the present estimates would be
+            decided; `seeds` where they are; inf: more than `MOST_SEEDS`, or the images alone leave
+            it open; NaN: unknown.
+        decisive: index of the contrast whose numbers are shown (the weakest for "all").
+        reason: of "undecided", or which limit a verdict has; a short sentence.
+    """
+
+    kind: Kind
+    estimate: float
+    interval: Interval | None
+    covers: Covers
+    smallest: float
+    seeds: int
+    seeds_needed: float
+    decisive: int
+    reason: str = ""
+
+
+def decide(
+    evidences: Sequence[Evidence], wanted: tuple[float, float], rule: Rule, combine: Combine
+) -> Verdict:
+    """Decide a claim about one contrast or more.
+
+    A contrast is as claimed where its whole interval is inside the open range `wanted`, and against
+    the claim where the whole interval is outside. Where `u` of J contrasts must be as claimed, the
+    claim holds if `u` intervals are inside, each with the error rate ``1 - level`` divided by
+    ``J - u + 1`` (partial conjunction). It is contradicted if ``J - u + 1`` are outside, each with
+    the error rate divided by `u`. So "all" needs no correction to hold (intersection-union test).
+
+    Source: Benjamini and Heller, "Screening for Partial Conjunction Hypotheses", Biometrics 64
+    (2008), with Bonferroni's combination.
+
+    Args:
+        evidences: one or more; of "mean" exactly one, whose terms already have the weights of the
+            mean contrast.
+        wanted: open range of a contrast that is as claimed.
+        rule: by whether the number of seeds depends on results.
+        combine: how many contrasts must be as claimed: "all"; "most", more than half; "any", one.
+
+    Raises:
+        ValueError: no evidence, several for "mean", an empty range, or no such `combine`.
+    """
+    low, high = wanted
+    if not low < high:
+        raise ValueError(f"wanted: expected a lower and a higher end, got {low} and {high}.")
+    if combine not in get_args(Combine):
+        raise ValueError(f"combine: expected {', '.join(get_args(Combine))}, got '{combine}'.")
+    if not evidences or (combine == "mean" and len(evidences) > 1):
+        expected = "one evidence, of the mean contrast" if combine == "mean" else "evidence"
+        raise ValueError(f"{combine}: expected {expected}, got {len(evidences)}.")
+    contrasts = tuple(_contrast(each, low, high) for each in evidences)
+    needed = {"all": len(contrasts), "most": len(contrasts) // 2 + 1, "any": 1, "mean": 1}[combine]
+    claim = _Claim(contrasts, rule, needed)
+    kind = claim.kind()
+    decisive = claim.decisive(kind)
+    shown = contrasts[decisive]
+    half = claim.halves(kind)[decisive]
+    if shown.seeds == 1 and shown.images is not None:
+        half = student(0.0, shown.images, claim.level(kind)).half
+    interval = Interval(shown.estimate - half, shown.estimate + half)
+    known = math.isfinite(half)
+    seeds_needed = claim.seeds_needed() if kind == "undecided" else float(shown.seeds)
+    return Verdict(
+        kind=kind,
+        estimate=shown.estimate,
+        interval=interval if known else None,
+        covers="none" if not known else "images and seeds" if shown.seeds > 1 else "images",
+        smallest=half if known else math.nan,
+        seeds=shown.seeds,
+        seeds_needed=seeds_needed,
+        decisive=decisive,
+        reason=_reason(kind, shown, half, seeds_needed),
+    )
+
+
+@dataclass(frozen=True)
+class _Contrast:
+    """One contrast in the numbers that decide.
+
+    Attributes:
+        margin: distance of the estimate from the nearer end of the range, negative outside.
+        sd: over seeds (n - 1); NaN for fewer than two.
+        seeds: their number; 0 where all terms are fixed.
+        images: None with too few blocks.
+    """
+
+    estimate: float
+    margin: float
+    sd: float
+    seeds: int
+    images: Spread | None
+
+    def half(self, rule: Rule, level: float, seeds: int) -> float:
+        """Half of the width of its interval with `seeds` seeds; inf or NaN where there is none."""
+        if self.images is None:
+            return math.nan
+        if self.seeds == 0:
+            return student(0.0, self.images, level).half
+        if math.isnan(self.sd):
+            return math.inf
+        return rule.half(Spread(self.sd / math.sqrt(seeds), seeds - 1), self.images, level)
+
+
+@dataclass(frozen=True)
+class _Claim:
+    """Contrasts of which at least `needed` must be as claimed."""
+
+    contrasts: tuple[_Contrast, ...]
+    rule: Rule
+    needed: int
+
+    @property
+    def against(self) -> int:
+        """Number of contrasts outside the range that contradict the claim."""
+        return len(self.contrasts) - self.needed + 1
+
+    def level(self, kind: Kind) -> float:
+        """Level of each interval; of an open claim that with which it would hold."""
+        others = self.needed if kind == "contradicted" else self.against
+        return 1.0 - (1.0 - self.rule.level) / others
+
+    def halves(self, kind: Kind, seeds: int = 0) -> list[float]:
+        """Half widths of the intervals that give the verdict `kind`.
+
+        Args:
+            kind: decides the level.
+            seeds: number of seeds to assume where it is above the present one.
+        """
+        level = self.level(kind)
+        return [each.half(self.rule, level, max(each.seeds, seeds)) for each in self.contrasts]
+
+    def standings(self, kind: Kind, seeds: int = 0) -> list[float]:
+        """Margins in half widths: above 1 inside the range ("contradicted": outside)."""
+        sign = -1.0 if kind == "contradicted" else 1.0
+        pairs = zip(self.contrasts, self.halves(kind, seeds), strict=True)
+        return [_standing(sign * each.margin, half) for each, half in pairs]
+
+    def kind(self, seeds: int = 0) -> Kind:
+        """The verdict, by the present seeds or as if there were `seeds`."""
+        if sum(each > 1 for each in self.standings("holds", seeds)) >= self.needed:
+            return "holds"
+        if sum(each > 1 for each in self.standings("contradicted", seeds)) >= self.against:
+            return "contradicted"
+        return "undecided"
+
+    def decisive(self, kind: Kind) -> int:
+        """The contrast that is the last one to make the verdict, or the first one to prevent it."""
+        standings = self.standings(kind)
+        order = sorted(range(len(standings)), key=lambda place: -standings[place])
+        return order[(self.against if kind == "contradicted" else self.needed) - 1]
+
+    def seeds_needed(self) -> float:
+        """See `Verdict.seeds_needed`; more seeds never make an interval wider."""
+        counts = range(2, MOST_SEEDS + 1)
+        place = bisect_left(counts, True, key=lambda seeds: self.kind(seeds) != "undecided")
+        if place < len(counts):
+            return float(counts[place])
+        unknown = any(
+            each.images is None or (each.seeds and math.isnan(each.sd)) for each in self.contrasts
+        )
+        return math.nan if unknown else math.inf
+
+
+def _contrast(evidence: Evidence, low: float, high: float) -> _Contrast:
+    values = np.array(evidence.values)
+    estimate = float(values.mean())
+    has_error = not math.isnan(evidence.error)
+    return _Contrast(
+        estimate=estimate,
+        margin=min(estimate - low, high - estimate),
+        sd=float(values.std(ddof=1)) if len(values) > 1 else math.nan,
+        seeds=len(evidence.seeds),
+        images=Spread(evidence.error, evidence.blocks - 1) if has_error else None,
+    )
+
+
+def _standing(margin: float, half: float) -> float:
+    """``margin / half``; 0 where there is no interval, or neither a margin nor a width."""
+    if not math.isfinite(half) or margin == 0:
+        return 0.0
+    return margin / half if half > 0 else math.copysign(math.inf, margin)
+
+
+def _reason(kind: Kind, shown: _Contrast, half: float, seeds_needed: float) -> str:
+    if kind != "undecided":
+        return "" if shown.seeds else "As trained: other trainings are not covered."
+    if shown.images is None:
+        return "There are too few images for an interval."
+    if shown.seeds == 1:
+        return "It needs two seeds or more."
+    if not math.isfinite(half):
+        return f"{shown.seeds} seeds are too few for an interval that is valid at any time."
+    if half == 0:
+        return "The estimate is the limit of the claimed range, on every draw of the images."
+    if math.isinf(seeds_needed):
+        return "These images leave it open with any number of seeds."
+    return f"Below {half:.2f}, nothing can be shown with these seeds and images."
