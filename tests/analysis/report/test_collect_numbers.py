@@ -15,13 +15,8 @@ from analysis.report.differences import difference_entries, load_choices
 from analysis.report.runs import percent_scores
 from analysis.report.store import MlflowRun
 from analysis.report.tables import cell_of, find_intervals
-from analysis.report.tables_recorded import (
-    CountsSource,
-    RecordedCell,
-    RecordedTable,
-    RescoredTable,
-    score_again,
-)
+from analysis.report.tables_recorded import RecordedCell, RecordedTable
+from analysis.report.tables_rescored import CountsSource, RescoredTable, score_again
 from analysis.uncertainty import Resampling, compare, estimate
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
@@ -93,7 +88,6 @@ def draft(tmp_path: Path, seeds: int, runs: dict[str, Any], text: str = TABLE) -
         scale="paper",
         seeds=tuple(range(seeds)),
         lines={("A", column): line for column in ("mIoU", "rgb", "drop")},
-        orders={},
     )
     return score_again(recorded, load_table(str(path)), runs)
 
@@ -125,7 +119,7 @@ def test_a_mean_of_columns_has_values_and_no_interval(tmp_path: Path) -> None:
     assert missing.values(row, column) == (None,)
 
 
-def test_counted_parameters_are_as_recorded_and_have_ranks(tmp_path: Path) -> None:
+def test_counted_parameters_are_as_recorded_and_have_no_marks(tmp_path: Path) -> None:
     path = tmp_path / "t.yaml"
     path.write_text(TABLE.replace("needs: the consistency metrics", "parameters: true"))
     lines = {
@@ -133,7 +127,7 @@ def test_counted_parameters_are_as_recorded_and_have_ranks(tmp_path: Path) -> No
         ("B", "TC"): RecordedCell(44.56, None, 0, None, "", ()),
         ("C", "TC"): RecordedCell(None, None, 0, None, "", ()),
     }
-    recorded = RecordedTable(name="own/t", scale="demo", seeds=(0,), lines=lines, orders={})
+    recorded = RecordedTable(name="own/t", scale="demo", seeds=(0,), lines=lines)
     found = score_again(recorded, load_table(str(path)), {})
     assert {place: cell.mean for place, cell in found.scored.cells.items()} == {
         ("A", "TC"): 54.36,
@@ -141,7 +135,7 @@ def test_counted_parameters_are_as_recorded_and_have_ranks(tmp_path: Path) -> No
     }
     row, column = found.scored.table.rows[0], found.scored.table.columns[-1]
     cell = cell_of(found, row, column, {})
-    assert (cell.mean, cell.seeds, cell.reason, cell.rank, cell.runs) == (54.36, 0, "", 1, ())
+    assert (cell.mean, cell.seeds, cell.reason, cell.rank, cell.runs) == (54.36, 0, "", 0, ())
     assert found.interval_key(row, column) is None
 
 

@@ -13,9 +13,10 @@ import pytest
 from analysis.report import collect, networks
 from analysis.report.__main__ import entry
 from analysis.report.contrasts import contrast_entries, verdict
-from analysis.report.data import CellEntry, ContrastEntry, ReportData
+from analysis.report.data import CellEntry, ContrastEntry, FormsEntry, ReportData
 from analysis.report.markdown import WIDTH, anchor, command_lines, page_texts, without_paths
 from analysis.report.networks import NetworkEntry, network_entries
+from analysis.report.page import page_text
 from analysis.report.results_file import load_results_file
 from analysis.report.runs import ReportRun
 from analysis.report.store import RunFiles
@@ -29,6 +30,7 @@ from sweeps.table.load_table import PUBLISHED, load_table
 from tests.analysis.report.pages import report, run_entry, table_entry
 from tests.analysis.report.stores import counts_of
 from tests.analysis.report.test_collect import quiet
+from tests.analysis.report.test_page import rows_of
 from tests.commands import Call
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -114,12 +116,11 @@ def test_page_row_with_runs_shows_mean_spread_interval_and_difference() -> None:
     )  # fmt: skip
     entry = table_entry("crm/table3a", {})
     cells = (*entry.cells[:-1], (cell,))
-    made = replace(entry, scale="demo", cells=cells, orders={"mIoU": (1.0, 6)})
+    made = replace(entry, scale="demo", cells=cells)
     text = page_texts(replace(report(0), tables=(made,)), ())["crm.md"]
     assert "| Ours | 3 | 60.50 ± 0.50 | [59.00, 62.00] | 61.2 | −0.70 |" in text
     assert "| Baseline | not run (a) | – | – | 59.5 | – |" in text
-    assert "mIoU +1.00 (n = 6)." in text
-    assert "Demo scale: compare the order" in text
+    assert "Demo scale: compare the verdicts" in text
     # Nothing is marked best: a rank is no evidence.
     assert not any("**" in line or "<u>" in line for line in table_lines(text))
 
@@ -148,6 +149,51 @@ def test_page_two_rows_of_the_same_runs_are_noted() -> None:
     made = replace(entry, scale="demo", cells=(*entry.cells[:-2], (cell,), (cell,)))
     text = page_texts(replace(report(0), tables=(made,)), ())["crm.md"]
     assert "At scale=demo the same runs as row (4)." in text
+
+
+def test_page_claims_of_a_table_have_verdicts_places_and_printed_values(
+    pages: dict[str, str],
+) -> None:
+    text = pages["spatialseg.md"]
+    section = text[text.index("## TABLE III") : text.index("## TABLE IV")]
+    claims = section[section.index("### Claims of the paper about TABLE III") :]
+    assert "4 claims: 1 holds, 1 contradicted, 1 undecided, 1 not run." in claims
+    contrast = "Ny/4 - CRM baseline, Var"
+    assert (
+        f"| `true` | ✓ holds | {contrast} | −1.25 | [−2.00, −0.50] | −2.47 | 2.25 | 3 | – |"
+        in claims
+    )
+    assert f"| `open` | ? undecided | {contrast} |" in claims
+    said = " ".join(claims.split())
+    place = "(Sec. V-C1, second paragraph)"
+    assert f"- `true`, **holds**: The statement called true. {place} The printed values" in said
+    assert "agree. - `false`" in said
+    assert "    - A reading of ours." in claims
+    assert "nothing can be shown. - `waiting`, **not run**" in said
+    assert f"The printed values do not agree: {contrast} is −2.47. Not run: CRM" in said
+
+
+def test_index_claims_are_counted_by_paper_and_listed_with_a_verdict(
+    pages: dict[str, str],
+) -> None:
+    text = pages["index.md"]
+    section = text[text.index("## Verdicts per claim") : text.index("## Speed")]
+    assert "| [crm](crm.md) | demo |" in section
+    assert "| [temporal](temporal.md) | – | 5 | 0 | 0 | 0 | 5 | 0 | 5 |" in section
+    assert "| The statement called true. (spatialseg, TABLE III) | ✓ holds |" in section
+    assert "called waiting" not in section
+    assert "Not measured yet" not in section
+
+
+def test_page_differences_of_the_forms_are_a_table() -> None:
+    entry = table_entry("crm/table3a", {})
+    forms = FormsEntry(header=("row, column", "shown"), rows=(("Ours, mIoU", "not shown"),))
+    made = replace(report(0), tables=(replace(entry, forms=forms, form="both"),))
+    text = page_texts(made, ())["crm.md"]
+    assert "## Table 3 (a) (both forms)" in text
+    assert "| Ours, mIoU | not shown |" in text
+    page = page_text(made)
+    assert rows_of(page, "forms of table-crm-table3a-both-forms") == [["Ours, mIoU", "not shown"]]
 
 
 def test_pages_lines_fit_and_links_resolve(data: ReportData, pages: dict[str, str]) -> None:
