@@ -169,6 +169,64 @@ def test_damaged_record_is_one_sentence(
         read(stored(files_of(tmp_path, **texts), rgbt__study="s"))
 
 
+RECORD_MD = """**own, TABLE I: Two masks**
+
+| | mIoU |
+| --- | ---: |
+| A | 1.0 |
+
+1. A footnote.
+
+- Published: somewhere; percent.
+- Form: as the text describes it.
+- Bold: shown to be the best of our rows.
+
+**Claims**
+
+| claim | verdict |
+| --- | ---: |
+| better | undecided |
+
+- difference: mean over paired seeds.
+
+- `better`, **undecided**: B is better (Sec. 1). The printed values agree.
+    - A reading of ours.
+"""
+
+
+def test_read_recorded_lines_of_claims_are_no_remarks(tmp_path: Path) -> None:
+    csv = HEADER + "own/t,A,mIoU,50.0,,1,61.5,,,aa0\n"
+    files = files_of(tmp_path, table__csv=csv, table__md=RECORD_MD)
+    assert read_recorded(stored(files)).remarks == ("Form: as the text describes it.",)
+
+
+def test_read_recorded_table_without_remarks_takes_none_of_its_claims(tmp_path: Path) -> None:
+    csv = HEADER + "own/t,A,mIoU,50.0,,1,61.5,,,aa0\n"
+    text = RECORD_MD[: RECORD_MD.index("1. A")] + RECORD_MD[RECORD_MD.index("**Claims") :]
+    assert read_recorded(stored(files_of(tmp_path, table__csv=csv, table__md=text))).remarks == ()
+
+
+@pytest.mark.parametrize(
+    ("tags", "label", "form"),
+    [
+        ({}, "B", "paper"),
+        ({"rgbt__form": "paper"}, "B", "paper"),
+        ({"rgbt__form": "released"}, "B", "released"),
+        ({"rgbt__form": "paper"}, "A, released", "both"),
+    ],
+)
+def test_read_recorded_form_is_that_of_the_rows(
+    tmp_path: Path, tags: dict[str, str], label: str, form: str
+) -> None:
+    csv = HEADER + f'own/t,A,mIoU,50.0,,1,61.5,,,aa0\nown/t,"{label}",mIoU,50.0,,1,,,,bb0\n'
+    assert read_recorded(stored(files_of(tmp_path, table__csv=csv), **tags)).form == form
+
+
+def test_reproduce_command_names_form_and_rule() -> None:
+    command = reproduce_command("own/t", (0, 1), "demo", form="both", until_decided=True)
+    assert command == "rgbt reproduce table=own/t seeds=until_decided scale=demo form=both"
+
+
 @pytest.mark.parametrize(
     ("seeds", "words"),
     [
