@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -12,9 +13,9 @@ from analysis.report.results_file import Contrast, load_results_file
 from analysis.report.runs import ReportRun
 from analysis.report.tables import Track
 from analysis.uncertainty import Comparison, Difference, Resampling, compare
+from analysis.uncertainty.verdicts import FixedSeeds, decide
 from rgbt.checks import InputError
 from rgbt.metrics import names
-from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import parse
 
 Settings = tuple[str, ...]
@@ -61,9 +62,9 @@ def _entries(
         sides = reference[settings], method[settings]
         at_scale = [replace(each, scale=settings[0]) for each in blank]
         try:
-            a, b = (_counts(side, contrast.counts) for side in sides)
+            a, b = ([run.counts(contrast.counts) for run in side] for side in _same_seeds(*sides))
             as_run = replace(resampling, absent=sides[0][0].absent)
-            found = compare(a, b, list(contrast.expected), as_run)
+            found = compare(a, b, list(contrast.expected), as_run, paired=True)
         except InputError as error:
             yield from (replace(each, verdict=f"Not measured: {error}") for each in at_scale)
             continue
@@ -86,10 +87,19 @@ def _blank(contrast: Contrast, metric: str) -> ContrastEntry:
     )
 
 
-def _counts(runs: Sequence[ReportRun], path: str) -> list[Counts]:
-    """Counts of the trainings in the order of their seeds."""
-    ordered = sorted(runs, key=lambda run: (run.entry.seed is None, run.entry.seed, run.key))
-    return [run.counts(path) for run in ordered]
+def _same_seeds(*sides: Sequence[ReportRun]) -> list[list[ReportRun]]:
+    """The runs of the seeds that both sides have: these share initial weights and data order.
+
+    Raises:
+        InputError: there is no such seed.
+    """
+    by_seed = [{run.entry.seed: run for run in side} for side in sides]
+    common = set.intersection(*map(set, by_seed))
+    shared = sorted(seed for seed in common if seed is not None)
+    if not shared:
+        seeds = (", ".join(map(str, runs)) for runs in by_seed)
+        raise InputError(f"the runs have no seed in common: {' and '.join(seeds)}.")
+    return [[runs[seed] for seed in shared] for runs in by_seed]
 
 
 def _measured(entry: ContrastEntry, each: Difference, found: Comparison) -> ContrastEntry:
@@ -110,20 +120,27 @@ def _measured(entry: ContrastEntry, each: Difference, found: Comparison) -> Cont
 def verdict(found: Difference, expected: str, level: float) -> str:
     """Whether the data shows what was expected: holds, contradicted, or undecided with the reason.
 
-    A difference is shown where its interval over images and seeds leaves 0 out and its p-value is
-    below 1 - `level`.
-
     Args:
-        found: method less reference.
+        found: method less reference, paired by seed.
         expected: "higher" or "lower".
         level: of the interval.
     """
-    if found.both is None:
+    if found.evidence is None:
+        return "Undecided: there is nothing to score."
+    wanted = (0.0, math.inf) if expected == "higher" else (-math.inf, 0.0)
+    decided = decide([found.evidence], wanted, FixedSeeds(level=level), "all")
+    if decided.kind != "undecided":
+        return f"{decided.kind.capitalize()}."
+    if decided.seeds < 2:
         return "Undecided: both methods need two seeds or more."
-    if found.p_both < 1 - level and 0.0 not in found.both:
-        return "Holds." if (found.value > 0) == (expected == "higher") else "Contradicted."
     unit = "" if parse(found.metric).score == names.VAR else " points"
     return (
-        f"Undecided: with these seeds and images, a difference below {found.both.half:.2f}{unit} "
-        "cannot be shown."
+        f"Undecided: with these seeds and images, a difference below {decided.smallest:.2f}{unit} "
+        f"cannot be shown. {_needed(decided.seeds_needed)}"
     )
+
+
+def _needed(seeds: float) -> str:
+    if math.isinf(seeds):
+        return "These images leave it open with any number of seeds."
+    return f"About {seeds:.0f} seeds would show the present difference."

@@ -7,10 +7,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from analysis.uncertainty.blocks import FEWEST
+from analysis.uncertainty.contrasts import Evidence
 from analysis.uncertainty.estimate import Estimate, by_part, estimate_of, image_spread
 from analysis.uncertainty.images import CommonImages, prepare
 from analysis.uncertainty.intervals import (
     Interval,
+    Spread,
+    Values,
     holm,
     over_images,
     over_seeds,
@@ -37,6 +40,7 @@ class Difference:
         images: interval over the draw of the images, trainings as they are.
         both: interval over images and seeds (Student); None unless both methods have two seeds.
         p_both: its p-value.
+        evidence: of paired trainings, for `analysis.uncertainty.verdicts.decide`; None without.
         p_corrected: `p`, corrected for the number of scores compared (Holm); NaN without p.
     """
 
@@ -48,6 +52,7 @@ class Difference:
     images: Interval | None = None
     both: Interval | None = None
     p_both: float = math.nan
+    evidence: Evidence | None = None
     p_corrected: float = math.nan
 
     @property
@@ -153,9 +158,12 @@ def _differences(
             value, resampled, without, method=settings.method, level=settings.level
         )
         spread = over_seeds(*((rows_b[0] - rows_a[0],) if paired else (rows_a[0], rows_b[0])))
-        both, p_both = None, math.nan
-        if around is not None and spread is not None:
-            whole = together(image_spread(images, resampled), spread)
+        both, p_both, evidence = None, math.nan, None
+        over_draws = None if around is None else image_spread(images, resampled)
+        if over_draws is not None and paired:
+            evidence = _evidence(images, rows_b[0] - rows_a[0], over_draws)
+        if over_draws is not None and spread is not None:
+            whole = together(over_draws, spread)
             used = widest(settings.level, whole, spread)
             both, p_both = student(value, used, settings.level), student_p(value, used)
         yield Difference(
@@ -167,4 +175,15 @@ def _differences(
             images=around,
             both=both,
             p_both=p_both,
+            evidence=evidence,
         )
+
+
+def _evidence(images: CommonImages, values: Values, over_draws: Spread) -> Evidence:
+    return Evidence(
+        values=tuple(values.tolist()),
+        seeds=tuple(range(len(values))),
+        error=over_draws.error,
+        blocks=images.blocks.count,
+        said=images.blocks.said,
+    )

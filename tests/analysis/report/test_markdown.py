@@ -250,7 +250,7 @@ def test_contrast_entries_two_groups_are_compared_over_images_and_seeds() -> Non
     found = entries_of(runs)["CRM against no masking, clean images", "mIoU"]
     sides = [[counts_of(seed, right) for seed in (0, 1, 2)] for right in (0.6, 0.8)]
     settings = Resampling(resamples=RESAMPLES, absent="released")
-    (wanted,) = compare(*sides, ["mIoU"], settings).differences
+    (wanted,) = compare(*sides, ["mIoU"], settings, paired=True).differences
     assert wanted.both is not None
     assert (found.difference, found.low, found.high, found.p) == (
         *(wanted.value, wanted.both.low, wanted.both.high, wanted.p_both),
@@ -278,21 +278,34 @@ def test_contrast_entries_other_data_sets_are_not_mixed() -> None:
     assert found.verdict == "Not run: crm."
 
 
+def test_contrast_entries_seeds_of_one_group_only_are_left_out() -> None:
+    """Seed 0 and 1 are in both; the interval is that of their two differences."""
+    runs = [run_of("baseline", seed, 0.6) for seed in (0, 1, 3)]
+    runs += [run_of("crm", seed, 0.8) for seed in (1, 0, 4)]
+    found = entries_of(runs)["CRM against no masking, clean images", "mIoU"]
+    assert found.seeds == (2, 2)
+    runs = [run_of("baseline", 0, 0.6), run_of("crm", 1, 0.8)]
+    found = entries_of(runs)["CRM against no masking, clean images", "mIoU"]
+    assert found.verdict == "Not measured: the runs have no seed in common: 0 and 1."
+
+
 def test_verdict_says_what_the_interval_shows() -> None:
     low, high = ([counts_of(seed, right) for seed in range(3)] for right in (0.6, 0.8))
     settings = Resampling(resamples=RESAMPLES)
-    (up,) = compare(low, high, ["mIoU"], settings).differences
+    (up,) = compare(low, high, ["mIoU"], settings, paired=True).differences
     assert verdict(up, "higher", 0.95) == "Holds."
     assert verdict(up, "lower", 0.95) == "Contradicted."
-    (alone,) = compare(low[:1], high[:1], ["mIoU"], settings).differences
+    (alone,) = compare(low[:1], high[:1], ["mIoU"], settings, paired=True).differences
     assert verdict(alone, "higher", 0.95) == "Undecided: both methods need two seeds or more."
     again = [counts_of(seed, 0.6) for seed in range(3, 6)]
-    (same,) = compare(low, again, ["mIoU"], settings).differences
+    (same,) = compare(low, again, ["mIoU"], settings, paired=True).differences
     assert same.both is not None
-    assert verdict(same, "higher", 0.95) == (
+    said = verdict(same, "higher", 0.95)
+    assert said.startswith(
         f"Undecided: with these seeds and images, a difference below {same.both.half:.2f} points "
-        "cannot be shown."
+        "cannot be shown. "
     )
+    assert said.endswith((" seeds would show the present difference.", "any number of seeds."))
 
 
 def test_results_file_names_what_exists() -> None:
