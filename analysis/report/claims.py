@@ -8,7 +8,6 @@ from dataclasses import replace
 
 from analysis.report.data import ClaimEntry, FormsEntry
 from analysis.report.tables_rescored import RescoredTable
-from analysis.uncertainty import Resampling
 from analysis.uncertainty.verdicts import AnyTime, FixedSeeds
 from sweeps.table.cells import CellRun
 from sweeps.table.table import Table
@@ -20,20 +19,15 @@ from sweeps.verdicts.judge import CellRunId, JudgedClaim, TableJudge
 def judge_of(draft: RescoredTable, resamples: int) -> TableJudge:
     """The judge of a table that was run.
 
-    Classes without pixels score as in the table. Intervals are valid at any number of seeds where
+    Intervals are valid at any number of seeds where
     seeds were added until claims were decided.
 
     Args:
         draft: the table with its runs.
         resamples: of the images.
     """
-    table = draft.scored.table
-    return TableJudge(
-        draft.recorded.name,
-        table,
-        AnyTime() if seeds_were_added(draft) else FixedSeeds(),
-        Resampling(resamples=resamples, absent=table.absent),
-    )
+    rule = AnyTime() if seeds_were_added(draft) else FixedSeeds()
+    return TableJudge(draft.recorded.name, draft.scored.table, rule, resamples)
 
 
 def seeds_were_added(draft: RescoredTable) -> bool:

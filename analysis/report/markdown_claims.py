@@ -110,7 +110,7 @@ def judged_table(papers: Sequence[PaperClaims]) -> str:
     """The claims of all papers that have a verdict, with their statements; "" without any."""
     header = [
         *("claim", "verdict", "contrast", "difference", "95 % interval", "printed"),
-        *("agrees as printed", "can show", "seeds", "would decide"),
+        *("printed agrees", "can show", "seeds", "would decide"),
     ]
     rows = []
     for paper in papers:

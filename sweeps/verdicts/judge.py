@@ -10,15 +10,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from statistics import fmean
 
+from analysis.uncertainty import Resampling
 from analysis.uncertainty.contrasts import Evidence, Resampler, Term
 from analysis.uncertainty.verdicts import FixedSeeds, Rule, Verdict, decide
-
-from analysis.uncertainty import Resampling
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from sweeps.table.cells import CellId, CellRun, ScoredRun, counts_path, is_counted, metric_of
 from sweeps.table.claim import Claim
-from sweeps.table.table import Table
+from sweeps.table.table import Column, Table
 from sweeps.verdicts.contrasts import Contrast, base_scores, contrasts_of, printed_value
 
 RESAMPLES = 2_000
@@ -64,17 +63,18 @@ class TableJudge:
     Attributes:
         name: of the table.
         rule: when a claim is decided.
-        settings: of the resampling of images.
+        resamples: of the images.
     """
 
     name: str
     table: Table
     rule: Rule = field(default_factory=FixedSeeds)
-    settings: Resampling = field(default_factory=lambda: Resampling(resamples=RESAMPLES))
+    resamples: int = RESAMPLES
 
     def __post_init__(self) -> None:
         self._rows = {row.label: row for row in self.table.rows}
-        self._resampler = Resampler(self.settings)
+        settings = Resampling(resamples=self.resamples, absent=self.table.absent)
+        self._resampler = Resampler(settings)
         self._counts: dict[tuple[str, str], Counts] = {}
 
     def claims(self, runs: Mapping[CellRunId, CellRun]) -> list[JudgedClaim]:
@@ -137,6 +137,8 @@ class TableJudge:
         Raises:
             InputError: a row without a finished run, or counts that cannot be compared.
         """
+        for _, contrast in contrasts:
+            self._check_differ(contrast, runs)
         terms = [
             term
             for weight, contrast in contrasts
@@ -200,6 +202,29 @@ class TableJudge:
         present = dict.fromkeys(label for label, _ in runs)
         names = {label: self.table.columns_of(self._rows[label]) for label in present}
         return [label for label in present if column in {each.name for each in names[label]}]
+
+    def _check_differ(self, contrast: Contrast, runs: Mapping[CellRunId, CellRun]) -> None:
+        """Refuse two rows of the same runs: their difference is 0 and says nothing."""
+        if contrast.other is None:
+            return
+        keys = [_keys(label, runs) for label in contrast.rows]
+        metrics = [
+            [metric_of(base, self._rows[label]) for base in self._bases(contrast, label)]
+            for label in contrast.rows
+        ]
+        if keys[0] and keys[0] == keys[1] and metrics[0] == metrics[1]:
+            raise InputError(
+                f"rows '{contrast.row}' and '{contrast.other}' are the same runs at this scale."
+            )
+
+    def _bases(self, contrast: Contrast, label: str) -> list[Column]:
+        names = {column for _, _, column in contrast.cells()}
+        present = {each.name for each in self.table.columns_of(self._rows[label])}
+        return [
+            base
+            for name in sorted(names & present)
+            for _, base in base_scores(self.table, self._rows[label], name)
+        ]
 
     def _terms(
         self, weight: float, label: str, name: str, runs: Mapping[CellRunId, CellRun]

@@ -155,13 +155,12 @@ def test_run_shows_its_provenance(data: ReportData) -> None:
     assert run.config["tracking.uri"] == "postgresql://me:***@host/db"
 
 
-def test_results_pages_compare_groups_and_hide_folders(data: ReportData, runs_dir: Path) -> None:
-    measured = {each.metric: each for each in data.contrasts if each.values}
-    assert set(measured) == {"mIoU", "Var"}
-    assert measured["mIoU"].scale == "paper"
-    assert measured["mIoU"].seeds == (3, 3)
+def test_results_pages_show_claims_and_hide_folders(data: ReportData, runs_dir: Path) -> None:
+    assert {each.verdict for each in data.contrasts} == {"Not run: baseline."}
     pages = page_texts(data, ())
     table = pages["own.md"]
+    assert "| `b_is_better` | ✓ holds | B - A, mIoU | +" in table
+    assert "| B is better than A. (own, TABLE I; paper scale) | ✓ holds |" in pages["index.md"]
     cell = table_of(data, "own/t").cells[0][0]
     assert f"| ours | 3 | {cell.mean:.2f} ± {cell.sd:.2f} |" in table
     assert "(paper scale, trainer.max_steps=9)" in table

@@ -17,15 +17,13 @@ from analysis.report.data import CellEntry, ContrastEntry, FormsEntry, ReportDat
 from analysis.report.markdown import WIDTH, anchor, command_lines, page_texts, without_paths
 from analysis.report.networks import NetworkEntry, network_entries
 from analysis.report.page import page_text
-from analysis.report.results_file import load_results_file
+from analysis.report.results_file import Contrast, load_results_file
 from analysis.report.runs import ReportRun
 from analysis.report.store import RunFiles
 from analysis.report.views import table_views
 from analysis.uncertainty import Resampling, compare
 from rgbt.config.compose import available
-from rgbt.metrics.pairs import file_name
 from rgbt.spec.corruption_names import row_name
-from sweeps.table.cells import OWN_COUNTS
 from sweeps.table.load_table import PUBLISHED, load_table
 from tests.analysis.report.pages import report, run_entry, table_entry
 from tests.analysis.report.stores import counts_of
@@ -239,15 +237,29 @@ def run_of(group: str, seed: int, right: float, folder: Path | None = None) -> R
     return ReportRun(entry=made, test_counts=counts, absent="released", config={}, files=files)
 
 
+CLEAN = Contrast(
+    question="clean",
+    source="own",
+    reference="baseline",
+    method="crm",
+    expected={"mIoU": "higher"},
+)
+DECLARED = (
+    CLEAN,
+    replace(CLEAN, question="missing", counts="evaluations/robustness/test/thermal_removed-1.npz"),
+    replace(CLEAN, question="loss", reference="grbm", expected={"Var": "lower"}),
+)
+
+
 def entries_of(runs: list[ReportRun]) -> dict[tuple[str, str], ContrastEntry]:
-    found = contrast_entries(runs, RESAMPLES, quiet)
-    return {(each.question.partition(" (")[0], each.metric): each for each in found}
+    found = contrast_entries(DECLARED, runs, RESAMPLES, quiet)
+    return {(each.question, each.metric): each for each in found}
 
 
 def test_contrast_entries_two_groups_are_compared_over_images_and_seeds() -> None:
     runs = [run_of("baseline", seed, 0.6) for seed in (0, 1, 2)]
     runs += [run_of("crm scale=demo", seed, 0.8) for seed in (2, 0, 1)]
-    found = entries_of(runs)["CRM against no masking, clean images", "mIoU"]
+    found = entries_of(runs)["clean", "mIoU"]
     sides = [[counts_of(seed, right) for seed in (0, 1, 2)] for right in (0.6, 0.8)]
     settings = Resampling(resamples=RESAMPLES, absent="released")
     (wanted,) = compare(*sides, ["mIoU"], settings, paired=True).differences
@@ -263,10 +275,10 @@ def test_contrast_entries_two_groups_are_compared_over_images_and_seeds() -> Non
 def test_contrast_entries_missing_runs_and_counts_are_named(tmp_path: Path) -> None:
     runs = [run_of(group, seed, 0.7, tmp_path) for group in ("baseline", "crm") for seed in (0, 1)]
     found = entries_of(runs)
-    missing = found["CRM against no masking, thermal image missing", "mIoU"]
+    missing = found["missing", "mIoU"]
     assert missing.verdict.startswith("Not measured: run baseline0 has no evaluations/robustness/")
     assert missing.values is None
-    waiting = found["GRBM and spatial-weighted loss against GRBM alone", "Var"]
+    waiting = found["loss", "Var"]
     assert waiting.verdict == "Not run: grbm."
 
 
@@ -274,7 +286,7 @@ def test_contrast_entries_other_data_sets_are_not_mixed() -> None:
     ours = [run_of("baseline", seed, 0.6) for seed in (0, 1)]
     theirs = [run_of("crm", seed, 0.8) for seed in (0, 1)]
     theirs = [replace(run, entry=replace(run.entry, dataset="other")) for run in theirs]
-    found = entries_of(ours + theirs)["CRM against no masking, clean images", "mIoU"]
+    found = entries_of(ours + theirs)["clean", "mIoU"]
     assert found.verdict == "Not run: crm."
 
 
@@ -282,10 +294,10 @@ def test_contrast_entries_seeds_of_one_group_only_are_left_out() -> None:
     """Seed 0 and 1 are in both; the interval is that of their two differences."""
     runs = [run_of("baseline", seed, 0.6) for seed in (0, 1, 3)]
     runs += [run_of("crm", seed, 0.8) for seed in (1, 0, 4)]
-    found = entries_of(runs)["CRM against no masking, clean images", "mIoU"]
+    found = entries_of(runs)["clean", "mIoU"]
     assert found.seeds == (2, 2)
     runs = [run_of("baseline", 0, 0.6), run_of("crm", 1, 0.8)]
-    found = entries_of(runs)["CRM against no masking, clean images", "mIoU"]
+    found = entries_of(runs)["clean", "mIoU"]
     assert found.verdict == "Not measured: the runs have no seed in common: 0 and 1."
 
 
@@ -324,8 +336,6 @@ def test_results_file_names_what_exists() -> None:
 def test_results_file_counts_are_named_as_runs_store_them() -> None:
     folder = "evaluations/robustness/test"
     known = {
-        OWN_COUNTS: "",
-        file_name("aligned", "test"): "frames=aligned",
         **{f"{folder}/features-{each}.npz": f"corruption=features-{each}" for each in BRANCHES},
         **{
             f"{folder}/{row_name(f'removed:{each}')}-1.npz": f"corruption=removed:{each}"
