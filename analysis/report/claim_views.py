@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import groupby
+from itertools import chain, groupby
 
 from analysis.report.data import ClaimEntry, VerdictWord
 from analysis.report.views import DASH, FORMS, TableView, plural, unique_names
@@ -23,7 +23,7 @@ MOST_LISTED = 3
 """Rows without a run that are named."""
 
 IMAGES = "images alone"
-"""In the place of the number of seeds where nothing that is compared has seeds."""
+"""What an interval covers, and in the place of the number of seeds where nothing has seeds."""
 
 
 @dataclass(frozen=True)
@@ -76,12 +76,7 @@ class PaperClaims:
     @property
     def judged(self) -> list[PlacedClaim]:
         """The claims with a verdict."""
-        return [each for each in self.claims if each.entry.verdict != "not run"]
-
-    @property
-    def waiting(self) -> list[PlacedClaim]:
-        """The claims that are not run."""
-        return [each for each in self.claims if each.entry.verdict == "not run"]
+        return [each for each in self.claims if not _is_waiting(each)]
 
     def count(self, verdict: VerdictWord) -> int:
         """Number of claims with a verdict."""
@@ -103,8 +98,9 @@ def placed(view: TableView) -> list[PlacedClaim]:
 def paper_claims(tables: Iterable[TableView]) -> list[PaperClaims]:
     """The claims of every paper, once for each scale and form that some of its tables were run in.
 
-    A table that was run several times with other overrides is counted once: the one with the most
-    runs. Tables that were not run at a scale and in a form have claims that are not run.
+    A claim of a table that was run several times, with other rows or overrides, is counted once: by
+    the most seeds, whatever its verdicts. Tables that were not run at a scale and in a form have
+    claims that are not run.
     """
     order = sorted(tables, key=lambda view: (view.entry.paper, view.entry.name))
     groups = [(paper, list(views)) for paper, views in groupby(order, lambda v: v.entry.paper)]
@@ -136,12 +132,26 @@ def _claims_of(views: Sequence[TableView], variant: tuple[str, str]) -> tuple[Pl
     claims: list[PlacedClaim] = []
     for _, group in groupby(views, lambda view: view.entry.name):
         of_table = list(group)
-        fitting = [view for view in of_table if view.is_run and _variant(view) == variant]
-        if fitting:
-            claims += placed(max(fitting, key=lambda view: len(view.keys)))
-        else:
-            claims += map(_not_run, placed(of_table[0]))
+        fitting = [placed(v) for v in of_table if v.is_run and _variant(v) == variant]
+        of_claims = _by_name(fitting or [list(map(_not_run, placed(of_table[0])))])
+        claims += sorted(map(_with_most_seeds, of_claims), key=_is_waiting)
     return tuple(claims)
+
+
+def _by_name(tables: Iterable[Sequence[PlacedClaim]]) -> Iterable[list[PlacedClaim]]:
+    """Every claim as each of the tables has it."""
+    found: dict[str, list[PlacedClaim]] = {}
+    for each in chain.from_iterable(tables):
+        found.setdefault(each.entry.name, []).append(each)
+    return found.values()
+
+
+def _with_most_seeds(claims: Sequence[PlacedClaim]) -> PlacedClaim:
+    return max(claims, key=lambda each: (not _is_waiting(each), each.entry.seeds))
+
+
+def _is_waiting(claim: PlacedClaim) -> bool:
+    return claim.entry.verdict == "not run"
 
 
 def _not_run(claim: PlacedClaim) -> PlacedClaim:

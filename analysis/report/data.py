@@ -167,7 +167,8 @@ class TableEntry:
         best: by column, "highest", "lowest" or "none".
         proposed: by row, whether it is the method that the paper proposes.
         cells: by row, then by column.
-        extra: overrides that every row of ours was run with, as typed, or "".
+        extra: further words of the command as typed, or "": the rows that were selected, and
+            overrides of every row.
         form: what the rows of ours are run as.
         claims: of the paper about this table.
         forms: differences of the forms where both were run; else None.

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from analysis.report.claim_views import (
+    IMAGES,
     VERDICTS,
     PaperClaims,
     PlacedClaim,
@@ -76,12 +77,13 @@ def _printed(claim: PlacedClaim) -> str:
 
 def _numbers(name: str, claim: PlacedClaim) -> list[str]:
     entry = claim.entry
+    alone = f" ({IMAGES})" if entry.covers == "images" else ""
     return [
         name,
         VERDICTS[entry.verdict],
         entry.contrast,
         with_sign(entry.estimate),
-        interval_text(entry.low, entry.high),
+        interval_text(entry.low, entry.high) + alone,
         with_sign(entry.printed),
         fixed(entry.smallest),
         seeds(entry),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -230,7 +231,7 @@ def _entry(draft: RescoredTable, intervals: Intervals, remarks: list[str]) -> Ta
         scale=recorded.scale,
         notes=tuple(dict.fromkeys((*_notes(table), *_form_notes(draft), *recorded.remarks))),
         command=_command(draft),
-        extra=recorded.extra,
+        extra=_words(draft),
         form=recorded.form,
     )
 
@@ -254,13 +255,22 @@ def _form_notes(draft: RescoredTable) -> Iterable[str]:
     return (sentences[form] for form in shown if form in sentences)
 
 
+def _words(draft: RescoredTable) -> str:
+    """Further words of the command as typed: the selected rows, and overrides of every row."""
+    recorded, table = draft.recorded, draft.scored.table
+    labels = recorded.rows()
+    is_selected = recorded.form != "both" and set(labels) < {row.label for row in table.rows}
+    rows = shlex.quote(f"rows={','.join(labels)}") if is_selected else ""
+    return " ".join(filter(None, (rows, recorded.extra)))
+
+
 def _command(draft: RescoredTable) -> str:
     recorded = draft.recorded
     return reproduce_command(
         recorded.name,
         recorded.seeds or DEFAULT_SEEDS,
         recorded.scale or DEFAULT_SCALE,
-        recorded.extra,
+        _words(draft),
         form=recorded.form,
         until_decided=seeds_were_added(draft),
     )

@@ -21,6 +21,7 @@ from analysis.report.tables_recorded import CSV_FILE, read_recorded, reproduce_c
 from rgbt.checks import InputError
 from rgbt.config.compose import flatten
 from rgbt.metrics.counts import Counts
+from sweeps.table.load_table import load_table
 from tests.analysis.report.stores import DATASET, MASKER, counts_of, files_of
 from tests.composed import composed as configuration
 
@@ -373,6 +374,8 @@ def test_overrides_of_a_table_are_shown_beside_its_name(
         "plain": "- A remark.\n",
         "short": "- Every row of ours was run with trainer.max_steps=9 loss.spatial.alpha=1.\n",
     }
+    labels = [row.label for row in load_table("spatialseg/table3").rows]
+    every = "".join(f"{name},{label},mIoU,50.0,,1,61.5,,,aa0\n" for label in labels)
     records = [
         MlflowRun(
             run_id=variant,
@@ -386,9 +389,22 @@ def test_overrides_of_a_table_are_shown_beside_its_name(
             files=files_of(tmp_path / variant, **{CSV_FILE: csv, "table.md": text}),
         )
         for variant, text in said.items()
-        for csv in [HEADER + f"{name},Ny/4,mIoU,50.0,,1,61.5,,,aa0\n"]
+        for csv in [HEADER + every]
     ]
     remarks: list[str] = []
     made = tables.table_entries(records, {}, 100, quiet, remarks)
     extras = [each.extra for each in made if each.name == name]
     assert extras == ["", "trainer.max_steps=9 loss.spatial.alpha=1"]
+
+
+def test_selected_rows_of_a_table_are_shown_beside_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tables, "table_names", lambda: ["spatialseg/table3"])
+    name = "spatialseg/table3"
+    csv = HEADER + "".join(f"{name},{label},mIoU,50,,1,,,,a\n" for label in ("CRM baseline", "Ny"))
+    files = files_of(tmp_path, **{"table__csv": csv})
+    record = stored(files, rgbt__table=name, rgbt__scale="demo", rgbt__seeds="0")
+    made = tables.table_entries([record], {}, 100, quiet, [])[0]
+    assert made.extra == "'rows=CRM baseline,Ny'"
+    assert made.command.endswith("scale=demo 'rows=CRM baseline,Ny'")

@@ -249,6 +249,17 @@ def test_tables_with_other_overrides_are_separate(text: str) -> None:
     assert [title[5:] for title in of_tables] == [[], [EXTRAS[0]], [EXTRAS[1]]]
 
 
+def test_claim_of_two_records_of_a_table_is_counted_with_the_most_seeds(data: ReportData) -> None:
+    """Whatever the verdicts: the choice of the record must not depend on its result."""
+    entry = replace(data.tables[0], extra="")
+    few = replace(entry, claims=(pages.claim("a", "holds", seeds=3), pages.claim("b", "not run")))
+    more = (pages.claim("a", "undecided", seeds=5), pages.claim("b", "undecided", seeds=1))
+    again = replace(entry, extra="rows=A,B", claims=more)
+    (paper,) = claim_views.paper_claims(views.table_views(replace(data, tables=(few, again))))
+    assert [(each.entry.name, each.entry.seeds) for each in paper.claims] == [("a", 5), ("b", 1)]
+    assert paper.counted == "2 claims: 0 holds, 0 contradicted, 2 undecided, 0 not run"
+
+
 def test_summary_names_the_row_that_is_shown_to_be_best(data: ReportData, text: str) -> None:
     table = data.tables[0]
     index = table.columns.index("mIoU")
