@@ -247,7 +247,8 @@ def heading(view: TableView) -> str:
     """Heading of a table on its page."""
     entry = view.entry
     scale = "paper scale" if entry.scale == "paper" else ""
-    which = ", ".join(filter(None, (scale, view.form, entry.extra)))
+    words = shlex.split(entry.extra)  # in a heading without the quotes of a shell
+    which = ", ".join(filter(None, (scale, view.form, " ".join(words))))
     return f"{entry.number} ({which})" if which else entry.number
 
 
