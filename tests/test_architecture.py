@@ -98,8 +98,9 @@ ANALYSIS_ROOMS = {
 }
 """Folders of analysis, and which others each of them knows; its commands join them."""
 
-PUBLISHED = ("sweeps.table", "sweeps.evaluation", "sweeps.report.study_data")
-"""What of the sweeps the report may import: the papers' tables as data, and studies read."""
+PUBLISHED = ("sweeps.table", "sweeps.verdicts", "sweeps.evaluation", "sweeps.report.study_data")
+"""What of the sweeps the report may import: the papers' tables as data, verdicts on their claims,
+and studies read."""
 
 PARENTS = {"sweeps.report"}
 """``from sweeps.report import data`` names this too."""

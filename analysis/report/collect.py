@@ -11,6 +11,7 @@ from analysis.report.contrasts import contrast_entries
 from analysis.report.data import ReportData
 from analysis.report.differences import difference_entries
 from analysis.report.masks import mask_pictures
+from analysis.report.results_file import load_results_file
 from analysis.report.runs import ReportRun, open_run
 from analysis.report.store import MlflowRun, read_store
 from analysis.report.studies import study_entries
@@ -61,7 +62,7 @@ def collect(
         studies = study_entries(records["study"], remarks)
         masks = mask_pictures(runs, track, remarks, trust)
         differences = difference_entries(runs, resamples, track)
-        contrasts = contrast_entries(runs, resamples, track)
+        contrasts = contrast_entries(load_results_file().contrasts, runs, resamples, track)
     assert isinstance(tracking, MlflowTracking), "read_store refuses others"
     if not runs:
         remarks.insert(0, "The store holds no runs yet; tables show what the papers printed.")

@@ -1,4 +1,7 @@
-"""Declared comparisons of two groups of runs, with intervals over images and seeds."""
+"""Declared comparisons of two groups of runs, with intervals over images and seeds.
+
+They are about groups that no table compares; what papers state about their tables are claims.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 from analysis.report.data import ContrastEntry
-from analysis.report.results_file import Contrast, load_results_file
+from analysis.report.results_file import Contrast
 from analysis.report.runs import ReportRun
 from analysis.report.tables import Track
 from analysis.uncertainty import Comparison, Difference, Resampling, compare
@@ -25,11 +28,12 @@ SCALE_WORD = re.compile(r" ?\bscale=\w+")
 
 
 def contrast_entries(
-    runs: Iterable[ReportRun], resamples: int, track: Track
+    declared: Sequence[Contrast], runs: Iterable[ReportRun], resamples: int, track: Track
 ) -> tuple[ContrastEntry, ...]:
-    """Every comparison of `results.yaml`, one entry per metric, scale and data set.
+    """Every declared comparison, one entry per metric, scale and data set.
 
     Args:
+        declared: as in `results.yaml`.
         runs: of the store.
         resamples: of the images, for intervals and p-values.
         track: shows how far it is.
@@ -42,7 +46,7 @@ def contrast_entries(
             group = groups.setdefault(SCALE_WORD.sub("", entry.group), {})
             group.setdefault(settings, []).append(run)
     entries: list[ContrastEntry] = []
-    for contrast in track(load_results_file().contrasts, "comparisons"):
+    for contrast in track(declared, "comparisons"):
         entries += _entries(contrast, groups, Resampling(resamples=resamples))
     return tuple(entries)
 

@@ -12,6 +12,9 @@ from typing import Literal
 from rgbt.spec.run_spec import NOT_IN_KEY
 
 Uncertainty = Literal["images", "seeds", "images and seeds", "none"]
+VerdictWord = Literal["holds", "contradicted", "undecided", "not run"]
+ShownForm = Literal["paper", "released", "both"]
+"""Rows as the text of the paper describes them, as its release made them, or both."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,8 +87,7 @@ class CellEntry:
         covers: what the interval is over.
         difference: mean minus published.
         reason: why there is no value, or seeds are missing.
-        rank: 1 best, 2 second best of the column among ours, else 0.
-        published_rank: the same among the printed values.
+        rank: 1 shown to be better than all other rows of ours, 2 than all but the first, else 0.
         values: of each run, in the order of `runs`; empty: not known. Shown beside the run.
     """
 
@@ -100,8 +102,58 @@ class CellEntry:
     reason: str = ""
     runs: tuple[str, ...] = ()
     rank: int = 0
-    published_rank: int = 0
     values: tuple[float | None, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClaimEntry:
+    """A statement of a paper about its own table, with the verdict of our runs.
+
+    Attributes:
+        name: unique in the table.
+        says: the statement in our words.
+        source: its place in the paper.
+        verdict: "not run" where a row that it needs has no score.
+        contrast: the rows and the column whose numbers are shown, such as "Ny - baseline, Var".
+        estimate: the contrast, mean over paired seeds.
+        low: lower end of its 95 % interval, `high` its upper end.
+        covers: what the interval is over.
+        printed: the same contrast of the printed values.
+        as_printed: whether the printed values agree with the statement; None: some are missing.
+        smallest: the smallest difference that these seeds and images could have shown.
+        seeds: paired seeds; 0 where nothing has seeds.
+        seeds_needed: with which the present estimate would be decided; inf: no number of seeds.
+        missing: rows without a finished run.
+        reason: why it is undecided or not run; one sentence, or "".
+        runs: keys of the runs of its rows.
+    """
+
+    name: str
+    says: str
+    source: str
+    remarks: tuple[str, ...] = ()
+    verdict: VerdictWord
+    contrast: str
+    estimate: float | None = None
+    low: float | None = None
+    high: float | None = None
+    covers: Uncertainty = "none"
+    printed: float | None = None
+    as_printed: bool | None = None
+    smallest: float | None = None
+    seeds: int = 0
+    seeds_needed: float | None = None
+    missing: tuple[str, ...] = ()
+    reason: str = ""
+    runs: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class FormsEntry:
+    """Differences of the forms of a table, as text: released less paper, by row and column."""
+
+    header: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,8 +167,11 @@ class TableEntry:
         best: by column, "highest", "lowest" or "none".
         proposed: by row, whether it is the method that the paper proposes.
         cells: by row, then by column.
-        orders: column -> (Spearman's rho or None, number of rows).
-        extra: overrides that every row of ours was run with, as typed, or "".
+        extra: further words of the command as typed, or "": the rows that were selected, and
+            overrides of every row.
+        form: what the rows of ours are run as.
+        claims: of the paper about this table.
+        forms: differences of the forms where both were run; else None.
     """
 
     name: str
@@ -131,10 +186,12 @@ class TableEntry:
     rows: tuple[str, ...]
     proposed: tuple[bool, ...]
     cells: tuple[tuple[CellEntry, ...], ...]
-    orders: Mapping[str, tuple[float | None, int]]
     notes: tuple[str, ...]
     command: str
     extra: str = ""
+    form: ShownForm = "paper"
+    claims: tuple[ClaimEntry, ...] = ()
+    forms: FormsEntry | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

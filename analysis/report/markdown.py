@@ -9,18 +9,23 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from analysis.report import views
+from analysis.report.claim_views import counted, paper_claims, placed
 from analysis.report.data import ContrastEntry, ReportData, RunEntry
-from analysis.report.markdown_tables import (
-    TableText,
-    difference_text,
-    interval_text,
-    markdown_table,
-    order_text,
-)
+from analysis.report.markdown_claims import ClaimTexts, counts_table, forms_table, judged_table
+from analysis.report.markdown_tables import TableText, markdown_table
 from analysis.report.networks import NetworkEntry
 from analysis.report.page import STATIC, write_files
 from analysis.report.results_file import Paper, load_results_file
-from analysis.report.views import DASH, Group, TableView, fixed, groups_of, table_views
+from analysis.report.views import (
+    DASH,
+    Group,
+    TableView,
+    fixed,
+    groups_of,
+    interval_text,
+    table_views,
+    with_sign,
+)
 from rgbt.checks import InputError
 from rgbt.metrics import names
 
@@ -75,7 +80,9 @@ def page_texts(data: ReportData, networks: Sequence[NetworkEntry]) -> dict[str, 
     texts = {"index.md": page("index", **_index(data, tables))}
     for name, paper in papers.items():
         shown = [(view, text := TableText(view), text.markdown()) for view in tables[name]]
-        texts[f"{name}.md"] = page("paper", paper=paper, shown=shown, order_text=order_text)
+        claims = {view.id: ClaimTexts(placed(view)) for view in tables[name] if view.entry.claims}
+        more = {"claims": claims, "counted": counted, "forms_table": forms_table}
+        texts[f"{name}.md"] = page("paper", paper=paper, shown=shown, **more)
     texts["networks.md"] = page("networks", networks=networks, table=_network_table(networks))
     return texts
 
@@ -132,6 +139,7 @@ def _index(data: ReportData, tables: Mapping[str, Sequence[TableView]]) -> dict[
     finished = [run for run in data.runs if run.status == "FINISHED"]
     groups = [group for group in groups_of(finished) if group.means]
     groups.sort(key=lambda group: (group.runs[0].scale, group.name))
+    claims = paper_claims(view for views in tables.values() for view in views)
     return {
         "finished": finished,
         "on_paper": [run for run in finished if run.scale == "paper"],
@@ -140,6 +148,8 @@ def _index(data: ReportData, tables: Mapping[str, Sequence[TableView]]) -> dict[
         "page_links": ", ".join(f"[{name}]({name}.md)" for name in tables),
         "origin": _origin(data, finished),
         "contrast_table": _contrast_table(data.contrasts),
+        "claim_counts": counts_table(claims) if claims else "",
+        "claim_table": judged_table(claims),
         "commands": list(dict.fromkeys(each.command for each in data.contrasts)),
         "group_table": _group_table(groups),
         "table_lines": _table_lines(tables),
@@ -190,7 +200,7 @@ def _contrast_table(contrasts: Sequence[ContrastEntry]) -> str:
                 each.metric,
                 reference,
                 method,
-                difference_text(each.difference),
+                with_sign(each.difference),
                 interval_text(each.low, each.high),
                 DASH if each.p is None else "< 0.001" if each.p < 0.001 else f"{each.p:.3f}",
                 " and ".join(dict.fromkeys(map(str, each.seeds))) if each.values else DASH,
@@ -225,20 +235,20 @@ def _table_lines(tables: Mapping[str, Sequence[TableView]]) -> str:
     for page, of_page in tables.items():
         for view in of_page:
             entry = view.entry
-            rho, count = view.order(entry.columns[view.main])
-            order = DASH if rho == DASH else f"{rho} ({entry.columns[view.main]}, n = {count})"
             run = f"{view.rows_run} of {len(entry.rows)}" if view.rows_run else "not run"
             title = f"[{entry.number}]({page}.md#{anchor(view)})"
-            rows.append([page, title, entry.scale or DASH, run, order])
-    header = ["paper", "table", "scale", "rows run", "order of rows: rho"]
-    return markdown_table(header, rows, (0, 1, 2, 3))
+            claims = counted(entry.claims) if entry.claims else DASH
+            rows.append([page, title, entry.scale or DASH, run, claims])
+    header = ["paper", "table", "scale", "rows run", "claims"]
+    return markdown_table(header, rows, (0, 1, 2, 3, 4))
 
 
 def heading(view: TableView) -> str:
     """Heading of a table on its page."""
     entry = view.entry
     scale = "paper scale" if entry.scale == "paper" else ""
-    which = ", ".join(filter(None, (scale, entry.extra)))
+    words = shlex.split(entry.extra)  # in a heading without the quotes of a shell
+    which = ", ".join(filter(None, (scale, view.form, " ".join(words))))
     return f"{entry.number} ({which})" if which else entry.number
 
 

@@ -6,7 +6,17 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 
 from analysis.report.data import CellEntry
-from analysis.report.views import DASH, KINDS, TableView, fixed, is_number, letters, seed_span
+from analysis.report.views import (
+    DASH,
+    KINDS,
+    TableView,
+    fixed,
+    interval_text,
+    is_number,
+    letters,
+    seed_span,
+    with_sign,
+)
 
 NOT_RUN = "not run"
 NO_VALUE = "no value"
@@ -25,17 +35,6 @@ def markdown_table(
     rule = ["---" if index in texts else "---:" for index in range(len(header))]
     lines = (" | ".join(cell.replace("|", "\\|") for cell in row) for row in [header, rule, *rows])
     return "\n".join(f"| {line} |" for line in lines)
-
-
-def difference_text(value: float | None) -> str:
-    """With its sign; a dash where there is none."""
-    text = fixed(value)
-    return f"+{text}" if is_number(value) and float(f"{value:.2f}") > 0 else text
-
-
-def interval_text(low: float | None, high: float | None) -> str:
-    """``[−1.20, 0.35]``; a dash where there is none."""
-    return f"[{fixed(low)}, {fixed(high)}]" if is_number(low) and is_number(high) else DASH
 
 
 @dataclass
@@ -88,7 +87,7 @@ class TableText:
         if kind == "interval":
             return interval_text(cell.low, cell.high)
         if kind == "difference":
-            return difference_text(cell.difference)
+            return with_sign(cell.difference)
         return fixed(cell.published, self.view.decimals)
 
     def _ours(self, cell: CellEntry) -> str:
@@ -122,10 +121,3 @@ class TableText:
 
 def _behind(row: Sequence[CellEntry]) -> list[tuple[tuple[str, ...], float | None]]:
     return [(cell.runs, cell.mean) for cell in row]
-
-
-def order_text(view: TableView) -> str:
-    """Spearman's rho by column, with the number of rows; "" where it is not known."""
-    found = [(name, *view.order(name)) for name in view.entry.columns]
-    known = [f"{name} {rho} (n = {rows})" for name, rho, rows in found if rho != DASH]
-    return ", ".join(known)

@@ -15,7 +15,7 @@ from typing import Any
 from markdown_it import MarkdownIt
 from markupsafe import Markup
 
-from analysis.report import charts, views
+from analysis.report import charts, claim_views, views
 from analysis.report.data import ReportData, RunEntry, StudyEntry, TrialEntry
 from analysis.report.panels import class_records, panels_of, run_records
 from rgbt.checks import InputError
@@ -25,6 +25,7 @@ STATIC = Path(__file__).with_name("static")
 
 SECTIONS = (
     ("summary", "Summary"),
+    ("claims", "Claims"),
     ("tables", "Tables"),
     ("runs", "Runs"),
     ("regions", "Regions"),
@@ -101,11 +102,13 @@ def page_text(data: ReportData) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    texts = (views.fixed, views.signed, views.plural, views.moment, views.duration)
-    environment.filters |= {each.__name__: each for each in (*texts, views.commit_text)}
-    names = ("words", "ranks", "dash", "is_number", "letters", "seed_span")
-    values = (views.KINDS, views.RANKS, views.DASH, views.is_number, views.letters, views.seed_span)
-    environment.globals |= dict(zip(names, values, strict=True))
+    numbers = (views.fixed, views.signed, views.with_sign, views.plural)
+    times = (views.moment, views.duration, views.commit_text)
+    environment.filters |= {each.__name__: each for each in (*numbers, *times)}
+    functions = (views.is_number, views.letters, views.seed_span, views.interval_text)
+    environment.globals |= {each.__name__: each for each in functions}
+    environment.globals |= {"words": views.KINDS, "ranks": views.RANKS, "dash": views.DASH}
+    environment.globals["claim_texts"] = claim_views
     scripts = [(STATIC / "early.js").read_text(), chart_library(), (STATIC / "page.js").read_text()]
     hashes = (hashlib.sha256(each.encode()).digest() for each in scripts)
     allowed = " ".join(f"'sha256-{base64.b64encode(each).decode()}'" for each in hashes)
@@ -159,6 +162,7 @@ def _context(data: ReportData) -> dict[str, Any]:
     return {
         "payload": embedded(payload),
         "run": run,
+        "paper_claims": claim_views.paper_claims(tables),
         "waiting": [view for view in tables if not view.is_run],
         "specs": specs,
         "commits": list(commits.items()),

@@ -8,6 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from analysis.report.claim_views import (
+    VERDICTS,
+    needed,
+    placed,
+    printed_sentence,
+    seeds,
+    why,
+)
 from analysis.report.data import ReportData, RunEntry, StudyEntry
 from analysis.report.views import (
     COVERS,
@@ -18,10 +26,12 @@ from analysis.report.views import (
     commit_text,
     duration,
     fixed,
+    interval_text,
     is_number,
     moment,
     plural,
     signed,
+    with_sign,
 )
 
 Panel = dict[str, Any]
@@ -136,7 +146,7 @@ def panels_of(
         keys = [run.key for run in group.runs]
         panels[group.id] = _panel(group.name, "Group of runs", keys, ["all"])
     for view in tables:
-        panels |= _cell_panels(view)
+        panels |= _cell_panels(view) | _claim_panels(view)
     for study, place in studies:
         peers[place] = [key for trial in study.trials for key in trial.runs]
         for trial in study.trials:
@@ -183,10 +193,37 @@ def _cell_panels(view: TableView) -> dict[str, Panel]:
             ("seeds", str(cell.seeds)),
             ("unit", "squared percent points" if column == "Var" else table.unit),
             *([("note", cell.reason)] if cell.reason else []),
-            *([("scale", "demo: compare orders, not values")] * (table.scale == "demo")),
+            *([("scale", "demo: compare the verdicts of claims")] * (table.scale == "demo")),
         ]
         subtitle = ", ".join(filter(None, (table.name, table.number, table.extra)))
         shown = _panel(f"{table.rows[r]}, {column}", subtitle, cell.runs, [view.id], facts)
         values = {"values": cell.values, "value_name": column}
         panels[f"cell={view.id}/{r}/{c}"] = shown | values
+    return panels
+
+
+def _claim_panels(view: TableView) -> dict[str, Panel]:
+    """What opens behind a verdict."""
+    table, panels = view.entry, {}
+    for claim in placed(view):
+        if not claim.panel:
+            continue
+        entry = claim.entry
+        covers = f" (95 %, {COVERS[entry.covers]})" if entry.covers in COVERS else ""
+        facts = [
+            ("statement", entry.says),
+            ("place", entry.source),
+            ("verdict", VERDICTS[entry.verdict]),
+            ("contrast", entry.contrast),
+            ("difference", with_sign(entry.estimate)),
+            ("interval", interval_text(entry.low, entry.high) + covers),
+            ("printed", f"{with_sign(entry.printed)}. {printed_sentence(entry)}"),
+            ("smallest difference that could be shown", fixed(entry.smallest)),
+            ("paired seeds", seeds(entry)),
+            ("seeds that would decide", needed(entry)),
+            *([("why", why(entry))] if entry.reason else []),
+            *(("remark", remark) for remark in entry.remarks),
+        ]
+        subtitle = f"Claim of {table.paper}, {table.number}"
+        panels[claim.panel] = _panel(entry.name, subtitle, entry.runs, [view.id], facts)
     return panels

@@ -32,7 +32,7 @@ class Contrast:
     Attributes:
         reference: group that the method is compared against.
         method: the other group.
-        expected: metric -> what the paper says of the method's score.
+        expected: metric -> the score of the method against that of the reference.
         counts: path of the counts in a run folder.
         options: of `rgbt compare`, to read the same counts; "" for the run's own.
     """

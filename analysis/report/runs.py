@@ -33,7 +33,7 @@ from rgbt.metrics.scores import iou, miou, summary
 from rgbt.spec.naming import group_of
 from rgbt.tracking.provenance import COMMIT_LENGTH, commit_of, without_passwords
 from sweeps.table.cells import OWN_COUNTS
-from sweeps.table.request import DEFAULT_SCALE, TAG
+from sweeps.table.request import DEFAULT_SCALE, TAG, UNTIL_DECIDED
 
 STUDY_TAG = "rgbt.study/"
 ABSENT = get_args(Absent)
@@ -51,6 +51,7 @@ class ReportRun:
         test_counts: that the run ended with; None where there are none.
         absent: how the run scores a class without pixels.
         config: dotted key -> value; empty where the store has no configuration.
+        until_decided: tables for whose claims runs were added until they were decided.
     """
 
     entry: RunEntry
@@ -58,6 +59,7 @@ class ReportRun:
     absent: Absent
     config: Mapping[str, Any]
     files: RunFiles
+    until_decided: tuple[str, ...] = ()
     _evaluations: dict[str, Counts] = field(default_factory=dict)
 
     @property
@@ -143,7 +145,14 @@ def open_run(run: MlflowRun, remarks: list[str]) -> ReportRun:
         dataset=run.tags.get("rgbt.dataset") or ("" if counts is None else counts.dataset),
         config={name: as_text(value) for name, value in config.items()} or dict(run.params),
     )
-    return ReportRun(entry=entry, test_counts=counts, absent=absent, config=config, files=run.files)
+    return ReportRun(
+        entry=entry,
+        test_counts=counts,
+        absent=absent,
+        config=config,
+        files=run.files,
+        until_decided=tuple(_after(run.tags, UNTIL_DECIDED)),
+    )
 
 
 def percent_scores(counts: Counts, absent: Absent) -> dict[str, float]:

@@ -3,31 +3,32 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, get_args
 
+from analysis.report.claims import claim_entries, forms_entry, judge_of, seeds_were_added
 from analysis.report.data import CellEntry, TableEntry, Uncertainty
 from analysis.report.runs import ReportRun
 from analysis.report.store import MlflowRun, read_each
 from analysis.report.tables_recorded import (
     NO_CELL,
-    CountsSource,
     RecordedCell,
     RecordedTable,
-    RescoredTable,
     read_recorded,
     reproduce_command,
-    score_again,
 )
+from analysis.report.tables_rescored import CountsSource, RescoredTable, score_again
 from analysis.uncertainty import Interval, Resampling, compare, estimate
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from sweeps.table.load_table import load_table, table_names
 from sweeps.table.request import DEFAULT_SCALE
 from sweeps.table.scoring import ScoredTable, published, score
-from sweeps.table.table import Column, Row, Table
+from sweeps.table.table import Column, Form, Row, Table
+from sweeps.verdicts.judge import TableJudge
 
 Track = Callable[[Sequence[Any], str], Iterable[Any]]
 """Goes over a sequence and shows how far it is: (sequence, what is done)."""
@@ -74,7 +75,7 @@ def table_entries(
         except InputError as error:
             remarks.append(f"Table '{name}' is omitted: {error}")
     recorded = read_each(records, read_recorded, remarks)
-    recorded.sort(key=lambda each: (each.name, each.scale, each.extra))
+    recorded.sort(key=lambda each: (each.name, each.scale, each.form, each.extra))
     drafts = [score_again(each, files.get(each.name) or _file_of(each), runs) for each in recorded]
     wanted = (
         draft.interval_key(row, column)
@@ -83,13 +84,11 @@ def table_entries(
         for column in draft.scored.table.columns
     )
     intervals = find_intervals(filter(None, wanted), runs, resamples, track)
-    made = [_entry(draft, intervals, remarks) for draft in drafts]
+    made = [_judged(draft, intervals, resamples, remarks) for draft in track(drafts, "claims")]
     known = {each.name for each in recorded}
-    for index, each in enumerate(recorded):
+    for each in recorded:
         if each.name not in files:
             remarks.append(f"Table '{each.name}' has no file any more; it is shown as recorded.")
-            orders = {name: (rho, 0) for name, rho in each.orders.items()}
-            made[index] = replace(made[index], orders=orders)
     return (*made, *(_waiting(name, files[name]) for name in files if name not in known))
 
 
@@ -163,7 +162,7 @@ def cell_of(draft: RescoredTable, row: Row, column: Column, intervals: Intervals
         difference=_difference(mean, plain.published),
         reason=line.reason or cell.reason or plain.reason,
         runs=line.keys,
-        rank=scored.ranks_ours.get(place, 0),
+        rank=scored.marks.get(place, 0),
     )
     key = draft.interval_key(row, column)
     found = None if key is None else intervals.get(key)
@@ -180,11 +179,7 @@ def _printed(scored: ScoredTable, row: Row, column: Column) -> CellEntry:
     needs = column.needs or row.needs or scored.table.needs or ""
     if not needs and row.experiment is None:
         needs = "shown as published only"
-    return CellEntry(
-        published=published(row, column),
-        reason=needs,
-        published_rank=scored.ranks_published.get((row.label, column.name), 0),
-    )
+    return CellEntry(published=published(row, column), reason=needs)
 
 
 def _as_recorded(plain: CellEntry, line: RecordedCell) -> CellEntry:
@@ -206,6 +201,20 @@ def _difference(mean: float | None, printed: float | None) -> float | None:
     return None if mean is None or printed is None else mean - printed
 
 
+def _judged(
+    draft: RescoredTable, intervals: Intervals, resamples: int, remarks: list[str]
+) -> TableEntry:
+    """A table that was run, with marks and with the verdicts of its claims."""
+    judge = judge_of(draft, resamples)
+    marked = replace(draft.scored, marks=judge.marks(draft.outcomes))
+    entry = _entry(replace(draft, scored=marked), intervals, remarks)
+    return replace(
+        entry,
+        claims=claim_entries(judge, draft.outcomes),
+        forms=forms_entry(judge, draft.outcomes),
+    )
+
+
 def _entry(draft: RescoredTable, intervals: Intervals, remarks: list[str]) -> TableEntry:
     recorded, scored = draft.recorded, draft.scored
     table = scored.table
@@ -220,13 +229,10 @@ def _entry(draft: RescoredTable, intervals: Intervals, remarks: list[str]) -> Ta
         table,
         lambda row, column: cell_of(draft, row, column, intervals),
         scale=recorded.scale,
-        orders={
-            name: (None if math.isnan(each.rho) else each.rho, each.rows)
-            for name, each in scored.orders.items()
-        },
-        notes=(*_notes(table), *recorded.remarks),
-        command=_command(recorded),
-        extra=recorded.extra,
+        notes=tuple(dict.fromkeys((*_notes(table), *_form_notes(draft), *recorded.remarks))),
+        command=_command(draft),
+        extra=_words(draft),
+        form=recorded.form,
     )
 
 
@@ -241,9 +247,33 @@ def _notes(table: Table) -> tuple[str, ...]:
     return (*needed, *table.remarks, *columns, *rows)
 
 
-def _command(recorded: RecordedTable) -> str:
-    seeds = recorded.seeds or DEFAULT_SEEDS
-    return reproduce_command(recorded.name, seeds, recorded.scale or DEFAULT_SCALE, recorded.extra)
+def _form_notes(draft: RescoredTable) -> Iterable[str]:
+    """What the rows of the shown form are run as, as far as the file says it."""
+    forms: tuple[Form, ...] = get_args(Form)
+    shown = forms if draft.recorded.form == "both" else (draft.scored.form,)
+    sentences = draft.scored.table.forms
+    return (sentences[form] for form in shown if form in sentences)
+
+
+def _words(draft: RescoredTable) -> str:
+    """Further words of the command as typed: the selected rows, and overrides of every row."""
+    recorded, table = draft.recorded, draft.scored.table
+    labels = recorded.rows()
+    is_selected = recorded.form != "both" and set(labels) < {row.label for row in table.rows}
+    rows = shlex.quote(f"rows={','.join(labels)}") if is_selected else ""
+    return " ".join(filter(None, (rows, recorded.extra)))
+
+
+def _command(draft: RescoredTable) -> str:
+    recorded = draft.recorded
+    return reproduce_command(
+        recorded.name,
+        recorded.seeds or DEFAULT_SEEDS,
+        recorded.scale or DEFAULT_SCALE,
+        _words(draft),
+        form=recorded.form,
+        until_decided=seeds_were_added(draft),
+    )
 
 
 def _waiting(name: str, table: Table) -> TableEntry:
@@ -253,7 +283,7 @@ def _waiting(name: str, table: Table) -> TableEntry:
         table,
         partial(_printed, score(name, table, {}, scale="")),
         scale="",
-        orders={},
+        claims=claim_entries(TableJudge(name, table)),
         notes=_notes(table),
         command=reproduce_command(name, DEFAULT_SEEDS, DEFAULT_SCALE),
     )

@@ -34,7 +34,8 @@ STATUS = {
     "FAILED": "✗ failed",
     "KILLED": "✗ killed",
 }
-RANKS = ("", "best", "second")
+RANKS = ("", "shown to be the best", "shown to be the second best")
+FORMS = {"paper": "", "released": "released form", "both": "both forms"}
 ENDS = {"ring": ("centre", "edge"), "vertical": ("left", "right"), "horizontal": ("top", "bottom")}
 """Kinds of partitions: what their first and last regions are called."""
 
@@ -62,6 +63,17 @@ def signed(value: float | None) -> str:
     if float(text) == 0:
         return f"= {text}"
     return f"▲ +{text}" if value > 0 else f"▼ −{text}"
+
+
+def with_sign(value: float | None) -> str:
+    """A difference as ``+0.35``; a dash where there is none."""
+    text = fixed(value)
+    return f"+{text}" if is_number(value) and float(f"{value:.2f}") > 0 else text
+
+
+def interval_text(low: float | None, high: float | None) -> str:
+    """``[−1.20, 0.35]``; a dash where there is none."""
+    return f"[{fixed(low)}, {fixed(high)}]" if is_number(low) and is_number(high) else DASH
 
 
 def plural(count: int, word: str) -> str:
@@ -185,31 +197,23 @@ class TableView:
         """Number of rows with a value of ours."""
         return sum(any(is_number(cell.mean) for cell in row) for row in self.entry.cells)
 
-    def rows_with(self, field: str, value: float | None = None) -> list[str]:
-        """Rows whose cell of the main column has `value` in `field`; None: has any number there."""
+    @property
+    def best_rows(self) -> list[str]:
+        """Rows that are shown to be better than all others of ours in the main column."""
         rows = zip(self.entry.rows, self.entry.cells, strict=True)
-        found = [(label, getattr(row[self.main], field)) for label, row in rows]
-        return [label for label, v in found if (is_number(v) if value is None else v == value)]
+        return [label for label, row in rows if row[self.main].rank == 1]
 
     @property
-    def agreement(self) -> str:
-        """Whether the best row is the paper's; unknown where that one was not run."""
-        ours, published = self.rows_with("rank", 1), self.rows_with("published_rank", 1)
-        if not ours or not published:
-            return DASH
-        if set(ours) & set(published):
-            return "✓ yes"
-        return "✗ no" if set(published) & set(self.rows_with("mean")) else f"{DASH} not run"
-
-    def order(self, column: str) -> tuple[str, int]:
-        """Spearman's rho of a column with its sign, and the number of rows."""
-        rho, rows = self.entry.orders.get(column, (None, 0))
-        return "+" * (rho is not None and rho > 0) + fixed(rho), rows
+    def form(self) -> str:
+        """What the rows of ours are run as, in words; "" for the paper's form."""
+        return FORMS[self.entry.form]
 
 
 def table_views(data: ReportData) -> list[TableView]:
     """The tables with their places."""
-    places = unique_names(f"table {each.name} {each.scale} {each.extra}" for each in data.tables)
+    places = unique_names(
+        f"table {each.name} {each.scale} {FORMS[each.form]} {each.extra}" for each in data.tables
+    )
     return [TableView(entry, place) for entry, place in zip(data.tables, places, strict=True)]
 
 

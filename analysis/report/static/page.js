@@ -81,6 +81,9 @@ function filter(field) {
     const rows = [...card.querySelectorAll("[data-row]")];
     rows.forEach((row) => (row.hidden = !named && !matches(row.dataset.row)));
     card.hidden = !named && rows.every((row) => row.hidden);
+    for (const folded of card.querySelectorAll("details.not-run")) {
+      folded.open = !!words[0] && [...folded.querySelectorAll("[data-row]")].some((row) => !row.hidden);
+    }
   }
 }
 

@@ -10,12 +10,14 @@ import base64
 import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
 
 from analysis.report.data import (
     CellEntry,
+    ClaimEntry,
     DifferenceEntry,
     PagePicture,
     ReportData,
@@ -23,6 +25,7 @@ from analysis.report.data import (
     StudyEntry,
     TableEntry,
     TrialEntry,
+    VerdictWord,
 )
 from analysis.report.studies import pareto_front
 from rgbt.randomness import numpy_generator
@@ -144,9 +147,8 @@ def table_entry(name: str, runs_by_row: dict[int, list[RunEntry]]) -> TableEntry
     for index, column in enumerate(table.columns):
         whole = [row[index].mean if row[index].seeds == len(SEEDS) else None for row in rows]
         ours = ranks(whole, column.best)
-        printed = ranks([row[index].published for row in rows], column.best)
-        for row, rank, published in zip(rows, ours, printed, strict=True):
-            row[index] = replace(row[index], rank=rank, published_rank=published)
+        for row, rank in zip(rows, ours, strict=True):
+            row[index] = replace(row[index], rank=rank)
     notes = [
         *table.remarks,
         *(f"{row.label}: {note}" for row in table.rows for note in row.remarks),
@@ -164,9 +166,40 @@ def table_entry(name: str, runs_by_row: dict[int, list[RunEntry]]) -> TableEntry
         rows=tuple(row.label for row in table.rows),
         proposed=tuple(row.proposed for row in table.rows),
         cells=tuple(tuple(row) for row in rows),
-        orders={c.name: order([row[i] for row in rows]) for i, c in enumerate(table.columns)},
         notes=tuple(notes),
         command=f"rgbt reproduce table={name} scale=demo seeds=0,1,2",
+    )
+
+
+def claim(name: str, verdict: VerdictWord, **others: Any) -> ClaimEntry:
+    """A claim about the first table; one with a verdict has numbers."""
+    numbers: dict[str, Any] = {}
+    if verdict != "not run":
+        numbers = {"estimate": -1.25, "low": -3.5, "high": 1.0, "covers": "images and seeds"}
+        numbers |= {"smallest": 2.25, "seeds": 3, "seeds_needed": 12.0}
+    given = {
+        "says": f"The statement called {name}.",
+        "source": "Sec. V-C1, second paragraph",
+        "contrast": "Ny/4 - CRM baseline, Var",
+        "printed": -2.47,
+        "as_printed": True,
+    }
+    return ClaimEntry(name=name, verdict=verdict, **{**numbers, **given, **others})
+
+
+def claims(table: TableEntry) -> tuple[ClaimEntry, ...]:
+    """One claim of each verdict; in a table without runs one that is not run."""
+    waiting = claim(
+        "waiting", "not run", as_printed=False, missing=table.rows[:1], reason="row has no run."
+    )
+    if not table.scale:
+        return (waiting,)
+    keys = table.cells[-1][0].runs
+    return (
+        claim("true", "holds", runs=keys, low=-2.0, high=-0.5),
+        claim("false", "contradicted", runs=keys, remarks=("A reading of ours.",)),
+        claim("open", "undecided", runs=keys, reason="Below 2.25, nothing can be shown."),
+        waiting,
     )
 
 
@@ -179,15 +212,6 @@ def _cell_of(
         reason = "Not run yet." if table.rows[row].experiment else ""
         return CellEntry(published=printed, reason=reason)
     return cell([_value(run, name, printed, rng) for run in runs], [r.key for r in runs], printed)
-
-
-def order(cells: Sequence[CellEntry]) -> tuple[float | None, int]:
-    """Spearman's rho (no ties) and the number of rows that have both values."""
-    pairs = [(c.mean, c.published) for c in cells if c.mean is not None and c.published is not None]
-    if len(pairs) < 2:
-        return None, len(pairs)
-    places = np.argsort(np.argsort(np.array(pairs), axis=0), axis=0)
-    return float(np.corrcoef(places.T)[0, 1]), len(pairs)
 
 
 def search(runs: Sequence[RunEntry]) -> StudyEntry:
@@ -296,6 +320,7 @@ def report(num_rows: int = 20) -> ReportData:
         gone = {"scores": {}, "region_ious": (), "class_region_ious": (), "images": 0}
         runs[17] = replace(runs[17], status="FAILED", seconds=None, **gone)
     tables = [table_entry(name, behind[name]) for name in names]
+    tables = [replace(table, claims=claims(table)) for table in tables]
     tables.sort(key=lambda table: not table.scale)
     return ReportData(
         title="RGB-thermal segmentation: what was run, beside the papers",

@@ -20,6 +20,7 @@ from rgbt.tracking.run_files import Description, counts_name
 from rgbt.tracking.run_folder import RunFolder
 from sweeps import attributes
 from sweeps.evaluation import ExtraEvaluation
+from sweeps.rendering.claims import claims_markdown
 from sweeps.rendering.file_formats import tidy_csv
 from sweeps.report.records import record
 from sweeps.report.study_data import read
@@ -27,6 +28,7 @@ from sweeps.report.tables import trials_csv
 from sweeps.study import markdown
 from sweeps.table.load_table import load_table
 from sweeps.table.scoring import score
+from sweeps.verdicts.judge import TableJudge
 from tests.sweeps.tabled import outcome
 
 IMAGES, REGIONS, CLASSES = 12, 2, ("road", "car")
@@ -44,6 +46,16 @@ columns:
   - {name: drop, minus: [rgb, mIoU], best: none}
   - {name: TC, needs: the consistency metrics}
 remarks: [A remark of the table.]
+forms: {paper: As the text describes it.}
+claims:
+  - {name: b_is_better, says: B is better than A., source: "Sec. 1", rows: [B], against: [A],
+     columns: [mIoU], expected: higher}
+  - {name: a_is_better, says: A is better than B., source: "Sec. 2", rows: [A], against: [B],
+     columns: [mIoU], expected: higher, remarks: [A reading of ours.]}
+  - {name: both_are_alike, says: Without RGB they are alike., source: "Sec. 3", rows: [B],
+     against: [A], columns: [Var], expected: lower, at_least: 1.0}
+  - {name: c_is_worse, says: C is worse than A., source: "Sec. 4", rows: [C], against: [A],
+     columns: [mIoU], expected: lower}
 rows:
   - {label: A, experiment: grbm, values: {mIoU: 61.0, Var: 9.0}}
   - {label: B, experiment: crm, proposed: true, values: {mIoU: 60.0, Var: 12.0}, remarks: [Odd.]}
@@ -172,14 +184,19 @@ def record_table(runs_dir: Path, tracking: MlflowTracking) -> None:
     }
     scored = score("own/t", load_table("own/t"), runs, scale="paper")
     (runs_dir / "table.csv").write_text(tidy_csv(scored))
-    said = "- Every row of ours was run with trainer.max_steps=9.\n- Bold: best.\n"
-    (runs_dir / "table.md").write_text(said)
+    judge = TableJudge("own/t", scored.table)
+    said = [
+        "**own, TABLE I: Two masks**\n\n| | mIoU |\n| --- | ---: |\n",
+        "- Every row of ours was run with trainer.max_steps=9.\n- Bold: best.\n",
+        claims_markdown(judge.claims(runs)),
+    ]
+    (runs_dir / "table.md").write_text("\n".join(said))
     record(
         tracking,
         name="own/t paper",
         kind="table",
         files=[runs_dir / "table.csv", runs_dir / "table.md"],
-        metrics={"order/mIoU": 1.0},
+        metrics={"claims/holds": 1.0},
         tags={"rgbt.table": "own/t", "rgbt.scale": "paper", "rgbt.seeds": "0, 1, 2"},
         note="",
     )

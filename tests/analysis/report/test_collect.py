@@ -155,13 +155,12 @@ def test_run_shows_its_provenance(data: ReportData) -> None:
     assert run.config["tracking.uri"] == "postgresql://me:***@host/db"
 
 
-def test_results_pages_compare_groups_and_hide_folders(data: ReportData, runs_dir: Path) -> None:
-    measured = {each.metric: each for each in data.contrasts if each.values}
-    assert set(measured) == {"mIoU", "Var"}
-    assert measured["mIoU"].scale == "paper"
-    assert measured["mIoU"].seeds == (3, 3)
+def test_results_pages_show_claims_and_hide_folders(data: ReportData, runs_dir: Path) -> None:
+    assert {each.verdict for each in data.contrasts} == {"Not run: baseline."}
     pages = page_texts(data, ())
     table = pages["own.md"]
+    assert "| `b_is_better` | ✓ holds | B - A, mIoU | +" in table
+    assert "| B is better than A. (own, TABLE I; paper scale) | ✓ holds |" in pages["index.md"]
     cell = table_of(data, "own/t").cells[0][0]
     assert f"| ours | 3 | {cell.mean:.2f} ± {cell.sd:.2f} |" in table
     assert "(paper scale, trainer.max_steps=9)" in table
@@ -211,24 +210,71 @@ def test_differences_of_columns_are_paired_over_images_and_seeds(data: ReportDat
     assert cell.covers == "images and seeds"
 
 
-def test_the_table_has_ranks_orders_and_notes(data: ReportData) -> None:
+def test_the_table_has_marks_and_notes(data: ReportData) -> None:
     table = table_of(data)
     assert (table.number, table.caption, table.scale) == ("TABLE I", "Two masks", "paper")
     assert table.proposed == (False, True, False)
-    assert [cell_of(data, row, "mIoU").rank for row in "ABC"] == [2, 1, 0]
-    assert [cell_of(data, row, "mIoU").published_rank for row in "ABC"] == [1, 2, 0]
-    assert table.orders["mIoU"] == (None, 2)
+    # B is better than A by ten points and more; no third row is left to be better than.
+    assert [cell_of(data, row, "mIoU").rank for row in "ABC"] == [0, 1, 0]
+    # The spread of Var over three seeds is as large as the difference: nothing is shown.
+    assert [cell_of(data, row, "Var").rank for row in "ABC"] == [0, 0, 0]
     assert table.notes == (
         "A remark of the table.",
         "TC: not computed, needs the consistency metrics.",
         "B: Odd.",
+        "As the text describes it.",
         "Every row of ours was run with trainer.max_steps=9.",
     )
     assert table.command == ("rgbt reproduce table=own/t seeds=3 scale=paper trainer.max_steps=9")
     assert cell_of(data, "A", "TC").reason == "the consistency metrics"
-    assert cell_of(data, "C", "mIoU") == CellEntry(
-        published=50.0, reason="shown as published only", published_rank=0
-    )
+    assert cell_of(data, "C", "mIoU") == CellEntry(published=50.0, reason="shown as published only")
+
+
+def test_claims_of_the_table_are_judged_by_its_runs(data: ReportData) -> None:
+    found = {claim.name: claim for claim in table_of(data).claims}
+    assert {name: claim.verdict for name, claim in found.items()} == {
+        "b_is_better": "holds",
+        "a_is_better": "contradicted",
+        "both_are_alike": "undecided",
+        "c_is_worse": "not run",
+    }
+    better = found["b_is_better"]
+    a, b = ([counts_of(seed, right) for seed in range(3)] for right in (0.7, 0.8))
+    scores = [[miou(each.counts.sum((0, 1))) for each in side] for side in (a, b)]
+    differences = [second - first for first, second in zip(*scores)]
+    assert better.estimate == pytest.approx(statistics.fmean(differences))
+    settings = Resampling(resamples=RESAMPLES)
+    (wanted,) = compare(a, b, ["mIoU"], settings, paired=True).differences
+    assert wanted.both is not None
+    assert (better.low, better.high) == pytest.approx((wanted.both.low, wanted.both.high), rel=0.1)
+    assert (better.seeds, better.covers) == (3, "images and seeds")
+    assert better.runs == (*keys_of("grbm scale=paper"), *keys_of("crm scale=paper"))
+    # Printed: 60 for B and 61 for A.
+    assert (better.printed, better.as_printed) == (-1.0, False)
+    assert (found["a_is_better"].printed, found["a_is_better"].as_printed) == (1.0, True)
+    assert found["a_is_better"].estimate == pytest.approx(-better.estimate)
+    waiting = found["c_is_worse"]
+    assert (waiting.missing, waiting.estimate, waiting.runs) == (("C",), None, ())
+    assert (waiting.printed, waiting.as_printed) == (-11.0, True)
+
+
+def test_seeds_added_until_decided_widen_the_intervals(changeable: Path) -> None:
+    """The tag of one run is enough: three seeds are too few for an interval valid at any time."""
+    tracking = tracker(changeable)
+    read = read_store(tracking, changeable, changeable)
+    tagged = [
+        replace(each, tags={**each.tags, "rgbt.until_decided/own/t": "true"})
+        if each.tags.get("rgbt.key") == "bb0"
+        else each
+        for each in read
+    ]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("analysis.report.collect.read_store", lambda *_: tagged)
+        found = collected(changeable)
+    table = table_of(found)
+    assert [claim.verdict for claim in table.claims] == [*["undecided"] * 3, "not run"]
+    assert "seeds=until_decided" in table.command
+    assert [cell_of(found, row, "mIoU").rank for row in "AB"] == [0, 0]
 
 
 def test_tables_not_run_are_listed_with_their_needs(data: ReportData) -> None:
@@ -373,6 +419,7 @@ def test_a_table_whose_file_is_gone_is_as_recorded(
     monkeypatch.chdir(tmp_path)
     found = collected(runs_dir)
     table = table_of(found)
+    assert table.claims == ()
     assert (table.rows, table.columns[:2]) == (("A", "B", "C"), ("mIoU", "Var"))
     cell = table.cells[0][0]
     values = [miou(counts_of(seed, 0.7).counts.sum((0, 1))) for seed in range(3)]

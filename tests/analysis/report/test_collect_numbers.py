@@ -11,17 +11,13 @@ import numpy as np
 import pytest
 
 from analysis.report import collect
+from analysis.report.claims import claim_entries, forms_entry, judge_of
 from analysis.report.differences import difference_entries, load_choices
 from analysis.report.runs import percent_scores
 from analysis.report.store import MlflowRun
 from analysis.report.tables import cell_of, find_intervals
-from analysis.report.tables_recorded import (
-    CountsSource,
-    RecordedCell,
-    RecordedTable,
-    RescoredTable,
-    score_again,
-)
+from analysis.report.tables_recorded import RecordedCell, RecordedTable
+from analysis.report.tables_rescored import CountsSource, RescoredTable, score_again
 from analysis.uncertainty import Resampling, compare, estimate
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
@@ -93,7 +89,6 @@ def draft(tmp_path: Path, seeds: int, runs: dict[str, Any], text: str = TABLE) -
         scale="paper",
         seeds=tuple(range(seeds)),
         lines={("A", column): line for column in ("mIoU", "rgb", "drop")},
-        orders={},
     )
     return score_again(recorded, load_table(str(path)), runs)
 
@@ -125,7 +120,7 @@ def test_a_mean_of_columns_has_values_and_no_interval(tmp_path: Path) -> None:
     assert missing.values(row, column) == (None,)
 
 
-def test_counted_parameters_are_as_recorded_and_have_ranks(tmp_path: Path) -> None:
+def test_counted_parameters_are_as_recorded_and_have_no_marks(tmp_path: Path) -> None:
     path = tmp_path / "t.yaml"
     path.write_text(TABLE.replace("needs: the consistency metrics", "parameters: true"))
     lines = {
@@ -133,7 +128,7 @@ def test_counted_parameters_are_as_recorded_and_have_ranks(tmp_path: Path) -> No
         ("B", "TC"): RecordedCell(44.56, None, 0, None, "", ()),
         ("C", "TC"): RecordedCell(None, None, 0, None, "", ()),
     }
-    recorded = RecordedTable(name="own/t", scale="demo", seeds=(0,), lines=lines, orders={})
+    recorded = RecordedTable(name="own/t", scale="demo", seeds=(0,), lines=lines)
     found = score_again(recorded, load_table(str(path)), {})
     assert {place: cell.mean for place, cell in found.scored.cells.items()} == {
         ("A", "TC"): 54.36,
@@ -141,7 +136,7 @@ def test_counted_parameters_are_as_recorded_and_have_ranks(tmp_path: Path) -> No
     }
     row, column = found.scored.table.rows[0], found.scored.table.columns[-1]
     cell = cell_of(found, row, column, {})
-    assert (cell.mean, cell.seeds, cell.reason, cell.rank, cell.runs) == (54.36, 0, "", 1, ())
+    assert (cell.mean, cell.seeds, cell.reason, cell.rank, cell.runs) == (54.36, 0, "", 0, ())
     assert found.interval_key(row, column) is None
 
 
@@ -180,6 +175,46 @@ def test_cell_without_a_recorded_seed_has_no_interval(tmp_path: Path) -> None:
     row, column = table.rows[0], table.columns[0]
     assert draft(tmp_path, 2, runs).interval_key(row, column) is not None
     assert draft(tmp_path, 3, runs).interval_key(row, column) is None
+
+
+def recorded_rows(tmp_path: Path, text: str, keys: dict[str, tuple[str, ...]]) -> RecordedTable:
+    """A record of rows with these runs, each with as many seeds as it has runs."""
+    (tmp_path / "t.yaml").write_text(text)
+    lines = {
+        (row, "mIoU"): RecordedCell(1.0, None, len(of_row), None, "", of_row)
+        for row, of_row in keys.items()
+    }
+    return RecordedTable(name="own/t", scale="demo", seeds=(0, 1, 2), lines=lines)
+
+
+def test_row_of_decided_claims_needs_fewer_seeds_without_a_reason(tmp_path: Path) -> None:
+    runs = {f"k{seed}": run_of({}, seed, counts_of(seed)) for seed in range(3)}
+    recorded = recorded_rows(tmp_path, TABLE, {"A": ("k0", "k1", "k2"), "B": ("k0", "k1")})
+    found = score_again(recorded, load_table(str(tmp_path / "t.yaml")), runs)
+    cells = {label: found.scored.cells[label, "mIoU"] for label in "AB"}
+    assert {label: cell.seeds for label, cell in cells.items()} == {"A": 3, "B": 2}
+    assert [cell.reason for cell in cells.values()] == ["", ""]
+
+
+def test_both_forms_have_a_row_each_and_their_difference(tmp_path: Path) -> None:
+    text = TABLE.replace("{label: A,", "{label: A, released: {remarks: [Other masks.]},")
+    runs = {f"k{seed}": run_of({}, seed, counts_of(seed)) for seed in range(2)}
+    made = [counts_of(seed, 0.9) for seed in range(2)]
+    runs |= {f"r{seed}": replace(run_of({}, seed, each)) for seed, each in enumerate(made)}
+    runs = {key: replace(run, entry=replace(run.entry, key=key)) for key, run in runs.items()}
+    keys = {"A": ("k0", "k1"), "A, released": ("r0", "r1")}
+    recorded = replace(recorded_rows(tmp_path, text, keys), form="both")
+    draft = score_again(recorded, load_table(str(tmp_path / "t.yaml")), runs)
+    judge = judge_of(draft, 200)
+    assert claim_entries(judge, draft.outcomes) == ()
+    entry = forms_entry(judge, draft.outcomes)
+    assert entry is not None
+    means = [
+        sum(value("mIoU", counts_of(seed, right), "released") for seed in range(2)) / 2
+        for right in (0.7, 0.9)
+    ]
+    (row,) = (row for row in entry.rows if row[0] == "A, mIoU")
+    assert row[1] == f"{means[1] - means[0]:+.2f}"
 
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])

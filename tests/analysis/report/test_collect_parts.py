@@ -21,6 +21,7 @@ from analysis.report.tables_recorded import CSV_FILE, read_recorded, reproduce_c
 from rgbt.checks import InputError
 from rgbt.config.compose import flatten
 from rgbt.metrics.counts import Counts
+from sweeps.table.load_table import load_table
 from tests.analysis.report.stores import DATASET, MASKER, counts_of, files_of
 from tests.composed import composed as configuration
 
@@ -169,6 +170,64 @@ def test_damaged_record_is_one_sentence(
         read(stored(files_of(tmp_path, **texts), rgbt__study="s"))
 
 
+RECORD_MD = """**own, TABLE I: Two masks**
+
+| | mIoU |
+| --- | ---: |
+| A | 1.0 |
+
+1. A footnote.
+
+- Published: somewhere; percent.
+- Form: as the text describes it.
+- Bold: shown to be the best of our rows.
+
+**Claims**
+
+| claim | verdict |
+| --- | ---: |
+| better | undecided |
+
+- difference: mean over paired seeds.
+
+- `better`, **undecided**: B is better (Sec. 1). The printed values agree.
+    - A reading of ours.
+"""
+
+
+def test_read_recorded_lines_of_claims_are_no_remarks(tmp_path: Path) -> None:
+    csv = HEADER + "own/t,A,mIoU,50.0,,1,61.5,,,aa0\n"
+    files = files_of(tmp_path, table__csv=csv, table__md=RECORD_MD)
+    assert read_recorded(stored(files)).remarks == ("Form: as the text describes it.",)
+
+
+def test_read_recorded_table_without_remarks_takes_none_of_its_claims(tmp_path: Path) -> None:
+    csv = HEADER + "own/t,A,mIoU,50.0,,1,61.5,,,aa0\n"
+    text = RECORD_MD[: RECORD_MD.index("1. A")] + RECORD_MD[RECORD_MD.index("**Claims") :]
+    assert read_recorded(stored(files_of(tmp_path, table__csv=csv, table__md=text))).remarks == ()
+
+
+@pytest.mark.parametrize(
+    ("tags", "label", "form"),
+    [
+        ({}, "B", "paper"),
+        ({"rgbt__form": "paper"}, "B", "paper"),
+        ({"rgbt__form": "released"}, "B", "released"),
+        ({"rgbt__form": "paper"}, "A, released", "both"),
+    ],
+)
+def test_read_recorded_form_is_that_of_the_rows(
+    tmp_path: Path, tags: dict[str, str], label: str, form: str
+) -> None:
+    csv = HEADER + f'own/t,A,mIoU,50.0,,1,61.5,,,aa0\nown/t,"{label}",mIoU,50.0,,1,,,,bb0\n'
+    assert read_recorded(stored(files_of(tmp_path, table__csv=csv), **tags)).form == form
+
+
+def test_reproduce_command_names_form_and_rule() -> None:
+    command = reproduce_command("own/t", (0, 1), "demo", form="both", until_decided=True)
+    assert command == "rgbt reproduce table=own/t seeds=until_decided scale=demo form=both"
+
+
 @pytest.mark.parametrize(
     ("seeds", "words"),
     [
@@ -315,6 +374,8 @@ def test_overrides_of_a_table_are_shown_beside_its_name(
         "plain": "- A remark.\n",
         "short": "- Every row of ours was run with trainer.max_steps=9 loss.spatial.alpha=1.\n",
     }
+    labels = [row.label for row in load_table("spatialseg/table3").rows]
+    every = "".join(f"{name},{label},mIoU,50.0,,1,61.5,,,aa0\n" for label in labels)
     records = [
         MlflowRun(
             run_id=variant,
@@ -328,9 +389,22 @@ def test_overrides_of_a_table_are_shown_beside_its_name(
             files=files_of(tmp_path / variant, **{CSV_FILE: csv, "table.md": text}),
         )
         for variant, text in said.items()
-        for csv in [HEADER + f"{name},Ny/4,mIoU,50.0,,1,61.5,,,aa0\n"]
+        for csv in [HEADER + every]
     ]
     remarks: list[str] = []
     made = tables.table_entries(records, {}, 100, quiet, remarks)
     extras = [each.extra for each in made if each.name == name]
     assert extras == ["", "trainer.max_steps=9 loss.spatial.alpha=1"]
+
+
+def test_selected_rows_of_a_table_are_shown_beside_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tables, "table_names", lambda: ["spatialseg/table3"])
+    name = "spatialseg/table3"
+    csv = HEADER + "".join(f"{name},{label},mIoU,50,,1,,,,a\n" for label in ("CRM baseline", "Ny"))
+    files = files_of(tmp_path, **{"table__csv": csv})
+    record = stored(files, rgbt__table=name, rgbt__scale="demo", rgbt__seeds="0")
+    made = tables.table_entries([record], {}, 100, quiet, [])[0]
+    assert made.extra == "'rows=CRM baseline,Ny'"
+    assert made.command.endswith("scale=demo 'rows=CRM baseline,Ny'")

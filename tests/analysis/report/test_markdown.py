@@ -13,22 +13,22 @@ import pytest
 from analysis.report import collect, networks
 from analysis.report.__main__ import entry
 from analysis.report.contrasts import contrast_entries, verdict
-from analysis.report.data import CellEntry, ContrastEntry, ReportData
+from analysis.report.data import CellEntry, ContrastEntry, FormsEntry, ReportData
 from analysis.report.markdown import WIDTH, anchor, command_lines, page_texts, without_paths
 from analysis.report.networks import NetworkEntry, network_entries
-from analysis.report.results_file import load_results_file
+from analysis.report.page import page_text
+from analysis.report.results_file import Contrast, load_results_file
 from analysis.report.runs import ReportRun
 from analysis.report.store import RunFiles
 from analysis.report.views import table_views
 from analysis.uncertainty import Resampling, compare
 from rgbt.config.compose import available
-from rgbt.metrics.pairs import file_name
 from rgbt.spec.corruption_names import row_name
-from sweeps.table.cells import OWN_COUNTS
 from sweeps.table.load_table import PUBLISHED, load_table
 from tests.analysis.report.pages import report, run_entry, table_entry
 from tests.analysis.report.stores import counts_of
 from tests.analysis.report.test_collect import quiet
+from tests.analysis.report.test_page import rows_of
 from tests.commands import Call
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -114,12 +114,11 @@ def test_page_row_with_runs_shows_mean_spread_interval_and_difference() -> None:
     )  # fmt: skip
     entry = table_entry("crm/table3a", {})
     cells = (*entry.cells[:-1], (cell,))
-    made = replace(entry, scale="demo", cells=cells, orders={"mIoU": (1.0, 6)})
+    made = replace(entry, scale="demo", cells=cells)
     text = page_texts(replace(report(0), tables=(made,)), ())["crm.md"]
     assert "| Ours | 3 | 60.50 ± 0.50 | [59.00, 62.00] | 61.2 | −0.70 |" in text
     assert "| Baseline | not run (a) | – | – | 59.5 | – |" in text
-    assert "mIoU +1.00 (n = 6)." in text
-    assert "Demo scale: compare the order" in text
+    assert "Demo scale: compare the verdicts" in text
     # Nothing is marked best: a rank is no evidence.
     assert not any("**" in line or "<u>" in line for line in table_lines(text))
 
@@ -148,6 +147,57 @@ def test_page_two_rows_of_the_same_runs_are_noted() -> None:
     made = replace(entry, scale="demo", cells=(*entry.cells[:-2], (cell,), (cell,)))
     text = page_texts(replace(report(0), tables=(made,)), ())["crm.md"]
     assert "At scale=demo the same runs as row (4)." in text
+
+
+def test_page_claims_of_a_table_have_verdicts_places_and_printed_values(
+    pages: dict[str, str],
+) -> None:
+    text = pages["spatialseg.md"]
+    section = text[text.index("## TABLE III") : text.index("## TABLE IV")]
+    claims = section[section.index("### Claims of the paper about TABLE III") :]
+    assert "4 claims: 1 holds, 1 contradicted, 1 undecided, 1 not run." in claims
+    contrast = "Ny/4 - CRM baseline, Var"
+    assert (
+        f"| `true` | ✓ holds | {contrast} | −1.25 | [−2.00, −0.50] | −2.47 | 2.25 | 3 | – |"
+        in claims
+    )
+    assert f"| `open` | ? undecided | {contrast} |" in claims
+    said = " ".join(claims.split())
+    place = "(Sec. V-C1, second paragraph)"
+    assert f"- `true`, **holds**: The statement called true. {place} The printed values" in said
+    assert "agree. - `false`" in said
+    assert "    - A reading of ours." in claims
+    assert "nothing can be shown. - `waiting`, **not run**" in said
+    assert f"The printed values do not agree: {contrast} is −2.47. Not run: CRM" in said
+
+
+def test_index_claims_are_counted_by_paper_and_listed_with_a_verdict(
+    pages: dict[str, str],
+) -> None:
+    text = pages["index.md"]
+    section = text[text.index("## Verdicts per claim") : text.index("## Speed")]
+    assert "| [crm](crm.md) | demo |" in section
+    assert "| [temporal](temporal.md) | – | 5 | 0 | 0 | 0 | 5 | 0 | 5 |" in section
+    assert "| The statement called true. (spatialseg, TABLE III) | ✓ holds |" in section
+    assert "called waiting" not in section
+    assert "Not measured yet" not in section
+
+
+def test_page_heading_of_selected_rows_has_no_quotes() -> None:
+    made = replace(table_entry("crm/table3a", {}), extra="'rows=Baseline,Ours (x)' a=1")
+    text = page_texts(replace(report(0), tables=(made,)), ())["crm.md"]
+    assert "## Table 3 (a) (rows=Baseline,Ours (x) a=1)" in text
+
+
+def test_page_differences_of_the_forms_are_a_table() -> None:
+    entry = table_entry("crm/table3a", {})
+    forms = FormsEntry(header=("row, column", "shown"), rows=(("Ours, mIoU", "not shown"),))
+    made = replace(report(0), tables=(replace(entry, forms=forms, form="both"),))
+    text = page_texts(made, ())["crm.md"]
+    assert "## Table 3 (a) (both forms)" in text
+    assert "| Ours, mIoU | not shown |" in text
+    page = page_text(made)
+    assert rows_of(page, "forms of table-crm-table3a-both-forms") == [["Ours, mIoU", "not shown"]]
 
 
 def test_pages_lines_fit_and_links_resolve(data: ReportData, pages: dict[str, str]) -> None:
@@ -193,15 +243,29 @@ def run_of(group: str, seed: int, right: float, folder: Path | None = None) -> R
     return ReportRun(entry=made, test_counts=counts, absent="released", config={}, files=files)
 
 
+CLEAN = Contrast(
+    question="clean",
+    source="own",
+    reference="baseline",
+    method="crm",
+    expected={"mIoU": "higher"},
+)
+DECLARED = (
+    CLEAN,
+    replace(CLEAN, question="missing", counts="evaluations/robustness/test/thermal_removed-1.npz"),
+    replace(CLEAN, question="loss", reference="grbm", expected={"Var": "lower"}),
+)
+
+
 def entries_of(runs: list[ReportRun]) -> dict[tuple[str, str], ContrastEntry]:
-    found = contrast_entries(runs, RESAMPLES, quiet)
-    return {(each.question.partition(" (")[0], each.metric): each for each in found}
+    found = contrast_entries(DECLARED, runs, RESAMPLES, quiet)
+    return {(each.question, each.metric): each for each in found}
 
 
 def test_contrast_entries_two_groups_are_compared_over_images_and_seeds() -> None:
     runs = [run_of("baseline", seed, 0.6) for seed in (0, 1, 2)]
     runs += [run_of("crm scale=demo", seed, 0.8) for seed in (2, 0, 1)]
-    found = entries_of(runs)["CRM against no masking, clean images", "mIoU"]
+    found = entries_of(runs)["clean", "mIoU"]
     sides = [[counts_of(seed, right) for seed in (0, 1, 2)] for right in (0.6, 0.8)]
     settings = Resampling(resamples=RESAMPLES, absent="released")
     (wanted,) = compare(*sides, ["mIoU"], settings, paired=True).differences
@@ -217,10 +281,10 @@ def test_contrast_entries_two_groups_are_compared_over_images_and_seeds() -> Non
 def test_contrast_entries_missing_runs_and_counts_are_named(tmp_path: Path) -> None:
     runs = [run_of(group, seed, 0.7, tmp_path) for group in ("baseline", "crm") for seed in (0, 1)]
     found = entries_of(runs)
-    missing = found["CRM against no masking, thermal image missing", "mIoU"]
+    missing = found["missing", "mIoU"]
     assert missing.verdict.startswith("Not measured: run baseline0 has no evaluations/robustness/")
     assert missing.values is None
-    waiting = found["GRBM and spatial-weighted loss against GRBM alone", "Var"]
+    waiting = found["loss", "Var"]
     assert waiting.verdict == "Not run: grbm."
 
 
@@ -228,7 +292,7 @@ def test_contrast_entries_other_data_sets_are_not_mixed() -> None:
     ours = [run_of("baseline", seed, 0.6) for seed in (0, 1)]
     theirs = [run_of("crm", seed, 0.8) for seed in (0, 1)]
     theirs = [replace(run, entry=replace(run.entry, dataset="other")) for run in theirs]
-    found = entries_of(ours + theirs)["CRM against no masking, clean images", "mIoU"]
+    found = entries_of(ours + theirs)["clean", "mIoU"]
     assert found.verdict == "Not run: crm."
 
 
@@ -236,10 +300,10 @@ def test_contrast_entries_seeds_of_one_group_only_are_left_out() -> None:
     """Seed 0 and 1 are in both; the interval is that of their two differences."""
     runs = [run_of("baseline", seed, 0.6) for seed in (0, 1, 3)]
     runs += [run_of("crm", seed, 0.8) for seed in (1, 0, 4)]
-    found = entries_of(runs)["CRM against no masking, clean images", "mIoU"]
+    found = entries_of(runs)["clean", "mIoU"]
     assert found.seeds == (2, 2)
     runs = [run_of("baseline", 0, 0.6), run_of("crm", 1, 0.8)]
-    found = entries_of(runs)["CRM against no masking, clean images", "mIoU"]
+    found = entries_of(runs)["clean", "mIoU"]
     assert found.verdict == "Not measured: the runs have no seed in common: 0 and 1."
 
 
@@ -278,8 +342,6 @@ def test_results_file_names_what_exists() -> None:
 def test_results_file_counts_are_named_as_runs_store_them() -> None:
     folder = "evaluations/robustness/test"
     known = {
-        OWN_COUNTS: "",
-        file_name("aligned", "test"): "frames=aligned",
         **{f"{folder}/features-{each}.npz": f"corruption=features-{each}" for each in BRANCHES},
         **{
             f"{folder}/{row_name(f'removed:{each}')}-1.npz": f"corruption=removed:{each}"

@@ -14,8 +14,8 @@ from typing import Any
 
 import pytest
 
-from analysis.report import page, views
-from analysis.report.data import PagePicture, ReportData
+from analysis.report import claim_views, page, views
+from analysis.report.data import CellEntry, PagePicture, ReportData
 from analysis.report.panels import class_records, run_records
 from rgbt.checks import InputError
 from tests.analysis.report import pages
@@ -165,7 +165,7 @@ def test_cell_has_a_line_per_kind_and_its_marks() -> None:
     table = made.tables[0]
     first = pages.cell([10.0, 12.0, 14.0], ["a", "b", "c"], 11.5)
     second = pages.cell([9.0, 8.0], ["d", "e"], 12.25)
-    first, second = replace(first, rank=1, published_rank=2), replace(second, published_rank=1)
+    first, second = replace(first, rank=1), replace(second, rank=2)
     small = replace(
         table,
         columns=("mIoU",),
@@ -173,19 +173,72 @@ def test_cell_has_a_line_per_kind_and_its_marks() -> None:
         rows=("A", "B"),
         proposed=(True, False),
         cells=((first,), (second,)),
-        orders={"mIoU": (-1.0, 2)},
         scale="paper",
+        claims=(),
     )
     text = page.page_text(replace(made, tables=(small,), runs=(), studies=()))
     label = ", ".join((small.name, small.number))
     upper, lower = rows_of(text, label)
     assert upper[:2] == ["Aproposed3 seeds", "ours95 % intervalpublisheddifference"]
-    assert upper[2] == "12.00 (best) ± 2.00[8.80, 15.10]11.50 (second)▲ +0.50 better"
-    assert lower[2] == "8.50 ± 0.71a[6.59, 10.31]12.25 (best)▼ −3.75 worse"
-    assert "order of rowsρ−1.00 n=2" in visible(text)
+    assert upper[2] == "12.00 (shown to be the best) ± 2.00[8.80, 15.10]11.50▲ +0.50 better"
+    assert lower[2] == ("8.50 (shown to be the second best) ± 0.71a[6.59, 10.31]12.25▼ −3.75 worse")
     assert rows_of(text, "tables with runs") == [
-        [small.name, "paper", "2 of 2", "2–3", "mIoU", "−1.00 n=2", "A", "B", "✗ no"]
+        [small.name, "paper", "2 of 2", "2–3", "mIoU", "A", "–"]
     ]
+
+
+def test_claims_have_verdicts_numbers_and_a_panel(text: str, script_data: Any) -> None:
+    """The four claims of the first table, on the page of a paper and below the table."""
+    lines = rows_of(text, "claims of spatialseg, demo scale")
+    holds, contradicted, undecided = lines[:3]
+    assert holds[0].startswith("The statement called true. Sec. V-C1, second paragraph TABLE III")
+    assert holds[1:] == [
+        *("✓ holds", "Ny/4 - CRM baseline, Var", "−1.25", "[−2.00, −0.50]", "−2.47", "✓ yes"),
+        *("2.25", "3", "–"),
+    ]
+    assert contradicted[0].endswith("A reading of ours.")
+    assert contradicted[1] == "✗ contradicted"
+    assert undecided[0].endswith("Below 2.25, nothing can be shown.")
+    assert (undecided[1], undecided[-1]) == ("? undecided", "12")
+    place = "table-spatialseg-table3-demo"
+    below = rows_of(text, f"claims about {place}")
+    assert [line[1:] for line in below] == [line[1:] for line in lines[:3]]
+    (waiting,) = rows_of(text, f"claims about {place}, not run")
+    assert waiting[0].endswith("Not run: CRM baseline.")
+    assert waiting[1:] == ["– not run", "Ny/4 - CRM baseline, Var", "−2.47", "✗ no"]
+    panel = script_data["panels"][f"claim={place}/0"]
+    assert (panel["title"], len(panel["runs"])) == ("true", 3)
+    facts = dict(panel["facts"])
+    assert facts["interval"] == "[−2.00, −0.50] (95 %, over images and seeds)"
+    assert facts["printed"] == "−2.47. The printed values agree."
+    assert f"claim={place}/3" not in script_data["panels"]
+
+
+def test_summary_counts_the_claims_of_each_paper_once(text: str) -> None:
+    """SpatialSeg: four tables with four claims each, table 7 with runs, others with one."""
+    tables = [name for name in pages.table_names() if name.startswith("spatialseg/")]
+    run = len([name for name in tables if name in (*pages.RUN_TABLES, *pages.ALSO)])
+    waiting = run + len(tables) - run
+    counts = {row[0]: row[1:] for row in rows_of(text, "claims by paper")}
+    assert counts["spatialseg, demo scale"] == [
+        f"{3 * run + waiting} claims: {run} holds, {run} contradicted, {run} undecided, "
+        f"{waiting} not run",
+        str(3 * run),
+        str(waiting),
+    ]
+    assert counts["temporal"][0].startswith("5 claims: 0 holds")
+
+
+def test_claims_of_two_scales_are_counted_apart(data: ReportData) -> None:
+    entry = replace(data.tables[0], extra="")
+    again = replace(entry, scale="paper", claims=(pages.claim("true", "holds"),))
+    other = replace(data.tables[0], name="spatialseg/x", scale="", claims=entry.claims[:1])
+    bare = replace(other, cells=tuple((CellEntry(),) * len(row) for row in other.cells))
+    views_ = views.table_views(replace(data, tables=(entry, again, bare)))
+    demo, paper = claim_views.paper_claims(views_)
+    assert (demo.title, paper.title) == ("spatialseg, demo scale", "spatialseg, paper scale")
+    assert demo.counted == "5 claims: 1 holds, 1 contradicted, 1 undecided, 2 not run"
+    assert paper.counted == "2 claims: 1 holds, 0 contradicted, 0 undecided, 1 not run"
 
 
 def test_tables_with_other_overrides_are_separate(text: str) -> None:
@@ -196,18 +249,24 @@ def test_tables_with_other_overrides_are_separate(text: str) -> None:
     assert [title[5:] for title in of_tables] == [[], [EXTRAS[0]], [EXTRAS[1]]]
 
 
-def test_summary_names_best_row_with_all_seeds(data: ReportData, text: str) -> None:
+def test_claim_of_two_records_of_a_table_is_counted_with_the_most_seeds(data: ReportData) -> None:
+    """Whatever the verdicts: the choice of the record must not depend on its result."""
+    entry = replace(data.tables[0], extra="")
+    few = replace(entry, claims=(pages.claim("a", "holds", seeds=3), pages.claim("b", "not run")))
+    more = (pages.claim("a", "undecided", seeds=5), pages.claim("b", "undecided", seeds=1))
+    again = replace(entry, extra="rows=A,B", claims=more)
+    (paper,) = claim_views.paper_claims(views.table_views(replace(data, tables=(few, again))))
+    assert [(each.entry.name, each.entry.seeds) for each in paper.claims] == [("a", 5), ("b", 1)]
+    assert paper.counted == "2 claims: 0 holds, 0 contradicted, 2 undecided, 0 not run"
+
+
+def test_summary_names_the_row_that_is_shown_to_be_best(data: ReportData, text: str) -> None:
     table = data.tables[0]
-    cells = [row[table.columns.index("mIoU")] for row in table.cells]
-    rows = range(len(cells))
-    assert cells[max(rows, key=lambda row: cells[row].mean or 0)].seeds == 2
-    whole = [row for row in rows if cells[row].seeds == 3]
-    best = max(whole, key=lambda row: cells[row].mean or 0)
-    printed = max(rows, key=lambda row: cells[row].published or 0)
-    same = "✓ yes" if best == printed else "✗ no"
-    overview = {row[0]: row[-3:] for row in rows_of(text, "tables with runs")}
-    assert overview[table.name] == [table.rows[best], table.rows[printed], same]
-    assert overview["multihead/table2"][-1] == "– not run"
+    index = table.columns.index("mIoU")
+    (best,) = (label for label, row in zip(table.rows, table.cells) if row[index].rank == 1)
+    overview = {row[0]: row[-2:] for row in rows_of(text, "tables with runs")}
+    counts = "4 claims: 1 holds, 1 contradicted, 1 undecided, 1 not run"
+    assert overview[table.name] == [best, counts]
 
 
 def test_panel_behind_a_number_has_its_runs_and_values(data: ReportData, script_data: Any) -> None:
