@@ -16,7 +16,8 @@ from sweeps.rendering.rendered_table import RenderedTable, render_table
 from sweeps.rendering.terminal import terminal
 from sweeps.report.records import record
 from sweeps.table.cells import NO_VALUE
-from sweeps.table.request import TableRequest, parameter_cells
+from sweeps.table.efficiency import efficiency_cells
+from sweeps.table.request import TableRequest
 from sweeps.table.scoring import ScoredTable, score
 from sweeps.worker.point_list import other_code_line
 from sweeps.worker.trial_sources import Outcome
@@ -33,7 +34,7 @@ def publish_table(
     Returns:
         1 where a cell failed or has no value, or the files could not be written; else 0.
     """
-    runs, sizes = request.runs(outcomes), parameter_cells(request)
+    runs, sizes = request.runs(outcomes), efficiency_cells(request, out)
     scored = score(request.name, request.table, runs, scale=request.scale, sizes=sizes)
     rendered = render_table(scored, request.typed_overrides())
     print_rich(terminal(rendered, plain=not sys.stdout.isatty(), width=line_width()))

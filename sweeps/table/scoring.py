@@ -1,7 +1,7 @@
 """A computed table: mean and spread over seeds, compared with the printed values.
 
 Rows that cannot be run and columns that cannot be computed have no cells; without any run only
-columns of parameters have some.
+columns of efficiency have some.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from rgbt.metrics.named import parse
 from sweeps.table.cells import CellId, CellRun, TableCell, is_counted, metric_of, row_cells
-from sweeps.table.table import Column, Row, Table
+from sweeps.table.table import MEASURED, Column, Row, Table
 
 MIN_ROWS = 3
 """Fewest rows whose order is compared: two rows agree or not by chance."""
@@ -39,7 +39,7 @@ class ScoredTable:
     Attributes:
         name: e.g. "spatialseg/table3".
         scale: "demo" or "paper".
-        cells: only rows that were run, and columns of parameters.
+        cells: only rows that were run, and columns of efficiency.
         orders: by name of the column.
         ranks_ours: 1 best, 2 second best of the column among our means.
         ranks_published: the same among the printed values.
@@ -57,7 +57,9 @@ class ScoredTable:
     commits: Mapping[str, int]
 
     def difference(self, row: Row, column: Column) -> float:
-        """Ours less the printed value; NaN where one of them is missing."""
+        """Ours less the printed value; NaN where one is missing or of another device."""
+        if column.efficiency in MEASURED:
+            return math.nan
         cell = self.cells.get((row.label, column.name))
         printed = published(row, column)
         return math.nan if cell is None or printed is None else cell.mean - printed
@@ -96,7 +98,7 @@ def score(
         table: its file.
         runs: (label of the row, seed) -> the run.
         scale: "demo" or "paper".
-        sizes: cells of the columns of parameters, see `sweeps.table.request.parameter_cells`.
+        sizes: cells of the columns of efficiency, see `sweeps.table.efficiency`.
     """
     seeds = sorted({seed for _, seed in runs})
     ran = {label for label, _ in runs}

@@ -50,7 +50,8 @@ def test_count_flops_of_convolution_and_matrix_product_by_hand() -> None:
     image = torch.rand(2, 3, 4, 6)
 
     def call() -> Tensor:
-        return linear(torch.cat([conv(image).relu(), conv(image)]))
+        maps: Tensor = linear(torch.cat([conv(image).relu(), conv(image)]))
+        return maps
 
     counted = count_flops(call)
     convolution = 2 * (4 * 6 * 5) * (3 * 9)  # of one image; two calls of two images
