@@ -94,5 +94,5 @@ def _states(folder: str) -> list[FileState]:
     """The state of every file in a folder, sorted; [] where there is none."""
     found: list[FileState] = []
     for parent, _, names in os.walk(folder):
-        found += [file_state(str(Path(parent, name))) for name in names if name.endswith(".yaml")]
+        found += [file_state(Path(parent, name)) for name in names if name.endswith(".yaml")]
     return sorted(found)

@@ -6,10 +6,10 @@ file is kept as a pickle, because Hydra changes the objects that a source return
 
 from __future__ import annotations
 
-import os
 import pickle
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from hydra._internal.core_plugins.file_config_source import FileConfigSource
@@ -29,14 +29,14 @@ FileState = tuple[str, int, int, int]
 _parsed: dict[Hashable, bytes] = {}
 
 
-def file_state(path: str) -> FileState:
+def file_state(path: Path) -> FileState:
     """What changes when a file does.
 
     Raises:
         OSError: there is no such file.
     """
-    status = os.stat(path)
-    return path, status.st_mtime_ns, status.st_size, status.st_ino
+    status = path.stat()
+    return str(path), status.st_mtime_ns, status.st_size, status.st_ino
 
 
 class ParsedFileSource(FileConfigSource):
@@ -45,11 +45,13 @@ class ParsedFileSource(FileConfigSource):
     def load_config(self, config_path: str) -> ConfigResult:
         """The file, parsed again if it has changed."""
         name = self._normalize_file_name(config_path)
-        path = os.path.realpath(os.path.join(self.path, name))
-        if not os.path.exists(path):
+        path = Path(self.path, name).resolve()
+        if not path.exists():
             return super().load_config(config_path)  # its error names the file
         key = file_state(path)  # before it is read: a later change has another state
-        return _loaded((self.path, self.provider, key), lambda: FileConfigSource.load_config(self, name))
+        return _loaded(
+            (self.path, self.provider, key), lambda: FileConfigSource.load_config(self, name)
+        )
 
 
 class ParsedPackageSource(ImportlibResourcesConfigSource):
