@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from analysis.report.results_file import Network, load_results_file
 from analysis.report.tables import Track
-from sweeps.table.request import million_parameters
+from sweeps.table.efficiency import million_parameters
 
 
 @dataclass(frozen=True)

@@ -321,7 +321,7 @@ def _file_of(recorded: RecordedTable) -> Table:
         caption="",
         data="",
         # As recorded, like the sizes of networks: how the values were made is not known.
-        columns=tuple(Column(name=name, best="none", parameters=True) for name in columns),
+        columns=tuple(Column(name=name, best="none", efficiency="parameters") for name in columns),
         rows=tuple(Row(label=row, experiment="", values=printed[row]) for row in rows),
         remarks=("Its file is gone: values as recorded, without intervals.",),
     )

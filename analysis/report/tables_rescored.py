@@ -144,7 +144,7 @@ def score_again(
             found = _by_seed(keys, recorded.seeds, runs)
             outcomes |= {(label, seed): outcome for seed, outcome in found.items()}
     # Columns of parameters as recorded: a network is not known here.
-    names = {column.name for column in table.columns if column.parameters}
+    names = {column.name for column in table.columns if column.efficiency is not None}
     sizes = {
         place: TableCell(math.nan if line.mean is None else line.mean, math.nan, 0, line.reason)
         for place, line in recorded.lines.items()

@@ -81,16 +81,7 @@ def open_session(
     keep_memory()
     fix_threads(spec.trainer.threads)
     trainer = spec.trainer
-    # Fabric sets itself to INFO when imported, and would say in a line what the configuration says.
-    logging.getLogger("lightning_fabric").setLevel(logging.WARNING)
-    try:
-        fabric = Fabric(accelerator=trainer.accelerator, devices=1, precision=trainer.precision)
-    except (RuntimeError, ValueError) as error:
-        raise InputError(
-            f"trainer.accelerator={trainer.accelerator} with "
-            f"trainer.precision={trainer.precision} cannot be used on this machine "
-            f"({str(error).splitlines()[0]}). Choose another accelerator or precision."
-        ) from error
+    fabric = open_fabric(trainer)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(derive(spec.seed, "weights"))
         model: nn.Module = spec.model.build()
@@ -123,6 +114,24 @@ def open_session(
         model=model.to(fabric.device),
         weights=weights,
     )
+
+
+def open_fabric(trainer: TrainerSettings) -> Fabric:
+    """Device and precision of a run.
+
+    Raises:
+        InputError: the machine has no such device, or it does not support the precision.
+    """
+    # Fabric sets itself to INFO when imported, and would say in a line what the configuration says.
+    logging.getLogger("lightning_fabric").setLevel(logging.WARNING)
+    try:
+        return Fabric(accelerator=trainer.accelerator, devices=1, precision=trainer.precision)
+    except (RuntimeError, ValueError) as error:
+        raise InputError(
+            f"trainer.accelerator={trainer.accelerator} with "
+            f"trainer.precision={trainer.precision} cannot be used on this machine "
+            f"({str(error).splitlines()[0]}). Choose another accelerator or precision."
+        ) from error
 
 
 def names_key(session: Session) -> str:

@@ -16,6 +16,8 @@ from hydra.core.object_type import ObjectType
 from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError, nearest
+from rgbt.config.compose_cache import compose_cached
+from rgbt.config.config_source import parsing_once
 
 SEARCH_PATH = "hydra.searchpath"
 """Override that names the folders of a user's own files for one command."""
@@ -56,8 +58,13 @@ def own_folders() -> str:
 
 def compose(overrides: Sequence[str]) -> DictConfig:
     """The configuration that `rgbt.run` would compose from these overrides, unchecked."""
+    folders = [str(conf_dir()), *filter(None, own_folders().split(","))]
+    return compose_cached(list(overrides), top_level()[1], folders, _composed_by_hydra)
+
+
+def _composed_by_hydra(words: list[str]) -> DictConfig:
     with own_hydra():
-        return hydra.compose("config", list(overrides))
+        return hydra.compose("config", words)
 
 
 def available(group: str) -> list[str]:
@@ -122,7 +129,8 @@ def own_hydra() -> Iterator[None]:
     outer = GlobalHydra.instance().hydra
     GlobalHydra.instance().clear()
     try:
-        with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
+        config_dir = str(conf_dir())
+        with parsing_once(), hydra.initialize_config_dir(config_dir, version_base="1.3"):
             yield
     finally:
         GlobalHydra.instance().clear()

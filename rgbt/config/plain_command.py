@@ -37,6 +37,7 @@ COMMANDS = {
     "predict": Entry("rgbt.predict", "predict class maps and overlays of images, or pseudo-labels"),
     "consistency": Entry("rgbt.consistency", "measure the temporal consistency (TC, CA) of a run"),
     "robustness": Entry("rgbt.robustness", "score a run under missing, noisy or occluded images"),
+    "profile": Entry("rgbt.profile", "measure speed, memory, parameters and FLOPs of networks"),
     "reproduce": Entry(
         "sweeps.reproduce", "run a published table or your own; new: write your own"
     ),

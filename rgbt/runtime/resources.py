@@ -55,7 +55,7 @@ def _sentence(error: BaseException) -> str | None:
     while cause is not None:
         if isinstance(cause, OSError) and cause.errno in DISK:
             return _disk_sentence(error, cause)
-        if _is_memory(cause):
+        if is_out_of_memory(cause):
             device = "the GPU" if "CUDA" in str(cause) else "this machine"
             reason = one_line(str(cause).partition("\n")[0]) or type(cause).__name__
             return (
@@ -97,7 +97,8 @@ def _free(path: Path) -> int:
     return shutil.disk_usage(path).free
 
 
-def _is_memory(error: BaseException) -> bool:
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether a library reports by this error that memory is exhausted."""
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
         return True
     if isinstance(error, OSError):

@@ -8,11 +8,13 @@ the predictions of its network. Both runs share seed, scale and data set
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from functools import cache
 from typing import Any, cast, get_args, get_type_hints
 
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from rgbt.checks import InputError, nearest
 from rgbt.config.component import RUN_SETTINGS, Component
@@ -31,6 +33,14 @@ from rgbt.spec.run_spec import (
 )
 
 PREFIX = "experiment:"
+
+TARGETS = re.compile(r"'_target_': '(\w*)")
+"""First part of every target in the text of a node."""
+
+MOST_NODES = 4096
+"""Checked nodes that are kept; more of them empty the cache."""
+
+_checked: dict[tuple[str, str], Component] = {}
 
 
 def specify(
@@ -56,14 +66,14 @@ def specify(
     values: dict[str, Any] = {
         key: check_value(key, config[key], each) for key, each in VALUES.items()
     }
-    components = {key: Component.from_node(config[key], key) for key in NODES}
-    types = get_type_hints(RunSpec)
+    plain = _resolved(config)
+    components = {key: _component(config, key, plain.get(key)) for key in NODES}
+    types = _types()
     nodes: dict[str, Any] = {
         key: node if types[key] is Component else node.build() for key, node in components.items()
     }
     if dependencies is None:
         dependencies = tuple(_dependencies(config, overrides, (*downstream, config.name)))
-    plain = cast("dict[str, Any]", OmegaConf.to_container(config, resolve=True))
     return RunSpec(
         **values,
         **nodes,
@@ -72,6 +82,41 @@ def specify(
         components=components,
         dependencies=tuple(dependencies),
     )
+
+
+@cache
+def _types() -> dict[str, Any]:
+    """Types of the attributes of a specification."""
+    return get_type_hints(RunSpec)
+
+
+def _resolved(config: DictConfig) -> dict[str, Any]:
+    """Plain values, with every reference to others replaced.
+
+    Raises:
+        InputError: a reference that leads nowhere, named by the node that has it.
+    """
+    try:
+        return cast("dict[str, Any]", OmegaConf.to_container(config, resolve=True))
+    except OmegaConfBaseException:
+        for key in NODES:
+            Component.from_node(config[key], key)
+        raise
+
+
+def _component(config: DictConfig, key: str, plain: Any) -> Component:
+    """The checked node at `key`; nodes of rgbt that were checked before are not checked again.
+
+    Rows of a table differ in few nodes. A user's own class may have changed since the last check.
+    """
+    text = repr(plain)
+    if not set(TARGETS.findall(text)) <= {"rgbt"}:
+        return Component.from_node(config[key], key)
+    if (key, text) not in _checked:
+        if len(_checked) >= MOST_NODES:
+            _checked.clear()
+        _checked[key, text] = Component.from_node(config[key], key)
+    return _checked[key, text]
 
 
 def _dependencies(

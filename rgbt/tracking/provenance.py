@@ -45,7 +45,7 @@ def provenance() -> dict[str, Any]:
         **code(),
         "python": platform.python_version(),
         "packages": _packages(),
-        **_machine(),
+        **machine(),
     }
 
 
@@ -172,7 +172,8 @@ def _packages() -> dict[str, str]:
     return {name: found[name] for name in sorted(found, key=str.lower)}
 
 
-def _machine() -> dict[str, Any]:
+def machine() -> dict[str, Any]:
+    """The machine: processor, cores, memory, graphics cards, threads of torch."""
     # Imported here, so that reading provenance does not cost the start of torch.
     import torch
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rgbt.metrics import names
-from sweeps.table.request import SCALE
+from sweeps.table.efficiency import SCALE
 from sweeps.table.scoring import ScoredTable, published
 from sweeps.table.table import Column, Row
 

@@ -8,7 +8,9 @@ from collections.abc import Sequence
 from statistics import median
 
 from rgbt.tracking.tables import ABSENT, TextTable
-from sweeps.table.request import SCALE, TableRequest
+from sweeps.table.efficiency import SCALE
+from sweeps.table.request import TableRequest
+from sweeps.table.table import MEASURED
 from sweeps.worker.point_list import estimated_seconds, other_code_line
 from sweeps.worker.progress import duration
 from sweeps.worker.trial_sources import Outcome, State
@@ -70,8 +72,9 @@ def summary(request: TableRequest, outcomes: Sequence[Outcome], workers: int) ->
     for column in request.table.columns:
         if column.needs is not None:
             lines.append(f"Column '{column.name}' is not computed yet; it needs {column.needs}.")
-        if column.parameters:
-            lines.append(f"Column '{column.name}' is counted at scale={SCALE}, without any run.")
+        if column.efficiency is not None:
+            verb = "measured" if column.efficiency in MEASURED else "counted"
+            lines.append(f"Column '{column.name}' is {verb} at scale={SCALE}, without any run.")
     return lines
 
 

@@ -18,7 +18,8 @@ from sweeps.rendering.rendered_table import RenderedTable, render_table
 from sweeps.rendering.terminal import terminal
 from sweeps.report.records import record
 from sweeps.table.cells import NO_VALUE, CellRun
-from sweeps.table.request import TableRequest, parameter_cells
+from sweeps.table.efficiency import efficiency_cells
+from sweeps.table.request import TableRequest
 from sweeps.table.scoring import ScoredTable, score, size_marks
 from sweeps.verdicts.forms import forms_grid
 from sweeps.verdicts.judge import CellRunId, JudgedClaim, TableJudge
@@ -64,7 +65,7 @@ def publish_table(
         1 where a cell failed or has no value, or the files could not be written; else 0.
     """
     runs: dict[CellRunId, CellRun] = {**request.runs(outcomes), **external}
-    sizes = parameter_cells(request)
+    sizes = efficiency_cells(request, out)
     scored = replace(
         score(request.name, request.table, runs, scale=request.scale, sizes=sizes),
         form=request.form,

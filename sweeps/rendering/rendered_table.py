@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 
 from rgbt.tracking.tables import number
 from sweeps.table.cells import NO_VALUE, is_counted, is_of_runs, metric_of
-from sweeps.table.request import SCALE
+from sweeps.table.efficiency import SCALE
 from sweeps.table.scoring import ScoredTable, published
-from sweeps.table.table import Column, Form, Row
+from sweeps.table.table import MEASURED, Column, Form, Row
 
 MAX_ON_ONE_LINE = 3
 """Most columns with ours, published and difference on one line; more columns use several lines."""
@@ -34,7 +34,15 @@ FORMS: dict[Form, str] = {
 }
 """Of tables that say nothing about their forms."""
 NOT_PRINTED = "Not in the paper."
-PARAMETERS = f"Parameters are counted at scale={SCALE}, without any run and without discriminators."
+COUNTED = (
+    "Parameters and operations are those of the networks at scale={scale}, without any run and "
+    "without discriminators."
+)
+MEASURED_ON = (
+    "Memory and speed are those of the networks at scale={scale} with random weights, measured on "
+    "{device}, batch 1. In brackets: the ratio to the first row. Compare the ratios with the "
+    "paper, not the values."
+)
 
 
 @dataclass(frozen=True)
@@ -111,7 +119,6 @@ def _remarks(scored: ScoredTable, extra: Sequence[str]) -> list[str]:
     """Sentences below the table."""
     table = scored.table
     printed = any(row.values for row in table.rows)
-    sizes = [column for column in table.columns if column.parameters]
     remarks = [f"Published: {table.data}; {table.unit}."] if printed else []
     if scored.seeds:
         many = len(scored.seeds) > 1
@@ -120,8 +127,7 @@ def _remarks(scored: ScoredTable, extra: Sequence[str]) -> list[str]:
         remarks.append(f"Ours: scale={scored.scale}, {spread} seed{'s' * many} {seeds}.")
     if scored.cells and printed:
         remarks.append(table.forms.get(scored.form, FORMS[scored.form]))
-    if any((row.label, c.name) in scored.cells for row in table.rows for c in sizes):
-        remarks.append(PARAMETERS)
+    remarks += _efficiency_remarks(scored)
     if scored.seeds and scored.scale == "demo" and printed:
         remarks.append(DEMO)
     if extra:
@@ -131,6 +137,21 @@ def _remarks(scored: ScoredTable, extra: Sequence[str]) -> list[str]:
         commits = ", ".join(f"{commit} ({count})" for commit, count in named)
         remarks.append(f"Our runs come from several git commits: {commits}.")
     return remarks
+
+
+def _efficiency_remarks(scored: ScoredTable) -> list[str]:
+    """How columns of efficiency were counted or measured."""
+    remarks = []
+    shown = [
+        (column, scored.cells[row.label, column.name])
+        for row in scored.table.rows
+        for column in scored.table.columns
+        if column.efficiency is not None and (row.label, column.name) in scored.cells
+    ]
+    if any(column.efficiency not in MEASURED for column, _ in shown):
+        remarks.append(COUNTED.format(scale=SCALE))
+    devices = dict.fromkeys(cell.device for _, cell in shown if cell.device)
+    return remarks + [MEASURED_ON.format(scale=SCALE, device=device) for device in devices]
 
 
 @dataclass
@@ -242,7 +263,7 @@ class _LineBuilder:
             return TextCell(DASH if cell.mark == NO_VALUE else cell.mark, notes=notes)
         spread = "" if math.isnan(cell.sd) or self.sd_apart else f"{cell.sd:.2f}"
         rank = self.scored.marks.get(cell_id, 0)
-        return TextCell(f"{cell.mean:.2f}", spread, rank, notes)
+        return TextCell(f"{cell.mean:.2f}{_bracketed_ratio(cell.ratio)}", spread, rank, notes)
 
     def _sd(self, row: Row, column: Column) -> TextCell:
         cell = self.scored.cells.get((row.label, column.name))
@@ -253,7 +274,21 @@ class _LineBuilder:
         if printed is None:
             return TextCell(DASH)
         doubts = (row.remarks or (DOUBTFUL,)) if column.name in row.doubtful else ()
-        return TextCell(f"{printed:.{self.decimals}f}", notes=self.notes(*doubts))
+        text = f"{printed:.{self.decimals}f}{_bracketed_ratio(self._printed_ratio(row, column))}"
+        return TextCell(text, notes=self.notes(*doubts))
+
+    def _printed_ratio(self, row: Row, column: Column) -> float:
+        """The printed value divided by that of the first row that we measured; NaN: not shown."""
+        if column.efficiency not in MEASURED:
+            return math.nan
+        rows = [each for each in self.scored.table.rows if self._is_measured(each, column)]
+        first = published(rows[0], column) if rows else None
+        printed = published(row, column)
+        return printed / first if first and printed is not None else math.nan
+
+    def _is_measured(self, row: Row, column: Column) -> bool:
+        cell = self.scored.cells.get((row.label, column.name))
+        return cell is not None and not math.isnan(cell.ratio)
 
     def _difference(self, row: Row, column: Column) -> TextCell:
         return TextCell(_signed(self.scored.difference(row, column)))
@@ -264,6 +299,10 @@ def _listed(seeds: Sequence[int]) -> str:
     if len(seeds) > 3 and seeds[-1] - seeds[0] == len(seeds) - 1:
         return f"{seeds[0]} to {seeds[-1]}"
     return ", ".join(map(str, seeds))
+
+
+def _bracketed_ratio(ratio: float) -> str:
+    return "" if math.isnan(ratio) else f" ({ratio:.2f}x)"
 
 
 def _signed(value: float) -> str:

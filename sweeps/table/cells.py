@@ -65,10 +65,12 @@ class TableCell:
     Attributes:
         mean: over seeds, percent (Var: squared percent points); NaN without any.
         sd: standard deviation over seeds with n - 1; NaN for fewer than two.
-        seeds: number of seeds of the mean; 0 for what is counted without any run.
+        seeds: number of seeds of the mean; 0 for the efficiency of a network, which needs no run.
         reason: why seeds are missing, or "".
         mark: the reason in a word, e.g. "failed".
         keys: of the runs.
+        ratio: to the first row, of memory and speed; NaN for all else.
+        device: that memory and speed were measured on; "" for all else.
     """
 
     mean: float
@@ -77,6 +79,8 @@ class TableCell:
     reason: str = ""
     mark: str = ""
     keys: tuple[str, ...] = ()
+    ratio: float = math.nan
+    device: str = ""
 
 
 def metric_of(column: Column, row: Row) -> str:
@@ -111,7 +115,7 @@ def is_counted(column: Column) -> bool:
 
 def is_of_runs(column: Column) -> bool:
     """Whether the column has values of runs."""
-    return column.needs is None and not column.parameters
+    return column.needs is None and column.efficiency is None
 
 
 def row_cells(table: Table, row: Row, outcomes: Mapping[int, CellRun]) -> dict[CellId, TableCell]:

@@ -15,7 +15,7 @@ from rgbt.metrics.named import OF_PAIRS
 from sweeps.table.claim import OTHERS, PREVIOUS, Claim
 from sweeps.table.table import Column, ReleasedForm, Row, Table
 
-KINDS = ("metric", "minus", "mean", "parameters", "needs")
+KINDS = ("metric", "minus", "mean", "efficiency", "needs")
 """Keys of a column that define its values; a column has one of them."""
 
 
@@ -56,7 +56,7 @@ def _check_scales(at: Iterable[str], where: str) -> None:
 
 
 def _check_column(column: Column, table: Table, before: Sequence[Column], where: str) -> None:
-    given = [key for key in KINDS if getattr(column, key) not in (None, False)]
+    given = [key for key in KINDS if getattr(column, key) is not None]
     if len(given) != 1:
         got = " and ".join(given) or "none"
         known = f"{', '.join(KINDS[:-1])} and {KINDS[-1]}"
@@ -94,9 +94,9 @@ def _check_sources(column: Column, table: Table, before: Sequence[Column], where
                 f"{where}: '{other.name}' is computed from other columns itself; move it in front "
                 f"of '{column.name}', or name the columns that it is computed from."
             )
-        if other.parameters:
+        if other.efficiency is not None:
             raise InputError(
-                f"{where}: '{other.name}' counts parameters and is not a score; remove it."
+                f"{where}: '{other.name}' is the efficiency of networks and no score; remove it."
             )
 
 
@@ -161,6 +161,16 @@ def _check_row(row: Row, table: Table, where: str) -> None:
             check_choice(f"{where}, '{key}' of metric {column.metric}", key, row.settings)
     if row.x is not None:
         _check_x(row.x, table, where)
+    _check_image(row.settings.get("image_hw", (1, 1)), where)
+
+
+def _check_image(value: Any, where: str) -> None:
+    """Refuse a size of images that is not two numbers of pixels."""
+    is_size = isinstance(value, tuple | list) and len(value) == len(("height", "width"))
+    if not is_size or not all(type(each) is int and each > 0 for each in value):
+        raise InputError(
+            f"{where}, settings, image_hw: expected [height, width] in pixels, got {value}."
+        )
 
 
 def _check_x(x: float, table: Table, where: str) -> None:

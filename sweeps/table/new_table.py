@@ -45,7 +45,7 @@ COLUMNS = """\
 #   corruption: noise, severity: 16    corrupted images (docs/how-to/measure-robustness.md)
 #   {name: both, mean: [day, night]}, {name: gain, minus: [day, night]}    from other columns
 #   {name: TC, metric: TC, frames: aligned}, also CA    docs/how-to/measure-consistency.md
-#   {name: size, parameters: true}    millions of parameters of the network
+#   {name: size, efficiency: parameters}    also gflops, peak_memory, latency, images_per_second
 columns:
 """
 

@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from rgbt.checks import InputError
-from rgbt.config.command import composing
-from rgbt.config.component import build
-from rgbt.config.compose import compose
 from rgbt.config.options import readable_paths
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Point
-from sweeps.table.cells import NO_VALUE, CellId, TableCell, evaluation_of, is_counted
+from sweeps.table.cells import evaluation_of, is_counted
 from sweeps.table.table import Form, Row, Table
 
 if TYPE_CHECKING:
@@ -23,10 +19,6 @@ if TYPE_CHECKING:
 
 DEFAULT_SCALE = "demo"
 """The scale of a run without ``scale=...``."""
-
-SCALE = "paper"
-"""Scale of all counts of parameters, whatever scale the rows are run at: papers print the sizes of
-networks."""
 
 TAG = "rgbt.table/"
 """Prefix of the tag that names a run's row: rgbt.table/spatialseg/table3 = "Ny/4"."""
@@ -83,7 +75,7 @@ class TableRequest:
     def row_seeds(self) -> list[tuple[str, int]]:
         """(label, seed) of every run; all rows of a seed before the next seed.
 
-        Empty where no column is a score: parameters are counted without any run.
+        Empty where no column is a score: columns of efficiency need no run.
         """
         if not any(map(is_counted, self.table.columns)):
             return []
@@ -183,44 +175,3 @@ def seeds_of(text: str) -> tuple[int, ...]:
             "seeds (0,4,7)."
         )
     return tuple(range(numbers[0])) if counted else numbers
-
-
-def parameter_cells(request: TableRequest) -> dict[CellId, TableCell]:
-    """The cells of all columns of parameters, of the rows that the project can run.
-
-    Returns:
-        millions of parameters at scale=paper; of a network that cannot be built, the reason.
-    """
-    table = request.table
-    columns = [column for column in table.columns if column.parameters]
-    at_paper = replace(request, scale=SCALE, pretrained={})
-    counted: dict[tuple[str, ...], TableCell] = {}
-    cells: dict[CellId, TableCell] = {}
-    for row in table.runnable_rows if columns else ():
-        network = at_paper.overrides(row.label, 0)[:-1]
-        if network not in counted:
-            try:
-                counted[network] = TableCell(million_parameters(network), math.nan, 0)
-            except InputError as error:
-                counted[network] = TableCell(math.nan, math.nan, 0, str(error), NO_VALUE)
-        names = (column.name for column in table.columns_of(row) if column in columns)
-        cells |= {(row.label, name): counted[network] for name in names}
-    return cells
-
-
-def million_parameters(overrides: Sequence[str]) -> float:
-    """Millions of parameters of the network that overrides of `python -m rgbt.run` describe.
-
-    Only the node `model` is built, on torch's device "meta": no data set is read, its `root` may be
-    missing, and no memory is used. Discriminators belong to the scheme and are not counted; frozen
-    parameters are.
-
-    Raises:
-        InputError: overrides that Hydra or the network's constructor refuses.
-    """
-    import torch
-
-    with composing(overrides), torch.device("meta"):
-        network = build(compose(overrides).model)
-    count: int = sum(parameter.numel() for parameter in network.parameters())
-    return count / 1e6

@@ -1,7 +1,7 @@
 """A computed table: mean and spread over seeds, compared with the printed values.
 
 Rows that cannot be run and columns that cannot be computed have no cells; without any run only
-columns of parameters have some.
+columns of efficiency have some.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 from rgbt.metrics.named import parse
 from sweeps.table.cells import CellId, CellRun, TableCell, is_counted, metric_of, row_cells
-from sweeps.table.table import Column, Form, Row, Table
+from sweeps.table.table import COUNTED, MEASURED, Column, Form, Row, Table
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class ScoredTable:
     Attributes:
         name: e.g. "spatialseg/table3".
         scale: "demo" or "paper".
-        cells: only rows that were run, and columns of parameters.
+        cells: only rows that were run, and columns of efficiency.
         commits: git commit -> number of runs made by it.
         form: what the rows were run as.
         marks: 1 for a row that is shown to be the best of the column, 2 for the second best; see
@@ -40,7 +40,9 @@ class ScoredTable:
     marks: Mapping[CellId, int] = field(default_factory=dict)
 
     def difference(self, row: Row, column: Column) -> float:
-        """Ours less the printed value; NaN where one of them is missing."""
+        """Ours less the printed value; NaN where one is missing or of another device."""
+        if column.efficiency in MEASURED:
+            return math.nan
         cell = self.cells.get((row.label, column.name))
         printed = published(row, column)
         return math.nan if cell is None or printed is None else cell.mean - printed
@@ -79,7 +81,7 @@ def score(
         table: its file.
         runs: (label of the row, seed) -> the run.
         scale: "demo" or "paper".
-        sizes: cells of the columns of parameters, see `sweeps.table.request.parameter_cells`.
+        sizes: cells of the columns of efficiency, see `sweeps.table.efficiency`.
     """
     seeds = sorted({seed for _, seed in runs})  # a row without seeds has a negative one
     ran = {label for label, _ in runs}
@@ -107,12 +109,14 @@ def size_marks(table: Table, sizes: Mapping[CellId, TableCell]) -> dict[CellId, 
     """
     marks: dict[CellId, int] = {}
     for column in table.columns:
+        if column.efficiency not in COUNTED or column.best == "none":
+            continue
         values = {
             cell_id: round(cell.mean, 2)
             for cell_id, cell in sizes.items()
             if cell_id[1] == column.name and not math.isnan(cell.mean)
         }
         best = sorted(set(values.values()), reverse=column.best == "highest")[:2]
-        if column.best != "none" and len(best) == 2:
+        if len(best) == 2:
             marks |= {each: best.index(v) + 1 for each, v in values.items() if v in best}
     return marks

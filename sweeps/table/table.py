@@ -23,12 +23,22 @@ Origin = Literal[
 Form = Literal["paper", "released"]
 """What a row is run as: as the paper's text describes it, or as its release made it."""
 
+Efficiency = Literal["parameters", "gflops", "peak_memory", "latency", "images_per_second"]
+"""What a network needs: millions of parameters, GFLOPs, MiB, milliseconds for one image, images per
+second."""
+
+COUNTED: tuple[Efficiency, ...] = ("parameters", "gflops")
+"""The same on every machine."""
+
+MEASURED: tuple[Efficiency, ...] = ("peak_memory", "latency", "images_per_second")
+"""Of one device; shown with the ratio to the first row."""
+
 STRICT: dict[str, Any] = {"extra": "forbid", "allow_inf_nan": False}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Column:
-    """One column: a score, a difference or mean of others, a size, or not computed yet.
+    """One column: a score, a difference or mean of others, or the efficiency of the network.
 
     Attributes:
         name: as in the rows' `values`.
@@ -36,8 +46,9 @@ class Column:
             ``{key}`` is replaced by that entry of the row's settings.
         minus: (a, b): column a minus column b.
         mean: mean of two or more other columns of the row, e.g. of day and night.
-        parameters: millions of parameters of the row's network, counted without any run and always
-            at scale=paper; discriminators are not counted.
+        efficiency: of the row's network, counted or measured without any run and always at
+            scale=paper (`sweeps.table.efficiency`); discriminators are not part of it. The images
+            have the size `settings.image_hw` of the row, or 480 x 640.
         needs: missing part of the project without which the column cannot be computed.
         modality: what is predicted from; "default": what the network is made for.
         frames: of a consistency metric: which two predictions it compares, see
@@ -57,7 +68,7 @@ class Column:
     metric: str | None = None
     minus: tuple[str, str] | None = None
     mean: tuple[str, ...] | None = None
-    parameters: bool = False
+    efficiency: Efficiency | None = None
     needs: str | None = None
     modality: Literal["default", "rgbt", "rgb", "thermal"] = "default"
     frames: Protocol | None = None

@@ -122,7 +122,7 @@ def test_a_mean_of_columns_has_values_and_no_interval(tmp_path: Path) -> None:
 
 def test_counted_parameters_are_as_recorded_and_have_no_marks(tmp_path: Path) -> None:
     path = tmp_path / "t.yaml"
-    path.write_text(TABLE.replace("needs: the consistency metrics", "parameters: true"))
+    path.write_text(TABLE.replace("needs: the consistency metrics", "efficiency: parameters"))
     lines = {
         ("A", "TC"): RecordedCell(54.36, None, 0, None, "", ()),
         ("B", "TC"): RecordedCell(44.56, None, 0, None, "", ()),

@@ -167,7 +167,7 @@ def test_render_table_notes_shared_runs_and_commits() -> None:
 
 
 def test_render_table_of_sizes_has_no_seeds() -> None:
-    size = Column(name="size", parameters=True, best="lowest")
+    size = Column(name="size", efficiency="parameters", best="lowest")
     rows = tuple(
         Row(label=label, experiment="crm", values={"size": printed})
         for label, printed in (("a", 54.4), ("b", 44.6))

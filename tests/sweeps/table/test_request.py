@@ -78,7 +78,7 @@ def test_heads_are_evaluated_apart_and_sizes_need_no_run() -> None:
         Column(name="night", metric="night/mIoU"),
         Column(name="by day", metric="night/mIoU", head="source"),
         Column(name="both", mean=("night", "by day")),
-        Column(name="size", parameters=True),
+        Column(name="size", efficiency="parameters"),
     )
     asked = TableRequest("own/t", table(ROWS, columns), "demo", (0,))
     assert asked.points()[0].evaluations == (ExtraEvaluation(head="source"),)

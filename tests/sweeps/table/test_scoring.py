@@ -118,7 +118,7 @@ def test_score_regions_of_table_and_placeholders() -> None:
 
 
 def test_score_sizes_have_marks_without_seeds() -> None:
-    size = Column(name="size", parameters=True, best="lowest")
+    size = Column(name="size", efficiency="parameters", best="lowest")
     rows = tuple(
         Row(label=label, experiment="crm", values={"size": printed})
         for label, printed in (("a", 54.4), ("b", 44.6), ("c", 50.0))
