@@ -6,7 +6,7 @@ The command line names them as ``weights.LABEL=FILE`` and ``predictions.LABEL=FO
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
@@ -14,6 +14,7 @@ from typing import Literal, get_args
 from rgbt.checks import InputError, nearest
 from rgbt.config.compose import available
 from rgbt.config.options import with_home
+from sweeps.table.row_names import WAYS
 from sweeps.table.table import Row, Table
 
 Kind = Literal["weights", "predictions"]
@@ -115,24 +116,3 @@ def _rows_called(rest: str, table: Table) -> tuple[str, list[Row]]:
             if rows:
                 return rest[:cut], rows
     return rest[: cuts[0]], []
-
-
-def _plain(text: str) -> str:
-    return " ".join(text.casefold().split())
-
-
-def _abbreviates(name: str, label: str) -> bool:
-    """Whether the words of `name` are words of `label` in their order, the first one included."""
-    short, words = (re.findall(r"[^\W_]+", text.casefold()) for text in (name, label))
-    rest = iter(words)
-    return bool(short) and short[:1] == words[:1] and all(word in rest for word in short)
-
-
-WAYS: tuple[Callable[[str, str], bool], ...] = (
-    lambda name, label: name == label,
-    lambda name, label: _plain(name) == _plain(label),
-    lambda name, label: _plain(name) == _plain(re.sub(r"[()]", "", label)),
-    lambda name, label: _plain(name) == _plain(re.sub(r"\([^)]*\)", "", label)),
-    _abbreviates,
-)
-"""How a name agrees with a label, the strictest way first."""

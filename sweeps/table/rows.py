@@ -7,11 +7,12 @@ from dataclasses import replace
 from itertools import combinations
 from typing import Any
 
-from rgbt.checks import InputError, nearest, split_list
+from rgbt.checks import InputError, split_list
 from rgbt.spec.run_spec import NOT_IN_KEY, WEIGHTS, RunSpec
 from sweeps.table.cells import is_counted, metric_of
 from sweeps.table.claim import OTHERS, PREVIOUS
 from sweeps.table.request import TableRequest
+from sweeps.table.row_names import find_label
 from sweeps.table.table import Row, Table
 from sweeps.worker.planner import specify_run
 
@@ -43,34 +44,6 @@ def select_rows(table: Table, text: str) -> Table:
     kept = tuple(table.claims if complete else claims)
     assert all(OTHERS not in each.against for each in kept) or complete
     return replace(table, rows=rows, claims=kept)
-
-
-def find_label(word: str, labels: Sequence[str], what: str) -> str:
-    """The label that a user means: as it is, in other case, without brackets, or its beginning.
-
-    Args:
-        word: as typed.
-        labels: of all rows.
-        what: option that the word belongs to, for messages.
-
-    Raises:
-        InputError: no label, or several.
-    """
-    for form in (str, _plain):
-        same = [label for label in labels if form(label) == form(word)]
-        if len(same) == 1:
-            return same[0]
-    begun = [label for label in labels if _plain(label).startswith(_plain(word))]
-    if len(begun) == 1:
-        return begun[0]
-    if begun:
-        listed = ", ".join(f"'{label}'" for label in begun)
-        raise InputError(f"{what}{word}: several rows begin so ({listed}); write one in full.")
-    raise InputError(f"{what}{word}: the table has no such row; {nearest(word, labels)}.")
-
-
-def _plain(label: str) -> str:
-    return "".join(letter for letter in label.lower() if letter.isalnum() or letter in "/.+*")
 
 
 def check_rows(request: TableRequest) -> None:

@@ -10,7 +10,7 @@ import pytest
 from rich.text import Text as RichText
 
 from sweeps.rendering.file_formats import latex, markdown, tidy_csv
-from sweeps.rendering.rendered_table import DEMO, FORMS, PARAMETERS, render_table
+from sweeps.rendering.rendered_table import COUNTED, DEMO, FORMS, render_table
 from sweeps.rendering.terminal import terminal
 from sweeps.table.cells import TableCell
 from sweeps.table.scoring import ScoredTable, score, size_marks
@@ -179,7 +179,7 @@ def test_render_table_of_sizes_has_no_seeds() -> None:
     shown = words(scored)
     assert shown[3] == ["a", "_54.36", "54.4", "-0.04"]
     assert shown[4] == ["b", "*44.56", "44.6", "-0.04"]
-    assert PARAMETERS in lines(scored)
+    assert COUNTED.format(scale="paper") in lines(scored)
     assert not any("scale=demo" in line for line in lines(scored))
     assert r"a &  & \underline{54.36} & 54.4 & -0.04 \\" in latex(render_table(scored))
     assert "| b |  | **44.56** | 44.6 | -0.04 |" in markdown(render_table(scored))

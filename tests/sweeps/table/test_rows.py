@@ -8,7 +8,8 @@ from rgbt.checks import InputError
 from sweeps.table.claim import Claim
 from sweeps.table.load_table import load_table
 from sweeps.table.request import TableRequest
-from sweeps.table.rows import check_rows, find_label, select_rows
+from sweeps.table.row_names import find_label
+from sweeps.table.rows import check_rows, select_rows
 from sweeps.table.table import Row, Table
 from tests.sweeps.tabled import table
 
