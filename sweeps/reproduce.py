@@ -110,6 +110,7 @@ def main(options: Options, overrides: list[str]) -> int:
     from rgbt.config.compose import compose
     from sweeps.rendering.publish import publish_table
     from sweeps.table.load_table import table_names
+    from sweeps.worker.planner import Planner
     from sweeps.worker.point_list import PointList, preview_points, run_points
     from sweeps.worker.run_store import open_run_store
 
@@ -139,7 +140,8 @@ def main(options: Options, overrides: list[str]) -> int:
         for wanted in requests
     ]
     if settings.dry_run:
-        previews = [preview_points(points, settings) for points in lists]
+        planner = Planner(base)
+        previews = [preview_points(points, settings, planner) for points in lists]
         _show(options.table, list(zip(requests, previews, strict=True)), settings.workers)
         return 0
     (wanted,), (points,) = requests, lists
