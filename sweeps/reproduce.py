@@ -133,6 +133,7 @@ def main(options: Options, overrides: list[str]) -> int:
     from rgbt.config.compose import compose
     from sweeps.rendering.publish import publish_table
     from sweeps.table.load_table import table_names
+    from sweeps.worker.planner import Planner
     from sweeps.worker.point_list import preview_points, run_points
     from sweeps.worker.run_store import open_run_store
 
@@ -151,7 +152,8 @@ def main(options: Options, overrides: list[str]) -> int:
     runs = open_run_store(config)
     plans = plans_of(tables, options, extra, runs, base)
     if settings.dry_run:
-        previews = [preview_points(plan.points, settings) for plan in plans]
+        planner = Planner(base)
+        previews = [preview_points(plan.points, settings, planner) for plan in plans]
         _show(options.table, list(zip(plans, previews, strict=True)), settings.workers)
         return 0
     (plan,) = plans

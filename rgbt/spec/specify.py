@@ -183,6 +183,9 @@ def upstream_config(config: DictConfig, key: str, experiment: str) -> DictConfig
 @cache
 def _composed(experiment: str, scale: str, _own: str) -> DictConfig:
     """Cached, because composing takes long and the seeds of a table share their upstream runs."""
+    chosen = compose([f"+experiment={experiment}"])  # often composed already, for a row of a table
+    if chosen.scale.name == scale:
+        return chosen
     return compose([f"+experiment={experiment}", f"scale={scale}"])
 
 

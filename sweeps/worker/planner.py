@@ -64,7 +64,7 @@ def specify_run(overrides: Sequence[str]) -> RunSpec:
 
 
 class Planner:
-    """Plans points; the fingerprint of every data set is computed once.
+    """Plans points; equal runs are specified once, and each data set is read once.
 
     Args:
         base: overrides that all runs have, e.g. the folders of runs and data.
@@ -73,6 +73,7 @@ class Planner:
     def __init__(self, base: Sequence[str] = ()) -> None:
         self.base = tuple(base)
         self._fingerprints: dict[str, str] = {}
+        self._planned: dict[tuple[str, ...], PlannedRun] = {}
 
     def plan(self, point: Point) -> PlannedPoint:
         """Compose and check all runs of `point`.
@@ -91,6 +92,11 @@ class Planner:
 
     def plan_run(self, overrides: tuple[str, ...]) -> PlannedRun:
         """Specify one run and read its data set; raises as `plan`."""
+        if overrides not in self._planned:
+            self._planned[overrides] = self._plan_run(overrides)
+        return self._planned[overrides]
+
+    def _plan_run(self, overrides: tuple[str, ...]) -> PlannedRun:
         spec = specify_run(overrides)
         name = json.dumps(spec.dataset.plain, sort_keys=True)
         if name not in self._fingerprints:

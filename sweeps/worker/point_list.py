@@ -64,9 +64,17 @@ def other_code_line(outcomes: Sequence[Outcome]) -> str:
     )
 
 
-def preview_points(points: PointList, settings: SweepSettings) -> list[Outcome]:
-    """The present state of the points; nothing is run and nothing written."""
-    planned = _PlannedPoints(points)
+def preview_points(
+    points: PointList, settings: SweepSettings, planner: Planner | None = None
+) -> list[Outcome]:
+    """The present state of the points; nothing is run and nothing written.
+
+    Args:
+        points: to preview.
+        settings: of their execution.
+        planner: with the same `base`, shared by several lists; None: one of this list alone.
+    """
+    planned = _PlannedPoints(points, planner)
     study = find_study(points.study, settings.storage, points.runs.runs_dir)
     trials = trials_by_key(() if study is None else counted_trials(study))
 
@@ -123,8 +131,8 @@ def run_points(points: PointList, settings: SweepSettings) -> list[Outcome]:
 class _PlannedPoints:
     """The points of a list, planned; those with a wrong configuration have failed."""
 
-    def __init__(self, points: PointList) -> None:
-        self._planner = Planner(points.base)
+    def __init__(self, points: PointList, planner: Planner | None = None) -> None:
+        self._planner = planner or Planner(points.base)
         self._study = points.study
         self.points: list[Point] = []
         self.plans: dict[int, PlannedPoint] = {}
