@@ -74,6 +74,7 @@ class Planner:
         self.base = tuple(base)
         self._fingerprints: dict[str, str] = {}
         self._planned: dict[tuple[str, ...], PlannedRun] = {}
+        self._specified: dict[tuple[str, ...], RunSpec] = {}
 
     def plan(self, point: Point) -> PlannedPoint:
         """Compose and check all runs of `point`.
@@ -97,7 +98,7 @@ class Planner:
         return self._planned[overrides]
 
     def _plan_run(self, overrides: tuple[str, ...]) -> PlannedRun:
-        spec = specify_run(overrides)
+        spec = self._specify(overrides)
         name = json.dumps(spec.dataset.plain, sort_keys=True)
         if name not in self._fingerprints:
             dataset: Any = spec.dataset.build()
@@ -117,6 +118,17 @@ class Planner:
             pixel_factor=spec.scale.pixel_factor,
             consistency_splits=tuple(views["splits"]) if views["sets"] else (),
         )
+
+    def _specify(self, overrides: tuple[str, ...]) -> RunSpec:
+        """The specification; seeds of the same run are composed once."""
+        *others, last = overrides
+        seed = last.removeprefix("seed=")
+        if seed == last or not seed.isdecimal():
+            return specify_run(overrides)
+        same = tuple(others)
+        if same not in self._specified:
+            self._specified[same] = specify_run(overrides)
+        return self._specified[same].with_seed(int(seed))
 
 
 def _identity(evaluation: ExtraEvaluation) -> dict[str, object]:

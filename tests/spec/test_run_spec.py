@@ -242,3 +242,13 @@ def test_pretrained_weights_count_in_the_first_stage(tmp_path: Path) -> None:
 def test_uses_pretrained_looks_upstream(experiment: str, typed: list[str], uses: bool) -> None:
     run = spec_of(experiment, "pretrained=/some/imagenet.pth", *typed)
     assert run.uses_pretrained == uses
+
+
+@pytest.mark.parametrize("experiment", ["grbm", "temporal_con", "multi_head_modified_night_init"])
+def test_run_with_another_seed_is_the_run_composed_with_it(experiment: str) -> None:
+    made = spec_of(experiment, "seed=0").with_seed(3)
+    composed_so = spec_of(experiment, "seed=3")
+    assert made.key == composed_so.key
+    assert made.plain == composed_so.plain
+    assert made.overrides == composed_so.overrides
+    assert [each.key for each in made.upstream] == [each.key for each in composed_so.upstream]

@@ -207,6 +207,8 @@ def test_pages_lines_fit_and_links_resolve(data: ReportData, pages: dict[str, st
         assert text.count("\n# ") == 1
         assert "\n\n\n" not in text, name
     for page, wanted in re.findall(r"\((\w+)\.md#([\w-]+)\)", pages["index.md"]):
+        if page == "measurements":  # written by hand
+            continue
         assert wanted in {anchor(v) for v in table_views(data) if v.entry.name.startswith(page)}
 
 
