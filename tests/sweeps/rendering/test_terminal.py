@@ -10,7 +10,7 @@ import pytest
 from rich.text import Text as RichText
 
 from sweeps.rendering.file_formats import latex, markdown, tidy_csv
-from sweeps.rendering.rendered_table import DEMO, PARAMETERS, render_table
+from sweeps.rendering.rendered_table import COUNTED, DEMO, render_table
 from sweeps.rendering.terminal import terminal
 from sweeps.table.cells import TableCell
 from sweeps.table.scoring import ScoredTable, score
@@ -169,7 +169,7 @@ def test_render_table_of_sizes_has_no_seeds() -> None:
     shown = words(scored)
     assert shown[3] == ["a", "_54.36", "_54.4", "-0.04"]
     assert shown[4] == ["b", "*44.56", "*44.6", "-0.04"]
-    assert PARAMETERS in lines(scored)
+    assert COUNTED.format(scale="paper") in lines(scored)
     assert not any("scale=demo" in line for line in lines(scored))
     assert r"a &  & \underline{54.36} & \underline{54.4} & -0.04 \\" in latex(render_table(scored))
     assert "| b |  | **44.56** | **44.6** | -0.04 |" in markdown(render_table(scored))
@@ -216,3 +216,22 @@ def test_csv_read_back() -> None:
     }
     assert second["mean"] == second["runs"] == ""
     assert (second["n"], second["published"], second["reason"]) == ("0", "4.0", "flow")
+
+
+def test_render_table_of_speed_shows_ratios_and_no_difference() -> None:
+    speed = Column(name="fps", efficiency="images_per_second")
+    rows = tuple(
+        Row(label=label, experiment="crm", values={"fps": printed})
+        for label, printed in (("a", 16.0), ("b", 8.0))
+    )
+    measured = {
+        (row.label, "fps"): TableCell(mean, math.nan, 0, ratio=ratio, device="a CPU")
+        for row, mean, ratio in zip(rows, (0.5, 0.2), (1.0, 0.4), strict=True)
+    }
+    scored = score("own/t", table(rows, (speed,)), {}, scale="demo", sizes=measured)
+    cells = [[cell.text for cell in line.fields] for line in render_table(scored).lines[:2]]
+    assert cells == [
+        ["", "0.50 (1.00x)", "16 (1.00x)", "-"],
+        ["", "0.20 (0.40x)", "8 (0.50x)", "-"],
+    ]
+    assert any("measured on a CPU" in remark for remark in render_table(scored).remarks)
