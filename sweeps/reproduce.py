@@ -25,6 +25,7 @@ from sweeps.table.request import seeds_of
 
 if TYPE_CHECKING:
     from sweeps.table_plan import TablePlan
+    from sweeps.worker.planner import Planner
     from sweeps.worker.run_store import RunStore
     from sweeps.worker.trial_sources import Outcome
 
@@ -150,16 +151,16 @@ def main(options: Options, overrides: list[str]) -> int:
         config = compose([*base, f"fresh={str(options.fresh).lower()}"])
         Component.from_node(config.tracking)
     runs = open_run_store(config)
-    plans = plans_of(tables, options, extra, runs, base)
+    planner = Planner(base)
+    plans = plans_of(tables, options, extra, runs, planner)
     if settings.dry_run:
-        planner = Planner(base)
         previews = [preview_points(plan.points, settings, planner) for plan in plans]
         _show(options.table, list(zip(plans, previews, strict=True)), settings.workers)
         return 0
     (plan,) = plans
     wanted = plan.request
     plan.evaluate_external(runs.runs_dir)
-    outcomes = run_points(plan.points, settings) if plan.points.points else []
+    outcomes = run_points(plan.points, settings, planner) if plan.points.points else []
     out = options.out or options.runs_dir / "tables" / f"{wanted.name}_{wanted.variant}"
     return publish_table(plan.judge, wanted, outcomes, plan.external, out, runs.tracking)
 
@@ -233,7 +234,7 @@ def plans_of(
     options: Options,
     extra: Sequence[str],
     runs: RunStore,
-    base: Sequence[str],
+    planner: Planner,
 ) -> list[TablePlan]:
     """The tables as they are run.
 
@@ -262,9 +263,9 @@ def plans_of(
             until_decided=adds,
         )
         request, rows = make_request(name, both_forms(table) if is_both else table, words)
-        check_rows(request)
+        check_rows(request, planner)
         most = options.max_seeds if adds else None
-        plans.append(TablePlan.of(request, rows, runs, base, most))
+        plans.append(TablePlan.of(request, rows, runs, planner.base, most))
     return plans
 
 

@@ -25,8 +25,8 @@ ON_CPU = (
 )
 ON_GPU = "Peak memory: most that PyTorch allocated for weights, batch and one prediction."
 TIMES = (
-    "Latency of a batch of {batch}: median and quartiles of {rounds} rounds after {warmup} "
-    "predictions that were not measured. Each round measures every network once, in random order."
+    "Latency of a batch of {batch}: median and quartiles; rounds: {rounds}, unmeasured predictions "
+    "before them: {warmup}. Each round measures every network once, in random order."
 )
 RATIO = (
     "Ratio: median over rounds of the latency divided by that of {first} in the same round, with "

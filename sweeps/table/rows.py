@@ -14,7 +14,7 @@ from sweeps.table.claim import OTHERS, PREVIOUS
 from sweeps.table.request import TableRequest
 from sweeps.table.row_names import find_label
 from sweeps.table.table import Row, Table
-from sweeps.worker.planner import specify_run
+from sweeps.worker.planner import Planner
 
 SUBJECTS = ("dataset", "domains", "transform", "masker", "model", "loss", "scheme")
 """Nodes of the configuration that a row can be about. The others say how long and on what it is
@@ -46,22 +46,26 @@ def select_rows(table: Table, text: str) -> Table:
     return replace(table, rows=rows, claims=kept)
 
 
-def check_rows(request: TableRequest) -> None:
+def check_rows(request: TableRequest, planner: Planner) -> None:
     """Refuse overrides that change what rows are about, and rows that are the same run unawares.
+
+    Args:
+        request: the table.
+        planner: of its runs.
 
     Raises:
         InputError: in one sentence, with the rows.
     """
-    _check_clashes(request)
-    _check_equal_runs(request)
+    _check_clashes(request, planner)
+    _check_equal_runs(request, planner)
 
 
-def _check_clashes(request: TableRequest) -> None:
+def _check_clashes(request: TableRequest, planner: Planner) -> None:
     words = [word for word in request.extra if _key(word).partition(".")[0] in SUBJECTS]
     if not words:
         return
     as_published = replace(request, extra=(), pretrained={})
-    for (first, a), (second, b) in combinations(_specified(as_published), 2):
+    for (first, a), (second, b) in combinations(_specified(as_published, planner), 2):
         varied = _varied(a, b)
         for word in words:
             key = _key(word)
@@ -72,11 +76,11 @@ def _check_clashes(request: TableRequest) -> None:
                 )
 
 
-def _check_equal_runs(request: TableRequest) -> None:
+def _check_equal_runs(request: TableRequest, planner: Planner) -> None:
     """Rows with the same metrics have runs of their own, unless the table says otherwise."""
     rows = {row.label: row for row in request.table.rows}
     seen: dict[tuple[Any, ...], str] = {}
-    for label, spec in _specified(request):
+    for label, spec in _specified(request, planner):
         row = rows[label]
         metrics = [metric_of(each, row) for each in request.table.columns if is_counted(each)]
         same = seen.setdefault((spec.key, *metrics), label)
@@ -102,11 +106,12 @@ def _chain(rows: Mapping[str, Row], label: str) -> Iterator[str]:
         row = rows.get(row.same_as)
 
 
-def _specified(request: TableRequest) -> Iterator[tuple[str, RunSpec]]:
+def _specified(request: TableRequest, planner: Planner) -> Iterator[tuple[str, RunSpec]]:
     """The trained rows with their specifications; those that cannot be composed fail later."""
     for row in request.trained_rows:
         try:
-            yield row.label, specify_run(request.overrides(row.label, 0))
+            overrides = (*planner.base, *request.overrides(row.label, 0))
+            yield row.label, planner.specify(overrides)
         except InputError:
             continue
 

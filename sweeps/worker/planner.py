@@ -98,7 +98,7 @@ class Planner:
         return self._planned[overrides]
 
     def _plan_run(self, overrides: tuple[str, ...]) -> PlannedRun:
-        spec = self._specify(overrides)
+        spec = self.specify(overrides)
         name = json.dumps(spec.dataset.plain, sort_keys=True)
         if name not in self._fingerprints:
             dataset: Any = spec.dataset.build()
@@ -119,8 +119,12 @@ class Planner:
             consistency_splits=tuple(views["splits"]) if views["sets"] else (),
         )
 
-    def _specify(self, overrides: tuple[str, ...]) -> RunSpec:
-        """The specification; seeds of the same run are composed once."""
+    def specify(self, overrides: tuple[str, ...]) -> RunSpec:
+        """The specification of one run; seeds of the same run are composed once.
+
+        Raises:
+            InputError: see `specify_run`.
+        """
         *others, last = overrides
         seed = last.removeprefix("seed=")
         if seed == last or not seed.isdecimal():

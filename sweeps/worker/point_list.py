@@ -93,13 +93,20 @@ def preview_points(
     return planned.outcomes(status)
 
 
-def run_points(points: PointList, settings: SweepSettings) -> list[Outcome]:
+def run_points(
+    points: PointList, settings: SweepSettings, planner: Planner | None = None
+) -> list[Outcome]:
     """Run all unfinished points; a failed point does not stop the others. Outcomes in their order.
+
+    Args:
+        points: their overrides.
+        settings: of execution.
+        planner: that has planned some of them already; None: a new one.
 
     Raises:
         InputError: the storage or the executor cannot be used.
     """
-    planned = _PlannedPoints(points)
+    planned = _PlannedPoints(points, planner)
     runs = points.runs
     storage = open_storage(settings.storage, runs.runs_dir)
     runs.create_tables()

@@ -42,7 +42,7 @@ def composed(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     [
         (),
         WORDS,
-        ("+experiment=temporal_con", "scale.crop_hw=[48,64]", "~out"),
+        ("+experiment=temporal_con", "scale.crop_hw=[48,64]", "~trainer.threads"),
         ("model.weights=experiment:crm/last.pt", "name=a"),
     ],
 )

@@ -11,6 +11,7 @@ from sweeps.table.request import TableRequest
 from sweeps.table.row_names import find_label
 from sweeps.table.rows import check_rows, select_rows
 from sweeps.table.table import Row, Table
+from sweeps.worker.planner import Planner
 from tests.sweeps.tabled import table
 
 LABELS = ("(A)", "(B)", "CMX (MiT-B2)", "CMX (MiT-B4)", "Multi-head", "Multi-head*")
@@ -79,19 +80,19 @@ def asked(name: str, *extra: str, rows: str = "", scale: str = "demo") -> TableR
 )
 def test_override_of_what_rows_are_about_is_refused(name: str, word: str) -> None:
     with pytest.raises(InputError, match=f"^'{word}' would replace what the rows .* rows=") as told:
-        check_rows(asked(name, word))
+        check_rows(asked(name, word), Planner())
     assert name in str(told.value)
 
 
 def test_overrides_of_how_long_and_on_what_are_allowed() -> None:
     words = ("recipe.batch_size=1", "dataset.root=/data", "optimizer.weight_decay=0.1")
-    check_rows(asked("spatialseg/table3", *words, "model.queries=8", rows="Ny,Ny/2"))
+    check_rows(asked("spatialseg/table3", *words, "model.queries=8", rows="Ny,Ny/2"), Planner())
 
 
 def test_override_of_chosen_rows_is_allowed() -> None:
-    check_rows(asked("spatialseg/table3", "masker=grbm_released", rows="Ny/4"))
+    check_rows(asked("spatialseg/table3", "masker=grbm_released", rows="Ny/4"), Planner())
     with pytest.raises(InputError, match="'Ny' and 'Ny/4'"):
-        check_rows(asked("spatialseg/table3", "masker.sigma_div=4", rows="Ny,Ny/4"))
+        check_rows(asked("spatialseg/table3", "masker.sigma_div=4", rows="Ny,Ny/4"), Planner())
 
 
 def test_rows_that_are_one_run_are_refused_unless_the_table_says_so() -> None:
@@ -100,5 +101,5 @@ def test_rows_that_are_one_run_are_refused_unless_the_table_says_so() -> None:
     third = Row(label="c", experiment="baseline", same_as="a")
     equal = of(first, Row(label="b", experiment="baseline"))
     with pytest.raises(InputError, match=r"'a' and 'b' of own/t would be the same run .* same_as"):
-        check_rows(TableRequest("own/t", equal, "demo", (0,)))
-    check_rows(TableRequest("own/t", of(first, same, third), "demo", (0,)))
+        check_rows(TableRequest("own/t", equal, "demo", (0,)), Planner())
+    check_rows(TableRequest("own/t", of(first, same, third), "demo", (0,)), Planner())
