@@ -18,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError, nearest
 from rgbt.config.compose_cache import compose_cached
-from rgbt.config.config_source import parsing_once
+from rgbt.config.config_source import parse_interpolations_once, parsing_once
 
 SEARCH_PATH = "hydra.searchpath"
 """Override that names the folders of a user's own files for one command."""
@@ -70,7 +70,7 @@ def _composed_by_hydra(words: list[str]) -> DictConfig:
 
 @contextmanager
 def _without_collection() -> Iterator[None]:
-    """No search for cycles of garbage: it takes a fifth of a composition, which leaves few."""
+    """No search for cycles of garbage, which takes a fifth of a composition that leaves few."""
     was_enabled = gc.isenabled()
     gc.disable()
     try:
@@ -158,6 +158,7 @@ def register_resolvers() -> None:
     ``${px:64}``: 64 pixels of the paper's images, scaled to the images of the scale.
     ``${scenes:600,6}``: 600 scenes of an embedded data set, or 6 where the scale takes a few.
     """
+    parse_interpolations_once()
     for name, resolve in (("by_scale", _by_scale), ("px", _scaled_pixels), ("scenes", _num_scenes)):
         if not OmegaConf.has_resolver(name):
             OmegaConf.register_new_resolver(name, resolve)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import pickle
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from hydra._internal.core_plugins.importlib_resources_config_source import (
 from hydra._internal.sources_registry import SourcesRegistry
 from hydra.core.plugins import Plugins
 from hydra.plugins.config_source import ConfigResult
+from omegaconf import _utils, base, grammar_parser
 
 MOST_FILES = 4096
 """Parsed files that are kept; more of them empty the cache."""
@@ -72,6 +74,19 @@ def _loaded(key: Hashable, load: Callable[[], ConfigResult]) -> ConfigResult:
         _parsed[key] = pickle.dumps(load())
     result: ConfigResult = pickle.loads(_parsed[key])  # noqa: S301 - made above
     return result
+
+
+def parse_interpolations_once() -> None:
+    """Let OmegaConf keep the parse trees of texts such as ``${scale.crop_hw}``.
+
+    It parses the same 300 texts again for every configuration, which takes a fifth of the time.
+    The trees are only read.
+    """
+    if not hasattr(grammar_parser.parse, "cache_info"):
+        kept = lru_cache(maxsize=MOST_FILES)(grammar_parser.parse)
+        modules: tuple[Any, ...] = (grammar_parser, base, _utils)
+        for module in modules:
+            module.parse = kept
 
 
 @contextmanager

@@ -8,6 +8,7 @@ the predictions of its network. Both runs share seed, scale and data set
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterator, Sequence
 from functools import cache
@@ -130,10 +131,31 @@ def _dependencies(
             if experiment in downstream:
                 circle = " -> ".join((*downstream, experiment))
                 raise InputError(f"{key} makes a cycle of upstream runs: {circle}.")
-            upstream = upstream_config(config, key, experiment)
             typed = [f"+experiment={experiment}", *_shared_overrides(overrides, key)]
-            run = specify(upstream, typed, downstream=downstream)
+            run = _upstream_run(config, key, experiment, typed, downstream)
             yield Dependency(key, run, checkpoint)
+
+
+def _upstream_run(
+    config: DictConfig,
+    key: str,
+    experiment: str,
+    typed: Sequence[str],
+    downstream: tuple[str, ...],
+) -> RunSpec:
+    """The upstream run; several runs that share the same settings have the same one."""
+    shared = _shared_settings(config, key)
+    about = (key, experiment, config.scale.name, own_folders(), *typed, *downstream)
+    text = json.dumps([*about, shared], default=str)
+    if text not in _upstream:
+        if len(_upstream) >= MOST_NODES:
+            _upstream.clear()
+        upstream = upstream_config(config, key, experiment)
+        _upstream[text] = specify(upstream, typed, downstream=downstream)
+    return _upstream[text]
+
+
+_upstream: dict[str, RunSpec] = {}
 
 
 def parse_reference(key: str, value: str | None) -> tuple[str, CheckpointFile] | None:
@@ -165,19 +187,28 @@ def upstream_config(config: DictConfig, key: str, experiment: str) -> DictConfig
     network. Everything else is the experiment's own.
     """
     upstream = _composed(experiment, config.scale.name, own_folders()).copy()
+    if key == WEIGHTS:
+        own = RUN_SETTINGS["model"]
+        upstream.model = {each: upstream.model._get_node(each) for each in own}
+    for each, value in _shared_settings(config, key).items():
+        OmegaConf.update(upstream, each, value, merge=False, force_add=True)
+    return upstream
+
+
+def _shared_settings(config: DictConfig, key: str) -> dict[str, Any]:
+    """Dotted key -> value, not resolved, of what an upstream run shares."""
     # Its experiment says whether a network has pretrained weights, the scale says all else.
     shared = [*SHARED, *(f"scale.{each}" for each in config.scale if each != "pretrained")]
     if key == WEIGHTS:
         own = RUN_SETTINGS["model"]
         shared += [f"model.{each}" for each in config.model if each not in own]
-        upstream.model = {each: upstream.model._get_node(each) for each in own}
+    values = {}
     for each in shared:
         *parents, last = each.split(".")
         mine: Any = OmegaConf.select(config, ".".join(parents)) if parents else config
         node = mine._get_node(last)
-        value = OmegaConf.to_container(node) if OmegaConf.is_config(node) else node._value()
-        OmegaConf.update(upstream, each, value, merge=False, force_add=True)
-    return upstream
+        values[each] = OmegaConf.to_container(node) if OmegaConf.is_config(node) else node._value()
+    return values
 
 
 @cache

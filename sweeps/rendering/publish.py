@@ -73,6 +73,7 @@ def publish_table(
     )
     findings = Findings(claims=judge.claims(runs), forms=forms_grid(judge, runs))
     rendered = render_table(scored, request.typed_overrides())
+    rendered = replace(rendered, remarks=(*rendered.remarks, *_not_trained(request)))
     print_rich(terminal(rendered, plain=not sys.stdout.isatty(), width=line_width()))
     if findings.forms is not None:
         print_rich(rich_table(findings.forms))
@@ -101,6 +102,16 @@ def publish_table(
     links = [("files", f"{out}/ ({', '.join(path.name for path in files)})"), *links]
     print_rich(path_lines(links))
     return 1 if failed else 0
+
+
+def _not_trained(request: TableRequest) -> list[str]:
+    """A sentence on rows that are evaluated and not trained."""
+    words = [word for word in request.typed if word.startswith(("weights.", "predictions."))]
+    if not words:
+        return []
+    return [
+        f"Not trained here, so that their spread over trainings is not known: {'; '.join(words)}."
+    ]
 
 
 def write_files(
