@@ -58,9 +58,27 @@ def _section(name: str, spec: dict[str, Any]) -> list[str]:
         f"data: {spec['data']}.",
         block(f"rgbt reproduce table={name} seeds=3 workers=2", "bash"),
         table(["Row", "Experiment", *columns], rows),
+        *_claims(spec),
+        *_forms(spec),
         "\n".join(remarks),
     ]
 
 
 def _value(value: Any) -> str:
     return "" if value is None else str(value)
+
+
+def _claims(spec: dict[str, Any]) -> list[str]:
+    """What the paper says about the table, as it is judged by `rgbt reproduce`."""
+    claims = [
+        [code(each["name"]), " ".join(each["says"].split()), each["source"]]
+        for each in spec.get("claims", [])
+    ]
+    return [table(["Claim", "Statement", "Place"], claims)] if claims else []
+
+
+def _forms(spec: dict[str, Any]) -> list[str]:
+    return [
+        f"`form={form}`: {' '.join(sentence.split())}"
+        for form, sentence in spec.get("forms", {}).items()
+    ]

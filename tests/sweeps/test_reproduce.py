@@ -15,6 +15,7 @@ from sweeps.reproduce import OF_THE_TABLE, Options, entry
 from sweeps.settings import SweepSettings
 from sweeps.table.cells import OWN_COUNTS
 from sweeps.worker import point_list
+from sweeps.worker.planner import Planner
 from sweeps.worker.point_list import PointList
 from sweeps.worker.trial_sources import Outcome
 from tests.commands import Call, assert_one_sentence
@@ -52,7 +53,7 @@ def driven(monkeypatch: pytest.MonkeyPatch) -> Driven:
     def drive(*states: str) -> Asked:
         asked: Asked = []
 
-        def work(wanted: PointList, settings: SweepSettings) -> Sequence[Outcome]:
+        def work(wanted: PointList, settings: SweepSettings, _: Planner) -> Sequence[Outcome]:
             asked.append((wanted, settings))
             turns = [states[index % len(states)] for index in range(len(wanted.points))]
             return [_outcome(*each) for each in zip(wanted.points, turns, range(99))]
