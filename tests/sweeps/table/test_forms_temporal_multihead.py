@@ -11,8 +11,9 @@ import pytest
 
 from rgbt.config.compose import flatten
 from rgbt.spec.run_spec import RunSpec
+from sweeps.table.efficiency import million_parameters
 from sweeps.table.load_table import load_table, table_names
-from sweeps.table.request import TableRequest, million_parameters
+from sweeps.table.request import TableRequest
 from sweeps.table.table import Form
 from sweeps.worker.planner import specify_run
 from tests.sweeps.composed import specified
