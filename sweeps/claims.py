@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
+from rgbt.checks import InputError
 from rgbt.config.common_options import RunsDir
 from rgbt.config.options import Help, readable_paths
 from rgbt.config.plain_command import PlainCommand
@@ -18,6 +19,7 @@ from rgbt.config.plain_command import PlainCommand
 if TYPE_CHECKING:
     from sweeps.table.request import TableRequest
     from sweeps.verdicts.judge import JudgedClaim
+    from sweeps.worker.planner import Planner
 
 ALL = "all"
 
@@ -52,11 +54,14 @@ def main(options: Options, overrides: list[str]) -> int:
     from sweeps.rendering.claims import claims_csv, claims_grid, claims_markdown, counted
 
     judged = judge_all(options, overrides)
-    print_rich(rich_table(claims_grid(judged, counted(judged), tables=True)))
+    where = f"scale={options.scale}, form={options.form}, runs in {options.runs_dir}"
+    print_rich(rich_table(claims_grid(judged, f"{counted(judged)} ({where})", tables=True)))
     print_rich(Text(by_paper(judged)))
     if options.out is not None:
         options.out.mkdir(parents=True, exist_ok=True)
-        text = f"# Claims of the papers\n\n{counted(judged)}\n\n{claims_markdown(judged)}"
+        text = (
+            f"# Claims of the papers\n\n{counted(judged)}\n\n{claims_markdown(judged, tables=True)}"
+        )
         write_atomic(options.out / "claims.md", text.encode())
         write_atomic(options.out / "claims.csv", claims_csv(judged).encode())
         print_rich(path_lines([("claims", str(options.out / "claims.md"))]))
@@ -73,31 +78,43 @@ def judge_all(options: Options, overrides: Sequence[str]) -> list[JudgedClaim]:
     from rich.progress import track
 
     from sweeps.table.load_table import PUBLISHED, table_names
-    from sweeps.table.make_request import TableWords, make_request, read_named
+    from sweeps.table.make_request import TableWords, check_override, make_request, read_named
+    from sweeps.table.rows import check_rows
     from sweeps.verdicts.stored import finished_by_seed
+    from sweeps.worker.planner import Planner
 
     names = table_names(PUBLISHED / "none") if options.table == ALL else [options.table]
     finished = finished_by_seed(options.runs_dir)
-    extra = [*readable_paths([f"runs_dir={options.runs_dir}"]), *overrides]
-    words = TableWords(seeds=(0,), scale=options.scale, form=options.form, overrides=extra)
+    for word in overrides:
+        check_override(word)
+    words = TableWords(seeds=(0,), scale=options.scale, form=options.form, overrides=overrides)
+    planner = Planner(readable_paths([f"runs_dir={options.runs_dir}"]))
     judged: list[JudgedClaim] = []
     for each in track(names, "judging", console=Console(stderr=True), transient=True):
         name, table = read_named(each)
         if table.claims:
-            request, _ = make_request(name, table, words)
-            judged += judge_stored(request, options.runs_dir, finished)
+            request, external = make_request(name, table, words)
+            if external:
+                raise InputError(
+                    f"{external[0].kind}.{external[0].label}: only finished runs are judged here; "
+                    f"use rgbt reproduce table={name} for rows that are not trained."
+                )
+            check_rows(request, planner)
+            judged += judge_stored(request, options.runs_dir, finished, planner)
     return judged
 
 
 def judge_stored(
-    request: TableRequest, runs_dir: Path, finished: dict[int, set[str]]
+    request: TableRequest, runs_dir: Path, finished: dict[int, set[str]], planner: Planner
 ) -> list[JudgedClaim]:
     """The claims of one table, judged by the finished runs of a folder."""
+    from sweeps.table.efficiency import exact_sizes
     from sweeps.verdicts.judge import TableJudge
     from sweeps.verdicts.stored import rule_of, stored_runs
 
-    runs = stored_runs(request, runs_dir, finished) if finished else {}
-    judge = TableJudge(request.name, request.table, rule_of(request, runs))
+    runs = stored_runs(request, runs_dir, finished, planner)
+    rule = rule_of(result.tags for run in runs.values() for result in run.results)
+    judge = TableJudge(request.name, request.table, rule, sizes=exact_sizes(request))
     return judge.claims(runs)
 
 
@@ -108,9 +125,13 @@ def by_paper(judged: Sequence[JudgedClaim]) -> str:
     apart = Counter(each.table.partition("/")[0] for each in judged if each.as_printed is False)
     return "\n".join(
         f"{paper}: {count} claims; its printed values agree with {agree[paper]}, do not agree with "
-        f"{apart[paper]}."
+        f"{apart[paper]}{_untold(count - agree[paper] - apart[paper])}."
         for paper, count in papers.items()
     )
+
+
+def _untold(count: int) -> str:
+    return f", and are not printed for {count}" if count else ""
 
 
 entry = PlainCommand(Options, main)

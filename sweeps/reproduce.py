@@ -134,13 +134,15 @@ def main(options: Options, overrides: list[str]) -> int:
     from rgbt.config.compose import compose
     from sweeps.rendering.publish import publish_table
     from sweeps.table.load_table import table_names
+    from sweeps.table.make_request import check_override
+    from sweeps.verdicts.stored import rule_of
     from sweeps.worker.planner import Planner
     from sweeps.worker.point_list import preview_points, run_points
     from sweeps.worker.run_store import open_run_store
 
     settings = settings_of(options)
     for word in overrides:
-        _check_override(word)
+        check_override(word)
     tracker = [word for word in overrides if word.lstrip("+~").startswith("tracking")]
     extra = tuple(word for word in overrides if word not in tracker)
     if options.table == ALL and not settings.dry_run:
@@ -161,6 +163,8 @@ def main(options: Options, overrides: list[str]) -> int:
     wanted = plan.request
     plan.evaluate_external(runs.runs_dir)
     outcomes = run_points(plan.points, settings, planner) if plan.points.points else []
+    if plan.until_decided is None:  # an earlier command may have added seeds
+        plan.judge.rule = rule_of(result.tags for each in outcomes for result in each.results)
     out = options.out or options.runs_dir / "tables" / f"{wanted.name}_{wanted.variant}"
     return publish_table(plan.judge, wanted, outcomes, plan.external, out, runs.tracking)
 
@@ -211,24 +215,6 @@ def settings_of(options: Options) -> SweepSettings:
         raise InputError(str(error).replace("hydra.sweeper.", "")) from error
 
 
-def _check_override(word: str) -> None:
-    """Refuse an override that belongs to the rows of the table."""
-    key = word.lstrip("+~").partition("=")[0]
-    if key in ("seed", "experiment"):
-        other = "seeds=3" if key == "seed" else "another table"
-        raise InputError(f"'{word}' is set by the rows of the table; choose {other}.")
-    if key.rpartition("@")[2].partition(".")[0] == "consistency":
-        raise InputError(
-            f"'{word}': the columns of the table define what is counted, on the published sets "
-            "of views; measure others with rgbt consistency run=..."
-        )
-    if key == "metric" or key.startswith("metric."):
-        raise InputError(
-            f"'{word}': the columns of the table define what is counted; set `regions` in your "
-            "own table."
-        )
-
-
 def plans_of(
     names: Sequence[str],
     options: Options,
@@ -242,7 +228,7 @@ def plans_of(
         InputError: no such table, row, scale or metric; no seeds; overrides that mix rows up.
     """
     from sweeps.table.make_request import TableWords, make_request, read_named
-    from sweeps.table.rows import check_rows
+    from sweeps.table.rows import check_rows, select_rows
     from sweeps.table_plan import TablePlan
     from sweeps.verdicts.forms import both_forms
     from sweeps.verdicts.until_decided import START
@@ -257,12 +243,14 @@ def plans_of(
             seeds=seeds,
             scale=options.scale,
             form="paper" if options.form == "both" else options.form,
-            rows=options.rows,
+            rows="" if is_both else options.rows,
             overrides=extra,
-            others=("form=both",) if is_both else (),
+            others=("form=both", f"rows={options.rows}") if is_both else (),
             until_decided=adds,
         )
-        request, rows = make_request(name, both_forms(table) if is_both else table, words)
+        if is_both:
+            table = both_forms(select_rows(table, options.rows) if options.rows else table)
+        request, rows = make_request(name, table, words)
         check_rows(request, planner)
         most = options.max_seeds if adds else None
         plans.append(TablePlan.of(request, rows, runs, planner.base, most))

@@ -10,6 +10,7 @@ from analysis.uncertainty.contrasts import FIXED
 from analysis.uncertainty.verdicts import AnyTime, FixedSeeds
 from rgbt.checks import InputError
 from sweeps.table.cells import CellRun
+from sweeps.table.efficiency import exact_sizes
 from sweeps.table.external import ExternalRow
 from sweeps.table.external_runs import check_external, run_external
 from sweeps.table.request import TableRequest
@@ -61,10 +62,11 @@ class TablePlan:
         """
         if max_seeds is not None and not request.table.claims:
             raise InputError(
-                f"seeds=until_decided: {request.name} has no claims with these rows; give a number "
-                "of seeds, or add claims to the table."
+                f"seeds=until_decided: {request.name} has no claims with these rows (and none with "
+                "form=both); give a number of seeds, or add claims to the table."
             )
-        judge = TableJudge(request.name, request.table, AnyTime() if max_seeds else FixedSeeds())
+        rule = AnyTime() if max_seeds else FixedSeeds()
+        judge = TableJudge(request.name, request.table, rule, sizes=exact_sizes(request))
         external: dict[CellRunId, CellRun] = {}
         more = max_seeds and SeedsUntilDecided(request, judge, max_seeds, external)
         points = PointList(

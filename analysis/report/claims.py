@@ -33,7 +33,7 @@ def judge_of(draft: RescoredTable, resamples: int) -> TableJudge:
 def seeds_were_added(draft: RescoredTable) -> bool:
     """Whether the number of seeds of a table depends on its results, by the tags of its runs."""
     keys = {run.key for outcome in draft.outcomes.values() for run in outcome.results}
-    return any(draft.recorded.name in draft.runs[key].until_decided for key in keys)
+    return any(draft.runs[key].until_decided for key in keys)
 
 
 def claim_entries(

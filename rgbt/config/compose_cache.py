@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import pickle
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -77,6 +78,8 @@ def _divided(
             return None
         if override.package is None and ("." in key or key in values):
             rest.append(override)
+        elif isinstance(override.value(), dict):
+            return None  # Hydra sets whole nodes in the order of the words
         else:
             chosen.append(word)
     return tuple(chosen), tuple(rest)
@@ -94,5 +97,7 @@ def _states(folder: str) -> list[FileState]:
     """The state of every file in a folder, sorted; [] where there is none."""
     found: list[FileState] = []
     for parent, _, names in os.walk(folder):
-        found += [file_state(Path(parent, name)) for name in names if name.endswith(".yaml")]
+        files = (name for name in names if name.endswith(".yaml") and name[0] != ".")
+        with suppress(FileNotFoundError):  # removed since, or a link to nothing
+            found += [file_state(Path(parent, name)) for name in files]
     return sorted(found)

@@ -8,7 +8,6 @@ the predictions of its network. Both runs share seed, scale and data set
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterator, Sequence
 from functools import cache
@@ -19,7 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from rgbt.checks import InputError, nearest
 from rgbt.config.component import RUN_SETTINGS, Component
-from rgbt.config.compose import available, check_keys, compose, own_folders
+from rgbt.config.compose import available, check_keys, compose
 from rgbt.config.hydra_messages import own_folder_hint
 from rgbt.config.values import check_value
 from rgbt.spec.run_spec import (
@@ -132,30 +131,9 @@ def _dependencies(
                 circle = " -> ".join((*downstream, experiment))
                 raise InputError(f"{key} makes a cycle of upstream runs: {circle}.")
             typed = [f"+experiment={experiment}", *_shared_overrides(overrides, key)]
-            run = _upstream_run(config, key, experiment, typed, downstream)
+            upstream = upstream_config(config, key, experiment)
+            run = specify(upstream, typed, downstream=downstream)
             yield Dependency(key, run, checkpoint)
-
-
-def _upstream_run(
-    config: DictConfig,
-    key: str,
-    experiment: str,
-    typed: Sequence[str],
-    downstream: tuple[str, ...],
-) -> RunSpec:
-    """The upstream run; several runs that share the same settings have the same one."""
-    shared = _shared_settings(config, key)
-    about = (key, experiment, config.scale.name, own_folders(), *typed, *downstream)
-    text = json.dumps([*about, shared], default=str)
-    if text not in _upstream:
-        if len(_upstream) >= MOST_NODES:
-            _upstream.clear()
-        upstream = upstream_config(config, key, experiment)
-        _upstream[text] = specify(upstream, typed, downstream=downstream)
-    return _upstream[text]
-
-
-_upstream: dict[str, RunSpec] = {}
 
 
 def parse_reference(key: str, value: str | None) -> tuple[str, CheckpointFile] | None:
@@ -186,7 +164,7 @@ def upstream_config(config: DictConfig, key: str, experiment: str) -> DictConfig
     Shared are `SHARED`, the sizes of the scale and durations that were typed; for weights also the
     network. Everything else is the experiment's own.
     """
-    upstream = _composed(experiment, config.scale.name, own_folders()).copy()
+    upstream = _composed(experiment, config.scale.name)
     if key == WEIGHTS:
         own = RUN_SETTINGS["model"]
         upstream.model = {each: upstream.model._get_node(each) for each in own}
@@ -211,9 +189,7 @@ def _shared_settings(config: DictConfig, key: str) -> dict[str, Any]:
     return values
 
 
-@cache
-def _composed(experiment: str, scale: str, _own: str) -> DictConfig:
-    """Cached, because composing takes long and the seeds of a table share their upstream runs."""
+def _composed(experiment: str, scale: str) -> DictConfig:
     chosen = compose([f"+experiment={experiment}"])  # often composed already, for a row of a table
     if chosen.scale.name == scale:
         return chosen

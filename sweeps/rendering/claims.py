@@ -19,9 +19,10 @@ CSV_HEADER = (
     *("covers", "printed", "as_printed", "smallest", "seeds", "seeds_needed", "missing", "reason"),
 )
 NOTES = (
-    "difference: mean over paired seeds; interval over images and seeds. can show: the smallest "
-    "difference that these seeds could have shown; would decide: seeds with which a difference as "
-    "large as ours would be decided.",
+    "difference: mean over paired seeds; interval over images and seeds, of one seed over images "
+    "alone. can show: the smallest difference that these seeds could have shown; would decide: "
+    "seeds with which a difference as large as ours would be decided.",
+    "A verdict is about the direction and the bounds of a claim, not about a size in its words. "
     "Each interval holds the truth in 95 % of cases by itself; of many claims without an effect, "
     "2.5 % are called holding.",
 )
@@ -58,14 +59,20 @@ def _plural(word: str, count: int) -> str:
     return "hold" if word == "holds" and count > 1 else word
 
 
-def claims_markdown(judged: Sequence[JudgedClaim]) -> str:
-    """The claims in Markdown: a table, then each statement with its place and its reason."""
-    grid = claims_grid(judged, "Claims of the paper")
+def claims_markdown(judged: Sequence[JudgedClaim], *, tables: bool = False) -> str:
+    """The claims in Markdown: a table, then each statement with its place and its reason.
+
+    Args:
+        judged: claims of one or several tables.
+        tables: name the table of each claim.
+    """
+    grid = claims_grid(judged, "Claims of the paper", tables=tables)
     lines = [grid.to_markdown(), ""]
     for each in judged:
         reason = f" {each.reason}" if each.reason else ""
+        name = f"{each.table} `{each.claim.name}`" if tables else f"`{each.claim.name}`"
         lines.append(
-            f"- `{each.claim.name}`, **{each.word}**: {each.claim.says} ({each.claim.source}) "
+            f"- {name}, **{each.word}**: {each.claim.says} ({each.claim.source}) "
             f"{printed_sentence(each)}{reason}".rstrip()
         )
         lines += [f"    - {remark}" for remark in each.claim.remarks]
@@ -113,7 +120,7 @@ def _fields(judged: JudgedClaim) -> tuple[str, ...]:
         needed = f"{found.seeds_needed:.0f}"
     return (
         *(judged.word, judged.contrast, f"{found.estimate:+.2f}", shown, printed),
-        *(number(found.smallest), seeds, needed),
+        *(number(found.smallest) if found.seeds != 1 else ABSENT, seeds, needed),
     )
 
 

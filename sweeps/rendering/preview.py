@@ -84,8 +84,8 @@ def most_line(most: int, outcomes: Sequence[Outcome], workers: int) -> str:
     seconds = [outcome.seconds for outcome in outcomes if outcome.seconds is not None]
     time = f", {duration(further * median(seconds) / workers)}" if seconds else ""
     return (
-        f"Until all claims are decided: at most {further} further runs{time}; rows of decided "
-        "claims get no more."
+        f"Until all claims are decided: at most {further} runs more than these{time}; rows of "
+        "decided claims get no more."
     )
 
 

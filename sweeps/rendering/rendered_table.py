@@ -202,7 +202,8 @@ class _LineBuilder:
     def row(self, row: Row) -> list[TableLine]:
         """The lines of one row: a single one for few columns."""
         columns = self.columns
-        needs = row.needs and f"Cannot be run yet: {row.needs}"
+        is_run = any((row.label, column.name) in self.scored.cells for column in columns)
+        needs = f"Cannot be run yet: {row.needs}" if row.needs and not is_run else None
         remarks = row.remarks if not row.doubtful else ()
         label = TextCell(row.label, notes=self.notes(needs, self._same_runs(row), *remarks))
         if self.on_one_line:

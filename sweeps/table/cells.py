@@ -20,6 +20,9 @@ NO_VALUE = "no value"
 OWN_COUNTS = "counts_test.npz"
 """Path of the counts of the evaluation that every run makes itself, relative to the run folder."""
 
+NO_SEED = "-1"
+"""The seed of a row that was not trained here, as text (`analysis.uncertainty.contrasts.FIXED`)."""
+
 CellId = tuple[str, str]
 """(label of the row, name of the column)."""
 
@@ -188,7 +191,9 @@ def over_seeds(
         if isinstance(each, str):
             reasons.setdefault(each, []).append(str(seed))
     sentences = [
-        f"seed{'s' if len(seeds) > 1 else ''} {', '.join(seeds)}: {reason}"
+        reason
+        if seeds == [NO_SEED]
+        else f"seed{'s' * (len(seeds) > 1)} {', '.join(seeds)}: {reason}"
         for reason, seeds in reasons.items()
     ]
     return TableCell(

@@ -37,7 +37,8 @@ class Claim:
         columns: names of columns.
         minus_column: a column that is subtracted from each of `columns`.
         expected: of each contrast. "similar" needs `at_most`.
-        at_least: smallest size of the difference that the statement means, >= 0.
+        at_least: smallest size of the difference that the statement means; below 0 for "not worse
+            by more than".
         at_most: largest size, e.g. of a "small improvement".
         combine: "all": each contrast is as expected; "most": more than half of them; "any": one of
             them; "mean": their mean is.

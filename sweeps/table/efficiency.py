@@ -97,6 +97,19 @@ def efficiency_cells(request: TableRequest, folder: Path) -> dict[CellId, TableC
     return cells
 
 
+def exact_sizes(request: TableRequest) -> dict[CellId, float]:
+    """Millions of parameters of the cells that claims of the table are about."""
+    named = {name for claim in request.table.claims for name in claim.columns}
+    columns = [each for each in request.table.columns if each.efficiency == "parameters"]
+    wanted = [column for column in columns if column.name in named]
+    networks = _networks(request, request.table.runnable_rows if wanted else [])
+    return {
+        (label, column.name): networks.parameters[overrides]
+        for label, (overrides, _) in networks.rows.items()
+        for column in wanted
+    }
+
+
 def _networks(request: TableRequest, rows: Sequence[Row]) -> _Networks:
     """The network of every row, counted once if rows share it."""
     at_paper = replace(request, scale=SCALE, pretrained={})

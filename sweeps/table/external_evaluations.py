@@ -125,15 +125,16 @@ def hash_of(description: dict[str, object]) -> str:
 
 
 def content_hash(path: Path) -> str:
-    """SHA-256 in hexadecimal of a file, or of names and contents of the files of a folder.
+    """SHA-256 in hexadecimal of a file, or of names and contents of all files in a folder.
 
     Hidden files and folders inside it are left out.
     """
     if path.is_file():
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
-    files = (each for each in path.iterdir() if each.is_file() and each.name[0] != ".")
-    lines = [f"{content_hash(each)} {each.name}\n" for each in sorted(files)]
+    inside = ((each, each.relative_to(path)) for each in sorted(path.rglob("*")) if each.is_file())
+    shown = ((each, name) for each, name in inside if not any(p[0] == "." for p in name.parts))
+    lines = [f"{content_hash(each)} {name.as_posix()}\n" for each, name in shown]
     return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from rgbt.checks import InputError, check_choice, nearest
 from rgbt.config.compose import available
 from sweeps.table.external import ExternalRow, external_rows
-from sweeps.table.load_table import load_table
+from sweeps.table.load_table import PUBLISHED, load_table, table_names
 from sweeps.table.request import PRETRAINED, TableRequest
 from sweeps.table.rows import select_rows
 from sweeps.table.scoring import check_metrics
@@ -26,7 +26,12 @@ def read_named(name: str) -> tuple[str, Table]:
     """
     table = load_table(name)
     if name.endswith((".yaml", ".yml")):
-        name = f"{table.paper}/{Path(name).stem}"
+        path, name = Path(name).expanduser(), f"{table.paper}/{Path(name).stem}"
+        if name in table_names(PUBLISHED / "none") and not path.resolve().is_relative_to(PUBLISHED):
+            raise InputError(
+                f"table={path}: '{name}' is a published table, whose records it would replace; "
+                "change `paper` in the file, or its name."
+            )
     check_metrics(table)
     if not re.fullmatch(NAME, name):
         raise InputError(
@@ -34,6 +39,28 @@ def read_named(name: str) -> tuple[str, Table]:
             "rename the file."
         )
     return name, table
+
+
+def check_override(word: str) -> None:
+    """Refuse an override that belongs to the rows or columns of a table.
+
+    Raises:
+        InputError: in one sentence, with what to do instead.
+    """
+    key = word.lstrip("+~").partition("=")[0]
+    if key in ("seed", "experiment"):
+        other = "seeds=3" if key == "seed" else "another table"
+        raise InputError(f"'{word}' is set by the rows of the table; choose {other}.")
+    if key.rpartition("@")[2].partition(".")[0] == "consistency":
+        raise InputError(
+            f"'{word}': the columns of the table define what is counted, on the published sets "
+            "of views; measure others with rgbt consistency run=..."
+        )
+    if key == "metric" or key.startswith("metric."):
+        raise InputError(
+            f"'{word}': the columns of the table define what is counted; set `regions` in your "
+            "own table."
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

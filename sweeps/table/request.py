@@ -171,7 +171,7 @@ def seeds_of(text: str) -> tuple[int, ...]:
         or (counted and not any(numbers))
     ):
         raise InputError(
-            f"seeds={text}: expected a number of seeds (3: seeds 0, 1, 2) or a list of different "
-            "seeds (0,4,7)."
+            f"seeds={text}: expected a number of seeds (3: seeds 0, 1, 2), a list of different "
+            "seeds (0,4,7), or until_decided."
         )
     return tuple(range(numbers[0])) if counted else numbers

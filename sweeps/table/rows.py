@@ -28,12 +28,15 @@ def select_rows(table: Table, text: str) -> Table:
         InputError: a name that no row has, or several.
     """
     labels = [row.label for row in table.rows]
-    chosen = {find_label(word, labels, "rows=") for word in split_list(text, "rows")}
-    rows = tuple(
-        row if row.same_as in chosen else replace(row, same_as=None)
-        for row in table.rows
-        if row.label in chosen
-    )
+    chosen = {find_label(word, labels, "rows=") for word in _listed(text, labels)}
+    by_label = {row.label: row for row in table.rows}
+    first: dict[str, str] = {}
+    rows: list[Row] = []
+    for row in table.rows:
+        if row.label in chosen:
+            *_, root = (row.label, *_chain(by_label, row.label))
+            same = first.setdefault(root, row.label)
+            rows.append(replace(row, same_as=None if same == row.label else same))
 
     def is_left(names: Sequence[str]) -> bool:
         return names == (PREVIOUS,) or set(names) <= chosen
@@ -43,7 +46,18 @@ def select_rows(table: Table, text: str) -> Table:
     complete = len(rows) == len(table.rows)
     kept = tuple(table.claims if complete else claims)
     assert all(OTHERS not in each.against for each in kept) or complete
-    return replace(table, rows=rows, claims=kept)
+    return replace(table, rows=tuple(rows), claims=kept)
+
+
+def _listed(text: str, labels: Sequence[str]) -> Iterator[str]:
+    """The parts of a list with commas; a label that has commas itself is one part."""
+    parts = split_list(text, "rows")
+    while parts:
+        ends = range(len(parts), 0, -1)
+        joined = [(end, ", ".join(parts[:end])) for end in ends]
+        end, word = next((each for each in joined if each[1] in labels), (1, parts[0]))
+        yield word
+        parts = parts[end:]
 
 
 def check_rows(request: TableRequest, planner: Planner) -> None:

@@ -6,11 +6,12 @@ initial weights and the order of their data.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from statistics import fmean
 
-from analysis.uncertainty import Resampling
+from analysis.uncertainty import Interval, Resampling
 from analysis.uncertainty.contrasts import Evidence, Resampler, Term
 from analysis.uncertainty.verdicts import FixedSeeds, Rule, Verdict, decide
 from rgbt.checks import InputError
@@ -66,12 +67,14 @@ class TableJudge:
         name: of the table.
         rule: when a claim is decided.
         resamples: of the images.
+        sizes: exact values of cells that are counted without a run.
     """
 
     name: str
     table: Table
     rule: Rule = field(default_factory=FixedSeeds)
     resamples: int = RESAMPLES
+    sizes: Mapping[CellId, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._rows = {row.label: row for row in self.table.rows}
@@ -86,6 +89,7 @@ class TableJudge:
     def judge(self, claim: Claim, runs: Mapping[CellRunId, CellRun]) -> JudgedClaim:
         """One claim; a contrast without scores leaves a claim about all of them undecided."""
         contrasts = contrasts_of(claim, self.table)
+        exact = [self._exact(each) for each in contrasts]
         printed = [printed_value(each, self.table) for each in contrasts]
         known: list[int] = []
         evidences: list[Evidence] = []
@@ -102,7 +106,18 @@ class TableJudge:
             except InputError as error:
                 reasons[str(error)] = None
         missing = self._missing(contrasts, runs)
-        agrees = _as_printed(claim, printed)
+        agrees = as_claimed(claim, printed)
+        counted = as_claimed(claim, exact)
+        if counted is not None:
+            return JudgedClaim(
+                table=self.name,
+                claim=claim,
+                verdict=_exact_verdict(exact, is_so=counted),
+                contrast=contrasts[0].label,
+                printed=printed[0],
+                as_printed=agrees,
+                complete=True,
+            )
         if not evidences:
             return JudgedClaim(
                 table=self.name,
@@ -131,6 +146,12 @@ class TableJudge:
             complete=not is_partial,
             reason=verdict.reason,
         )
+
+    def _exact(self, contrast: Contrast) -> float | None:
+        """The value of a contrast of exact cells; None where one of them is not."""
+        cells = [(weight, self.sizes.get((row, name))) for weight, row, name in contrast.cells()]
+        known = [weight * value for weight, value in cells if value is not None]
+        return sum(known) if len(known) == len(cells) else None
 
     def evidence(
         self, contrasts: Sequence[tuple[float, Contrast]], runs: Mapping[CellRunId, CellRun]
@@ -178,12 +199,12 @@ class TableJudge:
             try:
                 found = self.evidence([(1.0, Contrast(label, None, column))], runs)
             except InputError:
-                continue
+                return []  # a row without a score may be better than all others
             means[label] = fmean(found.values)
         if len(means) < 2:
             return []
         best = (max if highest else min)(means, key=lambda label: means[label])
-        same = [label for label in means if _keys(label, runs) == _keys(best, runs)]
+        same = [label for label in means if self._is_same(Contrast(best, label, column), runs)]
         others = [Contrast(best, label, column) for label in means if label not in same]
         if not others:
             return []
@@ -208,17 +229,19 @@ class TableJudge:
 
     def _check_differ(self, contrast: Contrast, runs: Mapping[CellRunId, CellRun]) -> None:
         """Refuse two rows of the same runs: their difference is 0 and says nothing."""
-        if contrast.other is None:
-            return
+        if contrast.other is not None and self._is_same(contrast, runs):
+            raise InputError(
+                f"rows '{contrast.row}' and '{contrast.other}' are the same runs at this scale."
+            )
+
+    def _is_same(self, contrast: Contrast, runs: Mapping[CellRunId, CellRun]) -> bool:
+        """Whether both rows of a contrast are the same scores of the same runs."""
         keys = [_keys(label, runs) for label in contrast.rows]
         metrics = [
             [metric_of(base, self._rows[label]) for base in self._bases(contrast, label)]
             for label in contrast.rows
         ]
-        if keys[0] and keys[0] == keys[1] and metrics[0] == metrics[1]:
-            raise InputError(
-                f"rows '{contrast.row}' and '{contrast.other}' are the same runs at this scale."
-            )
+        return bool(keys[0]) and keys[0] == keys[-1] and metrics[0] == metrics[-1]
 
     def _bases(self, contrast: Contrast, label: str) -> list[Column]:
         names = {column for _, _, column in contrast.cells()}
@@ -276,10 +299,10 @@ def _keys(label: str, runs: Mapping[CellRunId, CellRun]) -> frozenset[str]:
     return frozenset(result.key for run in found for result in run.results)
 
 
-def _as_printed(claim: Claim, printed: Sequence[float | None]) -> bool | None:
-    """Whether the printed values agree with the claim; None where some are missing."""
-    values = [value for value in printed if value is not None]
-    if len(values) < len(printed):
+def as_claimed(claim: Claim, contrasts: Sequence[float | None]) -> bool | None:
+    """Whether exact values of its contrasts agree with a claim; None where some are missing."""
+    values = [value for value in contrasts if value is not None]
+    if len(values) < len(contrasts):
         return None
     low, high = claim.range
     if claim.combine == "mean":
@@ -287,6 +310,21 @@ def _as_printed(claim: Claim, printed: Sequence[float | None]) -> bool | None:
     inside = sum(low < value < high for value in values)
     least = {"all": len(values), "most": len(values) // 2 + 1, "any": 1}[claim.combine]
     return inside >= least
+
+
+def _exact_verdict(values: Sequence[float | None], *, is_so: bool) -> Verdict:
+    first = values[0] or 0.0
+    return Verdict(
+        kind="holds" if is_so else "contradicted",
+        estimate=first,
+        interval=Interval(first, first),
+        covers="none",
+        smallest=0.0,
+        seeds=0,
+        seeds_needed=0,
+        decisive=0,
+        reason="Counted, not estimated.",
+    )
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
@@ -302,4 +340,5 @@ def _of_a_part(verdict: Verdict, claim: Claim, reason: str) -> Verdict:
     stands = {"all": "contradicted", "any": "holds"}.get(claim.combine)
     if verdict.kind == stands:
         return verdict
-    return replace(verdict, kind="undecided", reason=f"Some rows have no score: {reason}")
+    reason = f"Some rows have no score: {reason}"
+    return replace(verdict, kind="undecided", seeds_needed=math.nan, reason=reason)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +13,7 @@ from rgbt.tracking.run_folder import runs_in
 from rgbt.tracking.run_result import RunResult
 from sweeps.table.request import UNTIL_DECIDED, TableRequest
 from sweeps.verdicts.judge import CellRunId
-from sweeps.worker.planner import specify_run
+from sweeps.worker.planner import Planner
 
 SEED = "rgbt.seed"
 
@@ -43,30 +43,43 @@ def finished_by_seed(runs_dir: Path) -> dict[int, set[str]]:
 
 
 def stored_runs(
-    request: TableRequest, runs_dir: Path, finished: Mapping[int, Collection[str]]
+    request: TableRequest,
+    runs_dir: Path,
+    finished: Mapping[int, Collection[str]],
+    planner: Planner,
 ) -> dict[CellRunId, StoredRun]:
     """The finished runs of every row; rows that cannot be composed have none.
 
     Args:
         request: the table; its seeds do not matter.
         runs_dir: the folder of runs.
+        planner: of the runs.
         finished: see `finished_by_seed`.
+
+    Raises:
+        InputError: no row can be composed.
     """
     runs: dict[CellRunId, StoredRun] = {}
+    errors = []
     for row in request.trained_rows:
         try:
-            spec = specify_run(request.overrides(row.label, 0))
+            spec = planner.specify((*planner.base, *request.overrides(row.label, 0)))
             keys = {seed: spec.with_seed(seed).key for seed in finished}
-        except InputError:
+        except InputError as error:
+            errors.append(error)
             continue
         for seed, key in sorted(keys.items()):
             if key in finished[seed]:
                 runs[row.label, seed] = StoredRun((RunResult(runs_dir / key),))
+    if errors and len(errors) == len(request.trained_rows):
+        raise errors[0]  # of the command, and not of a row
     return runs
 
 
-def rule_of(request: TableRequest, runs: Mapping[CellRunId, StoredRun]) -> Rule:
-    """The rule that the runs allow: valid at any time where their number was decided by results."""
-    tag = UNTIL_DECIDED + request.name
-    tagged = any(tag in result.tags for run in runs.values() for result in run.results)
+def rule_of(tags: Iterable[Mapping[str, str]]) -> Rule:
+    """The rule that runs allow, by their tags: valid at any time where results decided how many.
+
+    The tag of any table counts, because tables share runs.
+    """
+    tagged = any(name.startswith(UNTIL_DECIDED) for each in tags for name in each)
     return AnyTime() if tagged else FixedSeeds()

@@ -6,6 +6,7 @@ run that two of them want is done once. The rule must be valid at any time it is
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -19,6 +20,9 @@ from sweeps.worker.trial_sources import Outcome
 START = 4
 """Seeds of every row before the claims are judged for the first time: with fewer, an interval that
 is valid at any time is infinite."""
+
+HOPELESS = 8
+"""Seeds after which a claim that would need more than 1,000 of them gets no more."""
 
 
 @dataclass
@@ -98,6 +102,8 @@ class SeedsUntilDecided:
 
     def most_runs(self) -> list[Point]:
         """Every point that may be run: `max_seeds` of rows of claims, `START` of others."""
+        if not self.request.row_seeds():
+            return []
         named = {
             label
             for claim in self.request.table.claims
@@ -125,5 +131,15 @@ class SeedsUntilDecided:
 
 
 def _is_open(judged: JudgedClaim) -> bool:
-    """Whether further seeds may decide a claim: every contrast of it has scores."""
-    return judged.word == "undecided" and judged.complete
+    """Whether further seeds may decide a claim.
+
+    Not without scores of every contrast or with too few images for an interval, and not where the
+    estimate of `HOPELESS` seeds says that no affordable number of seeds decides it. To stop for
+    such a reason cannot make a verdict wrong.
+    """
+    found = judged.verdict
+    if found is None or judged.word != "undecided" or not judged.complete:
+        return False
+    if found.seeds >= START and found.interval is None:
+        return False
+    return found.seeds < HOPELESS or math.isfinite(found.seeds_needed)

@@ -58,6 +58,7 @@ class FakeResult:
     by_path: Mapping[str, Counts]
     commit: str | None = "aaaaaaaaaa"
     other_code: str | None = None
+    tags: Mapping[str, str] = field(default_factory=dict)
 
     def counts(self, path: str = OWN_COUNTS) -> Counts:
         return self.by_path[path]

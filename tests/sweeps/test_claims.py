@@ -114,7 +114,7 @@ def test_dry_run_says_what_deciding_may_cost(call: Call, place: Path) -> None:
     code, out, _ = call(reproduce, *words, "dry_run=true")
     assert code == 0
     assert "12 runs: 9 finished, 3 waiting." in out
-    assert "at most 3 further runs" in out
+    assert "at most 3 runs more than these" in out
 
 
 @pytest.mark.parametrize(
@@ -153,6 +153,17 @@ def test_words_that_do_not_fit(call: Call, place: Path) -> None:
         (("masker=none",), "would replace what the rows"),
     ):
         code, _, err = call(reproduce, "table=my/planted", "tracking=none", *words)
+        assert code == 2, words
+        assert_one_sentence(err, told)
+    (place / "runs").mkdir(exist_ok=True)
+    (place / "file.pth").touch()
+    for words, told in (
+        (("masker=none",), "would replace what the rows"),
+        (("masker.blok=3",), "blok"),
+        (("weights.low=file.pth",), "use rgbt reproduce table=my/planted"),
+        (("seed=3",), "is set by the rows of the table"),
+    ):
+        code, _, err = call(claims, "table=my/planted", *words)
         assert code == 2, words
         assert_one_sentence(err, told)
     code, _, err = call(claims, "table=my/planted", "runs_dir=nowhere")

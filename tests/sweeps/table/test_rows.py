@@ -63,6 +63,19 @@ def test_selected_rows_keep_their_claims() -> None:
     assert select_rows(made, "a,b,c").claims == made.claims
 
 
+def test_twins_of_a_row_that_is_left_out_stay_declared() -> None:
+    rows = (
+        Row(label="a", experiment="crm"),
+        Row(label="b", experiment="crm", same_as="a"),
+        Row(label="c", experiment="crm", same_as="a"),
+        Row(label="d, with comma", experiment="grbm"),
+    )
+    chosen = select_rows(of(*rows), "b,c,d, with comma")
+    assert [(row.label, row.same_as) for row in chosen.rows] == [
+        *(("b", None), ("c", "b"), ("d, with comma", None)),
+    ]
+
+
 def asked(name: str, *extra: str, rows: str = "", scale: str = "demo") -> TableRequest:
     made = load_table(name)
     chosen = select_rows(made, rows) if rows else made

@@ -162,3 +162,23 @@ def test_rows_of_the_same_runs_share_a_mark() -> None:
     found = made.judge(one, runs)  # type: ignore[arg-type]
     assert found.word == "not run"
     assert found.reason == "rows 'high' and 'again' are the same runs at this scale."
+
+
+def test_nothing_is_marked_while_a_row_has_no_score() -> None:
+    rows = tuple(Row(label=label, experiment="crm") for label in ("low", "high", "later"))
+    runs: dict[CellRunId, Outcome] = {
+        **planted({"low": (50.0, 51.0, 49.0), "high": (60.0, 61.0, 60.0)}),
+        ("later", 0): failed("out of memory"),
+    }
+    assert TableJudge("own/t", table(rows, (ACC,)), resamples=200).marks(runs) == {}
+
+
+def test_claims_about_counted_sizes_are_exact() -> None:
+    size = Column(name="size", efficiency="parameters")
+    rows = tuple(Row(label=label, experiment="crm") for label in ("small", "large"))
+    one = claim(rows=("small",), against=("large",), columns=("size",), expected="lower")
+    sizes = {("small", "size"): 3.0, ("large", "size"): 5.0}
+    for given, word in ((sizes, "holds"), ({**sizes, ("small", "size"): 6.0}, "contradicted")):
+        made = TableJudge("own/t", table(rows, (size,), claims=(one,)), sizes=given)
+        assert made.judge(one, {}).word == word
+    assert TableJudge("own/t", table(rows, (size,), claims=(one,))).judge(one, {}).word == "not run"
