@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 from analysis.uncertainty.verdicts import decide
-
 from rgbt.checks import InputError
 from rgbt.metrics import names
 from rgbt.tracking.tables import ABSENT, TextTable
