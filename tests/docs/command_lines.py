@@ -24,7 +24,7 @@ from tests.docs.blocks import ROOT, PageError
 from tests.docs.shell import PLACEHOLDER, Line, without_runs
 
 HELP = ("-h", "--help", "--version")
-NOT_COMPOSED = ("corruption.", "weights.", "predictions.", "hydra.searchpath=")
+NOT_COMPOSED = ("corruption.", "weights.", "predictions.", "pretrained.", "hydra.searchpath=")
 """Words that are no overrides of one configuration: what a command reads by itself."""
 
 FILES = {
