@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rgbt.metrics import names
+from sweeps.table.cells import headline_columns
 from sweeps.table.efficiency import SCALE
 from sweeps.table.scoring import ScoredTable, published
 from sweeps.table.table import Column, Row
@@ -30,9 +30,6 @@ FAR_APART = 2.0
 
 MAX_PANELS = 4
 """Columns of a table without headlines up to which each has a panel."""
-
-HEADLINES = (names.MIOU, names.VAR, names.TC, names.CA, names.CA_RELEASED)
-"""What a figure is about where a table has it, over all images, those of the day or the night."""
 
 MAX_HEADLINES = 5
 """Of a table; those after them are left out of its figure."""
@@ -69,9 +66,7 @@ def draw_table(scored: ScoredTable, path: Path) -> bool:
 def main_columns(scored: ScoredTable) -> list[Column]:
     """What the figure shows: the headlines that the table has, else all of a few columns."""
     columns = [column for column in scored.table.columns if _has_values(scored, column)]
-    parts = ("", f"{names.DAY}/", f"{names.NIGHT}/")
-    headlines = {part + score for part in parts for score in HEADLINES}
-    chosen = [column for column in columns if column.metric in headlines]
+    chosen = headline_columns(columns)
     if chosen:
         return chosen[:MAX_HEADLINES]
     return columns if len(columns) <= MAX_PANELS else []

@@ -9,10 +9,14 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from rgbt.checks import InputError
+from rgbt.metrics import names
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.table.table import Column, Row, Table
+
+HEADLINES = (names.MIOU, names.VAR, names.TC, names.CA, names.CA_RELEASED)
+"""The scores that a table is about, where it has them."""
 
 NO_VALUE = "no value"
 """Mark of a cell whose run is finished but has no value for the column."""
@@ -109,6 +113,13 @@ def counts_path(column: Column, table: Table) -> str:
     """Path of the column's counts, relative to the run folder."""
     evaluation = evaluation_of(column, table)
     return OWN_COUNTS if evaluation is None else evaluation.path
+
+
+def headline_columns(columns: Sequence[Column]) -> list[Column]:
+    """Those of `HEADLINES`, over all images or those of the day or the night."""
+    parts = ("", f"{names.DAY}/", f"{names.NIGHT}/")
+    headlines = {part + score for part in parts for score in HEADLINES}
+    return [column for column in columns if column.metric in headlines]
 
 
 def is_counted(column: Column) -> bool:

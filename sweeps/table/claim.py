@@ -17,6 +17,9 @@ PREVIOUS = "previous"
 """In `Claim.against`: the row before in `Claim.rows`."""
 
 Range = tuple[float, float]
+HIGHER: Range = (0.0, math.inf)
+LOWER: Range = (-math.inf, 0.0)
+"""Of a difference whose size does not matter."""
 
 
 @dataclass(frozen=True, kw_only=True)

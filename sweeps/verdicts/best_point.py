@@ -20,10 +20,10 @@ from analysis.uncertainty import Resampling
 from analysis.uncertainty.contrasts import Resampler, Term
 from analysis.uncertainty.sequence import half_width
 from analysis.uncertainty.verdicts import AnyTime, Verdict, decide
-from rgbt.checks import InputError
-from rgbt.metrics.counts import Counts
 from sweeps.table.cells import CellRun, ScoredRun
+from sweeps.table.claim import HIGHER, LOWER
 from sweeps.verdicts.judge import RESAMPLES, CellRunId
+from sweeps.verdicts.loaded_counts import LoadedCounts
 
 ERROR_RATE = 0.025
 """Bound of the share of searches whose best point is called worse than another one."""
@@ -135,7 +135,7 @@ class BestPointJudge:
 
     def __post_init__(self) -> None:
         self._resampler = Resampler(self.settings)
-        self._counts: dict[tuple[str, str], Counts] = {}
+        self._counts = LoadedCounts()
         self._rule = AnyTime(level=level_of(len(self.files)))
 
     def race(self, runs: Mapping[CellRunId, CellRun]) -> Race:
@@ -201,7 +201,7 @@ class BestPointJudge:
             return None
         pair = ((1.0, label), (-1.0, other))
         terms = [self._term(weight, each, finished[each]) for weight, each in pair]
-        wanted = (-math.inf, 0.0) if self.maximize else (0.0, math.inf)
+        wanted = LOWER if self.maximize else HIGHER
         return decide([self._resampler.evidence(terms)], wanted, self._rule, "all")
 
     def _term(self, weight: float, label: str, own: Mapping[int, ScoredRun]) -> Term:
@@ -209,14 +209,6 @@ class BestPointJudge:
         return Term(
             weight=weight,
             metric=file.metric,
-            counts={seed: self._loaded(run, file.path) for seed, run in own.items()},
+            counts={seed: self._counts.of(run, file.path) for seed, run in own.items()},
             keys={seed: f"{run.key}/{file.path}" for seed, run in own.items()},
         )
-
-    def _loaded(self, run: ScoredRun, path: str) -> Counts:
-        if (run.key, path) not in self._counts:
-            try:
-                self._counts[run.key, path] = run.counts(path)
-            except OSError as error:
-                raise InputError(f"run {run.key}: {error}") from error
-        return self._counts[run.key, path]

@@ -7,21 +7,16 @@ from dataclasses import replace
 
 from analysis.uncertainty.verdicts import decide
 from rgbt.checks import InputError
-from rgbt.metrics import names
 from rgbt.tracking.tables import ABSENT, TextTable
-from sweeps.table.cells import CellRun, is_counted
-from sweeps.table.claim import Claim
-from sweeps.table.table import Column, Row, Table
+from sweeps.table.cells import CellRun, headline_columns, is_counted
+from sweeps.table.claim import HIGHER
+from sweeps.table.table import Row, Table
 from sweeps.verdicts.contrasts import Contrast
 from sweeps.verdicts.judge import CellRunId, TableJudge
 
 RELEASED = ", released"
 """Ending of the label of a row in its released form, beside the row of the paper's form."""
 
-HEADLINES = (names.MIOU, names.VAR, names.TC, names.CA, names.CA_RELEASED)
-"""Scores whose differences are shown where a table has them; else those of all columns."""
-
-HIGHER = Claim(name="form", says="", source="", rows=(), columns=(), expected="higher").range
 WORDS = {"holds": "released is higher", "contradicted": "released is lower"}
 HEADER = ("row, column", "released - paper", "95 % interval", "seeds", "shown")
 TITLE = "Difference of the forms"
@@ -68,13 +63,14 @@ def forms_grid(judge: TableJudge, runs: Mapping[CellRunId, CellRun]) -> TextTabl
     Returns:
         None where the table has one form.
     """
+    scores = list(filter(is_counted, judge.table.columns))
     labels = {row.label for row in judge.table.rows}
     both = [label for label in labels if f"{label}{RELEASED}" in labels]
     rows = [
         _line(judge, Contrast(f"{row.label}{RELEASED}", row.label, column.name), runs)
         for row in judge.table.rows
         if row.label in both
-        for column in _headlines(judge.table)
+        for column in headline_columns(scores) or scores
     ]
     return TextTable(TITLE, HEADER, tuple(rows)) if rows else None
 
@@ -91,10 +87,3 @@ def _line(
     shown = ABSENT if interval is None else f"[{interval.low:+.2f}, {interval.high:+.2f}]"
     word = WORDS.get(found.kind, "not shown")
     return name, f"{found.estimate:+.2f}", shown, str(found.seeds), word
-
-
-def _headlines(table: Table) -> list[Column]:
-    counted = [column for column in table.columns if is_counted(column)]
-    parts = ("", f"{names.DAY}/", f"{names.NIGHT}/")
-    headlines = {part + score for part in parts for score in HEADLINES}
-    return [column for column in counted if column.metric in headlines] or counted

@@ -15,11 +15,11 @@ from analysis.uncertainty import Interval, Resampling
 from analysis.uncertainty.contrasts import Evidence, Resampler, Term
 from analysis.uncertainty.verdicts import FixedSeeds, Rule, Verdict, decide
 from rgbt.checks import InputError
-from rgbt.metrics.counts import Counts
-from sweeps.table.cells import CellId, CellRun, ScoredRun, counts_path, is_counted, metric_of
-from sweeps.table.claim import Claim
+from sweeps.table.cells import CellId, CellRun, counts_path, is_counted, metric_of
+from sweeps.table.claim import HIGHER, LOWER, Claim
 from sweeps.table.table import Column, Table
 from sweeps.verdicts.contrasts import Contrast, base_scores, contrasts_of, printed_value
+from sweeps.verdicts.loaded_counts import LoadedCounts
 
 RESAMPLES = 2_000
 """Of the images: enough for a standard error, which is known to 2 % then."""
@@ -80,7 +80,7 @@ class TableJudge:
         self._rows = {row.label: row for row in self.table.rows}
         settings = Resampling(resamples=self.resamples, absent=self.table.absent)
         self._resampler = Resampler(settings)
-        self._counts: dict[tuple[str, str], Counts] = {}
+        self._counts = LoadedCounts()
 
     def claims(self, runs: Mapping[CellRunId, CellRun]) -> list[JudgedClaim]:
         """Every claim of the table, judged by the finished ones of `runs`."""
@@ -91,6 +91,18 @@ class TableJudge:
         contrasts = contrasts_of(claim, self.table)
         exact = [self._exact(each) for each in contrasts]
         printed = [printed_value(each, self.table) for each in contrasts]
+        agrees = as_claimed(claim, printed)
+        counted = as_claimed(claim, exact)
+        if counted is not None:
+            return JudgedClaim(
+                table=self.name,
+                claim=claim,
+                verdict=_exact_verdict(exact, is_so=counted),
+                contrast=contrasts[0].label,
+                printed=printed[0],
+                as_printed=agrees,
+                complete=True,
+            )
         known: list[int] = []
         evidences: list[Evidence] = []
         reasons: dict[str, None] = {}
@@ -106,18 +118,6 @@ class TableJudge:
             except InputError as error:
                 reasons[str(error)] = None
         missing = self._missing(contrasts, runs)
-        agrees = as_claimed(claim, printed)
-        counted = as_claimed(claim, exact)
-        if counted is not None:
-            return JudgedClaim(
-                table=self.name,
-                claim=claim,
-                verdict=_exact_verdict(exact, is_so=counted),
-                contrast=contrasts[0].label,
-                printed=printed[0],
-                as_printed=agrees,
-                complete=True,
-            )
         if not evidences:
             return JudgedClaim(
                 table=self.name,
@@ -208,14 +208,7 @@ class TableJudge:
         others = [Contrast(best, label, column) for label in means if label not in same]
         if not others:
             return []
-        wanted = Claim(
-            name="best",
-            says="",
-            source="",
-            rows=(best,),
-            columns=(column,),
-            expected="higher" if highest else "lower",
-        ).range
+        wanted = HIGHER if highest else LOWER
         try:
             shown = [self.evidence([(1.0, each)], runs) for each in others]
         except InputError:
@@ -272,17 +265,9 @@ class TableJudge:
             yield Term(
                 weight=weight * part,
                 metric=metric_of(column, row),
-                counts={seed: self._loaded(run.key, path, run) for seed, run in finished.items()},
+                counts={seed: self._counts.of(run, path) for seed, run in finished.items()},
                 keys={seed: f"{run.key}/{path}" for seed, run in finished.items()},
             )
-
-    def _loaded(self, key: str, path: str, run: ScoredRun) -> Counts:
-        if (key, path) not in self._counts:
-            try:
-                self._counts[key, path] = run.counts(path)
-            except OSError as error:
-                raise InputError(f"run {key}: {error}") from error
-        return self._counts[key, path]
 
     def _missing(
         self, contrasts: Sequence[Contrast], runs: Mapping[CellRunId, CellRun]
