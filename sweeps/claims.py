@@ -125,12 +125,12 @@ def by_paper(judged: Sequence[JudgedClaim]) -> str:
     apart = Counter(each.table.partition("/")[0] for each in judged if each.as_printed is False)
     return "\n".join(
         f"{paper}: {count} claims; its printed values agree with {agree[paper]}, do not agree with "
-        f"{apart[paper]}{_untold(count - agree[paper] - apart[paper])}."
+        f"{apart[paper]}{_not_printed(count - agree[paper] - apart[paper])}."
         for paper, count in papers.items()
     )
 
 
-def _untold(count: int) -> str:
+def _not_printed(count: int) -> str:
     return f", and are not printed for {count}" if count else ""
 
 

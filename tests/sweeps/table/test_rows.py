@@ -76,7 +76,7 @@ def test_twins_of_a_row_that_is_left_out_stay_declared() -> None:
     ]
 
 
-def asked(name: str, *extra: str, rows: str = "", scale: str = "demo") -> TableRequest:
+def request_for(name: str, *extra: str, rows: str = "", scale: str = "demo") -> TableRequest:
     made = load_table(name)
     chosen = select_rows(made, rows) if rows else made
     return TableRequest(name, chosen, scale, (0,), extra)
@@ -92,20 +92,26 @@ def asked(name: str, *extra: str, rows: str = "", scale: str = "demo") -> TableR
     ],
 )
 def test_override_of_what_rows_are_about_is_refused(name: str, word: str) -> None:
-    with pytest.raises(InputError, match=f"^'{word}' would replace what the rows .* rows=") as told:
-        check_rows(asked(name, word), Planner())
-    assert name in str(told.value)
+    with pytest.raises(
+        InputError, match=f"^'{word}' would replace what the rows .* rows="
+    ) as error:
+        check_rows(request_for(name, word), Planner())
+    assert name in str(error.value)
 
 
 def test_overrides_of_how_long_and_on_what_are_allowed() -> None:
     words = ("recipe.batch_size=1", "dataset.root=/data", "optimizer.weight_decay=0.1")
-    check_rows(asked("spatialseg/table3", *words, "model.queries=8", rows="Ny,Ny/2"), Planner())
+    check_rows(
+        request_for("spatialseg/table3", *words, "model.queries=8", rows="Ny,Ny/2"), Planner()
+    )
 
 
 def test_override_of_chosen_rows_is_allowed() -> None:
-    check_rows(asked("spatialseg/table3", "masker=grbm_released", rows="Ny/4"), Planner())
+    check_rows(request_for("spatialseg/table3", "masker=grbm_released", rows="Ny/4"), Planner())
     with pytest.raises(InputError, match="'Ny' and 'Ny/4'"):
-        check_rows(asked("spatialseg/table3", "masker.sigma_div=4", rows="Ny,Ny/4"), Planner())
+        check_rows(
+            request_for("spatialseg/table3", "masker.sigma_div=4", rows="Ny,Ny/4"), Planner()
+        )
 
 
 def test_rows_that_are_one_run_are_refused_unless_the_table_says_so() -> None:
