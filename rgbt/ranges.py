@@ -47,6 +47,7 @@ BatchSize = Annotated[int, Interval(ge=1, le=4096), doc("images held in memory a
 Workers = Annotated[int, Interval(ge=0, le=1024), doc("processes on one machine")]
 
 Threads = Annotated[int, Interval(ge=1, le=1024), doc("threads of one process")]
+NumDevices = Annotated[int, Interval(ge=1, le=1024), doc("devices of one machine")]
 
 Pixels = Annotated[int, Interval(ge=1, le=8192), doc("pixels")]
 """Side of an image or of a part of it."""

@@ -14,13 +14,13 @@ SWEEPS = sorted((ROOT / "sweeps").rglob("*.py"))
 ANALYSIS = sorted((ROOT / "analysis").rglob("*.py"))
 FILES = [*RGBT, *SWEEPS, *ANALYSIS, *sorted((ROOT / "hydra_plugins").rglob("*.py"))]
 
-BASE = {"types", "dataset", "requirements", "checks", "ranges", "randomness", "files"}
+BASE = {"types", "dataset", "requirements", "checks", "ranges", "randomness", "files", "processes"}
 SHARED = BASE | {"geometry"}
 COMPONENTS = {"data", "corruptions", "transforms", "maskers", "models", "losses", "metrics"}
 READING = SHARED | {"config", "spec", "tracking", "metrics", "data"}
 BUILDING = READING | COMPONENTS | {"schemes", "engine", "checkpoints", "runtime", "build"}
 MAY_IMPORT = {
-    **dict.fromkeys(("types", "checks", "ranges", "randomness"), set()),
+    **dict.fromkeys(("types", "checks", "ranges", "randomness", "processes"), set()),
     "dataset": {"types", "requirements"},
     "requirements": {"types", "checks"},
     "files": BASE,

@@ -13,6 +13,7 @@ from rgbt.ranges import (
     LearningRate,
     Lengths,
     NonNegative,
+    NumDevices,
     NumPoints,
     NumSteps,
     NumStepsOrZero,
@@ -25,6 +26,7 @@ from rgbt.ranges import (
 )
 
 Precision = Literal["32-true", "bf16-mixed"]
+Compile = Literal["none", "default", "max-autotune"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,6 +48,17 @@ class TrainerSettings:
         selection_split: split whose mIoU selects the best checkpoint. Released: "test".
         tested: checkpoint for the test split: "best", with the highest mIoU on the selection
             split, or "last", if that split has no images of the target domain.
+        devices: devices of each machine, with one process each; "auto": all that the accelerator
+            has. They divide every batch, so that the result does not depend on their number.
+        strategy: "ddp": each process has the whole network, and gradients are averaged; "auto": the
+            same.
+        batch_norm_parts: parts of a batch that are normalised separately in training. 1: the whole
+            batch, synchronised over the devices, as in all recipes here; else the number of
+            devices.
+        activation_checkpointing: whether the backbone's activations are computed again in the
+            backward pass instead of kept: less memory, more time, the same losses.
+        memory_format: layout of feature maps in memory; the result differs by rounding alone.
+        compile: mode of `torch.compile` for the network; "none" does not compile.
     """
 
     max_steps: NumSteps
@@ -59,6 +72,12 @@ class TrainerSettings:
     threads: Threads
     selection_split: Text
     tested: Literal["best", "last"] = "best"
+    devices: NumDevices | Literal["auto"] = 1
+    strategy: Literal["auto", "ddp"] = "auto"
+    batch_norm_parts: NumDevices = 1
+    activation_checkpointing: bool = False
+    memory_format: Literal["contiguous", "channels_last"] = "contiguous"
+    compile: Compile = "none"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +87,7 @@ class Recipe:
     Attributes:
         dataset: name of the data set for which the sizes and steps were published; a run at
             `scale=paper` on another one prints a warning.
-        batch_size: samples per process and step.
+        batch_size: samples per step, of all devices together.
         max_steps: optimiser steps.
         eval_every: steps between evaluations.
         train_sizes: shortest edges that the training resize draws from, pixels.

@@ -142,11 +142,15 @@ class RunSpec:
     optimizer: Component = _node()
     schedule: Component = _node()
     trainer: TrainerSettings = _node(
-        outside_key=("accelerator", "log_every", "checkpoint_every"),
-        added={"tested": "best", "threads": 2},
+        outside_key=(
+            *("accelerator", "log_every", "checkpoint_every", "devices", "strategy"),
+            *("activation_checkpointing", "memory_format", "compile"),
+        ),
+        added={"tested": "best", "threads": 2, "batch_norm_parts": 1},
         shared=(
             *("max_steps", "eval_every", "checkpoint_every", "log_every"),
-            *("precision", "accelerator", "threads"),
+            *("precision", "accelerator", "threads", "devices", "strategy", "batch_norm_parts"),
+            *("activation_checkpointing", "memory_format", "compile"),
         ),
     )
     metric: Component = _node(shared=True)
