@@ -13,18 +13,14 @@ from typing import Literal
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from rgbt.checks import check_shape
-from rgbt.geometry.padding import pad_to
+from rgbt.geometry.sampling import NOWHERE, normalised, sample
 
 Resampling = Literal["once", "twice"]
 """How often a value is interpolated on its way: "once", along the composed map, where the border
 pixels of the first frame reach to its outline; "twice", as in the release of Temporal: onto the
 canvas, where borders fade into zeros, and from the cut rectangle to the full size."""
-
-NOWHERE = -2.0
-"""A normalised coordinate that is further out than any pixel reaches."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,18 +61,25 @@ class Warp:
             image_hw=image_hw,
         )
 
-    def bilinear(self, values: Tensor, levels: int | None = None) -> Tensor:
-        """Interpolated `values` (B, C, H, W) float, 0 outside; differentiable in `values`.
+    def bilinear(self, values: Tensor, levels: int | None = None, every: int = 1) -> Tensor:
+        """Interpolated `values` (B, C, H, W) float, 0 outside; differentiable in `values` once.
 
-        Where a point falls on a pixel, that pixel's value comes back bit by bit. `levels` 255
-        rounds to 8-bit levels after each interpolation, as images that are kept in bytes, without a
-        gradient.
+        Where a point falls on a pixel, that pixel's value comes back bit by bit.
+
+        Args:
+            values: of the first frame.
+            levels: 255 rounds to 8-bit levels after each interpolation, as images that are kept in
+                bytes, without a gradient.
+            every: n gives every n-th row and column of the second frame, the first one included.
+
+        Returns:
+            (B, C, ceil(H / every), ceil(W / every)) of the type of `values`.
         """
         self._check(values, "B C H W")
         sampled = values.to(torch.promote_types(values.dtype, torch.float32))
-        for grid in self._grids:
-            padded = pad_to(sampled, _powers_of_two(self.image_hw))
-            sampled = F.grid_sample(padded, grid.to(padded.dtype), align_corners=False)
+        *canvas, last = self._grids
+        for grid in (*canvas, last[:, ::every, ::every]):
+            sampled = sample(sampled, grid)
             sampled = sampled if levels is None else (sampled * levels).round() / levels
         return sampled.to(values.dtype)
 
@@ -86,7 +89,7 @@ class Warp:
         index, inside = self._pixels
         flat = values.reshape(len(values), -1, index.shape[-1])
         picked = flat.gather(2, index[:, None].expand_as(flat))
-        return picked.masked_fill(~inside[:, None], outside).view(values.shape)
+        return picked.masked_fill_(~inside[:, None], outside).view(values.shape)
 
     def inside(self) -> Tensor:
         """(B, H, W) bool: the pixel shows a point within the outline of the first frame."""
@@ -138,45 +141,51 @@ class Warp:
         return x.mul_(scale), y.mul_(scale)
 
     @cached_property
-    def _composed(self) -> tuple[Tensor, Tensor]:
-        return self._source(*self._cut)
+    def _composed(self) -> tuple[Tensor, Tensor, Tensor]:
+        """x, y of every pixel of the second frame in the first, and whether it is there."""
+        x, y = self._source(*self._cut)
+        return x, y, self._within(x, y)
 
     def _within(self, x: Tensor, y: Tensor) -> Tensor:
+        """(B, H, W) bool; NaN is outside."""
         height, width = self.image_hw
-        return (x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5)
+        inside = x >= -0.5
+        for each in (x <= width - 0.5, y >= -0.5, y <= height - 0.5):
+            inside &= each
+        return inside
 
     @cached_property
     def _grids(self) -> list[Tensor]:
-        """What to sample one after the other: (B, H, W, 2) float32, see `_normalised`."""
+        """What to sample one after the other: (B, H, W, 2) float32, see `normalised`."""
         height, width = self.image_hw
         if self.resampling == "once":
-            x, y = self._composed
-            inner = _normalised(x.clamp(0, width - 1), y.clamp(0, height - 1), self.image_hw)
-            return [inner.masked_fill_(~self._within(x, y)[..., None], NOWHERE)]
+            x, y, inside = self._composed
+            inner = normalised(x.clamp(0, width - 1), y.clamp(0, height - 1), self.image_hw)
+            return [inner.masked_fill_(~inside[..., None], NOWHERE)]
         left, top, right, bottom = self.rectangle[..., None].unbind(1)
         columns, rows = self._cut
-        x = columns.clamp(left + 0.5, right - 0.5).float()[:, None, :].expand(-1, height, -1)
-        y = rows.clamp(top + 0.5, bottom - 0.5).float()[:, :, None].expand(-1, -1, width)
-        canvas = _normalised(*self._source(*self._whole()), self.image_hw)
-        return [grid.nan_to_num_(NOWHERE) for grid in (canvas, _normalised(x, y, self.image_hw))]
+        x = columns.clamp(left + 0.5, right - 0.5).float()[:, None, :]
+        y = rows.clamp(top + 0.5, bottom - 0.5).float()[:, :, None]
+        canvas = normalised(*self._source(*self._whole()), self.image_hw)
+        return [grid.nan_to_num_(NOWHERE) for grid in (canvas, normalised(x, y, self.image_hw))]
 
     @cached_property
     def _pixels(self) -> tuple[Tensor, Tensor]:
         """Flat index (B, H W) int64 of the nearest pixel, and (B, H W) whether there is one."""
         height, width = self.image_hw
         if self.resampling == "once":
-            x, y = self._composed
+            x, y, inside = self._composed
         else:  # canvas pixels that OpenCV's nearest resize takes from the rectangle
             left, top, right, bottom = self.rectangle[..., None].unbind(1)
             columns, rows = self._whole()
             picked = _nearest_resize(columns, left, right), _nearest_resize(rows, top, bottom)
             x, y = self._source(*picked)
-        inside = self._within(x, y)
+            inside = self._within(x, y)
         column, row = (
-            (torch.where(inside, at, 0.0) + 0.5).floor_().clamp_(0, side - 1).long()
+            (at + 0.5).floor_().clamp_(0, side - 1).nan_to_num_(0).int()
             for at, side in ((x, width), (y, height))
         )
-        return row.mul_(width).add_(column).flatten(1), inside.flatten(1)
+        return row.mul_(width).add_(column).long().flatten(1), inside.flatten(1)
 
 
 def _nearest_resize(pixels: Tensor, low: Tensor, high: Tensor) -> Tensor:
@@ -187,18 +196,3 @@ def _nearest_resize(pixels: Tensor, low: Tensor, high: Tensor) -> Tensor:
     step = 1 / (pixels.shape[-1] / (high - low))
     first = low + 0.5
     return first.floor() + (first.frac() + pixels * step).floor()
-
-
-def _powers_of_two(image_hw: tuple[int, int]) -> tuple[int, int]:
-    height, width = (1 << (side - 1).bit_length() for side in image_hw)
-    return height, width
-
-
-def _normalised(x: Tensor, y: Tensor, image_hw: tuple[int, int]) -> Tensor:
-    """(B, H, W, 2) of points in the frame padded to powers of two: -1 and 1 are its outer edges.
-
-    Only for such sizes does `grid_sample` find a whole pixel again exactly: (x + 0.5) / W is then
-    a float without rounding. At 640 columns it is off by 1e-5 pixel.
-    """
-    height, width = _powers_of_two(image_hw)
-    return torch.stack([x * (2 / width) + (1 / width - 1), y * (2 / height) + (1 / height - 1)], -1)

@@ -84,8 +84,10 @@ class TemporalLoss:
             second: frame 2, of the same sizes.
             warped: (B, K, H, W) probabilities of frame 1, warped to frame 2; only where the record
                 says `reads_warped`. Whether a gradient goes through it is for the caller to decide.
+                Or (B, K, ceil(H / 2), ceil(W / 2)), every second row and column of that: frame 2
+                is compared at these pixels.
             valid: (B, H, W) bool, pixels of frame 2 that frame 1 shows; others do not count in
-                "con" and "con_acc".
+                "con" and "con_acc". Of the size of `warped`.
             generator: of the segmentation loss, frame 1 first.
 
         Returns:
@@ -109,11 +111,13 @@ class TemporalLoss:
         elif self.second != "none":
             if warped is None:
                 raise ValueError(f"warped: needed for the part {self.second}, got None.")
-            p = single(second.logits).softmax(1)
+            every = 1 if warped.shape[2:] == second.logits.shape[2:] else 2
+            p = single(second.logits[..., ::every, ::every]).softmax(1)
             if self.second == "con":
                 value = con(warped, p, valid, self.form)
             else:
-                value = con_acc(warped, p, second.batch.label.where(valid, IGNORE), self.form)
+                label = second.batch.label[:, ::every, ::every]
+                value = con_acc(warped, p, label.where(valid, IGNORE), self.form)
             parts[self.second] = self.beta * value
         return parts
 

@@ -59,6 +59,9 @@ class Temporal:
         view: draws virtual views and applies them.
         warps: "logits": scores are interpolated, then normalised; "probabilities": the reverse.
         detach: whether the first prediction is a fixed teacher of the second.
+        resolution: of the loss between the predictions: "full" compares every pixel of the second
+            frame, "half" every second row and column, for a quarter of the time of the warp. Paper
+            and released: full.
     """
 
     model: nn.Module
@@ -66,6 +69,7 @@ class Temporal:
     view: VirtualViews
     warps: Literal["logits", "probabilities"]
     detach: bool
+    resolution: Literal["full", "half"] = "full"
 
     def __post_init__(self) -> None:
         self.stacks = record_of(self.model).stacks_passes
@@ -76,11 +80,13 @@ class Temporal:
     def record(self) -> Record:
         """A loss of two frames, whole images, and class scores of both."""
         makes_masks = record_of(self.model).outputs == "masks"
+        compares = Requirement("loss", "reads_warped", True, "scheme.resolution=half")
         return Record(
             requires=(
                 Requirement("loss", "frames", 2),
                 Requirement("masker", "hides_cells", False),
                 *((Requirement("model", "dense_logits", True),) if makes_masks else ()),
+                *((compares,) if self.resolution == "half" else ()),
             ),
             frames=2,
             camera=record_of(self.view).camera,
@@ -92,14 +98,15 @@ class Temporal:
         angles = self.view.draw(len(batch.name), generator_of("virtual view"))
         warp = self.view.warp(angles, image_hw)
         first, second = self._frames(batch, self.view.batch(batch, warp), generator_of)
-        warped = None
+        warped, every = None, 2 if self.resolution == "half" else 1
         if self.reads_warped:  # class probabilities of the first frame, as the second sees them
             scores = first.logits.detach() if self.detach else first.logits
             if self.warps == "probabilities":
-                warped = warp.bilinear(scores.float().softmax(1))
+                warped = warp.bilinear(scores.float().softmax(1), every=every)
             else:
-                warped = warp.bilinear(scores.float()).softmax(1)
-        parts = self.loss(first, second, warped, self.view.valid(warp), generator_of("loss"))
+                warped = warp.bilinear(scores.float(), every=every).softmax(1)
+        valid = self.view.valid(warp)[:, ::every, ::every]
+        parts = self.loss(first, second, warped, valid, generator_of("loss"))
         yield Phase(("main",), parts)
 
     def _frames(
