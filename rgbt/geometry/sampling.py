@@ -32,7 +32,7 @@ def powers_of_two(image_hw: tuple[int, int]) -> tuple[int, int]:
 def normalised(x: Tensor, y: Tensor, image_hw: tuple[int, int]) -> Tensor:
     """(B, H, W, 2) of points (B, H, W) in pixels: -1 and 1 are the edges of the padded frame.
 
-    float32; x and y may be of broadcast shapes.
+    float32.
     """
     sides = reversed(powers_of_two(image_hw))
     # A product with a power of two is exact, so that one rounding is left.
@@ -40,7 +40,7 @@ def normalised(x: Tensor, y: Tensor, image_hw: tuple[int, int]) -> Tensor:
         torch.add(at.new_tensor(1 / side - 1), at, alpha=2 / side)
         for at, side in zip((x, y), sides, strict=True)
     ]
-    return torch.stack(torch.broadcast_tensors(*parts), -1)
+    return torch.stack(parts, -1)
 
 
 def sample(values: Tensor, grid: Tensor) -> Tensor:

@@ -164,8 +164,8 @@ class Warp:
             return [inner.masked_fill_(~inside[..., None], NOWHERE)]
         left, top, right, bottom = self.rectangle[..., None].unbind(1)
         columns, rows = self._cut
-        x = columns.clamp(left + 0.5, right - 0.5).float()[:, None, :]
-        y = rows.clamp(top + 0.5, bottom - 0.5).float()[:, :, None]
+        x = columns.clamp(left + 0.5, right - 0.5).float()[:, None, :].expand(-1, height, -1)
+        y = rows.clamp(top + 0.5, bottom - 0.5).float()[:, :, None].expand(-1, -1, width)
         canvas = normalised(*self._source(*self._whole()), self.image_hw)
         return [grid.nan_to_num_(NOWHERE) for grid in (canvas, normalised(x, y, self.image_hw))]
 

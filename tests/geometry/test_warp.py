@@ -122,6 +122,50 @@ def test_the_gradient_is_the_numerical_one(resampling: Resampling) -> None:
     assert torch.autograd.gradcheck(warp.bilinear, (values,))
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_bilinear_of_random_homographies_is_grid_sample_with_repeated_borders(seed: int) -> None:
+    """Views that are not cut show borders and what is outside; torch repeats the former."""
+    height, width = HW
+    views = random_views(2, seed)
+    warp = Warp(views, whole(HW, 2), HW, "once")
+    rows, columns = torch.meshgrid(*(torch.arange(side).double() for side in HW), indexing="ij")
+    x, y, w = (
+        torch.linalg.inv(views) @ torch.stack([columns, rows, torch.ones_like(rows)]).flatten(1)
+    ).unbind(1)
+    grid = torch.stack([(2 * x / w + 1) / width - 1, (2 * y / w + 1) / height - 1], -1)
+    values, upstream = (random_values(2, 3, *HW, dtype=torch.float64) + offset for offset in (0, 1))
+    expected = torch.nn.functional.grid_sample(
+        values.requires_grad_(),
+        grid.view(2, height, width, 2),
+        padding_mode="border",
+        align_corners=False,
+    )
+    inside = grid.abs().amax(-1).view(2, 1, height, width) <= 1
+    assert torch.equal(inside[:, 0], warp.inside())
+    assert 0.5 < float(inside.double().mean()) < 0.99
+    found = warp.bilinear(values)
+    torch.testing.assert_close(found, expected * inside, atol=2e-3, rtol=0)
+    gradients = [
+        torch.autograd.grad(each, values, upstream * inside)[0] for each in (found, expected)
+    ]
+    torch.testing.assert_close(*gradients, atol=2e-3, rtol=0)
+
+
+@pytest.mark.parametrize("resampling", RESAMPLINGS)
+def test_every_second_row_and_column_is_that_of_all(resampling: Resampling) -> None:
+    views = random_views(2, 7)
+    warp = Warp(views, inner_rectangle(views, HW, "largest"), HW, resampling).resized((45, 60))
+    full, half = (random_values(2, 3, 45, 60).requires_grad_() for _ in range(2))
+    expected = warp.bilinear(full)[..., ::2, ::2]
+    found = warp.bilinear(half, every=2)
+    assert found.shape == (2, 3, 23, 30)
+    assert torch.equal(found, expected)
+    for each in (found, expected):
+        each.square().sum().backward()
+    torch.testing.assert_close(half.grad, full.grad)
+    assert torch.equal(warp.bilinear(full, 255, 2), warp.bilinear(full, 255)[..., ::2, ::2])
+
+
 def test_once_repeats_the_border_up_to_the_outline_and_twice_fades_it_out() -> None:
     ones, right = torch.ones(1, 1, 4, 6), shift(0.5, 0)
     once, twice = (Warp(right, whole((4, 6)), (4, 6), each) for each in RESAMPLINGS)

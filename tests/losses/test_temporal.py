@@ -104,6 +104,24 @@ def test_values(form: Any, frames: Any) -> None:
             assert torch.allclose(parts[f"cross_entropy_{number}"], seg)
 
 
+@pytest.mark.parametrize("second", ["con", "con_acc"])
+def test_every_second_row_and_column_is_compared_where_so_many_are_given(
+    second: Any, frames: Any
+) -> None:
+    """Frames of 6 x 7: rows 0, 2, 4 and columns 0, 2, 4, 6."""
+    first, other, warped, valid = frames
+    warped, valid = warped[..., ::2, ::2], valid[:, ::2, ::2]
+    assert warped.shape[2:] == (3, 4)
+    parts = loss_of(second=second)(first, other, warped, valid, NOTHING)
+    p = other.logits.softmax(1)[..., ::2, ::2]
+    label = other.batch.label[:, ::2, ::2].masked_fill(~valid, 255)
+    forms = {"con": lambda: con(warped, p, valid, "paper")}
+    forms["con_acc"] = lambda: con_acc(warped, p, label, "paper")
+    torch.testing.assert_close(parts[second], forms[second]())
+    with pytest.raises(ValueError, match="warped: expected shape"):
+        loss_of(second=second)(first, other, warped[..., :3], valid, NOTHING)
+
+
 def test_masks_of_queries() -> None:
     criterion, generator = criterion_of(), seeded(3)
     frames = []

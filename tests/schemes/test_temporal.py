@@ -13,8 +13,10 @@ from torch.nn import functional as F
 
 from rgbt.geometry.camera import Camera
 from rgbt.geometry.warp import Warp
+from rgbt.losses.cross_entropy import CrossEntropy
+from rgbt.losses.temporal import TemporalLoss
 from rgbt.models.mask2former.model import Mask2Former, semantic_logits
-from rgbt.requirements import Record
+from rgbt.requirements import Record, Requirement
 from rgbt.schemes.temporal import Temporal
 from rgbt.transforms.virtual_view import VirtualView
 from rgbt.types import Batch, Frame, Output
@@ -66,6 +68,21 @@ class Recorded:
         queries = [frame.output.aux.get("class_logits") for frame in (first, second)]
         parts += [each.square().mean() for each in queries if each is not None]
         return {str(number): part for number, part in enumerate(parts)}
+
+
+class Strided(Recorded):
+    """The same of every second row and column of the second frame."""
+
+    def __call__(
+        self, first: Frame, second: Frame, warped: Tensor, valid: Tensor, generator: Any
+    ) -> dict[str, Tensor]:
+        label = second.batch.label[:, ::2, ::2]
+        half = Frame(
+            second.output, replace(second.batch, label=label), second.logits[..., ::2, ::2]
+        )
+        parts = super().__call__(first, half, warped, valid, generator)
+        self.second = second
+        return parts
 
 
 def view(**changes: Any) -> VirtualView:
@@ -218,6 +235,55 @@ def test_scores_or_probabilities_are_brought_into_the_second_frame(
         assert net.scores.grad is not None
         touched = net.scores.grad[0, 1, 0] != 0
         assert touched.tolist() == [False, False, True, True]
+
+
+@pytest.mark.parametrize("warps", ["probabilities", "logits"])
+def test_half_resolution_is_every_second_row_and_column(warps: Any) -> None:
+    full, half = (
+        step(scheme(Net(nn.Identity()), loss=loss, view=view(mode="rotation"), warps=warps, **more))
+        for loss, more in ((Recorded(), {}), (Strided(), {"resolution": "half"}))
+    )
+    assert half.warped.shape == (B, K, 24, 32)
+    assert torch.equal(half.warped, full.warped[..., ::2, ::2])
+    assert torch.equal(half.valid, full.valid[:, ::2, ::2])
+    assert not full.valid.all()
+    # The second frame itself is whole.
+    assert torch.equal(half.second.batch.rgb, full.second.batch.rgb)
+    assert torch.equal(half.second.logits, full.second.logits)
+
+
+@pytest.mark.parametrize("second", ["con", "con_acc"])
+def test_half_resolution_changes_the_part_of_agreement_alone(second: Any) -> None:
+    parts = {}
+    for resolution in ("full", "half"):
+        net = Net(nn.Identity())
+        loss = TemporalLoss(
+            segmentation=CrossEntropy(class_weights=None),
+            **{"alpha": 1.0, "beta": 1.0, "second": second, "form": "paper"},
+        )
+        (phase,) = scheme(net, loss=loss, resolution=resolution).phases(batch(), generator_of)
+        parts[resolution] = phase.parts
+        phase.parts[second].backward()
+        assert all(bool(each.any()) for each in gradients(net))
+    full, half = ({k: v.detach() for k, v in each.items()} for each in parts.values())
+    assert list(full) == list(half)
+    for name in full.keys() - {second}:
+        assert torch.equal(full[name], half[name])
+    assert float(full[second]) != float(half[second])
+    assert float(half[second]) == pytest.approx(float(full[second]), rel=0.05)
+
+
+def test_half_resolution_requires_a_loss_of_agreement() -> None:
+    loss = TemporalLoss(
+        segmentation=CrossEntropy(class_weights=None),
+        **{"alpha": 1.0, "beta": 1.0, "second": "dice", "form": "paper"},
+    )
+    for resolution in ("full", "half"):
+        record = scheme(Net(nn.Identity()), loss=loss, resolution=resolution).record
+        unmet = [each for each in record.requires if each.node == "loss"]
+        unmet = [each for each in unmet if not each.is_met_by(loss.record)]
+        wanted = Requirement("loss", "reads_warped", True, "scheme.resolution=half")
+        assert unmet == ([wanted] if resolution == "half" else [])
 
 
 def test_background_views_count_every_pixel() -> None:

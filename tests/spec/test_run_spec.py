@@ -74,6 +74,14 @@ def test_every_upstream_run_has_the_key_of_its_experiment(experiment: str, scale
         assert run.key == key_of(run.name, *typed)
 
 
+def test_resolution_of_the_consistency_loss_is_in_the_key_unless_full() -> None:
+    recorded = json.loads(Path("tests/behaviour.json").read_text())["experiments"]
+    for experiment in ("temporal_con", "temporal_con_released"):
+        old = recorded[experiment]["compositions"]["demo"]["key"]
+        assert key_of(experiment, "scheme.resolution=full") == old
+        assert key_of(experiment, "scheme.resolution=half") != old
+
+
 def test_upstream_runs_of_another_seed_are_other_runs() -> None:
     first, second = (spec_of("multi_head_night_stage1", f"seed={seed}") for seed in (0, 1))
     assert first.key != second.key
