@@ -6,9 +6,9 @@ composed sampling, and the gradient of the logits. The loop does what the releas
 on NumPy copies and without a gradient: 8-bit image, float label and logits, each warped, cut and
 resized. On a GPU the loop includes the copies from and to it, as in the release.
 
-Three rows tell what limits ours: logits sampled by `grid_sample` alone (the same padded frames, with
-its own gradient), the gradient as a sparse matrix of SciPy (one thread, classes interleaved before),
-and a copy of the bytes that have to be moved. On one CPU the ratio by CPU time counts.
+Three rows tell what limits ours: logits sampled by `grid_sample` alone (the same padded frames,
+with its own gradient), the gradient as a sparse matrix of SciPy (one thread, classes interleaved
+before), and a copy of the bytes that have to be moved. On a CPU the ratio of CPU times counts.
 
 The memory of large tensors is kept as in every training here; "default" leaves the allocator as
 the release has it, which costs both about 10 ms a sample.
