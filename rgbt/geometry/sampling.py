@@ -15,8 +15,8 @@ from torch.nn import functional as F
 
 from rgbt.geometry.padding import pad_to
 
-NOWHERE = -2.0
-"""A normalised coordinate that is further out than any pixel reaches."""
+NOWHERE = -1e6
+"""A coordinate in pixels that is outside every frame."""
 
 
 def powers_of_two(image_hw: tuple[int, int]) -> tuple[int, int]:

@@ -160,14 +160,20 @@ class Warp:
         height, width = self.image_hw
         if self.resampling == "once":
             x, y, inside = self._composed
-            inner = normalised(x.clamp(0, width - 1), y.clamp(0, height - 1), self.image_hw)
-            return [inner.masked_fill_(~inside[..., None], NOWHERE)]
+            outside = ~inside
+            x, y = (
+                at.clamp(0, side - 1).masked_fill_(outside, NOWHERE)
+                for at, side in ((x, width), (y, height))
+            )
+            return [normalised(x, y, self.image_hw)]
         left, top, right, bottom = self.rectangle[..., None].unbind(1)
         columns, rows = self._cut
         x = columns.clamp(left + 0.5, right - 0.5).float()[:, None, :].expand(-1, height, -1)
         y = rows.clamp(top + 0.5, bottom - 0.5).float()[:, :, None].expand(-1, -1, width)
-        canvas = normalised(*self._source(*self._whole()), self.image_hw)
-        return [grid.nan_to_num_(NOWHERE) for grid in (canvas, normalised(x, y, self.image_hw))]
+        return [
+            normalised(across.nan_to_num(NOWHERE), down.nan_to_num(NOWHERE), self.image_hw)
+            for across, down in (self._source(*self._whole()), (x, y))
+        ]
 
     @cached_property
     def _pixels(self) -> tuple[Tensor, Tensor]:

@@ -45,7 +45,7 @@ HW = (480, 640)
 BATCH = 8
 CLASSES = 9
 AT_LEAST = {"cpu": 1.0, "cuda": 10.0}
-ROUNDS = 15
+ROUNDS = 9
 FULL, HALF = "ours, full, with gradient", "ours, half, with gradient"
 THREADS = 2
 

@@ -20,9 +20,8 @@ def points(hw: tuple[int, int], batch: int = 2, seed: int = 0) -> Tensor:
     x[:, 0], y[:, :, 0] = x[:, 0].round(), y[:, :, 0].round()
     x[:, 1], y[:, :, 1] = -0.5, HW[0] - 0.5
     x[:, 2], y[:, :, 2] = HW[1] - 1.0, 0.0
-    grid = normalised(x, y, HW)
-    grid[:, 3] = NOWHERE
-    return grid
+    x[:, 3] = y[:, 3] = NOWHERE
+    return normalised(x, y, HW)
 
 
 def random(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
