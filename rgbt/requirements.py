@@ -64,6 +64,7 @@ class Record:
         weighs_confidence: loss: whether it weighs pixels by the confidence of their labels.
         frames: loss and scheme: how many frames of a scene it takes, 1 or 2.
         reads_warped: loss of two frames: whether it reads the first prediction in the second frame.
+        compares_half: such a loss: whether that may be every second row and column.
         num_domains: scheme and domains: 1 or 2.
         shows_views: scheme: whether a domain's view and head are passed on to the network.
         optimizers: scheme: names that its phases use -> beginnings of the names of the parameters
@@ -94,6 +95,7 @@ class Record:
     weighs_confidence: bool = False
     frames: Literal[1, 2] = 1
     reads_warped: bool = False
+    compares_half: bool = False
     num_domains: Literal[1, 2] = 1
     shows_views: bool = False
     optimizers: Mapping[str, tuple[str, ...]] = field(default_factory=lambda: {"main": ()})

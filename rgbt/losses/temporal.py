@@ -63,10 +63,12 @@ class TemporalLoss:
     def record(self) -> Record:
         """The requirements of the loss of each frame, and a scheme of two frames."""
         of_frames = Requirement("scheme", "frames", 2)
+        compares = self.second in ("con", "con_acc")
         return Record(
             requires=(*record_of(self.segmentation).requires, of_frames),
             frames=2,
-            reads_warped=self.second in ("con", "con_acc"),
+            reads_warped=compares,
+            compares_half=compares,
         )
 
     def __call__(

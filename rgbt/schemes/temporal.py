@@ -80,13 +80,13 @@ class Temporal:
     def record(self) -> Record:
         """A loss of two frames, whole images, and class scores of both."""
         makes_masks = record_of(self.model).outputs == "masks"
-        compares = Requirement("loss", "reads_warped", True, "scheme.resolution=half")
+        half = Requirement("loss", "compares_half", True, "scheme.resolution=half")
         return Record(
             requires=(
                 Requirement("loss", "frames", 2),
                 Requirement("masker", "hides_cells", False),
                 *((Requirement("model", "dense_logits", True),) if makes_masks else ()),
-                *((compares,) if self.resolution == "half" else ()),
+                *((half,) if self.resolution == "half" else ()),
             ),
             frames=2,
             camera=record_of(self.view).camera,

@@ -52,6 +52,11 @@ MISSING: list[tuple[Requirement, str]] = [
         "provides weighs_confidence=false; choose loss=cross_entropy, cross_entropy_auxiliary, or "
         "change domains.target.confidence.",
     ),
+    (
+        Requirement("loss", "compares_half", True, "scheme.resolution=half"),
+        "provides compares_half=false; choose loss=temporal_paper, temporal_released, or change "
+        "scheme.resolution.",
+    ),
     (Requirement("masker", "hides_cells", False), "choose masker=none."),
     (Requirement("transform", "works_on_batches", True), "choose transform=crm, flip, none."),
     (Requirement("domains", "target_confidence", True), "choose domains=heatnet."),

@@ -282,7 +282,7 @@ def test_half_resolution_requires_a_loss_of_agreement() -> None:
         record = scheme(Net(nn.Identity()), loss=loss, resolution=resolution).record
         unmet = [each for each in record.requires if each.node == "loss"]
         unmet = [each for each in unmet if not each.is_met_by(loss.record)]
-        wanted = Requirement("loss", "reads_warped", True, "scheme.resolution=half")
+        wanted = Requirement("loss", "compares_half", True, "scheme.resolution=half")
         assert unmet == ([wanted] if resolution == "half" else [])
 
 
