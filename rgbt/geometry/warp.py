@@ -78,7 +78,7 @@ class Warp:
         self._check(values, "B C H W")
         sampled = values.to(torch.promote_types(values.dtype, torch.float32))
         *canvas, last = self._grids
-        for grid in (*canvas, last[:, ::every, ::every]):
+        for grid in (*canvas, last[:, ::every, ::every].contiguous()):
             sampled = sample(sampled, grid)
             sampled = sampled if levels is None else (sampled * levels).round() / levels
         return sampled.to(values.dtype)

@@ -60,8 +60,7 @@ class Temporal:
         warps: "logits": scores are interpolated, then normalised; "probabilities": the reverse.
         detach: whether the first prediction is a fixed teacher of the second.
         resolution: of the loss between the predictions: "full" compares every pixel of the second
-            frame, "half" every second row and column, for a quarter of the time of the warp. Paper
-            and released: full.
+            frame, "half" every second row and column, which is faster. Paper and released: full.
     """
 
     model: nn.Module

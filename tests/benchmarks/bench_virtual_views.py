@@ -65,6 +65,7 @@ class Work:
         logits = torch.randn(BATCH, CLASSES, 60, 80, generator=generator)
         self.logits = F.interpolate(logits, HW, mode="bilinear").to(device).requires_grad_()
         self.upstream = torch.randn(BATCH, CLASSES, *HW, generator=generator).to(device)
+        self.upstreams = {n: self.upstream[..., ::n, ::n].contiguous() for n in (1, 2)}
         limits = torch.tensor([10.0, 10.0, 5.0])
         self.angles = ((2 * torch.rand(BATCH, 3, generator=generator) - 1) * limits).to(device)
 
@@ -86,7 +87,7 @@ class Work:
             logits = warp.bilinear(self.logits, every=every)
         if gradient:
             self.logits.grad = None
-            logits.backward(self.upstream[..., ::every, ::every])
+            logits.backward(self.upstreams[every])
         return image, label, logits.detach()
 
     def opencv(self) -> tuple[Tensor, Tensor, Tensor]:
