@@ -9,9 +9,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.models.mask2former.decoder import QueryAttention, shrink
+from rgbt.models.mask2former.decoder import QueryAttention
 from rgbt.models.mask2former.deformable import DeformableAttention, centre_grid
-from rgbt.models.mask2former.pixel_decoder import sine_code
+from rgbt.models.mask2former.pixel_decoder import shrink, sine_code
 from rgbt.models.mask2former.swin import (
     PatchMerging,
     SwinBlock,
