@@ -90,9 +90,8 @@ def gradients(net: nn.Module, loss: Tensor) -> dict[str, Tensor]:
 @pytest.mark.parametrize(("predictions", "with_masks"), [(6, 4), (4, 4), (5, 1)])
 def test_fewer_predictions_equal_the_first_of_all(predictions: int, with_masks: int) -> None:
     """The loss reads the masks of some, and the final class logits of the others, as CRM does."""
-    net = nano().double().train()
-    rgb, thermal = images(4)
-    pair, hidden = (rgb.double(), thermal.double()), cells(4)
+    net = nano().train()
+    pair, hidden = images(4), cells(4)
     g = generator(4)
     weights = {
         "class_logits": torch.randn(4, predictions, 2, 5, 5, generator=g),
@@ -116,7 +115,7 @@ def test_fewer_predictions_equal_the_first_of_all(predictions: int, with_masks: 
     expected = gradients(net, loss(every))
     found = gradients(net, loss(fewer))
     for name, gradient in found.items():
-        torch.testing.assert_close(gradient, expected[name], rtol=1e-9, atol=1e-9)
+        torch.testing.assert_close(gradient, expected[name], rtol=1e-5, atol=1e-5)
 
 
 def test_the_finest_features_of_predictions_without_masks_need_no_gradient() -> None:
