@@ -26,6 +26,9 @@ class CRM:
     mark the masked pass. SDC is the mean absolute difference of the final class logits of F' to
     those of F, which are the fixed teacher; SDN the same for R' and T', summed.
 
+    No loss reads the masks of R' and T', so the network does not predict them. With w_n = 0 nothing
+    reads R' and T', and they are not predicted at all.
+
     With a masker that hides nothing there is no masked pass (the rows without masking of CRM
     Table 3a, which the release cannot run); the distillation weights must then be 0.
 
