@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from rgbt.losses.distillation import sdc, sdn
 from rgbt.ranges import NonNegative
@@ -75,6 +75,11 @@ class CRM:
 
     def phases(self, batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:
         """One phase: the criterion of the supervised passes and the distillation terms."""
+        # In a function of its own, so that the backward pass does not keep the mask logits.
+        yield Phase(("main",), self._parts(batch, generator_of))
+
+    def _parts(self, batch: Batch, generator_of: GeneratorOf) -> dict[str, Tensor]:
+        """Weighted parts of the loss."""
         passes = 2 if self.hides_cells else 1
         # Stacked pass by pass, F R T F' R' T': the supervised ones are the first len(weights).
         modality = [self.modality_weight] * (len(self.views) - 1)
@@ -90,7 +95,7 @@ class CRM:
                 weighted["sdc"] = self.complementary_weight * sdc(teacher, student)
             if self.nonlocal_weight:
                 weighted["sdn"] = self.nonlocal_weight * sdn(teacher, *singles)
-        yield Phase(("main",), weighted)
+        return weighted
 
     def _forward(self, batch: Batch, generator_of: GeneratorOf, *, supervised: int) -> Output:
         """What the network returns; it has masks of the first `supervised` predictions alone."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import weakref
+
 import torch
 from torch import Tensor
 
@@ -49,7 +51,8 @@ class Numbered:
         self.call |= {"num_predictions": count, "num_masks": num_masks or count}
         logits = torch.arange(count, dtype=torch.float32).view(1, -1, 1, 1, 1)
         class_logits = logits.expand(2, count, B, Q, K + 1)
-        mask_logits = class_logits[:, :num_masks, ..., None]
+        mask_logits = class_logits[:, :num_masks, ..., None].contiguous()
+        self.mask_logits = weakref.ref(mask_logits)
         return Output(None, {"class_logits": class_logits, "mask_logits": mask_logits})
 
 
@@ -96,6 +99,14 @@ def test_masks_are_predicted_only_where_the_criterion_reads_them() -> None:
     list(crm.phases(batch(), generator_of))
     assert crm.model.call["num_predictions"] == 6
     assert crm.model.call["num_masks"] == 4
+
+
+def test_mask_logits_are_freed_before_the_backward_pass() -> None:
+    crm = scheme(Halves())
+    phases = crm.phases(batch(), generator_of)
+    phase = next(phases)
+    assert phase.parts
+    assert crm.model.mask_logits() is None
 
 
 def test_without_sdn_the_masked_single_modalities_are_not_predicted() -> None:
