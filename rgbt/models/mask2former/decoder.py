@@ -58,7 +58,7 @@ class QueryAttention(nn.Module):
 
 def _attend(q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None) -> Tensor:
     """Scaled dot-product attention of (B, heads, Q, D) to (B, heads, S, D)."""
-    if q.device.type != "cpu":
+    if q.device.type != "cpu" or q.dtype not in (torch.bfloat16, torch.float16):
         return F.scaled_dot_product_attention(q, k, v, attn_mask=mask)
     # On CPU the gradient takes up to three times as long in bfloat16 as in single precision.
     with torch.autocast("cpu", enabled=False):
