@@ -55,7 +55,9 @@ class Record:
         views: network: the input images it can predict from; it is evaluated with the first one.
         heads: network and domains: names of the heads.
         auxiliary: network: whether it returns `aux["aux_logits"]`.
-        stacks_passes: network: whether `forward` takes `passes` of a batch, each as its own call.
+        stacks_passes: network: whether `forward` takes `passes` of a batch, each as its own call;
+            one that returns masks also takes `num_predictions` and `num_masks`, see
+            `rgbt.models.mask2former.model.Mask2Former.forward`.
         dense_logits: network: whether its method `dense_logits` converts masks to class scores.
         pretrained_parts: network: beginnings of the names of the parameters that an ImageNet file
             covers; they get the backbone's learning rate.

@@ -28,6 +28,8 @@ DATASET_CALLS = {
     **{"files": ("name",), "nights": ("names",), "fingerprint": (), "decoding": ()},
 }
 MODEL_CALLS = {"forward": ("rgb", "thermal", "masks", "views=", "generator=")}
+STACKED = ("passes=", "num_predictions=", "num_masks=")
+"""Further arguments of a network that returns masks and whose record says stacks_passes=True."""
 LOSS_CALLS: dict[int, dict[str, tuple[str, ...]]] = {
     1: {"__call__": ("output", "batch", "generator")},
     2: {"__call__": ("first", "second", "warped", "valid", "generator")},
@@ -153,7 +155,9 @@ def watch_model(model: nn.Module, num_classes: int) -> None:
 
     The arguments of its `forward` are checked at once.
     """
-    check_members("model", model, (), MODEL_CALLS)
+    record = record_of(model)
+    stacked = STACKED if record.stacks_passes and record.outputs == "masks" else ()
+    check_members("model", model, (), {"forward": (*MODEL_CALLS["forward"], *stacked)})
     left = {True, False}
 
     def check(

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from rgbt.losses.distillation import sdc, sdn
 from rgbt.ranges import NonNegative
@@ -26,11 +26,15 @@ class CRM:
     mark the masked pass. SDC is the mean absolute difference of the final class logits of F' to
     those of F, which are the fixed teacher; SDN the same for R' and T', summed.
 
+    No loss reads the masks of R' and T', so the network does not predict them. With w_n = 0 nothing
+    reads R' and T', and they are not predicted at all.
+
     With a masker that hides nothing there is no masked pass (the rows without masking of CRM
     Table 3a, which the release cannot run); the distillation weights must then be 0.
 
     Attributes:
-        model: network with the argument `passes` and `views` of `rgbt.models.mask2former`.
+        model: network with the arguments `passes`, `num_predictions` and `num_masks` of
+            `rgbt.models.mask2former`.
         loss: criterion that returns one value per stacked pass.
         masker: draws the masks of the masked pass.
         modality_weight: w_m. 1 in the release.
@@ -71,10 +75,16 @@ class CRM:
 
     def phases(self, batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:
         """One phase: the criterion of the supervised passes and the distillation terms."""
-        output, passes = self._forward(batch, generator_of)
+        # In a function of its own, so that the backward pass does not keep the mask logits.
+        yield Phase(("main",), self._parts(batch, generator_of))
+
+    def _parts(self, batch: Batch, generator_of: GeneratorOf) -> dict[str, Tensor]:
+        """Weighted parts of the loss."""
+        passes = 2 if self.hides_cells else 1
         # Stacked pass by pass, F R T F' R' T': the supervised ones are the first len(weights).
         modality = [self.modality_weight] * (len(self.views) - 1)
         weights = torch.tensor([1.0, *modality, *[1.0] * (passes - 1)]).to(batch.rgb.device)
+        output = self._forward(batch, generator_of, supervised=len(weights))
         supervised = {name: tensor[:, : len(weights)] for name, tensor in output.aux.items()}
         parts = self.loss(Output(None, supervised), batch, generator_of("loss"))
         weighted = {name: (values * weights).sum() for name, values in parts.items()}
@@ -85,22 +95,27 @@ class CRM:
                 weighted["sdc"] = self.complementary_weight * sdc(teacher, student)
             if self.nonlocal_weight:
                 weighted["sdn"] = self.nonlocal_weight * sdn(teacher, *singles)
-        yield Phase(("main",), weighted)
+        return weighted
 
-    def _forward(self, batch: Batch, generator_of: GeneratorOf) -> tuple[Output, int]:
-        """What the network returns, and the number of stacked passes."""
+    def _forward(self, batch: Batch, generator_of: GeneratorOf, *, supervised: int) -> Output:
+        """What the network returns; it has masks of the first `supervised` predictions alone."""
         generator = generator_of("stochastic depth")
+        output: Output
         if not self.hides_cells:
             output = self.model(batch.rgb, batch.thermal, views=self.views, generator=generator)
-            return output, 1
+            return output
         height, width = batch.rgb.shape[-2:]
         masks = self.masker((height, width), batch.centre_yx, generator_of("mask"))
+        # SDN reads the class logits of R' and T'; without it, nothing reads them.
+        distilled = len(self.views) - 1 if self.nonlocal_weight else 0
         output = self.model(
             batch.rgb.repeat(2, 1, 1, 1),
             batch.thermal.repeat(2, 1, 1, 1),
             MaskPair(*(torch.cat([torch.zeros_like(m), m]) for m in masks)),
             passes=2,
             views=self.views,
+            num_predictions=supervised + distilled,
+            num_masks=supervised,
             generator=generator,
         )
-        return output, 2
+        return output

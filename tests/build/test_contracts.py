@@ -144,6 +144,10 @@ REFUSED: list[tuple[Callable[[], Any], str]] = [
         lambda: contracts.watch_model(nn.Linear(1, 1), 5),
         "Linear.forward must accept the call forward(rgb,",
     ),
+    (
+        lambda: passed(None, outputs="masks", stacks_passes=True),
+        "forward(rgb, thermal, masks, views=..., generator=..., passes=..., num_predictions=...,",
+    ),
     (lambda: compared(VALUE), "loss: focal returned Tensor () float32; expected a dictionary of"),
     (lambda: compared({"a": 1.0}), "'a': float 1.0; expected"),
     (lambda: compared({"a": VALUE}), "'a': Tensor () float32; expected"),

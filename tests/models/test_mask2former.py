@@ -81,6 +81,53 @@ def test_batched_views_and_passes_equal_single_calls(training: bool) -> None:
     assert together.backbone.norm_layers["res2"].num_batches_tracked == (2 if training else 0)
 
 
+def gradients(net: nn.Module, loss: Tensor) -> dict[str, Tensor]:
+    net.zero_grad()
+    loss.backward()
+    return {name: p.grad.clone() for name, p in net.named_parameters()}
+
+
+@pytest.mark.parametrize(("predictions", "with_masks"), [(6, 4), (4, 4), (5, 1)])
+def test_fewer_predictions_equal_the_first_of_all(predictions: int, with_masks: int) -> None:
+    """The loss reads the masks of some, and the final class logits of the others, as CRM does."""
+    net = nano().train()
+    pair, hidden = images(4), cells(4)
+    g = generator(4)
+    weights = {
+        "class_logits": torch.randn(4, predictions, 2, 5, 5, generator=g),
+        "mask_logits": torch.randn(4, with_masks, 2, 5, 16, 24, generator=g),
+    }
+
+    def loss(aux: dict[str, Tensor]) -> Tensor:
+        supervised = sum(
+            (aux[name][:, :with_masks] * w[:, :with_masks]).sum() for name, w in weights.items()
+        )
+        others = slice(with_masks, predictions)
+        final = aux["class_logits"][-1, others] * weights["class_logits"][-1, others]
+        return supervised + final.sum()
+
+    every = net(*pair, hidden, passes=2, views=ALL_VIEWS).aux
+    wanted = {"num_predictions": predictions, "num_masks": with_masks}
+    fewer = net(*pair, hidden, passes=2, views=ALL_VIEWS, **wanted).aux
+    for name, number in (("class_logits", predictions), ("mask_logits", with_masks)):
+        assert fewer[name].shape[1] == number
+        assert torch.equal(fewer[name], every[name][:, :number])
+    expected = gradients(net, loss(every))
+    found = gradients(net, loss(fewer))
+    for name, gradient in found.items():
+        torch.testing.assert_close(gradient, expected[name], rtol=1e-5, atol=1e-5)
+
+
+def test_the_finest_features_of_predictions_without_masks_need_no_gradient() -> None:
+    net = nano().train()
+    aux = net(*images(2), views=ALL_VIEWS, num_masks=1).aux
+    aux["class_logits"][-1, 1:].sum().backward()
+    pixel_decoder = net.sem_seg_head.pixel_decoder
+    for parameter in (pixel_decoder.layer_1.weight, pixel_decoder.adapter_1.weight):
+        assert parameter.grad is None
+    assert pixel_decoder.input_proj[0][0].weight.grad.any()
+
+
 def test_mask_token_replaces_exactly_the_hidden_tokens() -> None:
     net = nano().eval()
     seen: dict[str, Tensor] = {}
@@ -166,6 +213,10 @@ def test_stochastic_depth_factors() -> None:
         {"passes": 2},
         {"views": ("rgb", "rgb")},
         {"views": ("infrared",)},
+        {"num_predictions": 2},
+        {"num_masks": 2},
+        {"num_masks": 0},
+        {"views": ALL_VIEWS, "num_predictions": 2, "num_masks": 3},
         {"masks": cells(2)},
     ],
 )

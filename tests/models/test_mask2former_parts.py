@@ -9,9 +9,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.models.mask2former.decoder import QueryAttention, shrink
+from rgbt.models.mask2former.decoder import QueryAttention
 from rgbt.models.mask2former.deformable import DeformableAttention, centre_grid
-from rgbt.models.mask2former.pixel_decoder import sine_code
+from rgbt.models.mask2former.pixel_decoder import shrink, sine_code
 from rgbt.models.mask2former.swin import (
     PatchMerging,
     SwinBlock,
@@ -19,6 +19,7 @@ from rgbt.models.mask2former.swin import (
     relative_index,
     shift_mask,
 )
+from tests.models import plain
 
 CPU = torch.device("cpu")
 
@@ -192,3 +193,35 @@ def test_shrink_equals_bilinear_interpolation(factor: int) -> None:
         x, size=(16 // factor, 24 // factor), mode="bilinear", align_corners=False
     )
     torch.testing.assert_close(shrink(x, factor), expected)
+
+
+def test_head_without_masks_of_some_samples_has_the_same_gradients() -> None:
+    """In double precision: what differs in single precision is the order of the sums."""
+    head = plain.nano("mask2former").sem_seg_head.double()
+    head.pixel_decoder.fp32 = False
+    widths, sides = (8, 16, 32, 64), ((16, 24), (8, 12), (4, 6), (2, 3))
+    sizes = [(5, width, *side) for width, side in zip(widths, sides, strict=True)]
+    found = []
+    for num_masks in (None, 3):
+        features = [seeded(*size, seed=i).double() for i, size in enumerate(sizes)]
+        leaves = [each.requires_grad_() for each in features]
+        classes, masks = head.predictor(head.pixel_decoder(leaves, num_masks))
+        assert masks.shape[1] == (num_masks or 5)
+        loss = classes.square().sum() + masks[:, :3].square().sum()
+        wanted = [*leaves, *head.parameters()]
+        found.append([classes, masks[:, :3], *torch.autograd.grad(loss, wanted)])
+    for every, fewer in zip(*found, strict=True):
+        torch.testing.assert_close(fewer, every, rtol=1e-10, atol=1e-10)
+
+
+def test_query_attention_under_autocast_is_near_single_precision() -> None:
+    attention = QueryAttention(8, 2)
+    randomise(attention)
+    query, key = seeded(2, 3, 8), seeded(2, 5, 8, seed=1)
+    allowed = seeded(2, 3, 5, seed=2) > 0
+    allowed[..., 0] = True
+    with torch.autocast("cpu", torch.bfloat16):
+        found = attention(query, key, key, allowed)
+    expected = attention(query, key, key, allowed)
+    assert found.dtype == torch.bfloat16
+    torch.testing.assert_close(found.float(), expected, rtol=0.05, atol=0.05)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import weakref
+
 import torch
 from torch import Tensor
 
@@ -32,12 +34,26 @@ def generator_of(purpose: str) -> torch.Generator:
 class Numbered:
     """Pass p predicts class logits that are all p; remembers how it was called."""
 
-    def __call__(self, rgb, thermal, masks=None, *, passes=1, views=("rgbt",), generator=None):
+    def __call__(
+        self,
+        rgb: Tensor,
+        thermal: Tensor,
+        masks: MaskPair | None = None,
+        *,
+        passes: int = 1,
+        views: tuple[str, ...] = ("rgbt",),
+        num_predictions: int | None = None,
+        num_masks: int | None = None,
+        generator: torch.Generator | None = None,
+    ) -> Output:
+        count = num_predictions or passes * len(views)
         self.call = {"n": len(rgb), "masks": masks, "passes": passes, "views": views}
-        count = passes * len(views)
+        self.call |= {"num_predictions": count, "num_masks": num_masks or count}
         logits = torch.arange(count, dtype=torch.float32).view(1, -1, 1, 1, 1)
         class_logits = logits.expand(2, count, B, Q, K + 1)
-        return Output(None, {"class_logits": class_logits, "mask_logits": class_logits[..., None]})
+        mask_logits = class_logits[:, :num_masks, ..., None].contiguous()
+        self.mask_logits = weakref.ref(mask_logits)
+        return Output(None, {"class_logits": class_logits, "mask_logits": mask_logits})
 
 
 class OneEach:
@@ -45,6 +61,7 @@ class OneEach:
 
     def __call__(self, output: Output, batch: Batch, generator: torch.Generator) -> dict:
         self.passes = output.aux["class_logits"].shape[1]
+        assert output.aux["mask_logits"].shape[1] == self.passes
         return {"class": torch.arange(1.0, self.passes + 1)}
 
 
@@ -74,6 +91,31 @@ def test_full_step_weights_four_supervised_passes_and_two_distillations() -> Non
     assert phase.parts["sdc"] == 2.0 * 3  # |F - F'| = |0 - 3|
     assert phase.parts["sdn"] == 3.0 * (4 + 5)  # |F - R'| + |F - T'|
     assert crm.model.call["views"] == ("rgbt", "rgb", "thermal")
+
+
+def test_masks_are_predicted_only_where_the_criterion_reads_them() -> None:
+    """SDN reads the class logits of R' and T' alone."""
+    crm = scheme(Halves())
+    list(crm.phases(batch(), generator_of))
+    assert crm.model.call["num_predictions"] == 6
+    assert crm.model.call["num_masks"] == 4
+
+
+def test_mask_logits_are_freed_before_the_backward_pass() -> None:
+    crm = scheme(Halves())
+    phases = crm.phases(batch(), generator_of)
+    phase = next(phases)
+    assert phase.parts
+    assert crm.model.mask_logits() is None
+
+
+def test_without_sdn_the_masked_single_modalities_are_not_predicted() -> None:
+    crm = scheme(Halves(), nonlocal_weight=0.0)
+    (phase,) = crm.phases(batch(), generator_of)
+    assert crm.model.call["num_predictions"] == 4
+    assert phase.parts["class"] == 1 + 2 + 3 + 4
+    assert phase.parts["sdc"] == 3.0
+    assert "sdn" not in phase.parts
 
 
 def test_the_clean_half_of_the_batch_is_not_masked() -> None:

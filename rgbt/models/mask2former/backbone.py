@@ -51,6 +51,7 @@ class RgbtBackbone(nn.Module):
         *,
         passes: int = 1,
         views: tuple[View, ...] = ("rgbt",),
+        num_predictions: int | None = None,
         generator: torch.Generator | None = None,
     ) -> list[Tensor]:
         """Features of all views as one batch; a branch that no view needs is not run.
@@ -61,10 +62,12 @@ class RgbtBackbone(nn.Module):
             passes: N holds this many stacked copies of a batch; the fusion's batch normalisation
                 takes them one after the other, so that each is normalised on its own.
             views: which sets of features, in this order within each pass.
+            num_predictions: P, how many of the len(views) * passes sets are returned, from the
+                first one on; None: all.
             generator: draws stochastic depth, first the RGB branch's, then the thermal one's.
 
         Returns:
-            four (len(views) N, C_s, H/s, W/s), s = 4, 8, 16, 32: pass by pass, then view by view.
+            four (P N / passes, C_s, H/s, W/s), s = 4, 8, 16, 32: pass by pass, then view by view.
         """
         maps: dict[str, list[Tensor]] = {}
         if views != ("thermal",):
@@ -73,12 +76,14 @@ class RgbtBackbone(nn.Module):
         if views != ("rgb",):
             mask = None if hidden is None else hidden.thermal
             maps["thermal"] = self.THR_branch(images[1], mask, generator)
-        return [self._join(level, maps, passes, views) for level in range(len(LEVELS))]
+        levels = (self._split(level, maps, passes, views) for level in range(len(LEVELS)))
+        wanted = [parts[:num_predictions] for parts in levels]
+        return [torch.cat(parts) if len(parts) > 1 else parts[0] for parts in wanted]
 
-    def _join(
+    def _split(
         self, level: int, maps: dict[str, list[Tensor]], passes: int, views: tuple[View, ...]
-    ) -> Tensor:
-        """The maps of one level along the batch: every view of the first pass, then the next."""
+    ) -> list[Tensor]:
+        """The maps of one level: of every view of the first pass, then of the next."""
         by_view: list[tuple[Tensor, ...]] = []
         for view in views:
             if view != "rgbt":
@@ -89,5 +94,4 @@ class RgbtBackbone(nn.Module):
             parts = fused.chunk(passes) if self.training else (fused,)
             normed = [self.norm_layers[norm](part) for part in parts]
             by_view.append(tuple(normed) if self.training else normed[0].chunk(passes))
-        joined = [part for one_pass in zip(*by_view, strict=True) for part in one_pass]
-        return torch.cat(joined) if len(joined) > 1 else joined[0]
+        return [part for one_pass in zip(*by_view, strict=True) for part in one_pass]

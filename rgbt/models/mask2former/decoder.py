@@ -16,7 +16,8 @@ class Predictions(NamedTuple):
 
     Attributes:
         class_logits: (L, B, Q, K + 1), last column = no object.
-        mask_logits: (L, B, Q, H/4, W/4), a view of memory ordered B, L, Q, H/4, W/4.
+        mask_logits: (L, M, Q, H/4, W/4) of the first M samples, those of `PixelPyramid.fine`; a
+            view of memory ordered M, L, Q, H/4, W/4.
     """
 
     class_logits: Tensor
@@ -50,9 +51,18 @@ class QueryAttention(nn.Module):
             for x, w, b in zip((query, key, value), weights, biases, strict=True)
         )
         mask = None if allowed is None else allowed[:, None]
-        out = F.scaled_dot_product_attention(q, k, v, attn_mask=mask)
+        out = _attend(q, k, v, mask)
         projected: Tensor = self.out_proj(out.transpose(1, 2).flatten(2))
         return projected
+
+
+def _attend(q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None) -> Tensor:
+    """Scaled dot-product attention of (B, heads, Q, D) to (B, heads, S, D)."""
+    if q.device.type != "cpu" or q.dtype not in (torch.bfloat16, torch.float16):
+        return F.scaled_dot_product_attention(q, k, v, attn_mask=mask)
+    # On CPU the gradient takes up to three times as long in bfloat16 as in single precision.
+    with torch.autocast("cpu", enabled=False):
+        return F.scaled_dot_product_attention(q.float(), k.float(), v.float(), attn_mask=mask)
 
 
 class AttentionLayer(nn.Module):
@@ -147,15 +157,8 @@ class Predictor(nn.Module):
         for tokens, hw, embed in every_level:
             values = tokens + embed
             memories.append((values + sine_code(hw, values.shape[-1], values.device), values))
-        # Resizing is linear: a resized mask is the product of the embedding with resized features,
-        # which costs the size of the level instead of the size of the mask.
-        with torch.no_grad():
-            reduced = [
-                shrink(pyramid.fine, pyramid.fine.shape[-1] // columns).flatten(2)
-                for _, columns in pyramid.levels
-            ]
         position = self.query_embed.weight
-        queries = self.query_feat.weight.expand(len(pyramid.fine), -1, -1)
+        queries = self.query_feat.weight.expand(len(pyramid.tokens[0]), -1, -1)
         normed: list[Tensor] = [self.decoder_norm(queries)]
         embeds: list[Tensor] = [self.mask_embed(normed[0])]
         layers = zip(
@@ -166,10 +169,11 @@ class Predictor(nn.Module):
         )
         for index, (cross_attention, self_attention, ffn) in enumerate(layers):
             level = index % NUM_LEVELS
-            with (
-                torch.no_grad()
-            ):  # read where the own mask has probability 1/2 or more, if anywhere
-                inside = _mask_logits(embeds[-1], pyramid, reduced[level]) >= 0
+            # Read where the own mask has probability 1/2 or more, if anywhere. Resizing is linear:
+            # a resized mask is the product of the embedding with resized features, which costs the
+            # size of the level instead of the size of the mask.
+            with torch.no_grad():
+                inside = _mask_logits(embeds[-1], pyramid, pyramid.reduced[level]) >= 0
                 allowed = inside | ~inside.any(-1, keepdim=True)
             queries = cross_attention(queries, queries + position, memories[level], allowed)
             placed = queries + position
@@ -179,7 +183,8 @@ class Predictor(nn.Module):
 
         # The masks of all layers are one matrix product: no copy, one gradient of the features.
         class_logits = self.class_embed(torch.stack(normed))
-        masks = _mask_logits(torch.cat(embeds, dim=1), pyramid, pyramid.fine.flatten(2))
+        embed = torch.cat(embeds, dim=1)[: len(pyramid.fine)]
+        masks = _mask_logits(embed, pyramid, pyramid.fine.flatten(2))
         masks = masks.view(len(masks), len(embeds), -1, *pyramid.fine.shape[-2:])
         return Predictions(class_logits, masks.transpose(0, 1))
 
@@ -188,14 +193,3 @@ def _mask_logits(embed: Tensor, pyramid: PixelPyramid, fine: Tensor) -> Tensor:
     """(B, Q, C) mask embeddings times mask features of `fine` (B, C, pixels) -> (B, Q, pixels)."""
     offset = embed @ pyramid.bias[:, None]
     return torch.baddbmm(offset.expand(-1, -1, fine.shape[-1]), embed @ pyramid.weight, fine)
-
-
-def shrink(x: Tensor, factor: int) -> Tensor:
-    """Bilinear resize by an even factor: the mean of the four pixels around each new centre.
-
-    Equals `interpolate(mode="bilinear", align_corners=False)`, which is slow on CPU. Sides of x
-    (..., H, W) are multiples of `factor`: (..., H / factor, W / factor).
-    """
-    low, high = factor // 2 - 1, factor // 2
-    rows = x[..., low::factor, :] + x[..., high::factor, :]
-    return (rows[..., low::factor] + rows[..., high::factor]) / 4

@@ -119,7 +119,7 @@ class Mask2Former(nn.Module):
         self.sem_seg_head = nn.Sequential(OrderedDict(parts))
         self.inputs = inputs
 
-    def forward(
+    def forward(  # noqa: PLR0913 - what every network takes, and what is stacked
         self,
         rgb: Tensor,
         thermal: Tensor,
@@ -127,9 +127,13 @@ class Mask2Former(nn.Module):
         *,
         passes: int = 1,
         views: tuple[View, ...] = (),
+        num_predictions: int | None = None,
+        num_masks: int | None = None,
         generator: torch.Generator | None = None,
     ) -> Output:
         """Predictions of every view and pass, as one batch through the head.
+
+        Predictions are in the order F R T F' R' T': pass by pass, within it view by view.
 
         Args:
             rgb: as `rgbt.models` says, N = passes * B, pass by pass.
@@ -139,20 +143,25 @@ class Mask2Former(nn.Module):
                 after the other, as successive calls would show them.
             views: which features are predicted from, each at most once: "rgbt" (fused), "rgb",
                 "thermal". () is "rgbt". A branch that no view needs is not computed.
+            num_predictions: P, how many of the len(views) * passes predictions are computed, from
+                the first one on. None: all.
+            num_masks: M, how many of the P have mask logits, from the first one on; the others have
+                class logits alone, which costs less, because the gradient of the finest features is
+                not needed. None: all.
             generator: draws stochastic depth, per sample and branch; needed in training mode
                 unless `drop_path_rate` is 0.
 
         Returns:
             logits: (B, K, H, W) float32 semantic scores in evaluation mode when there is one view
                 and one pass, else None. They are sums over queries, not normalised.
-            aux: with P = len(views) * passes, pass by pass, within it view by view, and
-                L = decoder_layers + 1, the last one final:
+            aux: with L = decoder_layers + 1, the last one final:
                 "class_logits" (L, P, B, Q, K + 1), last column = no object;
-                "mask_logits" (L, P, B, Q, h, w) at 1/4 of the padded size; in memory the order
-                is P, B, L, Q, h, w.
+                "mask_logits" (L, M, B, Q, h, w) at 1/4 of the padded size; in memory the order
+                is M, B, L, Q, h, w.
 
         Raises:
-            ValueError: shapes, passes or views that do not fit; no generator where one is needed.
+            ValueError: shapes, passes, views or numbers of predictions that do not fit; no
+                generator where one is needed.
             InputError: mask cells that do not divide the padded image.
         """
         views = views or VIEWS[:1]
@@ -162,22 +171,38 @@ class Mask2Former(nn.Module):
             raise ValueError(f"views must name each view at most once, got {views}.")
         for view in views:
             check_choice("view", view, VIEWS)
+        stacked = len(views) * passes
+        predictions = stacked if num_predictions is None else num_predictions
+        with_masks = predictions if num_masks is None else num_masks
+        if not 1 <= with_masks <= predictions <= stacked:
+            raise ValueError(
+                f"num_predictions={num_predictions} and num_masks={num_masks} do not fit: expected "
+                f"1 <= num_masks <= num_predictions <= {stacked} (views times passes)."
+            )
         if self.training and self.drop_path_rate > 0 and generator is None:
             raise ValueError("training with drop_path_rate > 0 requires `generator`, got None.")
         image_hw = rgb.shape[2], rgb.shape[3]
         full_hw = padded_hw(image_hw)
         images = self.inputs(rgb, thermal, multiple=STRIDE)
         hidden = None if masks is None else expand_cells(masks, len(rgb), full_hw, PATCH)
-        features = self.backbone(images, hidden, passes=passes, views=views, generator=generator)
+        features = self.backbone(
+            images,
+            hidden,
+            passes=passes,
+            views=views,
+            num_predictions=predictions,
+            generator=generator,
+        )
 
-        classes, mask_logits = self.sem_seg_head(features)
+        count = len(rgb) // passes
+        pyramid = self.sem_seg_head.get_submodule("pixel_decoder")(features, with_masks * count)
+        classes, mask_logits = self.sem_seg_head.get_submodule("predictor")(pyramid)
         logits = None
-        if not self.training and len(views) * passes == 1:
+        if not self.training and stacked == 1:
             logits = semantic_logits(classes[-1], mask_logits[-1], image_hw, full_hw)
-        stacked = (len(views) * passes, len(rgb) // passes)
         aux = {
-            "class_logits": classes.unflatten(1, stacked),
-            "mask_logits": mask_logits.unflatten(1, stacked),
+            "class_logits": classes.unflatten(1, (predictions, count)),
+            "mask_logits": mask_logits.unflatten(1, (with_masks, count)),
         }
         return Output(logits, aux)
 

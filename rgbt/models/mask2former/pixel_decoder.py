@@ -24,7 +24,8 @@ class PixelPyramid(NamedTuple):
     three factors: e (W f + b) = (e W) f + e b costs less, for fewer embeddings e than pixels.
 
     Attributes:
-        fine: f, (B, C, H/4, W/4).
+        fine: f, (M, C, H/4, W/4) of the first M of B samples, M <= B.
+        reduced: f of all samples at strides 32, 16, 8, (B, C, S_l) each, without gradient.
         weight: W, (C, C).
         bias: b, (C,).
         tokens: (B, S_l, C) at strides 32, 16, 8, row-major.
@@ -32,6 +33,7 @@ class PixelPyramid(NamedTuple):
     """
 
     fine: Tensor
+    reduced: tuple[Tensor, ...]
     weight: Tensor
     bias: Tensor
     tokens: tuple[Tensor, ...]
@@ -136,14 +138,21 @@ class PixelDecoder(nn.Module):
             nn.init.zeros_(projection.get_submodule("0").get_parameter("bias"))
         nn.init.zeros_(self.mask_features.get_parameter("bias"))
 
-    def forward(self, features: list[Tensor]) -> PixelPyramid:
-        """Features (B, C_s, H/s, W/s), s = 4, 8, 16, 32, to mask features and tokens."""
-        if not self.fp32:
-            return self._decode(features)
-        with torch.autocast(features[0].device.type, enabled=False):
-            return self._decode([each.float() for each in features])
+    def forward(self, features: list[Tensor], num_masks: int | None = None) -> PixelPyramid:
+        """Features (B, C_s, H/s, W/s), s = 4, 8, 16, 32, to mask features and tokens.
 
-    def _decode(self, features: list[Tensor]) -> PixelPyramid:
+        Args:
+            features: of the four strides.
+            num_masks: M, how many samples from the first one on have masks. No gradient is computed
+                of the mask features of the others. None: all.
+        """
+        count = len(features[0]) if num_masks is None else num_masks
+        if not self.fp32:
+            return self._decode(features, count)
+        with torch.autocast(features[0].device.type, enabled=False):
+            return self._decode([each.float() for each in features], count)
+
+    def _decode(self, features: list[Tensor], num_masks: int) -> PixelPyramid:
         fine, *coarse = features
         maps = [project(x) for project, x in zip(self.input_proj, reversed(coarse), strict=True)]
         levels = tuple((x.shape[2], x.shape[3]) for x in maps)
@@ -152,12 +161,37 @@ class PixelDecoder(nn.Module):
 
         per_level = tokens.split([rows * columns for rows, columns in levels], dim=1)
         stride_8 = per_level[-1].unflatten(1, levels[-1]).permute(0, 3, 1, 2)
+        finest = self._finest(fine[:num_masks], stride_8[:num_masks])
+        with torch.no_grad():
+            reduced = _reduce(finest, levels)
+            if num_masks < len(fine):
+                others = self._finest(fine[num_masks:], stride_8[num_masks:])
+                pairs = zip(reduced, _reduce(others, levels), strict=True)
+                reduced = tuple(torch.cat(pair) for pair in pairs)
+        weight, bias = (self.mask_features.get_parameter(name) for name in ("weight", "bias"))
+        return PixelPyramid(finest, reduced, weight.flatten(1), bias, per_level, levels)
+
+    def _finest(self, fine: Tensor, stride_8: Tensor) -> Tensor:
+        """The backbone's map at stride 4 and the enlarged one of stride 8: (M, C, H/4, W/4)."""
         upsampled = F.interpolate(
             stride_8, size=fine.shape[-2:], mode="bilinear", align_corners=False
         )
         # Contiguous, because group normalisation's gradient is slow where channels come last.
         summed = self.adapter_1(fine.contiguous()) + upsampled
-        weight, bias = (self.mask_features.get_parameter(name) for name in ("weight", "bias"))
-        return PixelPyramid(
-            F.relu(self.layer_1(summed)), weight.flatten(1), bias, per_level, levels
-        )
+        return F.relu(self.layer_1(summed))
+
+
+def _reduce(fine: Tensor, levels: Levels) -> tuple[Tensor, ...]:
+    """(B, C, H, W) at the sizes of all levels, (B, C, S_l) each."""
+    return tuple(shrink(fine, fine.shape[-1] // columns).flatten(2) for _, columns in levels)
+
+
+def shrink(x: Tensor, factor: int) -> Tensor:
+    """Bilinear resize by an even factor: the mean of the four pixels around each new centre.
+
+    Equals `interpolate(mode="bilinear", align_corners=False)`, which is slow on CPU. Sides of x
+    (..., H, W) are multiples of `factor`: (..., H / factor, W / factor).
+    """
+    low, high = factor // 2 - 1, factor // 2
+    rows = x[..., low::factor, :] + x[..., high::factor, :]
+    return (rows[..., low::factor] + rows[..., high::factor]) / 4
