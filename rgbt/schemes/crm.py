@@ -15,6 +15,7 @@ from torch import nn
 from rgbt.losses.distillation import sdc, sdn
 from rgbt.ranges import NonNegative
 from rgbt.requirements import Record, Requirement, record_of
+from rgbt.schemes.masks import draw_masks
 from rgbt.types import VIEWS, AnyMasker, Batch, GeneratorOf, Loss, MaskPair, Output, Phase
 
 
@@ -93,8 +94,7 @@ class CRM:
         if not self.hides_cells:
             output = self.model(batch.rgb, batch.thermal, views=self.views, generator=generator)
             return output, 1
-        height, width = batch.rgb.shape[-2:]
-        masks = self.masker((height, width), batch.centre_yx, generator_of("mask"))
+        masks = draw_masks(self.masker, batch, generator_of("mask"))
         output = self.model(
             batch.rgb.repeat(2, 1, 1, 1),
             batch.thermal.repeat(2, 1, 1, 1),
