@@ -53,7 +53,7 @@ def run_in_processes(
     for rank in range(num_processes):
         ours, theirs = PROCESSES.Pipe(duplex=False)
         given = (function, args, rank, num_processes, store.port, theirs, dict(environment or {}))
-        process = PROCESSES.Process(target=_run, args=given, daemon=True)
+        process = PROCESSES.Process(target=_run, args=given)  # it may start loader processes
         process.start()
         theirs.close()
         started.append((process, ours))
