@@ -1,7 +1,8 @@
 """Load batches for training and evaluation.
 
 The samples of a batch and their augmentation depend on (seed, step) alone, not on the number of
-worker processes. Batches are not padded: networks pad images and losses pad labels.
+worker processes. Where several processes train one run, each loads every W-th sample of a batch
+(`rgbt.processes`). Batches are not padded: networks pad images and losses pad labels.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from rgbt.data.reader import (
     start_worker,
 )
 from rgbt.dataset import LabelledDataset
+from rgbt.processes import num_processes, rank
 from rgbt.randomness import numpy_generator
 from rgbt.ranges import BatchSize, Text, Workers
 from rgbt.requirements import Record, Requirement
@@ -57,7 +59,8 @@ class LoaderSettings:
     """How samples are loaded.
 
     Attributes:
-        batch_size: samples of a training batch, >= 1.
+        batch_size: samples of a training batch, >= 1; of all devices together, which share it
+            equally.
         eval_batch_size: samples of an evaluation batch, >= 1; 1 where image sizes differ.
         num_workers: processes that decode and augment; 0: the main process does.
         prefetch: batches that each process makes in advance.
@@ -179,13 +182,16 @@ def train_batches(
 ) -> Batches[Loadable]:
     """Augmented training batches of the global steps in `steps`, made by ``transform.train``.
 
+    Process r of W has the samples r, r + W, r + 2 W, ... of each batch.
+
     Epoch e is a permutation of the split drawn from (seed, "order", e), cut into whole batches; the
     incomplete last one is dropped. Sample i of epoch e is augmented from (seed, "augment", e, i).
     So ``steps=range(10, 20)`` continues ``range(10)`` exactly. With ``augment="device"`` the
     transform is a `BatchTransform`, which augments batches when they are moved to the device.
 
     Raises:
-        InputError: the split is smaller than a batch, or, with on_error="skip", unreadable.
+        InputError: the split is smaller than a batch, or, with on_error="skip", unreadable; the
+            processes cannot share a batch equally.
     """
     per_epoch = steps_per_epoch(dataset, settings, split)
     names = dataset.names(split)
@@ -196,20 +202,26 @@ def train_batches(
     else:
         stack = partial(collate, advice=CROP_ADVICE)
         reader = BatchReader(TrainExamples(source, transform.train, seed), stack)
-    keys = _train_keys(len(names), settings.batch_size, per_epoch, seed, steps)
+    whole_batches = _train_keys(len(names), settings.batch_size, per_epoch, seed, steps)
+    own_samples = slice(rank(), None, num_processes())
+    keys = (keys[own_samples] for keys in whole_batches)
     return Batches(reader, keys=keys, settings=settings)
 
 
 def eval_batches(
     dataset: LabelledDataset, split: str, transform: Transform, settings: LoaderSettings
 ) -> Batches[Batch]:
-    """Every sample of the split once, in the order of its list, made by ``transform.test``."""
+    """Every sample of the split once, in the order of its list, made by ``transform.test``.
+
+    Process r of W has the batches r, r + W, r + 2 W, ..., possibly none.
+    """
     names = dataset.names(split)
     source = SplitReader(dataset, names, transform, settings.on_error == "skip")
     size = settings.eval_batch_size
+    keys = [list(names[start : start + size]) for start in range(0, len(names), size)]
     return Batches(
         BatchReader(EvalExamples(source), partial(collate, advice=EVAL_ADVICE)),
-        keys=[list(names[start : start + size]) for start in range(0, len(names), size)],
+        keys=keys[rank() :: num_processes()],
         settings=settings,
     )
 
@@ -217,7 +229,12 @@ def eval_batches(
 def steps_per_epoch(
     dataset: LabelledDataset, settings: LoaderSettings, split: str = "train"
 ) -> int:
-    """Whole batches of one epoch, at least 1; InputError if the split is smaller than a batch."""
+    """Whole batches of one epoch, at least 1.
+
+    Raises:
+        InputError: the split is smaller than a batch; the processes cannot share one equally.
+    """
+    check_batch_size(settings, num_processes())
     size = len(dataset.names(split))
     if size < settings.batch_size:
         raise InputError(
@@ -225,6 +242,20 @@ def steps_per_epoch(
             f"only {size} names; lower data.batch_size."
         )
     return size // settings.batch_size
+
+
+def check_batch_size(settings: LoaderSettings, processes: int) -> None:
+    """Refuse a training batch that this number of processes cannot share equally.
+
+    Raises:
+        InputError: the number does not divide the samples of a batch.
+    """
+    if settings.batch_size % processes:
+        raise InputError(
+            f"data.batch_size is {settings.batch_size}, which {processes} devices cannot share "
+            f"equally. Set data.batch_size to a multiple of {processes}, or trainer.devices to a "
+            f"divisor of {settings.batch_size}."
+        )
 
 
 def _train_keys(

@@ -40,7 +40,7 @@ class PairedBatches(Iterator[LoadedPair]):
     """A batch of the source with a batch of the target, each from its own stream.
 
     The two lists may differ in length. Each is shuffled again at its end, and an epoch of the run
-    is one of the source.
+    is one of the source. Each process has its own samples of both (`train_batches`).
 
     Args:
         source: of the labelled domain.

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from rgbt.checks import InputError, check_shape
+from rgbt.processes import mean_count
 from rgbt.ranges import NonNegative
 from rgbt.requirements import Record, Requirement
 from rgbt.types import IGNORE, Batch, Output
@@ -72,5 +73,5 @@ class CrossEntropy:
             total = (batch.confidence * costs).sum()
         kept = batch.label[batch.label != IGNORE]
         # The smallest float only matters where nothing is labelled and the sum is 0.
-        normaliser = weights[kept].sum().clamp(min=torch.finfo(torch.float32).tiny)
+        normaliser = mean_count(weights[kept].sum()).clamp(min=torch.finfo(torch.float32).tiny)
         return {"cross_entropy": (total / normaliser).reshape(1)}

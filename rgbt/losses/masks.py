@@ -37,9 +37,10 @@ def mask_losses(
 ) -> tuple[Tensor, Tensor]:
     """Cross-entropy and dice, each a sum over the matched masks of a set: two of (S,) float32."""
     device = logits_LPBQhw.device
-    image, label, query = (torch.from_numpy(each).to(device) for each in matches)
+    image, label, query = (torch.from_numpy(each).to(device) for each in matches[:3])
     masks = (targets.label[image] == label[:, None, None])[:, None].float()
-    bytes_per_set = 8 * len(image) * (sampling.candidates + sampling.fresh)
+    num_drawn = sampling.candidates + sampling.fresh
+    bytes_per_set = 8 * len(image) * num_drawn
     step = max(1, CHUNK_BYTES // max(1, bytes_per_set))
 
     parts = []
@@ -52,7 +53,7 @@ def mask_losses(
     matched_SGhw = logits_LPBQhw[layer, stacked, image, index].flatten(0, 1).float()
     for logits in torch.split(matched_SGhw, step):
         # (S, G, kept + fresh, 2) points: the least certain candidates, then fresh ones.
-        drawn = points.loss(len(logits), len(image), sampling.candidates + sampling.fresh)
+        drawn = points.loss(len(logits), matches.num_targets, num_drawn, matches.place)
         candidates, fresh = torch.split(drawn, [sampling.candidates, sampling.fresh], dim=2)
         with torch.no_grad():
             values = _read(logits, candidates).flatten(0, 1)

@@ -21,8 +21,9 @@ from torch.nn import functional as F
 
 from rgbt.checks import RunError
 from rgbt.geometry.padding import pad_to
-from rgbt.losses.points import Points, class_shares, sample
+from rgbt.losses.points import EVERY, Points, class_shares, sample
 from rgbt.losses.spatial import PointWeights, SpatialMap
+from rgbt.processes import num_processes, rank, whole
 from rgbt.types import IGNORE
 
 CHUNK_BYTES = 16 * 2**20
@@ -53,11 +54,15 @@ class Matches(NamedTuple):
         image: (G,) int64, image of each target.
         label: (G,) int64, class of each target.
         query: (S, G) int64, query matched to each target; -1 where targets outnumber queries.
+        place: which of the targets of all processes these are: their numbers, (G,) int64.
+        num_targets: how many these are.
     """
 
     image: NDArray[np.int64]
     label: NDArray[np.int64]
     query: NDArray[np.int64]
+    place: Tensor | slice
+    num_targets: int
 
 
 def targets_of(
@@ -171,10 +176,11 @@ def assign(cost: Tensor, targets: Targets) -> Matches:
         RunError: a cost that is not finite.
         ValueError: a label that is neither a class nor 255.
     """
-    parts = [cost.flatten(), targets.present.flatten(), targets.unknown.reshape(1)]
+    parts = [cost.flatten(), whole(targets.present).flatten(), targets.unknown.reshape(1)]
     numbers = torch.cat([part.float() for part in parts]).cpu().numpy()
     cost_SBQK = numbers[: cost.numel()].reshape(cost.shape)
-    present_BK = numbers[cost.numel() : -1].reshape(targets.present.shape) > 0
+    # Of the images of all processes.
+    present_BK = numbers[cost.numel() : -1].reshape(-1, targets.present.shape[1]) > 0
     if numbers[-1]:
         raise ValueError(
             f"label: expected 0 to {present_BK.shape[1] - 1} or {IGNORE}, got another value."
@@ -185,10 +191,16 @@ def assign(cost: Tensor, targets: Targets) -> Matches:
         )
 
     image, label = np.nonzero(present_BK)
+    num_targets = len(image)
+    place: Tensor | slice = EVERY
+    if num_processes() > 1:
+        own_targets = np.flatnonzero(image % num_processes() == rank())
+        image, label = image[own_targets] // num_processes(), label[own_targets]
+        place = torch.from_numpy(own_targets).to(cost.device)
     query = np.full((len(cost_SBQK), len(image)), -1)
     for one_image in np.unique(image):
         columns = np.flatnonzero(image == one_image)
         for one_set, cost_QK in enumerate(cost_SBQK[:, one_image]):
             rows, chosen = linear_sum_assignment(cost_QK[:, label[columns]])
             query[one_set, columns[chosen]] = rows
-    return Matches(image, label, query)
+    return Matches(image, label, query, place, num_targets)

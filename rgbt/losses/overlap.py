@@ -1,7 +1,8 @@
 """Soft overlaps: class probabilities with a label (Dice), and of two frames of one scene.
 
-Temporal, Eqs. 2 and 3. The caller warps the prediction of the first frame to the second. Not here:
-the dice term of matched queries (`rgbt.losses.masks`).
+Temporal, Eqs. 2 and 3. The caller warps the prediction of the first frame to the second. A ratio is
+one of sums over the batch, so that the sums are those of all processes. Not here: the dice term of
+matched queries (`rgbt.losses.masks`).
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from rgbt.checks import check_shape
+from rgbt.processes import total
 from rgbt.types import IGNORE
 
 Form = Literal["paper", "released"]
@@ -30,7 +32,7 @@ class Target:
     Attributes:
         label: (B, H, W) int64, the class of a pixel that counts, 0 elsewhere.
         weight: (B, H, W) float, 1 where a pixel counts, 0 elsewhere.
-        count: (K,) float, pixels that count, by class.
+        count: (K,) float, pixels of all processes that count, by class.
     """
 
     label: Tensor
@@ -81,9 +83,9 @@ def con(warped: Tensor, second: Tensor, valid: Tensor, form: Form) -> Tensor:
     _check(second, valid=valid, warped=warped)
     pairs = single(warped), single(second), valid
     sums: tuple[Tensor, Tensor] = _PairSums.apply(*pairs)  # type: ignore[no-untyped-call]
-    overlap, size = sums
+    overlap, size = (total(each) for each in sums)
     if form == "paper":
-        size = size + SIGMA * valid.sum()
+        size = size + SIGMA * total(valid.sum())
     # With sigma inside, no sum over at least one pixel lies below this.
     return (1 - 2 * overlap / size.clamp(min=SIGMA)).mean()
 
@@ -107,7 +109,7 @@ def con_acc(warped: Tensor, second: Tensor, label: Tensor, form: Form) -> Tensor
     overlap = at_label(warped, target) * at_label(second, target)
     size = sum_of_counted(warped + second, target) + target.count
     if form == "paper":
-        size = size + SIGMA * target.weight.sum()
+        size = size + SIGMA * total(target.weight.sum())
     factor = 2 if form == "paper" else 3
     score = factor * sum_by_class(overlap, target.label, num_classes) / size.clamp(min=SIGMA)
     return averaged(1 - score, target, form)
@@ -152,14 +154,14 @@ def at_label(probabilities: Tensor, target: Target) -> Tensor:
 
 
 def sum_by_class(values: Tensor, label: Tensor, num_classes: int) -> Tensor:
-    """(K,): sums of (B, H, W) values over the pixels of each class."""
+    """(K,): sums of (B, H, W) values over the pixels of each class, of all processes."""
     rows = values.new_zeros(*values.shape[:2], num_classes)
-    return rows.scatter_add(2, label, values).sum((0, 1))
+    return total(rows.scatter_add(2, label, values).sum((0, 1)))
 
 
 def sum_of_counted(values: Tensor, target: Target) -> Tensor:
-    """(K,): sums of (B, K, H, W) values over the pixels that count."""
-    return (values * target.weight[:, None]).sum((0, 2, 3))
+    """(K,): sums of (B, K, H, W) values over the pixels that count, of all processes."""
+    return total((values * target.weight[:, None]).sum((0, 2, 3)))
 
 
 class _PairSums(torch.autograd.Function):

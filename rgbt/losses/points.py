@@ -15,16 +15,20 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from rgbt.processes import num_processes, rank
 from rgbt.types import IGNORE
+
+EVERY = slice(None)
+"""All of them."""
 
 
 class Points:
     """Independent uniform points from one generator, on `device`.
 
-    Draws are made set by set in the order of the requests, so that the numbers do not
-    depend on how many sets are requested at once. The criterion requests the matcher's points of
-    all (layer, pass) pairs, then for the loss points of all pairs; within a loss set, the points of
-    one mask are its candidates followed by its random remainder.
+    Draws are made set by set in the order of the requests, so that the numbers do not depend on how
+    many sets are requested at once. Each set is drawn for the batch of all processes. The criterion
+    requests the matcher's points of all (layer, pass) pairs, then for the loss points of all pairs;
+    within a loss set, the points of one mask are its candidates followed by its random remainder.
 
     A coordinate takes the 2^15 centres of a regular grid (a step is 0.02 pixels of a 640-pixel
     image): four coordinates come from one random integer, in half the time of four floats.
@@ -34,8 +38,10 @@ class Points:
         self.generator = generator
         self.device = device
 
-    def loss(self, num_sets: int, num_masks: int, num_points: int) -> Tensor:
-        """(num_sets, num_masks, num_points, 2): the next sets for the mask losses."""
+    def loss(
+        self, num_sets: int, num_masks: int, num_points: int, kept: Tensor | slice = EVERY
+    ) -> Tensor:
+        """(num_sets, `kept` of num_masks, num_points, 2): the next sets for the mask losses."""
         numbers = 2 * num_masks * num_points
         bits = torch.empty(
             num_sets, -(-numbers // 4), dtype=torch.int64, device=self.generator.device
@@ -43,12 +49,15 @@ class Points:
         for one_set in bits:
             one_set.random_(generator=self.generator)
         # 63 random bits are four words of 16; the top bit of each is cut, because one is always 0.
-        words = bits.view(torch.int16)[:, :numbers].bitwise_and_(0x7FFF).to(self.device)
-        uniform = words.float().sub_(2.0**14 - 0.5).mul_(2.0**-14)
-        return uniform.reshape(num_sets, num_masks, num_points, 2)
+        words = bits.view(torch.int16)[:, :numbers].view(num_sets, num_masks, 2 * num_points)
+        own_words = words[:, kept].bitwise_and_(0x7FFF).to(self.device)
+        uniform = own_words.float().sub_(2.0**14 - 0.5).mul_(2.0**-14)
+        return uniform.reshape(num_sets, uniform.shape[1], num_points, 2)
 
-    matcher = loss
-    """The same for the matching costs, with images in the place of masks."""
+    def matcher(self, num_sets: int, num_images: int, num_points: int) -> Tensor:
+        """(num_sets, num_images, num_points, 2): the next sets for the matching costs."""
+        own_images = slice(rank(), None, num_processes())
+        return self.loss(num_sets, num_images * num_processes(), num_points, own_images)
 
 
 def sample(maps: Tensor, points: Tensor, outside: Literal["zeros", "border"] = "zeros") -> Tensor:

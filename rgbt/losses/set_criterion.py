@@ -13,7 +13,7 @@ from typing import Annotated
 import numpy as np
 import torch
 from annotated_types import Interval
-from torch import Tensor, distributed
+from torch import Tensor
 from torch.nn import functional as F
 
 from rgbt.checks import InputError, check_shape
@@ -21,6 +21,7 @@ from rgbt.losses.masks import Sampling, mask_losses
 from rgbt.losses.matcher import Matcher, Matches, targets_of
 from rgbt.losses.points import Points
 from rgbt.losses.spatial import PLAIN, SpatialMap, SpatialWeight
+from rgbt.processes import mean_count, num_processes
 from rgbt.ranges import NonNegative, NumClasses, NumPoints, Share
 from rgbt.requirements import Record, Requirement
 from rgbt.types import Batch, Output
@@ -129,12 +130,8 @@ class SetCriterion:
             targets = targets_of(batch.label, padded_hw, self.num_classes, spatial)
             matches = self.matcher(class_logits, mask_logits, targets, points)
             mask, dice = mask_losses(mask_logits, targets, matches, points, self.sampling)
-            # Targets of the batch, averaged over the processes, at least 1.
-            count = torch.tensor(float(len(matches.image)), device=mask.device)
-            if distributed.is_available() and distributed.is_initialized():
-                distributed.all_reduce(count)
-                count = count / distributed.get_world_size()
-            count = count.clamp(min=1)
+            # At least 1 target, averaged over the processes as the losses are.
+            count = max(matches.num_targets, 1) / num_processes()
             parts = {"mask": mask / count, "dice": dice / count}
             parts["class"] = self._class_loss(class_logits, matches)
         return {name: values.reshape(-1, passes) for name, values in parts.items()}
@@ -173,4 +170,4 @@ class SetCriterion:
         weights[-1] = self.no_object_weight
         logits = logits_LPBQC.float().reshape(layers * passes, images * queries, -1)
         each = F.cross_entropy(logits.transpose(1, 2), label_SQ, weights, reduction="none")
-        return each.sum(1) / weights[label_SQ].sum(1)
+        return each.sum(1) / mean_count(weights[label_SQ].sum(1))

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.checks import InputError
+from rgbt.processes import num_processes, own
 from rgbt.ranges import ShareBelowOne
 
 DropRates = tuple[ShareBelowOne, ShareBelowOne]
@@ -19,14 +20,20 @@ DropRates = tuple[ShareBelowOne, ShareBelowOne]
 
 
 def keep_factors(
-    rates: Tensor, shape: tuple[int, ...], generator: torch.Generator | None, device: torch.device
+    rates: Tensor,
+    shape: tuple[int, ...],
+    generator: torch.Generator | None,
+    device: torch.device,
+    *,
+    dim: int = 0,
 ) -> Tensor:
     """Factors of residuals that are dropped at random: 0, or 1 / (1 - rate) where kept.
 
     Source: Deep Networks with Stochastic Depth, Eq. (4), rescaled while training.
 
     `rates` are (n,) probabilities of being dropped, in [0, 1); `shape` is that of the draws for
-    each of them, such as (samples,). Returns (n, *shape) float32 on `device`.
+    each of them, such as (samples,), and `dim` the dimension of the samples in it. Returns
+    (n, *shape) float32 on `device`. Each process draws for the samples of all processes.
 
     Raises:
         ValueError: no generator.
@@ -34,7 +41,10 @@ def keep_factors(
     if generator is None:
         raise ValueError("training with random drops requires `generator`, got None.")
     probability = 1 - rates.view(-1, *(1 for _ in shape)).to(generator.device)
-    draw = torch.rand(len(rates), *shape, generator=generator, device=generator.device)
+    sizes = [*shape]
+    sizes[dim] *= num_processes()
+    draw = torch.rand(len(rates), *sizes, generator=generator, device=generator.device)
+    draw = own(draw, dim + 1)
     return ((draw < probability) / probability).to(device, non_blocking=True)
 
 

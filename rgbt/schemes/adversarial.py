@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from rgbt.checks import InputError
 from rgbt.losses.adversarial import VERDICT_LOSSES, Judged
 from rgbt.losses.adversarial import judged as judged_map
+from rgbt.processes import mean_count
 from rgbt.ranges import NonNegative
 from rgbt.requirements import Record, Requirement, record_of
 from rgbt.schemes.domains import Gradients, Passes, SourceAndTarget, scores
@@ -158,7 +159,8 @@ class Adversarial:
             if self.weighed_by_confidence:
                 confidence = batch.target.confidence
                 assert confidence is not None, "the record requires it"
-                cost = cost * (1.0 - confidence).mean()
+                # A factor of a cost that is averaged over the processes: that of all samples.
+                cost = cost * mean_count((1.0 - confidence).mean())
             parts[f"{name}/adversarial"] = self.weight * cost
         return parts
 

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from rgbt.losses.distillation import sdc, sdn
 from rgbt.ranges import NonNegative
 from rgbt.requirements import Record, Requirement, record_of
+from rgbt.schemes.masks import draw_masks
 from rgbt.types import VIEWS, AnyMasker, Batch, GeneratorOf, Loss, MaskPair, Output, Phase
 
 
@@ -104,8 +105,7 @@ class CRM:
         if not self.hides_cells:
             output = self.model(batch.rgb, batch.thermal, views=self.views, generator=generator)
             return output
-        height, width = batch.rgb.shape[-2:]
-        masks = self.masker((height, width), batch.centre_yx, generator_of("mask"))
+        masks = draw_masks(self.masker, batch, generator_of("mask"))
         # SDN reads the class logits of R' and T'; without it, nothing reads them.
         distilled = len(self.views) - 1 if self.nonlocal_weight else 0
         output = self.model(

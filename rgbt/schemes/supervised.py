@@ -8,6 +8,7 @@ from torch import nn
 
 from rgbt.requirements import Record, record_of
 from rgbt.schemes.domains import SourceAndTarget, options_of
+from rgbt.schemes.masks import draw_masks
 from rgbt.types import AnyMasker, Batch, GeneratorOf, Loss, Phase
 
 
@@ -34,10 +35,9 @@ class Supervised:
 
     def phases(self, batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:
         """One phase with the parts of the loss."""
-        height, width = batch.rgb.shape[-2:]
         masks = None
         if self.hides_cells:
-            masks = self.masker((height, width), batch.centre_yx, generator_of("mask"))
+            masks = draw_masks(self.masker, batch, generator_of("mask"))
         generator = generator_of("stochastic depth")
         output = self.model(batch.rgb, batch.thermal, masks, generator=generator, **self.options)
         parts = self.loss(output, batch, generator_of("loss"))

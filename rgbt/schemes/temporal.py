@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
 from rgbt.geometry.warp import Warp
+from rgbt.processes import own_draw
 from rgbt.requirements import Record, Requirement, record_of
 from rgbt.types import Batch, Frame, GeneratorOf, Output, Phase
 
@@ -94,7 +95,8 @@ class Temporal:
     def phases(self, batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:
         """One phase with the parts of Eq. 4."""
         image_hw = (batch.rgb.shape[2], batch.rgb.shape[3])
-        angles = self.view.draw(len(batch.name), generator_of("virtual view"))
+        generator = generator_of("virtual view")
+        angles = own_draw(lambda count: self.view.draw(count, generator), len(batch.name))
         warp = self.view.warp(angles, image_hw)
         first, second = self._frames(batch, self.view.batch(batch, warp), generator_of)
         warped, every = None, 2 if self.resolution == "half" else 1

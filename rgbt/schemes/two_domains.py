@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.losses.unlabelled import guidance
+from rgbt.processes import mean_count, num_processes
 from rgbt.ranges import NonNegative, Share
 from rgbt.requirements import Record, Requirement
 from rgbt.schemes.domains import Gradients, Passes, SourceAndTarget, scores
@@ -101,6 +101,7 @@ class UnlabelledTarget:
             label = guidance(probabilities, auxiliary.softmax(1), self.guidance_threshold)
             total = F.cross_entropy(auxiliary, label, ignore_index=IGNORE, reduction="sum")
             # Where neither head is sure anywhere, the sum is 0 and so is the cost.
-            cost = total / torch.clamp((label != IGNORE).sum(), min=1)
+            count = mean_count((label != IGNORE).sum())
+            cost = total / count.clamp(min=1 / num_processes())
             parts["guidance"] = self.guidance_weight * cost
         return {f"target/{name}": value for name, value in parts.items()}

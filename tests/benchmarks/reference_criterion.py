@@ -35,7 +35,8 @@ class Replayed:
     def matcher(self, num_sets: int, num_images: int, num_points: int) -> Tensor:
         return self._take("matcher", self._matcher, (num_sets, num_images, num_points, 2))
 
-    def loss(self, num_sets: int, num_masks: int, num_points: int) -> Tensor:
+    def loss(self, num_sets: int, num_masks: int, num_points: int, kept: object = None) -> Tensor:
+        del kept  # of one process: all of them
         return self._take("loss", self._loss, (num_sets, num_masks, num_points, 2))
 
     def matcher_of(self, layer: int, one_pass: int) -> Tensor:

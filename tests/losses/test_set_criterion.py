@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from rgbt.checks import InputError, RunError
-from rgbt.losses import set_criterion as module
 from rgbt.losses.masks import Sampling
 from rgbt.losses.points import Points
 from rgbt.losses.spatial import PLAIN, SpatialWeight
@@ -109,23 +108,6 @@ def test_a_batch_without_targets() -> None:
     classes, masks = gradients(parts, output)  # masks stay part of the graph
     assert classes.any()
     assert not masks.any()
-
-
-def test_targets_are_counted_over_all_processes(monkeypatch: Any) -> None:
-    output, batch = problem_of(1, 2, 2)
-    alone = criterion_of()(output, batch, seeded())
-    targets = sum(len(set(label.unique().tolist()) - {255}) for label in batch.label)
-
-    def add_the_other_process(count: Tensor) -> None:
-        count += 3 * targets  # it holds three times as many: (1 + 3) / 2 = 2 on average
-
-    monkeypatch.setattr(module.distributed, "is_initialized", lambda: True)
-    monkeypatch.setattr(module.distributed, "all_reduce", add_the_other_process)
-    monkeypatch.setattr(module.distributed, "get_world_size", lambda: 2)
-    shared = criterion_of()(output, batch, seeded())
-    assert torch.equal(shared["class"], alone["class"])
-    for name in ("mask", "dice"):
-        assert torch.allclose(shared[name], alone[name] / 2)
 
 
 def test_sums_stay_in_float32_under_autocast() -> None:

@@ -142,11 +142,12 @@ def test_decoder_equals_the_released_order(training: bool) -> None:
 @pytest.mark.parametrize(("eps", "evaluated"), [(None, 1e-3), (1e-5, 1e-5)])
 def test_decoder_eps_in_evaluation(eps: float | None, evaluated: float) -> None:
     """A constant map c, statistics mean 0 and variance v: c / sqrt(v + eps)."""
-    norm = nano(decoder_norm_eps_eval=eps).decode_head.linear_fuse[1]
+    decoder = nano(decoder_norm_eps_eval=eps).decode_head
+    norm = decoder.linear_fuse[1]
     x, variance = torch.full((1, 16, 2, 2), 3.0), 1e-3
     norm.running_var.fill_(variance)
     for mode, expected in ((False, evaluated), (True, 1e-3), (False, evaluated)):
-        assert norm.train(mode).eps == expected
+        assert decoder.train(mode).linear_fuse[1].eps == expected
     found = norm(x)
     torch.testing.assert_close(found, torch.full_like(x, 3 / math.sqrt(variance + evaluated)))
 

@@ -8,21 +8,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
+from torch.nn.modules.batchnorm import _BatchNorm
 
 from rgbt.models.parts import drop_channels
-
-
-class TwoEpsNorm(nn.BatchNorm2d):
-    """Batch normalisation with one eps while training and another one while evaluating."""
-
-    def __init__(self, channels: int, *, eps: float, eps_eval: float) -> None:
-        super().__init__(channels, eps=eps)
-        self.eps_train, self.eps_eval = eps, eps_eval
-
-    def train(self, mode: bool = True) -> TwoEpsNorm:
-        """Also chooses the eps."""
-        self.eps = self.eps_train if mode else self.eps_eval
-        return super().train(mode)
 
 
 class MlpDecoder(nn.Module):
@@ -52,15 +40,22 @@ class MlpDecoder(nn.Module):
     ) -> None:
         super().__init__()
         self.dropout = dropout
+        self.norm_eps, self.norm_eps_eval = norm_eps, norm_eps_eval
         self.linear_c1, self.linear_c2, self.linear_c3, self.linear_c4 = (
             nn.Sequential(OrderedDict(proj=nn.Linear(width, dim))) for width in dims
         )
         fuse = nn.Conv2d(4 * dim, dim, 1)
-        norm = TwoEpsNorm(dim, eps=norm_eps, eps_eval=norm_eps_eval)
-        self.linear_fuse = nn.Sequential(fuse, norm, nn.ReLU())
+        self.linear_fuse = nn.Sequential(fuse, nn.BatchNorm2d(dim, eps=norm_eps), nn.ReLU())
         self.linear_pred = nn.Conv2d(dim, num_classes, 1)
         for convolution in (fuse, self.linear_pred):
             nn.init.kaiming_normal_(convolution.weight, nonlinearity="relu")
+
+    def train(self, mode: bool = True) -> MlpDecoder:
+        """Also chooses the eps of the normalisation, of any class that normalises a batch."""
+        norm = self.linear_fuse[1]
+        assert isinstance(norm, _BatchNorm), "put there by the constructor"
+        norm.eps = self.norm_eps if mode else self.norm_eps_eval
+        return super().train(mode)
 
     def forward(self, maps: list[Tensor], generator: torch.Generator | None = None) -> Tensor:
         """Class scores (N, K, H_1, W_1) of four (N, H_i, W_i, C_i), the largest first.

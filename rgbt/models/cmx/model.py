@@ -61,7 +61,7 @@ class CmxEncoder(nn.Module):
         keep_thermal = keep_rgb
         if self.training and self.drop_rates is not None:
             shape = (2, len(rgb), 1, 1, 1)
-            drawn = keep_factors(self.drop_rates.flatten(), shape, generator, rgb.device)
+            drawn = keep_factors(self.drop_rates.flatten(), shape, generator, rgb.device, dim=1)
             keep_rgb, keep_thermal = (torch.split(x, list(self.depths)) for x in drawn.chunk(2))
         fused = []
         for stage, (rectify, fuse) in enumerate(zip(self.FRMs, self.FFMs, strict=True)):

@@ -263,7 +263,7 @@ class Swin(nn.Module):
         if self.training and self.shape.drop_path_rate > 0:
             # Factors of every residual of every sample; rates rise from 0.
             rates = torch.linspace(0, self.shape.drop_path_rate, sum(self.shape.depths))
-            drawn = keep_factors(rates, (2, len(x), 1, 1, 1), generator, x.device)
+            drawn = keep_factors(rates, (2, len(x), 1, 1, 1), generator, x.device, dim=1)
             keeps = list(torch.split(drawn, list(self.shape.depths)))
         maps = []
         for index, (stage, keep) in enumerate(zip(self.layers, keeps, strict=True)):

@@ -1,0 +1,144 @@
+"""Batch normalisation of a run with several processes: over the whole batch, or over its parts.
+
+With `trainer.batch_norm_parts` 1, mean and variance are those of the samples of all processes, and
+the result does not depend on their number. Otherwise each process normalises its own samples.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn.modules.batchnorm import _BatchNorm
+
+from rgbt.checks import InputError
+from rgbt.processes import agreed, num_processes, total
+
+OF_TORCH = (nn.BatchNorm1d, nn.BatchNorm2d, nn.BatchNorm3d)
+"""Classes that can be replaced without a change of behaviour."""
+
+
+def check_batch_norm_parts(parts: int, processes: int) -> None:
+    """Refuse parts of a batch that this number of processes does not make.
+
+    Raises:
+        InputError: `parts` is neither 1 nor the number of processes.
+    """
+    if parts not in (1, processes):
+        other = f" or {processes}, the number of its devices" if processes > 1 else ""
+        raise InputError(
+            f"trainer.batch_norm_parts is {parts}, but a run on {processes} "
+            f"device{'s' * (processes > 1)} requires 1{other}. Set trainer.batch_norm_parts=1, or "
+            f"trainer.devices={parts}."
+        )
+
+
+def synchronise_batch_norm(model: nn.Module) -> nn.Module:
+    """Let every batch normalisation read the batch of all processes.
+
+    Parameters, buffers and their names stay the same. On CUDA devices torch's own modules are
+    used. With one process, `model` is returned as it is.
+
+    Args:
+        model: on its device, before an optimizer or a wrapper refers to its modules; changed in
+            place, unless it is itself a normalisation.
+
+    Raises:
+        InputError: a subclass of torch's normalisations, whose behaviour would be lost.
+    """
+    if num_processes() == 1:
+        return model
+    for name, module in model.named_modules():
+        known = (*OF_TORCH, nn.SyncBatchNorm, SynchronisedBatchNorm)
+        if isinstance(module, _BatchNorm) and type(module) not in known:
+            raise InputError(
+                f"model: '{name}' is a {type(module).__name__}, a class derived from a batch "
+                f"normalisation of torch, which {num_processes()} devices cannot synchronise. Use "
+                "torch.nn.BatchNorm2d itself, or set "
+                f"trainer.batch_norm_parts={num_processes()}."
+            )
+    if any(parameter.is_cuda for parameter in model.parameters()):
+        on_cuda: nn.Module = nn.SyncBatchNorm.convert_sync_batchnorm(model)  # type: ignore[no-untyped-call]
+        return on_cuda
+    return _converted(model)
+
+
+def share_running_statistics(model: nn.Module) -> None:
+    """Give every process the running statistics of process 0.
+
+    Needed before an evaluation or a checkpoint where each process normalises its own samples;
+    the statistics have no effect on training. Called by all processes.
+    """
+    if num_processes() == 1:
+        return
+    buffers = {
+        f"{name}.{key}": buffer
+        for name, module in model.named_modules()
+        if isinstance(module, _BatchNorm)
+        for key, buffer in module.named_buffers(recurse=False)
+    }
+    for name, value in agreed({name: each.cpu() for name, each in buffers.items()}).items():
+        buffers[name].copy_(value)
+
+
+class SynchronisedBatchNorm(_BatchNorm):
+    """Batch normalisation over the samples of all processes, for devices without one of torch.
+
+    All processes have as many values. The variance of the batch is computed from differences to
+    the mean, so that the result equals that of one process to rounding.
+    """
+
+    def forward(self, input: Tensor) -> Tensor:  # noqa: A002 - the name in torch
+        """(N, C, ...) -> the same shape and dtype; computed in float32 for half precision too."""
+        if not self.training:
+            return super().forward(input)
+        x = input.to(torch.promote_types(input.dtype, torch.float32))
+        dims = (0, *range(2, x.dim()))
+        by_channel = (1, -1, *(1 for _ in dims[1:]))
+        count = x.numel() // x.shape[1] * num_processes()
+        mean = total(x.sum(dims)) / count
+        centred = x - mean.view(by_channel)
+        variance = total(centred.square().sum(dims)) / count
+        if self.track_running_stats:
+            self._track(mean.detach(), variance.detach() * (count / (count - 1)))
+        normed = centred * (variance + self.eps).rsqrt().view(by_channel)
+        if self.affine:
+            normed = normed * self.weight.view(by_channel) + self.bias.view(by_channel)
+        return normed.to(input.dtype)
+
+    @torch.no_grad()
+    def _track(self, mean: Tensor, unbiased_variance: Tensor) -> None:
+        assert self.num_batches_tracked is not None, "running statistics are tracked"
+        self.num_batches_tracked.add_(1)
+        share = self.momentum
+        if share is None:
+            share = 1.0 / float(self.num_batches_tracked)
+        for running, new in (
+            (self.running_mean, mean),
+            (self.running_var, unbiased_variance),
+        ):
+            assert running is not None, "running statistics are tracked"
+            running.mul_(1 - share).add_(new, alpha=share)
+
+    def _check_input_dim(self, input: Tensor) -> None:  # noqa: A002 - the name in torch
+        if input.dim() < 2:
+            raise ValueError(f"expected (N, C, ...), got {input.dim()} dimensions.")
+
+
+def _converted(module: nn.Module) -> nn.Module:
+    """`module` with every batch normalisation of torch replaced, with its own tensors."""
+    if isinstance(module, OF_TORCH):
+        made = SynchronisedBatchNorm(
+            module.num_features,
+            module.eps,
+            module.momentum,
+            module.affine,
+            module.track_running_stats,
+        )
+        made.weight, made.bias = module.weight, module.bias
+        for name, buffer in module.named_buffers(recurse=False):
+            setattr(made, name, buffer)
+        made.training = module.training
+        return made
+    for name, child in module.named_children():
+        module.add_module(name, _converted(child))
+    return module

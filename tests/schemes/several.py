@@ -1,0 +1,300 @@
+"""Steps of every scheme and loss with few parameters, run by any number of processes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from rgbt.data.domains import Domain, Domains
+from rgbt.engine.batch_norm import synchronise_batch_norm
+from rgbt.geometry.camera import Camera
+from rgbt.losses.auxiliary import WithAuxiliary
+from rgbt.losses.cross_entropy import CrossEntropy
+from rgbt.losses.spatial import PLAIN
+from rgbt.losses.temporal import TemporalLoss
+from rgbt.losses.unlabelled import Entropy, MaxSquares
+from rgbt.maskers.masker import Masker
+from rgbt.models.critic import Critic
+from rgbt.processes import num_processes, own, total
+from rgbt.randomness import torch_generator
+from rgbt.requirements import record_of
+from rgbt.schemes.adversarial import Adversarial
+from rgbt.schemes.crm import CRM
+from rgbt.schemes.supervised import Supervised
+from rgbt.schemes.temporal import Temporal
+from rgbt.schemes.two_domains import LabelledDomains, UnlabelledTarget
+from rgbt.transforms.virtual_view import VirtualView
+from rgbt.types import IGNORE, Batch, TwoDomains
+from tests.losses.problems import batch_of, criterion_of, whole_image
+from tests.models.plain import nano
+from tests.schemes.linear import Nothing, domains, network
+
+B, K = 4, 4
+HW = (32, 64)
+CAMERA = Camera(fx=70.0, fy=70.0, cx=31.5, cy=15.5, height=32, width=64)
+Values = dict[str, Tensor]
+
+
+@dataclass
+class Case:
+    """A scheme, the networks that it trains, and a batch of all processes."""
+
+    scheme: Any
+    networks: dict[str, nn.Module]
+    data: Any
+
+
+def batch(classes: int = K, purpose: str = "batch", *, confidence: bool = False) -> Batch:
+    """One image has no label at all, and one has few: counts differ between processes."""
+    draw = torch_generator(0, purpose)
+    blocks = torch.randint(0, classes, (B, HW[0] // 4, HW[1] // 4), generator=draw)
+    label = blocks.repeat_interleave(4, 1).repeat_interleave(4, 2)
+    label[1] = IGNORE
+    label[2, 8:] = IGNORE
+    return replace(
+        batch_of(label, whole_image(B, *HW) / 2 + 3, (40, 50)),
+        rgb=torch.rand(B, 3, *HW, generator=draw),
+        thermal=torch.rand(B, 1, *HW, generator=draw),
+        name=tuple("abcd"),
+        centre_yx=torch.randint(8, 24, (B, 2), generator=draw),
+        confidence=torch.rand(B, *HW, generator=draw) ** 2 if confidence else None,
+    )
+
+
+def own_part(data: Any) -> Any:
+    """Of a batch, or of both domains: the samples of this process."""
+    if isinstance(data, TwoDomains):
+        return TwoDomains(own_part(data.source), own_part(data.target), data.step)
+    values = {each.name: getattr(data, each.name) for each in fields(data)}
+    parts = {name: own(each) for name, each in values.items() if isinstance(each, Tensor)}
+    return replace(data, **parts, name=tuple(own(torch.arange(len(data.name))).tolist()))
+
+
+def doubled(batch: Batch) -> Batch:
+    return replace(batch, rgb=batch.rgb.double(), thermal=batch.thermal.double())
+
+
+def in_float64(name: str, **changes: Any) -> Any:
+    """Rounding in float32 changes the gradients of these networks by up to a thousandth."""
+    fp64 = {"pixel_decoder_fp32": False} if name == "mask2former" else {}
+    return nano(name, **fp64, **changes).double()
+
+
+# ---- cases ----------------------------------------------------------------------------------
+
+MASKER = {
+    **{"patch_size": 16, "sigma_height": None, "anchor": "tracked", "cell_position": "index"},
+    **{"pairing": "rand_comp", "pattern_probabilities": None, "ratio": 0.5, "sigma_div": 2.0},
+}
+SPATIAL = replace(
+    PLAIN, alpha=2.0, focus="edge", match="weighted", normaliser="weights", passes="fused"
+)
+SHALLOW = criterion_of(
+    num_classes=K, deep_supervision=False, spatial=replace(SPATIAL, passes="all")
+)
+INDEPENDENT = Masker(
+    **{"sampler": "uniform", "patch_size": 16, "ratio": 0.5, "pairing": "indiv"},
+    **dict.fromkeys(("sigma_div", "sigma_height", "anchor", "cell_position"), None),
+    pattern_probabilities=None,
+)
+WEIGHTED = CrossEntropy(class_weights=(0.2, 1.0, 2.0, 3.0))
+THREE = CrossEntropy(class_weights=(0.5, 1.0, 2.0))
+
+
+def crm(**criterion: Any) -> Case:
+    net = in_float64("mask2former", drop_path_rate=0.3)
+    scheme = CRM(
+        model=net,
+        loss=criterion_of(num_classes=K, **criterion),
+        masker=Masker(sampler="gaussian_count", **MASKER),
+        modality_weight=0.5,
+        complementary_weight=2.0,
+        nonlocal_weight=3.0,
+    )
+    return Case(scheme, {"model": net}, doubled(batch()))
+
+
+def supervised(name: str, loss: Any, masker: Any = None, **changes: Any) -> Case:
+    net = in_float64(name, **{"num_classes": K, **changes})
+    head = "source" if name == "deeplabv2" else None
+    one = Domains(
+        source=Domain(split="train", view="rgb" if head else None, head=head, labels="given"),
+        **{"target": None, "target_is": None, "tested_head": "own"},
+    )
+    scheme = Supervised(model=net, loss=loss, masker=masker or Nothing(), domains=one)
+    return Case(scheme, {"model": net}, doubled(batch()))
+
+
+def temporal(name: str, second: str, form: str, **changes: Any) -> Case:
+    net = network(False) if name == "linear" else in_float64(name, num_classes=K, **changes)
+    data = batch(3) if name == "linear" else doubled(batch())
+    losses = {"mask2former": criterion_of(num_classes=K), "linear": THREE}
+    loss = TemporalLoss(
+        segmentation=losses.get(name, WEIGHTED),
+        alpha=0.5,
+        beta=2.0,
+        second=second,  # type: ignore[arg-type]
+        form=form,  # type: ignore[arg-type]
+    )
+    view = VirtualView(
+        **{"camera": CAMERA, "order": "zyx", "yaw": (-8.0, 8.0), "pitch": (-8.0, 8.0)},
+        **{"roll": (-4.0, 4.0), "angles": "uniform", "mode": "both", "rectangle": "largest"},
+        **{"resampling": "once", "outside": "ignore"},
+    )
+    scheme = Temporal(model=net, loss=loss, view=view, warps="probabilities", detach=False)
+    return Case(scheme, {"model": net}, data)
+
+
+def two_domains(
+    kind: Any, *, heads: bool, step: int = 0, labels: str = "none", **given: Any
+) -> Case:
+    net = network(heads, auxiliary=True)
+    pseudo = given.get("weighed_by_confidence", False)
+    scheme = kind(
+        model=net,
+        loss=given.pop("loss", THREE),
+        domains=domains(heads, labels=labels, confidence=pseudo),
+        **given,
+    )
+    data = TwoDomains(batch(3, "source"), batch(3, "target", confidence=pseudo), step)
+    return Case(scheme, {"model": net, **record_of(scheme).networks}, data)
+
+
+def adversarial(*, heads: bool = False, step: int = 1, **changes: Any) -> Case:
+    torch.manual_seed(5)
+    settings: dict[str, Any] = {
+        **{"judged": "probabilities", "verdict_loss": "least_squares", "source_value": 0.0},
+        **{"target_value": 1.0, "weight": 0.4, "both_ways": False, "halved": False},
+        **{"weighed_by_confidence": False, "supervise_target": False, "alternates": False},
+        **{"gradients": "apart", **changes},
+    }
+    return two_domains(
+        Adversarial,
+        heads=heads,
+        step=step,
+        labels="/pseudo" if settings["supervise_target"] else "none",
+        critic=Critic(in_channels=3, base_width=2, upsample=False, align_corners=False),
+        critic_optimizer=torch.optim.SGD,
+        **settings,
+    )
+
+
+HEATNET: dict[str, Any] = {
+    **{"judged": "logits", "source_value": 1.0, "target_value": 0.0, "both_ways": True},
+    **{"weighed_by_confidence": True, "supervise_target": True, "alternates": True},
+}
+ADVENT: dict[str, Any] = {
+    **{"judged": "self_information", "verdict_loss": "cross_entropy", "halved": True}
+}
+
+
+def unlabelled(loss: Any, *, guidance: float = 0.0, heads: bool = False, **given: Any) -> Case:
+    weights = {"guidance_weight": guidance, "guidance_threshold": 0.4}
+    return two_domains(UnlabelledTarget, heads=heads, unlabelled=loss, **weights, **given)
+
+
+def max_squares(normalisation: Any, ratio: float | None) -> MaxSquares:
+    return MaxSquares(weight=0.7, normalisation=normalisation, image_wise_ratio=ratio)
+
+
+CASES: dict[str, Callable[[], Case]] = {
+    "crm": lambda: crm(spatial=SPATIAL),
+    "masked": lambda: supervised("mask2former", SHALLOW, INDEPENDENT),
+    "temporal masks": lambda: temporal("mask2former", "con", "paper", drop_path_rate=0.3),
+    "temporal con": lambda: temporal("linear", "con", "paper"),
+    "temporal con_acc": lambda: temporal("linear", "con_acc", "paper"),
+    "temporal con_acc released": lambda: temporal("linear", "con_acc", "released"),
+    "temporal dice": lambda: temporal("linear", "dice", "paper"),
+    "temporal dice released": lambda: temporal("linear", "dice", "released"),
+    "batch norm": lambda: supervised("mfnet", WEIGHTED),
+    "labelled": lambda: two_domains(LabelledDomains, heads=True, labels="given", gradients="kept"),
+    "adversarial": adversarial,
+    "adversarial two heads": lambda: adversarial(heads=True, gradients="together"),
+    "advent": lambda: adversarial(**ADVENT, loss=WithAuxiliary(loss=THREE, weight=0.1)),
+    "heatnet critic": lambda: adversarial(**HEATNET, step=0),
+    "heatnet": lambda: adversarial(**HEATNET, heads=True),
+    "max squares": lambda: unlabelled(max_squares("pixels", None), heads=True),
+    "max squares image-wise": lambda: unlabelled(max_squares("entries", 0.2), guidance=0.3),
+    "entropy": lambda: unlabelled(Entropy(weight=0.7), guidance=0.3),
+}
+"""Every scheme and every loss."""
+
+SLOW: dict[str, Callable[[], Case]] = {
+    "crm plain": crm,
+    "rtfnet": lambda: supervised("rtfnet", CrossEntropy(class_weights=None)),
+    "pspnet": lambda: supervised("pspnet", WEIGHTED),
+    "deeplab": lambda: supervised("deeplabv2", WithAuxiliary(loss=WEIGHTED, weight=0.4)),
+    "cmx": lambda: supervised("cmx", WEIGHTED, drop_path_rate=0.5, decoder_dropout=0.5),
+    "temporal batch norm": lambda: temporal("mfnet", "con", "released"),
+}
+"""The other networks, whose normalisations wait for each other hundreds of times."""
+
+
+# ---- steps ----------------------------------------------------------------------------------
+
+
+def mean_over_processes(values: Iterable[Tensor]) -> list[Tensor]:
+    """The averages over the processes, in one transfer."""
+    parts = list(values)
+    joined = total(torch.cat([each.detach().flatten() for each in parts])) / num_processes()
+    sizes = [each.numel() for each in parts]
+    return [new.view_as(old) for new, old in zip(joined.split(sizes), parts, strict=True)]
+
+
+def averaged_gradients(network: nn.Module) -> list[Tensor]:
+    """Of every parameter; 0 where nothing depends on it."""
+    return mean_over_processes(
+        torch.zeros_like(each) if each.grad is None else each.grad for each in network.parameters()
+    )
+
+
+def run_case(name: str) -> Values:
+    """Loss parts and gradients of every phase, and the buffers afterwards, by name."""
+    case = (CASES | SLOW)[name]()
+    for net in case.networks.values():
+        assert synchronise_batch_norm(net.train()) is net
+    found: Values = {}
+    phases = case.scheme.phases(own_part(case.data), lambda purpose: torch_generator(0, purpose))
+    for number, phase in enumerate(phases):
+        if phase.clear:
+            for net in case.networks.values():
+                net.zero_grad()
+        torch.stack(list(phase.parts.values())).sum().backward()
+        for part, value in zip(phase.parts, mean_over_processes(phase.parts.values()), strict=True):
+            found[f"{number} loss {part}"] = value
+        for title, net in case.networks.items():
+            names = [f"{number} gradient {title} {key}" for key, _ in net.named_parameters()]
+            found |= dict(zip(names, averaged_gradients(net), strict=True))
+    for title, net in case.networks.items():
+        found |= {f"buffer {title} {key}": each.clone() for key, each in net.named_buffers()}
+    return found
+
+
+def run_cases(names: tuple[str, ...]) -> dict[str, Values]:
+    """By name of the case."""
+    return {name: run_case(name) for name in names}
+
+
+def ten_steps(name: str) -> list[float]:
+    """The losses of ten steps with AdamW, on a new batch each."""
+    case = (CASES | SLOW)[name]()
+    net = case.networks["model"]
+    synchronise_batch_norm(net.train())
+    optimizer = torch.optim.AdamW(net.parameters(), lr=1e-4)  # as in the paper
+    losses = []
+    for step in range(10):
+        data = own_part(doubled(batch(purpose=f"batch {step}")))
+        generator_of = lambda purpose, step=step: torch_generator(0, purpose, step)  # noqa: E731
+        (phase,) = case.scheme.phases(data, generator_of)
+        optimizer.zero_grad()
+        loss = torch.stack(list(phase.parts.values())).sum()
+        loss.backward()
+        for parameter, gradient in zip(net.parameters(), averaged_gradients(net), strict=True):
+            parameter.grad = gradient
+        optimizer.step()
+        losses.append(float(mean_over_processes([loss])[0]))
+    return losses

@@ -1,0 +1,76 @@
+"""Losses and gradients of several processes equal those of one, for every scheme and loss."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import pytest
+import torch
+
+from tests.processes import run_in_processes
+from tests.schemes.several import CASES, SLOW, Values, run_cases, ten_steps
+
+TOLERANCE = 1e-5
+"""Of float32 sums in another order, relative to the largest value of a kind."""
+
+
+@cache
+def alone() -> tuple[dict[str, Values], list[float]]:
+    """Values by case, and the losses of ten steps."""
+    return everything()
+
+
+@cache
+def together(num_processes: int) -> list[tuple[dict[str, Values], list[float]]]:
+    """The same by rank. Processes are started once for all tests."""
+    return run_in_processes(everything, num_processes)
+
+
+def everything() -> tuple[dict[str, Values], list[float]]:
+    return run_cases(tuple(CASES)), ten_steps("crm")
+
+
+def kind(name: str) -> str:
+    """Gradients of one network in one phase have one scale; every other value is its own."""
+    phase, what, network, *_ = (*name.split(), "")
+    return f"{phase} {what} {network}" if what == "gradient" else name
+
+
+def assert_same(found: Values, expected: Values) -> None:
+    assert found.keys() == expected.keys()
+    largest: dict[str, float] = {}
+    for name, value in expected.items():
+        here = float(value.detach().abs().max()) if value.numel() else 0.0
+        largest[kind(name)] = max(largest.get(kind(name), 0.0), here)
+    for name, value in expected.items():
+        apart = (found[name] - value).abs()
+        assert not apart.numel() or apart.max() <= TOLERANCE * largest[kind(name)], name
+
+
+@pytest.mark.parametrize("num_processes", [2, 4])
+@pytest.mark.parametrize("name", CASES)
+def test_processes_compute_the_step_of_one(name: str, num_processes: int) -> None:
+    expected = alone()[0][name]
+    for found, _ in together(num_processes):
+        assert_same(found[name], expected)
+    # Neither is nothing.
+    losses = [value for key, value in expected.items() if " loss " in key]
+    gradients = [value for key, value in expected.items() if " gradient " in key]
+    assert all(value.isfinite().all() for value in expected.values())
+    assert all(value != 0 for value in losses)
+    assert any(value.any() for value in gradients)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SLOW)
+def test_processes_compute_the_step_of_one_with_other_networks(name: str) -> None:
+    for found in run_in_processes(run_cases, 2, (name,)):
+        assert_same(found[name], run_cases((name,))[name])
+
+
+@pytest.mark.parametrize("num_processes", [2, 4])
+def test_ten_steps_of_crm_have_the_losses_of_one_process(num_processes: int) -> None:
+    expected = torch.tensor(alone()[1])
+    for _, losses in together(num_processes):
+        torch.testing.assert_close(torch.tensor(losses), expected, rtol=1e-5, atol=0)
+    assert expected.diff().abs().min() > 0.01  # each step has another loss
