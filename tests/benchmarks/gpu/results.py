@@ -62,8 +62,8 @@ class StepResult:
         """The main figure, or why there is none."""
         if self.status == DONE:
             return self.headline or f"{len(self.rows)} rows"
-        rows = f" ({len(self.rows)} rows before)" if self.rows else ""
-        return f"{self.status}: {self.reason}{rows}"
+        before = f" Before: {self.headline or f'{len(self.rows)} rows'}." if self.rows else ""
+        return f"{self.status}: {self.reason}{before}"
 
 
 def write(folder: Path, command: str, started: str, results: Sequence[StepResult]) -> None:

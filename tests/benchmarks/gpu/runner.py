@@ -123,6 +123,7 @@ def _ending(code: int) -> str:
 
 def _words(request: Request) -> list[str]:
     values = asdict(replace(request, steps=()))
+    values["minutes"] = f"{request.minutes:g}"
     words = [f"{name}={value}" for name, value in values.items() if value not in (None, ())]
     if len(request.steps) < len(STEPS):
         words.append(f"steps={','.join(request.steps)}")

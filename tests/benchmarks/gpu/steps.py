@@ -39,7 +39,7 @@ STEPS = (
     Step("compile", "CRM step, compiled", f"{_PACKAGE}.step_compile", 60),
     Step("waits", "Host synchronisations of a step", f"{_PACKAGE}.step_waits", 35),
     Step("loading", "The input path", f"{_PACKAGE}.step_loading", 45),
-    Step("views", "Virtual views against an OpenCV loop", f"{_PACKAGE}.step_views", 20),
+    Step("views", "Virtual views against an OpenCV loop", f"{_PACKAGE}.step_views", 20, least=20),
     Step("runs", "Runs at demo scale, alone and eight at once", f"{_PACKAGE}.step_runs", 35),
     Step("table", "A table of the papers at demo scale", f"{_PACKAGE}.step_table", None),
 )

@@ -1,0 +1,33 @@
+"""CRM training steps with `trainer.compile`, each beside the same step without it.
+
+A step of its own: compilation may take minutes, and may break the process.
+"""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+from tests.benchmarks.gpu.step_training import NETWORKS, Bench, attempt, headline_of
+from tests.benchmarks.gpu.task import Skipped, Task
+
+CASES = (
+    *("swin_s bf16 default", "swin_s fp32 default", "swin_t bf16 default", "swin_b bf16 default"),
+    *("swin_s bf16 max-autotune", "swin_s tf32 default"),
+)
+
+
+def measure(task: Task) -> None:
+    """Pairs of rows, with and without compilation, as far as time allows."""
+    if task.device == "cuda" and find_spec("triton") is None:
+        raise Skipped("it needs the package triton, which torch.compile uses on a GPU.")
+    bench = Bench.of(task)
+    rates: dict[str, float] = {}
+    cases = ["swin_t fp32 default"] if task.smoke else list(CASES)
+    for case in task.as_time_allows(cases, first=15.0):
+        name, precision, mode = case.split()
+        network = next(each for each in NETWORKS if each.endswith(name))
+        pair = {each: attempt(bench, network, precision, compile=each) for each in ("none", mode)}
+        if all(pair.values()):
+            before, after = (pair[each]["images per second"] for each in ("none", mode))
+            rates[f"{pair[mode]['network']} {precision} {mode}"] = after / before
+            task.headline(headline_of(rates).replace("images per second", "times faster"))
