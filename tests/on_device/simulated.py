@@ -14,7 +14,7 @@ from __future__ import annotations
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any
 from unittest.mock import patch
 
@@ -98,6 +98,8 @@ class _Functions(TorchFunctionMode):
         if func is Tensor.new_tensor and isinstance(args[0], Placed):
             kwargs.setdefault("dtype", args[0].dtype)
             return torch.tensor(*args[1:], **kwargs).to(DEVICE)
+        if func is Tensor.tolist and isinstance(args[0], Placed):  # refuses subclasses
+            return args[0].to("cpu").tolist()
         return func(*args, **kwargs)
 
 
@@ -125,11 +127,11 @@ class _Operations(TorchDispatchMode):
             kwargs["device"] = torch.device("cpu")
         elif not placed and leaves:
             there = False
-        self._note(name, args, leaves, placed, there)
+        self._note(name, args, leaves, placed, there, waits=not kwargs.get("non_blocking"))
         result = func(*tree_map(_kept, args), **tree_map(_kept, kwargs))
         if name in READS:
             return result
-        if name == "copy_":
+        if name == "copy_":  # a tensor of the host stays one
             return args[0]
         if not there:
             return result
@@ -139,17 +141,27 @@ class _Operations(TorchDispatchMode):
         return return_and_correct_aliasing(func, args, kwargs, wrapped)
 
     def _note(
-        self, name: str, args: Any, leaves: list[Tensor], placed: list[Tensor], there: bool
+        self,
+        name: str,
+        args: Any,
+        leaves: list[Tensor],
+        placed: list[Tensor],
+        there: bool,
+        *,
+        waits: bool,
     ) -> None:
         """Count what the host waits for; raise where devices meet."""
         host = [each for each in leaves if not isinstance(each, Placed)]
         if name in ("_to_copy", "copy_"):
-            moves = bool(placed) and bool(host) or (bool(placed) != there)
-            if moves:
-                self._waits(name, "to the device" if host and there else "to the host")
+            to_host = isinstance(leaves[0], Placed) and not there
+            if (to_host or (host and there)) and (waits or to_host):
+                self._waits(name, "to the host" if to_host else "to the device")
             return
-        if not placed:
-            return
+        if placed:
+            self._note_operation(name, args, host)
+
+    def _note_operation(self, name: str, args: Any, host: list[Tensor]) -> None:
+        """The same for an operation on at least one tensor of the device."""
         if name in READS or name in SIZED_BY_VALUES:
             self._waits(name, "a value of the device")
         if name in INDEXING:
@@ -163,13 +175,13 @@ class _Operations(TorchDispatchMode):
         strangers = [each for each in host if each.dim() or name in ("cat", "stack")]
         if strangers:
             shapes = [tuple(each.shape) for each in strangers]
-            raise DeviceMismatch(f"{name}: tensors of the CPU {shapes} at {_line()}")
+            raise DeviceMismatch(f"{name}: tensors of the CPU {shapes} at {line_of_ours()}")
 
     def _waits(self, name: str, what: str) -> None:
-        self.waits[f"{_line()} {name}: {what}"] += 1
+        self.waits[f"{line_of_ours()} {name}: {what}"] += 1
 
 
-def _line() -> str:
+def line_of_ours() -> str:
     """File, line and function of the last frame in our code."""
     for frame in reversed(traceback.extract_stack()):
         if "/rgbt/" in frame.filename and "site-packages" not in frame.filename:
@@ -196,6 +208,11 @@ def _autocast(device_type: str, *args: Any, **kwargs: Any) -> Any:
     return _AUTOCAST("cpu" if device_type == DEVICE.type else device_type, *args, **kwargs)
 
 
+def _inference_mode(mode: bool = True) -> Any:
+    """No gradients: tensors of inference mode cannot be wrapped."""
+    return torch.no_grad() if mode else nullcontext()
+
+
 @contextmanager
 def simulation() -> Iterator[Counter[str]]:
     """Simulate the device within; what the host waits for, by line, with the number of times."""
@@ -203,6 +220,7 @@ def simulation() -> Iterator[Counter[str]]:
     with (
         patch("torch.Generator", _generator),
         patch("torch.autocast", _autocast),
+        patch("torch.inference_mode", _inference_mode),
         _Functions(),
         operations,
     ):
