@@ -37,7 +37,7 @@ INDEXING = ("index", "index_put", "index_put_", "_unsafe_index", "_index_put_imp
 """Operations that take indices on the host."""
 
 
-class DeviceMismatch(AssertionError):
+class DeviceMismatchError(AssertionError):
     """An operation on tensors of both devices."""
 
 
@@ -175,7 +175,7 @@ class _Operations(TorchDispatchMode):
         strangers = [each for each in host if each.dim() or name in ("cat", "stack")]
         if strangers:
             shapes = [tuple(each.shape) for each in strangers]
-            raise DeviceMismatch(f"{name}: tensors of the CPU {shapes} at {line_of_ours()}")
+            raise DeviceMismatchError(f"{name}: tensors of the CPU {shapes} at {line_of_ours()}")
 
     def _waits(self, name: str, what: str) -> None:
         self.waits[f"{line_of_ours()} {name}: {what}"] += 1

@@ -60,7 +60,7 @@ def simulated(words: Sequence[str], folder: Path, steps: int = 2) -> SimulatedRu
     """Steps in the project's loop, and an evaluation of the test split.
 
     Raises:
-        DeviceMismatch: an operation on tensors of both devices.
+        DeviceMismatchError: an operation on tensors of both devices.
     """
     setup = setup_of(words, CPU)
     _not_fused(setup)

@@ -140,7 +140,7 @@ def test_losses_without_labels(ratio: float | None) -> None:
     scores, other, _, _ = maps()
     squares = MaxSquares(weight=0.1, normalisation="entries", image_wise_ratio=ratio)
     for cost in (squares, Entropy(weight=0.5)):
-        assert_same_with_gradient(lambda s: sum(cost(s.softmax(1)).values()), scores)
+        assert_same_with_gradient(lambda s, c=cost: sum(c(s.softmax(1)).values()), scores)
     labels = [
         guidance(*(3 * each.to(to)).softmax(1).split(1), 0.6).cpu()
         for to in (CPU, device())

@@ -11,24 +11,21 @@ from statistics import median
 
 import torch
 
-from tests.benchmarks.gpu.task import Skipped
-
-NO_MEMORY = (torch.cuda.OutOfMemoryError, MemoryError)
-"""Errors of exhausted memory; `torch.OutOfMemoryError` is the first under another name."""
+from tests.benchmarks.gpu.task import SkippedError
 
 
 def checked(kind: str) -> torch.device:
     """The device of a kind, "cuda" or "cpu", started where it needs a start.
 
     Raises:
-        Skipped: PyTorch sees no GPU.
+        SkippedError: PyTorch sees no GPU.
     """
     if kind == "cpu":
         return torch.device("cpu")
     if not torch.cuda.is_available():
         built = torch.version.cuda
         why = "no GPU is visible" if built else f"PyTorch {torch.__version__} is built without CUDA"
-        raise Skipped(f"it needs a GPU, but {why}.")
+        raise SkippedError(f"it needs a GPU, but {why}.")
     torch.cuda.init()
     return torch.device("cuda", torch.cuda.current_device())
 

@@ -21,12 +21,16 @@ SCAN = 1.0
 
 
 def run(
-    command: Sequence[str], seconds: float, log: Path, environment: Mapping[str, str] | None = None
+    command: Sequence[str],
+    seconds: float,
+    log: Path,
+    environment: Mapping[str, str] | None = None,
+    folder: Path | None = None,
 ) -> int | None:
     """The exit code of a command, negative for a signal; None where it was ended at its limit.
 
     Its output is appended to `log`. Processes that it leaves behind are ended too, also when this
-    function is interrupted.
+    function is interrupted. `folder` is its working folder, None for that of this process.
     """
     with log.open("ab") as output:
         process = subprocess.Popen(
@@ -35,6 +39,7 @@ def run(
             stdout=output,
             stderr=subprocess.STDOUT,
             env=dict(os.environ if environment is None else environment),
+            cwd=folder,
             start_new_session=True,
         )
     end = time.monotonic() + seconds

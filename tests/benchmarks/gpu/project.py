@@ -50,7 +50,7 @@ def crm_words(network: str, batch_size: int, root: Path, *, smoke: bool) -> list
     return ["+experiment=crm", "scale=paper", *sizes]
 
 
-class Enough(Exception):
+class EnoughStepsError(Exception):
     """The requested number of steps has been measured."""
 
 
@@ -61,7 +61,7 @@ class Watched:
     Attributes:
         batches: endless.
         device: waited for before each reading, so that a step includes the work of the device.
-        steps: steps before `Enough`.
+        steps: steps before `EnoughStepsError`.
         synchronise: False: the host runs ahead of the device as in a training.
         times: readings of the clock, one more than steps.
     """
@@ -76,12 +76,12 @@ class Watched:
         return self
 
     def __next__(self) -> Any:
-        """The next batch; `Enough` after the last step."""
+        """The next batch; `EnoughStepsError` after the last step."""
         if self.synchronise or len(self.times) in (0, self.steps):
             wait(self.device)
         self.times.append(time.perf_counter())
         if len(self.times) > self.steps:
-            raise Enough
+            raise EnoughStepsError
         return next(self.batches)
 
     def seconds(self, skipped: int) -> list[float]:
@@ -139,7 +139,7 @@ class Training:
         watched = Watched(batches, session.fabric.device, steps, synchronise)
         try:
             trainer.fit(watched, self.state)
-        except Enough:
+        except EnoughStepsError:
             return watched
         raise AssertionError("the training ended before the batches did")
 

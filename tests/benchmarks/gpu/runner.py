@@ -25,6 +25,9 @@ ROOT = Path(__file__).resolve().parents[3]
 RESERVE = 2.0 + GRACE
 """Seconds kept for ending the last step and for writing the results."""
 
+REHEARSAL = 60.0
+"""Smallest limit of a step on a CPU, whose cores may be shared: imports alone may take 20 s."""
+
 
 def run_steps(request: Request, steps: Sequence[Step] = STEPS) -> list[StepResult]:
     """Run the requested steps; the results are written after each of them.
@@ -61,7 +64,8 @@ def limit_of(step: Step, request: Request, left: float) -> float:
     """Seconds that a step may take: its share of the whole, at most what is left."""
     if step.seconds is None:
         return left
-    return min(left, max(step.seconds * 60 * request.minutes / NOMINAL, step.least))
+    least = step.least if request.device == "cuda" else max(step.least, REHEARSAL)
+    return min(left, max(step.seconds * 60 * request.minutes / NOMINAL, least))
 
 
 def _reason_to_skip(step: Step, request: Request, left: float) -> str:
@@ -74,8 +78,8 @@ def _reason_to_skip(step: Step, request: Request, left: float) -> str:
 
 def _run(step: Step, request: Request, result: StepResult) -> None:
     """Run a step in a process of its own and read what it has reported."""
-    log = request.out / f"{step.name}.log"
-    report = request.out / f"{step.name}.jsonl"
+    out = request.out.resolve()
+    log, report = out / f"{step.name}.log", out / f"{step.name}.jsonl"
     for path in (log, report):
         path.unlink(missing_ok=True)
     began = time.monotonic()
@@ -86,11 +90,11 @@ def _run(step: Step, request: Request, result: StepResult) -> None:
         values = {
             **{"module": step.module, "device": request.device, "size": request.size},
             **{"data": None if request.data is None else str(request.data)},
-            **{"folder": str(scratch), "report": str(report.resolve()), "seconds": result.limit},
+            **{"folder": str(scratch), "report": str(report), "seconds": result.limit},
         }
         description.write_text(json.dumps(values))
         words = [sys.executable, "-m", "tests.benchmarks.gpu.worker", str(description)]
-        code = run(words, result.limit, log, environment(os.environ))
+        code = run(words, result.limit, log, environment(os.environ), ROOT)
     result.seconds = round(time.monotonic() - began, 1)
     result.log = log.name
     result.read(report)

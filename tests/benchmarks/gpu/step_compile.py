@@ -8,7 +8,7 @@ from __future__ import annotations
 from importlib.util import find_spec
 
 from tests.benchmarks.gpu.step_training import NETWORKS, Bench, attempt, headline_of
-from tests.benchmarks.gpu.task import Skipped, Task
+from tests.benchmarks.gpu.task import SkippedError, Task
 
 CASES = (
     *("swin_s bf16 default", "swin_s fp32 default", "swin_t bf16 default", "swin_b bf16 default"),
@@ -19,7 +19,7 @@ CASES = (
 def measure(task: Task) -> None:
     """Pairs of rows, with and without compilation, as far as time allows."""
     if task.device == "cuda" and find_spec("triton") is None:
-        raise Skipped("it needs the package triton, which torch.compile uses on a GPU.")
+        raise SkippedError("it needs the package triton, which torch.compile uses on a GPU.")
     bench = Bench.of(task)
     rates: dict[str, float] = {}
     cases = ["swin_t fp32 default"] if task.smoke else list(CASES)

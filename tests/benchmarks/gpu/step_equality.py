@@ -146,4 +146,3 @@ class _View:
 
 def _relative(one: float, other: float) -> float:
     return abs(one - other) / max(abs(one), 1e-12)
-

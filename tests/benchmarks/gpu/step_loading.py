@@ -10,7 +10,8 @@ from statistics import median
 from rgbt.build.training_setup import TrainingSetup
 from rgbt.engine.trainer import WAIT_SHARE
 from rgbt.evaluation.prediction import decode_ahead
-from tests.benchmarks.gpu.device import NO_MEMORY, arithmetic, checked, reset_peak, wait
+from rgbt.runtime.resources import is_out_of_memory
+from tests.benchmarks.gpu.device import arithmetic, checked, reset_peak, wait
 from tests.benchmarks.gpu.project import Training, crm_words, setup_of, write_mfnet
 from tests.benchmarks.gpu.task import Task
 
@@ -77,7 +78,9 @@ def _in_training(task: Task, setup: TrainingSetup, size: int) -> dict[str, float
     try:
         with arithmetic("tf32"):
             watched = training.run(batches, warm + steps, synchronise=False)
-    except NO_MEMORY:
+    except (RuntimeError, MemoryError) as error:
+        if not is_out_of_memory(error):
+            raise
         task.note(f"the step with batch {size} does not fit into memory.")
         return {}
     return {

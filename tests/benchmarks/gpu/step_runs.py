@@ -14,17 +14,20 @@ from tests.benchmarks.gpu.task import Task
 
 EXPERIMENT = "grbm"
 AT_ONCE = 8
+WHOLE, SHORT = 240.0, 60
+"""Seconds from which whole runs are trained, and the steps of shorter ones."""
 
 
 def measure(task: Task) -> None:
     """One row for a run alone, one for all runs at once."""
     checked(task.device)
-    alone = _runs(task, 1, first_seed=0)
+    more = _shortened(task)
+    alone = _runs(task, 1, 0, more)
     task.row(runs=1, **alone)
     number = 2 if task.smoke else AT_ONCE
-    together = _runs(task, number, first_seed=1)
+    together = _runs(task, number, 1, more)
     task.row(runs=number, **together)
-    task.note(f"+experiment={EXPERIMENT} scale=demo; synthetic scenes are drawn by the first run.")
+    task.note(f"+experiment={EXPERIMENT} scale=demo {' '.join(more)}")
     ratio = number * alone["seconds"] / together["seconds"]
     task.headline(
         f"{alone['seconds']:.3g} s alone, {together['seconds']:.3g} s for {number} at once "
@@ -32,7 +35,17 @@ def measure(task: Task) -> None:
     )
 
 
-def _runs(task: Task, number: int, first_seed: int) -> dict[str, float]:
+def _shortened(task: Task) -> list[str]:
+    """Overrides that make a run short enough; none where there is time for whole runs."""
+    if task.smoke:
+        return ["+debug=smoke"]
+    if task.left() > WHOLE:
+        return []
+    length = [f"trainer.max_steps={SHORT}", f"trainer.eval_every={SHORT}"]
+    return [*length, "scale.few_scenes=true"]
+
+
+def _runs(task: Task, number: int, first_seed: int, more: list[str]) -> dict[str, float]:
     """Seconds until all of some runs have ended, and the share before the first run trains."""
     runs_dir = task.folder / f"runs_{number}_{first_seed}"
     began = time.monotonic()
@@ -40,7 +53,7 @@ def _runs(task: Task, number: int, first_seed: int) -> dict[str, float]:
     started = []
     for index, log in enumerate(logs):
         with log.open("wb") as output:
-            words = _words(task, runs_dir, first_seed + index)
+            words = [*_words(task, runs_dir, first_seed + index), *more]
             started.append(subprocess.Popen(words, stdout=output, stderr=subprocess.STDOUT))
     for process, log in zip(started, logs, strict=True):
         if process.wait(max(1.0, task.left() - 1.0)):
@@ -62,8 +75,7 @@ def _runs(task: Task, number: int, first_seed: int) -> dict[str, float]:
 
 def _words(task: Task, runs_dir: Path, seed: int) -> list[str]:
     words = [sys.executable, "-m", "rgbt.run", f"+experiment={EXPERIMENT}", "tracking=none"]
-    words += [f"seed={seed}", f"runs_dir={runs_dir}", f"trainer.accelerator={task.device}"]
-    return words + (["+debug=smoke"] if task.smoke else [])
+    return [*words, f"seed={seed}", f"runs_dir={runs_dir}", f"trainer.accelerator={task.device}"]
 
 
 def _seconds_inside(result: Path) -> float:

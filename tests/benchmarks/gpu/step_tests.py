@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import re
 import sys
 import xml.etree.ElementTree as ET
 from collections import Counter
@@ -12,9 +13,9 @@ from pathlib import Path
 from tests.benchmarks.gpu.device import checked
 from tests.benchmarks.gpu.processes import run
 from tests.benchmarks.gpu.runner import ROOT
-from tests.benchmarks.gpu.task import Skipped, Task
+from tests.benchmarks.gpu.task import SkippedError, Task
 
-MARK = "mark.gpu"
+MARK = re.compile(r"mark\.gpu\b|\bON_DEVICE\b|@on_device\b")
 SMOKE = ("tests/on_device/test_draws.py",)
 """Of the rehearsal: all of them take as long as the other steps together."""
 
@@ -22,24 +23,22 @@ SMOKE = ("tests/on_device/test_draws.py",)
 def measure(task: Task) -> None:
     """Run them, one row for each that failed or was skipped, and one row of sums."""
     if importlib.util.find_spec("pytest") is None:
-        raise Skipped("it needs the package pytest, which is not installed.")
+        raise SkippedError("it needs the package pytest, which is not installed.")
     checked(task.device)
     # Collecting all tests of the repository would take longer than running these.
     files = SMOKE if task.smoke else files_with_mark()
     report, log = task.folder / "tests.xml", task.folder / "tests.log"
     words = [sys.executable, "-m", "pytest", "-m", "gpu", "-q", "--tb=short", "--no-header"]
     words += ["-p", "no:cacheprovider", f"--junitxml={report}", *files]
-    before = os.getcwd()
-    os.chdir(ROOT)
-    try:
-        code = run(words, task.left() - 4, log, {**os.environ, "RGBT_TEST_DEVICE": task.device})
-    finally:
-        os.chdir(before)
-        print(log.read_text())
+    environment = {**os.environ, "RGBT_TEST_DEVICE": task.device}
+    code = run(words, task.left() - 4, log, environment, ROOT)
+    print(log.read_text())
     if code is None:
         raise TimeoutError(f"the tests did not end; the last lines of {log.name} say which ran")
     counts = _report(task, report) if report.is_file() else Counter()
-    task.headline(f"{counts['passed']} passed, {counts['failed']} failed, {counts['skipped']} skipped")
+    task.headline(
+        f"{counts['passed']} passed, {counts['failed']} failed, {counts['skipped']} skipped"
+    )
     if code not in (0, 5) or counts["failed"] or not counts["passed"]:
         raise AssertionError(f"pytest ended with {code}; {counts['failed']} tests failed")
 
@@ -49,7 +48,7 @@ def files_with_mark() -> list[str]:
     return sorted(
         path.relative_to(ROOT).as_posix()
         for path in (ROOT / "tests").rglob("test_*.py")
-        if MARK in path.read_text() and "benchmarks" not in path.parts
+        if MARK.search(path.read_text()) and "benchmarks" not in path.parts
     )
 
 

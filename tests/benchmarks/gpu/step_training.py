@@ -19,8 +19,8 @@ import torch
 
 from rgbt.build.training_setup import TrainingSetup
 from rgbt.evaluation.flops import count_flops
+from rgbt.runtime.resources import is_out_of_memory
 from tests.benchmarks.gpu.device import (
-    NO_MEMORY,
     arithmetic,
     checked,
     matmul_rate,
@@ -112,7 +112,9 @@ def attempt(bench: Bench, network: str, precision: str, **trainer: str) -> dict[
         with arithmetic(precision):
             try:
                 row = _steps(bench, network, precision, size, trainer)
-            except NO_MEMORY as error:
+            except (RuntimeError, MemoryError) as error:
+                if not is_out_of_memory(error):
+                    raise
                 print(f"{names}, batch {size}: {error}")
         # Outside of the handler: the error holds the frames, and these hold the tensors.
         if row is not None:
@@ -178,4 +180,3 @@ def flops_of(setup: TrainingSetup, image: Any) -> float:
 
 def _short(network: str) -> str:
     return network.removeprefix("mask2former_")
-

@@ -30,7 +30,9 @@ def measure(task: Task) -> None:
     for name, call in ways.items():
         seconds = seconds_of(call, device, 1 if task.smoke else REPEATS)
         loop = loop or seconds
-        task.row(way=name, **{"ms per sample": 1e3 * seconds / BATCH, "times faster": loop / seconds})
+        task.row(
+            way=name, **{"ms per sample": 1e3 * seconds / BATCH, "times faster": loop / seconds}
+        )
         if name == "ours with gradient":
             task.headline(f"{loop / seconds:.3g} times faster than the loop, with gradient")
     task.note(f"{BATCH} x {HW[0]}x{HW[1]}, {CLASSES} classes, PyTorch {torch.__version__}.")

@@ -17,7 +17,8 @@ import torch
 from torch.overrides import TorchFunctionMode
 
 from rgbt.engine.trainer import WAIT_SHARE
-from tests.benchmarks.gpu.device import NO_MEMORY, checked, reset_peak
+from rgbt.runtime.resources import is_out_of_memory
+from tests.benchmarks.gpu.device import checked, reset_peak
 from tests.benchmarks.gpu.project import Training, crm_words, setup_of, write_mfnet
 from tests.benchmarks.gpu.task import Task
 from tests.on_device.simulated import line_of_ours
@@ -52,13 +53,15 @@ def _list_simulated(task: Task) -> None:
 
 
 def _measure_on_gpu(task: Task, device: torch.device) -> None:
-    root = task.data or write_mfnet(task.folder / "images", 28)
-    for size in (14, 7, 2):
+    root = task.data or write_mfnet(task.folder / "images", 4 if task.smoke else 28)
+    for size in (2,) if task.smoke else (14, 7, 2):
         reset_peak(device)
         try:
             training, batches = _warm(task, root, size, device)
             break
-        except NO_MEMORY:
+        except (RuntimeError, MemoryError) as error:
+            if not is_out_of_memory(error) or size == 2:
+                raise
             task.note(f"batch {size} does not fit into memory.")
     with _synchronisations() as seen, _Clock() as clock:
         watched = training.run(batches, STEPS, synchronise=False)
@@ -78,7 +81,7 @@ def _measure_on_gpu(task: Task, device: torch.device) -> None:
 
 def _warm(task: Task, root: Any, size: int, device: torch.device) -> tuple[Training, Iterator[Any]]:
     """A training after its first steps, and the batches that follow."""
-    words = crm_words("mask2former_swin_s", size, root, smoke=False)
+    words = crm_words("mask2former_swin_s", size, root, smoke=task.smoke)
     words += [f"data.cache={task.folder / 'cache'}", "data.augment=device", "data.num_workers=0"]
     setup = setup_of([*words, "trainer.precision=bf16-mixed"], device)
     batches = setup.batches(range(WARM + 3 * STEPS))

@@ -33,10 +33,10 @@ _PACKAGE = "tests.benchmarks.gpu"
 
 STEPS = (
     Step("machine", "The machine and its rates", f"{_PACKAGE}.step_machine", 30),
-    Step("tests", "Tests marked gpu", f"{_PACKAGE}.step_tests", 70),
-    Step("equality", "Losses and classes: CPU against device", f"{_PACKAGE}.step_equality", 70),
-    Step("training", "CRM step at the paper's batch", f"{_PACKAGE}.step_training", 100),
-    Step("compile", "CRM step, compiled", f"{_PACKAGE}.step_compile", 60),
+    Step("tests", "Tests marked gpu", f"{_PACKAGE}.step_tests", 90),
+    Step("equality", "Losses and classes: CPU against device", f"{_PACKAGE}.step_equality", 60),
+    Step("training", "CRM step at the paper's batch", f"{_PACKAGE}.step_training", 95),
+    Step("compile", "CRM step, compiled", f"{_PACKAGE}.step_compile", 50),
     Step("waits", "Host synchronisations of a step", f"{_PACKAGE}.step_waits", 35),
     Step("loading", "The input path", f"{_PACKAGE}.step_loading", 45),
     Step("views", "Virtual views against an OpenCV loop", f"{_PACKAGE}.step_views", 20, least=20),

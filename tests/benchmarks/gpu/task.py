@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 
-class Skipped(Exception):
+class SkippedError(Exception):
     """A step, or a part of it, that cannot run here; the message is the reason, one sentence."""
 
 

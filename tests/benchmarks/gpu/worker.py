@@ -14,7 +14,7 @@ import traceback
 from pathlib import Path
 from typing import Any
 
-from tests.benchmarks.gpu.task import Skipped, Task
+from tests.benchmarks.gpu.task import SkippedError, Task
 
 BEFORE_END = 3.0
 """Seconds before the limit at which the stacks of all threads are written to the log."""
@@ -36,7 +36,8 @@ def main(path: Path) -> int:
         )
         try:
             importlib.import_module(request["module"]).measure(task)
-        except Skipped as reason:
+            faulthandler.cancel_dump_traceback_later()
+        except SkippedError as reason:
             task.write("skipped", str(reason))
         except Exception as error:
             traceback.print_exc()
