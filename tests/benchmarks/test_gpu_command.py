@@ -225,6 +225,22 @@ def test_training_halves_the_batch_where_memory_runs_out(
     ]
 
 
+def test_a_configuration_that_fails_does_not_stop_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def attempt(bench: Any, network: str, precision: str, **trainer: str) -> Any:
+        if trainer["activation_checkpointing"] == "false":
+            raise RuntimeError("no kernel image\nmore")
+        bench.task.row(network=network)
+
+    monkeypatch.setattr(step_training, "attempt", attempt)
+    task = task_in(tmp_path)
+    with pytest.raises(AssertionError, match="1 configurations failed"):
+        step_training.measure(task)
+    assert len(lines_of(task, "row")) == 1
+    assert "failed: RuntimeError: no kernel image (" in lines_of(task, "note")[0]
+
+
 def test_waits_are_counted_by_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The code for a GPU, with a CPU that warns as CUDA does."""
     from rgbt.engine import trainer

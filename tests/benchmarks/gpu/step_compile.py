@@ -7,7 +7,14 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 
-from tests.benchmarks.gpu.step_training import NETWORKS, Bench, attempt, headline_of
+from tests.benchmarks.gpu.step_training import (
+    NETWORKS,
+    Bench,
+    attempt,
+    headline_of,
+    raise_if,
+    report_failure,
+)
 from tests.benchmarks.gpu.task import SkippedError, Task
 
 CASES = (
@@ -22,12 +29,19 @@ def measure(task: Task) -> None:
         raise SkippedError("it needs the package triton, which torch.compile uses on a GPU.")
     bench = Bench.of(task)
     rates: dict[str, float] = {}
+    failed = 0
     cases = ["swin_t fp32 default"] if task.smoke else list(CASES)
     for case in task.as_time_allows(cases, first=15.0):
         name, precision, mode = case.split()
         network = next(each for each in NETWORKS if each.endswith(name))
-        pair = {each: attempt(bench, network, precision, compile=each) for each in ("none", mode)}
+        try:
+            pair = {way: attempt(bench, network, precision, compile=way) for way in ("none", mode)}
+        except Exception as error:
+            report_failure(task, case, error)
+            failed += 1
+            continue
         if all(pair.values()):
             before, after = (pair[each]["images per second"] for each in ("none", mode))
             rates[f"{pair[mode]['network']} {precision} {mode}"] = after / before
             task.headline(headline_of(rates).replace("images per second", "times faster"))
+    raise_if(failed)

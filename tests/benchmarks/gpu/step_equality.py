@@ -7,6 +7,7 @@ a matching that rounding turns changes a loss by more.
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable
 from typing import Any
 
@@ -22,7 +23,7 @@ from rgbt.randomness import torch_generator
 from rgbt.types import MaskPair
 from tests.benchmarks.gpu.device import arithmetic, checked
 from tests.benchmarks.gpu.project import setup_of
-from tests.benchmarks.gpu.task import Task
+from tests.benchmarks.gpu.task import Task, sentence_of
 
 CPU = torch.device("cpu")
 
@@ -47,7 +48,8 @@ def measure(task: Task) -> None:
             try:
                 row = compare(name, device)
             except Exception as error:
-                task.row(experiment=name, error=f"{type(error).__name__}: {error}"[:300])
+                traceback.print_exc()
+                task.row(experiment=name, error=sentence_of(error)[:300])
                 largest["failed"] = largest.get("failed", 0) + 1
                 continue
             task.row(experiment=name, **row)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import gc
 import time
+import traceback
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import repeat
@@ -37,7 +38,7 @@ from tests.benchmarks.gpu.project import (
     setup_of,
     write_mfnet,
 )
-from tests.benchmarks.gpu.task import Task
+from tests.benchmarks.gpu.task import Task, sentence_of
 
 BATCH = 14
 """Images of a step (CRM, Sec. IV-A)."""
@@ -83,6 +84,7 @@ def measure(task: Task) -> None:
     """One row for each network, precision and checkpointing, as far as time allows."""
     bench = Bench.of(task)
     best: dict[str, float] = {}
+    failed = 0
     cases = [
         f"{network} {precision} {checkpointing}"
         for checkpointing in ("false", "true")
@@ -91,10 +93,28 @@ def measure(task: Task) -> None:
     ]
     for case in task.as_time_allows(cases, first=10.0):
         network, precision, checkpointing = case.split()
-        row = attempt(bench, network, precision, activation_checkpointing=checkpointing)
+        try:
+            row = attempt(bench, network, precision, activation_checkpointing=checkpointing)
+        except Exception as error:
+            report_failure(task, case, error)
+            failed += 1
+            continue
         if row and checkpointing == "false":
             best[f"{row['network']} {precision}"] = row["images per second"]
             task.headline(headline_of(best))
+    raise_if(failed)
+
+
+def report_failure(task: Task, case: str, error: Exception) -> None:
+    """A note of a configuration that failed; its traceback is in the log."""
+    traceback.print_exception(error)
+    task.note(f"{case} failed: {sentence_of(error)}")
+
+
+def raise_if(failed: int) -> None:
+    """Fail the step if a configuration has failed."""
+    if failed:
+        raise AssertionError(f"{failed} configurations failed; the notes name them")
 
 
 def headline_of(rates: dict[str, float]) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import time
+import traceback
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -85,3 +86,14 @@ def _plain(value: Any) -> Any:
     if not isinstance(value, float):
         return value
     return float(f"{value:.4g}") if math.isfinite(value) else str(value)
+
+
+def sentence_of(error: BaseException) -> str:
+    """Type, first line of the message, and the last line of our code that was running."""
+    said = (str(error).strip() or "no message").splitlines()[0]
+    own = [
+        f"{Path(frame.filename).name}:{frame.lineno}"
+        for frame in traceback.extract_tb(error.__traceback__)
+        if "site-packages" not in frame.filename
+    ]
+    return f"{type(error).__name__}: {said} ({own[-1] if own else 'no line'})"

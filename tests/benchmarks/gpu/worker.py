@@ -14,7 +14,7 @@ import traceback
 from pathlib import Path
 from typing import Any
 
-from tests.benchmarks.gpu.task import SkippedError, Task
+from tests.benchmarks.gpu.task import SkippedError, Task, sentence_of
 
 BEFORE_END = 3.0
 """Seconds before the limit at which the stacks of all threads are written to the log."""
@@ -56,17 +56,6 @@ def missing_package(error: Exception) -> str | None:
         return None
     package = error.name.partition(".")[0]
     return None if package in ("rgbt", "sweeps", "tests") else package
-
-
-def sentence_of(error: BaseException) -> str:
-    """Type, first line of the message, and the last line of our code that was running."""
-    said = (str(error).strip() or "no message").splitlines()[0]
-    own = [
-        f"{Path(frame.filename).name}:{frame.lineno}"
-        for frame in traceback.extract_tb(error.__traceback__)
-        if "site-packages" not in frame.filename
-    ]
-    return f"{type(error).__name__}: {said} ({own[-1] if own else 'no line'})"
 
 
 if __name__ == "__main__":
