@@ -17,7 +17,7 @@ from rgbt.build.training_setup import TrainingSetup
 from rgbt.data.loaders import eval_batches
 from rgbt.evaluation.prediction import Predictor
 from rgbt.evaluation.request import EvaluationRequest
-from tests.benchmarks.gpu.project import Training, setup_of
+from tests.benchmarks.gpu.project import Training, setup_of, smoke_words
 from tests.on_device.simulated import DEVICE, simulation
 
 CPU = torch.device("cpu")
@@ -42,8 +42,7 @@ class SimulatedRun:
 
 def words_of(experiment: str, augment: str = "loader") -> list[str]:
     """Overrides of a step at smoke size."""
-    sizes = ["data.num_workers=0", f"data.augment={augment}"]
-    return [f"+experiment={experiment}", "+debug=smoke", *sizes]
+    return [*smoke_words(experiment), f"data.augment={augment}"]
 
 
 def on_cpu(words: Sequence[str], folder: Path, steps: int = 2) -> SimulatedRun:

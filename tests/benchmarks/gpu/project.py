@@ -42,6 +42,18 @@ def setup_of(words: Sequence[str], device: torch.device) -> TrainingSetup:
     return set_up_training(spec_of(words, device), upstream_finished=False)
 
 
+def smoke_words(experiment: str) -> list[str]:
+    """Overrides of an experiment at smoke size that runs without its upstream runs.
+
+    They would make pseudo-labels, whose confidence weighs a loss of HeatNet.
+    """
+    words = [f"+experiment={experiment}", "+debug=smoke", "data.num_workers=0"]
+    scheme = specify(compose(words), words).scheme
+    if scheme.plain.get("weighed_by_confidence"):
+        words.append("scheme.weighed_by_confidence=false")
+    return words
+
+
 def crm_words(network: str, batch_size: int, root: Path, *, smoke: bool) -> list[str]:
     """Overrides of the CRM experiment as published, or at the smallest size."""
     if smoke:

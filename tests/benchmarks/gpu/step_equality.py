@@ -22,7 +22,7 @@ from rgbt.evaluation.request import EvaluationRequest
 from rgbt.randomness import torch_generator
 from rgbt.types import MaskPair
 from tests.benchmarks.gpu.device import arithmetic, checked
-from tests.benchmarks.gpu.project import setup_of
+from tests.benchmarks.gpu.project import setup_of, smoke_words
 from tests.benchmarks.gpu.task import Task, sentence_of
 
 CPU = torch.device("cpu")
@@ -67,9 +67,10 @@ def experiments() -> list[str]:
 
 def compare(name: str, device: torch.device) -> dict[str, Any]:
     """One step and one evaluation of an experiment on the CPU and on `device`."""
-    words = [f"+experiment={name}", "+debug=smoke", "data.augment=loader", "data.num_workers=0"]
+    words = [*smoke_words(name), "data.augment=loader"]
     setups = [setup_of(words, each) for each in (CPU, device)]
-    loaded = next(setups[0].batches(range(1)))
+    # Step 1: where steps alternate, step 0 trains the discriminator alone.
+    loaded = next(setups[0].batches(range(1, 2)))
     losses, norms, maps = [], [], []
     for setup in setups:
         draw_on_cpu(setup.scheme, setup.session.fabric.device)
