@@ -1,4 +1,4 @@
-"""The command that measures a GPU: its options, its limits, and a rehearsal of its steps."""
+"""The command that measures a GPU: its options, its limits, and its steps on the CPU."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_limits_are_shares_of_the_whole() -> None:
 def test_a_step_that_fails_costs_that_step_alone(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tests.benchmarks.gpu.runner.REHEARSAL", 3.0)
+    monkeypatch.setattr("tests.benchmarks.gpu.runner.CPU_LEAST", 3.0)
     names = ("crashes", "exhausts", "hangs", "lacks", "works")
     steps = [fake(name) for name in names]
     request = Request(tmp_path / "out", minutes=2.0, device="cpu", size="smoke", steps=names)
@@ -151,7 +151,7 @@ def test_a_table_keeps_every_column() -> None:
     assert "| x | y |\n| --- | --- |\n| 1 |  |\n|  | p\\|q |" in markdown("c", "now", [result])
 
 
-# Rehearsal of the steps.
+# The steps on the CPU.
 
 
 def test_arithmetic_is_restored() -> None:
@@ -266,7 +266,7 @@ def test_waits_are_counted_by_line(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.slow
-def test_the_whole_rehearsal(tmp_path: Path) -> None:
+def test_every_step_ends_on_the_cpu(tmp_path: Path) -> None:
     request = Request(tmp_path, minutes=10.0, device="cpu", size="smoke")
     found = run_steps(request)
     assert [(each.name, each.status) for each in found] == [(s.name, "done") for s in STEPS], [

@@ -1,4 +1,4 @@
-"""The device of the tests marked gpu: CUDA, or what RGBT_TEST_DEVICE names to rehearse them."""
+"""The device of the tests marked gpu: CUDA, or what RGBT_TEST_DEVICE names."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ NAME = os.environ.get("RGBT_TEST_DEVICE") or ("cuda" if torch.cuda.is_available(
 
 ON_DEVICE = [
     pytest.mark.gpu,
-    pytest.mark.skipif(not NAME, reason="needs a CUDA device; RGBT_TEST_DEVICE=cpu rehearses it"),
+    pytest.mark.skipif(
+        not NAME, reason="needs a CUDA device; RGBT_TEST_DEVICE=cpu tries it on a CPU"
+    ),
 ]
 """Marks of a test that runs on `device()`."""
 

@@ -30,7 +30,7 @@ class Request:
         out: folder of the results; made if it does not exist.
         minutes: limit of the whole command.
         data: folder of MFNet; None: images are written to a temporary folder.
-        device: "cuda", or "cpu" to rehearse.
+        device: "cuda", or "cpu" to try the command without a GPU.
         size: "full", or "smoke" for the smallest sizes.
         steps: names of the steps to run, in the order of the table.
     """

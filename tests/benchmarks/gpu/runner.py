@@ -25,7 +25,7 @@ ROOT = Path(__file__).resolve().parents[3]
 RESERVE = 2.0 + GRACE
 """Seconds kept for ending the last step and for writing the results."""
 
-REHEARSAL = 60.0
+CPU_LEAST = 60.0
 """Smallest limit of a step on a CPU, whose cores may be shared: imports alone may take 20 s."""
 
 
@@ -64,7 +64,7 @@ def limit_of(step: Step, request: Request, left: float) -> float:
     """Seconds that a step may take: its share of the whole, at most what is left."""
     if step.seconds is None:
         return left
-    least = step.least if request.device == "cuda" else max(step.least, REHEARSAL)
+    least = step.least if request.device == "cuda" else max(step.least, CPU_LEAST)
     return min(left, max(step.seconds * 60 * request.minutes / NOMINAL, least))
 
 

@@ -17,7 +17,7 @@ from tests.benchmarks.gpu.task import SkippedError, Task
 
 MARK = re.compile(r"mark\.gpu\b|\bON_DEVICE\b|@on_device\b")
 SMOKE = ("tests/on_device/test_draws.py",)
-"""Of the rehearsal: all of them take as long as the other steps together."""
+"""With size=smoke: all of them take as long as the other steps together."""
 
 
 def measure(task: Task) -> None:

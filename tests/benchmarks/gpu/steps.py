@@ -18,7 +18,7 @@ class Step:
         module: whose function ``measure(task)`` does it.
         seconds: limit with minutes=8; other limits are in proportion. None: what remains.
         least: seconds below which it is not started, and lower bound of its limit.
-        needs_cuda: whether nothing of it can be rehearsed on the CPU.
+        needs_cuda: whether nothing of it can be tried on the CPU.
     """
 
     name: str
