@@ -68,13 +68,6 @@ class TestContract:
         hidden = (masks.rgb | masks.thermal).any().item()
         assert configured(variant).record.hides_cells == bool(hidden)
 
-    @pytest.mark.gpu
-    @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-    def test_draws_on_the_device_of_the_batch(self, variant) -> None:
-        generator, centre = torch_generator(0, "m", device="cuda"), torch.zeros(4, 2).long().cuda()
-        masks = configured(variant)((240, 320), centre, generator)
-        assert masks.rgb.device.type == masks.thermal.device.type == "cuda"
-
 
 @pytest.mark.parametrize("variant", ["crm", "grbm_released"])
 def test_counts_are_exact_and_masks_complementary(variant) -> None:

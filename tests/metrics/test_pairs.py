@@ -21,6 +21,7 @@ from rgbt.metrics.pairs import (
 )
 from rgbt.metrics.scores import class_mean
 from tests.models.golden import FOLDER
+from tests.on_device.places import device, on_device
 
 GOLDEN = FOLDER / "losses.npz"
 BOTH = ["released", "exclude"]
@@ -120,11 +121,10 @@ def test_refuses_what_cannot_be_counted() -> None:
         pair_counts(zeros, zeros, zeros, 256)
 
 
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@on_device
 def test_counts_on_the_gpu() -> None:
     given = maps(2)
-    there = [torch.from_numpy(each).cuda() for each in given]
+    there = [torch.from_numpy(each).to(device()) for each in given]
     expected = pair_counts(*given[:3], 5, given[3])
     assert np.array_equal(pair_counts(there[0], there[1], there[2], 5, there[3]), expected)
 

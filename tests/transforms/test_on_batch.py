@@ -17,6 +17,7 @@ from rgbt.transforms.crm import CrmTransform
 from rgbt.transforms.hsv import to_hsv, to_rgb
 from rgbt.transforms.joint import View, bilinear_taps
 from rgbt.types import Batch, Sample
+from tests.on_device.places import device, on_device
 from tests.transforms.recipes import crm
 
 SIZES = ((48, 64), (60, 50), (48, 64), (31, 77))
@@ -104,12 +105,11 @@ def test_an_example_does_not_depend_on_its_batch() -> None:
         assert torch.equal(alone.label[0], whole.label[place])
 
 
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@on_device
 def test_a_gpu_gives_the_same_bits() -> None:
     made = transform(colour_probability=1.0)
     drawn = [made.drawn(sample(n), numpy_generator(0, "augment", 0, n)) for n in range(8)]
-    there = made.stack(drawn).to("cuda")
+    there = made.stack(drawn).to(device())
     here = {each.name: getattr(there, each.name) for each in fields(Batch)}
     moved = {
         key: value.cpu() if isinstance(value, torch.Tensor) else value
