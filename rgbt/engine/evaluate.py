@@ -28,8 +28,8 @@ def class_maps(
 ) -> Tensor:
     """(B, H', W') uint8: class index of every pixel of the labels of one batch.
 
-    Class scores are resized (bilinear) to the label before the classes are taken where the transform resized
-    the images, so that scores always count the pixels of the file.
+    Where the transform resized the images, their class scores are resized (bilinear) to the label
+    before classes are taken, so that scores always count the pixels of the file.
 
     Args:
         model: a network in evaluation mode.
