@@ -21,6 +21,7 @@ from omegaconf.errors import OmegaConfBaseException
 from rgbt.checks import InputError
 from rgbt.config.component import build
 from rgbt.config.compose import check_keys, compose, conf_dir, register_resolvers, searching
+from rgbt.config.config_source import parsing_once
 from rgbt.config.hydra_messages import check_words, hydra_sentence
 from rgbt.config.options import readable_paths
 from rgbt.config.plain_command import exit_code
@@ -65,9 +66,10 @@ def command(*, sweeper: str = "basic") -> Callable[[Main], Callable[[], None]]:
                 # Hydra's root logger shows the INFO lines of every library.
                 logging.getLogger("matplotlib").setLevel(logging.WARNING)
                 register_resolvers()
-                hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")(
-                    job
-                )()
+                with parsing_once():  # Hydra composes twice: first to learn hydra.mode
+                    hydra.main(
+                        version_base="1.3", config_path=str(conf_dir()), config_name="config"
+                    )(job)()
 
             with answered(), searching(words):
                 code = max([exit_code(run), *codes])

@@ -10,12 +10,11 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rgbt.checks import InputError
 from rgbt.config.component import Component
 from rgbt.data.domains import Domains
-from rgbt.metrics.pairs import file_name
 from rgbt.spec.naming import describe, group_of
 from rgbt.spec.request import KnownRun, known_run
 from rgbt.spec.run_spec import RunSpec
@@ -28,6 +27,7 @@ from rgbt.tracking.tracker import Tracking
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
+    from rgbt.dataset import LabelledDataset
     from rgbt.transforms.view_sets import ViewSets
 
 LAUNCHED = ("RANK", "SLURM_PROCID")
@@ -41,7 +41,8 @@ class FinishedRun:
     Attributes:
         folder: the run folder.
         requested: name, tags and parameters of this request.
-        dataset: makes the data set.
+        dataset: makes the data set; None: it is drawn from its settings alone, which are in the
+            key.
         domains: which head predicts an image.
         consistency: makes the views; None: the run measures none.
         tracking: the tracker.
@@ -49,7 +50,7 @@ class FinishedRun:
 
     folder: Path
     requested: Description
-    dataset: Component
+    dataset: Callable[[], LabelledDataset] | None
     domains: Domains
     consistency: Callable[[], ViewSets] | None
     tracking: Tracking
@@ -85,7 +86,7 @@ def finished_run(spec: RunSpec, extra_tags: Mapping[str, str] | None) -> Finishe
     return FinishedRun(
         folder=spec.folder,
         requested=describe(spec, extra_tags),
-        dataset=spec.dataset,
+        dataset=spec.dataset.build if "root" in spec.dataset.plain else None,
         domains=spec.domains,
         consistency=spec.consistency.build if spec.consistency.plain["sets"] else None,
         tracking=spec.tracking.build(),
@@ -93,16 +94,16 @@ def finished_run(spec: RunSpec, extra_tags: Mapping[str, str] | None) -> Finishe
 
 
 def _of_known(known: KnownRun, extra_tags: Mapping[str, str]) -> FinishedRun:
-    def node(key: str) -> Component:
-        return Component.from_node(known.config[key], key)
+    def node(key: str) -> Callable[[], Any]:
+        return lambda: Component.from_node(known.config[key], key).build()
 
     return FinishedRun(
         folder=known.folder,
         requested=describe(known, extra_tags),
-        dataset=node("dataset"),
-        domains=node("domains").build(),
-        consistency=node("consistency").build if known.plain["consistency"]["sets"] else None,
-        tracking=node("tracking").build(),
+        dataset=node("dataset") if "root" in known.plain["dataset"] else None,
+        domains=node("domains")(),
+        consistency=node("consistency") if known.plain["consistency"]["sets"] else None,
+        tracking=node("tracking")(),
     )
 
 
@@ -142,11 +143,11 @@ def _describe_again(run: FinishedRun, folder: RunFolder) -> None:
 
 def _report_other_files(run: FinishedRun, folder: RunFolder) -> None:
     """Report a finished run of the same key that was made on another copy of the data set."""
-    if "root" not in run.dataset.plain:
-        return  # drawn from its settings alone, which are in the key
+    if run.dataset is None:
+        return
     result = read_result(folder.path)
     try:
-        now = run.dataset.build().fingerprint()
+        now = run.dataset().fingerprint()
     except InputError:
         return  # a result can be shown without its data
     if result is not None and result["dataset"] != now:
@@ -160,6 +161,8 @@ def _report_consistency(run: FinishedRun, folder: RunFolder) -> None:
     """Report a request for views on which the run was not measured."""
     if run.consistency is None:
         return
+    from rgbt.metrics.pairs import file_name  # NumPy
+
     views = run.consistency()
     measured = [folder.path / file_name("aligned", each, views.mark) for each in views.splits]
     if not all(path.is_file() for path in measured):
