@@ -3,8 +3,9 @@
 The key of a run follows from its checked settings. The check imports every class that they name,
 and with these torch, which takes seconds. So a finished run notes its key in
 ``<runs_dir>/.requests/<digest>.json``, under a digest of everything that the key follows from: the
-resolved configuration, the code of this package and of the user, the content of weights and
-pseudo-labels, and the same of the upstream runs. A request with another digest is checked as usual.
+resolved configuration, the user's own code, the content of weights and pseudo-labels, and the same
+of the upstream runs. A request with another digest is checked as usual, and so is every request
+after a change of this package.
 """
 
 from __future__ import annotations
@@ -39,10 +40,12 @@ class Request:
 
     Attributes:
         key: of the run.
+        code: digest of the code of this package that made the key of the settings.
         uses_pretrained: `RunSpec.uses_pretrained`.
     """
 
     key: str
+    code: str
     uses_pretrained: bool
 
 
@@ -94,13 +97,15 @@ def known_run(config: DictConfig, overrides: tuple[str, ...]) -> KnownRun | None
     if not path.is_file():
         return None
     request: Request = read_json(path, Request, "remove it")
+    if request.code != code()["code"]:
+        return None
     known = KnownRun(config, overrides, {**plain, "fresh": False}, request)
     return known if (known.folder / "result.json").is_file() else None
 
 
 def note_request(config: DictConfig, spec: RunSpec) -> None:
     """Note the key of a finished run under what requested it."""
-    request = Request(spec.key, spec.uses_pretrained)
+    request = Request(spec.key, code()["code"], spec.uses_pretrained)
     path = _path(spec.plain, request_digest(config))
     path.parent.mkdir(exist_ok=True)
     write_atomic(path, json.dumps(sealed(vars(request))).encode())
@@ -119,7 +124,6 @@ def request_digest(config: DictConfig, downstream: tuple[str, ...] = ()) -> str:
     plain = _plain(config)
     content = {
         "config": {**plain, "fresh": False},
-        "code": code()["code"],
         "own_code": user_code(targets(plain).values()),
         "sets": [
             file_digest(Path(name).expanduser())

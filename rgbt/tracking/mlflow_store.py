@@ -66,7 +66,7 @@ class MlflowTracking(Tracking):
         self._warned = False
 
     def start(self, folder: RunFolder, description: Description) -> None:
-        """Note where the run of `folder` is sent; `logged` connects.
+        """Note where the run of `folder` is sent; `after_step` connects.
 
         MLflow takes seconds to import and to open its database. The first step does not wait for
         it, and a run that fails before contacts the store only in the end.
@@ -75,8 +75,8 @@ class MlflowTracking(Tracking):
         folder.describe(description)
         write_upload_state(folder, self._sent(folder))
 
-    def logged(self) -> None:
-        """Start the MLflow run after the first line of the log, or continue its existing run."""
+    def after_step(self) -> None:
+        """After the first step, start the MLflow run, or continue its existing run."""
         if not self._is_connected:
             self.update()
 

@@ -23,8 +23,8 @@ class Tracking:
         """Start or continue the run of `folder`; no step has been done yet by this process."""
         folder.describe(description)
 
-    def logged(self) -> None:
-        """A line of the training log was written. A store that starts slowly can start now."""
+    def after_step(self) -> None:
+        """Called after every step of a training; a store that starts slowly can start here."""
 
     def update(self) -> None:
         """Send new data of the folder; called after every evaluation."""

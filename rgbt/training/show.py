@@ -111,7 +111,7 @@ def show(run: FinishedRun) -> None:
     """Print the tables of a finished run, and what differs from the run that is requested now."""
     folder = RunFolder(run.folder)
     folder.clean()
-    _describe_again(run, folder)
+    describe_again(folder, run.tracking, run.requested)
     warn_of_result(folder.path)
     _report_other_files(run, folder)
     _report_consistency(run, folder)
@@ -127,8 +127,9 @@ def print_result(folder: RunFolder, tracking: Tracking, domains: Domains) -> Non
     print_rich(result_view(tables, folder.path, links))
 
 
-def _describe_again(run: FinishedRun, folder: RunFolder) -> None:
-    known, requested = read_description(folder.path), run.requested
+def describe_again(folder: RunFolder, tracking: Tracking, requested: Description) -> None:
+    """Report that a run is finished; show it under the requested name if that says more."""
+    known = read_description(folder.path)
     assert known is not None, "a finished run has its description"
     info(
         f"{requested.name} is already finished; its result follows. For a new run, choose "
@@ -138,7 +139,7 @@ def _describe_again(run: FinishedRun, folder: RunFolder) -> None:
     lengths = [len(group_of(each.tags, each.params)) for each in (requested, known)]
     shown = requested if lengths[0] > lengths[1] else known
     merged = Description(shown.name, {**known.tags, **shown.tags}, known.params)
-    run.tracking.refresh(folder, merged)
+    tracking.refresh(folder, merged)
 
 
 def _report_other_files(run: FinishedRun, folder: RunFolder) -> None:

@@ -240,15 +240,12 @@ class Run:
             schedule=self.setup.schedule,
             steps_per_epoch=max(1, per_epoch // session.trainer.accumulate),
             folder=self.folder.path,
-            record=self._log,
+            record=lambda step, values: self.folder.append(step, "train", values),
             validate=validate,
             committed=self.tracking.update,
+            after_step=self.tracking.after_step,
         )
         return trainer
-
-    def _log(self, step: int, values: Mapping[str, float]) -> None:
-        self.folder.append(step, "train", values)
-        self.tracking.logged()
 
     def _consistency(self, session: Session) -> dict[str, ConsistencyTable]:
         """TC and CA of the best checkpoint under "val" and "test", as far as requested."""
