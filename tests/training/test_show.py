@@ -94,9 +94,12 @@ def test_a_request_is_noted_once_and_belongs_to_the_code(
     from rgbt.spec import specify as module
 
     real = module.specify
-    monkeypatch.setattr(
-        module, "specify", lambda *given, **more: specified.append("") or real(*given, **more)
-    )
+
+    def specify(*given: Any, **more: Any) -> Any:
+        specified.append("")
+        return real(*given, **more)
+
+    monkeypatch.setattr(module, "specify", specify)
 
     def shown(*more: str) -> bool:
         """Whether the run is shown without its specification."""
