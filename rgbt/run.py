@@ -32,7 +32,8 @@ def main(config: DictConfig) -> int:
     run = specify(config, overrides)
     report_pretrained(run.pretrained, run.uses_pretrained, run.name)
     run_pipeline(run, tags)
-    note_request(config, run)
+    if run.is_finished:
+        note_request(config, run)
     return 0
 
 
