@@ -9,7 +9,7 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import wraps
 from typing import Any
 
@@ -26,6 +26,8 @@ from rgbt.config.hydra_messages import check_words, hydra_sentence
 from rgbt.config.options import readable_paths
 from rgbt.config.plain_command import exit_code
 from rgbt.runtime.signals import answered
+
+MULTIRUN = ("-m", "--multirun")
 
 Main = Callable[[DictConfig], int | None]
 
@@ -50,7 +52,7 @@ def command(*, sweeper: str = "basic") -> Callable[[Main], Callable[[], None]]:
             if not any(word.startswith("hydra/sweeper=") for word in words):
                 first = (n for n, word in enumerate(words) if "=" in word and word[0] != "-")
                 words.insert(next(first, len(words)), f"hydra/sweeper={sweeper}")
-            sys.argv[1:] = sorted(words, key=lambda word: word not in ("-m", "--multirun"))
+            sys.argv[1:] = sorted(words, key=lambda word: word not in MULTIRUN)
 
             def checked(config: DictConfig) -> int | None:
                 check_keys(config)
@@ -66,7 +68,9 @@ def command(*, sweeper: str = "basic") -> Callable[[Main], Callable[[], None]]:
                 # Hydra's root logger shows the INFO lines of every library.
                 logging.getLogger("matplotlib").setLevel(logging.WARNING)
                 register_resolvers()
-                with parsing_once():  # Hydra composes twice: first to learn hydra.mode
+                # To run, Hydra composes twice: first to learn hydra.mode. To show, as --cfg, once.
+                is_shown = any(word[:1] == "-" and word not in MULTIRUN for word in words)
+                with nullcontext() if is_shown else parsing_once():
                     hydra.main(
                         version_base="1.3", config_path=str(conf_dir()), config_name="config"
                     )(job)()
