@@ -7,9 +7,12 @@ numbers as an uninterrupted one, and a single mask or augmentation can be reprod
 from __future__ import annotations
 
 import hashlib
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
+
+if TYPE_CHECKING:
+    import torch
 
 
 def derive(seed: int, purpose: str, *index: int) -> int:
@@ -28,6 +31,8 @@ def torch_generator(
     seed: int, purpose: str, *index: int, device: torch.device | str = "cpu"
 ) -> torch.Generator:
     """A torch generator on `device`, seeded by `derive`."""
+    import torch  # not at the top: data sets are read without it
+
     return torch.Generator(device=device).manual_seed(derive(seed, purpose, *index))
 
 

@@ -16,21 +16,24 @@ if TYPE_CHECKING:
 @command(sweeper="study")
 def main(config: DictConfig) -> int:
     """Train the upstream runs and the run, evaluate its checkpoint on the test split."""
-    # torch is imported here, after --help
     from hydra.core.hydra_config import HydraConfig
 
     from rgbt.spec.naming import tags_from_environment
+    from rgbt.spec.request import note_request
     from rgbt.spec.specify import specify
-    from rgbt.tracking.terminal import info
+    from rgbt.training.show import report_pretrained, show_known
+
+    overrides, tags = list(HydraConfig.get().overrides.task), tags_from_environment()
+    if show_known(config, overrides, tags):
+        return 0
+    # torch is imported here, after --help and after finished runs
     from rgbt.training.pipeline import run_pipeline
 
-    run = specify(config, list(HydraConfig.get().overrides.task))
-    if run.pretrained is not None and not run.uses_pretrained:
-        info(
-            f"pretrained={run.pretrained} is ignored: the experiment {run.name} does not use "
-            "ImageNet weights."
-        )
-    run_pipeline(run, tags_from_environment())
+    run = specify(config, overrides)
+    report_pretrained(run.pretrained, run.uses_pretrained, run.name)
+    run_pipeline(run, tags)
+    if run.is_finished:
+        note_request(config, run)
     return 0
 
 

@@ -11,12 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, TypeAlias
 
-import numpy as np
-import torch
-from numpy.typing import NDArray
-from torch import Tensor
+if TYPE_CHECKING:  # commands that show results import these types without NumPy and torch
+    import numpy as np
+    import torch
+    from numpy.typing import NDArray
+    from torch import Tensor
 
 IGNORE = 255
 
@@ -25,7 +26,7 @@ View = Literal["rgbt", "rgb", "thermal"]
 
 VIEWS: tuple[View, ...] = ("rgbt", "rgb", "thermal")
 
-GeneratorOf = Callable[[str], torch.Generator]
+GeneratorOf: TypeAlias = "Callable[[str], torch.Generator]"
 """purpose -> generator; the same purpose in the same step always gives the same draws."""
 
 

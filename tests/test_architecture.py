@@ -15,12 +15,15 @@ ANALYSIS = sorted((ROOT / "analysis").rglob("*.py"))
 FILES = [*RGBT, *SWEEPS, *ANALYSIS, *sorted((ROOT / "hydra_plugins").rglob("*.py"))]
 
 BASE = {"types", "dataset", "requirements", "checks", "ranges", "randomness", "files", "processes"}
+BASE |= {"class_scores"}
 SHARED = BASE | {"geometry"}
 COMPONENTS = {"data", "corruptions", "transforms", "maskers", "models", "losses", "metrics"}
 READING = SHARED | {"config", "spec", "tracking", "metrics", "data"}
 BUILDING = READING | COMPONENTS | {"schemes", "engine", "checkpoints", "runtime", "build"}
 MAY_IMPORT = {
-    **dict.fromkeys(("types", "checks", "ranges", "randomness", "processes"), set()),
+    **dict.fromkeys(
+        ("types", "checks", "ranges", "randomness", "processes", "class_scores"), set()
+    ),
     "dataset": {"types", "requirements"},
     "requirements": {"types", "checks"},
     "files": BASE,

@@ -20,7 +20,7 @@ from rgbt.checks import InputError
 from rgbt.data.cache.dataset import cached_dataset
 from rgbt.data.domains import Domains
 from rgbt.data.label_map import LabelMap
-from rgbt.data.loaders import LoaderSettings
+from rgbt.data.loader_settings import LoaderSettings
 from rgbt.dataset import LabelledDataset
 from rgbt.engine.allocator import keep_memory
 from rgbt.engine.settings import TrainerSettings

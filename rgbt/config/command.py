@@ -9,7 +9,7 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import wraps
 from typing import Any
 
@@ -21,10 +21,13 @@ from omegaconf.errors import OmegaConfBaseException
 from rgbt.checks import InputError
 from rgbt.config.component import build
 from rgbt.config.compose import check_keys, compose, conf_dir, register_resolvers, searching
+from rgbt.config.config_source import parsing_once
 from rgbt.config.hydra_messages import check_words, hydra_sentence
 from rgbt.config.options import readable_paths
 from rgbt.config.plain_command import exit_code
 from rgbt.runtime.signals import answered
+
+MULTIRUN = ("-m", "--multirun")
 
 Main = Callable[[DictConfig], int | None]
 
@@ -49,7 +52,7 @@ def command(*, sweeper: str = "basic") -> Callable[[Main], Callable[[], None]]:
             if not any(word.startswith("hydra/sweeper=") for word in words):
                 first = (n for n, word in enumerate(words) if "=" in word and word[0] != "-")
                 words.insert(next(first, len(words)), f"hydra/sweeper={sweeper}")
-            sys.argv[1:] = sorted(words, key=lambda word: word not in ("-m", "--multirun"))
+            sys.argv[1:] = sorted(words, key=lambda word: word not in MULTIRUN)
 
             def checked(config: DictConfig) -> int | None:
                 check_keys(config)
@@ -65,9 +68,12 @@ def command(*, sweeper: str = "basic") -> Callable[[Main], Callable[[], None]]:
                 # Hydra's root logger shows the INFO lines of every library.
                 logging.getLogger("matplotlib").setLevel(logging.WARNING)
                 register_resolvers()
-                hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")(
-                    job
-                )()
+                # To run, Hydra composes twice: first to learn hydra.mode. To show, as --cfg, once.
+                is_shown = any(word[:1] == "-" and word not in MULTIRUN for word in words)
+                with nullcontext() if is_shown else parsing_once():
+                    hydra.main(
+                        version_base="1.3", config_path=str(conf_dir()), config_name="config"
+                    )(job)()
 
             with answered(), searching(words):
                 code = max([exit_code(run), *codes])

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.checks import RunError
+from rgbt.class_scores import classes_of
 from rgbt.requirements import record_of
 from rgbt.types import Batch, View
 
@@ -27,8 +28,8 @@ def class_maps(
 ) -> Tensor:
     """(B, H', W') uint8: class index of every pixel of the labels of one batch.
 
-    Class scores are resized (bilinear) to the label before the argmax where the transform resized
-    the images, so that scores always count the pixels of the file.
+    Where the transform resized the images, their class scores are resized (bilinear) to the label
+    before classes are taken, so that scores always count the pixels of the file.
 
     Args:
         model: a network in evaluation mode.
@@ -38,7 +39,7 @@ def class_maps(
         heads: which head predicts each image of the batch; () leaves it to the network.
     """
     with torch.inference_mode():
-        return label_scores(model, batch, fabric, view, heads).argmax(1).to(torch.uint8)
+        return classes_of(label_scores(model, batch, fabric, view, heads)).to(torch.uint8)
 
 
 def probabilities(

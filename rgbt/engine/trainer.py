@@ -78,6 +78,8 @@ class Trainer:
         record: called with (step, values) every `settings.log_every` steps.
         validate: called with the step; returns the score that selects the best checkpoint.
         committed: called after an evaluation has been committed.
+        after_step: called after every step, before its evaluation. A signal interrupts it, and the
+            step is saved.
     """
 
     fabric: Fabric
@@ -92,6 +94,7 @@ class Trainer:
     record: RecordStep
     validate: Validate
     committed: Callable[[], None] = lambda: None
+    after_step: Callable[[], None] = lambda: None
 
     def __post_init__(self) -> None:
         self.checkpoints = Checkpoints(self.folder)
@@ -163,6 +166,7 @@ class Trainer:
             check_weights({"model": self.model, **self.others}, state.step)
         try:
             with at_once():
+                self.after_step()
                 score = self.validate(state.step) if due else -math.inf
             if due:
                 if score > state.best_score or self.settings.tested == "last":

@@ -12,7 +12,7 @@ from rgbt.checks import InputError, nearest
 from rgbt.config.command import composing
 from rgbt.config.component import build
 from rgbt.config.compose import SEARCH_PATH, compose
-from rgbt.data.loaders import LoaderSettings
+from rgbt.data.loader_settings import LoaderSettings
 from rgbt.dataset import LabelledDataset
 from rgbt.evaluation.pair_frames import PROTOCOLS, Frames, check_frames, frames_mark
 from rgbt.files.atomic import write_atomic

@@ -15,7 +15,7 @@ from rgbt.build.session import Session
 from rgbt.checks import InputError, check_choice
 from rgbt.data.cache.dataset import cached_layer
 from rgbt.data.domains import TestedHead
-from rgbt.data.loaders import LoaderSettings
+from rgbt.data.loader_settings import LoaderSettings
 from rgbt.dataset import LabelledDataset
 from rgbt.engine.evaluate import class_maps, probabilities
 from rgbt.engine.progress import progress

@@ -21,6 +21,7 @@ from torch import nn
 
 from rgbt.build.session import Session
 from rgbt.checks import InputError, check_range
+from rgbt.class_scores import best_of
 from rgbt.config.command import composing
 from rgbt.config.component import build
 from rgbt.config.compose import compose
@@ -275,7 +276,7 @@ def _predict(
         task = display.add_task("predicting", total=total, completed=done, note="images")
         for batch in batches:
             found = predictor.probabilities(batch.to(session.fabric.device))
-            confidence, classes = (each.cpu().numpy() for each in found.max(1))
+            confidence, classes = (each.cpu().numpy() for each in best_of(found))
             for name, sure, ids in zip(batch.name, confidence, classes, strict=True):
                 ids = ids.astype(np.uint8) if label_map is None else label_map(ids.astype(np.uint8))
                 label = np.where(sure < labelling.threshold, np.uint8(IGNORE), ids)

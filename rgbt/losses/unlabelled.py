@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from rgbt.checks import check_shape
+from rgbt.class_scores import classes_of
 from rgbt.losses.overlap import single
 from rgbt.ranges import NonNegative, Share
 from rgbt.types import IGNORE
@@ -59,7 +60,7 @@ class MaxSquares:
             value = squares.mean() / 2
         else:
             p, ratio = probabilities.detach(), self.image_wise_ratio
-            classes = p.argmax(1).flatten(1)
+            classes = classes_of(p).flatten(1)
             sizes = p.new_zeros(p.shape[:2])
             sizes.scatter_add_(1, classes, torch.ones_like(classes, dtype=sizes.dtype))
             total = classes.shape[1]
@@ -110,4 +111,4 @@ def guidance(probabilities: Tensor, aux_probabilities: Tensor, threshold: float)
     check_shape("aux_probabilities", aux_probabilities, "B K H W", **sizes)
     p, q = probabilities.detach(), aux_probabilities.detach()
     sure = (p.amax(1) > threshold) | (q.amax(1) > threshold)
-    return (p + q).argmax(1).where(sure, IGNORE)
+    return classes_of(p + q).where(sure, IGNORE)

@@ -10,10 +10,11 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
 
 from rgbt.checks import InputError
 from rgbt.config.compose import flatten, with_pixels
-from rgbt.spec.run_spec import NODES, RunSpec
+from rgbt.spec.run_spec import NODES
 from rgbt.tracking.run_files import Description
 
 TAGS = "RGBT_TAGS"
@@ -37,7 +38,27 @@ OUTSIDE_KEY = tuple(name for name, node in NODES.items() if not node.in_key)
 and what is no part of the run."""
 
 
-def describe(spec: RunSpec, extra_tags: Mapping[str, str] | None = None) -> Description:
+class Named(Protocol):
+    """What the name of a run is made of; a `rgbt.spec.run_spec.RunSpec` has it."""
+
+    @property
+    def name(self) -> str:
+        """Of the experiment."""
+
+    @property
+    def seed(self) -> int:
+        """Of the run."""
+
+    @property
+    def overrides(self) -> Sequence[str]:
+        """As typed."""
+
+    @property
+    def plain(self) -> Mapping[str, Any]:
+        """The whole configuration as resolved values."""
+
+
+def describe(spec: Named, extra_tags: Mapping[str, str] | None = None) -> Description:
     """Name and group of a run: "sigma_div=2 seed=1 · grbm", in the group "grbm sigma_div=2".
 
     Only what differs from the experiment is named. Of a point of a sweep, what is common to all

@@ -15,7 +15,7 @@ from rgbt.checks import InputError
 from rgbt.config.component import Component
 from rgbt.config.stored_config import targets
 from rgbt.data.domains import GIVEN, NONE, Domains
-from rgbt.data.loaders import LoaderSettings
+from rgbt.data.loader_settings import LoaderSettings
 from rgbt.engine.settings import Recipe, Scale, TrainerSettings
 from rgbt.ranges import Seed, Text
 from rgbt.spec.run_key import file_digest, manifest_of, settings_digest
@@ -224,15 +224,7 @@ class RunSpec:
         if self.weights is None:
             return None
         dependency = self.dependency(WEIGHTS)
-        named = self.weights if dependency is None else str(dependency.path)
-        path = Path(named).expanduser()
-        path = path / "best.pt" if path.is_dir() else path
-        if not path.is_file():
-            raise InputError(
-                f"model.weights={named}: the file {path} does not exist; give a file of weights, "
-                "or a run folder."
-            )
-        return path
+        return weights_file(self.weights if dependency is None else str(dependency.path))
 
     def labels_folder(self, domain: str) -> Path | None:
         """The folder of pseudo-labels of "source" or "target"; None where it takes none."""
@@ -279,6 +271,22 @@ class RunSpec:
             assert path is not None, "model.weights has a value"
             return file_digest(path)
         return value if value in (GIVEN, NONE) else str(manifest_of(key, value)["digest"])
+
+
+def weights_file(named: str) -> Path:
+    """The file that `model.weights` names; of a run folder its best checkpoint.
+
+    Raises:
+        InputError: there is no such file.
+    """
+    path = Path(named).expanduser()
+    path = path / "best.pt" if path.is_dir() else path
+    if not path.is_file():
+        raise InputError(
+            f"model.weights={named}: the file {path} does not exist; give a file of weights, "
+            "or a run folder."
+        )
+    return path
 
 
 NODES: dict[str, Node] = {

@@ -9,6 +9,7 @@ from __future__ import annotations
 import shlex
 import sys
 import time
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +17,13 @@ from rgbt.checks import InputError
 from rgbt.ranges import Text
 from rgbt.tracking.mlflow_client import MlflowStore, locked, open_store
 from rgbt.tracking.mlflow_server import pages_of, python_command
-from rgbt.tracking.mlflow_upload import UploadState, read_upload_state, upload, write_upload_state
+from rgbt.tracking.mlflow_upload import (
+    UploadState,
+    is_up_to_date,
+    read_upload_state,
+    upload,
+    write_upload_state,
+)
 from rgbt.tracking.mlflow_view import GROUPS_VIEW, RUNS_VIEW, run_path, view_path
 from rgbt.tracking.provenance import without_passwords
 from rgbt.tracking.run_files import Description
@@ -54,18 +61,44 @@ class MlflowTracking(Tracking):
         self.experiment = experiment
         self._store: MlflowStore | None = None
         self._folder: RunFolder | None = None
+        self._is_connected = False
         self._quiet_until = 0.0
         self._warned = False
 
     def start(self, folder: RunFolder, description: Description) -> None:
-        """Start the MLflow run of `folder`, or continue its existing run."""
+        """Note where the run of `folder` is sent; `after_step` connects.
+
+        MLflow takes seconds to import and to open its database. The first step does not wait for
+        it, and a run that fails before contacts the store only in the end.
+        """
         self._folder = folder
         folder.describe(description)
         write_upload_state(folder, self._sent(folder))
-        self.update()
+
+    def after_step(self) -> None:
+        """After the first step, start the MLflow run, or continue its existing run."""
+        if not self._is_connected:
+            self.update()
+
+    def refresh(self, folder: RunFolder, description: Description) -> None:
+        """Send what the store lacks of a finished run; without any, MLflow is not imported.
+
+        What the store has is read from ``mlflow.json``. That it has lost runs since is detected
+        only where the file of an SQLite store is missing; `rgbt sync` asks every store.
+        """
+        self._folder = folder
+        folder.describe(description)
+        sent = self._sent(folder)
+        if self._has_file():
+            with suppress(InputError):  # a damaged file of the run: the upload reports it
+                if is_up_to_date(folder, sent, "FINISHED"):
+                    return
+        write_upload_state(folder, sent)
+        self.finish("FINISHED")
 
     def update(self) -> None:
         """Send what is new, unless the store failed a short time ago."""
+        self._is_connected = True
         if time.monotonic() >= self._quiet_until:
             self._guarded("RUNNING")
 
@@ -104,6 +137,11 @@ class MlflowTracking(Tracking):
         if self._store is None:
             self._store = open_store(self.uri, self.artifact_uri, self.experiment)
         return self._store
+
+    def _has_file(self) -> bool:
+        """Whether the database file exists; True for servers, which are not contacted."""
+        path = self.uri.removeprefix("sqlite:///")
+        return path == self.uri or Path(path).is_file()
 
     def _sent(self, folder: RunFolder) -> UploadState:
         """What this store has of the run; nothing if the folder was sent to another one."""

@@ -66,6 +66,7 @@ class UploadState:
         files: path in the folder -> digest of the content sent.
         profile: whether the region profile was sent.
         later: scores of the result that no line holds and that were sent, e.g. "test/TC/aligned".
+        shown: digest of name, tags, parameters and status that were sent; "" in older records.
     """
 
     uri: str
@@ -77,6 +78,7 @@ class UploadState:
     files: dict[str, str] = field(default_factory=dict)
     profile: bool = False
     later: list[str] = field(default_factory=list)
+    shown: str = ""
 
 
 def read_upload_state(folder: RunFolder) -> UploadState | None:
@@ -117,7 +119,7 @@ def upload(store: MlflowStore, folder: RunFolder, sent: UploadState, status: Sta
         metrics += _profile(tables, every)
         sent.profile = True
     later = _later(folder, every, sent)
-    metrics += later.values()
+    metrics += _later_metrics(later, every)
     _send(store, folder, sent, (metrics, set(run.data.params), description, tables))
     sent.steps |= {line.kind: line.step for line in lines}
     sent.later += later
@@ -131,7 +133,33 @@ def upload(store: MlflowStore, folder: RunFolder, sent: UploadState, status: Sta
         written = (folder.path / each for each in ("result.json", "metrics.jsonl", "run.json"))
         end = max(path.stat().st_mtime for path in written if path.exists())
         store.client.set_terminated(sent.run_id, status=status, end_time=round(1000 * end))
+    sent.shown = _shown(folder, description, tables, status)
     write_upload_state(folder, sent)
+
+
+def is_up_to_date(folder: RunFolder, sent: UploadState, status: Status) -> bool:
+    """Whether `upload` would send nothing, according to the record; MLflow is not imported."""
+    description = shown_description(folder)
+    if description is None or not sent.run_id:
+        return False
+    tables = read_tables(folder.path)
+    every = folder.lines()
+    return (
+        sent.shown == _shown(folder, description, tables, status)
+        and all(line.step <= sent.steps.get(line.kind, -1) for line in every)
+        and (tables is None or tables.split != "test" or sent.profile)
+        and not _later(folder, every, sent)
+        and not list(_changed_files(folder, sent, tables))
+    )
+
+
+def _shown(
+    folder: RunFolder, description: Description, tables: ResultTables | None, status: Status
+) -> str:
+    """Digest of name, tags, parameters and status that the store shows."""
+    tags = _tags(folder, description, tables)
+    text = json.dumps([description.name, tags, description.params, status], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _run_of(
@@ -166,7 +194,7 @@ def _run_of(
             store.experiment_id, start_time=start, tags=tags, run_name=_short(description.name)
         )
     sent.experiment_id, sent.run_id = store.experiment_id, run.info.run_id
-    sent.steps, sent.files, sent.profile, sent.later = {}, {}, False, []
+    sent.steps, sent.files, sent.profile, sent.later, sent.shown = {}, {}, False, [], ""
     write_upload_state(folder, sent)
     return run
 
@@ -194,6 +222,24 @@ def _send(
     # MLflow refuses to change a parameter.
     new = {name: value for name, value in description.params.items() if name not in known}
     params = [Param(name, value[:PARAM_LENGTH]) for name, value in new.items()]
+    tags = _tags(folder, description, tables)
+    client, run_id = store.client, sent.run_id
+    client.log_batch(
+        run_id,
+        metrics=metrics[:BATCH_LENGTH],
+        params=params[:BATCH_PARAMS],
+        tags=[RunTag(name, value[:TAG_LENGTH]) for name, value in tags.items() if value],
+    )
+    for start in range(BATCH_LENGTH, len(metrics), BATCH_LENGTH):
+        client.log_batch(run_id, metrics=metrics[start : start + BATCH_LENGTH])
+    for start in range(BATCH_PARAMS, len(params), BATCH_PARAMS):
+        client.log_batch(run_id, params=params[start : start + BATCH_PARAMS])
+
+
+def _tags(
+    folder: RunFolder, description: Description, tables: ResultTables | None
+) -> dict[str, str]:
+    """Tags of a run by name; those without a value are not sent."""
     first = (read_provenance(folder.path / "provenance.json") or [{}])[0]
     tags = {
         "mlflow.user": getpass.getuser(),
@@ -208,17 +254,7 @@ def _send(
     if tables is not None:
         tags["mlflow.note.content"] = "\n".join(g.to_markdown() for g in result_grids(tables))
         tags["mlflow.loggedArtifacts"] = json.dumps([{"path": TABLE_FILE, "type": "table"}])
-    client, run_id = store.client, sent.run_id
-    client.log_batch(
-        run_id,
-        metrics=metrics[:BATCH_LENGTH],
-        params=params[:BATCH_PARAMS],
-        tags=[RunTag(name, value[:TAG_LENGTH]) for name, value in tags.items() if value],
-    )
-    for start in range(BATCH_LENGTH, len(metrics), BATCH_LENGTH):
-        client.log_batch(run_id, metrics=metrics[start : start + BATCH_LENGTH])
-    for start in range(BATCH_PARAMS, len(params), BATCH_PARAMS):
-        client.log_batch(run_id, params=params[start : start + BATCH_PARAMS])
+    return tags
 
 
 def _metrics(lines: list[MetricLine]) -> Iterator[Any]:
@@ -240,13 +276,12 @@ def _metrics(lines: list[MetricLine]) -> Iterator[Any]:
                 yield Metric(f"{prefix}{name}", shown(name, value), round(1000 * line.time), step)
 
 
-def _later(folder: RunFolder, lines: list[MetricLine], sent: UploadState) -> dict[str, Any]:
+def _later(folder: RunFolder, lines: list[MetricLine], sent: UploadState) -> dict[str, float]:
     """Scores of pairs of frames in the result that no line holds and that were not sent yet.
 
-    Those of the selection split, and those that `rgbt.consistency` added to a finished run.
+    Those of the selection split, and those that `rgbt.consistency` added to a finished run; by
+    split and name.
     """
-    from mlflow.entities import Metric
-
     result = read_result(folder.path) or {}
     known = {f"test/{name}" for line in lines if line.kind == "test" for name in line.values}
     found = {}
@@ -255,10 +290,18 @@ def _later(folder: RunFolder, lines: list[MetricLine], sent: UploadState) -> dic
             key = f"{kind}/{name}"
             is_pairs = name.split("/")[0] in (names.TC, names.CA)
             if is_pairs and value is not None and key not in known and key not in sent.later:
-                label = name if kind == "test" else key
-                time_ms = round(1000 * lines[-1].time)
-                found[key] = Metric(label, shown(name, value), time_ms, 0)
+                found[key] = value
     return found
+
+
+def _later_metrics(later: dict[str, float], lines: list[MetricLine]) -> Iterator[Any]:
+    """Scores as MLflow metrics: those of the test split by their name alone."""
+    from mlflow.entities import Metric
+
+    for key, value in later.items():
+        name = key.partition("/")[2]
+        label = name if key.startswith("test/") else key
+        yield Metric(label, shown(name, value), round(1000 * lines[-1].time), 0)
 
 
 def _profile(tables: ResultTables, lines: list[MetricLine]) -> list[Any]:
@@ -303,16 +346,27 @@ def _send_files(
     store: MlflowStore, folder: RunFolder, sent: UploadState, tables: ResultTables | None
 ) -> None:
     """Upload the table and files that are new or changed, under their path in the folder."""
+    for name, digest in _changed_files(folder, sent, tables):
+        if name == TABLE_FILE and tables is not None:
+            text = json.dumps(artifact_table(tables))
+            store.client.log_text(sent.run_id, text, TABLE_FILE)
+        else:
+            parent = None if "/" not in name else str(Path(name).parent)
+            store.client.log_artifact(sent.run_id, str(folder.path / name), parent)
+        sent.files[name] = digest
+
+
+def _changed_files(
+    folder: RunFolder, sent: UploadState, tables: ResultTables | None
+) -> Iterator[tuple[str, str]]:
+    """Path in the folder and digest of the table and of files that are new or changed."""
     if tables is not None:
         text = json.dumps(artifact_table(tables))
         digest = hashlib.sha256(text.encode()).hexdigest()
         if sent.files.get(TABLE_FILE) != digest:
-            store.client.log_text(sent.run_id, text, TABLE_FILE)
-            sent.files[TABLE_FILE] = digest
+            yield TABLE_FILE, digest
     for path in sorted(found for pattern in FILES for found in folder.path.glob(pattern)):
-        inside = path.relative_to(folder.path)
+        name = str(path.relative_to(folder.path))
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
-        if sent.files.get(str(inside)) != digest:
-            parent = None if inside.parent == Path() else str(inside.parent)
-            store.client.log_artifact(sent.run_id, str(path), parent)
-            sent.files[str(inside)] = digest
+        if sent.files.get(name) != digest:
+            yield name, digest

@@ -168,8 +168,17 @@ def _git(folder: Path, *arguments: str) -> str | None:
 
 @cache
 def _packages() -> dict[str, str]:
-    found = {dist.metadata["Name"]: dist.version for dist in metadata.distributions()}
+    found = dict(map(_name_and_version, metadata.distributions()))
     return {name: found[name] for name in sorted(found, key=str.lower)}
+
+
+def _name_and_version(distribution: metadata.Distribution) -> tuple[str, str]:
+    """Both from the first lines of the metadata: parsing all of them takes ten times as long."""
+    text = distribution.read_text("METADATA") or distribution.read_text("PKG-INFO") or ""
+    fields = dict(line.partition(": ")[::2] for line in text.split("\n\n", 1)[0].splitlines())
+    if "Name" in fields and "Version" in fields:
+        return fields["Name"].strip(), fields["Version"].strip()
+    return distribution.metadata["Name"], distribution.version
 
 
 def machine() -> dict[str, Any]:

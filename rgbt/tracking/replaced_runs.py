@@ -45,8 +45,7 @@ def replace_finished(folder: RunFolder, tracking: Tracking) -> None:
     known = None if kept is None else read_description(kept.path)
     if kept is None or known is None:
         return
-    tracking.start(kept, known)
-    tracking.finish("FINISHED")
+    tracking.refresh(kept, known)
     info(f"the finished run was moved to {kept.path}; open it with run={kept.path}.")
 
 

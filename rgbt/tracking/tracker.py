@@ -20,14 +20,22 @@ class Tracking:
     """
 
     def start(self, folder: RunFolder, description: Description) -> None:
-        """Start or continue the run of `folder`."""
+        """Start or continue the run of `folder`; no step has been done yet by this process."""
         folder.describe(description)
+
+    def after_step(self) -> None:
+        """Called after every step of a training; a store that starts slowly can start here."""
 
     def update(self) -> None:
         """Send new data of the folder; called after every evaluation."""
 
     def finish(self, status: Status) -> None:
         """Close the run as finished, failed or stopped (killed)."""
+
+    def refresh(self, folder: RunFolder, description: Description) -> None:
+        """Show the finished run of `folder` under `description`; a store may have it already."""
+        self.start(folder, description)
+        self.finish("FINISHED")
 
     def links(self) -> list[Link]:
         """Addresses of the run's pages."""

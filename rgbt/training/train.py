@@ -28,9 +28,9 @@ from rgbt.metrics import names, scores
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import file_name
 from rgbt.runtime.signals import deferred
-from rgbt.spec.naming import describe, group_of
+from rgbt.spec.naming import describe
 from rgbt.spec.run_spec import RunSpec
-from rgbt.tracking.other_code import warn_of_result, warn_of_steps
+from rgbt.tracking.other_code import warn_of_steps
 from rgbt.tracking.pair_pictures import draw_pairs
 from rgbt.tracking.pictures import RegionHeat, draw_panel, draw_region_heat
 from rgbt.tracking.provenance import provenance, without_passwords
@@ -38,17 +38,14 @@ from rgbt.tracking.replaced_runs import replace_finished
 from rgbt.tracking.run_files import (
     Description,
     counts_name,
-    read_description,
     read_marker,
-    read_result,
-    read_tables,
 )
 from rgbt.tracking.run_folder import RunFolder
 from rgbt.tracking.tables import ConsistencyTable, without_nan
-from rgbt.tracking.terminal import info, print_rich, result_view, warn
+from rgbt.tracking.terminal import info, warn
 from rgbt.tracking.tracker import Tracking
 from rgbt.training.overview import announce_training
-from rgbt.transforms.view_sets import ViewSets
+from rgbt.training.show import finished_run, print_result, show
 
 MUCH_WAITING = 0.3
 """Share of a step spent waiting for images above which a warning is printed."""
@@ -70,67 +67,21 @@ def train(spec: RunSpec, extra_tags: Mapping[str, str] | None = None) -> None:
             f"out={spec.out} has no effect here, because runs are written to runs_dir=...; omit "
             "out=..."
         )
+    if spec.is_finished and not spec.fresh:
+        show(finished_run(spec, extra_tags))
+        return
     description = describe(spec, extra_tags)
     tracking: Tracking = spec.tracking.build()
-    if spec.is_finished and not spec.fresh:
-        folder = RunFolder(spec.folder)
-        folder.clean()
-        _show_again(folder, tracking, description)
-        warn_of_result(spec.folder)
-        _warn_of_other_files(folder, spec)
-        views: ViewSets = spec.consistency.build()
-        measured = [spec.folder / file_name("aligned", each, views.mark) for each in views.splits]
-        if views.sets and not all(path.is_file() for path in measured):
-            info(
-                "the consistency of this run has not been measured on these views and splits. To "
-                f"measure it: rgbt consistency run={folder.path} split=..."
-            )
-    else:
-        # Everything is built before the folder is made: a wrong value leaves nothing behind.
-        setup = set_up_training(spec)
-        announce_training(setup, description.name, spec.folder)
-        decode_ahead(setup.session, *setup.read_splits())
-        if spec.is_finished:
-            replace_finished(RunFolder(spec.folder), tracking)
-        folder = RunFolder(spec.folder)
-        with folder.lock():
-            Run(setup, folder, tracking, description).complete()
-    tables = read_tables(folder.path)
-    assert tables is not None, "a finished run has its tables"
-    heads = spec.domains.heads_in_words(spec.domains.tested_head)
-    links = [*([("heads", heads)] if heads else []), *tracking.links()]
-    print_rich(result_view(tables, folder.path, links))
-
-
-def _show_again(folder: RunFolder, tracking: Tracking, requested: Description) -> None:
-    known = read_description(folder.path)
-    assert known is not None, "a finished run has its description"
-    info(
-        f"{requested.name} is already finished; its result follows. For a new run, choose "
-        "another value of seed=..."
-    )
-    # A point of a grid may be the default of an experiment: the longer name says what it varies.
-    lengths = [len(group_of(each.tags, each.params)) for each in (requested, known)]
-    shown = requested if lengths[0] > lengths[1] else known
-    merged = Description(shown.name, {**known.tags, **shown.tags}, known.params)
-    tracking.start(folder, merged)
-    tracking.finish("FINISHED")
-
-
-def _warn_of_other_files(folder: RunFolder, spec: RunSpec) -> None:
-    """Warn where a finished run of the same key was made on another copy of the data set."""
-    if "root" not in spec.dataset.plain:
-        return  # drawn from its settings alone, which are in the key
-    result = read_result(folder.path)
-    try:
-        now = spec.dataset.build().fingerprint()
-    except InputError:
-        return  # a result can be shown without its data
-    if result is not None and result["dataset"] != now:
-        info(
-            f"this run was trained on other files of the data set ({result['dataset'][:8]}, now "
-            f"{now[:8]}). To train on the present files, set runs_dir=... or dataset.name=..."
-        )
+    # Everything is built before the folder is made: a wrong value leaves nothing behind.
+    setup = set_up_training(spec)
+    announce_training(setup, description.name, spec.folder)
+    decode_ahead(setup.session, *setup.read_splits())
+    if spec.is_finished:
+        replace_finished(RunFolder(spec.folder), tracking)
+    folder = RunFolder(spec.folder)
+    with folder.lock():
+        Run(setup, folder, tracking, description).complete()
+    print_result(folder, tracking, spec.domains)
 
 
 @dataclass(frozen=True)
@@ -292,6 +243,7 @@ class Run:
             record=lambda step, values: self.folder.append(step, "train", values),
             validate=validate,
             committed=self.tracking.update,
+            after_step=self.tracking.after_step,
         )
         return trainer
 

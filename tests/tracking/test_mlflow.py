@@ -64,6 +64,7 @@ def tracking(runs_dir: Path, uri: str | None = None) -> MlflowTracking:
 
 def begin(folder: RunFolder, tracker: MlflowTracking | NoTracking) -> None:
     tracker.start(folder, Description("grbm seed=0", TAGS, PARAMS))
+    tracker.after_step()
 
 
 def conclude(folder: RunFolder) -> None:
@@ -223,7 +224,8 @@ def test_a_run_without_a_result_ends_as_failed_and_can_go_on(runs_dir: Path) -> 
     assert sent is not None
     store = client(runs_dir)
     assert store.get_run(sent.run_id).info.status == "FAILED"
-    tracking(runs_dir).start(folder, Description("grbm sigma_div=4 seed=0", TAGS, PARAMS))
+    tracker.start(folder, Description("grbm sigma_div=4 seed=0", TAGS, PARAMS))
+    tracker.update()
     info = store.get_run(sent.run_id).info
     assert (info.status, info.run_name) == ("RUNNING", "grbm sigma_div=4 seed=0")
 
@@ -368,6 +370,76 @@ def test_a_damaged_log_and_a_held_lock_do_not_halt_a_run(
     assert capsys.readouterr().err == ""
 
 
+def test_a_store_is_contacted_after_the_first_step_and_not_at_every_step(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    contacts: list[str] = []
+    monkeypatch.setattr(MlflowTracking, "sync", lambda _, __, status: contacts.append(status))
+    folder, tracker = RunFolder(tmp_path / "late"), tracking(tmp_path)
+    tracker.start(folder, Description("grbm seed=0", TAGS, PARAMS))
+    assert contacts == []
+    sent = read_upload_state(folder)
+    assert sent is not None, "a run that is killed now is sent to this store by rgbt sync"
+    assert sent.uri == tracker.uri
+    for _ in range(3):
+        tracker.after_step()
+    assert contacts == ["RUNNING"]
+    tracker.update()
+    tracker.finish("FINISHED")
+    assert contacts == ["RUNNING", "RUNNING", "FINISHED"]
+
+
+def test_a_finished_run_is_sent_again_only_if_the_store_lacks_something(
+    runs_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = RunFolder(runs_dir / "shown")
+    folder.add_provenance({"started": "2026-01-05T00:00:00+00:00"})
+    tracker = tracking(runs_dir)
+    begin(folder, tracker)
+    conclude(folder)
+    tracker.finish("FINISHED")
+    sent: list[str] = []
+    real = MlflowTracking.sync
+
+    def noted(self: MlflowTracking, folder: RunFolder, status: Any) -> str:
+        sent.append(status)
+        return real(self, folder, status)
+
+    monkeypatch.setattr(MlflowTracking, "sync", noted)
+
+    def refreshed(name: str = "grbm seed=0", tags: dict[str, str] = TAGS) -> list[str]:
+        sent.clear()
+        tracker = tracking(runs_dir)
+        tracker.refresh(folder, Description(name, tags, PARAMS))
+        assert tracker.links()[-3][0] == "this run"
+        return list(sent)
+
+    assert refreshed() == []
+    assert refreshed("sigma_div=4 seed=0 · grbm") == ["FINISHED"]
+    assert client(runs_dir).get_run(run_id(folder)).info.run_name == "sigma_div=4 seed=0 · grbm"
+    assert refreshed("sigma_div=4 seed=0 · grbm") == []
+    assert refreshed(tags={**TAGS, "row": "b"}) == ["FINISHED"]
+    assert refreshed() == ["FINISHED"], "the name and tags of before"
+    (folder.path / "evaluations").mkdir()
+    (folder.path / "evaluations" / "later.npz").write_bytes(b"counts")
+    assert refreshed() == ["FINISHED"]
+    assert refreshed() == []
+    (folder.path / "evaluations" / "later.npz").write_bytes(b"more counts")
+    assert refreshed() == ["FINISHED"]
+    folder.append(30, "val", {"mIoU": 0.5})
+    assert refreshed() == ["FINISHED"]
+    assert refreshed() == []
+    record = read_upload_state(folder)
+    assert record is not None
+    write_upload_state(folder, replace(record, shown=""))
+    assert refreshed() == ["FINISHED"], "a record of an older version"
+    database = runs_dir / "mlflow.db"
+    database.rename(runs_dir / "away.db")
+    monkeypatch.setattr(MlflowTracking, "sync", lambda *arguments: sent.append(arguments[-1]))
+    assert refreshed() == ["FINISHED"], "the file of the store is missing"
+    (runs_dir / "away.db").rename(database)
+
+
 def test_links_open_the_pages(runs_dir: Path) -> None:
     tracker = tracking(runs_dir)
     begin(RunFolder(runs_dir / "links"), tracker)
@@ -387,6 +459,7 @@ def test_many_processes_may_start_on_a_fresh_store(tmp_path: Path) -> None:
         "runs, key = sys.argv[1:]\n"
         "t = MlflowTracking(None, artifact_uri=None, experiment='rgbt', runs_dir=runs)\n"
         "t.start(RunFolder(f'{runs}/{key}'), Description(key, {}, {}))\n"
+        "t.after_step()\n"
     )
     workers = [
         subprocess.Popen(

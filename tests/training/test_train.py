@@ -10,9 +10,9 @@ import pytest
 
 from rgbt.engine.checkpoint import State
 from rgbt.tracking.mlflow_store import NoTracking
-from rgbt.tracking.run_files import Description, read_description
+from rgbt.tracking.run_files import Description
 from rgbt.tracking.run_folder import RunFolder
-from rgbt.training.train import Run, _show_again
+from rgbt.training.train import Run
 
 
 def stderr_of(
@@ -44,28 +44,6 @@ def test_much_waiting_is_reported_with_what_helps(capsys: pytest.CaptureFixture[
     assert "31%" in stderr_of(capsys, [*earlier, *steps(0.31)], None)
     for lines in (steps(0.3, 0.3), steps(0.99, 0.1, 0.2), [], earlier):
         assert stderr_of(capsys, lines, None) == ""
-
-
-@pytest.mark.parametrize(
-    ("group", "name"),
-    [("grbm", "grbm sigma_div=2 seed=0"), ("grbm sigma_div=2", "grbm sigma_div=2 seed=0")],
-)
-def test_a_finished_run_keeps_its_name_unless_the_new_one_says_more(
-    tmp_path: Path, group: str, name: str
-) -> None:
-    folder = RunFolder(tmp_path)
-    folder.describe(Description(name, {"rgbt.group": "grbm sigma_div=2", "row": "a"}, {}))
-    typed = Description("seed=0 · a longer name than before", {"rgbt.group": group}, {})
-    _show_again(folder, NoTracking(), typed)
-    kept = read_description(folder.path)
-    assert kept is not None
-    assert (kept.name, kept.tags["row"]) == (name, "a")
-
-    more = Description("lr=1 · grbm", {"rgbt.group": "grbm sigma_div=2 lr=1"}, {})
-    _show_again(folder, NoTracking(), more)
-    kept = read_description(folder.path)
-    assert kept is not None
-    assert (kept.name, kept.tags["row"]) == ("lr=1 · grbm", "a")
 
 
 def test_a_run_that_is_stopped_while_its_tracking_begins_is_closed(

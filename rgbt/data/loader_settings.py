@@ -1,0 +1,50 @@
+"""Settings of the loader, in a module that does not import torch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from annotated_types import Interval
+
+from rgbt.ranges import BatchSize, Text, Workers
+from rgbt.requirements import Record, Requirement
+
+
+@dataclass(frozen=True)
+class LoaderSettings:
+    """How samples are loaded.
+
+    Attributes:
+        batch_size: samples of a training batch, >= 1; of all devices together, which share it
+            equally.
+        eval_batch_size: samples of an evaluation batch, >= 1; 1 where image sizes differ.
+        num_workers: processes that decode and augment; 0: the main process does.
+        prefetch: batches that each process makes in advance.
+        augment: "loader" augments in the reading processes, "device" whole batches on the device
+            of the network, with the same result; "auto": "device" on a GPU if the transform can.
+        cache: images are decoded once into memory-mapped files of this folder and read from there
+            (`rgbt.data.cache`); "auto": in the folder of the user's cache; None: no such files.
+        on_error: "raise" stops at an unreadable file; "skip" reports it once and uses the next
+            readable sample of the list instead (training) or skips it (evaluation).
+    """
+
+    batch_size: BatchSize
+    eval_batch_size: BatchSize
+    num_workers: Workers
+    prefetch: Annotated[int, Interval(ge=1, le=1024)] = 2
+    augment: Literal["auto", "loader", "device"] = "auto"
+    cache: Text | None = None
+    on_error: Literal["raise", "skip"] = "raise"
+
+    def __post_init__(self) -> None:
+        if self.cache is not None:
+            from rgbt.data.cache.dataset import check_cache  # only here: it imports OpenCV
+
+            check_cache("data.cache", self.cache)
+
+    @property
+    def record(self) -> Record:
+        """Augmentation on the device, where it is requested, is the transform's work."""
+        on_device = Requirement("transform", "works_on_batches", True, "data.augment=device")
+        return Record(requires=(on_device,) if self.augment == "device" else ())
