@@ -132,8 +132,8 @@ def study_command(study: str, runs_dir: Path, storage: str | None) -> str:
 
 
 def _grid(points: PointList, settings: SweepSettings) -> None:
-    outcomes = preview_points(points, settings)
     if settings.dry_run:
+        outcomes = preview_points(points, settings)
         print_rich(rich_table(grid_table(points, outcomes)))
         seconds = estimated_seconds(outcomes, settings.workers)
         missing = sum(outcome.state in UNFINISHED for outcome in outcomes)
@@ -141,11 +141,8 @@ def _grid(points: PointList, settings: SweepSettings) -> None:
         info(f"{missing} of {len(outcomes)} points would be run{guess}.")
         _warn_other_code(outcomes)
         return
-    wrong = [outcome for outcome in outcomes if outcome.state == "failed" and not outcome.keys]
-    if wrong:
-        # Before anything is run: a typing error should not cost hours of other runs.
-        raise InputError(f"{wrong[0].point.label}: {wrong[0].reason}")
-    outcomes = run_points(points, settings)
+    # A typing error should not cost hours of other runs.
+    outcomes = run_points(points, settings, strict=True)
     print_rich(rich_table(group_grid(points.title, outcomes)))
     unfinished = unfinished_grid(outcomes)
     if unfinished.rows:
