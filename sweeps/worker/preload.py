@@ -6,5 +6,11 @@ The runs then have the digests of the code that they execute, even if files are 
 from rgbt.spec.source_code import loaded_modules, user_code
 from rgbt.tracking.provenance import code
 
-code()
-user_code(f"{module}.any" for module in loaded_modules())
+
+def record_code() -> None:
+    """Keep the digests of all modules that this process has imported until now."""
+    code()
+    user_code(f"{module}.any" for module in loaded_modules())
+
+
+record_code()
