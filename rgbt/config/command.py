@@ -21,6 +21,7 @@ from omegaconf.errors import OmegaConfBaseException
 from rgbt.checks import InputError
 from rgbt.config.component import build
 from rgbt.config.compose import check_keys, compose, conf_dir, register_resolvers, searching
+from rgbt.config.config_source import parsing_once
 from rgbt.config.hydra_messages import check_words, hydra_sentence
 from rgbt.config.options import readable_paths
 from rgbt.config.plain_command import exit_code
@@ -69,7 +70,7 @@ def command(*, sweeper: str = "basic") -> Callable[[Main], Callable[[], None]]:
                     job
                 )()
 
-            with answered(), searching(words):
+            with answered(), searching(words), parsing_once():
                 code = max([exit_code(run), *codes])
             sys.exit(code)
 
