@@ -114,9 +114,14 @@ def _is_own(file: str | None) -> bool:
     return not any(Path(file).is_relative_to(folder) for folder in library)
 
 
-@cache
 def _read(name: str, file: Path) -> tuple[str, list[str]]:
-    """Digest of a module's code, and what it imports."""
+    """Digest of a module's code, and what it imports; read once as long as it does not change."""
+    status = file.stat()
+    return _parsed(name, file, (status.st_mtime_ns, status.st_size, status.st_ino))
+
+
+@cache
+def _parsed(name: str, file: Path, _state: tuple[int, ...]) -> tuple[str, list[str]]:
     content = file.read_bytes()
     try:
         tree = ast.parse(content) if file.suffix == ".py" else None

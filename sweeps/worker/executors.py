@@ -19,7 +19,7 @@ import time
 from collections.abc import Mapping, Sequence
 from multiprocessing import forkserver
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, TextIO
 
 import rgbt
 from rgbt.checks import InputError
@@ -191,7 +191,16 @@ def _run_module(
     output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
     for stream in (1, 2):
         os.dup2(output, stream)
+    # Not the objects of the command, which may write elsewhere.
+    sys.stdout, sys.stderr = _stream(1), _stream(2)
     module, *arguments = command
     sys.argv = [module, *arguments]
     sys.orig_argv = [sys.executable, "-m", *command]
     runpy.run_module(module, run_name="__main__", alter_sys=True)
+
+
+def _stream(number: int) -> TextIO:
+    # Open until the process ends, like those of Python.
+    return open(  # noqa: SIM115
+        number, "w", buffering=1, encoding="utf-8", errors="backslashreplace", closefd=False
+    )

@@ -59,6 +59,8 @@ class Template:
             try:
                 self._connection.close()
                 _serve(theirs, modules, imported)
+            except Exception as error:  # the answer to the first request
+                theirs.send(OSError(f"{type(error).__name__}: {error}"))
             finally:  # never back into the copy of the command
                 os._exit(1)
         theirs.close()
@@ -151,7 +153,7 @@ def _call(connection: Connection, work: Work, arguments: Sequence[Any]) -> None:
 
 
 def _forget_command() -> None:
-    """Undo what the command has set for itself: signal handlers, and Hydra's state."""
+    """Undo what the command has set for itself: signal handlers, terminal, Hydra's state."""
     from hydra.core.global_hydra import GlobalHydra
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the command, which stops its runs
@@ -159,6 +161,11 @@ def _forget_command() -> None:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, signal.SIG_DFL)
     sys.unraisablehook = sys.__unraisablehook__
+    # Consoles that are made from now on write to the log of a run and not to a terminal.
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for stream in (1, 2):
+        os.dup2(nowhere, stream)
+    os.close(nowhere)
     GlobalHydra.instance().clear()
 
 
