@@ -28,7 +28,7 @@ from sweeps.worker.trial_sources import (
 from sweeps.worker.trial_store import Owner, TrialStore, counted_trials, trials_by_key
 
 PLANNED_FIRST_S = 2.0
-"""Seconds of planning before the first run of a grid starts; about 200 points."""
+"""Seconds of planning before the first run of a grid starts; about 100 points."""
 
 
 @dataclass(frozen=True)
