@@ -131,7 +131,12 @@ def main(options: Options, overrides: list[str]) -> int:
     To write your own table:
     rgbt reproduce new table=my/ablation experiment=grbm masker.sigma_div=1,2,4
     """
+    from sweeps.worker.executors import fork_template, limit_spinning
+
+    settings = settings_of(options)
+    limit_spinning(settings.workers)  # before the imports that load torch
     from rgbt.config.compose import compose
+    from rgbt.tracking.mlflow_store import MlflowTracking
     from sweeps.rendering.publish import publish_table
     from sweeps.table.load_table import table_names
     from sweeps.table.make_request import check_override
@@ -140,7 +145,6 @@ def main(options: Options, overrides: list[str]) -> int:
     from sweeps.worker.point_list import preview_points, run_points
     from sweeps.worker.run_store import open_run_store
 
-    settings = settings_of(options)
     for word in overrides:
         check_override(word)
     tracker = [word for word in overrides if word.lstrip("+~").startswith("tracking")]
@@ -153,6 +157,8 @@ def main(options: Options, overrides: list[str]) -> int:
         config = compose([*base, f"fresh={str(options.fresh).lower()}"])
         Component.from_node(config.tracking)
     runs = open_run_store(config)
+    if settings.executor == "local" and not settings.dry_run:
+        fork_template(with_mlflow=isinstance(runs.tracking, MlflowTracking))
     planner = Planner(base)
     plans = plans_of(tables, options, extra, runs, planner)
     if settings.dry_run:

@@ -15,6 +15,7 @@ from omegaconf import DictConfig
 
 from rgbt.checks import InputError, RunError
 from rgbt.metrics import names
+from rgbt.tracking.mlflow_store import MlflowTracking
 from rgbt.tracking.provenance import without_passwords
 from rgbt.tracking.tables import ABSENT, TextTable, number
 from rgbt.tracking.terminal import info, print_rich, rich_table
@@ -32,6 +33,7 @@ from sweeps.space.grid import (
     split,
 )
 from sweeps.space.space import as_overrides
+from sweeps.worker.executors import fork_template
 from sweeps.worker.point_list import (
     PointList,
     estimated_seconds,
@@ -60,6 +62,9 @@ def sweep(arguments: Sequence[str], config: DictConfig, loader: ConfigLoader) ->
         RunError: points failed; all others were run.
     """
     settings = read_settings(config.hydra.sweeper)
+    runs = open_run_store(config)
+    if settings.executor == "local" and not settings.dry_run:
+        fork_template(with_mlflow=isinstance(runs.tracking, MlflowTracking))
     # `fresh` is for the sweep, which decides for each point: no setting of its runs.
     arguments = [word for word in arguments if word.partition("=")[0] != "fresh"]
     # Text of `params` stands as it would be typed, other values as Hydra reads them.
@@ -71,7 +76,6 @@ def sweep(arguments: Sequence[str], config: DictConfig, loader: ConfigLoader) ->
     given = [word for word in config.hydra.overrides.hydra if "hydra.searchpath" in word]
     is_search = "search" in config.hydra.runtime.choices
     base = (*given, *(["hydra.mode=RUN"] if is_search else []))
-    runs = open_run_store(config)
     if settings.space or intervals:
         parameters = merge_space(settings.space, fixed, swept, intervals)
         taken = {parameter.key for parameter in parameters}
@@ -132,8 +136,8 @@ def study_command(study: str, runs_dir: Path, storage: str | None) -> str:
 
 
 def _grid(points: PointList, settings: SweepSettings) -> None:
-    outcomes = preview_points(points, settings)
     if settings.dry_run:
+        outcomes = preview_points(points, settings)
         print_rich(rich_table(grid_table(points, outcomes)))
         seconds = estimated_seconds(outcomes, settings.workers)
         missing = sum(outcome.state in UNFINISHED for outcome in outcomes)
@@ -141,11 +145,8 @@ def _grid(points: PointList, settings: SweepSettings) -> None:
         info(f"{missing} of {len(outcomes)} points would be run{guess}.")
         _warn_other_code(outcomes)
         return
-    wrong = [outcome for outcome in outcomes if outcome.state == "failed" and not outcome.keys]
-    if wrong:
-        # Before anything is run: a typing error should not cost hours of other runs.
-        raise InputError(f"{wrong[0].point.label}: {wrong[0].reason}")
-    outcomes = run_points(points, settings)
+    # A typing error should not cost hours of other runs.
+    outcomes = run_points(points, settings, strict=True)
     print_rich(rich_table(group_grid(points.title, outcomes)))
     unfinished = unfinished_grid(outcomes)
     if unfinished.rows:

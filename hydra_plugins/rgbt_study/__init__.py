@@ -41,8 +41,11 @@ class StudySweeper(Sweeper):
         from rgbt.config.shadowing import check_not_shadowed
 
         check_not_shadowed("sweeps")
-        from sweeps.sweep import sweep
-
         assert self.hydra_context is not None, "Hydra calls setup() before sweep()"
         assert self.config is not None, "as above"
+        from sweeps.worker.executors import limit_spinning
+
+        limit_spinning(2 if self.config.hydra.sweeper.get("workers") != 1 else 1)
+        from sweeps.sweep import sweep
+
         sweep(arguments, self.config, self.hydra_context.config_loader)

@@ -75,7 +75,7 @@ def command(*, sweeper: str = "basic") -> Callable[[Main], Callable[[], None]]:
                         version_base="1.3", config_path=str(conf_dir()), config_name="config"
                     )(job)()
 
-            with answered(), searching(words):
+            with answered(), searching(words), parsing_once():
                 code = max([exit_code(run), *codes])
             sys.exit(code)
 

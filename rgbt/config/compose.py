@@ -60,7 +60,19 @@ def own_folders() -> str:
 def compose(overrides: Sequence[str]) -> DictConfig:
     """The configuration that `rgbt.run` would compose from these overrides, unchecked."""
     folders = [str(conf_dir()), *filter(None, own_folders().split(","))]
-    return compose_cached(list(overrides), top_level()[1], folders, _composed_by_hydra)
+    words = [word for word in overrides if not _is_without_effect(word)]
+    return compose_cached(words, top_level()[1], folders, _composed_by_hydra)
+
+
+def _is_without_effect(word: str) -> bool:
+    """Whether an override of Hydra's own node does not change a configuration composed here.
+
+    The node is left out of the result. The folders of ``searching`` are searched in any case.
+    """
+    key, _, value = word.partition("=")
+    return word == "hydra.mode=RUN" or (
+        key == SEARCH_PATH and value.strip("[]") == own_folders() != ""
+    )
 
 
 def _composed_by_hydra(words: list[str]) -> DictConfig:

@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import os
 import pickle
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
@@ -21,7 +20,7 @@ from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf import DictConfig
 
-from rgbt.config.config_source import FileState, file_state
+from rgbt.config.config_source import FileState
 
 MOST = 256
 """Compositions that are kept."""
@@ -95,9 +94,20 @@ def _parsed(word: str) -> Override | None:
 
 def _states(folder: str) -> list[FileState]:
     """The state of every file in a folder, sorted; [] where there is none."""
-    found: list[FileState] = []
-    for parent, _, names in os.walk(folder):
-        files = (name for name in names if name.endswith(".yaml") and name[0] != ".")
-        with suppress(FileNotFoundError):  # removed since, or a link to nothing
-            found += [file_state(Path(parent, name)) for name in files]
-    return sorted(found)
+    return sorted(_unsorted_states(folder))
+
+
+def _unsorted_states(folder: str) -> Iterator[FileState]:
+    # os.walk with a Path per file takes twice as long, for every composition.
+    try:
+        with os.scandir(folder) as listed:
+            entries = list(listed)
+    except (FileNotFoundError, NotADirectoryError):
+        return
+    for entry in entries:
+        if entry.is_dir(follow_symlinks=False):
+            yield from _unsorted_states(entry.path)
+        elif entry.name.endswith(".yaml") and entry.name[0] != ".":
+            with suppress(FileNotFoundError):  # removed since, or a link to nothing
+                status = entry.stat()
+                yield entry.path, status.st_mtime_ns, status.st_size, status.st_ino

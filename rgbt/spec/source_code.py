@@ -14,12 +14,16 @@ import pkgutil
 import sys
 import sysconfig
 from collections.abc import Iterable, Iterator
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 RELEASED = ("rgbt", "torch")
 """Packages whose targets do not count: their versions are in ``provenance.json``."""
+
+SHIPPED = (*RELEASED, "sweeps", "analysis", "hydra_plugins")
+"""Packages that are not the user's: ours may be in a working tree and not installed."""
 
 INSTALLED = {"site-packages", "dist-packages"}
 
@@ -63,7 +67,7 @@ def counted_modules() -> list[str]:
 def loaded_modules() -> list[str]:
     """Modules of the user's own tree that this process has imported."""
     files = [(name, getattr(module, "__file__", None)) for name, module in sys.modules.items()]
-    return [name for name, file in files if name.split(".")[0] not in RELEASED and _is_own(file)]
+    return [name for name, file in files if name.split(".")[0] not in SHIPPED and _is_own(file)]
 
 
 def _follow(module: str) -> Iterator[Used]:
@@ -111,7 +115,13 @@ def _is_own(file: str | None) -> bool:
 
 
 def _read(name: str, file: Path) -> tuple[str, list[str]]:
-    """Digest of a module's code, and what it imports."""
+    """Digest of a module's code, and what it imports; read once as long as it does not change."""
+    status = file.stat()
+    return _parsed(name, file, (status.st_mtime_ns, status.st_size, status.st_ino))
+
+
+@cache
+def _parsed(name: str, file: Path, _state: tuple[int, ...]) -> tuple[str, list[str]]:
     content = file.read_bytes()
     try:
         tree = ast.parse(content) if file.suffix == ".py" else None

@@ -44,7 +44,7 @@ def provenance() -> dict[str, Any]:
         "pid": os.getpid(),
         **code(),
         "python": platform.python_version(),
-        "packages": _packages(),
+        "packages": packages(),
         **machine(),
     }
 
@@ -167,7 +167,8 @@ def _git(folder: Path, *arguments: str) -> str | None:
 
 
 @cache
-def _packages() -> dict[str, str]:
+def packages() -> dict[str, str]:
+    """Name -> version of the installed distributions as this process first saw them."""
     found = dict(map(_name_and_version, metadata.distributions()))
     return {name: found[name] for name in sorted(found, key=str.lower)}
 

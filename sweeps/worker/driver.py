@@ -68,7 +68,9 @@ class Driver:
         """Execute trials until none is left; on Ctrl-C or SIGTERM release the unfinished ones."""
         try:
             while self._step_or_wait():
-                time.sleep(POLL_S)
+                # The rest of a long list is planned while the first runs train.
+                if not self.source.plan(POLL_S):
+                    time.sleep(POLL_S)
         except BaseException:
             self._release_all()
             raise

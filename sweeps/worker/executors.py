@@ -1,12 +1,14 @@
 """Starts commands as processes of this machine, forked from one that is warmed up.
 
-Importing torch and MLflow takes longer than a small run's first step. A fork server imports them
-once and forks a fresh process for every run: no state is carried from run to run, and the code is
-that of the start of the driver, also if a file is edited meanwhile.
+Importing torch and MLflow takes longer than a small run's first step. One process imports them and
+forks a fresh process for every run: no state is carried from run to run, and the code is that of
+the start of the driver, also if a file is edited meanwhile. That process is a fork of the command
+(`fork_template`); where a driver is no command of its own, it is Python's fork server.
 """
 
 from __future__ import annotations
 
+import importlib
 import multiprocessing
 import os
 import pkgutil
@@ -17,17 +19,17 @@ import time
 from collections.abc import Mapping, Sequence
 from multiprocessing import forkserver
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, TextIO
 
 import rgbt
 from rgbt.checks import InputError
 from rgbt.config.shadowing import searches_working_directory_first, starting_alike
 from rgbt.spec.source_code import counted_modules
+from sweeps.worker.template import Template, TemplateProcess
 
-PRELOADED = (
-    *("sweeps.worker.executors", "torch", "hydra"),
-    *("mlflow", "mlflow.store.tracking.sqlalchemy_store"),
-)
+MLFLOW = ("mlflow", "mlflow.store.tracking.sqlalchemy_store")
+PRELOADED = ("sweeps.worker.executors", "torch", "hydra")
+PRELOADED_LAST = "sweeps.worker.preload"
 COMMANDS = ("rgbt.run", "rgbt.evaluate", "rgbt.consistency")
 """Run as programs, and a few lines each: not imported before."""
 
@@ -60,33 +62,64 @@ class Executor(Protocol):
         """
 
 
+_templates: list[Template] = []
+"""The template of this command, if it has one."""
+
+
+def limit_spinning(workers: int) -> None:
+    """Let threads that wait sleep if several runs share the cores; before torch is imported.
+
+    A run has a fixed number of threads: those of one that wait in a loop would take the cores of
+    the others (2.3 times slower). A run alone is faster with them (1.15 to 1.5).
+    """
+    if workers > 1:
+        os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+
+def fork_template(*, with_mlflow: bool) -> None:
+    """Fork the process from which the runs of this command are started.
+
+    Call it once, before a store is opened or a point is planned.
+
+    Args:
+        with_mlflow: whether runs send their results to MLflow.
+    """
+    shared = (*PRELOADED, *(MLFLOW if with_mlflow else ()))
+    for name in shared:
+        importlib.import_module(name)
+    _templates[:] = [Template(own_modules(), _record_code)]
+
+
+def _record_code() -> None:
+    from sweeps.worker.preload import record_code  # it records the code when it is imported
+
+    record_code()
+
+
 class LocalExecutor:
     """Processes on this machine, at most `workers` at a time."""
 
     def __init__(self, workers: int = 1) -> None:
-        if workers > 1:
-            # Read when torch loads in the fork server. A run has a fixed number of threads: those
-            # of one that wait in a loop would take the cores of the others (2.3 times slower). A
-            # run alone is faster with them (1.15 to 1.5).
-            os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+        limit_spinning(workers)
         self._context = multiprocessing.get_context("forkserver")
         self._is_preloaded = False
 
     def start(self, command: Sequence[str], environment: Mapping[str, str], log: Path) -> Job:
         """See `Executor.start`."""
         log.parent.mkdir(parents=True, exist_ok=True)
+        arguments = (tuple(command), dict(environment), str(log), str(Path.cwd()))
+        if _templates:
+            # Points that are planned have imported what the user wrote for them.
+            return LocalJob(_templates[0].start(_run_module, arguments, counted_modules()))
         if not self._is_preloaded:
-            # Now, when the points are planned and have imported what the user wrote for them.
-            last = "sweeps.worker.preload"
             first = () if searches_working_directory_first() else ("sweeps.worker.search_last",)
-            modules = (*first, *PRELOADED, *own_modules(), *counted_modules(), last)
+            shared = (*PRELOADED, *MLFLOW, *own_modules(), *counted_modules())
+            modules = (*first, *shared, PRELOADED_LAST)
             self._context.set_forkserver_preload(list(modules))
             with starting_alike():
                 forkserver.ensure_running()
             self._is_preloaded = True
-        process = self._context.Process(
-            target=_run_module, args=(tuple(command), dict(environment), str(log), str(Path.cwd()))
-        )
+        process = self._context.Process(target=_run_module, args=arguments)
         # Ctrl-C in the terminal is for the driver, which then stops its jobs in order.
         process.start()
         return LocalJob(process)
@@ -123,7 +156,7 @@ def own_modules() -> list[str]:
 class LocalJob:
     """See `Job`. The process leads a process group, so that its workers go with it."""
 
-    def __init__(self, process: multiprocessing.process.BaseProcess) -> None:
+    def __init__(self, process: multiprocessing.process.BaseProcess | TemplateProcess) -> None:
         self._process = process
         self._kill_at = float("inf")
 
@@ -158,7 +191,16 @@ def _run_module(
     output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
     for stream in (1, 2):
         os.dup2(output, stream)
+    # Not the objects of the command, which may write elsewhere.
+    sys.stdout, sys.stderr = _stream(1), _stream(2)
     module, *arguments = command
     sys.argv = [module, *arguments]
     sys.orig_argv = [sys.executable, "-m", *command]
     runpy.run_module(module, run_name="__main__", alter_sys=True)
+
+
+def _stream(number: int) -> TextIO:
+    # Open until the process ends, like those of Python.
+    return open(  # noqa: SIM115
+        number, "w", buffering=1, encoding="utf-8", errors="backslashreplace", closefd=False
+    )

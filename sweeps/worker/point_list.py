@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from statistics import median
 from typing import Any
 
-from rgbt.checks import InputError
-from rgbt.spec.naming import VARIED
 from sweeps import attributes as names
-from sweeps.point import COLOUR, Point, colour, varied_keys
+from sweeps.point import Point
 from sweeps.settings import SweepSettings
 from sweeps.worker.driver import drive
+from sweeps.worker.planned_points import PlannedPoints
 from sweeps.worker.planner import PlannedPoint, Planner
 from sweeps.worker.progress import ProgressView
 from sweeps.worker.run_store import RunStore
@@ -26,6 +26,9 @@ from sweeps.worker.trial_sources import (
     reason_of,
 )
 from sweeps.worker.trial_store import Owner, TrialStore, counted_trials, trials_by_key
+
+PLANNED_FIRST_S = 2.0
+"""Seconds of planning before the first run of a grid starts; about 100 points."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +77,8 @@ def preview_points(
         settings: of their execution.
         planner: with the same `base`, shared by several lists; None: one of this list alone.
     """
-    planned = _PlannedPoints(points, planner)
+    planned = _planned(points, planner)
+    planned.plan_and_show(points.title)
     study = find_study(points.study, settings.storage, points.runs.runs_dir)
     trials = trials_by_key(() if study is None else counted_trials(study))
 
@@ -94,7 +98,11 @@ def preview_points(
 
 
 def run_points(
-    points: PointList, settings: SweepSettings, planner: Planner | None = None
+    points: PointList,
+    settings: SweepSettings,
+    planner: Planner | None = None,
+    *,
+    strict: bool = False,
 ) -> list[Outcome]:
     """Run all unfinished points; a failed point does not stop the others. Outcomes in their order.
 
@@ -102,11 +110,17 @@ def run_points(
         points: their overrides.
         settings: of execution.
         planner: that has planned some of them already; None: a new one.
+        strict: refuse a point with a wrong configuration. All points that are planned in the first
+            `PLANNED_FIRST_S` seconds are checked before a run starts. The others are planned while
+            the first runs train; if one of them is wrong, these runs are stopped and resume in the
+            next call.
 
     Raises:
-        InputError: the storage or the executor cannot be used.
+        InputError: the storage or the executor cannot be used, all points are wrong, or with
+            `strict` one of them.
     """
-    planned = _PlannedPoints(points, planner)
+    planned = _planned(points, planner, strict=strict)
+    planned.plan_and_show(points.title, PLANNED_FIRST_S if strict else math.inf)
     runs = points.runs
     storage = open_storage(settings.storage, runs.runs_dir)
     runs.create_tables()
@@ -124,67 +138,29 @@ def run_points(
 
     view = ProgressView(points.title, len(source.plans), settings.workers, num_done)
 
+    def plan_more(seconds: float) -> list[PlannedPoint] | None:
+        if not planned.num_left:
+            return None
+        added = planned.plan(seconds)
+        view.planned(planned.num_runs, planned.num_left)
+        return added
+
     def more() -> list[PlannedPoint]:
-        added = planned.add(points.more(outcomes())) if points.more else []
+        planned.append(points.more(outcomes()) if points.more else [])
+        added = planned.plan()
         if added:
             view.added([plan.point.label for plan in added])
         return added
 
-    source.more = more
+    source.plan_more, source.more = plan_more, more
+    view.planned(planned.num_runs, planned.num_left)
     drive(view, source, store, runs, settings)
     return outcomes()
 
 
-class _PlannedPoints:
-    """The points of a list, planned; those with a wrong configuration have failed."""
-
-    def __init__(self, points: PointList, planner: Planner | None = None) -> None:
-        self._planner = planner or Planner(points.base)
-        self._study = points.study
-        self.points: list[Point] = []
-        self.plans: dict[int, PlannedPoint] = {}
-        self.errors: dict[int, str] = {}
-        self.add(points.points)
-        if self.errors and not self.plans:
-            # An error of every point is one of the command and not of a point.
-            raise InputError(next(iter(self.errors.values())))
-
-    def add(self, points: Sequence[Point]) -> list[PlannedPoint]:
-        """Plan further points; returns those without an error."""
-        first = len(self.points)
-        self.points += points
-        for index, point in enumerate(points, start=first):
-            try:
-                self.plans[index] = self._planner.plan(point)
-            except InputError as error:
-                self.errors[index] = str(error)
-        self._describe()
-        return [plan for index, plan in self.plans.items() if index >= first]
-
-    def _describe(self) -> None:
-        """Give every plan its tags, its colour and the keys that vary."""
-        # Points of the same run in other words (1 and 1.0) get the tags of all of them. Every run
-        # gets its own colour, and the keys that vary, which begin its name.
-        varied = " ".join(varied_keys(self.points))
-        tags: dict[str, dict[str, list[str]]] = {}
-        for index, plan in self.plans.items():
-            own = tags.setdefault(plan.key, {})
-            for name, value in self.points[index].tags.items():
-                values = own.setdefault(name, [])
-                values += [] if value in values else [value]
-        for index, plan in self.plans.items():
-            merged = {name: " | ".join(each) for name, each in tags[plan.key].items()}
-            merged |= {VARIED: varied, COLOUR: colour(self._study, list(tags).index(plan.key))}
-            self.plans[index] = replace(plan, point=replace(plan.point, tags=merged))
-
-    def outcomes(self, status_of: Callable[[PlannedPoint], Outcome]) -> list[Outcome]:
-        """One outcome per point, in order."""
-        return [
-            Outcome(point, "failed", self.errors[index])
-            if index in self.errors
-            else status_of(self.plans[index])
-            for index, point in enumerate(self.points)
-        ]
+def _planned(points: PointList, planner: Planner | None, *, strict: bool = False) -> PlannedPoints:
+    planner = planner or Planner(points.base)
+    return PlannedPoints(points.study, points.points, planner, strict=strict)
 
 
 def estimated_seconds(outcomes: Sequence[Outcome], workers: int) -> float | None:

@@ -4,7 +4,14 @@ The runs then have the digests of the code that they execute, even if files are 
 """
 
 from rgbt.spec.source_code import loaded_modules, user_code
-from rgbt.tracking.provenance import code
+from rgbt.tracking.provenance import code, packages
 
-code()
-user_code(f"{module}.any" for module in loaded_modules())
+
+def record_code() -> None:
+    """Keep the digests of all modules imported until now, and the versions of packages."""
+    code()
+    packages()
+    user_code(f"{module}.any" for module in loaded_modules())
+
+
+record_code()

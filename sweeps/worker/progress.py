@@ -8,12 +8,14 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from statistics import median
 
 from rich.console import Console, Group
 from rich.live import Live
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
@@ -25,6 +27,9 @@ CONSOLE = Console(stderr=True)
 LABEL_WIDTH = 52
 OTHER_WIDTH = 68
 """Characters of a line beside the label: bar, share, status and score."""
+
+SAY_S = 10.0
+"""Seconds between two lines about planning where stderr is no terminal."""
 
 SHORT_S = 5.0
 """A trial that took less was not trained: its runs were finished before."""
@@ -51,6 +56,7 @@ class ProgressView:
         self._seconds: list[float] = []
         self._done = self.count()
         self._counted = time.monotonic()
+        self._planning = ""
         self._live = Live(console=CONSOLE, refresh_per_second=4) if CONSOLE.is_terminal else None
 
     def __enter__(self) -> ProgressView:
@@ -84,6 +90,11 @@ class ProgressView:
         self.total = None if self.total is None else self.total + len(labels)
         self._say(f"added    {', '.join(labels)}")
 
+    def planned(self, num_runs: int, num_left: int) -> None:
+        """Show that so many different points are planned, and so many points are not yet."""
+        self.total = num_runs + num_left
+        self._planning = f", {num_left} points to plan" if num_left else ""
+
     def rejected(self, label: str, reason: str) -> None:
         """Show that the configuration of a point is wrong."""
         self._ended["failed"] += 1
@@ -111,7 +122,7 @@ class ProgressView:
         ends = ((how, self._ended[how]) for how in ("failed", "pruned"))
         ended = "".join(f", {count} {how}" for how, count in ends if count)
         running = f"{len(trials)} running{self._left(trials)}"
-        return f"{self.title}: {self._done}{of} done{ended}, {running}"
+        return f"{self.title}: {self._done}{of} done{ended}, {running}{self._planning}"
 
     def _left(self, trials: Sequence[RunningTrial]) -> str:
         """Estimated time left, from the trials finished so far."""
@@ -130,6 +141,31 @@ class ProgressView:
             self._live.console.print(text, markup=False, highlight=False, soft_wrap=True)
         else:
             CONSOLE.print(f"{time.strftime('%H:%M:%S')} {text}", markup=False, soft_wrap=True)
+
+
+@contextmanager
+def planning_progress(title: str, num_points: int) -> Iterator[Callable[[int], None]]:
+    """Show how many of some points are planned, until the context ends.
+
+    Yields:
+        a function that takes the number of planned points; called often.
+    """
+    if CONSOLE.is_terminal:
+        columns = (TextColumn("{task.description}"), BarColumn(bar_width=24), MofNCompleteColumn())
+        with Progress(*columns, console=CONSOLE, transient=True) as display:
+            task = display.add_task(f"{title}: planning", total=num_points)
+            yield lambda count: display.update(task, completed=count)
+        return
+    last = time.monotonic()
+
+    def say(count: int) -> None:
+        nonlocal last
+        if time.monotonic() - last > SAY_S:
+            last = time.monotonic()
+            text = f"{time.strftime('%H:%M:%S')} planned  {count} of {num_points} points"
+            CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
+
+    yield say
 
 
 def duration(seconds: float) -> str:

@@ -31,6 +31,9 @@ if TYPE_CHECKING:
 PAUSE_S = 5.0
 """How long a search waits after a point that is being run already."""
 
+PLAN_S = 0.2
+"""Seconds of planning between two searches for a point to claim."""
+
 State = Literal["finished", "failed", "running", "waiting"]
 UNFINISHED: tuple[State, ...] = ("waiting", "failed")
 """States of points that a command runs."""
@@ -56,6 +59,9 @@ class TrialSource(Protocol):
 
     def next(self) -> ClaimedTrial | None:
         """The next trial, claimed for this driver; None when there is none at the moment."""
+
+    def plan(self, seconds: float) -> bool:
+        """Plan further points for so many seconds; False: there is nothing to plan."""
 
     def is_exhausted(self, *, wait: bool) -> bool:
         """Whether no trial is left; with `wait`, whether other drivers have finished too."""
@@ -114,15 +120,21 @@ class Outcome:
         return sum(known) if known and len(known) == len(each) else None
 
 
+def _nothing_to_plan(seconds: float) -> None:
+    del seconds
+
+
 @dataclass
 class ListSource:
     """Claims the points of a list in their order.
 
     Attributes:
-        points: planned; of equal keys the last one counts.
+        points: planned; of equal keys the first one counts.
         settings: `retries` and `retry` count here.
         distributions: of the parameters of a grid, by name.
-        more: further points, from the outcomes until now; called when no point is waiting.
+        plan_more: plans further points of the list for some seconds; None: all are planned.
+        more: further points, from the outcomes until now; called when all points are planned and no
+            point is waiting.
     """
 
     points: InitVar[Sequence[PlannedPoint]]
@@ -130,12 +142,15 @@ class ListSource:
     runs: RunStore
     settings: SweepSettings
     distributions: Mapping[str, Any]
+    plan_more: Callable[[float], Sequence[PlannedPoint] | None] = _nothing_to_plan
     more: Callable[[], Sequence[PlannedPoint]] = tuple
     requeues: bool = field(default=False, init=False)
     rejected: int = field(default=0, init=False)
 
     def __post_init__(self, points: Sequence[PlannedPoint]) -> None:
-        self.plans = {plan.key: plan for plan in points}
+        self.plans: dict[str, PlannedPoint] = {}
+        self._keep(points)
+        self._is_planned = False
         before = self.store.trials() if self.settings.retry == "failed" else []
         self._forgiven = {trial.number for trial in before if trial.state.name == "FAIL"}
         self._finished: dict[str, tuple[RunResult, ...]] = {}
@@ -145,16 +160,23 @@ class ListSource:
         """See `TrialSource.next`."""
         claimed = self._claim()
         # Points that were added before this command was stopped are finished: others follow them.
-        while claimed is None and self._add():
+        while claimed is None and (self.plan(PLAN_S) or self._keep(self.more())):
             claimed = self._claim()
         return claimed
 
-    def _add(self) -> bool:
-        """Add further points; whether there are any."""
-        further = {plan.key: plan for plan in self.more()}
-        is_new = bool(further.keys() - self.plans.keys())
-        self.plans = {**further, **self.plans}
-        return is_new
+    def plan(self, seconds: float) -> bool:
+        """See `TrialSource.plan`."""
+        added = None if self._is_planned else self.plan_more(seconds)
+        self._is_planned = added is None
+        self._keep(added or ())
+        return added is not None
+
+    def _keep(self, points: Sequence[PlannedPoint]) -> bool:
+        """Add points; whether one of them is a new one."""
+        before = len(self.plans)
+        for plan in points:
+            self.plans.setdefault(plan.key, plan)
+        return len(self.plans) > before
 
     def _claim(self) -> ClaimedTrial | None:
         by_key = self.store.by_key()
@@ -173,7 +195,7 @@ class ListSource:
     def is_exhausted(self, *, wait: bool) -> bool:
         """See `TrialSource.is_exhausted`."""
         states = {status.state for status in self.statuses()}
-        return not states & ({"running", "waiting"} if wait else {"waiting"})
+        return self._is_planned and not states & ({"running", "waiting"} if wait else {"waiting"})
 
     def statuses(self) -> list[Outcome]:
         """The states of all points."""
@@ -274,6 +296,11 @@ class SamplerSource:
             return None
         self.store.set_attributes(trial.number, trial_attributes(plan))
         return ClaimedTrial(plan, trial.number, self._pruning_callback(trial))
+
+    def plan(self, seconds: float) -> bool:
+        """See `TrialSource.plan`; a sampler proposes a point when a worker is free."""
+        del seconds
+        return False
 
     def is_exhausted(self, *, wait: bool) -> bool:
         """See `TrialSource.is_exhausted`."""

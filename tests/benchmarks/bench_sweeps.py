@@ -6,9 +6,11 @@ All parts train CMX's tiny network on the embedded data, one thread a run, in a 
   result, of the sweeper and of the plain command called in a loop;
 * workers: wall seconds of the same grid with one worker and with two;
 * pruning: the same search with and without a median pruner, equal trials and sampler seed: training
-  steps done and the best value.
+  steps done and the best value;
+* smoke: CPU seconds, with all processes, of six smoke runs on two workers, by Hydra's basic
+  launcher in sequence, and by its joblib launcher if it is installed.
 
-Run: python -m tests.benchmarks.bench_sweeps [overhead] [workers] [pruning]
+Run: python -m tests.benchmarks.bench_sweeps [overhead] [workers] [pruning] [smoke]
 """
 
 from __future__ import annotations
@@ -20,10 +22,12 @@ import subprocess
 import sys
 import tempfile
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 
 from sweeps import attributes as names
 from sweeps.worker.storage import load_study, open_storage, study_names
+from tests.benchmarks.process_cost import cpu_seconds
 from tests.benchmarks.timing import seconds
 
 POINTS = 6
@@ -119,7 +123,28 @@ def pruning(place: Path) -> None:
     print(f"steps saved: {100 * (1 - found['median'] / found['none']):.0f} %")
 
 
-PARTS = {"overhead": overhead, "workers": workers, "pruning": pruning}
+LAUNCHERS = {
+    "sweeper, two workers": ("hydra.sweeper.workers=2",),
+    "basic launcher, in sequence": ("hydra/sweeper=basic",),
+    "joblib launcher, two workers": (
+        *("hydra/sweeper=basic", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"),
+    ),
+}
+
+
+def smoke(place: Path) -> None:
+    words = ("rgbt.run", "-m", "+experiment=grbm", "+debug=smoke", "seed=0,1,2,3,4,5")
+    for number, (name, launcher) in enumerate(LAUNCHERS.items()):
+        if "joblib" in name and find_spec("hydra_plugins.hydra_joblib_launcher") is None:
+            print(f"{name}: hydra-joblib-launcher is not installed")
+            continue
+        runs = place / str(number)
+        where = (f"runs_dir={runs}", f"hydra.sweep.dir={runs / 'hydra'}")
+        cost = cpu_seconds((*words, *where, *launcher), {**os.environ})
+        print(f"six smoke runs, {name}: {cost:.1f} CPU s", flush=True)
+
+
+PARTS = {"overhead": overhead, "workers": workers, "pruning": pruning, "smoke": smoke}
 
 
 def main() -> None:

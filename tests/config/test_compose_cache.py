@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import random
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -108,6 +110,50 @@ def test_overrides_of_hydra_are_not_cached(composed: list[list[str]], tmp_path: 
         compose((f"hydra.searchpath=[{tmp_path}]",))
     assert len(composed) == 2
     assert not compose_cache._composed
+
+
+def test_trials_of_a_search_are_cached(composed: list[list[str]], tmp_path: Path) -> None:
+    file = tmp_path / "masker" / "mine.yaml"
+    file.parent.mkdir()
+    file.write_text("_target_: mine.Masker\nvalue: 1\n")
+    hydras = ("hydra.mode=RUN", f"hydra.searchpath=[{tmp_path}]")
+    with composing.searching(hydras):
+        expected = composing._composed_by_hydra([*hydras, "masker=mine", "seed=2"])
+        composed.clear()
+        for _ in range(2):
+            found = compose((*hydras, "masker=mine", "seed=2"))
+            assert OmegaConf.to_yaml(found) == OmegaConf.to_yaml(expected)
+    assert composed == [["masker=mine"]]
+    with pytest.raises(HydraException, match="mine"):
+        compose(("hydra.mode=RUN", "masker=mine"))
+
+
+VALUES = (
+    *("optimizer.lr=0.003", "seed=7", "model.fresh=[a,b]", "model.weights=null"),
+    *("name='a, b'", 'name="it\'s"', "scale.crop_hw=[48,64]", "scale.pixel_factor=0.25"),
+    *("+model.extra={a:1,b:[x,null]}", "trainer.max_steps=${scale.eval_every}", "out=null"),
+    *("scale.few_scenes=true", "data.batch_size=2", "~trainer.threads", "++trainer.threads=2"),
+)
+CHOICES = (
+    *("masker=square", "masker=none", "+experiment=crm", "+experiment=grbm", "scale=paper"),
+    *("model=mfnet", "optimizer=adamw", "+debug=smoke"),
+)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_random_points_are_what_hydra_composes(seed: int) -> None:
+    draw = random.Random(seed)
+    words = [*draw.sample(CHOICES, 2), *draw.sample(VALUES, 4)]
+    draw.shuffle(words)
+
+    def by(make: Callable[[list[str]], object]) -> str:
+        try:
+            return OmegaConf.to_yaml(make(words))
+        except Exception as error:  # refused by both, in the same words
+            return f"{type(error).__name__}: {error}"
+
+    assert by(compose) == by(composing._composed_by_hydra), words
+    assert by(compose) == by(composing._composed_by_hydra), "from the cache"
 
 
 def test_files_are_parsed_once(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -34,7 +34,8 @@ class RecordedCalls:
 def calls(monkeypatch: pytest.MonkeyPatch) -> RecordedCalls:
     found = RecordedCalls()
 
-    def run_points(wanted: PointList, settings: SweepSettings) -> list[Outcome]:
+    def run_points(wanted: PointList, settings: SweepSettings, *, strict: bool) -> list[Outcome]:
+        assert strict, "a wrong point of a grid is refused"
         del settings
         found.lists.append(wanted)
         return found.outcomes or [Outcome(point, "finished") for point in wanted.points]
@@ -151,11 +152,10 @@ def test_sweep_search_settings_of_grid_are_refused(
     assert calls.lists == []
 
 
-def test_mistake_is_reported_before_any_run(calls: RecordedCalls, tmp_path: Path) -> None:
-    calls.outcomes = [Outcome(Point("a", ()), "failed", "no such key")]
-    with pytest.raises(InputError, match="a: no such key"):
-        call(tmp_path, "+experiment=grbm", "seed=0,1")
-    assert calls.lists == []
+def test_mistake_is_reported_before_any_run(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="masker=squre: there is no masker 'squre'"):
+        call(tmp_path, "+experiment=grbm", "masker=square,squre")
+    assert not any(tmp_path.iterdir())
 
 
 def test_failed_points_end_in_an_error_after_the_table(

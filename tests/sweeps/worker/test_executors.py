@@ -19,7 +19,8 @@ import pytest
 from rgbt.checks import InputError
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.worker import executors
-from sweeps.worker.executors import Job, LocalExecutor, check_gpus
+from sweeps.worker.executors import Job, LocalExecutor, check_gpus, fork_template
+from sweeps.worker.template import Template
 from tests.sweeps.fakes import DEADLINE_S, is_alive, until
 
 MODULE = """
@@ -75,14 +76,21 @@ def module(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     sys.path.remove(str(folder))
 
 
-@pytest.fixture(scope="module")
-def executor(module: Path) -> Iterator[LocalExecutor]:
+@pytest.fixture(scope="module", params=["fork server", "template"])
+def executor(module: Path, request: pytest.FixtureRequest) -> Iterator[LocalExecutor]:
     # Nothing here needs torch. The server is one of the whole process: later tests start their own.
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(executors, "PRELOADED", ())
+        patch.setattr(executors, "MLFLOW", ())
         patch.setattr(executors, "own_modules", list)
+        patch.setattr(executors, "_templates", [])
+        if request.param == "template":
+            fork_template(with_mlflow=False)
         yield LocalExecutor()
-    forkserver._forkserver._stop()
+        for template in executors._templates:
+            template.close()
+    if request.param == "fork server":
+        forkserver._forkserver._stop()
 
 
 Start = Callable[..., Job]
@@ -186,6 +194,8 @@ from sweeps.worker import executors
 if __name__ == "__main__":
     sys.path.insert(0, sys.argv[1])
     executors.PRELOADED, executors.own_modules = (), list
+    if sys.argv[3] == "template":
+        executors.fork_template(with_mlflow=False)
     folder = Path(sys.argv[2])
     command = ("tiny_run", "wait", str(folder / "pid"))
     job = executors.LocalExecutor().start(command, {}, folder / "log")
@@ -202,12 +212,14 @@ if __name__ == "__main__":
 """
 
 
-@pytest.fixture
-def driver(module: Path, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+@pytest.fixture(params=["fork server", "template"])
+def driver(
+    module: Path, tmp_path: Path, request: pytest.FixtureRequest
+) -> Iterator[subprocess.Popen[str]]:
     """A driver in a process group of its own, as a shell starts it."""
     (tmp_path / "a_driver.py").write_text(DRIVER)
     process = subprocess.Popen(
-        [sys.executable, str(tmp_path / "a_driver.py"), str(module), str(tmp_path)],
+        [sys.executable, str(tmp_path / "a_driver.py"), str(module), str(tmp_path), request.param],
         stdout=subprocess.PIPE,
         text=True,
         start_new_session=True,
@@ -240,9 +252,42 @@ def test_run_continues_when_driver_is_killed(driver: subprocess.Popen[str], tmp_
     until(lambda: not is_alive(pid), "its end")
 
 
+def test_template_that_ended_fails_the_start_and_ends_the_wait(module: Path) -> None:
+    template = Template((), lambda: None)
+    process = template.start(time.sleep, (600,), ())
+    assert process.exitcode is None
+    os.kill(template._pid, signal.SIGKILL)
+    os.waitpid(template._pid, 0)
+    with pytest.raises(OSError, match="the process that starts runs has ended"):
+        template.start(time.sleep, (600,), ())
+    assert process.exitcode is None, "the run continues"
+    os.kill(process.pid, signal.SIGKILL)
+    until(lambda: process.exitcode == 255, "the end of a process without a parent")
+
+
+def test_template_imports_modules_before_it_forks(module: Path, tmp_path: Path) -> None:
+    (module / "late.py").write_text("NUMBER = 1\n")
+    template = Template((), lambda: None)
+    try:
+        for name in ("first", "second"):
+            process = template.start(_write_number, (str(tmp_path / name),), ("late", "no_such"))
+            until(lambda job=process: job.exitcode is not None, "its end")
+            (module / "late.py").write_text("NUMBER = 2\n")
+    finally:
+        template.close()
+    assert [(tmp_path / name).read_text() for name in ("first", "second")] == ["1", "1"]
+
+
+def _write_number(path: str) -> None:
+    import late
+
+    Path(path).write_text(str(late.NUMBER))
+
+
 def test_preloaded_modules_exist_and_commands_are_not_among_them() -> None:
     """A misspelt name would be left out in silence, and every run would take seconds longer."""
-    assert all(importlib.util.find_spec(name) is not None for name in executors.PRELOADED)
+    names = (*executors.PRELOADED, *executors.MLFLOW, executors.PRELOADED_LAST)
+    assert all(importlib.util.find_spec(name) is not None for name in names)
     evaluations = (ExtraEvaluation(), ExtraEvaluation(frames="aligned"))
     called = {"rgbt.run", *(evaluation.command[0] for evaluation in evaluations)}
     assert called == set(executors.COMMANDS)

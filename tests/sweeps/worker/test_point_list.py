@@ -78,7 +78,8 @@ def test_points_that_are_one_run_share_their_tags(
 ) -> None:
     monkeypatch.setattr(point_list, "Planner", OneKey)
     rows = [Point(label, (f"x={label}",), tags={"table": label}) for label in ("1", "1.0")]
-    prepared = point_list._PlannedPoints(wanted(tmp_path, *rows))
+    prepared = point_list._planned(wanted(tmp_path, *rows), None)
+    prepared.plan()
     first, second = (plan.point.tags for plan in prepared.plans.values())
     assert first == second == {"table": "1 | 1.0", VARIED: "x", COLOUR: colour("s", 0)}
 
