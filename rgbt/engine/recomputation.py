@@ -1,0 +1,107 @@
+"""Activation checkpointing: compute activations again in the backward pass instead of keeping them.
+
+Losses, gradients and running statistics keep their bits. Networks draw nothing inside the modules
+that are recomputed (`rgbt.requirements.Record.recomputed`), so no generator has to be restored.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from typing import Any
+
+import torch
+from torch import nn
+from torch.nn.modules.batchnorm import _BatchNorm
+from torch.utils.checkpoint import checkpoint
+
+from rgbt.checks import InputError
+from rgbt.requirements import record_of
+
+SETTING = "trainer.activation_checkpointing=true"
+
+
+def recompute_activations(network: nn.Module) -> None:
+    """Checkpoint every module that the record of `network` names in `recomputed`.
+
+    Modules stay where they are, so the keys of a checkpoint do not change. Evaluation and passes
+    without gradient are not affected.
+
+    Raises:
+        InputError: the network declares no such module, or a name fits none.
+    """
+    kind = type(network).__name__
+    patterns = record_of(network).recomputed
+    if not patterns:
+        raise InputError(
+            f"{SETTING} requires a network that declares which modules are recomputed, but the "
+            f'record of {kind} does not; add recomputed=("blocks.*",) with the names of its '
+            "modules, or set trainer.activation_checkpointing=false."
+        )
+    modules = dict(network.named_modules())
+    for pattern in patterns:
+        names = [name for name in modules if _fits(pattern, name)]
+        if not names:
+            raise InputError(
+                f"{SETTING}: the record of {kind} names '{pattern}' in `recomputed`, but no module "
+                f"of the network has such a name; choose from its named_modules(), such as "
+                f"{', '.join(list(modules)[1:4])}."
+            )
+        for name in names:
+            # Set through vars(), because a module takes no other attribute `forward`.
+            vars(modules[name])["forward"] = Recomputed(modules[name])
+
+
+class Recomputed:
+    """The forward of a module that keeps its inputs alone in training.
+
+    Args:
+        module: its own `forward` is called; arguments and results are unchanged.
+    """
+
+    def __init__(self, module: nn.Module) -> None:
+        self.module = module
+        self.forward = module.forward
+
+    def __call__(self, *arguments: Any, **keywords: Any) -> Any:
+        """Call the forward; with gradient in training mode, keep nothing of what it computes."""
+        if not (self.module.training and torch.is_grad_enabled()):
+            return self.forward(*arguments, **keywords)
+        # A compiler changes the statistics once by itself, and takes no context.
+        compiling = torch.compiler.is_compiling()
+        contexts: dict[str, Any] = {} if compiling else {"context_fn": self._contexts}
+        return checkpoint(
+            self.forward,
+            *arguments,
+            use_reentrant=False,
+            preserve_rng_state=False,
+            **contexts,
+            **keywords,
+        )
+
+    def _contexts(self) -> tuple[AbstractContextManager[None], AbstractContextManager[None]]:
+        """Of the forward pass, and of the recomputation."""
+        return nullcontext(), kept_statistics(self.module)
+
+
+@contextmanager
+def kept_statistics(module: nn.Module) -> Iterator[None]:
+    """Within it, batch normalisations in training mode do not update their running statistics.
+
+    What they return stays the same, because training normalises by the statistics of the batch.
+    """
+    norms = [each for each in module.modules() if isinstance(each, _BatchNorm)]
+    tracking = [norm.track_running_stats for norm in norms]
+    for norm in norms:
+        norm.track_running_stats = False
+    try:
+        yield
+    finally:
+        for norm, tracks in zip(norms, tracking, strict=True):
+            norm.track_running_stats = tracks
+
+
+def _fits(pattern: str, name: str) -> bool:
+    """Whether a dotted name fits a pattern, in which * is any part of a name without a dot."""
+    return re.fullmatch(re.escape(pattern).replace(r"\*", "[^.]*"), name) is not None
