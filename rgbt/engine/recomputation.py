@@ -13,7 +13,6 @@ from typing import Any
 
 import torch
 from torch import nn
-from torch.nn.modules.batchnorm import _BatchNorm
 from torch.utils.checkpoint import checkpoint
 
 from rgbt.checks import InputError
@@ -87,19 +86,21 @@ class Recomputed:
 
 @contextmanager
 def kept_statistics(module: nn.Module) -> Iterator[None]:
-    """Within it, batch normalisations in training mode do not update their running statistics.
+    """Within it, buffers are copies, so that running statistics are updated in the forward alone.
 
-    What they return stays the same, because training normalises by the statistics of the batch.
+    Batch normalisation returns the same, because training normalises by the statistics of the
+    batch.
     """
-    norms = [each for each in module.modules() if isinstance(each, _BatchNorm)]
-    tracking = [norm.track_running_stats for norm in norms]
-    for norm in norms:
-        norm.track_running_stats = False
+    kept = [(each, dict(each.named_buffers(recurse=False))) for each in module.modules()]
+    for each, buffers in kept:
+        for name, buffer in buffers.items():
+            setattr(each, name, buffer.clone())
     try:
         yield
     finally:
-        for norm, tracks in zip(norms, tracking, strict=True):
-            norm.track_running_stats = tracks
+        for each, buffers in kept:
+            for name, buffer in buffers.items():
+                setattr(each, name, buffer)
 
 
 def _fits(pattern: str, name: str) -> bool:
