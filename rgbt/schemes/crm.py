@@ -85,6 +85,8 @@ class CRM:
                 weighted["sdc"] = self.complementary_weight * sdc(teacher, student)
             if self.nonlocal_weight:
                 weighted["sdn"] = self.nonlocal_weight * sdn(teacher, *singles)
+        # The loop holds this frame until the phases of all accumulated batches are done.
+        del output, supervised
         yield Phase(("main",), weighted)
 
     def _forward(self, batch: Batch, generator_of: GeneratorOf) -> tuple[Output, int]:

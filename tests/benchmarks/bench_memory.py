@@ -91,9 +91,7 @@ class Live(TorchDispatchMode):
         self.now += size
         self.peak = max(self.peak, self.now)
 
-    def __torch_dispatch__(
-        self, func: Any, types: Any, args: Any = (), kwargs: Any = None
-    ) -> Any:
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         found = func(*args, **(kwargs or {}))
         for leaf in tree_leaves(found):
             if isinstance(leaf, Tensor):
@@ -231,9 +229,7 @@ def table(name: str) -> None:
         one, two = (by_batch[count]["activations"] for count in (1, 2))
         slope, fixed = two - one, 4 * weights + 2 * one - two
         total = {count: 4 * weights + each["activations"] for count, each in by_batch.items()}
-        fits = [
-            max(0, int(((card - SPARE) * 1e9 / MIB - fixed) // slope)) for card in CARDS
-        ]
+        fits = [max(0, int(((card - SPARE) * 1e9 / MIB - fixed) // slope)) for card in CARDS]
         print(
             f"| {name} | {setting} | {4 * weights / 1024:.2f} | {total[1] / 1024:.2f} | "
             f"{total[2] / 1024:.2f} | {slope / 1024:.2f} | {paper}: {total[paper] / 1024:.1f} "
