@@ -1,6 +1,6 @@
 """Activation checkpointing: compute activations again in the backward pass instead of keeping them.
 
-Losses, gradients and running statistics keep their bits. Networks draw nothing inside the modules
+Losses, gradients and running statistics keep their bits. Networks draw nothing in the modules
 that are recomputed (`rgbt.requirements.Record.recomputed`), so no generator has to be restored.
 """
 
