@@ -35,6 +35,12 @@ def prepare_training(network: nn.Module, settings: TrainerSettings, device: torc
     Raises:
         InputError: a network or a machine that cannot follow a setting.
     """
+    if settings.activation_checkpointing and settings.compile != "none":
+        raise InputError(
+            f"trainer.activation_checkpointing=true cannot be used with trainer.compile="
+            f"{settings.compile}, because a graph recomputes by rules of its own; set one of them "
+            "to its default (false or none)."
+        )
     if settings.activation_checkpointing:
         from rgbt.engine.recomputation import recompute_activations
 

@@ -67,15 +67,12 @@ class Recomputed:
         """Call the forward; with gradient in training mode, keep nothing of what it computes."""
         if not (self.module.training and torch.is_grad_enabled()):
             return self.forward(*arguments, **keywords)
-        # A compiler changes the statistics once by itself, and takes no context.
-        compiling = torch.compiler.is_compiling()
-        contexts: dict[str, Any] = {} if compiling else {"context_fn": self._contexts}
         return checkpoint(
             self.forward,
             *arguments,
             use_reentrant=False,
             preserve_rng_state=False,
-            **contexts,
+            context_fn=self._contexts,
             **keywords,
         )
 
