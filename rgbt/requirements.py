@@ -61,6 +61,9 @@ class Record:
         dense_logits: network: whether its method `dense_logits` converts masks to class scores.
         pretrained_parts: network: beginnings of the names of the parameters that an ImageNet file
             covers; they get the backbone's learning rate.
+        recomputed: network: names of the modules that `trainer.activation_checkpointing` computes
+            again in the backward pass, each on its own; * stands for a part of a name without a
+            dot. They draw nothing at random and are not parts of each other.
         drawn_anew: network: beginnings of the names of parameters that are not read from a file
             that has them -> why.
         weighs_confidence: loss: whether it weighs pixels by the confidence of their labels.
@@ -93,6 +96,7 @@ class Record:
     stacks_passes: bool = False
     dense_logits: bool = False
     pretrained_parts: tuple[str, ...] = ()
+    recomputed: tuple[str, ...] = ()
     drawn_anew: Mapping[str, str] = field(default_factory=dict)
     weighs_confidence: bool = False
     frames: Literal[1, 2] = 1

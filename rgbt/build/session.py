@@ -23,6 +23,7 @@ from rgbt.data.label_map import LabelMap
 from rgbt.data.loader_settings import LoaderSettings
 from rgbt.dataset import LabelledDataset
 from rgbt.engine.allocator import keep_memory
+from rgbt.engine.network_settings import place
 from rgbt.engine.settings import TrainerSettings
 from rgbt.engine.threads import fix_threads
 from rgbt.metrics.metric import Regions
@@ -111,7 +112,7 @@ def open_session(
         consistency=spec.consistency.build(),
         trainer=trainer,
         fabric=fabric,
-        model=model.to(fabric.device),
+        model=place(model, fabric.device, trainer),
         weights=weights,
     )
 

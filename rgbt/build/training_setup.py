@@ -24,6 +24,7 @@ from rgbt.data.loaders import Batches, steps_per_epoch, train_batches
 from rgbt.data.pairs import PairedBatches
 from rgbt.data.pseudo_labels import PseudoLabelled, Unlabelled
 from rgbt.dataset import LabelledDataset
+from rgbt.engine.network_settings import prepare_training
 from rgbt.engine.schedules import Schedule
 from rgbt.engine.trainer import Scheme
 from rgbt.randomness import derive
@@ -122,6 +123,7 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
     masker: AnyMasker = spec.masker.build()
     loss = spec.loss.build()
     checked = CheckedLoss(loss) if is_own(loss) else loss
+    prepare_training(session.model, session.trainer, session.fabric.device)
     model = session.fabric.setup_module(session.model)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(derive(spec.seed, "scheme weights"))  # of networks of its own

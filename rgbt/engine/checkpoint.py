@@ -123,7 +123,10 @@ def step_of(payload: Mapping[str, Any], source: Path) -> int:
 
 
 def restore_optimizer(optimizer: torch.optim.Optimizer, stored: Any, source: Path) -> None:
-    """Restore the state of an optimizer.
+    """Restore the state of an optimizer, each tensor in the memory format of its parameter.
+
+    A fused optimizer reads both in the order of memory, and a checkpoint may come from a run with
+    another `trainer.memory_format`.
 
     Raises:
         InputError: it is the state of another optimizer.
@@ -135,6 +138,12 @@ def restore_optimizer(optimizer: torch.optim.Optimizer, stored: Any, source: Pat
             f"{source} holds the state of a different optimizer than this run uses. Resume with "
             "the code that wrote it, or train the run again in another runs_dir=..."
         ) from error
+    for parameter, state in optimizer.state.items():
+        for name, value in state.items():
+            if not isinstance(value, Tensor) or value.shape != parameter.shape:
+                continue
+            if value.stride() != parameter.stride():
+                state[name] = torch.empty_like(parameter, dtype=value.dtype).copy_(value)
 
 
 def restore_weights(model: nn.Module, weights: dict[str, Tensor], source: Path) -> None:

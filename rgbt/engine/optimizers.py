@@ -85,8 +85,15 @@ class SGD:
             _group(parameters, self.lr * (self.backbone_multiplier if pretrained else 1.0))
             for pretrained, parameters in by_part.items()
         ]
+        # On a GPU the default makes a copy of all gradients to add the decay; the fused one none.
+        # On a CPU it would change the last bits of published runs.
+        on_gpu = any(parameter.is_cuda for group in settings for parameter in group["params"])
         return torch.optim.SGD(
-            settings, lr=self.lr, momentum=self.momentum, weight_decay=self.weight_decay
+            settings,
+            lr=self.lr,
+            momentum=self.momentum,
+            weight_decay=self.weight_decay,
+            fused=True if on_gpu else None,
         )
 
 

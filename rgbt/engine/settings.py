@@ -55,10 +55,13 @@ class TrainerSettings:
         batch_norm_parts: parts of a batch that are normalised separately in training. 1: the whole
             batch, synchronised over the devices, as in all recipes here; else the number of
             devices.
-        activation_checkpointing: whether the backbone's activations are computed again in the
-            backward pass instead of kept: less memory, more time, the same losses.
-        memory_format: layout of feature maps in memory; the result differs by rounding alone.
-        compile: mode of `torch.compile` for the network; "none" does not compile.
+        activation_checkpointing: whether activations of the blocks that the network names
+            (`Record.recomputed`) are computed again in the backward pass instead of kept: less
+            memory, more time, the same losses.
+        memory_format: layout of convolutions' kernels, and so of feature maps, in memory; the
+            result differs by rounding alone.
+        compile: mode of `torch.compile` for the network in training; "none" does not compile,
+            "max-autotune" leaves out CUDA graphs.
     """
 
     max_steps: NumSteps

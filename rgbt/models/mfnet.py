@@ -80,7 +80,7 @@ class MFNet(nn.Module):
         InputError: widths that are odd where a mini-inception halves them.
     """
 
-    record = Record(views=("rgbt",))
+    record = Record(views=("rgbt",), recomputed=("conv*", "decode*"))
 
     def __init__(
         self,

@@ -95,7 +95,11 @@ class PSPNet(nn.Module):
     @staticmethod
     def record_from(*, modalities: str, **_: object) -> Record:
         """Output and views."""
-        return Record(views=(VIEW_OF[modalities],), pretrained_parts=("feats.",))
+        return Record(
+            views=(VIEW_OF[modalities],),
+            pretrained_parts=("feats.",),
+            recomputed=("feats.layer*.*", "up_*"),
+        )
 
     def forward(
         self,

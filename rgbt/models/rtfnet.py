@@ -136,6 +136,7 @@ class RTFNet(nn.Module):
         return Record(
             views=("rgbt",),
             pretrained_parts=("encoder_",),
+            recomputed=("encoder_*_layer*.*", "deconv*.*"),
             drawn_anew={"encoder_thermal_conv1.": reason} if thermal_stem == "xavier" else {},
         )
 

@@ -41,4 +41,5 @@ class Supervised:
         generator = generator_of("stochastic depth")
         output = self.model(batch.rgb, batch.thermal, masks, generator=generator, **self.options)
         parts = self.loss(output, batch, generator_of("loss"))
+        del output  # the loop holds this frame until all accumulated batches are done
         yield Phase(("main",), {name: values.sum() for name, values in parts.items()})

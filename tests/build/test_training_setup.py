@@ -17,6 +17,7 @@ from rgbt.build.training_setup import _where_to_augment, set_up_training, valida
 from rgbt.checks import InputError
 from rgbt.config.compose import compose
 from rgbt.data.pseudo_labels import FORMAT
+from rgbt.engine.recomputation import Recomputed
 from rgbt.evaluation.prediction import decode_ahead
 from rgbt.evaluation.pseudo_labels import UNFINISHED, Labelling, write_pseudo_labels
 from rgbt.evaluation.request import EvaluationRequest
@@ -263,3 +264,28 @@ def test_where_batches_are_augmented() -> None:
         assert where("auto", device, object()) == "loader"
         assert where("device", device, able) == "device", "as requested"
         assert where("loader", device, able) == "loader"
+
+
+def test_network_settings_are_applied_and_keep_the_loss(composed: Composed) -> None:
+    def first_loss(*words: str) -> tuple[torch.nn.Module, torch.Tensor]:
+        setup = set_up_training(composed("mfnet", "masker=none", *words))
+        (loaded,) = [next(setup.batches(range(1)))]
+        phase = next(
+            iter(setup.scheme.phases(loaded.to("cpu"), lambda _: torch.Generator().manual_seed(0)))
+        )
+        return setup.session.model, torch.stack(list(phase.parts.values())).sum()
+
+    plain, expected = first_loss()
+    network, loss = first_loss("trainer.activation_checkpointing=true")
+    assert torch.equal(loss, expected)
+    assert isinstance(network.get_submodule("conv1_rgb").forward, Recomputed)
+    network, loss = first_loss("trainer.memory_format=channels_last")
+    torch.testing.assert_close(loss, expected, rtol=1e-4, atol=0)
+    assert not network.get_parameter("conv2_1_rgb.conv.weight").is_contiguous()
+    assert list(network.state_dict()) == list(plain.state_dict())
+
+
+def test_settings_of_the_network_do_not_change_the_key(composed: Composed) -> None:
+    words = ("activation_checkpointing=true", "memory_format=channels_last", "compile=default")
+    plain, changed = composed("mfnet"), composed("mfnet", *(f"trainer.{word}" for word in words))
+    assert changed.key == plain.key

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import weakref
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -149,3 +150,25 @@ def test_supervised_masks_its_pass_when_there_is_a_masker() -> None:
     supervised = Supervised(model=Numbered(), loss=OneEach(), masker=Halves(), domains=ONE)
     list(supervised.phases(batch(), generator_of))
     assert supervised.model.call["masks"].rgb.shape == (B, 2, 2)
+
+
+@pytest.mark.parametrize("kind", ["crm", "supervised"])
+def test_phase_does_not_keep_the_predictions(kind: str) -> None:
+    """Of all accumulated batches, the predictions would exist at the same time."""
+    kept: list[weakref.ref[Tensor]] = []
+
+    class Watched(Numbered):
+        def __call__(self, *arguments, **keywords) -> Output:
+            output = super().__call__(*arguments, **keywords)
+            kept.append(weakref.ref(output.aux["mask_logits"]))
+            return output
+
+    if kind == "crm":
+        made = scheme(Halves())
+        made.model = Watched()
+    else:
+        made = Supervised(model=Watched(), loss=OneEach(), masker=Halves(), domains=ONE)
+    phases = made.phases(batch(), generator_of)
+    phase = next(phases)
+    assert phase.parts
+    assert [predictions() for predictions in kept] == [None]

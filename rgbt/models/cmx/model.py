@@ -114,7 +114,11 @@ class CMX(nn.Module):
         inputs: normalisation of the images.
     """
 
-    record = Record(views=("rgbt",), pretrained_parts=("backbone.",))
+    record = Record(
+        views=("rgbt",),
+        pretrained_parts=("backbone.",),
+        recomputed=("backbone.*block*.*", "backbone.FRMs.*", "backbone.FFMs.*"),
+    )
 
     def __init__(  # noqa: PLR0913 - each is a key of conf/model/*.yaml
         self,

@@ -164,6 +164,7 @@ class DeepLabV2(nn.Module):
             heads=heads,
             auxiliary=auxiliary,
             pretrained_parts=("backbone.",),
+            recomputed=("backbone.layer*.*",),
         )
 
     def forward(  # noqa: PLR0913 - what every network takes, and the head

@@ -59,6 +59,11 @@ class Mask2Former(nn.Module):
         stacks_passes=True,
         dense_logits=True,
         pretrained_parts=("backbone.",),
+        recomputed=(
+            "backbone.*_branch.layers.*.blocks.*",
+            "sem_seg_head.pixel_decoder.transformer.encoder.layers.*",
+            "sem_seg_head.predictor.transformer_*_layers.*",
+        ),
     )
 
     def __init__(  # noqa: PLR0913 - each is a key of conf/model/*.yaml
