@@ -53,7 +53,6 @@ class Numbered:
         logits = torch.arange(count, dtype=torch.float32).view(1, -1, 1, 1, 1)
         class_logits = logits.expand(2, count, B, Q, K + 1)
         mask_logits = class_logits[:, :num_masks, ..., None].contiguous()
-        self.mask_logits = weakref.ref(mask_logits)
         return Output(None, {"class_logits": class_logits, "mask_logits": mask_logits})
 
 
@@ -100,14 +99,6 @@ def test_masks_are_predicted_only_where_the_criterion_reads_them() -> None:
     list(crm.phases(batch(), generator_of))
     assert crm.model.call["num_predictions"] == 6
     assert crm.model.call["num_masks"] == 4
-
-
-def test_mask_logits_are_freed_before_the_backward_pass() -> None:
-    crm = scheme(Halves())
-    phases = crm.phases(batch(), generator_of)
-    phase = next(phases)
-    assert phase.parts
-    assert crm.model.mask_logits() is None
 
 
 def test_without_sdn_the_masked_single_modalities_are_not_predicted() -> None:
