@@ -19,10 +19,11 @@ def main(config: DictConfig) -> int:
     # torch is imported here, after --help
     from hydra.core.hydra_config import HydraConfig
 
+    from rgbt.config.command import words_of_run
     from rgbt.spec.naming import tags_from_environment
     from rgbt.spec.specify import specify
     from rgbt.tracking.terminal import info
-    from rgbt.training.pipeline import run_pipeline
+    from rgbt.training.start import start
 
     run = specify(config, list(HydraConfig.get().overrides.task))
     if run.pretrained is not None and not run.uses_pretrained:
@@ -30,8 +31,7 @@ def main(config: DictConfig) -> int:
             f"pretrained={run.pretrained} is ignored: the experiment {run.name} does not use "
             "ImageNet weights."
         )
-    run_pipeline(run, tags_from_environment())
-    return 0
+    return start(run, tags_from_environment(), words_of_run())
 
 
 if __name__ == "__main__":

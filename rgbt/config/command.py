@@ -14,16 +14,26 @@ from functools import wraps
 from typing import Any
 
 import hydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
+from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from rgbt.checks import InputError
 from rgbt.config.component import build
-from rgbt.config.compose import check_keys, compose, conf_dir, register_resolvers, searching
+from rgbt.config.compose import (
+    SEARCH_PATH,
+    check_keys,
+    compose,
+    conf_dir,
+    register_resolvers,
+    searching,
+)
 from rgbt.config.hydra_messages import check_words, hydra_sentence
 from rgbt.config.options import readable_paths
 from rgbt.config.plain_command import exit_code
+from rgbt.runtime.member import taking_part
 from rgbt.runtime.signals import answered
 
 Main = Callable[[DictConfig], int | None]
@@ -69,13 +79,23 @@ def command(*, sweeper: str = "basic") -> Callable[[Main], Callable[[], None]]:
                     job
                 )()
 
-            with answered(), searching(words):
+            with taking_part(), answered(), searching(words):
                 code = max([exit_code(run), *codes])
             sys.exit(code)
 
         return entry
 
     return decorate
+
+
+def words_of_run() -> list[str]:
+    """Arguments with which another process runs the same configuration as this job of Hydra."""
+    job = HydraConfig.get()
+    if job.mode != RunMode.MULTIRUN:
+        return sys.argv[1:]
+    # One point of a grid: its values, and where the files of the configuration are.
+    found = [word for word in job.overrides.hydra if word.startswith(f"{SEARCH_PATH}=")]
+    return [*found, *job.overrides.task]
 
 
 @contextmanager
