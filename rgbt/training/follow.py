@@ -1,7 +1,7 @@
-"""The processes beside process 0: they train and evaluate their part of each run, and write nothing
-into its folder.
+"""The processes beside process 0: they train and evaluate their part of each run.
 
-Every collective call here has its counterpart in `rgbt.training.members` or `rgbt.training.train`.
+They write nothing. Every collective call here has its counterpart in `rgbt.training.members` or
+`rgbt.training.train`.
 """
 
 from __future__ import annotations

@@ -26,6 +26,7 @@ from rgbt.runtime.group import SUPERVISOR
 from rgbt.runtime.member import LOST
 from rgbt.runtime.signals import WORDS
 
+COMMAND = ("-m", "rgbt.run")
 POLL_S = 0.05
 GRACE_S = 10.0
 """Time in which the other processes may end by themselves after one has ended, in seconds."""
@@ -82,7 +83,7 @@ def _start(
         preferred["GLOO_SOCKET_IFNAME"] = LOOPBACK
     with starting_alike():
         process = subprocess.Popen(
-            [sys.executable, "-m", "rgbt.run", *words],
+            [sys.executable, *COMMAND, *words],
             env={**preferred, **os.environ, **variables},
             stdin=subprocess.DEVNULL,
             stdout=output,
@@ -139,14 +140,15 @@ def _passing_signals(members: Sequence[_Member]) -> Iterator[None]:
     def forward(number: int, frame: FrameType | None) -> None:
         if not members:  # nothing has started
             handler = before[signal.Signals(number)]
-            assert callable(handler), "only handlers of Python are replaced"
+            if not callable(handler):
+                sys.exit(128 + number)
             handler(number, frame)
         elif members[0].process.returncode is None:
             members[0].process.send_signal(number)
 
     before = {number: signal.getsignal(number) for number in WORDS}
     for number, handler in before.items():
-        if callable(handler):  # not ignored (nohup)
+        if handler is not signal.SIG_IGN:  # nohup
             signal.signal(number, forward)
     try:
         yield
