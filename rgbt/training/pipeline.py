@@ -65,8 +65,7 @@ def run_pipeline(run: RunSpec, extra_tags: Mapping[str, str]) -> None:
     for spec in specs:
         with _naming(spec, run):
             for teacher in (each for each in spec.dependencies if each.key != WEIGHTS):
-                with alone():
-                    _predict_labels(spec, teacher)
+                _predict_labels(spec, teacher)
             if spec is run:
                 train(run, extra_tags)
             else:
@@ -113,6 +112,7 @@ def _train_upstream(spec: RunSpec, run: RunSpec) -> None:
                 raise
 
 
+@alone()
 def _predict_labels(spec: RunSpec, teacher: Dependency) -> None:
     """Predict the pseudo-labels of a run with the network of an upstream run."""
     name = teacher.key.split(".")[1]
