@@ -51,7 +51,7 @@ class Command:
 
     def __post_init__(self) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
-        self.log = self.folder / "log"
+        self.log = self.folder / f"log_{len(list(self.folder.glob('log_*')))}"
         with self.log.open("wb") as log:
             self.process = subprocess.Popen(
                 [sys.executable, *self.program, *self.words, f"runs_dir={self.folder}"],
@@ -302,10 +302,7 @@ def test_tasks_of_srun_train_the_same_run(data: Path, tmp_path: Path) -> None:
     tasks = []
     for rank in "01":
         environment = {**variables, "SLURM_PROCID": rank, "SLURM_LOCALID": rank}
-        # Both write into one folder of runs, and each into its own log.
-        command = Command(words, tmp_path, environment=environment)
-        command.log = command.log.rename(tmp_path / f"log_{rank}")
-        tasks.append(command)
+        tasks.append(Command(words, tmp_path, environment=environment))
     assert [task.wait() for task in tasks] == [0, 0], tasks[0].text + tasks[1].text
     assert "IoU by region" in tasks[0].text
     assert tasks[1].text == ""
