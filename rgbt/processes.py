@@ -10,18 +10,21 @@ mean over the processes is the loss of the batch. A divisor that depends on the 
 samples, divided by W (`mean_count`). Where a loss is not linear in its sums, the sums are those of
 all samples (`total`).
 
-With one process, every function returns its argument.
+With one process, every function returns its argument. Within `alone`, so does process 0.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, distributed
 
 Value = TypeVar("Value")
+
+_alone = False
 
 
 def num_processes() -> int:
@@ -115,8 +118,19 @@ def wait_for_all() -> None:
         distributed.barrier()
 
 
+@contextmanager
+def alone() -> Iterator[None]:
+    """Within it, this process works as if it were the only one, while the others wait."""
+    global _alone
+    before, _alone = _alone, True
+    try:
+        yield
+    finally:
+        _alone = before
+
+
 def _is_distributed() -> bool:
-    return distributed.is_available() and distributed.is_initialized()
+    return not _alone and distributed.is_available() and distributed.is_initialized()
 
 
 class _Total(torch.autograd.Function):

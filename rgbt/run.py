@@ -18,23 +18,23 @@ def main(config: DictConfig) -> int:
     """Train the upstream runs and the run, evaluate its checkpoint on the test split."""
     from hydra.core.hydra_config import HydraConfig
 
+    from rgbt.config.command import words_of_run
     from rgbt.spec.naming import tags_from_environment
     from rgbt.spec.request import note_request
     from rgbt.spec.specify import specify
-    from rgbt.training.show import report_pretrained, show_known
+    from rgbt.training.show import is_launched, report_pretrained, show_known
+    from rgbt.training.start import start
 
     overrides, tags = list(HydraConfig.get().overrides.task), tags_from_environment()
     if show_known(config, overrides, tags):
         return 0
-    # torch is imported here, after --help and after finished runs
-    from rgbt.training.pipeline import run_pipeline
-
+    # torch is imported from here on, after --help and after finished runs
     run = specify(config, overrides)
     report_pretrained(run.pretrained, run.uses_pretrained, run.name)
-    run_pipeline(run, tags)
-    if run.is_finished:
+    code = start(run, tags, words_of_run())
+    if run.is_finished and not is_launched():
         note_request(config, run)
-    return 0
+    return code
 
 
 if __name__ == "__main__":

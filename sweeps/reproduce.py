@@ -77,7 +77,11 @@ class Options:
     ] = None
     workers: Annotated[int, Help("number of runs at the same time")] = 1
     gpus: Annotated[
-        tuple[int, ...] | None, Help("GPUs to use: gpus=[0,1] assigns one GPU to each worker")
+        tuple[int | tuple[int, ...], ...] | None,
+        Help(
+            "GPUs to use: gpus=[0,1] assigns one GPU to each worker, gpus=[[0,1],[2,3]] two, for "
+            "runs with trainer.devices=auto"
+        ),
     ] = None
     retry: Annotated[
         Literal["none", "failed"],

@@ -66,6 +66,11 @@ class Objective:
         return self.metric.startswith("val/") and not self.is_consistency
 
 
+Gpu = Annotated[int, Interval(ge=0, le=1023)]
+
+GpuSlot = Gpu | Annotated[tuple[Gpu, ...], Len(1, 64)]
+"""The GPU that a worker uses, or several for runs with `trainer.devices`."""
+
 NumRuns = Annotated[int, Interval(ge=1, le=10**6)]
 
 
@@ -97,7 +102,7 @@ class SweepSettings:
 
     storage: Text | None
     workers: Annotated[int, Interval(ge=1, le=1024), doc("processes at the same time")]
-    gpus: Annotated[tuple[Annotated[int, Interval(ge=0, le=1023)], ...], Len(1, 1024)] | None
+    gpus: Annotated[tuple[GpuSlot, ...], Len(1, 1024)] | None
     executor: Literal["local", "submitit"]
     submitit: dict[str, Any] | None
     retries: Annotated[int, Interval(ge=0, le=1000)]

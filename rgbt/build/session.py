@@ -6,11 +6,14 @@ import hashlib
 import json
 import logging
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from lightning_fabric import Fabric
+from lightning_fabric.plugins.environments.lightning import LightningEnvironment
 from torch import nn
 
 from rgbt.build.contracts import check_dataset, is_own, watch_model
@@ -27,7 +30,9 @@ from rgbt.engine.network_settings import place
 from rgbt.engine.settings import TrainerSettings
 from rgbt.engine.threads import fix_threads
 from rgbt.metrics.metric import Regions
+from rgbt.processes import num_processes
 from rgbt.randomness import derive
+from rgbt.runtime.group import Group, group_from_environment
 from rgbt.spec.run_spec import RunSpec
 from rgbt.transforms.view_sets import ViewSets
 
@@ -120,13 +125,44 @@ def open_session(
 def open_fabric(trainer: TrainerSettings) -> Fabric:
     """Device and precision of a run.
 
+    One device, except in a process that trains a run together with others: then its own device.
+
     Raises:
         InputError: the machine has no such device, or it does not support the precision.
     """
+    group = group_from_environment() if num_processes() > 1 else None
+    if group is not None:
+        return connect(trainer, group)
+    with _refusing_device(trainer):
+        # Otherwise Fabric reads the variables of SLURM, also for a command that runs alone.
+        return Fabric(
+            accelerator=trainer.accelerator,
+            devices=1,
+            precision=trainer.precision,
+            plugins=[LightningEnvironment()],
+        )
+
+
+def connect(trainer: TrainerSettings, group: Group) -> Fabric:
+    """Device and precision of this process of a group, which is connected with the others.
+
+    Raises:
+        InputError: as `open_fabric`; the machine has fewer devices than processes.
+    """
+    from rgbt.engine.fabric import group_fabric  # not needed with one device
+
+    with _refusing_device(trainer):
+        return group_fabric(trainer, group)
+
+
+@contextmanager
+def _refusing_device(trainer: TrainerSettings) -> Iterator[None]:
     # Fabric sets itself to INFO when imported, and would say in a line what the configuration says.
     logging.getLogger("lightning_fabric").setLevel(logging.WARNING)
     try:
-        return Fabric(accelerator=trainer.accelerator, devices=1, precision=trainer.precision)
+        yield
+    except InputError:
+        raise
     except (RuntimeError, ValueError) as error:
         raise InputError(
             f"trainer.accelerator={trainer.accelerator} with "

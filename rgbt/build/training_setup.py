@@ -26,7 +26,9 @@ from rgbt.data.pseudo_labels import PseudoLabelled, Unlabelled
 from rgbt.dataset import LabelledDataset
 from rgbt.engine.network_settings import prepare_training
 from rgbt.engine.schedules import Schedule
+from rgbt.engine.settings import TrainerSettings
 from rgbt.engine.trainer import Scheme
+from rgbt.processes import num_processes
 from rgbt.randomness import derive
 from rgbt.requirements import record_of
 from rgbt.spec.run_spec import WEIGHTS, RunSpec, labels_key
@@ -123,6 +125,7 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
     masker: AnyMasker = spec.masker.build()
     loss = spec.loss.build()
     checked = CheckedLoss(loss) if is_own(loss) else loss
+    _share_batch_norm(session.model, session.trainer)
     prepare_training(session.model, session.trainer, session.fabric.device)
     model = session.fabric.setup_module(session.model)
     with torch.random.fork_rng(devices=[]):
@@ -243,6 +246,17 @@ def _check_labelled(session: Session, name: str, domain: Domain) -> None:
         )
 
 
+def _share_batch_norm(network: nn.Module, trainer: TrainerSettings) -> None:
+    """Let the processes of a run normalise their batch together, unless each has its own part."""
+    if num_processes() == 1:
+        return
+    from rgbt.engine.batch_norm import check_batch_norm_parts, synchronise_batch_norm
+
+    check_batch_norm_parts(trainer.batch_norm_parts, num_processes())
+    if trainer.batch_norm_parts == 1:
+        synchronise_batch_norm(network)
+
+
 def _networks_and_optimizers(
     session: Session, scheme: Any
 ) -> tuple[dict[str, nn.Module], dict[str, torch.optim.Optimizer]]:
@@ -252,6 +266,7 @@ def _networks_and_optimizers(
     parts, others = record.optimizers, record.networks
     built = {name: builder(session.model, without=without) for name, without in parts.items()}
     for name, module in others.items():
+        _share_batch_norm(module, session.trainer)
         built[name] = record.builders[name](module)
         others[name] = fabric.setup_module(module)
     wrapped: Any = {name: fabric.setup_optimizers(each) for name, each in built.items()}

@@ -14,17 +14,27 @@ from functools import wraps
 from typing import Any
 
 import hydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
+from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from rgbt.checks import InputError
 from rgbt.config.component import build
-from rgbt.config.compose import check_keys, compose, conf_dir, register_resolvers, searching
+from rgbt.config.compose import (
+    SEARCH_PATH,
+    check_keys,
+    compose,
+    conf_dir,
+    register_resolvers,
+    searching,
+)
 from rgbt.config.config_source import parsing_once
 from rgbt.config.hydra_messages import check_words, hydra_sentence
 from rgbt.config.options import readable_paths
 from rgbt.config.plain_command import exit_code
+from rgbt.runtime.member import taking_part
 from rgbt.runtime.signals import answered
 
 MULTIRUN = ("-m", "--multirun")
@@ -75,13 +85,23 @@ def command(*, sweeper: str = "basic") -> Callable[[Main], Callable[[], None]]:
                         version_base="1.3", config_path=str(conf_dir()), config_name="config"
                     )(job)()
 
-            with answered(), searching(words), parsing_once():
+            with taking_part(), answered(), searching(words):
                 code = max([exit_code(run), *codes])
             sys.exit(code)
 
         return entry
 
     return decorate
+
+
+def words_of_run() -> list[str]:
+    """Arguments with which another process runs the same configuration as this job of Hydra."""
+    job = HydraConfig.get()
+    if job.mode != RunMode.MULTIRUN:
+        return sys.argv[1:]
+    # One point of a grid: its values, and where the files of the configuration are.
+    found = [word for word in job.overrides.hydra if word.startswith(f"{SEARCH_PATH}=")]
+    return [*found, *job.overrides.task]
 
 
 @contextmanager

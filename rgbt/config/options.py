@@ -94,7 +94,9 @@ def _plain(key: str, text: str, annotation: Any) -> Any:
     if str in kinds or Path in kinds or text in kinds:
         return text
     for kind in kinds:
-        if typing.get_origin(kind) is tuple:
+        # An entry of a list may be one number or a list of them.
+        is_number = bool({int, float} & set(kinds)) and not text.startswith("[")
+        if typing.get_origin(kind) is tuple and not is_number:
             item = typing.get_args(kind)[0]
             return [_plain(key, each, item) for each in split_list(text, "values")]
     from hydra.core.override_parser.overrides_parser import OverridesParser

@@ -17,6 +17,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 from rgbt.checks import InputError, RunError, nearest, without_controls
 from rgbt.config.options import help_text, parse, readable_paths
+from rgbt.runtime.member import write_error
 from rgbt.runtime.resources import reporting_exhaustion
 from rgbt.runtime.signals import Stopped, answered
 
@@ -103,7 +104,7 @@ def say(sentence: str, code: int) -> int:
     with suppress(OSError):  # output may go to a file on a disk that is full
         sys.stdout.flush()
     # Names of files and words of damaged files may hold anything.
-    sys.stderr.write(f"rgbt: {without_controls(sentence)}\n")
+    write_error(without_controls(sentence))
     return code
 
 

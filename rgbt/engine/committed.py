@@ -98,6 +98,15 @@ class Checkpoints:
         self._publish(state.best_step)
         return payload, state
 
+    def committed(self) -> tuple[dict[str, Any], State]:
+        """What `load` returned in another process of this run, which repaired the files.
+
+        Raises:
+            InputError: this machine does not see the files.
+        """
+        payload = load_checkpoint(self.last)
+        return payload, State.of(payload)
+
     def load_best(self, step: int) -> dict[str, Any]:
         """The weights of the best step, by name.
 

@@ -18,9 +18,11 @@ from torch import Tensor, nn
 from rgbt.checks import InputError, RunError, not_finite
 from rgbt.engine.checkpoint import State, restore_optimizer, restore_weights, training_payload
 from rgbt.engine.committed import Checkpoints
+from rgbt.engine.gradients import average_gradients, check_gradients
 from rgbt.engine.progress import progress
 from rgbt.engine.schedules import Schedule
 from rgbt.engine.settings import TrainerSettings
+from rgbt.processes import collected, mean_count, num_processes
 from rgbt.randomness import torch_generator
 from rgbt.runtime.signals import Stopped, at_once, deferred
 from rgbt.types import Batch, GeneratorOf, Phase, TwoDomains
@@ -80,6 +82,7 @@ class Trainer:
         committed: called after an evaluation has been committed.
         after_step: called after every step, before its evaluation. A signal interrupts it, and the
             step is saved.
+        writes: whether this process writes the checkpoints; of several processes, process 0 does.
     """
 
     fabric: Fabric
@@ -95,9 +98,11 @@ class Trainer:
     validate: Validate
     committed: Callable[[], None] = lambda: None
     after_step: Callable[[], None] = lambda: None
+    writes: bool = True
 
     def __post_init__(self) -> None:
         self.checkpoints = Checkpoints(self.folder)
+        self._checked_phases: set[tuple[str, ...]] = set()
 
     def resume(self, state: State) -> bool:
         """Restore everything from the last checkpoint into `state`; False if there is none.
@@ -106,7 +111,7 @@ class Trainer:
             RunError: the checkpoints are damaged.
             InputError: they are of another configuration.
         """
-        loaded = self.checkpoints.load()
+        loaded = self.checkpoints.load() if self.writes else self.checkpoints.committed()
         if loaded is None:
             return False
         payload, stored = loaded
@@ -162,7 +167,10 @@ class Trainer:
         is_last = state.step == self.settings.max_steps
         due = is_last or state.step % self.settings.eval_every == 0
         due = due and state.evaluated_step < state.step
-        if due:
+        saves = due or state.step % self.settings.checkpoint_every == 0
+        if saves:
+            self._exchange(state)
+        if due and self.writes:
             check_weights({"model": self.model, **self.others}, state.step)
         try:
             with at_once():
@@ -170,10 +178,10 @@ class Trainer:
                 score = self.validate(state.step) if due else -math.inf
             if due:
                 if score > state.best_score or self.settings.tested == "last":
-                    self.checkpoints.save_best(state.step, self.model.state_dict())
+                    self._save_best(state.step)
                     state.best_score, state.best_step = score, state.step
                 state.evaluated_step = state.step
-            if due or state.step % self.settings.checkpoint_every == 0:
+            if saves:
                 self._save(state)
             if due:
                 with at_once():
@@ -184,7 +192,23 @@ class Trainer:
             stop.step = state.step
             raise
 
+    def _exchange(self, state: State) -> None:
+        """Collect in `state` what every process has by itself, before process 0 saves it."""
+        for names in collected(state.skipped):
+            state.skip(names)
+        if num_processes() > 1 and self.settings.batch_norm_parts > 1:
+            from rgbt.engine.batch_norm import share_running_statistics
+
+            for module in (self.model, *self.others.values()):
+                share_running_statistics(module)
+
+    def _save_best(self, step: int) -> None:
+        if self.writes:
+            self.checkpoints.save_best(step, self.model.state_dict())
+
     def _save(self, state: State) -> None:
+        if not self.writes:
+            return
         check_weights({"model": self.model, **self.others}, state.step)
         payload = training_payload(self.model, self.others, self.optimizers, state)
         self.checkpoints.commit(payload, state)
@@ -221,7 +245,7 @@ class Trainer:
         return {
             **values,
             **rates,
-            "images_per_s": sum(len(batch.name) for batch in micro) / elapsed,
+            "images_per_s": num_processes() * sum(len(batch.name) for batch in micro) / elapsed,
             WAIT_SHARE: waited / elapsed,
             "peak_memory_mib": peak,
         }
@@ -238,8 +262,12 @@ class Trainer:
         groups = [group["params"] for optimizer in stepped for group in optimizer.param_groups]
         # Once for all of them: what two optimisers share is clipped as one gradient.
         parameters = list({id(each): each for group in groups for each in group}.values())
-        norm = nn.utils.clip_grad_norm_(parameters, self.settings.clip_norm or math.inf)
         names = "+".join(phase.optimizers)
+        if phase.optimizers not in self._checked_phases:  # the first time, by all processes
+            check_gradients(parameters, names)
+            self._checked_phases.add(phase.optimizers)
+        average_gradients(parameters)
+        norm = nn.utils.clip_grad_norm_(parameters, self.settings.clip_norm or math.inf)
         key = "grad_norm" if len(self.optimizers) == 1 else f"grad_norm/{names}"
         logged[key] = _finite_values({"gradient norm": norm})["gradient norm"]
         for optimizer in stepped:
@@ -249,7 +277,7 @@ class Trainer:
     def _backward(self, phase: Phase) -> dict[str, float]:
         share = 1.0 / self.settings.accumulate
         total = torch.stack(list(phase.parts.values())).sum()
-        values = _finite_values(phase.parts)
+        values = _finite_values(phase.parts, mean_over_processes=True)
         self.fabric.backward(total * share)
         logged = {f"loss/{name}": value * share for name, value in values.items()}
         logged["loss"] = sum(values.values()) * share
@@ -288,10 +316,14 @@ def _add(values: dict[str, float], more: dict[str, float]) -> None:
         values[name] = values.get(name, 0.0) + value
 
 
-def _finite_values(parts: dict[str, Tensor]) -> dict[str, float]:
+def _finite_values(
+    parts: dict[str, Tensor], *, mean_over_processes: bool = False
+) -> dict[str, float]:
     # One transfer for all parts: reading them one by one would wait for the device each time.
-    numbers = torch.stack([part.detach().float() for part in parts.values()]).tolist()
-    values = dict(zip(parts, numbers, strict=True))
+    numbers = torch.stack([part.detach().float() for part in parts.values()])
+    # Checked after the mean, so that all processes raise the same error.
+    numbers = mean_count(numbers) if mean_over_processes else numbers
+    values = dict(zip(parts, numbers.tolist(), strict=True))
     for name, value in values.items():
         if not math.isfinite(value):
             raise RunError(f"{name} is {value}.")

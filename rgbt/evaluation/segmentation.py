@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from rgbt.metrics.absent import absent_notes
 from rgbt.metrics.confusion import RegionCounter
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Regions
+from rgbt.processes import collected, num_processes
 from rgbt.tracking.pictures import Legend, PanelExample
 from rgbt.tracking.tables import ClassTable, RegionTable, ResultTables
 from rgbt.tracking.terminal import result_view
@@ -29,6 +31,10 @@ from rgbt.types import View
 
 NUM_PANELS = 6
 """Images of the qualitative panel: the same number by day and by night if the split has both."""
+
+
+Counted = dict[str, NDArray[np.int64]]
+"""Name of an image -> its counts (R, K, K)."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +55,8 @@ class EvaluationResult:
 def evaluate(session: Session, model: nn.Module, request: EvaluationRequest) -> EvaluationResult:
     """Predict a split with `model`, left in evaluation mode, and count, with a progress bar.
 
+    Several processes of a run predict a part of the split each, and return the same result.
+
     Raises:
         InputError: a file cannot be read (data.on_error=raise), or none could be; the network
             has not the view or the head; a corruption that does not fit the images.
@@ -60,20 +68,42 @@ def evaluate(session: Session, model: nn.Module, request: EvaluationRequest) -> 
     decode_ahead(session, request.split)
     batches = eval_batches(dataset, request.split, session.transform, session.loading)
     counter = RegionCounter(len(dataset.classes), session.regions)
-    counted: dict[str, NDArray[np.int64]] = {}
+    counted: Counted = {}
     kept: list[PanelExample] = []
     with progress() as display:
         total = len(dataset.names(request.split))
         task = display.add_task(request.split, total=total, note="images")
+        done = 0
         for batch in batches:
             predicted = predictor.classes(batch.to(session.fabric.device)).cpu()
             for name, label, classes in zip(batch.name, batch.label, predicted, strict=True):
                 counted[name] = counter(label, classes)
                 is_kept = name in request.keep
                 kept += [_example(session, name, classes.numpy())] if is_kept else []
-            display.advance(task, len(batch.name))
+            done = min(total, done + num_processes() * len(batch.name))
+            display.update(task, completed=done)
+    counted, kept, skipped = _of_all_processes(
+        counted, kept, tuple(batches.skipped), dataset.names(request.split)
+    )
     counts = counts_of(session, request.split, counted, session.regions.name)
-    return EvaluationResult(counts, predictor.view, tuple(kept), tuple(batches.skipped))
+    return EvaluationResult(counts, predictor.view, tuple(kept), skipped)
+
+
+def _of_all_processes(
+    counted: Counted, kept: list[PanelExample], skipped: tuple[str, ...], names: Sequence[str]
+) -> tuple[Counted, list[PanelExample], tuple[str, ...]]:
+    """What all processes have counted, kept and skipped, in the order of `names`."""
+    if num_processes() == 1:
+        return counted, kept, skipped
+    parts = collected((counted, kept, skipped))
+    position = {name: index for index, name in enumerate(names)}
+    merged = {name: counts for part, _, _ in parts for name, counts in part.items()}
+    examples = [example for _, part, _ in parts for example in part]
+    return (
+        {name: merged[name] for name in sorted(merged, key=position.__getitem__)},
+        sorted(examples, key=lambda example: position[example.name]),
+        tuple(sorted((name for *_, part in parts for name in part), key=position.__getitem__)),
+    )
 
 
 def _example(session: Session, name: str, classes: NDArray[np.uint8]) -> PanelExample:

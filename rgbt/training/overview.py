@@ -11,6 +11,7 @@ from torch import nn
 from rgbt.build.load_run import TrainedNetwork
 from rgbt.build.session import Session
 from rgbt.build.training_setup import TrainingSetup
+from rgbt.processes import num_processes
 from rgbt.tracking.terminal import path_lines
 
 MILLION = 1e6
@@ -50,7 +51,10 @@ def device_line(session: Session) -> str:
     gpu = f" ({torch.cuda.get_device_name(device)})" if device.type == "cuda" else ""
     threads = torch.get_num_threads()
     plural = "" if threads == 1 else "s"
-    return f"{device}{gpu}, {threads} thread{plural}, {session.trainer.precision}"
+    name, each = f"{device}", ""
+    if num_processes() > 1:
+        name, each = f"{num_processes()} x {device.type}", " each"
+    return f"{name}{gpu}, {threads} thread{plural}{each}, {session.trainer.precision}"
 
 
 def network_line(session: Session) -> str:

@@ -20,9 +20,11 @@ from rgbt.data.pseudo_labels import MANIFEST
 from rgbt.evaluation.pseudo_labels import Labelling, write_pseudo_labels
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.files.atomic import is_held
+from rgbt.processes import alone
 from rgbt.spec.run_spec import WEIGHTS, Dependency, RunSpec
 from rgbt.tracking.other_code import other_code
 from rgbt.tracking.terminal import info, warn
+from rgbt.training.members import is_training_together
 from rgbt.training.train import train
 
 POLL_S = 1.0
@@ -58,7 +60,7 @@ def run_pipeline(run: RunSpec, extra_tags: Mapping[str, str]) -> None:
     has_labels = all(each is None or (each / MANIFEST).is_file() for each in labels)
     if not has_labels or not all(each.is_finished for each in run.upstream):
         for spec in specs:
-            with _naming(spec, run):
+            with _naming(spec, run), alone():
                 validate(spec)
     for spec in specs:
         with _naming(spec, run):
@@ -106,10 +108,11 @@ def _train_upstream(spec: RunSpec, run: RunSpec) -> None:
             train(spec)
         except InputError:
             # Another process may have started it since the look, and even finished it.
-            if not (spec.is_finished or is_held(spec.folder / "lock")):
+            if is_training_together() or not (spec.is_finished or is_held(spec.folder / "lock")):
                 raise
 
 
+@alone()
 def _predict_labels(spec: RunSpec, teacher: Dependency) -> None:
     """Predict the pseudo-labels of a run with the network of an upstream run."""
     name = teacher.key.split(".")[1]

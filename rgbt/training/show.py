@@ -62,7 +62,7 @@ def show_known(config: DictConfig, overrides: list[str], extra_tags: Mapping[str
     Returns:
         False: the run is not finished, or its key is not noted (`rgbt.spec.request`).
     """
-    if any(name in os.environ for name in LAUNCHED):
+    if is_launched():
         return False
     known = known_run(config, tuple(overrides))
     if known is None:
@@ -70,6 +70,11 @@ def show_known(config: DictConfig, overrides: list[str], extra_tags: Mapping[str
     report_pretrained(known.plain["pretrained"], known.request.uses_pretrained, known.name)
     show(_of_known(known, extra_tags))
     return True
+
+
+def is_launched() -> bool:
+    """Whether this process is one of several that were started for one run."""
+    return any(name in os.environ for name in LAUNCHED)
 
 
 def report_pretrained(pretrained: str | None, is_used: bool, name: str) -> None:

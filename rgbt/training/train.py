@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from omegaconf import OmegaConf
@@ -15,18 +14,17 @@ from torch import nn
 from rgbt.build.session import Session, names_key
 from rgbt.build.training_setup import TrainingSetup, set_up_training
 from rgbt.checks import InputError
-from rgbt.data.loaders import Batches
-from rgbt.data.pairs import PairedBatches
-from rgbt.engine.checkpoint import State, restore_weights
+from rgbt.engine.checkpoint import State
 from rgbt.engine.committed import Checkpoints
-from rgbt.engine.trainer import WAIT_SHARE, Loaded, Trainer
-from rgbt.evaluation.prediction import decode_ahead, view_of
+from rgbt.engine.trainer import WAIT_SHARE, Trainer
+from rgbt.evaluation.prediction import decode_ahead
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.evaluation.segmentation import evaluate, legend_of, panel_names, result_tables
 from rgbt.evaluation.temporal_consistency import consistency_table, consistency_values, count_pairs
 from rgbt.metrics import names, scores
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import file_name
+from rgbt.processes import agreed, alone
 from rgbt.runtime.signals import deferred
 from rgbt.spec.naming import describe
 from rgbt.spec.run_spec import RunSpec
@@ -44,6 +42,8 @@ from rgbt.tracking.run_folder import RunFolder
 from rgbt.tracking.tables import ConsistencyTable, without_nan
 from rgbt.tracking.terminal import info, warn
 from rgbt.tracking.tracker import Tracking
+from rgbt.training.common import fit, load_best, make_trainer, target_request
+from rgbt.training.members import training_together
 from rgbt.training.overview import announce_training
 from rgbt.training.show import finished_run, print_result, show
 
@@ -72,16 +72,24 @@ def train(spec: RunSpec, extra_tags: Mapping[str, str] | None = None) -> None:
         return
     description = describe(spec, extra_tags)
     tracking: Tracking = spec.tracking.build()
-    # Everything is built before the folder is made: a wrong value leaves nothing behind.
-    setup = set_up_training(spec)
-    announce_training(setup, description.name, spec.folder)
-    decode_ahead(setup.session, *setup.read_splits())
-    if spec.is_finished:
-        replace_finished(RunFolder(spec.folder), tracking)
-    folder = RunFolder(spec.folder)
-    with folder.lock():
-        Run(setup, folder, tracking, description).complete()
+    folder = _train_unfinished(spec, tracking, description)
     print_result(folder, tracking, spec.domains)
+
+
+def _train_unfinished(spec: RunSpec, tracking: Tracking, description: Description) -> RunFolder:
+    """Train a run, in all processes of the command, and return its folder."""
+    with training_together(spec) as start_others:
+        # Everything is built before the folder is made: a wrong value leaves nothing behind.
+        setup = set_up_training(spec)
+        announce_training(setup, description.name, spec.folder)
+        decode_ahead(setup.session, *setup.read_splits())
+        if spec.is_finished:
+            replace_finished(RunFolder(spec.folder), tracking)
+        folder = RunFolder(spec.folder)
+        with folder.lock():
+            start_others()
+            Run(setup, folder, tracking, description).complete()
+    return folder
 
 
 @dataclass(frozen=True)
@@ -102,12 +110,12 @@ class Run:
         try:
             self.tracking.start(self.folder, replace(self.description, tags=tags))
             state = self._train(session)
-            checkpoints = Checkpoints(self.folder.path)
-            best = checkpoints.load_best(state.best_step)
-            restore_weights(session.model, best, checkpoints.best)
-            pairs = self._consistency(session)
+            agreed(None)  # the other processes may read the best checkpoint
+            load_best(session, self.folder.path, state.best_step)
+            with alone():
+                pairs = self._consistency(session)
             self._test(session, state, pairs.get("test"))
-            checkpoints.tidy()
+            Checkpoints(self.folder.path).tidy()
             self.folder.finish(
                 {
                     "name": self.description.name,
@@ -166,16 +174,14 @@ class Run:
     def _train(self, session: Session) -> State:
         state = State(seed=session.spec.seed)
         trainer = self._trainer(session, state)
-        if trainer.resume(state):
+        if agreed(trainer.resume(state)):
             if trainer.checkpoints.warning:
                 info(trainer.checkpoints.warning)
             info(f"{self.description.name} resumes at step {state.step} ({self.folder.path}).")
         self.folder.begin_at(state.step)
         warn_of_steps(self.folder.path, state.step)
         self._truncate(state)
-        accumulate = session.trainer.accumulate
-        steps = range(state.step * accumulate, session.trainer.max_steps * accumulate)
-        trainer.fit(_noting_skipped(self.setup.batches(steps), state), state)
+        fit(trainer, self.setup, state)
         self._report_waiting(session)
         return state
 
@@ -229,17 +235,9 @@ class Run:
             state.skip(result.skipped)
             return values[names.MIOU]
 
-        per_epoch = self.setup.steps_per_epoch()
-        trainer = Trainer(
-            fabric=session.fabric,
-            settings=session.trainer,
-            scheme=self.setup.scheme,
-            model=self.setup.model,
-            others=self.setup.others,
-            optimizers=self.setup.optimizers,
-            schedule=self.setup.schedule,
-            steps_per_epoch=max(1, per_epoch // session.trainer.accumulate),
-            folder=self.folder.path,
+        trainer = make_trainer(
+            self.setup,
+            self.folder.path,
             record=lambda step, values: self.folder.append(step, "train", values),
             validate=validate,
             committed=self.tracking.update,
@@ -308,19 +306,11 @@ class Run:
 
         Its counts are written to `folder`.
         """
-        target = session.domains.target
-        if target is None or target.view in (None, view_of(session)):
+        request = target_request(session, split)
+        if request is None or request.view is None:
             return {}
-        request = EvaluationRequest(split=split, view=target.view)
         counts = evaluate(session, model, request).counts
-        counts.save(folder / counts_name(f"{split}_{target.view}"))
+        counts.save(folder / counts_name(f"{split}_{request.view}"))
         values = scores.summary(counts, session.regions.absent)
         kept = (names.MIOU, *(names.subset(part, names.MIOU) for part in (names.DAY, names.NIGHT)))
-        return {names.subset(target.view, name): values[name] for name in kept if name in values}
-
-
-def _noting_skipped(batches: Batches[Any] | PairedBatches, state: State) -> Iterator[Loaded]:
-    """The batches, with unreadable files noted in `state` before a checkpoint is written."""
-    for batch in batches:
-        state.skip(batches.skipped)
-        yield batch
+        return {names.subset(request.view, name): values[name] for name in kept if name in values}

@@ -23,7 +23,14 @@ from rgbt.metrics.names import CA, TC
 from rgbt.spec.naming import TAGS
 from sweeps import attributes as names
 from sweeps.settings import SweepSettings
-from sweeps.worker.executors import GPUS, Executor, Job, LocalExecutor, check_gpus
+from sweeps.worker.executors import (
+    GPUS,
+    Executor,
+    Job,
+    LocalExecutor,
+    check_gpus,
+    gpus_of,
+)
 from sweeps.worker.progress import ProgressView
 from sweeps.worker.run_store import RunStore
 from sweeps.worker.running_trial import RunningTrial, TrialError, TrialPruned, mean_scores
@@ -152,7 +159,8 @@ class Driver:
     ) -> Job:
         environment = {TAGS: json.dumps(dict(tags))}
         if self.settings.gpus:
-            environment[GPUS] = str(self.settings.gpus[slot % len(self.settings.gpus)])
+            gpus = gpus_of(self.settings.gpus[slot % len(self.settings.gpus)])
+            environment[GPUS] = ",".join(map(str, gpus))
         return self.executor.start(command, environment, log)
 
     def _advance(self, trial: RunningTrial) -> bool:

@@ -125,7 +125,12 @@ class LocalExecutor:
         return LocalJob(process)
 
 
-def check_gpus(gpus: tuple[int, ...] | None) -> None:
+def gpus_of(slot: int | tuple[int, ...]) -> tuple[int, ...]:
+    """The GPUs of one entry of `gpus`."""
+    return (slot,) if isinstance(slot, int) else slot
+
+
+def check_gpus(gpus: Sequence[int | tuple[int, ...]] | None) -> None:
     """Refuse numbers of GPUs that this machine does not have or that are hidden."""
     if gpus is None:
         return
@@ -136,12 +141,13 @@ def check_gpus(gpus: tuple[int, ...] | None) -> None:
         known = [str(number) for number in range(torch.cuda.device_count())]
     else:
         known = [word.strip() for word in shown.split(",") if word.strip()]
-    for number in gpus:
+    shown_slots = [slot if isinstance(slot, int) else list(slot) for slot in gpus]
+    for number in (each for slot in gpus for each in gpus_of(slot)):
         if str(number) not in known:
             here = "this machine" if shown is None else f"{GPUS}={shown}"
             found = f"the GPUs {', '.join(known)} only; choose" if known else "no GPU; omit"
             raise InputError(
-                f"gpus={list(gpus)}: there is no GPU {number}, {here} shows {found} "
+                f"gpus={shown_slots}: there is no GPU {number}, {here} shows {found} "
                 f"{'some of these' if known else 'gpus'}."
             )
 

@@ -23,6 +23,7 @@ class Options:
     dry_run: Annotated[bool, Help("show only")] = False
     blocks: Annotated[Literal["auto", "none"] | int, Help("drawn together")] = "auto"
     gpus: Annotated[tuple[int, ...] | None, Help("numbers")] = None
+    slots: Annotated[tuple[int | tuple[int, ...], ...] | None, Help("numbers")] = None
     extra: Annotated[dict[str, Any], Help("more")] = field(default_factory=dict)
 
 
@@ -44,6 +45,8 @@ class Options:
         ("gpus=[0,1]", (0, 1)),
         ("gpus=0,1", (0, 1)),
         ("gpus=null", None),
+        ("slots=[0,[1,2]]", (0, (1, 2))),
+        ("slots=[[0,1],[2]]", ((0, 1), (2,))),
         ("extra={a: 1}", {"a": 1}),
     ],
 )

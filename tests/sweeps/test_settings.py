@@ -42,7 +42,7 @@ def test_values_are_taken_as_their_types(composed: DictConfig) -> None:
         changed(
             composed,
             workers=3,
-            gpus=[0, 1],
+            gpus=[0, [1, 2]],
             hours=8,
             timeout_minutes=1.5,
             objectives=[{"metric": "test/Var", "direction": "minimize"}],
@@ -50,7 +50,7 @@ def test_values_are_taken_as_their_types(composed: DictConfig) -> None:
         )
     )
     assert settings.workers == 3
-    assert settings.gpus == (0, 1)
+    assert settings.gpus == (0, (1, 2))
     assert (settings.hours, settings.timeout_minutes) == (8.0, 1.5)
     assert settings.objectives == (Objective("test/Var", "minimize"),)
     assert settings.points == (("a=1", "b=[2,3]"), ("a=4",))
@@ -86,6 +86,7 @@ def objective(metric: str, **more: Any) -> dict[str, Any]:
         ({"hours": 0}, "hours' must be a number above 0 .*, or null, got 0"),
         ({"timeout_minutes": -2}, "timeout_minutes' must be a number above 0"),
         ({"gpus": []}, r"gpus' must be a list of 1 to 1024"),
+        ({"gpus": [[]]}, r"gpus'? ?.*must be"),
         ({"retry": "all"}, "hydra.sweeper.retry"),
         ({"executor": "ray"}, "hydra.sweeper.executor"),
         ({"submitit": {"cluster": "slurm"}}, "executor=submitit"),

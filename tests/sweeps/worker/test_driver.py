@@ -170,6 +170,12 @@ def test_driver_gives_processes_tags_and_gpu(tmp_path: Path) -> None:
     assert json.loads(environments[0][TAGS]) == {"rgbt.table/one": "row"}
 
 
+def test_driver_gives_processes_several_gpus(tmp_path: Path) -> None:
+    desk = list_desk(tmp_path, plans(2), workers=2, gpus=((0, 1), (2, 3))).run()
+    shown = [call.environment["CUDA_VISIBLE_DEVICES"] for call in desk.executor.calls]
+    assert shown == ["0,1", "2,3"]
+
+
 def together(desks: list[Desk]) -> None:
     """Run all drivers at the same time; what one raises is raised."""
     errors: list[BaseException] = []

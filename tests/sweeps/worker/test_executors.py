@@ -301,13 +301,15 @@ def test_preloaded_modules_exist_and_commands_are_not_among_them() -> None:
         ("", (0,), "there is no GPU 0, CUDA_VISIBLE_DEVICES= shows no GPU; omit gpus."),
         (None, (0, 99), "there is no GPU "),
         ("2,3", (3, 2), None),
+        ("2,3", ((3, 2),), None),
+        ("2,3", ((2, 3), (4,)), "gpus=[[2, 3], [4]]: there is no GPU 4"),
         ("2,3", None, None),
     ],
 )
 def test_check_gpus_refuses_hidden_ones(
     monkeypatch: pytest.MonkeyPatch,
     shown: str | None,
-    gpus: tuple[int, ...] | None,
+    gpus: tuple[int | tuple[int, ...], ...] | None,
     sentence: str | None,
 ) -> None:
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
