@@ -32,7 +32,7 @@ def compile_training(
     check_compiler(mode, device)
     # The graph recomputes what these functions keep per size, which costs little.
     warnings.filterwarnings("ignore", message=r"(?s).*lru_cache", category=UserWarning)
-    vars(network)["forward"] = Compiled(network, MODES[mode])
+    object.__setattr__(network, "forward", Compiled(network, MODES[mode]))
 
 
 class Compiled:

@@ -48,8 +48,7 @@ def recompute_activations(network: nn.Module) -> None:
                 f"{', '.join(list(modules)[1:4])}."
             )
         for name in names:
-            # Set through vars(), because a module takes no other attribute `forward`.
-            vars(modules[name])["forward"] = Recomputed(modules[name])
+            object.__setattr__(modules[name], "forward", Recomputed(modules[name]))
 
 
 class Recomputed:
