@@ -148,11 +148,15 @@ def deferred() -> Iterator[None]:
 def at_once() -> Iterator[None]:
     """Inside `deferred`: raise the signal that came, and others when they come.
 
+    A loop that comes here again after `Stopped` was raised did not get it: a library dropped it,
+    and it is raised once more.
+
     Raises:
         Stopped: a signal came.
     """
     before, _signals.is_deferred = _signals.is_deferred, False
     try:
+        _signals.is_raised = False
         _raise_noted()
         yield
     finally:
