@@ -58,6 +58,7 @@ class _Signals:
     number: int = 0
     is_raised: bool = False
     is_deferred: bool = False
+    was_raised: bool = False  # before the outermost `deferred` began
 
 
 _signals = _Signals()
@@ -133,6 +134,8 @@ def deferred() -> Iterator[None]:
     An error after it is taken for its consequence: processes that were started just now end.
     """
     before, _signals.is_deferred = _signals.is_deferred, True
+    if not before:
+        _signals.was_raised = _signals.is_raised
     try:
         yield
     except Exception:
@@ -156,7 +159,7 @@ def at_once() -> Iterator[None]:
     """
     before, _signals.is_deferred = _signals.is_deferred, False
     try:
-        _signals.is_raised = False
+        _signals.is_raised = _signals.was_raised
         _raise_noted()
         yield
     finally:
