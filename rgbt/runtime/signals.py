@@ -58,6 +58,7 @@ class _Signals:
     number: int = 0
     is_raised: bool = False
     is_deferred: bool = False
+    was_raised: bool = False  # before the outermost `deferred` began
 
 
 _signals = _Signals()
@@ -133,6 +134,8 @@ def deferred() -> Iterator[None]:
     An error after it is taken for its consequence: processes that were started just now end.
     """
     before, _signals.is_deferred = _signals.is_deferred, True
+    if not before:
+        _signals.was_raised = _signals.is_raised
     try:
         yield
     except Exception:
@@ -148,11 +151,15 @@ def deferred() -> Iterator[None]:
 def at_once() -> Iterator[None]:
     """Inside `deferred`: raise the signal that came, and others when they come.
 
+    A loop that comes here again after `Stopped` was raised did not get it: a library dropped it,
+    and it is raised once more.
+
     Raises:
         Stopped: a signal came.
     """
     before, _signals.is_deferred = _signals.is_deferred, False
     try:
+        _signals.is_raised = _signals.was_raised
         _raise_noted()
         yield
     finally:

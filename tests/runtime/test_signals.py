@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -304,3 +305,20 @@ def test_workers_of_a_fork_server_end_with_the_main_process(tmp_path: Path, end:
     while Path(f"/proc/{worker}").exists() and time.monotonic() < deadline:
         time.sleep(0.1)
     assert not Path(f"/proc/{worker}").exists()
+
+
+def test_signal_that_a_library_dropped_is_raised_by_the_next_block() -> None:
+    """C code that looks up an attribute may clear whatever the lookup raised."""
+    reached = []
+
+    def work() -> None:
+        with answered(), deferred():
+            with suppress(Stopped), at_once():
+                os.kill(os.getpid(), signal.SIGTERM)
+            reached.append("after the drop")
+            with at_once():
+                reached.append("inside the next block")
+
+    with pytest.raises(Stopped):
+        work()
+    assert reached == ["after the drop"]
