@@ -255,9 +255,8 @@ class Trainer:
         if phase.clear:
             for optimizer in self.optimizers.values():
                 optimizer.zero_grad()
-        logged = self._backward(phase)
-        for phases in others:
-            _add(logged, self._backward(next(phases)))
+        losses = [self._backward(phase)]
+        losses += [self._backward(next(phases)) for phases in others]
         stepped = [self.optimizers[name] for name in phase.optimizers]
         groups = [group["params"] for optimizer in stepped for group in optimizer.param_groups]
         # Once for all of them: what two optimisers share is clipped as one gradient.
@@ -268,17 +267,29 @@ class Trainer:
             self._checked_phases.add(phase.optimizers)
         average_gradients(parameters)
         norm = nn.utils.clip_grad_norm_(parameters, self.settings.clip_norm or math.inf)
+        # One transfer for all values: each one would wait for the device.
+        numbers = iter(torch.cat([*(values for _, values in losses), norm.reshape(1)]).tolist())
+        logged: dict[str, float] = {}
+        for parts, _ in losses:
+            values = _finite_values({name: next(numbers) for name in parts})
+            _add(logged, self._logged(values))
         key = "grad_norm" if len(self.optimizers) == 1 else f"grad_norm/{names}"
-        logged[key] = _finite_values({"gradient norm": norm})["gradient norm"]
+        logged[key] = _finite_values({"gradient norm": next(numbers)})["gradient norm"]
         for optimizer in stepped:
             optimizer.step()
         return logged
 
-    def _backward(self, phase: Phase) -> dict[str, float]:
+    def _backward(self, phase: Phase) -> tuple[tuple[str, ...], Tensor]:
+        """Backward through a phase; names and values of its parts, not read from the device yet."""
+        parts = list(phase.parts.values())
+        self.fabric.backward(torch.stack(parts).sum() * (1.0 / self.settings.accumulate))
+        values = torch.stack([part.detach().float() for part in parts])
+        # Checked after the mean, so that all processes raise the same error.
+        return tuple(phase.parts), mean_count(values)
+
+    def _logged(self, values: dict[str, float]) -> dict[str, float]:
+        """The share of one accumulated batch in the values of a step."""
         share = 1.0 / self.settings.accumulate
-        total = torch.stack(list(phase.parts.values())).sum()
-        values = _finite_values(phase.parts, mean_over_processes=True)
-        self.fabric.backward(total * share)
         logged = {f"loss/{name}": value * share for name, value in values.items()}
         logged["loss"] = sum(values.values()) * share
         return logged
@@ -316,14 +327,7 @@ def _add(values: dict[str, float], more: dict[str, float]) -> None:
         values[name] = values.get(name, 0.0) + value
 
 
-def _finite_values(
-    parts: dict[str, Tensor], *, mean_over_processes: bool = False
-) -> dict[str, float]:
-    # One transfer for all parts: reading them one by one would wait for the device each time.
-    numbers = torch.stack([part.detach().float() for part in parts.values()])
-    # Checked after the mean, so that all processes raise the same error.
-    numbers = mean_count(numbers) if mean_over_processes else numbers
-    values = dict(zip(parts, numbers.tolist(), strict=True))
+def _finite_values(values: dict[str, float]) -> dict[str, float]:
     for name, value in values.items():
         if not math.isfinite(value):
             raise RunError(f"{name} is {value}.")

@@ -53,13 +53,7 @@ class CrossEntropy:
         assert output.logits is not None, "the record requires scores"
         sizes = check_shape("logits", output.logits, "B K H W")
         check_shape("label", batch.label, "B H W", **{k: sizes[k] for k in "BHW"})
-        given = self.class_weights or (1.0,) * sizes["K"]
-        if len(given) != sizes["K"]:
-            raise InputError(
-                f"loss.class_weights has {len(given)} numbers, but the network has {sizes['K']} "
-                "classes; give one number per class."
-            )
-        weights = torch.tensor(given, device=output.logits.device)
+        weights = self._weights(sizes["K"], output.logits.device)
         logits = output.logits.float()
         if batch.confidence is None:
             total = F.cross_entropy(
@@ -71,7 +65,25 @@ class CrossEntropy:
                 logits, batch.label, weights, ignore_index=IGNORE, reduction="none"
             )
             total = (batch.confidence * costs).sum()
-        kept = batch.label[batch.label != IGNORE]
         # The smallest float only matters where nothing is labelled and the sum is 0.
-        normaliser = mean_count(weights[kept].sum()).clamp(min=torch.finfo(torch.float32).tiny)
+        normaliser = mean_count(_sum_of_weights(batch.label, weights))
+        normaliser = normaliser.clamp(min=torch.finfo(torch.float32).tiny)
         return {"cross_entropy": (total / normaliser).reshape(1)}
+
+    def _weights(self, num_classes: int, device: torch.device) -> Tensor | None:
+        if self.class_weights is None:
+            return None
+        if len(self.class_weights) != num_classes:
+            raise InputError(
+                f"loss.class_weights has {len(self.class_weights)} numbers, but the network has "
+                f"{num_classes} classes; give one number per class."
+            )
+        return torch.tensor(self.class_weights, device=device)
+
+
+def _sum_of_weights(label: Tensor, weights: Tensor | None) -> Tensor:
+    """() float32: the sum of the class weights of the labelled pixels, or their number."""
+    labelled = label != IGNORE
+    if weights is None:  # without a wait for the number of pixels, as a selection has
+        return labelled.sum().float()
+    return weights[label[labelled]].sum()
