@@ -70,7 +70,7 @@ class Warp:
         """
         height, width = self.image_hw
         rows, columns = height + height % 2, width + width % 2
-        first, last = self.rectangle.split(2, 1)
+        first, last = self.rectangle[:, :2], self.rectangle[:, 2:]
         grown = first + (last - first) * last.new_tensor([columns / width, rows / height])
         even = replace(self, rectangle=torch.cat([first, grown], 1), image_hw=(rows, columns))
         return even.resized((rows // 2, columns // 2))
