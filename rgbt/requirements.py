@@ -69,7 +69,7 @@ class Record:
         weighs_confidence: loss: whether it weighs pixels by the confidence of their labels.
         frames: loss and scheme: how many frames of a scene it takes, 1 or 2.
         reads_warped: loss of two frames: whether it reads the first prediction in the second frame.
-        compares_half: such a loss: whether that may be every second row and column.
+        compares_half: such a loss: whether it compares them at half the size too.
         num_domains: scheme and domains: 1 or 2.
         shows_views: scheme: whether a domain's view and head are passed on to the network.
         optimizers: scheme: names that its phases use -> beginnings of the names of the parameters

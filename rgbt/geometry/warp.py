@@ -61,7 +61,21 @@ class Warp:
             image_hw=image_hw,
         )
 
-    def bilinear(self, values: Tensor, levels: int | None = None, every: int = 1) -> Tensor:
+    def halved(self) -> Warp:
+        """The same view for frames whose pixels cover 2x2 pixels of these.
+
+        (`rgbt.geometry.halving`.)
+
+        At odd sizes, both frames end one row or column later, so that pixels keep their places.
+        """
+        height, width = self.image_hw
+        rows, columns = height + height % 2, width + width % 2
+        first, last = self.rectangle[:, :2], self.rectangle[:, 2:]
+        grown = first + (last - first) * last.new_tensor([columns / width, rows / height])
+        even = replace(self, rectangle=torch.cat([first, grown], 1), image_hw=(rows, columns))
+        return even.resized((rows // 2, columns // 2))
+
+    def bilinear(self, values: Tensor, levels: int | None = None) -> Tensor:
         """Interpolated `values` (B, C, H, W) float, 0 outside; differentiable in `values` once.
 
         Where a point falls on a pixel, that pixel's value comes back bit by bit.
@@ -70,15 +84,13 @@ class Warp:
             values: of the first frame.
             levels: 255 rounds to 8-bit levels after each interpolation, as images that are kept in
                 bytes, without a gradient.
-            every: n gives every n-th row and column of the second frame, the first one included.
 
         Returns:
-            (B, C, ceil(H / every), ceil(W / every)) of the type of `values`.
+            (B, C, H, W) of the type of `values`.
         """
         self._check(values, "B C H W")
         sampled = values.to(torch.promote_types(values.dtype, torch.float32))
-        *canvas, last = self._grids
-        for grid in (*canvas, last[:, ::every, ::every].contiguous()):
+        for grid in self._grids:
             sampled = sample(sampled, grid)
             sampled = sampled if levels is None else (sampled * levels).round() / levels
         return sampled.to(values.dtype)

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from rgbt.checks import InputError
+from rgbt.geometry.halving import halved_label, halved_mean
 from rgbt.losses.overlap import Form, con, con_acc, dice, single
 from rgbt.ranges import NonNegative
 from rgbt.requirements import Record, Requirement, record_of
@@ -86,8 +87,8 @@ class TemporalLoss:
             second: frame 2, of the same sizes.
             warped: (B, K, H, W) probabilities of frame 1, warped to frame 2; only where the record
                 says `reads_warped`. Whether a gradient goes through it is for the caller to decide.
-                Or (B, K, ceil(H / 2), ceil(W / 2)), every second row and column of that: frame 2
-                is compared at these pixels.
+                Or (B, K, ceil(H / 2), ceil(W / 2)): frame 2 is compared at half the size, by its
+                scores averaged over 2x2 pixels, and by the label on which these pixels agree.
             valid: (B, H, W) bool, pixels of frame 2 that frame 1 shows; others do not count in
                 "con" and "con_acc". Of the size of `warped`.
             generator: of the segmentation loss, frame 1 first.
@@ -113,12 +114,14 @@ class TemporalLoss:
         elif self.second != "none":
             if warped is None:
                 raise ValueError(f"warped: needed for the part {self.second}, got None.")
-            every = 1 if warped.shape[2:] == second.logits.shape[2:] else 2
-            p = single(second.logits[..., ::every, ::every]).softmax(1)
+            half = warped.shape[2:] != second.logits.shape[2:]
+            scores = single(second.logits)
+            p = (halved_mean(scores) if half else scores).softmax(1)
             if self.second == "con":
                 value = con(warped, p, valid, self.form)
             else:
-                label = second.batch.label[:, ::every, ::every]
+                label = second.batch.label
+                label = halved_label(label) if half else label
                 value = con_acc(warped, p, label.where(valid, IGNORE), self.form)
             parts[self.second] = self.beta * value
         return parts

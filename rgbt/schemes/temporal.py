@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
+from rgbt.geometry.halving import halved_all, halved_mean
 from rgbt.geometry.warp import Warp
 from rgbt.processes import own_draw
 from rgbt.requirements import Record, Requirement, record_of
@@ -60,8 +61,9 @@ class Temporal:
         view: draws virtual views and applies them.
         warps: "logits": scores are interpolated, then normalised; "probabilities": the reverse.
         detach: whether the first prediction is a fixed teacher of the second.
-        resolution: of the loss between the predictions: "full" compares every pixel of the second
-            frame, "half" every second row and column, which is faster. Paper and released: full.
+        resolution: of the loss between the predictions. "full" compares pixels. "half" is faster:
+            it averages the scores of both frames over 2x2 pixels and compares these means. A
+            mean counts where all of its pixels do. Paper and released: full.
     """
 
     model: nn.Module
@@ -99,16 +101,23 @@ class Temporal:
         angles = own_draw(lambda count: self.view.draw(count, generator), len(batch.name))
         warp = self.view.warp(angles, image_hw)
         first, second = self._frames(batch, self.view.batch(batch, warp), generator_of)
-        warped, every = None, 2 if self.resolution == "half" else 1
-        if self.reads_warped:  # class probabilities of the first frame, as the second sees them
-            scores = first.logits.detach() if self.detach else first.logits
-            if self.warps == "probabilities":
-                warped = warp.bilinear(scores.float().softmax(1), every=every)
-            else:
-                warped = warp.bilinear(scores.float(), every=every).softmax(1)
-        valid = self.view.valid(warp)[:, ::every, ::every]
+        valid = self.view.valid(warp)
+        if self.resolution == "half":
+            warp = warp.halved()
+            # At odd sizes, the last half pixel may show a point outside where its pixels do not.
+            valid = halved_all(valid) & self.view.valid(warp)
+        warped = self._warped(first.logits, warp) if self.reads_warped else None
         parts = self.loss(first, second, warped, valid, generator_of("loss"))
         yield Phase(("main",), parts)
+
+    def _warped(self, logits: Tensor, warp: Warp) -> Tensor:
+        """Class probabilities of the first frame, as the second sees them."""
+        scores = (logits.detach() if self.detach else logits).float()
+        if self.resolution == "half":
+            scores = halved_mean(scores)
+        if self.warps == "probabilities":
+            return warp.bilinear(scores.softmax(1))
+        return warp.bilinear(scores).softmax(1)
 
     def _frames(
         self, first: Batch, second: Batch, generator_of: GeneratorOf

@@ -151,21 +151,6 @@ def test_bilinear_of_random_homographies_is_grid_sample_with_repeated_borders(se
     torch.testing.assert_close(*gradients, atol=2e-3, rtol=0)
 
 
-@pytest.mark.parametrize("resampling", RESAMPLINGS)
-def test_every_second_row_and_column_is_that_of_all(resampling: Resampling) -> None:
-    views = random_views(2, 7)
-    warp = Warp(views, inner_rectangle(views, HW, "largest"), HW, resampling).resized((45, 60))
-    full, half = (random_values(2, 3, 45, 60).requires_grad_() for _ in range(2))
-    expected = warp.bilinear(full)[..., ::2, ::2]
-    found = warp.bilinear(half, every=2)
-    assert found.shape == (2, 3, 23, 30)
-    assert torch.equal(found, expected)
-    for each in (found, expected):
-        each.square().sum().backward()
-    torch.testing.assert_close(half.grad, full.grad)
-    assert torch.equal(warp.bilinear(full, 255, 2), warp.bilinear(full, 255)[..., ::2, ::2])
-
-
 def test_once_repeats_the_border_up_to_the_outline_and_twice_fades_it_out() -> None:
     ones, right = torch.ones(1, 1, 4, 6), shift(0.5, 0)
     once, twice = (Warp(right, whole((4, 6)), (4, 6), each) for each in RESAMPLINGS)

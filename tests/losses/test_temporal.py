@@ -12,6 +12,7 @@ from torch.nn import functional as F
 
 from rgbt.checks import InputError
 from rgbt.config.component import Component, build
+from rgbt.geometry.halving import halved_label
 from rgbt.losses.cross_entropy import CrossEntropy
 from rgbt.losses.overlap import con, con_acc, dice
 from rgbt.losses.temporal import TemporalLoss
@@ -105,16 +106,20 @@ def test_values(form: Any, frames: Any) -> None:
 
 
 @pytest.mark.parametrize("second", ["con", "con_acc"])
-def test_every_second_row_and_column_is_compared_where_so_many_are_given(
+def test_means_of_two_by_two_pixels_are_compared_where_so_many_are_given(
     second: Any, frames: Any
 ) -> None:
-    """Frames of 6 x 7: rows 0, 2, 4 and columns 0, 2, 4, 6."""
+    """Frames of 6 x 7: three rows and four columns, the last one of single pixels."""
     first, other, warped, valid = frames
     warped, valid = warped[..., ::2, ::2], valid[:, ::2, ::2]
     assert warped.shape[2:] == (3, 4)
+    other.batch.label[:, 2:] = 3
     parts = loss_of(second=second)(first, other, warped, valid, NOTHING)
-    p = other.logits.softmax(1)[..., ::2, ::2]
-    label = other.batch.label[:, ::2, ::2].masked_fill(~valid, 255)
+    p = F.avg_pool2d(other.logits, 2, ceil_mode=True).softmax(1)
+    label = halved_label(other.batch.label)
+    assert bool((label[:, 1:] == 3).all())
+    assert bool((label[:, 0] == 255).any())  # pixels that do not agree
+    label = label.masked_fill(~valid, 255)
     forms = {"con": lambda: con(warped, p, valid, "paper")}
     forms["con_acc"] = lambda: con_acc(warped, p, label, "paper")
     torch.testing.assert_close(parts[second], forms[second]())

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.geometry.camera import Camera
+from rgbt.geometry.halving import halved_all, halved_label, halved_mean
 from rgbt.geometry.warp import Warp
 from rgbt.losses.cross_entropy import CrossEntropy
 from rgbt.losses.temporal import TemporalLoss
@@ -70,16 +71,14 @@ class Recorded:
         return {str(number): part for number, part in enumerate(parts)}
 
 
-class Strided(Recorded):
-    """The same of every second row and column of the second frame."""
+class Halved(Recorded):
+    """The same of means over 2x2 pixels of the second frame."""
 
     def __call__(
         self, first: Frame, second: Frame, warped: Tensor, valid: Tensor, generator: Any
     ) -> dict[str, Tensor]:
-        label = second.batch.label[:, ::2, ::2]
-        half = Frame(
-            second.output, replace(second.batch, label=label), second.logits[..., ::2, ::2]
-        )
+        batch = replace(second.batch, label=halved_label(second.batch.label))
+        half = Frame(second.output, batch, halved_mean(second.logits))
         parts = super().__call__(first, half, warped, valid, generator)
         self.second = second
         return parts
@@ -237,19 +236,46 @@ def test_scores_or_probabilities_are_brought_into_the_second_frame(
         assert touched.tolist() == [False, False, True, True]
 
 
+@pytest.mark.parametrize("hw", [HW, (48, 61)])
 @pytest.mark.parametrize("warps", ["probabilities", "logits"])
-def test_half_resolution_is_every_second_row_and_column(warps: Any) -> None:
+def test_half_resolution_warps_the_scores_averaged_over_two_by_two_pixels(
+    warps: Any, hw: tuple[int, int]
+) -> None:
+    camera = Camera(fx=70.0, fy=70.0, cx=31.5, cy=23.5, height=hw[0], width=hw[1])
+    turned = view(mode="rotation", camera=camera)
     full, half = (
-        step(scheme(Net(nn.Identity()), loss=loss, view=view(mode="rotation"), warps=warps, **more))
-        for loss, more in ((Recorded(), {}), (Strided(), {"resolution": "half"}))
+        step(scheme(Net(nn.Identity()), loss=loss, view=turned, warps=warps, **more), batch(hw=hw))
+        for loss, more in ((Recorded(), {}), (Halved(), {"resolution": "half"}))
     )
-    assert half.warped.shape == (B, K, 24, 32)
-    assert torch.equal(half.warped, full.warped[..., ::2, ::2])
-    assert torch.equal(half.valid, full.valid[:, ::2, ::2])
-    assert not full.valid.all()
+    scores = halved_mean(full.first.logits)
+    warp = turned.warp(turned.draw(B, generator_of("virtual view")), hw).halved()
+    expected = (
+        warp.bilinear(scores.softmax(1))
+        if warps == "probabilities"
+        else warp.bilinear(scores).softmax(1)
+    )
+    assert half.warped.shape == (B, K, 24, -(-hw[1] // 2))
+    assert torch.equal(half.warped, expected)
+    counted = halved_all(full.valid)
+    assert torch.equal(half.valid[..., :-1], counted[..., :-1])
+    assert not bool((half.valid & ~counted).any())
+    assert not counted.all()
+    # It shows what the full map shows, up to the rounding of edges.
+    apart = (half.warped - halved_mean(full.warped)).abs().amax(1)[half.valid].detach()
+    assert float(apart.mean()) < 0.02
     # The second frame itself is whole.
     assert torch.equal(half.second.batch.rgb, full.second.batch.rgb)
     assert torch.equal(half.second.logits, full.second.logits)
+
+
+@pytest.mark.parametrize("warps", ["probabilities", "logits"])
+def test_half_resolution_of_frames_that_agree_is_agreement(warps: Any) -> None:
+    """A view of no turn: both frames are averaged in the same way."""
+    still = view(mode="rotation", yaw=(0.0, 0.0), pitch=(0.0, 0.0), roll=(0.0, 0.0))
+    net = Net(nn.Identity())
+    loss = step(scheme(net, loss=Halved(), view=still, warps=warps, resolution="half"))
+    assert bool(loss.valid.all())
+    torch.testing.assert_close(loss.warped, halved_mean(loss.second.logits).softmax(1))
 
 
 @pytest.mark.parametrize("second", ["con", "con_acc"])
