@@ -258,7 +258,7 @@ ENDINGS = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("ending", ENDINGS)
-@pytest.mark.parametrize("resumed_with", [1, 4])
+@pytest.mark.parametrize("resumed_with", [1, 2, 4])
 def test_killed_run_resumes_with_another_number(
     data: Path, straight: Path, tmp_path: Path, ending: str, resumed_with: int
 ) -> None:
