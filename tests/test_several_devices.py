@@ -132,6 +132,7 @@ def settings(data: Path, steps: int, *more: str) -> tuple[str, ...]:
     return (*SMALL, f"dataset.root={data}", *length, "optimizer.lr=1e-4", *more)
 
 
+@pytest.mark.slow
 def test_two_processes_train_as_one(
     call: Call, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
