@@ -68,8 +68,9 @@ def whole(part: Tensor) -> Tensor:
     """
     if num_processes() == 1:
         return part
-    parts = [torch.empty_like(part) for _ in range(num_processes())]
-    distributed.all_gather(parts, part.detach().contiguous())
+    sent = part.detach().contiguous()  # the parts received have its layout
+    parts = [torch.empty_like(sent) for _ in range(num_processes())]
+    distributed.all_gather(parts, sent)
     return torch.stack(parts, 1).flatten(0, 1)
 
 

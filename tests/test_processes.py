@@ -33,7 +33,7 @@ from tests.models.plain import generator
 from tests.processes import run_in_processes
 from tests.transforms.recipes import crm
 
-SIZES = pytest.mark.parametrize("size", [2, 4])
+SIZES = pytest.mark.parametrize("size", [2, pytest.param(4, marks=pytest.mark.slow)])
 B = 8
 CPU = torch.device("cpu")
 SPLITS = {"train": [f"{i:05d}D" for i in range(11)], "val": [f"{i:05d}N" for i in range(5)]}
@@ -52,6 +52,11 @@ def everything() -> dict[str, Any]:
 # ---- functions of rgbt.processes --------------------------------------------------------------
 
 
+def in_another_layout() -> Tensor:
+    maps = torch.arange(B * 12).view(B, 2, 3, 2)
+    return maps.contiguous(memory_format=torch.channels_last)
+
+
 def sharing() -> dict[str, Any]:
     rank, size = processes.rank(), processes.num_processes()
     entries = torch.arange(2 * B).view(B, 2)
@@ -66,6 +71,7 @@ def sharing() -> dict[str, Any]:
         "own_draw": processes.own_draw(lambda n: torch.arange(n), B // size),
         "whole": processes.whole(processes.own(entries)),
         "whole bool": processes.whole(processes.own(entries > 5)),
+        "whole of another layout": processes.whole(processes.own(in_another_layout())),
         "total": total.detach(),
         "total int": processes.total(torch.tensor(rank)),
         "gradient": part.grad,
@@ -85,6 +91,7 @@ def test_parts_and_wholes(size: int) -> None:
         assert found["own_draw"].tolist() == list(range(rank, B, size))
         assert torch.equal(found["whole"], entries)
         assert torch.equal(found["whole bool"], entries > 5)
+        assert torch.equal(found["whole of another layout"], in_another_layout())
         assert found["agreed"] == {"rank": 0}
         assert found["collected"] == [("of", other) for other in range(size)]
 

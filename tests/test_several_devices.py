@@ -132,6 +132,7 @@ def settings(data: Path, steps: int, *more: str) -> tuple[str, ...]:
     return (*SMALL, f"dataset.root={data}", *length, "optimizer.lr=1e-4", *more)
 
 
+@pytest.mark.slow
 def test_two_processes_train_as_one(
     call: Call, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -193,8 +194,18 @@ def test_processes_that_torchrun_started_must_fit_the_devices(
     assert call(main, *settings(data, 4), f"runs_dir={tmp_path}") == (2, "", "")
 
 
-EXPERIMENTS = ("grbm", "crm", "multi_head_night", "sh_adversarial")
-"""Losses of masks, three passes, two domains with two optimizers, and a discriminator."""
+EXPERIMENTS = {
+    "cmx": ("optimizer.lr=1e-5",),
+    "grbm": ("optimizer.lr=1e-6",),
+    "crm": ("optimizer.lr=1e-6",),
+    "multi_head_night": ("optimizer.lr=1e-5", "scale.critic_lr=1e-5", "model.weights=null"),
+    "sh_adversarial": ("optimizer.lr=1e-5", "scale.critic_lr=1e-5", "model.weights=null"),
+}
+"""Batch normalisation, losses of masks with three passes, two domains and a discriminator.
+
+With these rates a step changes the weights little, so that rounding is not amplified. Upstream
+runs take their own rates, and are left out.
+"""
 
 
 @pytest.mark.slow
@@ -203,19 +214,17 @@ def test_any_number_of_processes_trains_the_same_run(tmp_path: Path, experiment:
     words = (
         *(f"+experiment={experiment}", "+debug=smoke", "scale.batch_size=4", "scale.num_points=64"),
         *("trainer.max_steps=10", "trainer.eval_every=10", "data.num_workers=0", *ON_CPU),
-        *("scale.lr=1e-6", "scale.critic_lr=1e-6", "scale.crop_hw=[64,80]"),
-        *("scale.train_sizes=[64]", "scale.test_short_edge=64"),
+        *("scale.crop_hw=[64,80]", "scale.train_sizes=[64]", "scale.test_short_edge=64"),
+        *EXPERIMENTS[experiment],
     )
     folders = {}
     for number in (1, 2, 4):
         command = Command((*words, f"trainer.devices={number}"), tmp_path / str(number))
         assert command.wait() == 0, command.text
-        results = sorted(tmp_path.glob(f"{number}/*/result.json"))
-        folders[number] = {path.parent.name: path.parent for path in results}
+        folders[number] = only_run(tmp_path / str(number))
     for number in (2, 4):
-        assert folders[number].keys() == folders[1].keys()
-        for key, folder in folders[number].items():
-            assert_same_run(folder, folders[1][key])
+        assert folders[number].name == folders[1].name
+        assert_same_run(folders[number], folders[1])
 
 
 @pytest.fixture(scope="module")
@@ -258,7 +267,7 @@ ENDINGS = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("ending", ENDINGS)
-@pytest.mark.parametrize("resumed_with", [1, 4])
+@pytest.mark.parametrize("resumed_with", [1, 2, 4])
 def test_killed_run_resumes_with_another_number(
     data: Path, straight: Path, tmp_path: Path, ending: str, resumed_with: int
 ) -> None:

@@ -19,7 +19,7 @@ from rgbt.checks import InputError, RunError, nearest, without_controls
 from rgbt.config.options import help_text, parse, readable_paths
 from rgbt.runtime.member import write_error
 from rgbt.runtime.resources import reporting_exhaustion
-from rgbt.runtime.signals import Stopped, answered
+from rgbt.runtime.signals import Stopped, answered, ending_command, handled
 
 T = TypeVar("T")
 HELP = ("-h", "--help")
@@ -74,13 +74,14 @@ def exit_code(work: Callable[[], int | None], *, catch_interrupt: bool = True) -
         catch_interrupt: False inside a grid, where Ctrl-C ends all points and not only this one.
     """
     try:
-        with reporting_exhaustion():
+        with ending_command(), reporting_exhaustion():
             return work() or 0
     except (InputError, RunError) as error:
         return say(str(error), 2 if isinstance(error, InputError) else 1)
     except KeyboardInterrupt as stop:
         if not catch_interrupt:
             raise
+        handled()
         if isinstance(stop, Stopped):
             return say(str(stop), stop.code)
         # A second Ctrl-C.

@@ -2,9 +2,12 @@
 
 Ctrl-C and SIGHUP (a terminal that is closed) and SIGTERM (a cluster that takes its machine away)
 raise `Stopped`. Inside `deferred` they are only noted, so that no step and no file stays
-incomplete; inside `at_once` within it they are handled at once again. Python drops what is raised
-while it frees an object (``__del__``, a callback of a weak reference): `Stopped` is then raised
-again soon after.
+incomplete; inside `at_once` within it they are handled at once again.
+
+A raised `Stopped` may get lost. Python drops what is raised while it frees an object (``__del__``,
+a callback of a weak reference), C code may clear it, and a ``finally`` of a library that is left
+halfway may raise another error, which the library then handles. A timer therefore raises `Stopped`
+again until it is handled.
 """
 
 from __future__ import annotations
@@ -25,7 +28,10 @@ WORDS = {
 
 
 SOON = 0.05
-"""Seconds until a `Stopped` that Python dropped is raised again."""
+"""Seconds until a `Stopped` that Python reported as dropped is raised again."""
+
+AGAIN = 1.0
+"""Seconds between two checks whether a `Stopped` was dropped without a report."""
 
 
 class Stopped(KeyboardInterrupt):
@@ -53,12 +59,12 @@ class Stopped(KeyboardInterrupt):
 
 @dataclass
 class _Signals:
-    """The first signal that came (0: none), whether it was raised, whether it waits."""
+    """The first signal that came (0: none), whether it was raised, waits, or has been handled."""
 
     number: int = 0
     is_raised: bool = False
     is_deferred: bool = False
-    was_raised: bool = False  # before the outermost `deferred` began
+    is_handled: bool = False
 
 
 _signals = _Signals()
@@ -103,17 +109,21 @@ def answered() -> Iterator[None]:
 
 @contextmanager
 def _raised_again() -> Iterator[None]:
-    """Raise a `Stopped` that Python dropped again, by a timer: no thread may start just there."""
+    """Raise a `Stopped` that was dropped again, by a timer: no thread may start just there."""
 
     def note(dropped: sys.UnraisableHookArgs) -> None:
         if isinstance(dropped.exc_value, Stopped):
             _signals.is_raised = False
-            signal.setitimer(signal.ITIMER_REAL, SOON)
+            signal.setitimer(signal.ITIMER_REAL, SOON, AGAIN)
         else:
             hook(dropped)
 
     def again(number: int, frame: FrameType | None) -> None:
         del number, frame
+        if _signals.is_handled:
+            return
+        if _signals.is_raised and not _is_being_handled():
+            _signals.is_raised = False
         if not _signals.is_deferred:
             _raise_noted()
 
@@ -127,6 +137,33 @@ def _raised_again() -> Iterator[None]:
         signal.signal(signal.SIGALRM, alarm)
 
 
+def _is_being_handled() -> bool:
+    """Whether an ``except``, a ``finally`` or an ``__exit__`` runs because of `Stopped`."""
+    error = sys.exception()
+    while error is not None and not isinstance(error, Stopped):
+        error = error.__context__
+    return error is not None
+
+
+@contextmanager
+def ending_command() -> Iterator[None]:
+    """Turn any error after `Stopped` was raised into `Stopped`, which the caller handles.
+
+    A library that is left halfway may raise an error of its own.
+    """
+    try:
+        yield
+    except Exception as error:
+        if _signals.is_raised:
+            raise Stopped(_signals.number) from error
+        raise
+
+
+def handled() -> None:
+    """Do not raise the signal again: the command ends because of it."""
+    _signals.is_handled = True
+
+
 @contextmanager
 def deferred() -> Iterator[None]:
     """Note signals; the one that came is raised on leaving, or by `at_once`.
@@ -134,8 +171,6 @@ def deferred() -> Iterator[None]:
     An error after it is taken for its consequence: processes that were started just now end.
     """
     before, _signals.is_deferred = _signals.is_deferred, True
-    if not before:
-        _signals.was_raised = _signals.is_raised
     try:
         yield
     except Exception:
@@ -151,15 +186,11 @@ def deferred() -> Iterator[None]:
 def at_once() -> Iterator[None]:
     """Inside `deferred`: raise the signal that came, and others when they come.
 
-    A loop that comes here again after `Stopped` was raised did not get it: a library dropped it,
-    and it is raised once more.
-
     Raises:
         Stopped: a signal came.
     """
     before, _signals.is_deferred = _signals.is_deferred, False
     try:
-        _signals.is_raised = _signals.was_raised
         _raise_noted()
         yield
     finally:
@@ -169,6 +200,7 @@ def at_once() -> Iterator[None]:
 def _raise_noted() -> None:
     if _signals.number and not _signals.is_raised:
         _signals.is_raised = True
+        signal.setitimer(signal.ITIMER_REAL, AGAIN, AGAIN)
         raise Stopped(_signals.number)
 
 

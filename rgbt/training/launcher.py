@@ -103,9 +103,12 @@ def _outcome(members: Sequence[_Member]) -> int:
     deadline = time.monotonic() + GRACE_S
     while first.code is None and time.monotonic() < deadline:
         time.sleep(POLL_S)
-    if first.code == 0:
+    if first.code in (0, LOST):  # with LOST, the one that caused it may still be ending
         while any(member.code is None for member in members) and time.monotonic() < deadline:
+            if any(member.code not in (None, 0, LOST) for member in others):
+                break
             time.sleep(POLL_S)
+    if first.code == 0:
         return 0
     if first.code not in (None, LOST):
         return _reported(first, len(members))

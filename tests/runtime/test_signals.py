@@ -18,6 +18,7 @@ from rgbt.config.plain_command import PlainCommand
 from rgbt.data.reader import start_worker
 from rgbt.engine.checkpoint import State
 from rgbt.engine.trainer import Trainer
+from rgbt.runtime import signals
 from rgbt.runtime.signals import Stopped, answered, at_once, deferred
 from rgbt.types import Batch
 from tests.commands import Call, NoOptions, assert_one_sentence
@@ -307,14 +308,29 @@ def test_workers_of_a_fork_server_end_with_the_main_process(tmp_path: Path, end:
     assert not Path(f"/proc/{worker}").exists()
 
 
-def test_signal_that_a_library_dropped_is_raised_by_the_next_block() -> None:
-    """C code that looks up an attribute may clear whatever the lookup raised."""
+@pytest.fixture
+def soon_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(signals, "AGAIN", 0.05)
+
+
+@pytest.mark.usefixtures("soon_again")
+def test_signal_that_a_library_dropped_is_raised_again() -> None:
+    """C code may clear an error, for example of an attribute that it looks up."""
+    with suppress(Stopped):
+        send(signal.SIGTERM)
+    with pytest.raises(Stopped):
+        time.sleep(5)
+
+
+@pytest.mark.usefixtures("soon_again")
+def test_signal_that_a_library_dropped_waits_until_the_step_is_complete() -> None:
     reached = []
 
     def work() -> None:
-        with answered(), deferred():
+        with deferred():
             with suppress(Stopped), at_once():
-                os.kill(os.getpid(), signal.SIGTERM)
+                send(signal.SIGTERM)
+            time.sleep(0.2)
             reached.append("after the drop")
             with at_once():
                 reached.append("inside the next block")
@@ -322,3 +338,38 @@ def test_signal_that_a_library_dropped_is_raised_by_the_next_block() -> None:
     with pytest.raises(Stopped):
         work()
     assert reached == ["after the drop"]
+
+
+@pytest.mark.usefixtures("soon_again")
+def test_signal_does_not_interrupt_what_is_done_because_of_it() -> None:
+    cleaned = []
+
+    def work() -> None:
+        try:
+            send(signal.SIGTERM)
+        except KeyboardInterrupt:
+            with suppress(ValueError):
+                int("nothing")
+            time.sleep(0.2)
+            cleaned.append(True)
+            raise
+
+    with pytest.raises(Stopped):
+        work()
+    assert cleaned == [True]
+
+
+def test_an_error_of_a_library_that_a_signal_left_halfway_is_its_consequence(call: Call) -> None:
+    """As where a ``finally`` needs what was not complete yet."""
+
+    def main(options: NoOptions, overrides: list[str]) -> int:
+        del options, overrides
+        half: list[str] = []
+        try:
+            send(signal.SIGTERM)
+        finally:
+            half.pop()
+
+    found, _, err = call(PlainCommand(NoOptions, main))
+    assert found == 143
+    assert_one_sentence(err, "stopped by SIGTERM; rerun the command to resume.")

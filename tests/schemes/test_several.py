@@ -10,6 +10,7 @@ import torch
 from tests.processes import run_in_processes
 from tests.schemes.several import CASES, SLOW, Values, run_cases, ten_steps
 
+NUMBERS = pytest.mark.parametrize("num_processes", [2, pytest.param(4, marks=pytest.mark.slow)])
 TOLERANCE = 1e-5
 """Of float32 sums in another order, relative to the largest value of a kind."""
 
@@ -47,7 +48,7 @@ def assert_same(found: Values, expected: Values) -> None:
         assert not apart.numel() or apart.max() <= TOLERANCE * largest[kind(name)], name
 
 
-@pytest.mark.parametrize("num_processes", [2, 4])
+@NUMBERS
 @pytest.mark.parametrize("name", CASES)
 def test_processes_compute_the_step_of_one(name: str, num_processes: int) -> None:
     expected = alone()[0][name]
@@ -68,7 +69,7 @@ def test_processes_compute_the_step_of_one_with_other_networks(name: str) -> Non
         assert_same(found[name], run_cases((name,))[name])
 
 
-@pytest.mark.parametrize("num_processes", [2, 4])
+@NUMBERS
 def test_ten_steps_of_crm_have_the_losses_of_one_process(num_processes: int) -> None:
     expected = torch.tensor(alone()[1])
     for _, losses in together(num_processes):
