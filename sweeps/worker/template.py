@@ -17,6 +17,7 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any, NoReturn
 
 UNKNOWN = 255
@@ -81,7 +82,7 @@ class Template:
         try:
             self._connection.send((work, tuple(arguments), tuple(modules)))
             answer = self._connection.recv()
-        except EOFError as error:
+        except (EOFError, ConnectionError) as error:
             raise OSError("the process that starts runs has ended") from error
         if isinstance(answer, OSError):
             raise answer
@@ -103,11 +104,16 @@ class Template:
 
 
 def _exists(pid: int) -> bool:
+    """Whether a process runs; one that ended may remain where nobody collects its exit code."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
         return False
-    return True
+    try:
+        status = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
+    except OSError:  # no such folder on this system, or the process has just ended
+        return not Path("/proc/self").exists()
+    return status.rpartition(")")[2].split()[0] != "Z"
 
 
 def _serve(
