@@ -114,8 +114,9 @@ def test_fewer_predictions_equal_the_first_of_all(predictions: int, with_masks: 
         assert torch.equal(fewer[name], every[name][:, :number])
     expected = gradients(net, loss(every))
     found = gradients(net, loss(fewer))
-    for name, gradient in found.items():
-        torch.testing.assert_close(gradient, expected[name], rtol=1e-5, atol=1e-5)
+    for name, gradient in found.items():  # sums of other rows are rounded in another order
+        tolerance = 1e-5 * float(expected[name].abs().max()) + 1e-5
+        torch.testing.assert_close(gradient, expected[name], rtol=1e-5, atol=tolerance)
 
 
 def test_the_finest_features_of_predictions_without_masks_need_no_gradient() -> None:
