@@ -113,12 +113,6 @@ def collected(value: Value) -> list[Value]:
     return values
 
 
-def wait_for_all() -> None:
-    """Return when every process has reached this call."""
-    if num_processes() > 1:
-        distributed.barrier()
-
-
 @contextmanager
 def alone() -> Iterator[None]:
     """Within it, this process works as if it were the only one, while the others wait."""

@@ -20,6 +20,7 @@ import pytest
 from hydra._internal.hydra import Hydra
 
 from rgbt.randomness import numpy_generator
+from rgbt.runtime.signals import WORDS
 from tests.commands import SPLITS, Call, Trained, only_run, without_pictures, words_of
 
 WriteMFNet = Callable[..., Path]
@@ -42,6 +43,14 @@ def composed_once() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Hydra, "get_mode", get_mode)
         yield
+
+
+@pytest.fixture(autouse=True)
+def same_signal_handlers() -> Iterator[None]:
+    """No command leaves a signal ignored, which later tests' processes would inherit."""
+    before = {number: signal.getsignal(number) for number in WORDS}
+    yield
+    assert {number: signal.getsignal(number) for number in WORDS} == before
 
 
 def pair(name: str, hw: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import Tensor, distributed, nn
 
 from rgbt import processes
 from rgbt.checks import InputError
@@ -64,7 +64,6 @@ def sharing() -> dict[str, Any]:
     total = processes.total(part)
     # Each process has a loss of its own in the sum: (rank + 1) * total^2.
     ((rank + 1) * total.square()).sum().backward()
-    processes.wait_for_all()
     return {
         "rank": (rank, size),
         "own": (processes.own(entries), processes.own(entries, 1)),
@@ -350,7 +349,7 @@ def test_batch_that_processes_cannot_share_is_refused() -> None:
 def failing() -> None:
     if processes.rank() == 1:
         raise ValueError("one of them")
-    processes.wait_for_all()
+    distributed.barrier()
 
 
 def test_a_process_that_fails_ends_all_with_its_traceback() -> None:

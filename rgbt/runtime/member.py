@@ -62,8 +62,7 @@ def taking_part() -> Iterator[None]:
 
 @contextmanager
 def _quiet(group: Group) -> Iterator[None]:
-    for number in WORDS:
-        signal.signal(number, signal.SIG_IGN)
+    handlers = {number: signal.signal(number, signal.SIG_IGN) for number in WORDS}
     streams = sys.stdout, sys.stderr
     _Output.errors, _Output.prefix = sys.stderr, f"{group.title}: "
     # Before the processes are connected, they fail alike: one message of a machine is enough.
@@ -77,6 +76,8 @@ def _quiet(group: Group) -> Iterator[None]:
             # Python writes an exception that nobody handles after this.
             sys.stdout, sys.stderr = streams
             _Output.errors, _Output.prefix, _Output.is_silent = None, "", False
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
 
 
 def report_errors() -> None:

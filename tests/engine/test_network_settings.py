@@ -122,8 +122,11 @@ def test_recomputed_modules_are_plain_in_evaluation(monkeypatch: pytest.MonkeyPa
     prepare_training(net, settings(activation_checkpointing=True), CPU)
     monkeypatch.setattr("rgbt.engine.recomputation.checkpoint", None)
     net(*images(1)).logits.sum().backward()
+    net.train()
     with torch.no_grad():
-        net.train()(*images(1))
+        net(*images(1))
+    with pytest.raises(TypeError):  # None is not callable: here modules are recomputed
+        net(*images(1))
 
 
 class Own(nn.Module):
