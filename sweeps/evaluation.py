@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from typing import Literal
 
@@ -24,6 +25,8 @@ class ExtraEvaluation:
         corruption: of the images, NAME or NAME:IMAGE with a file of ``conf/corruption``; None:
             clean, as the evaluation that the run makes itself.
         severity: of the corruption; None: the only one that it has.
+        world: name of the images where they are not the run's own, e.g. "O-N+"; "" where they are.
+        dataset: overrides of the data set that make this world.
     """
 
     modality: str = "default"
@@ -32,6 +35,8 @@ class ExtraEvaluation:
     head: Head = "as trained"
     corruption: str | None = None
     severity: float | None = None
+    world: str = ""
+    dataset: tuple[str, ...] = ()
 
     @property
     def label(self) -> str:
@@ -42,7 +47,8 @@ class ExtraEvaluation:
         if self.frames is not None:
             return f"consistency, {self.frames}"
         head = [] if self.head == "as trained" else [f"{self.head} head"]
-        return ", ".join([self.modality, self.regions, *head, *self._corrupted])
+        world = [f"world {self.world}"] if self.world else []
+        return ", ".join([self.modality, self.regions, *head, *self._corrupted, *world])
 
     @property
     def command(self) -> tuple[str, ...]:
@@ -56,7 +62,7 @@ class ExtraEvaluation:
         words += [] if self.head == "as trained" else [f"head={self.head}"]
         words += [] if self.corruption is None else [f"corruption={self.corruption}"]
         words += [] if self.severity is None else [f"severity={self.severity:g}"]
-        return ("rgbt.evaluate", *words)
+        return ("rgbt.evaluate", *words, *self.dataset)
 
     @property
     def path(self) -> str:
@@ -65,7 +71,10 @@ class ExtraEvaluation:
             return file_name(self.frames, "test")
         head = [] if self.head == "as trained" else [f"{self.head}-head"]
         regions = self.regions.replace(" ", "-")
-        name = "_".join(["table", self.modality, regions, *head, *self._corrupted])
+        # By the overrides and not by the name, whose overrides may change.
+        digest = hashlib.sha256("\n".join(self.dataset).encode()).hexdigest()[:8]
+        world = [f"world-{digest}"] if self.dataset else []
+        name = "_".join(["table", self.modality, regions, *head, *self._corrupted, *world])
         return f"evaluations/{name}.npz"
 
     @property

@@ -94,7 +94,11 @@ def _evaluations(request: TableRequest, outcomes: Sequence[Outcome]) -> list[str
     commands = [
         shlex.join(evaluation.command).replace("rgbt.", "rgbt ", 1)
         for evaluation in request.evaluations()
+        if not evaluation.world
     ]
+    worlds = {each.world: None for each in request.evaluations() if each.world}
+    if worlds:
+        commands.append(f"rgbt evaluate in {len(worlds)} worlds ({', '.join(worlds)})")
     if not outcomes or not commands:
         return []
     shown = "; ".join(dict.fromkeys(commands))

@@ -12,6 +12,8 @@ from rgbt.files.atomic import write_atomic
 from rgbt.tracking.tables import TextTable
 from rgbt.tracking.terminal import info, line_width, path_lines, print_rich, rich_table
 from sweeps.rendering.claims import claims_csv, claims_grid, claims_markdown, counted
+from sweeps.rendering.effects import effects_csv, effects_grids
+from sweeps.rendering.effects_figure import draw_effects
 from sweeps.rendering.figure import draw_table
 from sweeps.rendering.file_formats import latex, markdown, tidy_csv
 from sweeps.rendering.rendered_table import RenderedTable, render_table
@@ -21,6 +23,8 @@ from sweeps.table.cells import NO_VALUE, CellRun
 from sweeps.table.efficiency import efficiency_cells
 from sweeps.table.request import TableRequest
 from sweeps.table.scoring import ScoredTable, score, size_marks
+from sweeps.table.table import Table
+from sweeps.verdicts.effects import DesignEffects, DesignJudge
 from sweeps.verdicts.forms import forms_grid
 from sweeps.verdicts.judge import CellRunId, JudgedClaim, TableJudge
 from sweeps.worker.point_list import other_code_line
@@ -37,10 +41,12 @@ class Findings:
     Attributes:
         claims: judged.
         forms: differences of the forms as text; None where one form was run.
+        effects: of the factors of its design; None where it has none.
     """
 
     claims: Sequence[JudgedClaim] = ()
     forms: TextTable | None = None
+    effects: DesignEffects | None = None
 
 
 def publish_table(
@@ -71,12 +77,19 @@ def publish_table(
         form=request.form,
         marks=judge.marks(runs) | size_marks(request.table, sizes),
     )
-    findings = Findings(claims=judge.claims(runs), forms=forms_grid(judge, runs))
+    has_design = request.table.design is not None
+    findings = Findings(
+        claims=judge.claims(runs),
+        forms=forms_grid(judge, runs),
+        effects=DesignJudge(request.table).effects(runs) if has_design else None,
+    )
     rendered = render_table(scored, request.typed_overrides())
     rendered = replace(rendered, remarks=(*rendered.remarks, *_not_trained(request)))
     print_rich(terminal(rendered, plain=not sys.stdout.isatty(), width=line_width()))
     if findings.forms is not None:
         print_rich(rich_table(findings.forms))
+    for grid in _effects_of(findings, request.table):
+        print_rich(rich_table(grid))
     if findings.claims:
         print_rich(rich_table(claims_grid(findings.claims, counted(findings.claims))))
     failed = _report_missing(scored, outcomes)
@@ -97,7 +110,7 @@ def publish_table(
             "rgbt.form": request.form,
             "rgbt.seeds": ", ".join(map(str, scored.seeds)),
         },
-        note=_whole_markdown(rendered, findings),
+        note=_whole_markdown(request.table, rendered, findings),
     )
     links = [("files", f"{out}/ ({', '.join(path.name for path in files)})"), *links]
     print_rich(path_lines(links))
@@ -120,22 +133,34 @@ def write_files(
     """Write the table in every format, its claims, and its figure if there is one to draw."""
     out.mkdir(parents=True, exist_ok=True)
     texts = {
-        "table.md": _whole_markdown(rendered, findings),
+        "table.md": _whole_markdown(scored.table, rendered, findings),
         "table.csv": tidy_csv(scored),
         "table.tex": latex(rendered),
     }
     if findings.claims:
         texts["claims.csv"] = claims_csv(findings.claims)
+    if findings.effects is not None:
+        texts["effects.csv"] = effects_csv(findings.effects.lines)
     for name, text in texts.items():
         write_atomic(out / name, text.encode())
     figure = out / "figure.png"
-    drawn = draw_table(scored, figure)
+    if findings.effects is None:
+        drawn = draw_table(scored, figure)
+    else:
+        drawn = draw_effects(findings.effects, scored.name, figure)
     return [*(out / name for name in texts), *([figure] if drawn else [])]
 
 
-def _whole_markdown(rendered: RenderedTable, findings: Findings) -> str:
+def _effects_of(findings: Findings, table: Table) -> list[TextTable]:
+    if findings.effects is None or table.design is None:
+        return []
+    return effects_grids(findings.effects, table.design)
+
+
+def _whole_markdown(table: Table, rendered: RenderedTable, findings: Findings) -> str:
     parts = [markdown(rendered)]
     parts += [] if findings.forms is None else [findings.forms.to_markdown()]
+    parts += [grid.to_markdown() for grid in _effects_of(findings, table)]
     parts += [claims_markdown(findings.claims)] if findings.claims else []
     return "\n".join(parts)
 

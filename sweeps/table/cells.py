@@ -109,6 +109,14 @@ def evaluation_of(column: Column, table: Table) -> ExtraEvaluation | None:
     return None if needed == ExtraEvaluation() else needed
 
 
+def world_evaluations(table: Table, row: Row) -> dict[str, ExtraEvaluation]:
+    """Name -> evaluation of the row's network in every world of `Row.tested_in`."""
+    return {
+        name: ExtraEvaluation(regions=table.regions, world=name, dataset=overrides)
+        for name, overrides in row.tested_in.items()
+    }
+
+
 def counts_path(column: Column, table: Table) -> str:
     """Path of the column's counts, relative to the run folder."""
     evaluation = evaluation_of(column, table)

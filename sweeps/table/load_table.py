@@ -1,4 +1,7 @@
-"""Reads and checks table files: the papers' in ``sweeps/tables``, the user's in ``tables``."""
+"""Reads and checks table files.
+
+The papers' are in ``sweeps/tables``, our studies in ``sweeps/studies``, the user's in ``tables``.
+"""
 
 from __future__ import annotations
 
@@ -12,10 +15,15 @@ from rgbt.checks import InputError, nearest
 from rgbt.files.yaml_files import read_yaml
 from sweeps.table.check_table import check_table
 from sweeps.table.claim import Claim
+from sweeps.table.design import Combined, Design, DesignFactor, DesignMethod, Part
+from sweeps.table.design_rows import with_design_rows
 from sweeps.table.table import Column, Factor, Row, Table
 
 PUBLISHED = Path(__file__).resolve().parents[1] / "tables"
 """The papers' tables, part of the package."""
+
+STUDIES = Path(__file__).resolve().parents[1] / "studies"
+"""Our own studies, part of the package; no paper has printed them."""
 
 OWN = Path("tables")
 """Tables of the user, in the current folder."""
@@ -25,7 +33,14 @@ SHAPES: dict[str, type[Any]] = {
     "columns": Column,
     "factor": Factor,
     "claims": Claim,
+    "design": Design,
+    "design/factors": DesignFactor,
+    "design/combined": Combined,
+    "design/methods": DesignMethod,
+    "design/trained": Part,
+    "design/tested": Part,
 }
+"""What the parts of a file are read as."""
 
 
 def table_names(folder: Path = OWN) -> list[str]:
@@ -37,12 +52,17 @@ def table_names(folder: Path = OWN) -> list[str]:
     ]
 
 
+def study_names() -> list[str]:
+    """Names for `load_table` of our own studies."""
+    return [path.stem for path in sorted(STUDIES.glob("*.yaml"))]
+
+
 def load_table(name: str, folder: Path = OWN) -> Table:
     """Read and check a table.
 
     Args:
-        name: "spatialseg/table3" for a published table, "my/ablation" for one in `folder`, or a
-            path that ends in .yaml.
+        name: "spatialseg/table3" for a published table, "spatial_bias" for a study of ours,
+            "my/ablation" for one in `folder`, or a path that ends in .yaml.
         folder: of the user's tables.
 
     Raises:
@@ -58,6 +78,9 @@ def load_table(name: str, folder: Path = OWN) -> Table:
         table = pydantic.TypeAdapter(Table).validate_json(text, strict=True)
     except pydantic.ValidationError as error:
         raise InputError(f"{path}, {_sentence(error.errors()[0], plain)}") from None
+    if "rows" not in plain and table.design is None:
+        raise InputError(f"{path}, 'rows' has no value; give one.")
+    table = with_design_rows(table, str(path))
     check_table(table, str(path))
     return table
 
@@ -68,11 +91,14 @@ def _find(name: str, folder: Path) -> Path:
         if not path.is_file():
             raise InputError(f"table={name}: there is no such file.")
         return path
-    paths = [path for root in (PUBLISHED, folder) if (path := root / f"{name}.yaml").is_file()]
+    paths = [
+        path for root in (PUBLISHED, STUDIES, folder) if (path := root / f"{name}.yaml").is_file()
+    ]
     if len(paths) > 1:
         raise InputError(f"table={name} is both {paths[0]} and {paths[1]}; give the path of one.")
     if not paths:
-        raise InputError(f"there is no table '{name}'; {nearest(name, table_names(folder))}.")
+        known = [*table_names(folder), *study_names()]
+        raise InputError(f"there is no table '{name}'; {nearest(name, known)}.")
     return paths[0]
 
 
@@ -89,7 +115,8 @@ def _sentence(error: Mapping[str, Any], plain: Any) -> str:
         words[:2] = [f"{words[0].removesuffix('s')} {index + 1 if title is None else repr(title)}"]
     where = f"{', '.join(words)}: " if words else ""
     if error["type"] == "unexpected_keyword_argument":
-        shape = SHAPES[parents[0]] if parents else Table
+        named = "/".join(part for part in parents if isinstance(part, str))
+        shape = SHAPES.get(named, SHAPES[parents[0]]) if parents else Table
         known = [entry.name for entry in fields(shape)]
         return f"{where}'{last}' is not a key; {nearest(str(last), known)}."
     if error["type"] == "missing":

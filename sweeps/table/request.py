@@ -11,7 +11,7 @@ from rgbt.checks import InputError
 from rgbt.config.options import readable_paths
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Point
-from sweeps.table.cells import evaluation_of, is_counted
+from sweeps.table.cells import evaluation_of, is_counted, world_evaluations
 from sweeps.table.table import Form, Row, Table
 
 if TYPE_CHECKING:
@@ -111,7 +111,9 @@ class TableRequest:
         names = {column.name for row in named for column in self.table.columns_of(row)}
         counted = (each for each in self.table.columns if is_counted(each) and each.name in names)
         evaluations = (evaluation_of(column, self.table) for column in counted)
-        return tuple(dict.fromkeys(each for each in evaluations if each is not None))
+        worlds = (each for row in named for each in world_evaluations(self.table, row).values())
+        found = (each for each in evaluations if each is not None)
+        return tuple(dict.fromkeys([*found, *worlds]))
 
     def runs(self, outcomes: Sequence[Outcome]) -> Mapping[tuple[str, int], Outcome]:
         """The outcome of every row and seed."""

@@ -24,11 +24,12 @@ run, which a user may change for all rows: recipe, trainer, optimizer, schedule.
 def select_rows(table: Table, text: str) -> Table:
     """The table with the rows of ``rows=A,H`` alone, and with the claims about them.
 
+    A group of rows (`Row.group`) is chosen by its name.
+
     Raises:
         InputError: a name that no row has, or several.
     """
-    labels = [row.label for row in table.rows]
-    chosen = {find_label(word, labels, "rows=") for word in _listed(text, labels)}
+    chosen = _chosen(table, text)
     by_label = {row.label: row for row in table.rows}
     first: dict[str, str] = {}
     rows: list[Row] = []
@@ -47,6 +48,19 @@ def select_rows(table: Table, text: str) -> Table:
     kept = tuple(table.claims if complete else claims)
     assert all(OTHERS not in each.against for each in kept) or complete
     return replace(table, rows=tuple(rows), claims=kept)
+
+
+def _chosen(table: Table, text: str) -> set[str]:
+    """Labels of the rows of ``rows=A,H``; the name of a group stands for its rows."""
+    groups: dict[str, set[str]] = {}
+    for row in table.rows:
+        if row.group:
+            groups.setdefault(row.group, set()).add(row.label)
+    labels = [row.label for row in table.rows]
+    chosen: set[str] = set()
+    for word in _listed(text, labels):
+        chosen |= groups.get(word) or {find_label(word, labels, "rows=")}
+    return chosen
 
 
 def _listed(text: str, labels: Sequence[str]) -> Iterator[str]:

@@ -10,6 +10,7 @@ from rgbt.checks import InputError
 from rgbt.metrics.pairs import Protocol
 from sweeps.evaluation import Head
 from sweeps.table.claim import Claim
+from sweeps.table.design import Design
 
 Origin = Literal[
     "own_method",
@@ -124,6 +125,7 @@ class Row:
 
     Attributes:
         label: as printed.
+        group: rows with the same word are chosen together by ``rows=WORD``; "": none.
         origin: whose numbers are printed; None in a table of the user.
         proposed: whether the row is the method that the paper proposes.
         settings: what the paper says about the row, by name.
@@ -139,6 +141,7 @@ class Row:
         needs: missing part of the project without which the row cannot be run.
         without: columns that the row's network has no score for; columns computed from them are
             left out too.
+        tested_in: name -> overrides of the data set with which the row's network is tested too.
         values: printed values by column; None where the paper prints a dash.
         doubtful: columns whose printed value carries the row's remarks as a footnote.
         remarks: one sentence each.
@@ -147,6 +150,7 @@ class Row:
     __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
 
     label: str
+    group: str = ""
     origin: Origin | None = None
     proposed: bool = False
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -159,6 +163,7 @@ class Row:
     x: float | None = None
     needs: str | None = None
     without: tuple[str, ...] = ()
+    tested_in: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     values: Mapping[str, float | None] = field(default_factory=dict)
     doubtful: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
@@ -184,7 +189,8 @@ class Table:
         forms: one sentence per form that says what the rows are run as.
         claims: what the paper says about the table.
         remarks: footnotes of the whole table, one sentence each.
-        rows: in order.
+        design: a factorial design whose rows follow `rows`; None: there is none.
+        rows: in order; may be omitted beside a design.
     """
 
     __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
@@ -203,7 +209,8 @@ class Table:
     forms: Mapping[Form, str] = field(default_factory=dict)
     claims: tuple[Claim, ...] = ()
     remarks: tuple[str, ...] = ()
-    rows: tuple[Row, ...]
+    design: Design | None = None
+    rows: tuple[Row, ...] = ()
 
     def runnable(self, row: Row) -> bool:
         """Whether the project can run the row today."""
