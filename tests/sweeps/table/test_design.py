@@ -1,0 +1,222 @@
+"""Factorial designs in table files: their cells, rows, aliases and messages."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from rgbt.checks import InputError
+from sweeps.table.design import Design, DesignFactor, DesignMethod, Part, cell_name
+from sweeps.table.load_table import load_table
+from sweeps.table.request import TableRequest
+from sweeps.table.rows import select_rows
+
+FACTORS: list[dict[str, Any]] = [
+    {
+        "letter": letter,
+        "name": name,
+        "low": [f"dataset.{key}={low}"],
+        "high": [f"dataset.{key}={high}"],
+        "low_means": "little",
+        "high_means": "much",
+    }
+    for letter, name, key, low, high in (
+        ("N", "noise", "rgb_noise", "0.0", "0.1"),
+        ("T", "texture", "texture_strength", "1.0", "2.0"),
+    )
+]
+DESIGN: dict[str, Any] = {
+    "factors": FACTORS,
+    "methods": [
+        {"name": "baseline", "experiment": "baseline"},
+        {"name": "crm", "experiment": "crm", "against": "baseline"},
+    ],
+    "overrides": ["dataset=synth"],
+    "outcomes": ["mIoU"],
+    "trained": {"overrides": ["dataset.num_far_objects=3"]},
+    "tested": {},
+}
+FILE: dict[str, Any] = {
+    "paper": "my",
+    "number": "1",
+    "caption": "A design.",
+    "data": "synth",
+    "columns": [{"name": "mIoU", "metric": "mIoU"}],
+}
+
+
+def write(folder: Path, **changes: Any) -> str:
+    path = folder / "design.yaml"
+    path.write_text(yaml.safe_dump({**FILE, "design": {**DESIGN, **changes}}))
+    return str(path)
+
+
+def factor(**changes: Any) -> dict[str, Any]:
+    return {"factors": [FACTORS[0], {**FACTORS[1], **changes}]}
+
+
+def test_rows_of_a_design_are_methods_times_cells(tmp_path: Path) -> None:
+    table = load_table(write(tmp_path))
+    cells = ["N-T-", "N-T+", "N+T-", "N+T+"]
+    trained = [f"{method} {cell}" for method in ("baseline", "crm") for cell in cells]
+    assert [row.label for row in table.rows] == [*trained, "baseline natural", "crm natural"]
+    assert table.rows[6].experiment == "crm"
+    assert table.rows[6].overrides == (
+        *("dataset=synth", "dataset.num_far_objects=3"),
+        *("dataset.rgb_noise=0.1", "dataset.texture_strength=1.0"),
+    )
+    natural = table.rows[9]
+    assert natural.overrides == ("dataset=synth",)
+    assert list(natural.tested_in) == cells
+    assert natural.tested_in["N-T+"] == ("dataset.rgb_noise=0.0", "dataset.texture_strength=2.0")
+
+
+def test_combined_overrides_follow_those_of_the_factors(tmp_path: Path) -> None:
+    combined = [{"levels": {"N": "high", "T": "low"}, "overrides": ["dataset.rgb_noise=0.5"]}]
+    table = load_table(write(tmp_path, combined=combined))
+    words = {row.label: row.overrides[2:] for row in table.rows[:4]}
+    assert words["baseline N+T-"][-1] == "dataset.rgb_noise=0.5"
+    assert "dataset.rgb_noise=0.5" not in words["baseline N+T+"]
+
+
+def test_groups_of_rows_are_chosen_by_name(tmp_path: Path) -> None:
+    table = load_table(write(tmp_path))
+    tested = select_rows(table, "tested")
+    assert [row.label for row in tested.rows] == ["baseline natural", "crm natural"]
+    mixed = select_rows(table, "tested,crm N-T-")
+    assert [row.label for row in mixed.rows] == ["crm N-T-", "baseline natural", "crm natural"]
+
+
+def test_rows_tested_in_worlds_request_an_evaluation_of_each(tmp_path: Path) -> None:
+    table = load_table(write(tmp_path))
+    request = TableRequest("my/design", table, "demo", (0,))
+    by_label = {point.label: point for point in request.points()}
+    assert by_label["crm N-T- seed=0"].evaluations == ()
+    worlds = by_label["crm natural seed=0"].evaluations
+    assert [each.world for each in worlds] == ["N-T-", "N-T+", "N+T-", "N+T+"]
+    assert worlds[1].command == (
+        *("rgbt.evaluate", "modality=default", "regions=as trained"),
+        *("dataset.rgb_noise=0.0", "dataset.texture_strength=2.0"),
+    )
+    assert len({each.path for each in worlds}) == 4
+
+
+def design(generators: dict[str, str], letters: str = "OCNS") -> tuple[Design, Part]:
+    factors = tuple(
+        DesignFactor(letter=each, name=each.lower(), low_means="", high_means="")
+        for each in letters
+    )
+    part = Part(generators=generators)
+    methods = (DesignMethod(name="m", experiment="crm"),)
+    return Design(factors=factors, methods=methods, outcomes=("mIoU",), trained=part), part
+
+
+def test_half_fraction_has_the_product_as_last_level() -> None:
+    made, part = design({"S": "OCN"})
+    # S is high where an odd number of O, C and N is high.
+    assert [cell_name(cell) for cell in made.cells(part)] == [
+        *("O-C-N-S-", "O-C-N+S+", "O-C+N-S+", "O-C+N+S-"),
+        *("O+C-N-S+", "O+C-N+S-", "O+C+N-S-", "O+C+N+S+"),
+    ]
+
+
+def test_half_fraction_mixes_pairs_of_interactions_alone() -> None:
+    made, part = design({"S": "OCN"})
+    # I = OCNS, so OC = NS, ON = CS and CN = OS.
+    assert made.effects(part) == {
+        **{"o": {"O": 1}, "c": {"C": 1}, "n": {"N": 1}, "s": {"S": 1}},
+        **{"o x c + n x s": {"OC": 1, "NS": 1}, "o x n + c x s": {"ON": 1, "CS": 1}},
+        "o x s + c x n": {"OS": 1, "CN": 1},
+    }
+
+
+def test_whole_factorial_has_no_aliases() -> None:
+    made, part = design({})
+    assert len(made.cells(part)) == 16
+    assert all(len(group) == 1 for group in made.effects(part).values())
+    assert len(made.effects(part)) == 4 + 6
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"factors": FACTORS[:1]}, "factors: expected two or more, got 1"),
+        (factor(letter="N"), "factors, letter: 'N' is used twice"),
+        (factor(letter="t"), "letter: expected one capital letter, got 't'"),
+        (factor(hihg=[]), "'hihg' is not a key; did you mean 'high'"),
+        (factor(low=[], high=[]), "the cells N-T- and N-T+ have equal overrides"),
+        ({"outcomes": ["mIuO"]}, "outcomes: 'mIuO' is not a valid choice; did you mean 'mIoU'"),
+        ({"outcomes": []}, "outcomes: expected the name of one column or more"),
+        ({"methods": []}, "methods: expected one or more"),
+        (
+            {"methods": [{"name": "a", "experiment": "crm", "against": "b"}]},
+            "against (an earlier method): 'b' is not a valid choice",
+        ),
+        ({"methods": [{"name": "a", "experiment": "crn"}]}, "experiment: 'crn' is not a valid"),
+        ({"trained": None, "tested": None}, "expected trained, tested or both"),
+        ({"trained": {"generators": {"T": "X"}}}, "generators, T (factors without a generator): "),
+        ({"trained": {"generators": {"T": "N"}}}, "main effect of N cannot be told apart from T"),
+        ({"trained": {"generatros": {}}}, "'generatros' is not a key; did you mean 'generators'"),
+        (
+            {"combined": [{"levels": {"N": "low"}, "overrides": []}]},
+            "combined 1, levels: expected the levels of two factors or more, got N",
+        ),
+        (
+            {"combined": [{"levels": {"N": "low", "X": "low"}, "overrides": []}]},
+            "combined 1, levels: 'X' is not a valid choice",
+        ),
+    ],
+)
+def test_design_refuses_parts_that_do_not_fit(
+    tmp_path: Path, changes: dict[str, Any], sentence: str
+) -> None:
+    with pytest.raises(InputError) as error:
+        load_table(write(tmp_path, **changes))
+    assert sentence in str(error.value)
+
+
+def test_resolution_three_is_refused() -> None:
+    from sweeps.table.design_rows import check_design
+
+    made, _ = design({"N": "OC"}, "OCN")
+    table = load_table("spatial_bias")
+    with pytest.raises(InputError, match="main effect of O cannot be told apart from CN"):
+        check_design(made, table, "file, design")
+
+
+def test_rows_may_be_omitted_beside_a_design_alone(tmp_path: Path) -> None:
+    path = tmp_path / "plain.yaml"
+    path.write_text(yaml.safe_dump(FILE))
+    with pytest.raises(InputError, match="'rows' has no value; give one"):
+        load_table(str(path))
+
+
+def test_study_of_the_spatial_bias_has_its_cells() -> None:
+    table = load_table("spatial_bias")
+    made = table.design
+    assert made is not None
+    assert made.trained is not None
+    assert made.tested is not None
+    assert len(made.cells(made.trained)) == 8
+    assert len(made.cells(made.tested)) == 16
+    assert len(table.rows) == 5 * 8 + 5
+    # Both levels of a radial factor have the same mean square over an image of 3 x 4, where the
+    # mean of r^2 is 1/3 and that of r^4 (256/5 + 81/5 + 2 x 144/9) / 625.
+    fourth = (256 / 5 + 81 / 5 + 2 * 144 / 9) / 625
+
+    def square(words: tuple[str, ...], key: str, gain: str) -> float:
+        values = dict(word.removeprefix("dataset.").split("=") for word in words)
+        g = float(values[gain])
+        return float(values[key]) ** 2 * (1 + 2 * g / 3 + fourth * g**2)
+
+    by_letter = {each.letter: each for each in made.factors}
+    for letter, key, gain in (
+        ("C", "texture_strength", "texture_radius_gain"),
+        ("N", "rgb_noise", "rgb_noise_radius_gain"),
+        ("N", "thermal_noise", "thermal_noise_radius_gain"),
+    ):
+        low, high = by_letter[letter].low, by_letter[letter].high
+        assert square(low, key, gain) == pytest.approx(square(high, key, gain), rel=0.005)
