@@ -40,6 +40,13 @@ OPTIONS = {"rgbt.evaluate": OfEvaluate, "rgbt.consistency": OfConsistency}
             "rgb, ring5, own head, rgb_removed",
         ),
         (
+            ExtraEvaluation(regions="ring5", world="N+", dataset=("dataset.rgb_noise=0.1",)),
+            "rgbt.evaluate modality=default regions=ring5 dataset.rgb_noise=0.1",
+            # sha256 of "dataset.rgb_noise=0.1"
+            "table_default_ring5_world-45f37709.npz",
+            "default, ring5, world N+",
+        ),
+        (
             ExtraEvaluation(frames="aligned"),
             "rgbt.consistency frames=virtual",
             "consistency_aligned_test.npz",
@@ -66,4 +73,5 @@ def test_evaluation_has_command_file_and_label(
     module, *words = command.split(" ")
     assert evaluation.command == (module, *words)
     assert (evaluation.path, evaluation.label) == (f"evaluations/{file}", label)
-    assert {word.partition("=")[0] for word in words} <= set(types_of(OPTIONS[module]))
+    options = {word.partition("=")[0] for word in words if word not in evaluation.dataset}
+    assert options <= set(types_of(OPTIONS[module]))

@@ -46,6 +46,17 @@ def test_preview_lists_each_evaluation_command_once() -> None:
     ]
 
 
+def test_preview_names_worlds_in_one_command() -> None:
+    wanted, outcomes = request_of((RGB,))
+    worlds = {"N-": ("dataset.rgb_noise=0.0",), "N+": ("dataset.rgb_noise=0.1",)}
+    rows = tuple(replace(row, tested_in=worlds) for row in wanted.table.rows)
+    wanted = replace(wanted, table=replace(wanted.table, rows=rows))
+    assert summary(wanted, outcomes, 2)[-1] == (
+        "Evaluations of every run that still lacks them: rgbt evaluate modality=rgb "
+        "'regions=as trained'; rgbt evaluate in 2 worlds (N-, N+)."
+    )
+
+
 def test_trained_runs_without_evaluations_are_reported(tmp_path: Any) -> None:
     (tmp_path / "result.json").write_text('{"seconds_of_last_process": 10}')
     wanted, (first, second) = request_of(FRAMES)

@@ -1,0 +1,204 @@
+"""Effects of a design from fake runs: which counts are used, differences, missing cells, texts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rgbt.metrics.counts import Counts
+from sweeps.rendering.effects import CSV_HEADER, effects_csv, effects_grids
+from sweeps.rendering.effects_figure import draw_effects
+from sweeps.table.cells import world_evaluations
+from sweeps.table.design import Design, DesignFactor, DesignMethod, Part
+from sweeps.table.design_rows import with_design_rows
+from sweeps.table.rows import select_rows
+from sweeps.table.table import Column, Table
+from sweeps.verdicts.effects import MEAN, DesignJudge
+from tests.sweeps.tabled import counts_of, failed, outcome
+
+CELLS = ("N-T-", "N-T+", "N+T-", "N+T+")
+
+
+def design_table(**parts: Part | None) -> Table:
+    factors = tuple(
+        DesignFactor(
+            letter=letter,
+            name=name,
+            low=(f"dataset.{name}=0",),
+            high=(f"dataset.{name}=1",),
+            low_means="little",
+            high_means="much",
+        )
+        for letter, name in (("N", "noise"), ("T", "texture"))
+    )
+    design = Design(
+        factors=factors,
+        methods=(
+            DesignMethod(name="baseline", experiment="baseline"),
+            DesignMethod(name="crm", experiment="crm", against="baseline"),
+        ),
+        outcomes=("contrast",),
+        **{"trained": Part(), "tested": None, **parts},
+    )
+    columns = (
+        Column(name="one", metric="region/1"),
+        Column(name="two", metric="region/2"),
+        Column(name="contrast", minus=("one", "two")),
+    )
+    table = Table(paper="my", number="1", caption="", data="", columns=columns, design=design)
+    return with_design_rows(table, "file")
+
+
+def with_rates(first: float, second: float) -> Counts:
+    """Twelve equal images: shares of the pixels of both classes that are right, by region."""
+    right = [round(1000 * first), round(1000 * second)]
+    image = [[[each, 1000 - each], [1000 - each, each]] for each in right]
+    return counts_of(*[image] * 12, night=None)
+
+
+def iou(right: float) -> float:
+    """Percent of both classes: right / (2 - right)."""
+    return 100 * right / (2 - right)
+
+
+RATES = {"N-T-": 0.9, "N-T+": 0.9, "N+T-": 0.8, "N+T+": 0.8}
+"""Of region 1 by the baseline: noise makes it worse. Region 2 is always at 0.9."""
+
+EFFECT = iou(0.8) - iou(0.9)
+
+
+def trained(seeds: int = 2) -> dict[tuple[str, int], Any]:
+    """crm has half of the noise's effect; a seed moves both regions of all cells alike."""
+    runs = {}
+    for seed in range(seeds):
+        for cell, rate in RATES.items():
+            moved = 0.01 * seed
+            for method, share in (("baseline", rate), ("crm", (rate + 0.9) / 2)):
+                label = f"{method} {cell}"
+                runs[label, seed] = outcome(
+                    f"{label}{seed}", with_rates(share + moved, 0.9 + moved)
+                )
+    return runs
+
+
+def estimates(table: Table, runs: Any) -> dict[tuple[str, str, str], Any]:
+    lines = DesignJudge(table, resamples=100).effects(runs).lines
+    return {(line.method, line.against, line.effect): line.estimate for line in lines}
+
+
+def test_effects_are_of_contrasts_within_runs() -> None:
+    runs = {key: run for key, run in trained().items() if key[1] == 0}
+    found = estimates(design_table(), runs)
+    assert found["baseline", "", "noise"].value == pytest.approx(EFFECT)
+    assert found["baseline", "", "texture"].value == pytest.approx(0)
+    assert found["baseline", "", "noise x texture"].value == pytest.approx(0)
+    assert found["baseline", "", MEAN].value == pytest.approx(EFFECT / 2)
+    own = iou(0.85) - iou(0.9)
+    assert found["crm", "", "noise"].value == pytest.approx(own)
+    assert found["crm", "baseline", "noise"].value == pytest.approx(own - EFFECT)
+
+
+def test_effect_is_shown_and_null_effect_is_not() -> None:
+    found = estimates(design_table(), trained())
+    assert found["baseline", "", "noise"].is_shown()
+    assert found["baseline", "", "noise"].value == pytest.approx(EFFECT, abs=0.5)
+    assert not found["baseline", "", "texture"].is_shown()
+    assert found["baseline", "", "noise"].seeds == 2
+
+
+def test_method_with_a_missing_cell_is_named_and_others_are_analysed() -> None:
+    runs = trained()
+    for seed in (0, 1):
+        runs["crm N+T-", seed] = failed("no memory")
+    found = DesignJudge(design_table(), resamples=100).effects(runs)
+    assert {line.method for line in found.lines} == {"baseline"}
+    assert found.missing == ("trained, crm: row 'crm N+T-' has no finished run.",)
+
+
+def test_seeds_that_not_all_cells_have_are_left_out() -> None:
+    runs = trained(3)
+    runs["baseline N+T+", 2] = failed("no memory")
+    found = estimates(design_table(), runs)
+    assert found["baseline", "", "noise"].seeds == 2
+    assert found["crm", "", "noise"].seeds == 3
+    assert found["crm", "baseline", "noise"].seeds == 2
+
+
+def test_networks_tested_in_worlds_use_the_counts_of_each_world() -> None:
+    table = design_table(trained=None, tested=Part())
+    worlds = world_evaluations(table, table.rows[0])
+    assert list(worlds) == list(CELLS)
+    runs = {}
+    for seed in (0, 1):
+        made: dict[Any, Counts] = {None: with_rates(0.5, 0.5)}
+        made |= {worlds[cell]: with_rates(rate, 0.9) for cell, rate in RATES.items()}
+        runs["baseline natural", seed] = outcome(f"run{seed}", made)
+    found = estimates(table, runs)
+    assert found["baseline", "", "noise"].value == pytest.approx(EFFECT)
+    assert ("crm", "", "noise") not in found
+
+
+def test_part_whose_rows_are_not_chosen_is_left_out() -> None:
+    table = select_rows(design_table(tested=Part()), "trained")
+    found = DesignJudge(table, resamples=100).effects(trained())
+    assert {line.part for line in found.lines} == {"trained"}
+    assert found.missing == ()
+
+
+def test_method_with_rows_that_are_not_chosen_says_which() -> None:
+    table = select_rows(design_table(), "baseline N-T-")
+    found = DesignJudge(table, resamples=100).effects({})
+    assert found.lines == ()
+    assert found.missing[0] == "trained, baseline: row 'baseline N-T-' has no finished run."
+
+
+def test_outcome_of_corrupted_images_is_refused_by_name() -> None:
+    table = design_table()
+    noisy = replace(table.columns[0], corruption="noise", severity=16.0)
+    table = replace(table, columns=(noisy, *table.columns[1:]))
+    found = DesignJudge(table, resamples=100).effects(trained())
+    assert "'one' is no score of the plain test images" in found.missing[0]
+
+
+def test_grids_and_csv_have_a_line_for_each_effect(tmp_path: Path) -> None:
+    table = design_table()
+    assert table.design is not None
+    effects = DesignJudge(table, resamples=100).effects(trained())
+    (grid,) = effects_grids(effects, table.design)
+    # Three methods and differences, each with the mean, two main effects and an interaction.
+    assert len(grid.rows) == 3 * 4
+    noise = next(row for row in grid.rows if row[:2] == ("baseline", "noise"))
+    assert noise[4] == "lower"
+    texture = next(row for row in grid.rows if row[:2] == ("crm - baseline", "texture"))
+    assert texture[4] == "no"
+    assert grid.notes[0] == "N, noise: - little; + much."
+    lines = effects_csv(effects.lines).splitlines()
+    assert lines[0] == ",".join(CSV_HEADER)
+    assert len(lines) == 1 + 12
+    figure = tmp_path / "figure.png"
+    assert draw_effects(effects, "my/design", figure)
+    assert figure.stat().st_size > 1000
+
+
+def test_one_seed_has_no_interval_and_no_figure(tmp_path: Path) -> None:
+    table = design_table()
+    assert table.design is not None
+    runs = {key: run for key, run in trained().items() if key[1] == 0}
+    effects = DesignJudge(table, resamples=100).effects(runs)
+    (grid,) = effects_grids(effects, table.design)
+    assert {row[4] for row in grid.rows if row[1] != MEAN} == {"2 seeds needed"}
+    assert not draw_effects(effects, "my/design", tmp_path / "figure.png")
+
+
+def test_scenes_are_paired_although_labels_differ() -> None:
+    """A factor that adds objects changes labels, which comparisons of rows refuse."""
+    runs = trained()
+    more = with_rates(0.8, 0.9)
+    doubled = replace(more, counts=np.asarray(more.counts * 2))
+    runs["baseline N+T+", 0] = outcome("other labels", doubled)
+    found = estimates(design_table(), runs)
+    assert found["baseline", "", "noise"].value == pytest.approx(EFFECT, abs=0.5)
