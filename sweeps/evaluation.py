@@ -8,6 +8,7 @@ from typing import Literal
 
 from rgbt.metrics.pairs import Protocol, file_name
 from rgbt.spec.corruption_names import row_name
+from rgbt.tracking.run_result import RunResult
 
 Head = Literal["as trained", "own", "source", "target"]
 """The head that predicts: that of the domain of each image, or that of one domain for all."""
@@ -37,6 +38,10 @@ class ExtraEvaluation:
     severity: float | None = None
     world: str = ""
     dataset: tuple[str, ...] = ()
+
+    def is_stored(self, result: RunResult) -> bool:
+        """Whether a finished run has its counts."""
+        return result.has_counts(self.path, other_dataset=bool(self.dataset))
 
     @property
     def label(self) -> str:

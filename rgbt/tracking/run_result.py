@@ -139,8 +139,13 @@ class RunResult:
             f"'{split}'; {how}."
         )
 
-    def has_counts(self, path: str) -> bool:
-        """Whether `path` holds counts of the test split that this training made."""
+    def has_counts(self, path: str, *, other_dataset: bool = False) -> bool:
+        """Whether `path` holds counts of the test split that this training made.
+
+        Args:
+            path: of the file, relative to the run folder.
+            other_dataset: whether they may be of another data set than the run's own.
+        """
         # Compared with the checkpoint: a run may write an evaluation before its result.
         file, best = self.folder / path, self.folder / CHECKPOINT
         if not file.exists() or (best.exists() and file.stat().st_mtime < best.stat().st_mtime):
@@ -149,4 +154,5 @@ class RunResult:
             counts = Counts.load(file)
         except InputError:  # not readable: the evaluation is repeated
             return False
-        return counts.dataset == self.dataset and counts.split == "test"
+        is_own = counts.dataset == self.dataset
+        return (is_own or other_dataset) and counts.split == "test"

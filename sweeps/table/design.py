@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from itertools import combinations, product
+from itertools import chain, combinations, product
 from math import prod
 from typing import Any, ClassVar, Literal
 
@@ -160,21 +160,16 @@ class Design:
         """
         cells = self.cells(part)
         names = {factor.letter: factor.name for factor in self.factors}
-        groups: list[dict[Effect, int]] = []
-        contrasts: list[tuple[int, ...]] = []
-        for order in (1, 2):
-            for letters in combinations(self.letters, order):
-                effect = "".join(letters)
-                signs = tuple(sign_of(cell, effect) for cell in cells)
-                opposite = tuple(-sign for sign in signs)
-                for group, known in zip(groups, contrasts, strict=True):
-                    if known in (signs, opposite):
-                        group[effect] = 1 if known == signs else -1
-                        break
-                else:
-                    groups.append({effect: 1})
-                    contrasts.append(signs)
-        return {_shown(group, names): group for group in groups}
+        groups: dict[tuple[int, ...], dict[Effect, int]] = {}
+        orders = (combinations(self.letters, order) for order in (1, 2))
+        for effect in map("".join, chain(*orders)):
+            signs = tuple(sign_of(cell, effect) for cell in cells)
+            opposite = tuple(-sign for sign in signs)
+            if opposite in groups:
+                groups[opposite][effect] = -1
+            else:
+                groups.setdefault(signs, {})[effect] = 1
+        return {_shown(group, names): group for group in groups.values()}
 
 
 Effect = str

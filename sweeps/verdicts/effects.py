@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 
 import numpy as np
 
@@ -102,19 +103,26 @@ class DesignJudge:
         lines: list[EffectLine] = []
         missing: dict[str, None] = {}
         for part in _parts(self.table):
-            found: dict[str, list[Cell]] = {}
-            for method in part.design.methods:
+            found, reasons = self._counts_of(part, runs)
+            missing |= dict.fromkeys(reasons)
+            for outcome, method in product(part.design.outcomes, part.design.methods):
                 try:
-                    found[method.name] = self._cells(part, method.name, runs)
+                    lines += self._of_method(part, outcome, method, found)
                 except InputError as error:
-                    missing[f"{part.name}, {method.name}: {error}"] = None
-            for outcome in part.design.outcomes:
-                for method in part.design.methods:
-                    try:
-                        lines += self._of_method(part, outcome, method, found)
-                    except InputError as error:
-                        missing[f"{part.name}, {method.name}, {outcome}: {error}"] = None
+                    missing[f"{part.name}, {method.name}, {outcome}: {error}"] = None
         return DesignEffects(tuple(lines), tuple(missing))
+
+    def _counts_of(
+        self, part: _Part, runs: Mapping[CellRunId, CellRun]
+    ) -> tuple[dict[str, list[Cell]], list[str]]:
+        """Counts of the methods that have them in every cell, and why others have not."""
+        found, reasons = {}, []
+        for method in part.design.methods:
+            try:
+                found[method.name] = self._cells(part, method.name, runs)
+            except InputError as error:
+                reasons.append(f"{part.name}, {method.name}: {error}")
+        return found, reasons
 
     def _of_method(
         self,

@@ -20,6 +20,7 @@ from rgbt.tracking.run_folder import RunFolder
 from rgbt.tracking.run_result import ALL_COUNTS, RunResult
 from rgbt.tracking.terminal import info
 from rgbt.tracking.tracker import Status, Tracking
+from sweeps.evaluation import ExtraEvaluation
 
 FETCHED_FILES = ("result.json", ALL_COUNTS, "provenance.json", "evaluations")
 FETCHED = ".fetched"
@@ -101,10 +102,10 @@ class RunStore:
         folder.describe(replace(description, tags={**description.tags, **tags}))
         self._with_mlflow(lambda tracking: tracking.sync(folder, status))
 
-    def fetch_counts(self, result: RunResult, path: str) -> bool:
-        """Download evaluations that another machine made since; whether `path` is among them."""
+    def fetch_counts(self, result: RunResult, evaluation: ExtraEvaluation) -> bool:
+        """Download what another machine evaluated since; whether `evaluation` is among it."""
         self._with_mlflow(lambda tracking: _download(tracking, result, ("evaluations",)))
-        return result.has_counts(path)
+        return evaluation.is_stored(result)
 
     def create_tables(self) -> None:
         """Open the store once, before several processes create its tables at the same time."""

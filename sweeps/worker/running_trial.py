@@ -168,10 +168,10 @@ class RunningTrial:
     def _evaluate(
         self, run: PlannedRun, result: RunResult, evaluation: ExtraEvaluation
     ) -> Iterator[None]:
-        if result.has_counts(evaluation.path):
+        if evaluation.is_stored(result):
             return
         if result.run_id:
-            if self.runs.fetch_counts(result, evaluation.path):
+            if self.runs.fetch_counts(result, evaluation):
                 return
             raise TrialError(
                 f"run {result.key} was trained on another machine: its further evaluations "
@@ -189,7 +189,7 @@ class RunningTrial:
             *(word for word in run.overrides if word.startswith("dataset.root=")),
         )
         code, reason = yield from self._run(command, result.key)
-        if code != 0 or not result.has_counts(evaluation.path):
+        if code != 0 or not evaluation.is_stored(result):
             raise TrialError(reason())
         self.runs.sync(result)
 

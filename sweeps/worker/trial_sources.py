@@ -248,8 +248,8 @@ def finished_runs(plan: PlannedPoint, runs: RunStore) -> tuple[RunResult, ...] |
 
 def is_evaluated(plan: PlannedPoint, results: Sequence[RunResult]) -> bool:
     """Whether all further evaluations of a point's runs exist."""
-    paths = [evaluation.path for evaluation in plan.point.evaluations]
-    return all(result.has_counts(path) for result in results for path in paths)
+    wanted = plan.point.evaluations
+    return all(evaluation.is_stored(result) for result in results for evaluation in wanted)
 
 
 def reason_of(trial: FrozenTrial) -> str:

@@ -75,6 +75,9 @@ def test_has_counts_wants_test_counts_of_this_training(run: RunResult) -> None:
     for name in ("none.npz", "other.npz", "val.npz", "damaged.npz"):
         assert not run.has_counts(name), name
     assert run.has_counts("counts_test.npz")
+    assert run.has_counts("counts_test.npz", other_dataset=True)
+    assert run.has_counts("other.npz", other_dataset=True)
+    assert not run.has_counts("val.npz", other_dataset=True)
     (run.folder / "best.pt").touch()
     written = (run.folder / "best.pt").stat().st_mtime
     os.utime(run.folder / "counts_test.npz", (written - 9, written - 9))

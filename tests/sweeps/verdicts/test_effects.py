@@ -20,10 +20,13 @@ from sweeps.table.table import Column, Table
 from sweeps.verdicts.effects import MEAN, DesignJudge
 from tests.sweeps.tabled import counts_of, failed, outcome
 
+WHOLE = Part()
+"""All combinations of the levels."""
+
 CELLS = ("N-T-", "N-T+", "N+T-", "N+T+")
 
 
-def design_table(**parts: Part | None) -> Table:
+def design_table(trained: Part | None = WHOLE, tested: Part | None = None) -> Table:
     factors = tuple(
         DesignFactor(
             letter=letter,
@@ -42,7 +45,8 @@ def design_table(**parts: Part | None) -> Table:
             DesignMethod(name="crm", experiment="crm", against="baseline"),
         ),
         outcomes=("contrast",),
-        **{"trained": Part(), "tested": None, **parts},
+        trained=trained,
+        tested=tested,
     )
     columns = (
         Column(name="one", metric="region/1"),

@@ -195,5 +195,5 @@ def test_evaluations_made_elsewhere_later_are_fetched(machines: Machines) -> Non
     there.sync(RunResult(made.path))
     found = here.find("e", DATASET)
     assert found is not None
-    assert here.fetch_counts(found, ring.path)
+    assert here.fetch_counts(found, ring)
     assert found.counts(ring.path).counts.tolist() == counts(right=7).counts.tolist()
