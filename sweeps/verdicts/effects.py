@@ -118,6 +118,8 @@ class DesignJudge:
         """Counts of the methods that have them in every cell, and why others have not."""
         found, reasons = {}, []
         for method in part.design.methods:
+            if all(label not in self._rows for label, _ in part.places(method.name)):
+                continue  # rows=... left it out
             try:
                 found[method.name] = self._cells(part, method.name, runs)
             except InputError as error:

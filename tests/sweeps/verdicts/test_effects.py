@@ -157,7 +157,7 @@ def test_method_with_rows_that_are_not_chosen_says_which() -> None:
     table = select_rows(design_table(), "baseline N-T-")
     found = DesignJudge(table, resamples=100).effects({})
     assert found.lines == ()
-    assert found.missing[0] == "trained, baseline: row 'baseline N-T-' has no finished run."
+    assert found.missing == ("trained, baseline: row 'baseline N-T-' has no finished run.",)
 
 
 def test_outcome_of_corrupted_images_is_refused_by_name() -> None:

@@ -297,6 +297,28 @@ def test_running_trial_evaluates_finished_run(tmp_path: Path) -> None:
     assert Bench(tmp_path, plan, fail).work.advance() is not None, "all there: nothing is started"
 
 
+def test_running_trial_accepts_counts_of_another_world(tmp_path: Path) -> None:
+    def in_world(call: Call) -> Process:
+        if call.module == "rgbt.run":
+            return (yield from succeed(call))
+        yield
+        Path(call.value("out")).parent.mkdir(exist_ok=True)
+        counts(dataset="another").save(Path(call.value("out")))
+        return 0
+
+    world = ExtraEvaluation(world="N+", dataset=("dataset.rgb_noise=0.1",))
+    plan = evaluated(evaluations=(world,))
+    bench = Bench(tmp_path, plan, in_world)
+    (found,) = bench.run()
+    assert "dataset.rgb_noise=0.1" in bench.executor.calls[-1].words
+    assert found.counts(world.path).dataset == "another"
+    assert Bench(tmp_path, plan, fail).work.advance() is not None, "all there: nothing is started"
+    # Of the run's own data set, counts of another one are refused.
+    other = evaluated(evaluations=(RING,))
+    with pytest.raises(TrialError):
+        Bench(tmp_path, other, in_world).run()
+
+
 def test_running_trial_failed_evaluation_fails_trial(tmp_path: Path) -> None:
     plan = evaluated(evaluations=(RING,))
     finish(tmp_path / plan.runs[0].key)
