@@ -32,8 +32,8 @@ ASKS = {
 NOTES = (
     "difference: mean at the high level less mean at the low level; of an interaction half of the "
     "difference of two effects. of seeds, of images: standard errors.",
-    "shown: differs from 0 at the 5 % level, corrected for all effects of the method (Holm). The "
-    "intervals are not corrected.",
+    "shown: differs from 0 at the 5 % level, corrected for the number of main effects, or of "
+    "interactions, of the method (Holm). The intervals are not corrected.",
 )
 
 

@@ -208,12 +208,12 @@ class _Part:
         groups = self.design.effects(self.part)
         levels = self.design.cells(self.part)
         firsts = [next(iter(effects)) for effects in groups.values()]
-        signs = np.array([[sign_of(cell, first) for cell in levels] for first in firsts], float)
-        found = [estimate_mean(cells), *estimate_effects(cells, signs, self.noise)]
-        shown = [
-            (MEAN, False),
-            *((each, len(first) == 1) for each, first in zip(groups, firsts, strict=True)),
-        ]
+        mains = [first for first in firsts if len(first) == 1]
+        found = [estimate_mean(cells)]
+        for family in (mains, firsts[len(mains) :]):  # p-values are corrected within each
+            signs = np.array([[sign_of(cell, first) for cell in levels] for first in family], float)
+            found += estimate_effects(cells, signs, self.noise) if family else []
+        shown = [(MEAN, False), *((name, place < len(mains)) for place, name in enumerate(groups))]
         return [
             EffectLine(
                 part=self.name,
