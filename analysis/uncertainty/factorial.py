@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.uncertainty.blocks import FEWEST, ImageBlocks, make_blocks
+from analysis.uncertainty.blocks import FEWEST, make_blocks
 from analysis.uncertainty.estimate import block_spread
 from analysis.uncertainty.intervals import (
     Interval,
@@ -32,7 +32,6 @@ from analysis.uncertainty.run_scores import RunScores
 from analysis.uncertainty.settings import Resampling
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts, check_same_means, convention
-from rgbt.metrics.metric import Absent
 
 Floats = NDArray[np.float64]
 
@@ -136,40 +135,24 @@ class CellScorer:
         order = _same_images([counts for _, counts in every])
         absent = self._settings.absent or convention(counts for _, counts in every)
         blocks = make_blocks(order, self._settings.blocks, np.zeros((1, len(order))))
-        columns = []
-        for cell in runs:
-            by_key = {cell[seed][0]: _ordered(cell[seed][1], order) for seed in seeds}
-            keys = [cell[seed][0] for seed in seeds]
-            values = np.zeros(len(seeds))
-            drawn = np.zeros(0 if blocks.count < FEWEST else self._settings.resamples)
-            for metric, weight in weights.items():
-                points = self._scores.points(metric, by_key, absent)
-                values += weight * np.array([points[key] for key in keys])
-                if len(drawn):
-                    drawn += weight * self._drawn(metric, by_key, keys, blocks, absent)
-            if np.isnan(values).any():
-                raise InputError(
-                    f"{', '.join(weights)}: {keys[int(np.isnan(values).argmax())]} has nothing to "
-                    "score: no pixel is labelled or predicted so. Use absent=released."
-                )
-            columns.append((values, drawn))
-        return CellScores(
-            values=np.stack([values for values, _ in columns], 1),
-            drawn=np.stack([drawn for _, drawn in columns], 1),
-            images=blocks.count,
-            seeds=tuple(seeds),
-        )
-
-    def _drawn(
-        self,
-        metric: str,
-        by_key: Mapping[str, Counts],
-        keys: Sequence[str],
-        blocks: ImageBlocks,
-        absent: Absent,
-    ) -> Floats:
-        found = self._scores.resampled(metric, by_key, blocks, absent)
-        return np.asarray(np.mean([found[key] for key in keys], axis=0), np.float64)
+        by_key = {cell[seed][0]: _ordered(cell[seed][1], order) for cell in runs for seed in seeds}
+        keys = [[cell[seed][0] for cell in runs] for seed in seeds]
+        resamples = 0 if blocks.count < FEWEST else self._settings.resamples
+        values = np.zeros((len(seeds), len(runs)))
+        drawn = np.zeros((resamples, len(runs)))
+        for metric, weight in weights.items():  # of all runs at once: draws are the slow part
+            points = self._scores.points(metric, by_key, absent)
+            values += weight * np.array([[points[key] for key in row] for row in keys])
+            if resamples:
+                found = self._scores.resampled(metric, by_key, blocks, absent)
+                drawn += weight * np.mean([[found[key] for key in row] for row in keys], axis=0).T
+        if np.isnan(values).any():
+            seed, cell = np.argwhere(np.isnan(values))[0]
+            raise InputError(
+                f"{', '.join(weights)}: {keys[seed][cell]} has nothing to score: no pixel is "
+                "labelled or predicted so. Use absent=released."
+            )
+        return CellScores(values=values, drawn=drawn, images=blocks.count, seeds=tuple(seeds))
 
 
 def estimate_effects(

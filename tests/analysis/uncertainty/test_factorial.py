@@ -219,3 +219,11 @@ def test_intervals_of_cells_cover_normal_truths(seeds: int) -> None:
     assert all(0.93 <= count / 600 <= 0.985 for count in covered), covered
     family = np.mean([t[1].is_shown() or t[2].is_shown() for t in trials])
     assert family <= 0.05
+
+
+def test_scorer_names_counts_without_anything_to_score() -> None:
+    full = counts(np.full((12, 2), 0.1), absent="exclude")
+    empty = replace(full, counts=np.zeros_like(full.counts))
+    scorer = CellScorer(Resampling(resamples=100, blocks="none"))
+    with pytest.raises(InputError, match="run-b has nothing to score"):
+        scorer.cells(SCORER, [{0: ("run-a", full)}, {0: ("run-b", empty)}], (0,))
