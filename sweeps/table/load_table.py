@@ -1,4 +1,8 @@
-"""Reads and checks table files: the papers' in ``sweeps/tables``, the user's in ``tables``."""
+"""Reads and checks table files.
+
+The papers' lie in ``sweeps/tables``, studies of the project in ``sweeps/studies``, the user's in
+``tables``.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +20,12 @@ from sweeps.table.table import Column, Factor, Row, Table
 
 PUBLISHED = Path(__file__).resolve().parents[1] / "tables"
 """The papers' tables, part of the package."""
+
+STUDIES = Path(__file__).resolve().parents[1] / "studies"
+"""Tables of the project that no paper prints, part of the package."""
+
+STUDY = "studies/"
+"""Beginning of the name of a table in `STUDIES`."""
 
 OWN = Path("tables")
 """Tables of the user, in the current folder."""
@@ -37,12 +47,17 @@ def table_names(folder: Path = OWN) -> list[str]:
     ]
 
 
+def study_names() -> list[str]:
+    """Names for `load_table` of the project's studies: "studies/missing_image"."""
+    return [f"{STUDY}{path.stem}" for path in sorted(STUDIES.glob("*.yaml"))]
+
+
 def load_table(name: str, folder: Path = OWN) -> Table:
     """Read and check a table.
 
     Args:
-        name: "spatialseg/table3" for a published table, "my/ablation" for one in `folder`, or a
-            path that ends in .yaml.
+        name: "spatialseg/table3" for a published table, "studies/missing_image" for a study,
+            "my/ablation" for one in `folder`, or a path that ends in .yaml.
         folder: of the user's tables.
 
     Raises:
@@ -68,11 +83,13 @@ def _find(name: str, folder: Path) -> Path:
         if not path.is_file():
             raise InputError(f"table={name}: there is no such file.")
         return path
-    paths = [path for root in (PUBLISHED, folder) if (path := root / f"{name}.yaml").is_file()]
+    roots = (PUBLISHED, STUDIES.parent, folder) if name.startswith(STUDY) else (PUBLISHED, folder)
+    paths = [path for root in roots if (path := root / f"{name}.yaml").is_file()]
     if len(paths) > 1:
         raise InputError(f"table={name} is both {paths[0]} and {paths[1]}; give the path of one.")
     if not paths:
-        raise InputError(f"there is no table '{name}'; {nearest(name, table_names(folder))}.")
+        known = [*table_names(folder), *study_names()]
+        raise InputError(f"there is no table '{name}'; {nearest(name, known)}.")
     return paths[0]
 
 
