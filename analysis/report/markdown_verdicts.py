@@ -183,7 +183,12 @@ def _rows(runs: Sequence[RunEntry]) -> str:
 
 def _times(runs: Sequence[RunEntry]) -> list[str]:
     known = [run.seconds for run in runs if run.seconds is not None]
-    return [duration(median(known)), duration(sum(known))] if known else [DASH, DASH]
+    return [_seconds(median(known)), duration(sum(known))] if known else [DASH, DASH]
+
+
+def _seconds(seconds: float) -> str:
+    """Seconds as such below ten minutes, because minutes are too coarse for runs of a few."""
+    return f"{seconds:.0f} s" if seconds < 600 else duration(seconds)
 
 
 def _by_seed(runs: Iterable[RunEntry]) -> list[RunEntry]:
@@ -240,8 +245,8 @@ def limits(papers: Sequence[PaperClaims], runs: Sequence[RunEntry]) -> list[str]
     single = sum(each.covers == "images" and each.seeds == 1 for each in judged)
     if single:
         sentences.append(
-            f"**Trainings:** {plural(single, 'claim')} has or have one seed only. The interval is "
-            "over images alone and does not cover the spread of trainings."
+            f"**Trainings:** the verdict of {plural(single, 'claim')} is of one seed. The interval "
+            "is over images alone and does not cover the spread of trainings."
         )
     if judged:
         sentences.append(
