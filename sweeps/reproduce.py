@@ -182,7 +182,25 @@ def main(options: Options, overrides: list[str]) -> int:
     if plan.until_decided is None:  # an earlier command may have added seeds
         plan.judge.rule = rule_of(result.tags for each in outcomes for result in each.results)
     out = options.out or options.runs_dir / "tables" / f"{wanted.name}_{wanted.variant}"
-    return publish_table(plan.judge, wanted, outcomes, plan.external, out, runs.tracking)
+    code = publish_table(plan.judge, wanted, outcomes, plan.external, out, runs.tracking)
+    _show_time(outcomes, planner)
+    return code
+
+
+def _show_time(outcomes: Sequence[Outcome], planner: Planner) -> None:
+    """Print how long the finished runs and those upstream of them took."""
+    from rich.text import Text
+
+    from rgbt.tracking.terminal import print_rich
+    from sweeps.rendering.times import time_line, upstream_line
+
+    finished = [outcome for outcome in outcomes if outcome.results]
+    lines = (
+        time_line(result for outcome in finished for result in outcome.results),
+        upstream_line((outcome.point.overrides for outcome in finished), planner),
+    )
+    if any(lines):
+        print_rich(Text("\n".join(line for line in lines if line)))
 
 
 def _show(

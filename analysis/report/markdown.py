@@ -41,6 +41,7 @@ PAGE_NAME = re.compile(r"[\w-]+")
 PAGES = ("index", "claims", "networks", "measurements")
 """Pages that are not about the tables of one folder."""
 
+STUDY_PAGE = "studies"
 STUDIES = Paper(title="Studies", reference="Tables of this project that no paper prints.")
 
 
@@ -137,12 +138,14 @@ def _papers(tables: Iterable[TableView]) -> dict[str, Paper]:
                 f"table '{view.entry.name}' cannot have a page {name}.md; rename its folder."
             )
         own = Paper(title=name, reference="Tables of the user.")
-        known.setdefault(name, STUDIES if name == "studies" else own)
+        known.setdefault(name, STUDIES if name == STUDY_PAGE else own)
     return known
 
 
 def _page_of(view: TableView) -> str:
-    return view.entry.name.partition("/")[0]
+    """Name of the page of a table: the folder of its file; all studies of ours have one."""
+    folder, slash, _ = view.entry.name.partition("/")
+    return folder if slash else STUDY_PAGE
 
 
 def _index(data: ReportData, tables: Mapping[str, Sequence[TableView]]) -> dict[str, object]:

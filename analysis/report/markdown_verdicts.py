@@ -32,7 +32,7 @@ from analysis.report.views import (
 )
 from sweeps.table.request import DEFAULT_SCALE
 
-UPSTREAM = re.compile(r"experiment:([\w-]+)/")
+UPSTREAM = re.compile(r"(?:experiment|common):([\w-]+)/")
 """In a setting, the experiment of an upstream run."""
 
 CHANCE = 0.025

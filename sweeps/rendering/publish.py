@@ -8,8 +8,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.text import Text
-
 from rgbt.files.atomic import write_atomic
 from rgbt.tracking.tables import TextTable
 from rgbt.tracking.terminal import info, line_width, path_lines, print_rich, rich_table
@@ -18,7 +16,6 @@ from sweeps.rendering.figure import draw_table
 from sweeps.rendering.file_formats import latex, markdown, tidy_csv
 from sweeps.rendering.rendered_table import RenderedTable, render_table
 from sweeps.rendering.terminal import terminal
-from sweeps.rendering.times import time_line
 from sweeps.report.records import record
 from sweeps.table.cells import NO_VALUE, CellRun
 from sweeps.table.efficiency import efficiency_cells
@@ -82,9 +79,6 @@ def publish_table(
         print_rich(rich_table(findings.forms))
     if findings.claims:
         print_rich(rich_table(claims_grid(findings.claims, counted(findings.claims))))
-    time = time_line(result for outcome in outcomes for result in outcome.results)
-    if time:
-        print_rich(Text(time))
     failed = _report_missing(scored, outcomes)
     try:
         files = write_files(scored, rendered, findings, out)

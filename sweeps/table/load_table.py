@@ -1,7 +1,6 @@
 """Reads and checks table files.
 
-The papers' lie in ``sweeps/tables``, studies of the project in ``sweeps/studies``, the user's in
-``tables``.
+The papers' are in ``sweeps/tables``, our studies in ``sweeps/studies``, the user's in ``tables``.
 """
 
 from __future__ import annotations
@@ -22,10 +21,7 @@ PUBLISHED = Path(__file__).resolve().parents[1] / "tables"
 """The papers' tables, part of the package."""
 
 STUDIES = Path(__file__).resolve().parents[1] / "studies"
-"""Tables of the project that no paper prints, part of the package."""
-
-STUDY = "studies/"
-"""Beginning of the name of a table in `STUDIES`."""
+"""Our own studies, part of the package; no paper has printed them."""
 
 OWN = Path("tables")
 """Tables of the user, in the current folder."""
@@ -48,15 +44,15 @@ def table_names(folder: Path = OWN) -> list[str]:
 
 
 def study_names() -> list[str]:
-    """Names for `load_table` of the project's studies: "studies/missing_image"."""
-    return [f"{STUDY}{path.stem}" for path in sorted(STUDIES.glob("*.yaml"))]
+    """Names for `load_table` of our own studies."""
+    return [path.stem for path in sorted(STUDIES.glob("*.yaml"))]
 
 
 def load_table(name: str, folder: Path = OWN) -> Table:
     """Read and check a table.
 
     Args:
-        name: "spatialseg/table3" for a published table, "studies/missing_image" for a study,
+        name: "spatialseg/table3" for a published table, "spatial_bias" for a study of ours,
             "my/ablation" for one in `folder`, or a path that ends in .yaml.
         folder: of the user's tables.
 
@@ -83,8 +79,9 @@ def _find(name: str, folder: Path) -> Path:
         if not path.is_file():
             raise InputError(f"table={name}: there is no such file.")
         return path
-    roots = (PUBLISHED, STUDIES.parent, folder) if name.startswith(STUDY) else (PUBLISHED, folder)
-    paths = [path for root in roots if (path := root / f"{name}.yaml").is_file()]
+    paths = [
+        path for root in (PUBLISHED, STUDIES, folder) if (path := root / f"{name}.yaml").is_file()
+    ]
     if len(paths) > 1:
         raise InputError(f"table={name} is both {paths[0]} and {paths[1]}; give the path of one.")
     if not paths:

@@ -234,14 +234,5 @@ class Table:
         overrides = row.overrides if chosen.overrides is None else chosen.overrides
         at = row.at if chosen.at is None else chosen.at
         experiment = chosen.experiment or row.experiment
-        shared, own = _at_scale(self.at, scale), _at_scale(at, scale)
+        shared, own = self.at.get(scale, ()), at.get(scale, ())
         return (f"+experiment={experiment}", *shared, *overrides, *own)
-
-
-def _at_scale(at: Mapping[str, tuple[str, ...]], scale: str) -> tuple[str, ...]:
-    """The overrides of a scale: its own, else at every scale but "paper" those of "demo".
-
-    All scales but "paper" have the small networks and the embedded data sets.
-    """
-    small = () if scale == "paper" else at.get("demo", ())
-    return at.get(scale, small)

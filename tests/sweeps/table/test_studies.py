@@ -1,4 +1,4 @@
-"""Tables of the project that no paper prints, and overrides of scales without an entry."""
+"""Tables of the project that no paper prints."""
 
 from __future__ import annotations
 
@@ -9,11 +9,10 @@ import pytest
 from rgbt.checks import InputError
 from sweeps.table.load_table import STUDIES, load_table, study_names, table_names
 from sweeps.table.make_request import TableWords, make_request, read_named
-from sweeps.table.table import Column, Row, Table
 from sweeps.verdicts.contrasts import contrasts_of
 from sweeps.worker.planner import Planner
 
-MISSING = "studies/missing_image"
+MISSING = "missing_image"
 
 
 def test_study_is_found_by_name_and_by_path() -> None:
@@ -26,8 +25,8 @@ def test_study_is_found_by_name_and_by_path() -> None:
 
 
 def test_study_that_does_not_exist_is_refused_with_the_nearest_name() -> None:
-    with pytest.raises(InputError, match="did you mean 'studies/missing_image'"):
-        load_table("studies/mising_image")
+    with pytest.raises(InputError, match="did you mean 'missing_image'"):
+        load_table("mising_image")
 
 
 def test_missing_image_has_the_runs_of_the_ablation_of_crm() -> None:
@@ -65,23 +64,3 @@ def test_missing_image_claims_are_the_contrasts_that_they_state() -> None:
     assert labels["night_needs_thermal"] == [
         "Baseline, night_loss_no_thermal - day_loss_no_thermal"
     ]
-
-
-@pytest.mark.parametrize(
-    ("at", "scale", "added"),
-    [
-        ({"demo": ("a=1",), "paper": ("b=2",)}, "demo", ("a=1",)),
-        ({"demo": ("a=1",), "paper": ("b=2",)}, "paper", ("b=2",)),
-        ({"demo": ("a=1",), "paper": ("b=2",)}, "bench", ("a=1",)),
-        ({"demo": ("a=1",), "bench": ()}, "bench", ()),
-        ({"demo": ("a=1",)}, "paper", ()),
-        ({"paper": ("b=2",)}, "bench", ()),
-    ],
-)
-def test_overrides_of_a_small_scale_are_those_of_demo_without_its_own(
-    at: dict[str, tuple[str, ...]], scale: str, added: tuple[str, ...]
-) -> None:
-    row = Row(label="r", experiment="crm", at=at)
-    columns = (Column(name="mIoU", metric="mIoU"),)
-    table = Table(paper="my", number="1", caption="", data="", columns=columns, rows=(row,))
-    assert table.overrides(row, scale) == ("+experiment=crm", *added)
