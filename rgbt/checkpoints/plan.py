@@ -13,6 +13,7 @@ from rgbt.checkpoints.layout import COUNTER, Rule, reason
 from rgbt.checks import InputError, nearest
 
 NAMED_FRESH = "named in model.fresh"
+OTHER_SHAPE = "of another shape in the common start, which has other classes"
 
 
 @dataclass
@@ -52,6 +53,7 @@ def make_plan(
     *,
     prefix: str,
     fresh: tuple[str, ...],
+    other_classes: bool = False,
 ) -> Plan:
     """Find a place for everything.
 
@@ -61,6 +63,8 @@ def make_plan(
         rule: how this network is filled from this kind of file.
         prefix: before every name in the file that belongs to the network.
         fresh: parts that keep their initial values, by the beginning of their names.
+        other_classes: whether an entry of another shape keeps its initial values; False: it does
+            not fit.
 
     Raises:
         InputError: a part in `fresh` that the network does not have.
@@ -74,8 +78,12 @@ def make_plan(
         elif why := reason(rule.fresh, entry):
             plan.fresh[entry] = why
         elif name in tensors:
+            difference = _difference(tensors[name], value, is_stem=entry in rule.stems)
+            if difference and other_classes:
+                plan.fresh[entry] = explained[name] = OTHER_SHAPE
+                continue
             plan.values[entry] = name
-            if difference := _difference(tensors[name], value, is_stem=entry in rule.stems):
+            if difference:
                 plan.unfit[entry] = difference
         elif entry.endswith(COUNTER):
             plan.zeros.append(entry)
