@@ -45,6 +45,15 @@ class Plan:
         """Every name is used or explained, every entry set or explained."""
         return not (self.missing or self.unexpected or self.unfit or self.torn)
 
+    def put(self, entry: str, name: str, difference: str, *, other_classes: bool) -> None:
+        """Assign the tensor `name` to an entry, which it fits without a `difference`."""
+        if difference and other_classes:
+            self.fresh[entry] = self.leftover[name] = OTHER_SHAPE
+            return
+        self.values[entry] = name
+        if difference:
+            self.unfit[entry] = difference
+
 
 def make_plan(
     state: Mapping[str, Tensor],
@@ -79,17 +88,12 @@ def make_plan(
             plan.fresh[entry] = why
         elif name in tensors:
             difference = _difference(tensors[name], value, is_stem=entry in rule.stems)
-            if difference and other_classes:
-                plan.fresh[entry] = explained[name] = OTHER_SHAPE
-                continue
-            plan.values[entry] = name
-            if difference:
-                plan.unfit[entry] = difference
+            plan.put(entry, name, difference, other_classes=other_classes)
         elif entry.endswith(COUNTER):
             plan.zeros.append(entry)
         else:
             plan.missing.append(entry)
-    used = set(plan.values.values())
+    used = {*plan.values.values(), *plan.leftover}
     for name in (name for name in tensors if name not in used):
         why = explained.get(name) or reason(rule.leftover, name.removeprefix(prefix))
         if why:

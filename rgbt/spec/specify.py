@@ -177,9 +177,7 @@ def parse_reference(key: str, value: str | None) -> Reference | None:
         )
     name, _, checkpoint = rest.rpartition("/")
     if checkpoint not in get_args(CheckpointFile):
-        raise InputError(
-            f"{key}={value}: expected {prefix}:NAME/best.pt or {prefix}:NAME/last.pt."
-        )
+        raise InputError(f"{key}={value}: expected {prefix}:NAME/best.pt or {prefix}:NAME/last.pt.")
     known = available("experiment")
     if name not in known:
         raise InputError(
@@ -234,7 +232,9 @@ def _composed(experiment: str, scale: str) -> DictConfig:
 def _shared_overrides(overrides: Sequence[str], key: str, reference: Reference) -> list[str]:
     """The typed overrides that the upstream run of the setting `key` shares."""
     network = ("model",) if key == WEIGHTS else ()
-    groups = ("scale", *network) if reference.is_common else ("scale", "dataset", "metric", *network)
+    groups = (
+        ("scale", *network) if reference.is_common else ("scale", "dataset", "metric", *network)
+    )
     always = SHARED_BY_COMMON if reference.is_common else SHARED
     own = (WEIGHTS, "model.fresh", "seed", "runs_dir")
 
