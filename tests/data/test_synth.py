@@ -76,6 +76,11 @@ def test_every_class_is_frequent_and_large() -> None:
         ({"thermal_drift": 0.2}, ("rgb", "label")),
         ({"texture_strength": 0.0}, ("label",)),
         ({"night_share": 1.0}, ("label", "depth")),
+        ({"rgb_noise_radius_gain": -0.5}, ("thermal", "label")),
+        ({"thermal_noise_radius_gain": -0.5}, ("rgb", "label")),
+        ({"rgb_blur": 1.0}, ("thermal", "label")),
+        ({"texture_radius_gain": 2.0}, ("label",)),
+        ({"passive_contrast": 0.0}, ("rgb", "label")),
     ],
 )
 def test_factor_changes_its_own_image_only(change: dict, kept: tuple) -> None:

@@ -71,6 +71,7 @@ def test_methods_with_the_same_network_share_the_start(name: str) -> None:
 
 CHANGES = {
     "seed": ["seed=7"],
+    "seeds by source": ["seeds.weights=7", "seeds.order=8"],
     "data set": ["dataset.seed=5", "dataset.rgb_noise=0.1", "dataset.num_train=10"],
     "another data set": ["dataset=synth_pst900"],
     "files": ["dataset=mfnet", "dataset.root=/data/mfnet", "dataset.cache_dir=/data/cache"],
