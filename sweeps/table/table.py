@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
 from rgbt.checks import InputError
+from rgbt.config.compose import chosen_scale
 from rgbt.metrics.pairs import Protocol
 from sweeps.evaluation import Head
 from sweeps.table.claim import Claim
@@ -237,5 +238,5 @@ class Table:
         overrides = row.overrides if chosen.overrides is None else chosen.overrides
         at = row.at if chosen.at is None else chosen.at
         experiment = chosen.experiment or row.experiment
-        shared, own = self.at.get(scale, ()), at.get(scale, ())
+        shared, own = (each.get(chosen_scale(scale, each), ()) for each in (self.at, at))
         return (f"+experiment={experiment}", *shared, *overrides, *own)

@@ -85,7 +85,7 @@ def test_own_table_needs_no_printed_values(tmp_path: Path) -> None:
         ({"rows": [{"experiment": "grbm"}]}, "row 1: 'label' has no value"),
         ({"rows": [{"label": "a"}, {"label": "a"}]}, "rows: 'a' is used twice"),
         ({"rows": ["a"]}, "'rows[0]': input should be an object"),
-        ({"at": {"big": []}}, "at: 'big' is not a valid choice; known: demo, paper"),
+        ({"at": {"big": []}}, "at: 'big' is not a valid choice; known: bench, demo, paper"),
         ({"regions": "ring7"}, "regions: 'ring7' is not a valid choice"),
         ({"absent": "exlude"}, "'absent': input should be 'released' or 'exclude'"),
         (column(metric="Var", name="mIoU"), "columns: 'mIoU' is used twice"),
