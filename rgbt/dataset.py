@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,6 +73,27 @@ class LabelledDataset(Protocol):
 
     def fingerprint(self) -> str:
         """Hash of names and files; equal copies in different folders have equal fingerprints."""
+        ...
+
+
+class SceneMaps(NamedTuple):
+    """What is known about the scene behind each pixel of a label.
+
+    Attributes:
+        depth_m: (H, W) float32, distance in metres, inf: the sky.
+        objects: (H, W) int32, number of the object from 1 on, 0: none.
+    """
+
+    depth_m: NDArray[np.float32]
+    objects: NDArray[np.int32]
+
+
+@runtime_checkable
+class KnownScenes(Protocol):
+    """A data set that knows depth and objects of its scenes, such as a generated one."""
+
+    def scene_maps(self, name: str) -> SceneMaps:
+        """Maps of the size of the label; InputError if the image has none."""
         ...
 
 
