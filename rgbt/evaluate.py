@@ -58,6 +58,9 @@ class Options(NetworkOptions):
     boundary_width: Annotated[
         float, Help("width of a boundary as a share of the image diagonal, 0.001 to 0.2")
     ] = WIDTH
+    boundary_border: Annotated[
+        bool, Help("whether the border of the image is an outline of masks, as Cheng et al. coded")
+    ] = False
     distances: Annotated[str, Help("edges between bins of distance in metres")] = _text(DISTANCES)
     sizes: Annotated[str, Help("edges between bins of size in pixels of an object")] = _text(SIZES)
     out: Annotated[
@@ -82,7 +85,8 @@ def main(options: Options, overrides: list[str]) -> int:
     from rgbt.training.overview import announce_network
 
     _check_out(options)
-    details = requested(options.details, options.boundary_width, options.distances, options.sizes)
+    boundary = options.boundary_width, options.boundary_border
+    details = requested(options.details, boundary, options.distances, options.sizes)
     words, overrides = split_overrides(overrides)
     network = NetworkRequest(options, overrides, options.regions)
     corruption = requested_corruption(options.corruption, options.severity, words, network.trust)

@@ -25,6 +25,9 @@ from rgbt.metrics import names
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import ParsedMetric, parse
 
+NEVER_NEGATIVE = (names.VAR, "calibration")
+"""Scores that chance alone raises, so that their intervals are corrected for it."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
@@ -94,7 +97,7 @@ def estimate_of(
     settings, value = images.settings, float(points.mean())
     level = settings.level
     around = over_images(value, resampled, without, method=settings.method, level=level)
-    if metric.score == names.VAR and around is not None and settings.method == "auto":
+    if metric.score in NEVER_NEGATIVE and around is not None and settings.method == "auto":
         bias = float(np.nanmean(resampled)) - value
         around = corrected(value, bias, image_spread(images, resampled), level)
     spread = over_seeds(points)

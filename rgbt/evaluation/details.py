@@ -59,7 +59,8 @@ class DetailCounter:
 def _counter(details: Details, dataset: LabelledDataset, regions: Regions) -> Count:
     classes = len(dataset.classes)
     if details.kind == "boundary":
-        boundary = BoundaryCounter(classes, regions, details.setting[0])
+        width, border = details.setting[0], details.with_border
+        boundary = BoundaryCounter(classes, regions, width, border=border)
         return lambda name, label, predicted, confidence: boundary(label, predicted)  # noqa: ARG005
     if details.kind == "calibration":
         calibration = CalibrationCounter(classes, regions, details.groups)

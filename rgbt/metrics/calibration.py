@@ -3,8 +3,8 @@
 Source: Guo, Pleiss, Sun, Weinberger: "On Calibration of Modern Neural Networks", ICML 2017, Eq. 3,
 with M = 15 equal bins (0, 1/M], (1/M, 2/M], ... of the highest probability of each pixel.
 
-The confidence of a pixel is rounded to whole units of 1/10,000 before it is added. So all counts are
-integers and add exactly, in any order and over any number of processes. The rounding changes an
+The confidence of a pixel is rounded to whole units of 1/10,000 before it is added. So all counts
+are integers and add exactly, in any order and over any number of processes. The rounding changes an
 error by at most 0.005 percent points.
 """
 

@@ -51,9 +51,10 @@ class Details:
 
     Attributes:
         kind: see the module.
-        setting: of boundaries their width as a share of the image diagonal, 0.001..0.2; of
-            calibration the number of bins; of distance (metres) and size (pixels of the image) the
-            rising edges between bins, above 0.
+        setting: of boundaries their width as a share of the image diagonal, 0.001..0.2, and then
+            1 if the border of the image is an outline; of calibration the number of bins; of
+            distance (metres) and size (pixels of the image) the rising edges between bins, above
+            0.
 
     Raises:
         InputError: a value out of range.
@@ -73,6 +74,11 @@ class Details:
                 raise InputError(
                     f"{self.kind}s={given}: expected 1 to {MOST_EDGES} rising numbers above 0."
                 )
+
+    @property
+    def with_border(self) -> bool:
+        """Of boundaries, whether the border of the image is an outline."""
+        return self.kind == "boundary" and len(self.setting) > 1
 
     @property
     def bins(self) -> tuple[str, ...]:
@@ -109,8 +115,13 @@ def default(kind: DetailKind) -> Details:
     return Details(kind, settings[kind])
 
 
-def requested(kinds: str, width: float, distances: str, sizes: str) -> tuple[Details, ...]:
+def requested(
+    kinds: str, boundary: tuple[float, bool], distances: str, sizes: str
+) -> tuple[Details, ...]:
     """The details that options of a command request; `kinds` is a list, "all" or "none".
+
+    `boundary` is the width, and whether the border of the image is an outline; `distances` and
+    `sizes` are lists of edges.
 
     Raises:
         InputError: an unknown kind, or a setting out of range.
@@ -119,7 +130,7 @@ def requested(kinds: str, width: float, distances: str, sizes: str) -> tuple[Det
         return ()
     named = list(KINDS) if kinds == "all" else split_list(kinds, "details")
     chosen: dict[str, Callable[[], tuple[float, ...]]] = {
-        "boundary": lambda: (width,),
+        "boundary": lambda: (boundary[0], *([1.0] if boundary[1] else [])),
         "calibration": lambda: (float(CALIBRATION_BINS),),
         "distance": lambda: _edges("distances", distances),
         "size": lambda: _edges("sizes", sizes),

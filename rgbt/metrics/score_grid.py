@@ -57,6 +57,7 @@ def score_grid(counts: Counts) -> ScoreGrid:
     ]
     rows.append((MEAN, _everywhere(names.BOUNDARY_MIOU, numbers)))
     title = f"Boundary IoU in percent, width {100 * details.setting[0]:g} % of the image diagonal"
+    title += ", with the border of the image" if details.with_border else ""
     return ScoreGrid(title, columns, tuple(rows))
 
 

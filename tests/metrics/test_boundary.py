@@ -32,7 +32,7 @@ def test_boundary_pixels_are_a_share_of_the_diagonal(hw, width, expected) -> Non
 def test_counts_of_a_square_that_is_predicted_one_pixel_to_the_right() -> None:
     # 7 x 7, d = 1. The label is the square of rows and columns 2..4, the prediction columns 3..5.
     label, prediction = square(7, 2, 5), np.roll(square(7, 2, 5), 1, axis=1)
-    found = BoundaryCounter(2, ONE, 0.02)(label, prediction)
+    found = BoundaryCounter(2, ONE, 0.02, border=True)(label, prediction)
     # Class 1: 9 pixels each, all but the middle one are boundary. The squares share columns 3 and
     # 4, 6 pixels, of which (3, 3) is the middle of the label and (3, 4) that of the prediction.
     assert found[0, :, 1].tolist() == [4, 8, 8]
@@ -40,6 +40,9 @@ def test_counts_of_a_square_that_is_predicted_one_pixel_to_the_right() -> None:
     # Of the prediction: the border, and its ring without the 5 pixels of column 6 on the border.
     # Both: the border, and that ring without the 3 pixels of column 2 that the label calls 1.
     assert found[0, :, 0].tolist() == [24 + 8, 24 + 16, 24 + 11]
+    # Without the border of the image: its 24 pixels count where the ring touches them (5).
+    without = BoundaryCounter(2, ONE, 0.02)(label, prediction)
+    assert without[0].tolist() == [[8, 4], [16, 8], [11 + 5, 8]]
     ious = boundary_iou(found.sum(0), "released")
     assert ious.tolist() == pytest.approx([32 / (40 + 35 - 32), 4 / (8 + 8 - 4)])
 
@@ -53,17 +56,22 @@ def test_counts_by_region_add_to_those_of_the_image() -> None:
     assert np.array_equal(mirrored, halves[::-1])
 
 
+@pytest.mark.parametrize("border", [True, False])
 @pytest.mark.parametrize("pixels", [1, 2, 5])
-def test_boundary_is_what_erosions_of_each_padded_mask_leave(pixels: int) -> None:
+def test_boundary_is_what_erosions_of_each_padded_mask_leave(pixels: int, border: bool) -> None:
     # The released code pads a mask with one pixel of background and erodes it d times by 3 x 3.
+    # Where the border is no outline, the mask is continued beyond it.
     rng = np.random.default_rng(pixels)
     blobs = cv2.resize(rng.integers(0, 3, (6, 8)).astype(np.uint8), (40, 30), interpolation=0)
     expected = np.zeros(blobs.shape, bool)
     for each in range(3):
-        padded = np.pad((blobs == each).astype(np.uint8), 1)
-        eroded = cv2.erode(padded, np.ones((3, 3), np.uint8), iterations=pixels)[1:-1, 1:-1]
+        mask = (blobs == each).astype(np.uint8)
+        padded = np.pad(mask, 9) if border else np.pad(mask, 9, mode="edge")
+        eroded = cv2.erode(padded, np.ones((3, 3), np.uint8), iterations=pixels)[9:-9, 9:-9]
         expected |= (blobs == each) & (eroded == 0)
-    assert np.array_equal(outlined(blobs, np.ones(blobs.shape, bool), pixels), expected)
+    assert np.array_equal(
+        outlined(blobs, np.ones(blobs.shape, bool), pixels, border=border), expected
+    )
 
 
 def test_ignored_pixels_are_not_counted_and_are_no_outline() -> None:
@@ -71,7 +79,8 @@ def test_ignored_pixels_are_not_counted_and_are_no_outline() -> None:
     label[3, 3] = 255
     prediction = np.zeros((7, 7), np.uint8)
     prediction[3, 3] = 1  # not counted, and no outline of class 0 around it
-    found = BoundaryCounter(2, ONE, 0.02)(label, prediction)
+    assert not BoundaryCounter(2, ONE, 0.02)(label, prediction).any()
+    found = BoundaryCounter(2, ONE, 0.02, border=True)(label, prediction)
     assert found[0].tolist() == [[24, 0], [24, 0], [24, 0]]  # the border of the image alone
 
 

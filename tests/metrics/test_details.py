@@ -10,8 +10,8 @@ import pytest
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.details import Details, default, details_of, parse_detail, regions_of, requested
-from rgbt.metrics.names import in_percent
 from rgbt.metrics.named import parse, value
+from rgbt.metrics.names import in_percent
 from rgbt.metrics.score_grid import headlines, score_grid
 from tests.sweeps.tabled import counts_of
 
@@ -143,6 +143,7 @@ def test_names_of_other_metrics_keep_their_meaning() -> None:
     [
         *map(default, ("boundary", "calibration", "distance", "size")),
         Details("boundary", (0.0012,)),
+        Details("boundary", (0.02, 1.0)),
         Details("size", (0.5, 123456.0, 1e7)),
         Details("distance", (1e-05,)),
     ],
@@ -160,26 +161,34 @@ def test_other_partitions_are_no_details(partition: str) -> None:
 
 
 def test_requested_details() -> None:
-    assert requested("none", 0.02, "10", "64") == ()
-    assert [each.kind for each in requested("[size,boundary,size]", 0.1, "10", "64")] == [
+    assert requested("none", (0.02, False), "10", "64") == ()
+    assert [each.kind for each in requested("[size,boundary,size]", (0.1, False), "10", "64")] == [
         "size",
         "boundary",
     ]
-    every = requested("all", 0.1, "5,7.5", "64,128")
+    every = requested("all", (0.1, False), "5,7.5", "64,128")
     assert [each.setting for each in every] == [(0.1,), (15.0,), (5.0, 7.5), (64.0, 128.0)]
+    assert [each.with_border for each in every] == [False] * 4
+    assert requested("boundary", (0.1, True), "1", "1") == (Details("boundary", (0.1, 1.0)),)
     assert every[2].bins == ("0-5", "5-7.5", "7.5-inf")
 
 
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        (("boundry", 0.02, "1", "1"), "did you mean 'boundary'"),
-        (("size,all", 0.02, "1", "1"), "'all' stands alone"),
-        (("boundary", 0.5, "1", "1"), "boundary_width must be between 0.001 and 0.2, got 0.5"),
-        (("distance", 0.02, "10,5", "1"), "distances=10,5: expected 1 to 20 rising numbers"),
-        (("distance", 0.02, "near", "1"), "distances=near: expected numbers"),
-        (("size", 0.02, "1", "0,5"), "sizes=0,5: expected 1 to 20 rising numbers"),
-        (("size", 0.02, "1", "inf"), "sizes=inf: expected 1 to 20 rising numbers"),
+        (("boundry", (0.02, False), "1", "1"), "did you mean 'boundary'"),
+        (("size,all", (0.02, False), "1", "1"), "'all' stands alone"),
+        (
+            ("boundary", (0.5, False), "1", "1"),
+            "boundary_width must be between 0.001 and 0.2, got 0.5",
+        ),
+        (
+            ("distance", (0.02, False), "10,5", "1"),
+            "distances=10,5: expected 1 to 20 rising numbers",
+        ),
+        (("distance", (0.02, False), "near", "1"), "distances=near: expected numbers"),
+        (("size", (0.02, False), "1", "0,5"), "sizes=0,5: expected 1 to 20 rising numbers"),
+        (("size", (0.02, False), "1", "inf"), "sizes=inf: expected 1 to 20 rising numbers"),
     ],
 )
 def test_wrong_settings_are_refused(given, words: str) -> None:
