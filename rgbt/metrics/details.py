@@ -187,6 +187,12 @@ class DetailScore:
     bin: str = ""
 
 
+def details_of_metric(metric: str) -> DetailScore | None:
+    """The details that a metric name needs, also after day/ or night/; None: other counts."""
+    words = metric.split("/")
+    return parse_detail(words[1:] if words[0] in (names.DAY, names.NIGHT) else words)
+
+
 BIN = re.compile(r"\d+(\.\d+)?-(\d+(\.\d+)?|inf)")
 
 
