@@ -52,7 +52,7 @@ class Options(NetworkOptions):
         Help(
             "what else to count, a list: boundary (boundary IoU), calibration (ECE), distance "
             "(IoU by distance), size (recall by size of the object); all; none. Distance and size "
-            "need a data set that knows them (dataset=synth_calibrated)"
+            "require a data set with scene maps"
         ),
     ] = "none"
     boundary_width: Annotated[

@@ -30,7 +30,7 @@ from rgbt.processes import collected, num_processes
 from rgbt.tracking.pictures import Legend, PanelExample
 from rgbt.tracking.tables import ClassTable, RegionTable, ResultTables
 from rgbt.tracking.terminal import result_view
-from rgbt.types import Batch, View
+from rgbt.types import Loadable, View
 
 NUM_PANELS = 6
 """Images of the qualitative panel: the same number by day and by night if the split has both."""
@@ -83,14 +83,11 @@ def evaluate(session: Session, model: nn.Module, request: EvaluationRequest) -> 
         task = display.add_task(request.split, total=total, note="images")
         done = 0
         for batch in batches:
-            on_device = batch.to(session.fabric.device)
-            predicted, confidence = _predicted(predictor, on_device, detail.needs_confidence)
+            predicted, confidence = _predicted(predictor, batch, session, detail)
             for index, (name, label) in enumerate(zip(batch.name, batch.label, strict=True)):
                 classes = predicted[index]
                 counted[name] = counter(label, classes)
-                if request.details:
-                    sure = None if confidence is None else confidence[index]
-                    detailed[name] = detail(name, label, classes, sure)
+                detailed[name] = detail(name, label, classes, confidence[index])
                 is_kept = name in request.keep
                 kept += [_example(session, name, classes.numpy())] if is_kept else []
             done = min(total, done + num_processes() * len(batch.name))
@@ -103,13 +100,14 @@ def evaluate(session: Session, model: nn.Module, request: EvaluationRequest) -> 
 
 
 def _predicted(
-    predictor: Predictor, batch: Batch, needs_confidence: bool
-) -> tuple[Tensor, Tensor | None]:
-    """Classes (B, H, W) of a batch on the CPU, with their probabilities where needed."""
-    if not needs_confidence:
-        return predictor.classes(batch).cpu(), None
-    classes, confidence = predictor.confident_classes(batch)
-    return classes.cpu(), confidence.cpu()
+    predictor: Predictor, batch: Loadable, session: Session, detail: DetailCounter
+) -> tuple[Tensor, Sequence[Tensor | None]]:
+    """Classes (B, H, W) of a batch on the CPU, with the probability of each where it is needed."""
+    on_device = batch.to(session.fabric.device)
+    if not detail.needs_confidence:
+        return predictor.classes(on_device).cpu(), [None] * len(batch.name)
+    classes, confidence = predictor.confident_classes(on_device)
+    return classes.cpu(), list(confidence.cpu())
 
 
 class _Part(NamedTuple):

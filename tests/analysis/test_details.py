@@ -16,6 +16,7 @@ from analysis.uncertainty import Resampling, compare, estimate
 from analysis.uncertainty.contrasts import Resampler, Term
 from analysis.uncertainty.same_images import aligned, aligned_images
 from rgbt.checks import InputError
+from rgbt.metrics.calibration import ece
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.details import Details
 from rgbt.metrics.named import value
@@ -197,3 +198,28 @@ def test_missing_details_are_named(call: Call, runs: Path) -> None:
     code, _, err = call(entry)
     assert code == 2
     assert_one_sentence(err, "'run' has no value")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("gap", [0.0, 0.03, 0.1])
+def test_interval_of_a_calibration_error_holds_the_truth(gap: float) -> None:
+    """60 images, bins that are too confident by `gap`, and images that differ."""
+    rng = np.random.default_rng(0)
+    centre = (np.arange(15) + 0.5) / 15
+
+    def drawn(images: int) -> np.ndarray:
+        right = np.clip(centre * (1 - gap) + 0.05 * rng.normal(size=(images, 15)), 0, 1)
+        number = np.full((images, 15), 100)
+        units = np.broadcast_to(np.rint(100 * centre * 10_000), number.shape).astype(np.int64)
+        one = np.stack([number, rng.binomial(number, right), units], 2)[..., None]
+        return np.concatenate([one, np.zeros_like(one)], -1)  # all are predicted as road
+
+    truth = 100 * float(ece(drawn(50_000).sum(0)))
+    settings = Resampling(resamples=300, blocks="none")
+    holds = 0
+    for _ in range(100):
+        counts = counts_of(drawn(60), "ring1-calibration-15")
+        images = estimate([counts], ["ECE"], settings)["ECE"].images
+        assert images is not None
+        holds += truth in images
+    assert holds >= 88  # 95 but for chance
