@@ -5,6 +5,7 @@ rgbt spatial dataset=mfnet dataset.root=... split=train out=folder
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -23,6 +24,7 @@ if TYPE_CHECKING:  # --help answers without waiting for torch and OpenCV
     from analysis.statistics.data import SpatialStatistics
     from analysis.statistics.judging import Claim
     from rgbt.metrics.metric import Regions
+    from rgbt.tracking.tables import TextTable
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,11 @@ class Options:
     kernel: Annotated[
         Literal["four", "eight"], Help("neighbours in the kernel of the Laplacian: four or eight")
     ] = "four"
+    short_edge: Annotated[
+        int,
+        Interval(ge=0, le=10_000),
+        Help("resize images to this shorter edge, pixels; 0: measure them as they are"),
+    ] = 0
     estimator: Annotated[
         Literal["immerkaer", "wavelet_mad", "std"], Help("estimator of the noise in the tables")
     ] = "immerkaer"
@@ -64,6 +71,10 @@ class Options:
     level: Level = 0.95
     seed: Annotated[int, Interval(ge=0, le=MOST), Help("seed of the resampling")] = 0
     workers: Annotated[int, Interval(ge=0, le=1024), Help("threads; 0: one per core")] = 0
+    against: Annotated[
+        Path | None,
+        Help("statistics.npz of another data set; the last tables compare both"),
+    ] = None
     out: Annotated[
         Path | None,
         Help(
@@ -86,14 +97,18 @@ def main(options: Options, overrides: list[str]) -> int:
     from analysis.statistics import tables
     from analysis.statistics.claims import check_resampling, claims
     from analysis.statistics.collect import MeasurementSettings, collect
+    from analysis.statistics.comparison import Resampling, comparison_grids
+    from analysis.statistics.data import SpatialStatistics
     from rgbt.tracking.terminal import info, path_lines, print_rich, rich_table
 
     check_out(options.out)
     level, split = options.level, options.split
     check_resampling(options.blocks, options.resamples, level)
+    reference = None if options.against is None else SpatialStatistics.load(options.against)
     settings = MeasurementSettings(
         regions=_regions(options),
         kernel=options.kernel,
+        short_edge=options.short_edge,
         workers=options.workers,
         skip_unreadable=built("data", overrides).on_error == "skip",
     )
@@ -103,13 +118,8 @@ def main(options: Options, overrides: list[str]) -> int:
         stats = collect(dataset, split, settings, advance, left_out.append)
     for sentence in sorted(left_out):
         info(f"left out: {sentence}")
-    found = claims(
-        stats,
-        level=level,
-        blocks=options.blocks,
-        resamples=options.resamples,
-        seed=options.seed,
-    )
+    resampling = Resampling(level, options.blocks, options.resamples, options.seed)
+    found = claims(stats, **resampling._asdict())
     # Of the claims about noise those of the chosen estimator and average.
     way = options.estimator, options.average
     shown = [claim for claim in found if not claim.estimator or _way(claim) == way]
@@ -120,10 +130,14 @@ def main(options: Options, overrides: list[str]) -> int:
         tables.claims_grid(shown, level),
         tables.estimator_grid(found),
     ]
+    compared = []
+    if reference is not None:
+        compared = list(comparison_grids(stats, reference, way, resampling))
+        grids += compared
     print_rich(Group(tables.heading(stats), *map(rich_table, grids)))
     if options.out is not None:
         options.out.mkdir(parents=True, exist_ok=True)
-        print_rich(path_lines(_write(stats, found, options, options.out)))
+        print_rich(path_lines(_write(stats, found, compared, options)))
     return 0
 
 
@@ -142,18 +156,24 @@ def _regions(options: Options) -> Regions:
 
 
 def _write(
-    stats: SpatialStatistics, found: tuple[Claim, ...], options: Options, folder: Path
+    stats: SpatialStatistics,
+    found: tuple[Claim, ...],
+    compared: Sequence[TextTable],
+    options: Options,
 ) -> list[tuple[str, str]]:
-    """The files of `folder`, as (what, path)."""
+    """The files of the output folder, as (what, path)."""
     from analysis.statistics import tables
     from rgbt.files.atomic import write_atomic
 
+    folder = options.out
+    assert folder is not None
     # The chosen way first, the others in the order of the claims.
     every = dict.fromkeys([(options.estimator, options.average), *map(_way, found)])
     ways = [way for way in every if way[0]]
     stats.save(folder / "statistics.npz")
     write_atomic(folder / "regions.csv", tables.to_csv(stats).encode())
     text = tables.markdown(stats, found, ways, options.level)
+    text = "\n".join([text, *(grid.to_markdown() for grid in compared)])
     write_atomic(folder / "statistics.md", text.encode())
     kinds = (("measurements", "statistics.npz"), ("values", "regions.csv"))
     return [(kind, str(folder / file)) for kind, file in (*kinds, ("tables", "statistics.md"))]

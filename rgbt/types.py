@@ -154,6 +154,18 @@ class TwoDomains:
     step: int
 
 
+class SceneMaps(NamedTuple):
+    """What a rendered image shows at each pixel, beyond the label.
+
+    Attributes:
+        depth_m: (H, W) float32, metres along the optical axis; infinity for the sky.
+        objects: (H, W) int32, number of the object from 1; 0 where there is none.
+    """
+
+    depth_m: NDArray[np.float32]
+    objects: NDArray[np.int32]
+
+
 class MaskPair(NamedTuple):
     """Which cells are hidden: rgb (B, h, w) and thermal (B, h, w), bool, True = hidden."""
 

@@ -6,9 +6,10 @@ Kept per image are a few numbers by region; the maps of occupancy are added up a
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from threading import Lock
 
+import cv2
 import numpy as np
 
 from analysis.bar import in_threads
@@ -27,20 +28,40 @@ class MeasurementSettings:
 
     Attributes:
         kernel: of the Laplacian, one of `KERNELS`.
+        short_edge: images are resized so that their shorter edge has so many pixels, the images by
+            area and the labels to the nearest pixel; 0: as they are.
         workers: threads; 0: one per core.
         skip_unreadable: leave out what cannot be read, and say so, instead of stopping.
 
     Raises:
-        InputError: fewer than 0 workers.
+        InputError: fewer than 0 workers, or a negative edge.
     """
 
     regions: Regions
     kernel: str = KERNELS[0]
+    short_edge: int = 0
     workers: int = 0
     skip_unreadable: bool = False
 
     def __post_init__(self) -> None:
         check_range("workers", self.workers, 0, 1024)
+        check_range("short_edge", self.short_edge, 0, 10_000)
+
+    def resized(self, sample: Sample) -> Sample:
+        """A sample in the size in which it is measured."""
+        height, width = sample.thermal.shape[:2]
+        if self.short_edge in (0, min(height, width)):
+            return sample
+        factor = self.short_edge / min(height, width)
+        size = round(width * factor), round(height * factor)
+        label = sample.label
+        if label is not None:
+            label = np.asarray(cv2.resize(label, size, interpolation=cv2.INTER_NEAREST), np.uint8)
+        rgb, thermal = (
+            np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+            for image in (sample.rgb, sample.thermal)
+        )
+        return replace(sample, rgb=rgb, thermal=thermal, label=label)
 
 
 def collect(
@@ -84,7 +105,7 @@ def collect(
     def measure(name: str, night: bool) -> ImageMeasurements | None:
         """None for an image that is left out."""
         try:
-            sample = dataset.read(name)
+            sample = settings.resized(dataset.read(name))
         except InputError as error:
             if not settings.skip_unreadable:
                 raise
@@ -144,7 +165,7 @@ def _first_readable(
     first = ""
     for name in names:
         try:
-            return dataset.read(name)
+            return settings.resized(dataset.read(name))
         except InputError as error:
             if not settings.skip_unreadable:
                 raise

@@ -105,8 +105,8 @@ def claims_grid(claims: Sequence[Claim], level: float) -> TextTable:
         rows.append((f"{claim.statement}{how} ({claim.source})", "", "", "", claim.verdict, ""))
         for each in claim.findings:
             value, low, high = each.interval
-            ends = ABSENT if math.isnan(low) else f"[{_digits(low)}, {_digits(high)}]"
-            cells = (_digits(value), ends, _range(each.wanted), SHORT[each.verdict], each.note)
+            ends = ABSENT if math.isnan(low) else f"[{digits(low)}, {digits(high)}]"
+            cells = (digits(value), ends, range_text(each.wanted), SHORT[each.verdict], each.note)
             rows.append((f"   {each.what}", *cells))
     header = ("claim", "value", f"{100 * level:g} % interval", "claimed", "holds", "")
     return TextTable("claims of SpatialSeg, Sec. III", header, tuple(rows))
@@ -123,8 +123,8 @@ def estimator_grid(claims: Sequence[Claim]) -> TextTable:
     rows = []
     for statement, what in columns[ways[0]]:
         found = [columns[way][statement, what] for way in ways]
-        cells = [f"{_digits(each.interval.value)} {SHORT[each.verdict]}" for each in found]
-        rows.append((what, _range(found[0].wanted), *cells))
+        cells = [f"{digits(each.interval.value)} {SHORT[each.verdict]}" for each in found]
+        rows.append((what, range_text(found[0].wanted), *cells))
     header = ("signal to noise", "claimed", *(f"{name}, {average}" for name, average in ways))
     return TextTable(
         "how it depends on the estimator of the noise and the average", header, tuple(rows)
@@ -197,14 +197,15 @@ def _quantities(
                 yield ("snr", modality, "", estimator, average), ratio
 
 
-def _range(wanted: Range) -> str:
+def range_text(wanted: Range) -> str:
+    """Where a claim puts a number, e.g. "> 1"."""
     low, high = wanted
     if math.isinf(high):
         return f"> {low:g}"
     return f"< {high:g}" if low <= 0 else f"{low:.3g} to {high:.3g}"
 
 
-def _digits(value: float) -> str:
+def digits(value: float) -> str:
     """Three significant digits, or two decimals of what is larger than 10."""
     if math.isnan(value):
         return ABSENT

@@ -76,6 +76,11 @@ def test_every_class_is_frequent_and_large() -> None:
         ({"thermal_drift": 0.2}, ("rgb", "label")),
         ({"texture_strength": 0.0}, ("label",)),
         ({"night_share": 1.0}, ("label", "depth")),
+        ({"rgb_noise_radius_gain": -0.5}, ("thermal", "label")),
+        ({"thermal_noise_radius_gain": -0.5}, ("rgb", "label")),
+        ({"rgb_blur": 1.0}, ("thermal", "label")),
+        ({"texture_radius_gain": 2.0}, ("label",)),
+        ({"passive_contrast": 0.0}, ("rgb", "label")),
     ],
 )
 def test_factor_changes_its_own_image_only(change: dict, kept: tuple) -> None:
@@ -89,7 +94,7 @@ def test_factor_changes_its_own_image_only(change: dict, kept: tuple) -> None:
 
 
 def test_more_objects_do_not_move_others() -> None:
-    road = draw_road(0, 9)
+    road = draw_road(0, 9, FACTORS)
     few = place_objects(0, 9, road, replace(FACTORS, num_objects=3, num_far_objects=0))
     more = place_objects(0, 9, road, replace(FACTORS, num_objects=8, num_far_objects=0))
     assert more[: len(few)] == few
@@ -181,7 +186,7 @@ def test_label_and_depth_of_box_follow_camera() -> None:
     # A 2 m wide, 1 m high box whose front is 10 m ahead; focal length 100, horizon in the middle.
     camera = SynthCamera(101, 201, focal=100.0, position=(0.0, 1.5, 0.0), pitch=0.0)
     shape = shape_of(box((-1.0, 0.0, 10.0), (1.0, 1.0, 12.0), "paint", CAR))
-    ground = scene.ground_quads(draw_road(0, 0))
+    ground = scene.ground_quads(draw_road(0, 0, FACTORS))
     placed = [scene.Placed(shape, 0.0, 0.0)]
     facets = scene.facets_of(ground, placed)
     drawing = draw(facets, camera)
@@ -198,7 +203,7 @@ def test_label_and_depth_of_box_follow_camera() -> None:
 
 
 def test_near_objects_hide_far_ones() -> None:
-    road = draw_road(0, 2)
+    road = draw_road(0, 2, FACTORS)
     placed = sorted_for_drawing(place_objects(0, 2, road, FACTORS))
     order = [(thing.layer, -thing.z) for thing in placed]
     assert order == sorted(order)

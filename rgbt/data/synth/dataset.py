@@ -61,18 +61,27 @@ def synth(  # noqa: PLR0913 - each is a key of the configuration
     Raises:
         InputError: a factor out of range, a turn without a motion, a cache that cannot be written.
     """
-    if ego_forward_m is None and ego_yaw_deg != 0:
-        raise InputError(
-            f"dataset.ego_yaw_deg is {ego_yaw_deg:g}, but no second frame is requested. Set "
-            "dataset.ego_forward_m too (0 turns on the spot)."
-        )
-    motion = None if ego_forward_m is None else EgoMotion(ego_forward_m, ego_yaw_deg)
+    motion = ego_motion(ego_forward_m, ego_yaw_deg)
     numbers = {"num_train": num_train, "num_val": num_val, "num_test": num_test}
     plan = Plan(seed=seed, numbers=numbers, factors=factors, motion=motion)
     return MFNet(str(LAYOUT.cached(plan, cache_dir)), name="synth", num_classes=num_classes)
 
 
-def _shots(plan: Plan) -> list[Shot]:
+def ego_motion(forward_m: float | None, yaw_deg: float) -> EgoMotion | None:
+    """The motion to a second frame; None for single frames.
+
+    Raises:
+        InputError: a turn without a motion.
+    """
+    if forward_m is None and yaw_deg != 0:
+        raise InputError(
+            f"dataset.ego_yaw_deg is {yaw_deg:g}, but no second frame is requested. Set "
+            "dataset.ego_forward_m too (0 turns on the spot)."
+        )
+    return None if forward_m is None else EgoMotion(forward_m, yaw_deg)
+
+
+def shots(plan: Plan) -> list[Shot]:
     """Names have five digits and D (day) or N (night), as in MFNet."""
     return [
         Shot(scene, split, night, f"{scene:05d}{'N' if night else 'D'}")
@@ -82,7 +91,8 @@ def _shots(plan: Plan) -> list[Shot]:
     ]
 
 
-def _images(scene: Scene, shot: Shot) -> Images:
+def images(scene: Scene, shot: Shot) -> Images:
+    """Image and label of a scene."""
     return {
         # The fourth channel, alpha, is thermal.
         f"images/{shot.name}.png": np.dstack([bgr(scene), scene.thermal]),
@@ -90,7 +100,8 @@ def _images(scene: Scene, shot: Shot) -> Images:
     }
 
 
-def _lists(shots: Sequence[Shot]) -> dict[str, list[str]]:
+def split_lists(shots: Sequence[Shot]) -> dict[str, list[str]]:
+    """The names of each split, and those of the test split by day and at night."""
     lists: dict[str, list[str]] = {}
     for shot in shots:
         lists.setdefault(f"{shot.split}.txt", []).append(shot.name)
@@ -101,5 +112,5 @@ def _lists(shots: Sequence[Shot]) -> dict[str, list[str]]:
 
 
 LAYOUT = Layout(
-    name="synth", versions={"version": VERSION}, shots=_shots, images=_images, lists=_lists
+    name="synth", versions={"version": VERSION}, shots=shots, images=images, lists=split_lists
 )

@@ -6,7 +6,7 @@ import inspect
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import wraps
-from typing import Annotated, Any, TypeVar, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, get_type_hints
 
 from annotated_types import Interval, doc
 
@@ -20,6 +20,11 @@ NumScenes = Annotated[int, Interval(ge=1, le=30_000)]
 Side = Annotated[int, Interval(ge=32, le=2048), doc("pixels")]
 Strength = Annotated[float, Interval(ge=0, le=4)]
 Gain = Annotated[float, Interval(ge=0, le=20)]
+RadiusGain = Annotated[float, Interval(ge=-0.95, le=20)]
+"""Corners have (1 + this) times the value of the centre; negative: the centre has more."""
+
+Metres = Annotated[float, Interval(ge=2, le=60)]
+Multiple = Annotated[float, Interval(ge=0.1, le=10)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +40,7 @@ class SceneFactors:
         rgb_noise: standard deviation of the sensor noise at the centre of a white image,
             1 = full scale.
         rgb_noise_radius_gain: noise at the corners is (1 + this) times the noise at the centre;
-            in between it grows with the squared radius.
+            in between it changes with the squared radius. Negative: more noise in the centre.
         rgb_noise_dark_gain: noise of a black image is (1 + this) times the noise of a white one.
         thermal_noise: standard deviation of the thermal noise, 1 = full scale.
         thermal_contrast: factor on all temperature differences; 1 looks natural, 0 is flat.
@@ -45,6 +50,26 @@ class SceneFactors:
         camera_height_m: height of the camera above the road in metres.
         camera_pitch_deg: downward tilt of the camera in degrees.
         field_of_view_deg: horizontal field of view in degrees.
+        thermal_noise_radius_gain: as for RGB.
+        rgb_blur: standard deviation of a Gaussian blur of RGB at the centre, in pixels of an image
+            that is 160 wide; 0: none.
+        rgb_blur_radius_gain: as for the noise.
+        texture_radius_gain: the same for the strength of the texture, in RGB and thermal.
+        night_light: factor on all light by night except lamps seen directly.
+        glare: strength of the veil around headlights that point at the camera, and around a low
+            sun in a third of the clear days; 0: none.
+        passive_contrast: factor on the difference between the temperature of the road and that of
+            markings, kerbs, cones, car stops, bumps, guardrails and bicycles; 0: only RGB
+            distinguishes them from the road.
+        far_object_scale: factor on the size of far objects.
+        object_mix: shares of the kinds of objects; demo: each kind is frequent; mfnet: more cars,
+            fewer cones and car stops, as in the labels of MFNet.
+        rail_share: share of scenes with a guardrail.
+        bump_share: share of scenes with a bump.
+        bump_nearest_m: distance of the nearest bumps in metres.
+        bump_farthest_m: distance of the farthest bumps in metres.
+        kerb_share: factor on the share of streets with kerbs.
+        kerb_scale: factor on the width and height of kerbs.
     """
 
     height: Side = 120
@@ -53,7 +78,7 @@ class SceneFactors:
     num_far_objects: Annotated[int, Interval(ge=0, le=64)] = 16
     texture_strength: Strength = 1.0
     rgb_noise: Share = 0.012
-    rgb_noise_radius_gain: Gain = 0.5
+    rgb_noise_radius_gain: RadiusGain = 0.5
     rgb_noise_dark_gain: Gain = 1.5
     thermal_noise: Share = 0.012
     thermal_contrast: Strength = 1.0
@@ -62,6 +87,38 @@ class SceneFactors:
     camera_height_m: Annotated[float, Interval(ge=0.9, le=4)] = 1.6
     camera_pitch_deg: Annotated[float, Interval(ge=-10, le=20)] = 2.0
     field_of_view_deg: Annotated[float, Interval(ge=20, le=110)] = 64.0
+    # Those below are keys of calibrated data sets alone; see `NEUTRAL`.
+    thermal_noise_radius_gain: RadiusGain = 0.0
+    rgb_blur: Strength = 0.0
+    rgb_blur_radius_gain: RadiusGain = 0.0
+    texture_radius_gain: RadiusGain = 0.0
+    night_light: Strength = 1.0
+    glare: Strength = 0.0
+    passive_contrast: Strength = 1.0
+    far_object_scale: Multiple = 1.0
+    object_mix: Literal["demo", "mfnet"] = "demo"
+    rail_share: Share = 0.55
+    bump_share: Share = 0.6
+    bump_nearest_m: Metres = 4.2
+    bump_farthest_m: Metres = 11.7
+    kerb_share: Share = 1.0
+    kerb_scale: Multiple = 1.0
+
+    def values(self) -> dict[str, Any]:
+        """All factors by name, without those of `NEUTRAL` that have their default value.
+
+        The folder of a written data set is named by them.
+        """
+        return {
+            factor.name: getattr(self, factor.name)
+            for factor in fields(self)
+            if factor.name not in NEUTRAL or getattr(self, factor.name) != factor.default
+        }
+
+
+_NAMES = [factor.name for factor in fields(SceneFactors)]
+NEUTRAL = frozenset(_NAMES[_NAMES.index("thermal_noise_radius_gain") :])
+"""Factors that change nothing at their default value, which most data sets keep."""
 
 
 ForwardMetres = Annotated[float, Interval(ge=-3, le=3)]
@@ -83,7 +140,7 @@ class EgoMotion:
 
 
 def with_factors(
-    *left_out: str, **defaults: float
+    *left_out: str, calibrated: bool = False, **defaults: float | str
 ) -> Callable[[Callable[..., Made]], Callable[..., Made]]:
     """Lets a function of ``factors: SceneFactors`` take each factor as a keyword of its own.
 
@@ -93,6 +150,7 @@ def with_factors(
 
     Args:
         left_out: factors that the data set decides itself; they keep their default.
+        calibrated: whether the factors of `NEUTRAL` are keywords, too.
         defaults: of factors that have another one in this data set.
     """
 
@@ -107,7 +165,7 @@ def with_factors(
                 annotation=types[factor.name],
             )
             for factor in fields(SceneFactors)
-            if factor.name not in left_out
+            if factor.name not in left_out and (calibrated or factor.name not in NEUTRAL)
         ]
 
         @wraps(function)

@@ -38,6 +38,8 @@ class Light(NamedTuple):
         lamp: colour of the street lamps; zero where they are off.
         lit_windows: share of windows with light by night.
         visibility_m: distance at which 37 % of the light comes through.
+        clear: a day without a cover of clouds.
+        others: factor on the light that cars and vending machines cast.
     """
 
     is_night: bool
@@ -53,6 +55,8 @@ class Light(NamedTuple):
     lamp: Floats
     lit_windows: float
     visibility_m: float
+    clear: bool = False
+    others: float = 1.0
 
 
 def is_night(seed: int, index: int, night_share: float) -> bool:
@@ -65,8 +69,11 @@ def _night_start(seed: int) -> float:
     return float(numpy_generator(seed, "synth/night").random())
 
 
-def draw_light(seed: int, index: int, night_share: float) -> Light:
-    """The light of one scene. Both day and night are drawn, so the share changes nothing else."""
+def draw_light(seed: int, index: int, night_share: float, night_light: float = 1.0) -> Light:
+    """The light of one scene. Both day and night are drawn, so the share changes nothing else.
+
+    `night_light` is a factor on everything that lights the night.
+    """
     u = numpy_generator(seed, "synth/light", index).random(16).tolist()
     dark = floats([0, 0, 0])
     angle, height = 2 * math.pi * u[2], math.radians(22 + 43 * u[3])
@@ -88,7 +95,7 @@ def draw_light(seed: int, index: int, night_share: float) -> Light:
         lit_windows=0.06 + 0.4 * u[5] ** 2,
         visibility_m=140 + 300 * u[6],
     )
-    return (_night if common.is_night else _day)(common, u)
+    return _dimmed(_night(common, u), night_light) if common.is_night else _day(common, u)
 
 
 def _day(light: Light, u: list[float]) -> Light:
@@ -100,6 +107,7 @@ def _day(light: Light, u: list[float]) -> Light:
             direct=0.15, ambient=0.72, zenith=grey * 0.9, horizon=grey, cloud=0.25
         )
     return brighter._replace(
+        clear=True,
         direct=0.95,
         ambient=0.42,
         zenith=floats([0.28, 0.50, 0.95]),
@@ -117,6 +125,17 @@ def _night(light: Light, u: list[float]) -> Light:
         cloud=0.3,
         exposure=1.5 * light.exposure,
         tint=light.tint * floats([0.93, 1.03, 0.92]),
+    )
+
+
+def _dimmed(light: Light, factor: float) -> Light:
+    return light._replace(
+        ambient=light.ambient * factor,
+        zenith=light.zenith * np.float32(factor),
+        horizon=light.horizon * np.float32(factor),
+        headlight=light.headlight * factor,
+        lamp=light.lamp * np.float32(factor),
+        others=factor,
     )
 
 
@@ -164,12 +183,19 @@ def lamps_of(placed: Sequence[Placed], light: Light) -> list[Lamp]:
     return lamps[-_MAX_LAMPS:]
 
 
+def is_oncoming(thing: Placed) -> bool:
+    """Whether it is a car whose headlights point at the camera."""
+    return thing.shape in _CARS and math.cos(thing.yaw) < 0
+
+
 def _lamps(thing: Placed, light: Light) -> list[Lamp]:
     if thing.shape is backdrop.street_lamp():
         reach = 1.35 * math.cos(thing.yaw)
         return [Lamp((thing.x + reach, 5.4, thing.z), light.lamp, 5.5)]
     if thing.shape is backdrop.vending_machine():
-        return [Lamp((thing.x, 1.0, thing.z - 0.7), floats([0.30, 0.33, 0.36]), 1.6)]
-    if thing.shape in _CARS and math.cos(thing.yaw) < 0:
-        return [Lamp((thing.x, 0.4, thing.z - 4.0), floats([0.9, 0.85, 0.75]), 1.8)]
+        colour = floats([0.30, 0.33, 0.36]) * np.float32(light.others)
+        return [Lamp((thing.x, 1.0, thing.z - 0.7), colour, 1.6)]
+    if is_oncoming(thing):
+        colour = floats([0.9, 0.85, 0.75]) * np.float32(light.others)
+        return [Lamp((thing.x, 0.4, thing.z - 4.0), colour, 1.8)]
     return []

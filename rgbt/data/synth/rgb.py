@@ -26,12 +26,18 @@ _TEXTURES = materials.column("rgb_texture")
 
 
 def render_rgb(
-    surface: Surface, light: Light, lamps: list[Lamp], strength: float, seed: int
+    surface: Surface,
+    light: Light,
+    lamps: list[Lamp],
+    veil: Floats | None,
+    factors: SceneFactors,
+    seed: int,
 ) -> Floats:
     """Light that reaches the sensor: (3, H, W) float32 in 0..1, gamma-encoded, without noise.
 
-    `strength` is a factor on texture, `seed` of the data set gives the clouds.
+    `veil` (3, H, W) is light scattered in the lens, `seed` of the data set gives the clouds.
     """
+    strength = texture_strength(factors)
     colour = average(_colour_table(surface, light), surface.drawing)
     glow = average(_glow_table(surface.facets, light), surface.drawing)
     image = _decoded(colour)
@@ -60,6 +66,8 @@ def render_rgb(
     last = int(np.flatnonzero(glow[..., 3].any(1)).max(initial=-1)) + 1
     share = glow[:last, :, 3] * np.float32(1 / 255)
     image[:, :last] += share * _sky(surface.rays[:, :last], light, surface.camera, seed)
+    if veil is not None:
+        image += veil
     optical = image * _column(light.tint * np.float32(-1.7 * light.exposure))
     # cv2.exp is five times as fast as NumPy's; it takes two dimensions.
     exposed = 1.0 - cv2.exp(optical.reshape(-1, image.shape[2])).reshape(image.shape)
@@ -145,15 +153,41 @@ def develop(
         sd(p) = rgb_noise (1 + radius_gain r(p)^2) (1 + dark_gain (1 - brightness))
 
     with r the distance from the centre (1 at the corners) and the brightness the mean of the image:
-    a camera in the dark raises its gain, and its noise.
+    a camera in the dark raises its gain, and its noise. The lens blurs before the sensor adds it.
     """
     radius_squared = squared_radius(*image.shape[1:])
+    image = blurred(image, factors.rgb_blur, factors.rgb_blur_radius_gain)
     sd = factors.rgb_noise * (1 + factors.rgb_noise_radius_gain * radius_squared)
     sd *= 1 + factors.rgb_noise_dark_gain * (1 - float(image.mean()))
     noisy = generator.standard_normal(image.shape, np.float32)
     noisy *= sd
     noisy += image * (1 - 0.18 * radius_squared)
     return np.asarray(cv2.merge(list(eight_bits(noisy))), np.uint8)
+
+
+def blurred(image: Floats, sd: float, radius_gain: float) -> Floats:
+    """An image (3, H, W) behind a lens whose blur has the standard deviation sd (1 + gain r^2).
+
+    In pixels of an image that is 160 wide. Each pixel is a mix of the sharp image and of the one
+    with the strongest blur, which gives the point spread that variance exactly.
+    """
+    if sd == 0:
+        return image
+    height, width = image.shape[1:]
+    growth = 1 + np.float32(radius_gain) * squared_radius(height, width)
+    strongest = max(1.0, 1.0 + radius_gain)
+    share = np.square(growth / np.float32(strongest))
+    pixels = sd * strongest * width / 160
+    soft = np.stack([cv2.GaussianBlur(plane, (0, 0), pixels) for plane in image])
+    return np.asarray(image + share * (soft - image), np.float32)
+
+
+def texture_strength(factors: SceneFactors) -> Floats | float:
+    """Factor on the texture, (H, W) where it changes with the radius."""
+    if factors.texture_radius_gain == 0:
+        return factors.texture_strength
+    growth = 1 + factors.texture_radius_gain * squared_radius(factors.height, factors.width)
+    return np.asarray(factors.texture_strength * growth, np.float32)
 
 
 def eight_bits(image: Floats) -> NDArray[np.uint8]:

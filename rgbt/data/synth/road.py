@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.data.synth.camera import Floats
+from rgbt.data.synth.factors import SceneFactors
 from rgbt.data.synth.materials import INDEX
 from rgbt.data.synth.shapes import CURVE, MAX_CORNERS, UNLABELED
 from rgbt.randomness import numpy_generator
@@ -31,6 +32,7 @@ class Road(NamedTuple):
         curvature: 1 / metres, positive to the right.
         sidewalk: widths in metres (left, right).
         kerb: whether there is one (left, right).
+        kerb_m: width and height of kerbs.
         crossing_z: distance of a zebra crossing, or None.
         line_phase: where in a dash the centre line begins, 0..1.
         edge_line: whether there are solid lines along the edges.
@@ -43,6 +45,7 @@ class Road(NamedTuple):
     curvature: float
     sidewalk: tuple[float, float]
     kerb: tuple[bool, bool]
+    kerb_m: tuple[float, float]
     crossing_z: float | None
     line_phase: float
     edge_line: bool
@@ -58,7 +61,7 @@ class Road(NamedTuple):
         return math.atan(self.curvature * z)
 
 
-def draw_road(seed: int, index: int) -> Road:
+def draw_road(seed: int, index: int, factors: SceneFactors) -> Road:
     """The road of one scene."""
     generator = numpy_generator(seed, "synth/road", index)
     u = generator.random(16).tolist()
@@ -68,7 +71,8 @@ def draw_road(seed: int, index: int) -> Road:
         centre=half_width * (0.30 + 0.25 * u[1]),
         curvature=0.0055 * (u[2] - 0.5) * (u[3] > 0.4),
         sidewalk=(1.6 + 2.2 * u[4], 1.6 + 2.2 * u[5]),
-        kerb=(u[6] < 0.8, u[7] < 0.75),
+        kerb=(u[6] < 0.8 * factors.kerb_share, u[7] < 0.75 * factors.kerb_share),
+        kerb_m=(KERB_M[0] * factors.kerb_scale, KERB_M[1] * factors.kerb_scale),
         crossing_z=7 + 9 * u[8] if u[9] < 0.3 else None,
         line_phase=u[10],
         edge_line=u[11] < 0.5,
@@ -169,7 +173,7 @@ def _markings(road: Road) -> list[Floats]:
 
 
 def _kerbs(road: Road) -> list[tuple[str, int, Floats]]:
-    width, height = KERB_M
+    width, height = road.kerb_m
     strips = []
     for side, present in zip((-1, 1), road.kerb, strict=True):
         if present:

@@ -12,6 +12,7 @@ from rgbt.data.synth import rgb, thermal
 from rgbt.data.synth.camera import Floats, SynthCamera, camera_of, flow_between
 from rgbt.data.synth.facets import Facets, facets_of, sorted_for_drawing
 from rgbt.data.synth.factors import EgoMotion, SceneFactors
+from rgbt.data.synth.glare import veil_of
 from rgbt.data.synth.layout import place_objects
 from rgbt.data.synth.light import Lamp, Light, draw_light, lamps_of
 from rgbt.data.synth.placement import Placed
@@ -96,8 +97,8 @@ def render_pair(seed: int, index: int, factors: SceneFactors, motion: EgoMotion)
 
 
 def _world(seed: int, index: int, factors: SceneFactors) -> _World:
-    road = draw_road(seed, index)
-    light = draw_light(seed, index, factors.night_share)
+    road = draw_road(seed, index, factors)
+    light = draw_light(seed, index, factors.night_share, factors.night_light)
     placed = place_objects(seed, index, road, factors) + place_scenery(seed, index, road)
     placed = sorted_for_drawing(placed)
     return _World(facets_of(ground_quads(road), placed), placed, light, lamps_of(placed, light))
@@ -111,9 +112,9 @@ def _frame(
     drawing = draw(facets, camera)
     shadow = shadow_map(world.placed, camera, light)
     surface = surface_of(drawing, facets, camera, shadow, (seed, index))
-    strength = factors.texture_strength
-    image = rgb.render_rgb(surface, light, world.lamps, strength, seed)
-    heat = thermal.render_thermal(surface, light, strength)
+    veil = veil_of(world.placed, camera, light, factors.glare, (seed, index))
+    image = rgb.render_rgb(surface, light, world.lamps, veil, factors, seed)
+    heat = thermal.render_thermal(surface, light, factors)
     rgb_noise = numpy_generator(seed, "synth/rgb_noise", index, frame)
     thermal_noise = numpy_generator(seed, "synth/thermal_noise", index, frame)
     grey = thermal.develop(heat, factors, seed, index, thermal_noise)

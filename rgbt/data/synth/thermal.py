@@ -14,6 +14,7 @@ from rgbt.data.synth.camera import Floats
 from rgbt.data.synth.factors import SceneFactors
 from rgbt.data.synth.light import Light
 from rgbt.data.synth.raster import average
+from rgbt.data.synth.rgb import squared_radius, texture_strength
 from rgbt.data.synth.surface import Surface
 from rgbt.randomness import numpy_generator
 
@@ -27,13 +28,19 @@ _DAY, _NIGHT, _HEAT = (materials.column(name) for name in ("day", "night", "heat
 _TEXTURES = materials.column("heat_texture")
 
 
-def render_thermal(surface: Surface, light: Light, strength: float) -> Floats:
-    """Temperature of each pixel, (H, W) float32 degrees above the air; not yet blurred or noisy.
+_PASSIVE = np.isin(
+    list(materials.INDEX),
+    ["line", "kerb_top", "kerb_face", "yellow", "black_band", "cone_orange", "cone_white",
+     "cone_base", "rail_light", "rail_dark", "rail_mesh", "metal", "spokes", "saddle"],
+)  # fmt: skip
+"""Materials that nothing heats but the sun."""
 
-    `strength` is a factor on texture.
-    """
+
+def render_thermal(surface: Surface, light: Light, factors: SceneFactors) -> Floats:
+    """Temperature of each pixel, (H, W) float32 degrees above the air; not yet blurred or noisy."""
+    strength = texture_strength(factors)
     table = np.zeros((len(surface.facets.material) + 1, 4), np.uint8)
-    degrees = np.concatenate([[-34.0], _facet_degrees(surface, light)])
+    degrees = np.concatenate([[-34.0], _facet_degrees(surface, light, factors)])
     table[:, 0] = np.clip((degrees - _COLDEST) / _SPAN * 255, 0, 255)
     table[0, 1] = 255
     mean = average(table, surface.drawing)
@@ -50,13 +57,18 @@ def render_thermal(surface: Surface, light: Light, strength: float) -> Floats:
     return np.asarray(heat + lower, np.float32)
 
 
-def _facet_degrees(surface: Surface, light: Light) -> Floats:
+def _facet_degrees(surface: Surface, light: Light, factors: SceneFactors) -> Floats:
     facets = surface.facets
-    degrees = (_NIGHT if light.is_night else _DAY)[facets.material]
+    of_material = _NIGHT if light.is_night else _DAY
+    degrees = of_material[facets.material]
     degrees = degrees + _HEAT[facets.material] * facets.warmth
     if not light.is_night:
         facing = np.maximum(surface.drawing.normals[1:] @ light.sun, 0)
         degrees = degrees + 4.0 * light.direct * (facing - 0.5) * ~facets.on_ground
+    if factors.passive_contrast != 1:
+        road = of_material[materials.INDEX["asphalt"]]
+        closer = road + factors.passive_contrast * (degrees - road)
+        degrees = np.where(_PASSIVE[facets.material], closer, degrees)
     return np.asarray(degrees, np.float32)
 
 
@@ -82,7 +94,10 @@ def develop(
         generator.standard_normal(heat.shape, np.float32),
         generator.standard_normal(width, np.float32),
     )
-    grey += factors.thermal_noise * (0.75 * pixel + 0.35 * column + 1.4 * _blurred(pixel))
+    noise = 0.75 * pixel + 0.35 * column + 1.4 * _blurred(pixel)
+    if factors.thermal_noise_radius_gain != 0:
+        noise *= 1 + factors.thermal_noise_radius_gain * squared_radius(height, width)
+    grey += factors.thermal_noise * noise
     return np.asarray(grey, np.float32)
 
 

@@ -116,7 +116,7 @@ class Layout:
             **self.versions,
             "seed": plan.seed,
             **plan.numbers,
-            "factors": asdict(plan.factors),
+            "factors": plan.factors.values(),
             **self.named,
             **motion,
         }
