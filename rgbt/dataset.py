@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.requirements import Record, record_of
-from rgbt.types import Sample
+from rgbt.types import Sample, SceneMaps
 
 
 class LabelledDataset(Protocol):
@@ -74,18 +74,6 @@ class LabelledDataset(Protocol):
     def fingerprint(self) -> str:
         """Hash of names and files; equal copies in different folders have equal fingerprints."""
         ...
-
-
-class SceneMaps(NamedTuple):
-    """What is known about the scene behind each pixel of a label.
-
-    Attributes:
-        depth_m: (H, W) float32, distance in metres, inf: the sky.
-        objects: (H, W) int32, number of the object from 1 on, 0: none.
-    """
-
-    depth_m: NDArray[np.float32]
-    objects: NDArray[np.int32]
 
 
 @runtime_checkable

@@ -52,7 +52,7 @@ class Options(NetworkOptions):
         Help(
             "what else to count, a list: boundary (boundary IoU), calibration (ECE), distance "
             "(IoU by distance), size (recall by size of the object); all; none. Distance and size "
-            "require a data set with scene maps"
+            "require a data set with scene maps, such as dataset=synth_calibrated"
         ),
     ] = "none"
     boundary_width: Annotated[

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from rgbt.build.session import Session
 from rgbt.checks import InputError
-from rgbt.dataset import KnownScenes, LabelledDataset, SceneMaps, reader_of
+from rgbt.dataset import KnownScenes, LabelledDataset, reader_of
 from rgbt.evaluation.prediction import counts_of
 from rgbt.metrics.boundary import BoundaryCounter
 from rgbt.metrics.calibration import CalibrationCounter
@@ -23,7 +23,7 @@ from rgbt.metrics.named import value
 from rgbt.metrics.scene_counts import SceneCounter
 from rgbt.metrics.score_grid import score_grid
 from rgbt.tracking.tables import TextTable, number
-from rgbt.types import View
+from rgbt.types import SceneMaps, View
 
 DetailedImages: TypeAlias = "dict[str, dict[DetailKind, NDArray[np.int64]]]"
 """Name of an image -> kind -> its counts (R G, M, K)."""
@@ -96,8 +96,8 @@ def _scenes(dataset: LabelledDataset, kind: DetailKind) -> KnownScenes:
     if isinstance(reader, KnownScenes):
         return reader
     raise InputError(
-        f"details={kind}: {dataset.name} has no maps of distance and objects; use a data set with "
-        f"scene_maps, or remove {' and '.join(OF_SCENES)}."
+        f"details={kind}: {dataset.name} has no maps of distance and objects. Use "
+        f"dataset=synth_calibrated, or remove {' and '.join(OF_SCENES)} from details."
     )
 
 

@@ -28,7 +28,7 @@ DetailKind = Literal["boundary", "calibration", "distance", "size"]
 KINDS: tuple[DetailKind, ...] = get_args(DetailKind)
 
 OF_SCENES: tuple[DetailKind, ...] = ("distance", "size")
-"""Kinds that need `rgbt.dataset.SceneMaps`."""
+"""Kinds that need `rgbt.types.SceneMaps`."""
 
 WIDTH: Final = 0.02
 """Width of a boundary as a share of the image diagonal (Cheng et al., CVPR 2021, Sec. 4)."""

@@ -15,7 +15,7 @@ from rgbt.build.session import Session, open_session
 from rgbt.checks import InputError
 from rgbt.config.compose import compose
 from rgbt.data.mfnet import MFNet
-from rgbt.dataset import DatasetWrapper, SceneMaps
+from rgbt.dataset import DatasetWrapper
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.evaluation.segmentation import _of_all_processes, _Part, evaluate
 from rgbt.metrics.boundary import BoundaryCounter
@@ -24,7 +24,7 @@ from rgbt.metrics.named import value
 from rgbt.processes import rank
 from rgbt.requirements import Record
 from rgbt.spec.specify import specify
-from rgbt.types import Output
+from rgbt.types import Output, SceneMaps
 from tests.commands import SPLITS, words_of
 from tests.processes import run_in_processes
 
@@ -125,6 +125,21 @@ def test_details_follow_the_input(data: Path) -> None:
     )
     assert not np.array_equal(both.counts, rgb.counts)
     assert np.array_equal(both.counts[:, :, 1], rgb.counts[:, :, 1])  # the labels are the same
+
+
+def test_generated_scenes_have_distances_and_sizes(tmp_path: Path) -> None:
+    words = ("dataset=synth_calibrated", f"dataset.cache_dir={tmp_path}", "+experiment=mfnet")
+    small = ("dataset.num_train=1", "dataset.num_val=1", "dataset.num_test=2")
+    size = ("dataset.height=48", "dataset.width=64", "trainer.accelerator=cpu")
+    session = open_session(specify(compose((*words, *small, *size))))
+    result = evaluate(session, Decoder(), request(*OF_SCENES))
+    for kind, counts in result.details.items():
+        bins = counts.counts.reshape(2, 5, -1, 9, 9)
+        assert np.array_equal(bins.sum(2), result.counts.counts)
+        assert bins[:, :, :-1].sum() > 0
+        assert bins[:, :, -1].sum() > 0  # the sky, and pixels of no object
+        if kind == "size":
+            assert bins[:, :, :-1, 0].sum() == 0  # objects have a class
 
 
 @pytest.mark.parametrize("kind", OF_SCENES)
