@@ -49,7 +49,7 @@ COMMANDS = {
     ),
     "compare": Entry("analysis.compare", "compare two methods: differences, intervals, p-values"),
     "details": Entry(
-        "analysis.details", "show boundary IoU, calibration, distance, size and inputs of a run"
+        "analysis.details", "show boundary IoU, calibration, distance and size with intervals"
     ),
     "score": Entry("analysis.score", "score predictions of any method by region"),
     "spatial": Entry("analysis.spatial", "measure the statistics of a data set by region"),
