@@ -17,9 +17,11 @@ import pytest
 
 from rgbt import evaluate, predict
 from rgbt.checks import InputError
+from rgbt.engine.checkpoint import load_checkpoint
 from rgbt.metrics.counts import Counts
 from rgbt.run import main
 from rgbt.tracking.run_folder import find_run
+from tests.checkpoints.test_stored import same
 from tests.commands import (
     SPLITS,
     Call,
@@ -97,8 +99,22 @@ def test_seed_decides_losses_and_key(
     assert losses(other) != losses(first)
 
 
-def test_killed_run_resumed_equals_uninterrupted(call: Call, data: Path, tmp_path: Path) -> None:
-    overrides = ("+experiment=grbm", *short(6))
+def test_seeds_of_every_source_together_are_the_seed(
+    call: Call, data: Path, trained: Trained, tmp_path: Path
+) -> None:
+    first = losses(trained("+experiment=crm", *short(1)))
+    all_three = ("seeds.weights=0", "seeds.order=0", "seeds.masks=0")
+    for name, seeds in (("same", all_three), ("masks", all_three[:2])):
+        train(call, data, tmp_path / name, "+experiment=crm", "seed=1", *seeds, *short(1))
+    assert losses(only_run(tmp_path / "same")) == first
+    assert losses(only_run(tmp_path / "masks")) != first
+
+
+@pytest.mark.parametrize("averaging", ["none", "ema"])
+def test_killed_run_resumed_equals_uninterrupted(
+    call: Call, data: Path, tmp_path: Path, averaging: str
+) -> None:
+    overrides = ("+experiment=grbm", f"trainer.averaging={averaging}", *short(6))
 
     def run() -> None:
         sys.argv = ["rgbt", *words_of(data, tmp_path / "killed", *overrides)]
@@ -124,6 +140,9 @@ def test_killed_run_resumed_equals_uninterrupted(call: Call, data: Path, tmp_pat
     for split in ("val", "test"):
         a, b = (Counts.load(f / f"counts_{split}.npz").counts for f in (resumed, straight))
         assert np.array_equal(a, b)
+    ends = [load_checkpoint(each / "last.pt") for each in (resumed, straight)]
+    assert same(ends[0]["model"], ends[1]["model"])
+    assert same(ends[0].get("unaveraged"), ends[1].get("unaveraged"))
     assert [line["step"] for line in logged(resumed, "train")] == list(range(1, 7))
 
 

@@ -133,10 +133,11 @@ def settings(data: Path, steps: int, *more: str) -> tuple[str, ...]:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("more", [(), ("trainer.averaging=ema", "trainer.ema_decay=0.9")])
 def test_two_processes_train_as_one(
-    call: Call, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    call: Call, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, more: tuple[str, ...]
 ) -> None:
-    words = settings(data, 4)
+    words = settings(data, 4, *more)
     two = Command((*words, "trainer.devices=2"), tmp_path / "two")
     code, _, err = call(main, *words, f"runs_dir={tmp_path / 'one'}")
     assert code == 0, err

@@ -89,7 +89,7 @@ def open_session(
     trainer = spec.trainer
     fabric = open_fabric(trainer)
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(derive(spec.seed, "weights"))
+        torch.manual_seed(derive(spec.drawn.weights, "weights"))
         model: nn.Module = spec.model.build()
     files: LabelledDataset = spec.dataset.build()
     if is_own(files):

@@ -75,7 +75,7 @@ class TrainingSetup:
 
     def batches(self, steps: range) -> Batches[Loadable] | PairedBatches:
         """Training batches of these steps: of one domain, or a pair of batches of both."""
-        session, seed = self.session, self.session.spec.seed
+        session, seed = self.session, self.session.spec.drawn.order
         loading = replace(session.loading, augment=_where_to_augment(session))
         # Each domain is shuffled and augmented by draws of its own.
         seeds = {"source": seed, "target": derive(seed, "target domain")}
@@ -129,7 +129,7 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
     prepare_training(session.model, session.trainer, session.fabric.device)
     model = session.fabric.setup_module(session.model)
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(derive(spec.seed, "scheme weights"))  # of networks of its own
+        torch.manual_seed(derive(spec.drawn.weights, "scheme weights"))  # of networks of its own
         scheme: Any = spec.scheme.build(model=model, loss=checked, masker=masker, domains=domains)
     components = {
         **{"scheme": scheme, "loss": loss, "domains": domains, "model": session.model},

@@ -20,10 +20,11 @@ PREFIXES = ("module.", "_orig_mod.")
 
 OURS = (
     *({"model", "others", "optimizers", "state"}, {"model", "optimizers", "state"}),
+    {"model", "unaveraged", "others", "optimizers", "state"},
     {"model", "step"},
 )
-"""Keys of the last checkpoint of a run, now and before there were other networks beside the model,
-and of the best one."""
+"""Keys of the last checkpoint of a run, now and before there were other networks beside the model;
+of one with averaged weights; and of the best one."""
 
 NOTE = "rgbt"
 """Key of the note in an export."""

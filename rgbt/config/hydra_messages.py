@@ -35,7 +35,8 @@ def check_words(words: Sequence[str]) -> None:
     """Refuse words of a command that Hydra would misread or ignore with a warning.
 
     Raises:
-        InputError: an unknown option, a list of seeds, a folder of configurations that is missing.
+        InputError: an unknown option, a list of seeds, `seeds` as a value, a folder of
+            configurations that is missing.
     """
     options = {each for action in get_args_parser()._actions for each in action.option_strings}
     for word in words:
@@ -47,6 +48,11 @@ def check_words(words: Sequence[str]) -> None:
             seeds = ",".join(split_list(value, "seeds"))
             raise InputError(
                 f"'{word}': a run has one seed; for several runs use a grid: -m seed={seeds}."
+            )
+        if key == "seeds":
+            raise InputError(
+                f"'{word}': 'seeds' is a mapping; set the seed of one source "
+                f"(seeds.order={value}), or that of the run (seed={value})."
             )
         for folder in split_list(value, "folders") if key == SEARCH_PATH else ():
             scheme, _, path = folder.strip("'\"").rpartition("://")

@@ -19,6 +19,9 @@ from torch import Tensor, nn
 from rgbt.checkpoints.stored import ZIP, explained, plain, read_torch_file
 from rgbt.checks import InputError
 
+UNAVERAGED = "unaveraged"
+"""Entry of a checkpoint with the weights of the last step, where "model" has averaged ones."""
+
 
 @dataclass
 class State:
@@ -28,7 +31,8 @@ class State:
         step: optimiser steps done.
         best_score: highest selection score so far, fraction; -1 before the first evaluation.
         best_step: the step of the best score.
-        seed: run seed, from which every generator is derived together with `step`.
+        seed: from which every generator of a step is derived, together with `step`: `seeds.masks`,
+            or the seed of the run.
         skipped: names of the unreadable files that were skipped so far, sorted.
         evaluated_step: step of the last evaluation; below `step` where a signal came before the
             evaluation of `step`, which is then made on resuming.
@@ -70,14 +74,24 @@ class State:
 
 
 def training_payload(
-    model: nn.Module,
+    weights: dict[str, Tensor],
+    unaveraged: dict[str, Tensor] | None,
     others: dict[str, nn.Module],
     optimizers: dict[str, torch.optim.Optimizer],
     state: State,
 ) -> dict[str, Any]:
-    """Everything a run needs to resume as if it had not stopped."""
+    """Everything a run needs to resume as if it had not stopped.
+
+    Args:
+        weights: of the network, as they are evaluated.
+        unaveraged: those of the last step, where `weights` are averaged.
+        others: further networks that are trained, by name.
+        optimizers: by name.
+        state: progress.
+    """
     return {
-        "model": model.state_dict(),
+        "model": weights,
+        **({} if unaveraged is None else {UNAVERAGED: unaveraged}),
         "others": {name: module.state_dict() for name, module in others.items()},
         "optimizers": {name: optimizer.state_dict() for name, optimizer in optimizers.items()},
         "state": asdict(state),

@@ -19,6 +19,7 @@ from rgbt.ranges import (
     NumStepsOrZero,
     Pixels,
     Positive,
+    ShareBelowOne,
     Size,
     Text,
     Threads,
@@ -27,6 +28,7 @@ from rgbt.ranges import (
 
 Precision = Literal["32-true", "bf16-mixed"]
 Compile = Literal["none", "default", "max-autotune"]
+Averaging = Literal["none", "ema", "last"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,6 +50,12 @@ class TrainerSettings:
         selection_split: split whose mIoU selects the best checkpoint. Released: "test".
         tested: checkpoint for the test split: "best", with the highest mIoU on the selection
             split, or "last", if that split has no images of the target domain.
+        averaging: weights that are evaluated and tested. "none": those of the last step, as
+            published. "ema": their exponential moving average over the steps. "last": the mean of
+            those after each of the last steps; before these begin, the weights of the last step.
+        ema_decay: averaging=ema: after step n the average is d times itself plus (1 - d) times the
+            weights, with d the smaller of `ema_decay` and n / (n + 9), 0 <= d < 1.
+        averaged_share: averaging=last: share of all steps that are averaged, in (0, 1].
         devices: devices of each machine, with one process each; "auto": all that the accelerator
             has. They divide every batch, so that the result does not depend on their number.
         strategy: "ddp": each process has the whole network, and gradients are averaged; "auto": the
@@ -75,6 +83,9 @@ class TrainerSettings:
     threads: Threads
     selection_split: Text
     tested: Literal["best", "last"] = "best"
+    averaging: Averaging = "none"
+    ema_decay: ShareBelowOne = 0.99
+    averaged_share: Annotated[float, Interval(gt=0, le=1)] = 0.25
     devices: NumDevices | Literal["auto"] = 1
     strategy: Literal["auto", "ddp"] = "auto"
     batch_norm_parts: NumDevices = 1

@@ -16,6 +16,7 @@ from lightning_fabric import Fabric
 from torch import Tensor, nn
 
 from rgbt.checks import InputError, RunError, not_finite
+from rgbt.engine.averaging import AveragedWeights
 from rgbt.engine.checkpoint import State, restore_optimizer, restore_weights, training_payload
 from rgbt.engine.committed import Checkpoints
 from rgbt.engine.gradients import average_gradients, check_gradients
@@ -102,6 +103,7 @@ class Trainer:
 
     def __post_init__(self) -> None:
         self.checkpoints = Checkpoints(self.folder)
+        self.average = AveragedWeights(self.model, self.settings)
         self._checked_phases: set[tuple[str, ...]] = set()
 
     def resume(self, state: State) -> bool:
@@ -116,7 +118,7 @@ class Trainer:
             return False
         payload, stored = loaded
         source = self.checkpoints.last
-        restore_weights(self.model, payload["model"], source)
+        self.average.restore(payload, stored.step, source)
         others, optimizers = payload.get("others", {}), payload.get("optimizers", {})
         if others.keys() != self.others.keys() or optimizers.keys() != self.optimizers.keys():
             raise InputError(
@@ -155,6 +157,7 @@ class Trainer:
                 values = self._step(step, batches, state.seed)
                 state.unlogged |= values
                 state.step = step + 1
+                self.average.update(state.step)
                 note = f"loss {values['loss']:.3f}  {values['images_per_s']:.1f} images/s"
                 display.update(task, completed=state.step, note=note)
                 if state.step % self.settings.log_every == 0 or state.step == total:
@@ -175,8 +178,9 @@ class Trainer:
         try:
             with at_once():
                 self.after_step()
-                score = self.validate(state.step) if due else -math.inf
             if due:
+                with self.average.in_network(), at_once():
+                    score = self.validate(state.step)
                 if score > state.best_score or self.settings.tested == "last":
                     self._save_best(state.step)
                     state.best_score, state.best_step = score, state.step
@@ -201,16 +205,23 @@ class Trainer:
 
             for module in (self.model, *self.others.values()):
                 share_running_statistics(module)
+            self.average.share_buffers()
 
     def _save_best(self, step: int) -> None:
         if self.writes:
-            self.checkpoints.save_best(step, self.model.state_dict())
+            self.checkpoints.save_best(step, self.average.weights())
 
     def _save(self, state: State) -> None:
         if not self.writes:
             return
         check_weights({"model": self.model, **self.others}, state.step)
-        payload = training_payload(self.model, self.others, self.optimizers, state)
+        payload = training_payload(
+            self.average.weights(),
+            self.average.unaveraged(),
+            self.others,
+            self.optimizers,
+            state,
+        )
         self.checkpoints.commit(payload, state)
 
     def _step(self, step: int, batches: Iterator[Loaded], seed: int) -> dict[str, float]:

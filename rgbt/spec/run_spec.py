@@ -19,6 +19,7 @@ from rgbt.data.loader_settings import LoaderSettings
 from rgbt.engine.settings import Recipe, Scale, TrainerSettings
 from rgbt.ranges import Seed, Text
 from rgbt.spec.run_key import file_digest, manifest_of, settings_digest
+from rgbt.spec.seeds import Seeds, SourceSeeds
 from rgbt.spec.source_code import user_code
 
 WEIGHTS = "model.weights"
@@ -37,7 +38,9 @@ class Node:
             take up.
         added: settings that are newer than the first runs -> what these runs did: left out of the
             key where they say that, so that a run keeps its key.
-        added_as: the same for the whole node; None: the node is as old as the first runs.
+        used_with: settings that have an effect only where another setting has a value -> that
+            setting and value; left out of the key elsewhere.
+        added_as: the same as `added` for the whole node; None: it is as old as the first runs.
         shared: whether upstream runs take it over from the run that needs them; or which of its
             settings.
     """
@@ -45,6 +48,7 @@ class Node:
     in_key: bool = True
     outside_key: tuple[str, ...] = ()
     added: Mapping[str, Any] = field(default_factory=dict)
+    used_with: Mapping[str, tuple[str, Any]] = field(default_factory=dict)
     added_as: Mapping[str, Any] | None = None
     shared: bool | tuple[str, ...] = False
 
@@ -52,8 +56,10 @@ class Node:
         """The part of a node's canonical `values` that enters the run key, below its `name`."""
         if not self.in_key or values == self.added_as:
             return {}
-        old = {key: value for key, value in self.added.items() if values.get(key) == value}
-        return {name: {key: values[key] for key in values if key not in (*self.outside_key, *old)}}
+        old = [key for key, value in self.added.items() if values.get(key) == value]
+        unused = [key for key, (other, v) in self.used_with.items() if values.get(other) != v]
+        left_out = {*self.outside_key, *old, *unused}
+        return {name: {key: values[key] for key in values if key not in left_out}}
 
 
 def labels_key(domain: str) -> str:
@@ -95,7 +101,7 @@ class RunSpec:
 
     Attributes:
         name: of its experiment.
-        seed: of every generator.
+        seed: of every generator, but for those that `seeds` names.
         runs_dir: the folder of run folders.
         fresh: whether a finished run is trained again.
         pretrained: file of ImageNet weights that the network, or that of its first upstream run,
@@ -130,6 +136,13 @@ class RunSpec:
             **{"target": None, "target_is": None, "tested_head": "own"},
         }
     )
+    seeds: Seeds = _node(
+        added_as={
+            "_target_": "rgbt.spec.seeds.Seeds",
+            **{"weights": None, "order": None, "masks": None},
+        },
+        shared=True,
+    )
     data: LoaderSettings = _node(
         outside_key=("num_workers", "on_error", "eval_batch_size", "prefetch", "augment", "cache"),
         shared=True,
@@ -146,7 +159,8 @@ class RunSpec:
             *("accelerator", "log_every", "checkpoint_every", "devices", "strategy"),
             *("activation_checkpointing", "memory_format", "compile"),
         ),
-        added={"tested": "best", "threads": 2, "batch_norm_parts": 1},
+        added={"tested": "best", "threads": 2, "batch_norm_parts": 1, "averaging": "none"},
+        used_with={"ema_decay": ("averaging", "ema"), "averaged_share": ("averaging", "last")},
         shared=(
             *("max_steps", "eval_every", "checkpoint_every", "log_every"),
             *("precision", "accelerator", "threads", "devices", "strategy", "batch_norm_parts"),
@@ -182,8 +196,15 @@ class RunSpec:
             if name == "domains":
                 for domain, each in self.domains.named.items():
                     values[domain]["labels"] = self._content(labels_key(domain), each.labels)
+            if name == "seeds":  # the seed of the run, typed or not, is the same run
+                values = {k: None if v == self.seed else v for k, v in values.items()}
             settings |= node.key_settings(name, values)
         return settings_digest(settings)
+
+    @property
+    def drawn(self) -> SourceSeeds:
+        """The seed of every source of random draws."""
+        return self.seeds.filled(self.seed)
 
     @property
     def folder(self) -> Path:

@@ -78,7 +78,7 @@ class _Part:
         session = self.setup.session
         folder = session.spec.folder
         split = session.trainer.selection_split
-        state = State(seed=session.spec.seed)
+        state = State(seed=session.spec.drawn.masks)
         trainer = make_trainer(
             self.setup,
             folder,

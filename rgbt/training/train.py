@@ -172,7 +172,7 @@ class Run:
         self.folder.add_provenance({**provenance(), "own_code": session.spec.own_code()})
 
     def _train(self, session: Session) -> State:
-        state = State(seed=session.spec.seed)
+        state = State(seed=session.spec.drawn.masks)
         trainer = self._trainer(session, state)
         if agreed(trainer.resume(state)):
             if trainer.checkpoints.warning:

@@ -1,4 +1,7 @@
-"""Reads and checks table files: the papers' in ``sweeps/tables``, the user's in ``tables``."""
+"""Reads and checks table files.
+
+The papers' are in ``sweeps/tables``, our studies in ``sweeps/studies``, the user's in ``tables``.
+"""
 
 from __future__ import annotations
 
@@ -13,14 +16,19 @@ from rgbt.files.yaml_files import read_yaml
 from sweeps.table.check_table import check_table
 from sweeps.table.claim import Claim
 from sweeps.table.table import Column, Factor, Row, Table
+from sweeps.table.variance import Variance
 
 PUBLISHED = Path(__file__).resolve().parents[1] / "tables"
 """The papers' tables, part of the package."""
+
+STUDIES = Path(__file__).resolve().parents[1] / "studies"
+"""Our own studies, part of the package; no paper has printed them."""
 
 OWN = Path("tables")
 """Tables of the user, in the current folder."""
 
 SHAPES: dict[str, type[Any]] = {
+    "variance": Variance,
     "rows": Row,
     "columns": Column,
     "factor": Factor,
@@ -37,12 +45,17 @@ def table_names(folder: Path = OWN) -> list[str]:
     ]
 
 
+def study_names() -> list[str]:
+    """Names for `load_table` of our own studies."""
+    return [path.stem for path in sorted(STUDIES.glob("*.yaml"))]
+
+
 def load_table(name: str, folder: Path = OWN) -> Table:
     """Read and check a table.
 
     Args:
-        name: "spatialseg/table3" for a published table, "my/ablation" for one in `folder`, or a
-            path that ends in .yaml.
+        name: "spatialseg/table3" for a published table, "spatial_bias" for a study of ours,
+            "my/ablation" for one in `folder`, or a path that ends in .yaml.
         folder: of the user's tables.
 
     Raises:
@@ -68,11 +81,14 @@ def _find(name: str, folder: Path) -> Path:
         if not path.is_file():
             raise InputError(f"table={name}: there is no such file.")
         return path
-    paths = [path for root in (PUBLISHED, folder) if (path := root / f"{name}.yaml").is_file()]
+    paths = [
+        path for root in (PUBLISHED, STUDIES, folder) if (path := root / f"{name}.yaml").is_file()
+    ]
     if len(paths) > 1:
         raise InputError(f"table={name} is both {paths[0]} and {paths[1]}; give the path of one.")
     if not paths:
-        raise InputError(f"there is no table '{name}'; {nearest(name, table_names(folder))}.")
+        known = [*table_names(folder), *study_names()]
+        raise InputError(f"there is no table '{name}'; {nearest(name, known)}.")
     return paths[0]
 
 

@@ -10,6 +10,7 @@ from rgbt.checks import InputError
 from rgbt.metrics.pairs import Protocol
 from sweeps.evaluation import Head
 from sweeps.table.claim import Claim
+from sweeps.table.variance import Variance
 
 Origin = Literal[
     "own_method",
@@ -182,6 +183,7 @@ class Table:
         needs: missing part of the project without which no row can be run.
         columns: in order.
         factor: x axis of the figure; None: no figure over a factor.
+        variance: rows that measure the variance of a score by source; None: there are none.
         forms: one sentence per form that says what the rows are run as.
         claims: what the paper says about the table.
         remarks: footnotes of the whole table, one sentence each.
@@ -201,6 +203,7 @@ class Table:
     needs: str | None = None
     columns: tuple[Column, ...]
     factor: Factor | None = None
+    variance: Variance | None = None
     forms: Mapping[Form, str] = field(default_factory=dict)
     claims: tuple[Claim, ...] = ()
     remarks: tuple[str, ...] = ()

@@ -289,3 +289,21 @@ def test_settings_of_the_network_do_not_change_the_key(composed: Composed) -> No
     words = ("activation_checkpointing=true", "memory_format=channels_last", "compile=default")
     plain, changed = composed("mfnet"), composed("mfnet", *(f"trainer.{word}" for word in words))
     assert changed.key == plain.key
+
+
+@pytest.mark.parametrize(("source", "changed"), [("weights", 0), ("order", 1), ("masks", None)])
+def test_seed_of_a_source_changes_what_is_drawn_from_it_alone(
+    composed: Composed, source: str, changed: int | None
+) -> None:
+    def drawn(*more: str) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
+        setup = set_up_training(composed("sh_adversarial", "model.weights=null", *more))
+        weights = [*setup.model.parameters(), *setup.others["critic"].parameters()]
+        pair: Any = next(setup.batches(range(1)))
+        return weights, [pair.source.rgb, pair.target.rgb]
+
+    before, after = drawn(), drawn(f"seeds.{source}=1")
+    for index, (one, other) in enumerate(zip(before, after, strict=True)):
+        is_same = [
+            torch.equal(a, b) for a, b in zip(one, other, strict=True) if a.unique().numel() > 1
+        ]
+        assert not any(is_same) if index == changed else all(is_same)

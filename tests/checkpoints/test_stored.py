@@ -35,7 +35,7 @@ def payload() -> dict[str, Any]:
         model(torch.rand(2, 4, 8, 8)).square().sum().backward()
         optimizer.step()
     state = State(seed=3, step=7, best_score=0.25, best_step=4, skipped=["a"])
-    return training_payload(model, {}, {"main": optimizer}, state)
+    return training_payload(model.state_dict(), None, {}, {"main": optimizer}, state)
 
 
 def same(one: object, other: object) -> bool:

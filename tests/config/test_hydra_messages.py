@@ -48,6 +48,7 @@ def test_word_that_hydra_refuses_says_what_to_type(words: tuple[str, ...], sente
             "seed=[0, 1]",
             "'seed=[0, 1]': a run has one seed; for several runs use a grid: -m seed=0,1.",
         ),
+        ("seeds=3", "'seeds=3': 'seeds' is a mapping; set the seed of one source (seeds.order=3)"),
         (
             "hydra.searchpath=[file:///no/where]",
             "the folder /no/where does not exist; give the absolute path",

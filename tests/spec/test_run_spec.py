@@ -260,3 +260,31 @@ def test_run_with_another_seed_is_the_run_composed_with_it(experiment: str) -> N
     assert made.plain == composed_so.plain
     assert made.overrides == composed_so.overrides
     assert [each.key for each in made.upstream] == [each.key for each in composed_so.upstream]
+
+
+def test_averaging_is_in_the_key_with_the_setting_that_it_uses() -> None:
+    plain = key_of("grbm")
+    unused = ("trainer.ema_decay=0.5", "trainer.averaged_share=0.5")
+    assert key_of("grbm", "trainer.averaging=none", *unused) == plain
+    ema, last = key_of("grbm", "trainer.averaging=ema"), key_of("grbm", "trainer.averaging=last")
+    assert len({plain, ema, last}) == 3
+    assert key_of("grbm", "trainer.averaging=ema", "trainer.averaged_share=0.5") == ema
+    assert key_of("grbm", "trainer.averaging=ema", "trainer.ema_decay=0.5") != ema
+    assert key_of("grbm", "trainer.averaging=last", "trainer.ema_decay=0.5") == last
+    assert key_of("grbm", "trainer.averaging=last", "trainer.averaged_share=0.5") != last
+
+
+def test_seeds_that_are_the_seed_of_the_run_are_not_in_the_key() -> None:
+    assert key_of("grbm", "seed=3", "seeds.order=3") == key_of("grbm", "seed=3")
+    others = [key_of("grbm", f"seeds.{source}=3") for source in ("weights", "order", "masks")]
+    assert len({*others, key_of("grbm")}) == 4
+
+
+def test_seeds_are_those_of_upstream_runs_too() -> None:
+    (upstream,) = spec_of("sh_max_squares", "seeds.order=3").upstream
+    assert (upstream.seeds.order, upstream.seeds.weights) == (3, None)
+
+
+def test_drawn_with_another_seed_keeps_the_seeds_of_sources() -> None:
+    drawn = spec_of("grbm", "seeds.order=7").with_seed(2).drawn
+    assert (drawn.weights, drawn.order, drawn.masks) == (2, 7, 2)

@@ -57,13 +57,13 @@ def _headlamps(
     placed: Sequence[Placed], camera: SynthCamera
 ) -> Iterator[tuple[float, float, float]]:
     """Column, row and brightness of each pair of headlights in view."""
-    for thing in placed:
-        if thing.lit and is_oncoming(thing):
-            point = camera.to_camera(floats([thing.x, 0.7, thing.z]))
-            if point[2] > NEAR_M:
-                column, row = camera.project(point).tolist()
-                if 0 <= column < camera.width and 0 <= row < camera.height:
-                    yield column, row, 10 / max(float(point[2]), 10.0)
+    oncoming = (thing for thing in placed if thing.lit and is_oncoming(thing))
+    points = (camera.to_camera(floats([thing.x, 0.7, thing.z])) for thing in oncoming)
+    for point in points:
+        column, row = camera.project(point).tolist()
+        inside = 0 <= column < camera.width and 0 <= row < camera.height
+        if inside and point[2] > NEAR_M:
+            yield column, row, 10 / max(float(point[2]), 10.0)
 
 
 def _low_sun(
