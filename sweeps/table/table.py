@@ -44,7 +44,8 @@ class Column:
 
     Attributes:
         name: as in the rows' `values`.
-        metric: a name of `rgbt.metrics.names`, or class/<name>/acc, class/<name>/region/<n>;
+        metric: a name of `rgbt.metrics.names`, or class/<name>/acc, class/<name>/region/<n>, or of
+            details (`rgbt.metrics.details`) with their default bins, such as distance/10-20;
             ``{key}`` is replaced by that entry of the row's settings.
         minus: (a, b): column a minus column b.
         mean: mean of two or more other columns of the row, e.g. of day and night.

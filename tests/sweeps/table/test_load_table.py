@@ -111,6 +111,11 @@ def test_own_table_needs_no_printed_values(tmp_path: Path) -> None:
         (column(metric="Var", severity=8), "'severity' needs a corruption; add corruption"),
         (column(needs="x", corruption="removed:rgb"), "only for scores of single frames; remove"),
         (column(metric="TC", frames="aligned", corruption="removed:rgb"), "remove corruption: re"),
+        (
+            column(metric="distance/0-15"),
+            "distance: '0-15' is not a valid choice; did you mean '0-10",
+        ),
+        (column(metric="night/region/1/size/0-65"), "'0-65' is not a valid choice; did you mean"),
         ({**column(metric="class/{kind}"), **row()}, "'kind' of metric class/{kind}"),
         (column(metric="TC"), "TC compares two frames; add frames: aligned, released or next"),
         (column(metric="Var", frames="aligned"), "'frames' is only for TC, CA, CA_released"),
