@@ -145,11 +145,14 @@ def metrics_of(text: str, every: Sequence[Counts], settings: Resampling) -> list
     enough images of them for `settings`.
     """
     from analysis.uncertainty.blocks import FEWEST
-    from rgbt.metrics import names
+    from rgbt.metrics import names, score_grid
+    from rgbt.metrics.details import details_of
     from rgbt.metrics.pairs import HEADLINES, protocol_of
 
     if text != "auto":
         return split_list(text, "metrics")
+    if details_of(every[0].partition) is not None:
+        return list(score_grid.headlines(every[0]))
     headlines: tuple[str, ...] = (names.MIOU,)
     by_region = [names.VAR, *map(names.region, range(1, every[0].counts.shape[1] + 1))]
     protocol = protocol_of(every[0].partition)
@@ -203,11 +206,12 @@ def absent_classes(every: Sequence[Counts], absent: Absent | None) -> tuple[str,
 
     from rgbt.metrics.absent import absent_notes
     from rgbt.metrics.counts import convention
+    from rgbt.metrics.details import details_of
     from rgbt.metrics.pairs import protocol_of
 
     first = every[0]
-    if protocol_of(first.partition) is not None:
-        return ()  # matrices of pairs of frames have no labels as rows
+    if protocol_of(first.partition) is not None or details_of(first.partition) is not None:
+        return ()  # matrices of pairs of frames and of boundaries have no labels as rows
     summed = np.sum([counts.by_region() for counts in every], axis=0)
     used = absent or convention(every)
     return absent_notes(summed, first.classes, first.scored, first.split, used)

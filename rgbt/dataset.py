@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.requirements import Record, record_of
-from rgbt.types import Sample
+from rgbt.types import Sample, SceneMaps
 
 
 class LabelledDataset(Protocol):
@@ -73,6 +73,15 @@ class LabelledDataset(Protocol):
 
     def fingerprint(self) -> str:
         """Hash of names and files; equal copies in different folders have equal fingerprints."""
+        ...
+
+
+@runtime_checkable
+class KnownScenes(Protocol):
+    """A data set that knows depth and objects of its scenes, such as a generated one."""
+
+    def scene_maps(self, name: str) -> SceneMaps:
+        """Maps of the size of the label; InputError if the image has none."""
         ...
 
 

@@ -5,14 +5,23 @@ The command writes the counts and prints the tables derived from them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 from rgbt.checks import InputError
-from rgbt.config.common_options import Head, Modality, NetworkOptions, RegionsFile, Split
+from rgbt.config.common_options import Head, NetworkOptions, RegionsFile, Split
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
+from rgbt.metrics.details import DISTANCES, SIZES, WIDTH
+
+ALL = "all"
+"""Value of `modality`: each view of the network."""
+
+
+def _text(edges: Sequence[float]) -> str:
+    return ",".join(f"{edge:g}" for edge in edges)
 
 
 @dataclass(frozen=True)
@@ -20,7 +29,13 @@ class Options(NetworkOptions):
     """Options of the command."""
 
     split: Split = "test"
-    modality: Modality = "default"
+    modality: Annotated[
+        str,
+        Help(
+            "input images of the network: rgbt, rgb or thermal; by default those that it was "
+            "designed for; all: each that it predicts from, and a table of them"
+        ),
+    ] = "default"
     regions: RegionsFile = "as trained"
     head: Head = "as trained"
     corruption: Annotated[
@@ -32,8 +47,25 @@ class Options(NetworkOptions):
         ),
     ] = "none"
     severity: Annotated[str, Help("severity of the corruption")] = ""
+    details: Annotated[
+        str,
+        Help(
+            "what else to count, a list: boundary (boundary IoU), calibration (ECE), distance "
+            "(IoU by distance), size (recall by size of the object); all; none. Distance and size "
+            "require a data set with scene maps, such as dataset=synth_calibrated"
+        ),
+    ] = "none"
+    boundary_width: Annotated[
+        float, Help("width of a boundary as a share of the image diagonal, 0.001 to 0.2")
+    ] = WIDTH
+    boundary_border: Annotated[
+        bool, Help("whether the border of the image is an outline of masks, as Cheng et al. coded")
+    ] = False
+    distances: Annotated[str, Help("edges between bins of distance in metres")] = _text(DISTANCES)
+    sizes: Annotated[str, Help("edges between bins of size in pixels of an object")] = _text(SIZES)
     out: Annotated[
-        Path | None, Help("file for the counts; default: evaluations/ in the run folder")
+        Path | None,
+        Help("file for the counts, details beside it; default: evaluations/ in the run folder"),
     ] = None
 
 
@@ -44,30 +76,58 @@ def main(options: Options, overrides: list[str]) -> int:
     of the corruption: corruption.block=16 corruption.seed=1
     """
     from rgbt.evaluation.corruption_request import requested_corruption, split_overrides
-    from rgbt.evaluation.request import EvaluationRequest, NetworkRequest
-    from rgbt.evaluation.segmentation import counts_path, evaluate, overview
-    from rgbt.tracking.terminal import print_rich
+    from rgbt.evaluation.details import save_details, score_table, views_table
+    from rgbt.evaluation.request import DEFAULT_VIEW, EvaluationRequest, NetworkRequest
+    from rgbt.evaluation.segmentation import counts_path, evaluate, label_of, overview
+    from rgbt.metrics.details import requested
+    from rgbt.requirements import record_of
+    from rgbt.tracking.terminal import path_lines, print_rich, rich_table
     from rgbt.training.overview import announce_network
 
-    if options.out is not None and options.out.is_dir():
+    _check_out(options)
+    boundary = options.boundary_width, options.boundary_border
+    details = requested(options.details, boundary, options.distances, options.sizes)
+    words, overrides = split_overrides(overrides)
+    network = NetworkRequest(options, overrides, options.regions)
+    corruption = requested_corruption(options.corruption, options.severity, words, network.trust)
+    modality = DEFAULT_VIEW if options.modality == ALL else options.modality
+    request = EvaluationRequest.from_options(
+        options.split, modality, options.head, corruption, details
+    )
+    opened = network.open()
+    announce_network(opened)
+    views = record_of(opened.session.model).views if options.modality == ALL else (request.view,)
+    by_view = {}
+    for each in (replace(request, view=view) for view in views):
+        result = evaluate(opened.session, opened.session.model, each)
+        by_view[result.view] = result.counts
+        path = options.out or counts_path(opened, network, each, result)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        result.counts.save(path)
+        files = save_details(result.details, path)
+        print_rich(overview(opened, each, result, path))
+        for counts in result.details.values():
+            print_rich(rich_table(score_table(counts, label_of(opened, each, result.view))))
+        if files:
+            print_rich(path_lines(files))
+    if len(by_view) > 1:
+        print_rich(rich_table(views_table(by_view, opened.label)))
+    return 0
+
+
+def _check_out(options: Options) -> None:
+    if options.out is None:
+        return
+    if options.out.is_dir():
         raise InputError(
             f"out={options.out} is a folder; give a file name for the counts, such as "
             "out=counts.npz."
         )
-    words, overrides = split_overrides(overrides)
-    network = NetworkRequest(options, overrides, options.regions)
-    corruption = requested_corruption(options.corruption, options.severity, words, network.trust)
-    request = EvaluationRequest.from_options(
-        options.split, options.modality, options.head, corruption
-    )
-    opened = network.open()
-    announce_network(opened)
-    result = evaluate(opened.session, opened.session.model, request)
-    path = options.out or counts_path(opened, network, request, result)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    result.counts.save(path)
-    print_rich(overview(opened, request, result, path))
-    return 0
+    if options.modality == ALL:
+        raise InputError(
+            f"out={options.out} is the file of a single evaluation, but modality=all makes "
+            "several; omit out=."
+        )
 
 
 entry = PlainCommand(Options, main)

@@ -5,8 +5,9 @@ Nothing is run: the verdicts come from the finished runs in the folder of runs.
 
 from __future__ import annotations
 
+import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -17,9 +18,10 @@ from rgbt.config.options import Help, readable_paths
 from rgbt.config.plain_command import PlainCommand
 
 if TYPE_CHECKING:
+    from rgbt.tracking.run_result import RunResult
     from sweeps.table.request import TableRequest
-    from sweeps.verdicts.judge import JudgedClaim
-    from sweeps.worker.planner import Planner
+    from sweeps.verdicts.judge import CellRunId, JudgedClaim
+    from sweeps.verdicts.stored import StoredRun
 
 ALL = "all"
 
@@ -29,9 +31,10 @@ class Options:
     """Options of ``rgbt claims``."""
 
     table: Annotated[
-        str, Help("claims of one table, such as spatialseg/table3; all: of every table")
+        str,
+        Help("claims of one table, such as spatialseg/table3; all: of every table of the papers"),
     ] = ALL
-    scale: Annotated[str, Help("scale of the runs: demo or paper")] = "demo"
+    scale: Annotated[str, Help("scale of the runs: demo, bench or paper")] = "demo"
     form: Annotated[
         Literal["paper", "released"], Help("form of the rows, as of rgbt reproduce")
     ] = "paper"
@@ -53,14 +56,17 @@ def main(options: Options, overrides: list[str]) -> int:
     from rgbt.tracking.terminal import path_lines, print_rich, rich_table
     from sweeps.rendering.claims import claims_csv, claims_grid, claims_markdown, counted
 
-    judged = judge_all(options, overrides)
-    where = f"scale={options.scale}, form={options.form}, runs in {options.runs_dir}"
+    judged, times = judge_all(options, overrides)
+    run_as = " ".join([f"scale={options.scale}", f"form={options.form}", *overrides])
+    where = f"{run_as}, runs in {options.runs_dir}"
     print_rich(rich_table(claims_grid(judged, f"{counted(judged)} ({where})", tables=True)))
-    print_rich(Text(by_paper(judged)))
+    print_rich(Text("\n".join([by_paper(judged), *times])))
     if options.out is not None:
         options.out.mkdir(parents=True, exist_ok=True)
         text = (
-            f"# Claims of the papers\n\n{counted(judged)}\n\n{claims_markdown(judged, tables=True)}"
+            f"# Claims of the papers\n\n{counted(judged)} Runs: `{without_folders(run_as)}`.\n\n"
+            + "".join(f"{line}\n\n" for line in times)
+            + claims_markdown(judged, tables=True)
         )
         write_atomic(options.out / "claims.md", text.encode())
         write_atomic(options.out / "claims.csv", claims_csv(judged).encode())
@@ -68,8 +74,13 @@ def main(options: Options, overrides: list[str]) -> int:
     return 0
 
 
-def judge_all(options: Options, overrides: Sequence[str]) -> list[JudgedClaim]:
-    """The claims of the requested tables, judged by the finished runs.
+def without_folders(words: str) -> str:
+    """Words of a command without the folder of the data, which names a machine."""
+    return re.sub(r" ?dataset\.root=\S+", "", words)
+
+
+def judge_all(options: Options, overrides: Sequence[str]) -> tuple[list[JudgedClaim], list[str]]:
+    """The claims of the requested tables, judged by the finished runs; and how long these took.
 
     Raises:
         InputError: no such table, scale or folder of runs.
@@ -77,10 +88,11 @@ def judge_all(options: Options, overrides: Sequence[str]) -> list[JudgedClaim]:
     from rich.console import Console
     from rich.progress import track
 
+    from sweeps.rendering.times import time_line, upstream_line
     from sweeps.table.load_table import PUBLISHED, table_names
     from sweeps.table.make_request import TableWords, check_override, make_request, read_named
     from sweeps.table.rows import check_rows
-    from sweeps.verdicts.stored import finished_by_seed
+    from sweeps.verdicts.stored import finished_by_seed, stored_runs
     from sweeps.worker.planner import Planner
 
     names = table_names(PUBLISHED / "none") if options.table == ALL else [options.table]
@@ -90,6 +102,8 @@ def judge_all(options: Options, overrides: Sequence[str]) -> list[JudgedClaim]:
     words = TableWords(seeds=(0,), scale=options.scale, form=options.form, overrides=overrides)
     planner = Planner(readable_paths([f"runs_dir={options.runs_dir}"]))
     judged: list[JudgedClaim] = []
+    results: dict[str, RunResult] = {}
+    trained: list[tuple[str, ...]] = []
     for each in track(names, "judging", console=Console(stderr=True), transient=True):
         name, table = read_named(each)
         if table.claims:
@@ -100,19 +114,20 @@ def judge_all(options: Options, overrides: Sequence[str]) -> list[JudgedClaim]:
                     f"use rgbt reproduce table={name} for rows that are not trained."
                 )
             check_rows(request, planner)
-            judged += judge_stored(request, options.runs_dir, finished, planner)
-    return judged
+            runs = stored_runs(request, options.runs_dir, finished, planner)
+            judged += judge_stored(request, runs)
+            results |= {each.key: each for run in runs.values() for each in run.results}
+            trained += [request.overrides(label, seed) for label, seed in runs]
+    times = (time_line(results.values()), upstream_line(trained, planner))
+    return judged, [line for line in times if line]
 
 
-def judge_stored(
-    request: TableRequest, runs_dir: Path, finished: dict[int, set[str]], planner: Planner
-) -> list[JudgedClaim]:
-    """The claims of one table, judged by the finished runs of a folder."""
+def judge_stored(request: TableRequest, runs: Mapping[CellRunId, StoredRun]) -> list[JudgedClaim]:
+    """The claims of one table, judged by its finished runs."""
     from sweeps.table.efficiency import exact_sizes
     from sweeps.verdicts.judge import TableJudge
-    from sweeps.verdicts.stored import rule_of, stored_runs
+    from sweeps.verdicts.stored import rule_of
 
-    runs = stored_runs(request, runs_dir, finished, planner)
     rule = rule_of(result.tags for run in runs.values() for result in run.results)
     judge = TableJudge(request.name, request.table, rule, sizes=exact_sizes(request))
     return judge.claims(runs)

@@ -6,6 +6,7 @@ import hashlib
 from dataclasses import dataclass
 from typing import Literal
 
+from rgbt.metrics.details import OF_SCENES, DetailKind
 from rgbt.metrics.pairs import Protocol, file_name
 from rgbt.spec.corruption_names import row_name
 from rgbt.tracking.run_result import RunResult
@@ -26,6 +27,7 @@ class ExtraEvaluation:
         corruption: of the images, NAME or NAME:IMAGE with a file of ``conf/corruption``; None:
             clean, as the evaluation that the run makes itself.
         severity: of the corruption; None: the only one that it has.
+        details: kind of counts beside the confusion matrices, see `rgbt.metrics.details`.
         world: name of the images where they are not the run's own, e.g. "O-N+"; "" where they are.
         dataset: overrides of the data set that make this world.
     """
@@ -36,6 +38,7 @@ class ExtraEvaluation:
     head: Head = "as trained"
     corruption: str | None = None
     severity: float | None = None
+    details: DetailKind | None = None
     world: str = ""
     dataset: tuple[str, ...] = ()
 
@@ -52,14 +55,16 @@ class ExtraEvaluation:
         if self.frames is not None:
             return f"consistency, {self.frames}"
         head = [] if self.head == "as trained" else [f"{self.head} head"]
+        details = [] if self.details is None else [self.details]
         world = [f"world {self.world}"] if self.world else []
-        return ", ".join([self.modality, self.regions, *head, *self._corrupted, *world])
+        return ", ".join([self.modality, self.regions, *head, *self._corrupted, *details, *world])
 
     @property
     def command(self) -> tuple[str, ...]:
         """Module that makes it, and its arguments except the run.
 
-        One call makes both protocols of virtual views, aligned and released.
+        One call makes both protocols of virtual views, aligned and released, and one call makes
+        several details, because the network takes most of the time.
         """
         if self.frames is not None:
             return ("rgbt.consistency", f"frames={'next' if self.frames == 'next' else 'virtual'}")
@@ -67,11 +72,24 @@ class ExtraEvaluation:
         words += [] if self.head == "as trained" else [f"head={self.head}"]
         words += [] if self.corruption is None else [f"corruption={self.corruption}"]
         words += [] if self.severity is None else [f"severity={self.severity:g}"]
+        if self.details is not None:
+            words.append(
+                f"details={'all' if self.details in OF_SCENES else 'boundary,calibration'}"
+            )
         return ("rgbt.evaluate", *words, *self.dataset)
 
     @property
     def path(self) -> str:
         """Path of its counts inside the run folder, and among the run's files in MLflow."""
+        return self.details_path(self.out)
+
+    def details_path(self, out: str) -> str:
+        """Path of its counts if the command writes `out`: details are beside the matrices."""
+        return out if self.details is None else f"{out.removesuffix('.npz')}-{self.details}.npz"
+
+    @property
+    def out(self) -> str:
+        """Path, inside the run folder, of the file that the command writes."""
         if self.frames is not None:
             return file_name(self.frames, "test")
         head = [] if self.head == "as trained" else [f"{self.head}-head"]

@@ -55,7 +55,13 @@ class Options:
     max_seeds: Annotated[
         int, Interval(ge=4, le=1000), Help("most seeds of a row with seeds=until_decided")
     ] = 20
-    scale: Annotated[str, Help("demo (minutes, embedded data) or paper (published sizes)")] = "demo"
+    scale: Annotated[
+        str,
+        Help(
+            "demo (minutes, embedded data), bench (calibrated data, common start) or paper "
+            "(published sizes)"
+        ),
+    ] = "demo"
     form: Annotated[
         Literal["paper", "released", "both"],
         Help(
@@ -167,7 +173,7 @@ def main(options: Options, overrides: list[str]) -> int:
     plans = plans_of(tables, options, extra, runs, planner)
     if settings.dry_run:
         previews = [preview_points(plan.points, settings, planner) for plan in plans]
-        _show(options.table, list(zip(plans, previews, strict=True)), settings.workers)
+        _show(options.table, list(zip(plans, previews, strict=True)), settings.workers, planner)
         return 0
     (plan,) = plans
     wanted = plan.request
@@ -176,17 +182,39 @@ def main(options: Options, overrides: list[str]) -> int:
     if plan.until_decided is None:  # an earlier command may have added seeds
         plan.judge.rule = rule_of(result.tags for each in outcomes for result in each.results)
     out = options.out or options.runs_dir / "tables" / f"{wanted.name}_{wanted.variant}"
-    return publish_table(plan.judge, wanted, outcomes, plan.external, out, runs.tracking)
+    code = publish_table(plan.judge, wanted, outcomes, plan.external, out, runs.tracking)
+    _show_time(outcomes, planner)
+    return code
+
+
+def _show_time(outcomes: Sequence[Outcome], planner: Planner) -> None:
+    """Print how long the finished runs and those upstream of them took."""
+    from rich.text import Text
+
+    from rgbt.tracking.terminal import print_rich
+    from sweeps.rendering.times import time_line, upstream_line
+
+    finished = [outcome for outcome in outcomes if outcome.results]
+    lines = (
+        time_line(result for outcome in finished for result in outcome.results),
+        upstream_line((outcome.point.overrides for outcome in finished), planner),
+    )
+    if any(lines):
+        print_rich(Text("\n".join(line for line in lines if line)))
 
 
 def _show(
-    table: str, previews: Sequence[tuple[TablePlan, Sequence[Outcome]]], workers: int
+    table: str,
+    previews: Sequence[tuple[TablePlan, Sequence[Outcome]]],
+    workers: int,
+    planner: Planner,
 ) -> None:
     """Print the preview of one table, or one line for each of all."""
     from rich.text import Text
 
     from rgbt.tracking.terminal import print_rich, rich_table
     from sweeps.rendering.preview import cells_grid, most_line, summary, tables_grid
+    from sweeps.rendering.times import upstream_line
 
     if table == ALL:
         requests = [(plan.request, outcomes) for plan, outcomes in previews]
@@ -198,7 +226,8 @@ def _show(
     lines = summary(plan.request, outcomes, workers)
     if plan.until_decided is not None:
         lines.append(most_line(len(plan.until_decided.most_runs()), outcomes, workers))
-    print_rich(Text("\n".join(lines)))
+    upstream = upstream_line((each.point.overrides for each in outcomes), planner)
+    print_rich(Text("\n".join([*lines, *([upstream] if upstream else [])])))
 
 
 def settings_of(options: Options) -> SweepSettings:

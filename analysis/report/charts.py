@@ -36,13 +36,13 @@ def _specifications() -> Any:
 def table_charts(view: TableView) -> list[Spec]:
     """Ours with intervals and single runs, and the published values, by row.
 
-    At demo scale the published values have a separate chart and axis.
+    At every scale but "paper" the published values have a separate chart and axis.
     """
     rows = list(_table_rows(view))
     printed = [row for row in rows if row["kind"] == "published"]
     ours = [row for row in rows if row["kind"] != "published"]
-    apart = view.entry.scale == "demo" and ours and printed
-    parts = [("ours (demo scale)", ours), ("published, own axis", printed)]
+    apart = not view.entry.at_paper_scale and ours and printed
+    parts = [(f"ours ({view.entry.scale} scale)", ours), ("published, own axis", printed)]
     unit = view.entry.unit + ", Var: squared percent points" * ("Var" in view.entry.columns)
     charts = []
     for title, values in parts if apart else [("", rows)]:

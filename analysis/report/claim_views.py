@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -21,6 +22,9 @@ VERDICTS: dict[VerdictWord, str] = {
 
 MOST_LISTED = 3
 """Rows without a run that are named."""
+
+DATA_WORDS = ("dataset=", "dataset.")
+FOLDERS = ("dataset.root=", "dataset.cache_dir=")
 
 IMAGES = "images alone"
 """What an interval covers, and in the place of the number of seeds where nothing has seeds."""
@@ -48,25 +52,32 @@ class PlacedClaim:
 
 @dataclass(frozen=True)
 class PaperClaims:
-    """The claims of a paper at one scale and in one form.
+    """The claims of a paper at one scale, on the data of the scale or on others, in one form.
 
     Attributes:
         id: its anchor.
-        title: the paper, with scale and form where something was run.
+        title: the paper, with scale, data and form where something was run.
+        data: overrides that chose other data, such as "dataset=mfnet"; "": those of the scale.
         claims: of its tables in their order.
     """
 
     id: str
     paper: str
     scale: str
+    data: str
     form: str
     claims: tuple[PlacedClaim, ...]
 
     @property
-    def title(self) -> str:
-        """The paper, with scale and form where something was run."""
+    def run_as(self) -> str:
+        """Scale, data and form; "" where nothing was run."""
         scale = f"{self.scale} scale" if self.scale else ""
-        return ", ".join(filter(None, (self.paper, scale, self.form)))
+        return ", ".join(filter(None, (scale, self.data, self.form)))
+
+    @property
+    def title(self) -> str:
+        """The paper, with scale, data and form where something was run."""
+        return ", ".join(filter(None, (self.paper, self.run_as)))
 
     @property
     def counted(self) -> str:
@@ -96,11 +107,11 @@ def placed(view: TableView) -> list[PlacedClaim]:
 
 
 def paper_claims(tables: Iterable[TableView]) -> list[PaperClaims]:
-    """The claims of every paper, once for each scale and form that some of its tables were run in.
+    """The claims of every paper, once for each scale, data set and form that some table was run in.
 
     A claim of a table that was run several times, with other rows or overrides, is counted once: by
-    the most seeds, whatever its verdicts. Tables that were not run at a scale and in a form have
-    claims that are not run.
+    the most seeds, whatever its verdicts. Runs of different scales or data are never in one
+    verdict. Tables that were not run in such a way have claims that are not run.
     """
     order = sorted(tables, key=lambda view: (view.entry.paper, view.entry.name))
     groups = [(paper, list(views)) for paper, views in groupby(order, lambda v: v.entry.paper)]
@@ -117,17 +128,31 @@ def paper_claims(tables: Iterable[TableView]) -> list[PaperClaims]:
     ]
 
 
-def _variants(views: Sequence[TableView]) -> list[tuple[str, str]]:
-    """Scale and form of the tables that were run; ("", "") where none was."""
+Variant = tuple[str, str, str]
+"""Scale, data and form."""
+
+
+def _variants(views: Sequence[TableView]) -> list[Variant]:
+    """The ways in which the tables were run; ("", "", "") where none was."""
     run = [view for view in views if view.is_run and view.entry.form != "both"]
-    return sorted({_variant(view) for view in run}) or [("", "")]
+    return sorted({_variant(view) for view in run}) or [("", "", "")]
 
 
-def _variant(view: TableView) -> tuple[str, str]:
-    return view.entry.scale, FORMS[view.entry.form]
+def _variant(view: TableView) -> Variant:
+    return view.entry.scale, chosen_data(view.entry.extra), FORMS[view.entry.form]
 
 
-def _claims_of(views: Sequence[TableView], variant: tuple[str, str]) -> tuple[PlacedClaim, ...]:
+def chosen_data(extra: str) -> str:
+    """The overrides of a table that choose other images than those of the scale.
+
+    Args:
+        extra: `TableEntry.extra`. Folders are left out: the same images may lie anywhere.
+    """
+    words = [word for word in shlex.split(extra) if word.startswith(DATA_WORDS)]
+    return " ".join(sorted(word for word in words if not word.startswith(FOLDERS)))
+
+
+def _claims_of(views: Sequence[TableView], variant: Variant) -> tuple[PlacedClaim, ...]:
     """The claims of each table: of its variant where it was run, else as not run."""
     claims: list[PlacedClaim] = []
     for _, group in groupby(views, lambda view: view.entry.name):

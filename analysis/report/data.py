@@ -23,7 +23,7 @@ class RunEntry:
 
     Attributes:
         status: "FINISHED", "RUNNING", "FAILED" or "KILLED".
-        scale: "demo" or "paper".
+        scale: "demo", "bench" or "paper".
         group: what seeds of one method share, or "".
         studies: names of the studies that the run is part of.
         table_rows: table -> row that the run belongs to.
@@ -37,6 +37,8 @@ class RunEntry:
         class_region_ious: K rows of R values.
         commit: git commit, "+" after it for uncommitted changes, or "".
         started: ISO 8601, UTC.
+        seconds: from its start to its end, without the further evaluations of tables.
+        resumed: whether several processes worked on it, so that `seconds` contains pauses.
         command: as typed.
         repeat: command that makes the run again.
         dataset: fingerprint of the data set.
@@ -73,6 +75,7 @@ class RunEntry:
     dataset: str
     config: Mapping[str, str]
     hardware: str = ""
+    resumed: bool = False
     versions: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -162,7 +165,7 @@ class TableEntry:
 
     Attributes:
         name: e.g. "spatialseg/table3"; `number` as printed.
-        scale: "demo" or "paper"; "" where nothing was run yet.
+        scale: "demo", "bench" or "paper"; "" where nothing was run yet.
         data: what the printed values were measured on.
         best: by column, "highest", "lowest" or "none".
         proposed: by row, whether it is the method that the paper proposes.
@@ -192,6 +195,11 @@ class TableEntry:
     form: ShownForm = "paper"
     claims: tuple[ClaimEntry, ...] = ()
     forms: FormsEntry | None = None
+
+    @property
+    def at_paper_scale(self) -> bool:
+        """Whether values may be compared with the printed ones; also where nothing was run."""
+        return self.scale in ("", "paper")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -262,7 +270,7 @@ class ContrastEntry:
         source: table or section of the paper, or that it is not in one.
         reference: group of the runs that are compared against.
         method: group of the other runs.
-        scale: "demo" or "paper"; "" where the runs are missing.
+        scale: "demo", "bench" or "paper"; "" where the runs are missing.
         values: mean over seeds of the reference and of the method.
         seeds: of the reference and of the method.
         low: lower end of the 95 % interval of the difference, `high` its upper end.

@@ -13,6 +13,7 @@ from analysis.report.claim_views import counted, paper_claims, placed
 from analysis.report.data import ContrastEntry, ReportData, RunEntry
 from analysis.report.markdown_claims import ClaimTexts, counts_table, forms_table, judged_table
 from analysis.report.markdown_tables import TableText, markdown_table
+from analysis.report.markdown_verdicts import verdicts_context
 from analysis.report.networks import NetworkEntry
 from analysis.report.page import STATIC, write_files
 from analysis.report.results_file import Paper, load_results_file
@@ -28,6 +29,7 @@ from analysis.report.views import (
 )
 from rgbt.checks import InputError
 from rgbt.metrics import names
+from sweeps.table.request import DEFAULT_SCALE
 
 WIDTH = 100
 DIGEST = 12
@@ -36,6 +38,11 @@ ABSOLUTE = re.compile(r"(?<![\w.:/)\]])/(?:[\w.+@%~-]+/)+([\w.+@%~-]*)")
 """A path from the root of a machine; addresses of pages and relative paths do not match."""
 
 PAGE_NAME = re.compile(r"[\w-]+")
+PAGES = ("index", "claims", "networks", "measurements")
+"""Pages that are not about the tables of one folder."""
+
+STUDY_PAGE = "studies"
+STUDIES = Paper(title="Studies", reference="Tables of this project that no paper prints.")
 
 
 def write_pages(data: ReportData, networks: Sequence[NetworkEntry], out: Path) -> list[Path]:
@@ -77,7 +84,10 @@ def page_texts(data: ReportData, networks: Sequence[NetworkEntry]) -> dict[str, 
         text = environment.get_template(f"results_{template}.md.j2").render(**shared, **more)
         return without_paths(text)
 
-    texts = {"index.md": page("index", **_index(data, tables))}
+    texts = {
+        "index.md": page("index", **_index(data, tables)),
+        "claims.md": page("claims", **verdicts_context(data, found, papers)),
+    }
     for name, paper in papers.items():
         shown = [(view, text := TableText(view), text.markdown()) for view in tables[name]]
         claims = {view.id: ClaimTexts(placed(view)) for view in tables[name] if view.entry.claims}
@@ -119,20 +129,23 @@ def without_paths(text: str) -> str:
 
 
 def _papers(tables: Iterable[TableView]) -> dict[str, Paper]:
-    """Pages of tables: the papers', then folders of the user's tables."""
+    """Pages of tables: the papers', then the studies and folders of the user's tables."""
     known = dict(load_results_file().papers)
     for view in tables:
         name = _page_of(view)
-        if not PAGE_NAME.fullmatch(name) or name in ("index", "networks", "measurements"):
+        if not PAGE_NAME.fullmatch(name) or name in PAGES:
             raise InputError(
                 f"table '{view.entry.name}' cannot have a page {name}.md; rename its folder."
             )
-        known.setdefault(name, Paper(title=name, reference="Tables of the user."))
+        own = Paper(title=name, reference="Tables of the user.")
+        known.setdefault(name, STUDIES if name == STUDY_PAGE else own)
     return known
 
 
 def _page_of(view: TableView) -> str:
-    return view.entry.name.partition("/")[0]
+    """Name of the page of a table: the folder of its file; all studies of ours have one."""
+    folder, slash, _ = view.entry.name.partition("/")
+    return folder if slash else STUDY_PAGE
 
 
 def _index(data: ReportData, tables: Mapping[str, Sequence[TableView]]) -> dict[str, object]:
@@ -143,6 +156,7 @@ def _index(data: ReportData, tables: Mapping[str, Sequence[TableView]]) -> dict[
     return {
         "finished": finished,
         "on_paper": [run for run in finished if run.scale == "paper"],
+        "small_scales": sorted({run.scale for run in finished} - {"paper"}),
         "on_gpu": [run for run in finished if run.hardware and not run.hardware.endswith("cores")],
         "on_real": [run for run in finished if not _is_embedded(run)],
         "page_links": ", ".join(f"[{name}]({name}.md)" for name in tables),
@@ -193,7 +207,7 @@ def _contrast_table(contrasts: Sequence[ContrastEntry]) -> str:
     for each in contrasts:
         reference, method = (fixed(value) for value in each.values or (None, None))
         # Of one training each the interval is over images alone; the verdict says so.
-        scale = f" ({each.scale} scale)" if each.scale == "paper" else ""
+        scale = f" ({each.scale} scale)" if each.scale else ""
         rows.append(
             [
                 f"{each.question}{scale}: `{each.method}` against `{each.reference}`",
@@ -246,7 +260,7 @@ def _table_lines(tables: Mapping[str, Sequence[TableView]]) -> str:
 def heading(view: TableView) -> str:
     """Heading of a table on its page."""
     entry = view.entry
-    scale = "paper scale" if entry.scale == "paper" else ""
+    scale = "" if entry.scale in ("", DEFAULT_SCALE) else f"{entry.scale} scale"
     words = shlex.split(entry.extra)  # in a heading without the quotes of a shell
     which = ", ".join(filter(None, (scale, view.form, " ".join(words))))
     return f"{entry.number} ({which})" if which else entry.number

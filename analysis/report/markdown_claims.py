@@ -96,7 +96,7 @@ def counts_table(papers: Sequence[PaperClaims]) -> str:
     header = ["paper", "scale", "claims", *VERDICTS, "printed agree", "printed do not agree"]
     rows = [
         [
-            f"[{paper.paper}]({paper.paper}.md)" + (f", {paper.form}" if paper.form else ""),
+            ", ".join(filter(None, (f"[{paper.paper}]({paper.paper}.md)", paper.data, paper.form))),
             paper.scale or DASH,
             str(len(paper.claims)),
             *(str(paper.count(verdict)) for verdict in VERDICTS),
@@ -118,9 +118,7 @@ def judged_table(papers: Sequence[PaperClaims]) -> str:
     for paper in papers:
         for each in paper.judged:
             number = each.view.entry.number
-            scale = f"; {paper.scale} scale" if paper.scale == "paper" else ""
-            form = f"; {paper.form}" if paper.form else ""
-            name = f"{each.entry.says} ({paper.paper}, {number}{scale}{form})"
+            name = f"{each.entry.says} ({paper.paper}, {number}; {paper.run_as})"
             numbers = _numbers(name, each)
             rows.append([*numbers[:6], AGREES[each.entry.as_printed], *numbers[6:]])
     return markdown_table(header, rows, (0, 1, 2, 6)) if rows else ""

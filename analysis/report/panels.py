@@ -193,7 +193,11 @@ def _cell_panels(view: TableView) -> dict[str, Panel]:
             ("seeds", str(cell.seeds)),
             ("unit", "squared percent points" if column == "Var" else table.unit),
             *([("note", cell.reason)] if cell.reason else []),
-            *([("scale", "demo: compare the verdicts of claims")] * (table.scale == "demo")),
+            *(
+                []
+                if table.at_paper_scale
+                else [("scale", f"{table.scale}: compare the verdicts of claims")]
+            ),
         ]
         subtitle = ", ".join(filter(None, (table.name, table.number, table.extra)))
         shown = _panel(f"{table.rows[r]}, {column}", subtitle, cell.runs, [view.id], facts)

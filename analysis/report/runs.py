@@ -127,7 +127,7 @@ def open_run(run: MlflowRun, remarks: list[str]) -> ReportRun:
         run_id=run.run_id,
         status=run.status,
         experiment=run.tags.get("rgbt.experiment", ""),
-        scale=(SCALE.findall(group) or [DEFAULT_SCALE])[-1],
+        scale=_scale_of(config, group),
         seed=int(seed) if (seed := run.tags.get("rgbt.seed", "")).isdecimal() else None,
         group=group,
         studies=tuple(_after(run.tags, STUDY_TAG)),
@@ -137,6 +137,7 @@ def open_run(run: MlflowRun, remarks: list[str]) -> ReportRun:
         commit=commit_of(first) or run.tags.get(COMMIT_TAG, "")[:COMMIT_LENGTH],
         started=run.started,
         seconds=run.seconds,
+        resumed=len(processes) > 1,
         command=command,
         repeat=repeat_command(command, config, run.tags),
         host=host_of(first),
@@ -153,6 +154,11 @@ def open_run(run: MlflowRun, remarks: list[str]) -> ReportRun:
         files=run.files,
         until_decided=tuple(_after(run.tags, UNTIL_DECIDED)),
     )
+
+
+def _scale_of(config: Mapping[str, Any], group: str) -> str:
+    """Name of the scale: of the configuration, else of the words of the group."""
+    return str(config.get("scale.name") or (SCALE.findall(group) or [DEFAULT_SCALE])[-1])
 
 
 def percent_scores(counts: Counts, absent: Absent) -> dict[str, float]:

@@ -24,7 +24,7 @@ from analysis.report.tables_rescored import CountsSource, RescoredTable, score_a
 from analysis.uncertainty import Interval, Resampling, compare, estimate
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
-from sweeps.table.load_table import load_table, table_names
+from sweeps.table.load_table import load_table, study_names, table_names
 from sweeps.table.request import DEFAULT_SCALE
 from sweeps.table.scoring import ScoredTable, published, score
 from sweeps.table.table import Column, Form, Row, Table
@@ -69,7 +69,8 @@ def table_entries(
         remarks: gets a sentence for everything that cannot be read or does not agree.
     """
     files: dict[str, Table] = {}
-    for name in track(list(dict.fromkeys(table_names())), "tables"):
+    studies = study_names()
+    for name in track(list(dict.fromkeys([*table_names(), *studies])), "tables"):
         try:
             files[name] = load_table(name)
         except InputError as error:
@@ -89,6 +90,7 @@ def table_entries(
     for each in recorded:
         if each.name not in files:
             remarks.append(f"Table '{each.name}' has no file any more; it is shown as recorded.")
+    known |= set(studies)  # shown only where they were run
     return (*made, *(_waiting(name, files[name]) for name in files if name not in known))
 
 

@@ -18,7 +18,7 @@ HEADER = ("table", "row", "column", "mean", "sd", "n", "published", "difference"
 """Columns of `CSV_FILE`, which is one line per row and column."""
 
 EXTRA = re.compile(r"Every row of ours was run with (.*)\.")
-SHOWN = ("Bold:", "rho:", "Published:", "Ours:", "scale=demo:")
+SHOWN = ("Bold:", "rho:", "Published:", "Ours:", "scale=")
 """Beginnings of remarks that the page shows by itself: marks, data, seeds and scale. Records of
 earlier versions have rank correlations ("rho:"), which are not shown any more."""
 
@@ -44,7 +44,7 @@ class RecordedTable:
 
     Attributes:
         name: e.g. "spatialseg/table3".
-        scale: "demo" or "paper".
+        scale: "demo", "bench" or "paper".
         lines: (row, column) -> cell, in the order of the file.
         remarks: sentences that stood below it.
         extra: overrides that were added to every row, as typed.
@@ -154,7 +154,7 @@ def reproduce_command(
     Args:
         name: of the table.
         seeds: 0, 1, 2 is "3"; a single other one needs brackets.
-        scale: "demo" or "paper".
+        scale: "demo", "bench" or "paper".
         extra: overrides of every row, as typed.
         form: what the rows are run as.
         until_decided: whether seeds are added to the rows of undecided claims.

@@ -177,7 +177,7 @@ class TableView:
     def way(self, column: int, difference: float) -> str:
         """What a difference means: "better", "worse", or "neutral" where orders alone count."""
         best = self.entry.best[column]
-        if not difference or best == "none" or self.entry.scale == "demo":
+        if not difference or best == "none" or not self.entry.at_paper_scale:
             return "neutral"
         return "better" if (difference > 0) == (best == "highest") else "worse"
 

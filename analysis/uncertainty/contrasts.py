@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from analysis.uncertainty.blocks import FEWEST, ImageBlocks, make_blocks
 from analysis.uncertainty.estimate import block_spread
+from analysis.uncertainty.images import watched
 from analysis.uncertainty.run_scores import RunScores
 from analysis.uncertainty.same_images import aligned_images
 from analysis.uncertainty.settings import Resampling
@@ -24,7 +25,6 @@ from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts, convention
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.named import images_of, parse
-from rgbt.metrics.pairs import protocol_of
 
 FIXED = -1
 """Seed of counts that belong to no seed: a folder of predictions, one file of weights."""
@@ -183,7 +183,7 @@ class Resampler:
         if self._settings.blocks != "auto":
             return np.empty((0, 0))
         every = [self._scores.influence(each, absent) for each in runs]
-        kinds = {protocol_of(counts.partition) for each in runs for counts in each.values()}
+        kinds = {watched(counts) for each in runs for counts in each.values()}
         if len(terms) > 1 and len(kinds) == 1:
             weighted = [term.weight * each for term, each in zip(terms, every, strict=True)]
             every.append(np.sum(weighted, axis=0))

@@ -15,6 +15,7 @@ from analysis.uncertainty.intervals import (
     Spread,
     Values,
     corrected,
+    of_gaps,
     over_images,
     over_seeds,
     together,
@@ -94,9 +95,13 @@ def estimate_of(
     settings, value = images.settings, float(points.mean())
     level = settings.level
     around = over_images(value, resampled, without, method=settings.method, level=level)
-    if metric.score == names.VAR and around is not None and settings.method == "auto":
+    if around is not None and settings.method == "auto":
+        # Chance alone raises these scores, and each resample raises them again.
         bias = float(np.nanmean(resampled)) - value
-        around = corrected(value, bias, image_spread(images, resampled), level)
+        if metric.score == names.VAR:
+            around = corrected(value, bias, image_spread(images, resampled), level)
+        elif metric.details == "calibration":
+            around = of_gaps(value, bias, image_spread(images, resampled), around, level)
     spread = over_seeds(points)
     trainings = both = None
     if spread is not None:

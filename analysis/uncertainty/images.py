@@ -15,9 +15,11 @@ from analysis.uncertainty.settings import Resampling
 from rgbt.checks import InputError
 from rgbt.metrics import names
 from rgbt.metrics.counts import Counts, convention
+from rgbt.metrics.details import details_of
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.named import ParsedMetric, images_of, parse, values
 from rgbt.metrics.pairs import protocol_of
+from rgbt.metrics.score_grid import headlines
 from rgbt.randomness import numpy_generator
 
 CHUNK = 500
@@ -50,9 +52,9 @@ class CommonImages:
     """Counts of M methods, each with its seeds, on the same images.
 
     Attributes:
-        methods: per method (S, B, R K K) float64: counts of every seed, summed inside each block;
+        methods: per method (S, B, R M K) float64: counts of every seed, summed inside each block;
             whole numbers below 2^53, so that sums are exact.
-        shape: (R, K, K).
+        shape: (R, M, K) of the counts of one image; of single frames M = K.
         like: counts of the same classes, scored ones and partition.
         images: N.
         absent: how a class without pixels scores.
@@ -151,14 +153,14 @@ def prepare(
     alike = [[aligned(like, counts) for counts in seeds] for seeds in methods]
     parts = [[images_of(metric, counts) for counts in seeds] for seeds in alike]
     first = parts[0][0]
-    regions, classes = first.counts.shape[1], len(first.classes)
+    regions, rows, classes = first.counts.shape[1:]
     flat = [
         np.stack([counts.counts.reshape(len(first.names), -1) for counts in seeds])
         for seeds in parts
     ]
     single = CommonImages(
         methods=tuple(each.astype(np.float64) for each in flat),
-        shape=(regions, classes, classes),
+        shape=(regions, rows, classes),
         like=first,
         images=len(first.names),
         blocks=ImageBlocks(np.arange(len(first.names)), len(first.names), ""),
@@ -172,12 +174,17 @@ def prepare(
     return single.in_blocks(blocks)
 
 
-WATCHED = (parse(names.MIOU), parse(names.PIXEL_ACCURACY))
-"""Scores that tell how far neighbouring images are alike, whatever is requested: the one that
-counts, and the one that shows likeness most clearly."""
+def watched(like: Counts) -> tuple[ParsedMetric, ...]:
+    """Scores that tell how far neighbouring images are alike, whatever is requested.
 
-WATCHED_PAIRS = (parse(names.TC), parse(names.CA))
-"""The same for counts of pairs of frames."""
+    Of single frames the one that counts, and the one that shows likeness most clearly; of pairs of
+    frames and of details their main scores.
+    """
+    if details_of(like.partition) is not None:
+        return tuple(map(parse, headlines(like)))
+    of_pairs = protocol_of(like.partition) is not None
+    scores = (names.TC, names.CA) if of_pairs else (names.MIOU, names.PIXEL_ACCURACY)
+    return tuple(map(parse, scores))
 
 
 def _influence(single: CommonImages) -> Scores:
@@ -191,8 +198,7 @@ def _influence(single: CommonImages) -> Scores:
 
 def influence(single: CommonImages) -> list[Scores]:
     """Per method (L, N): the watched scores without each image; NaN: nothing to score."""
-    of_pairs = protocol_of(single.like.partition) is not None
-    return single.without_each(WATCHED_PAIRS if of_pairs else WATCHED)
+    return single.without_each(watched(single.like))
 
 
 def _chunks(total: int) -> Iterator[slice]:

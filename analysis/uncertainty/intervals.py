@@ -104,6 +104,28 @@ def corrected(value: float, bias: float, spread: Spread, level: float) -> Interv
     return Interval(min(max(0.0, around.low), value), max(around.high, value))
 
 
+def of_gaps(value: float, bias: float, spread: Spread, around: Interval, level: float) -> Interval:
+    """Interval of a sum of absolute differences, such as a calibration error.
+
+        from  value - (1 + sqrt 2) bias - t error,  cut at 0,  to the upper end of `around`
+
+    Chance makes differences of 0 positive. If s is the standard deviation of such an error, the
+    estimate has the mean ``s sqrt(2 / pi)``. A resample adds another error of the same size and has
+    the mean ``sqrt(2) s sqrt(2 / pi)``. So if all differences are chance, the true bias is
+    ``bias / (sqrt(2) - 1) = (1 + sqrt 2) bias``; if they are large, both are near 0. The lower end
+    allows for the first, the upper end for the second.
+
+    Args:
+        value: the estimate, >= 0.
+        bias: mean of the resamples less `value`.
+        spread: standard error of the estimate.
+        around: quantiles of the resamples.
+        level: of the interval.
+    """
+    low = student(value - (1 + math.sqrt(2)) * max(bias, 0.0), spread, level).low
+    return Interval(min(max(0.0, low), around.low), around.high)
+
+
 def _acceleration(without_each: Values) -> float:
     """How fast the standard error changes with the score; from the jackknife."""
     known = without_each[~np.isnan(without_each)]

@@ -78,10 +78,10 @@ class RunScores:
         kept = images_of(metric, first).names
         used = np.isin(first.names, kept)[:, None, None, None]
         regions = first.counts.shape[1]
-        whole = metric.region is None and metric.score != names.VAR
-        if protocol_of(first.partition) is not None:
-            whole = False
-        one = metric.region is not None and metric.region <= regions
+        # Rows of counts of pairs of frames and of details are not regions.
+        of_regions = protocol_of(first.partition) is None and metric.details is None
+        whole = of_regions and metric.region is None and metric.score != names.VAR
+        one = of_regions and metric.region is not None and metric.region <= regions
         arrays: list[NDArray[np.integer]] = []
         for counts in every:
             array = counts.counts * used
@@ -98,11 +98,11 @@ class RunScores:
     def _common(
         self, arrays: list[NDArray[np.integer]], like: Counts, regions: int, absent: Absent
     ) -> CommonImages:
-        """Every array (N, R K K) as a method with one seed."""
-        count, classes = len(like.names), len(like.classes)
+        """Every array (N, R M K) as a method with one seed."""
+        count, (rows, classes) = len(like.names), like.counts.shape[2:]
         return CommonImages(
             methods=tuple(each.astype(np.float64)[None] for each in arrays),
-            shape=(regions, classes, classes),
+            shape=(regions, rows, classes),
             like=like,
             images=count,
             blocks=ImageBlocks(np.arange(count), count, ""),

@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rgbt.checks import InputError
+from rgbt.metrics import boundary, calibration
 from rgbt.metrics.counts import Counts, check_same_means
+from rgbt.metrics.details import details_of
 from rgbt.metrics.pairs import protocol_of
 
 
@@ -100,22 +103,44 @@ def _in_order(first: Counts, other: Counts) -> Counts:
 
 def _check_labels(first: Counts, same: Counts) -> None:
     """Compare the labelled pixels of every image, by region where both have the same regions."""
-    pairs = [protocol_of(each.partition) for each in (first, same)]
-    within: tuple[int, ...] = (-1,)
+    kinds = [_kind(each) for each in (first, same)]
     if first.partition == same.partition:
-        # Of pairs of frames the label is no row of the matrices but says which matrix it is.
-        within = (-1,) if pairs[0] is None else (-2, -1)
-    elif pairs == [None, None]:
-        within = (1, -1)
+        labelled = [_labelled(each) for each in (first, same)]
+    elif kinds == [None, None]:
+        labelled = [each.counts.sum((1, -1), dtype=np.int64) for each in (first, same)]
     else:
         return
-    labelled = [
-        each.counts.sum(within, dtype=np.int64).reshape(len(each.names), -1)
-        for each in (first, same)
-    ]
+    labelled = [each.reshape(len(first.names), -1) for each in labelled]
     unequal = np.flatnonzero((labelled[0] != labelled[1]).any(1))
     if len(unequal):
         raise InputError(
             f"'{first.names[unequal[0]]}' has different labels in the two counts "
             f"({len(unequal)} images do); score both on the same labels at the same size."
         )
+
+
+def _kind(counts: Counts) -> str | None:
+    """Protocol of pairs of frames or kind of details; None: confusion matrices of regions."""
+    details = details_of(counts.partition)
+    return protocol_of(counts.partition) if details is None else details.kind
+
+
+def _labelled(counts: Counts) -> NDArray[np.int64]:
+    """(N, ...) numbers of pixels that depend on the labels alone."""
+    array = counts.counts
+    labelled: NDArray[np.int64]
+    match _kind(counts):
+        case None | "distance" | "size":
+            labelled = array.sum(-1, dtype=np.int64)
+        case "boundary":
+            labelled = array[:, :, boundary.LABEL].astype(np.int64)
+        case "calibration":
+            # Bins and classes are those of the prediction; only their sum over a region is not.
+            details = details_of(counts.partition)
+            groups = 1 if details is None else details.groups
+            number = array[:, :, calibration.NUMBER].sum(-1, dtype=np.int64)
+            labelled = number.reshape(len(array), -1, groups).sum(-1)
+        case _:
+            # Of pairs of frames the label is no row but says which matrix it is.
+            labelled = array.sum((-2, -1), dtype=np.int64)
+    return labelled

@@ -14,7 +14,7 @@ from rgbt.checkpoints.report import Report
 from rgbt.checks import InputError
 from rgbt.config.compose import compose
 from rgbt.config.stored_config import read_settings
-from rgbt.spec.run_spec import RunSpec
+from rgbt.spec.run_spec import WEIGHTS, RunSpec
 from rgbt.tracking.terminal import info
 
 
@@ -35,7 +35,9 @@ def start_from_weights(model: nn.Module, spec: RunSpec) -> Report | None:
                 "the file with model.weights=..., or omit model.fresh."
             )
         return None
-    report = load_weights(model, source, fresh)
+    dependency = spec.dependency(WEIGHTS)
+    is_common = dependency is not None and dependency.is_common
+    report = load_weights(model, source, fresh, other_classes=is_common)
     info(report.sentence())
     node = spec.model.plain
     others = differences(node, report.facts.convention)

@@ -15,7 +15,9 @@ from rgbt.checkpoints.report import Report, counted, refusal
 from rgbt.checks import InputError, not_finite
 
 
-def load_weights(model: nn.Module, path: Path | str, fresh: tuple[str, ...] = ()) -> Report:
+def load_weights(
+    model: nn.Module, path: Path | str, fresh: tuple[str, ...] = (), *, other_classes: bool = False
+) -> Report:
     """Set the weights of a network from a file, ours or a released one.
 
     Every name of the file must be used or known to be unused. Every entry of the network must be
@@ -26,13 +28,14 @@ def load_weights(model: nn.Module, path: Path | str, fresh: tuple[str, ...] = ()
         path: of the file (see `rgbt.checkpoints.read.read`).
         fresh: parts that keep their initial values, by the beginning of their names, such as
             "sem_seg_head.predictor.class_embed" for another number of classes.
+        other_classes: whether parts whose shape differs keep their initial values too.
 
     Raises:
         InputError: unreadable, asking for code, of another network, incomplete, of another shape,
             or with NaN or infinity.
     """
     contents = read(Path(path))
-    facts, plan, remarks = plan_for(model, contents, fresh)
+    facts, plan, remarks = plan_for(model, contents, fresh, other_classes=other_classes)
     state = model.state_dict()
     if not plan.fits:
         raise InputError(refusal(contents.path, facts, plan, family_of(type(model)), len(state)))
@@ -62,7 +65,7 @@ def load_weights(model: nn.Module, path: Path | str, fresh: tuple[str, ...] = ()
 
 
 def plan_for(
-    model: nn.Module, contents: Contents, fresh: tuple[str, ...]
+    model: nn.Module, contents: Contents, fresh: tuple[str, ...], *, other_classes: bool = False
 ) -> tuple[Facts, Plan, tuple[str, ...]]:
     """What a file is, where its tensors go in `model`, and remarks on that.
 
@@ -83,7 +86,12 @@ def plan_for(
     if rule is None:
         raise InputError(_another_network(model, contents, facts))
     plan = make_plan(
-        model.state_dict(keep_vars=True), contents.tensors, rule, prefix=facts.prefix, fresh=fresh
+        model.state_dict(keep_vars=True),
+        contents.tensors,
+        rule,
+        prefix=facts.prefix,
+        fresh=fresh,
+        other_classes=other_classes,
     )
     kinds = sorted({str(contents.tensors[name].dtype) for name in plan.values.values()})
     short = [kind.removeprefix("torch.") for kind in kinds if kind.endswith("float16")]

@@ -13,6 +13,7 @@ from rgbt.checkpoints.layout import COUNTER, Rule, reason
 from rgbt.checks import InputError, nearest
 
 NAMED_FRESH = "named in model.fresh"
+OTHER_SHAPE = "of another shape in the common start, which has other classes"
 
 
 @dataclass
@@ -44,6 +45,15 @@ class Plan:
         """Every name is used or explained, every entry set or explained."""
         return not (self.missing or self.unexpected or self.unfit or self.torn)
 
+    def put(self, entry: str, name: str, difference: str, *, other_classes: bool) -> None:
+        """Assign the tensor `name` to an entry, which it fits without a `difference`."""
+        if difference and other_classes:
+            self.fresh[entry] = self.leftover[name] = OTHER_SHAPE
+            return
+        self.values[entry] = name
+        if difference:
+            self.unfit[entry] = difference
+
 
 def make_plan(
     state: Mapping[str, Tensor],
@@ -52,6 +62,7 @@ def make_plan(
     *,
     prefix: str,
     fresh: tuple[str, ...],
+    other_classes: bool = False,
 ) -> Plan:
     """Find a place for everything.
 
@@ -61,6 +72,8 @@ def make_plan(
         rule: how this network is filled from this kind of file.
         prefix: before every name in the file that belongs to the network.
         fresh: parts that keep their initial values, by the beginning of their names.
+        other_classes: whether an entry of another shape keeps its initial values; False: it does
+            not fit.
 
     Raises:
         InputError: a part in `fresh` that the network does not have.
@@ -74,14 +87,13 @@ def make_plan(
         elif why := reason(rule.fresh, entry):
             plan.fresh[entry] = why
         elif name in tensors:
-            plan.values[entry] = name
-            if difference := _difference(tensors[name], value, is_stem=entry in rule.stems):
-                plan.unfit[entry] = difference
+            difference = _difference(tensors[name], value, is_stem=entry in rule.stems)
+            plan.put(entry, name, difference, other_classes=other_classes)
         elif entry.endswith(COUNTER):
             plan.zeros.append(entry)
         else:
             plan.missing.append(entry)
-    used = set(plan.values.values())
+    used = {*plan.values.values(), *plan.leftover}
     for name in (name for name in tensors if name not in used):
         why = explained.get(name) or reason(rule.leftover, name.removeprefix(prefix))
         if why:

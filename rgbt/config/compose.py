@@ -26,6 +26,10 @@ SEARCH_PATH = "hydra.searchpath"
 OWN_FOLDERS = "RGBT_CONF"
 """Variable that names them for every composition, with commas (read by conf/config.yaml)."""
 
+SAME_FILES = {"bench": "demo"}
+"""Scale -> scale whose data sets, networks and other files it has, where a choice by scale does not
+name it."""
+
 PIXELS = re.compile(r"\$\{px:\s*(\d+)\}")
 
 
@@ -167,18 +171,42 @@ def register_resolvers() -> None:
     """Register the resolvers that configuration files may use.
 
     ``${by_scale:{demo:cmx_tiny,paper:cmx_b2}}``: the entry of the scale, also in a defaults list.
+    ``${by_network:{CMX:start_cmx}}``: the entry of the class of the network; with several heads it
+    ends with ``_heads``.
     ``${px:64}``: 64 pixels of the paper's images, scaled to the images of the scale.
     ``${scenes:600,6}``: 600 scenes of an embedded data set, or 6 where the scale takes a few.
     """
     parse_interpolations_once()
-    for name, resolve in (("by_scale", _by_scale), ("px", _scaled_pixels), ("scenes", _num_scenes)):
+    for name, resolve in (
+        *(("by_scale", _by_scale), ("px", _scaled_pixels), ("scenes", _num_scenes)),
+        ("by_network", _by_network),
+    ):
         if not OmegaConf.has_resolver(name):
             OmegaConf.register_new_resolver(name, resolve)
 
 
 def _by_scale(choices: dict[str, Any], *, _root_: DictConfig) -> Any:
     scale = _root_.scale  # in a defaults list the name of the file, elsewhere the node
-    return choices[scale if isinstance(scale, str) else scale.name]
+    name = scale if isinstance(scale, str) else scale.name
+    return choices[chosen_scale(name, choices)]
+
+
+def chosen_scale(scale: str, choices: Iterable[str]) -> str:
+    """The entry of `choices` for a scale: its own, or that of the scale whose files it shares."""
+    return scale if scale in choices else SAME_FILES.get(scale, scale)
+
+
+def _by_network(choices: dict[str, Any], *, _root_: DictConfig) -> Any:
+    model = _root_.model
+    heads = "_heads" if len(model.get("heads", ())) > 1 else ""
+    name = str(model._target_).rpartition(".")[2] + heads
+    if name not in choices:
+        raise InputError(
+            f"scale={_root_.scale.name} has no common start for the network {name}; expected one "
+            f"of {', '.join(choices)}. Name the initial weights with model.weights=..., or set "
+            "model.weights=null to start from random weights."
+        )
+    return choices[name]
 
 
 def _scaled_pixels(pixels: int, *, _root_: DictConfig) -> int:

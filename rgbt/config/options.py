@@ -156,13 +156,14 @@ def readable_paths(words: Sequence[str]) -> list[str]:
     """Arguments as Hydra reads them: shells keep ~ after "=", and file names hold anything.
 
     A path with "=", spaces or brackets (epoch=299.ckpt) is put in quotes; a comma still makes a
-    grid. Names of upstream runs (experiment:NAME/last.pt) are read as they are.
+    grid. Names of upstream runs (experiment:NAME/last.pt, common:NAME/last.pt) are read as
+    they are.
     """
     readable = []
     for word in words:
         key, equals, value = word.partition("=")
         value = with_home(value)
-        is_path = key in PATHS and not value.startswith("experiment:")
+        is_path = key in PATHS and not value.startswith(("experiment:", "common:"))
         if is_path and re.search(r"[=\s()\[\]{}:]", value) and value[0] not in "'\"":
             value = "'" + value.replace("'", "\\'") + "'"
         readable.append(f"{key}{equals}{value}")

@@ -48,6 +48,9 @@ COMMANDS = {
         "analysis.report.__main__", "write one page with everything in the MLflow store"
     ),
     "compare": Entry("analysis.compare", "compare two methods: differences, intervals, p-values"),
+    "details": Entry(
+        "analysis.details", "show boundary IoU, calibration, distance and size with intervals"
+    ),
     "score": Entry("analysis.score", "score predictions of any method by region"),
     "spatial": Entry("analysis.spatial", "measure the statistics of a data set by region"),
     "figures": Entry("analysis.figures.__main__", "draw a figure of the papers"),

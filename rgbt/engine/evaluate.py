@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.checks import RunError
-from rgbt.class_scores import classes_of
+from rgbt.class_scores import best_of, classes_of
 from rgbt.requirements import record_of
 from rgbt.types import Batch, View
 
@@ -61,10 +61,33 @@ def probabilities(
     not tell a pixel that queries of one class hardly claim from one that they claim wholly.
     """
     with torch.inference_mode():
+        return _shares(label_scores(model, batch, fabric, view, heads), model)
+
+
+def confident_class_maps(
+    model: nn.Module,
+    batch: Batch,
+    fabric: Fabric,
+    view: View | None = None,
+    heads: Sequence[str | None] = (),
+) -> tuple[Tensor, Tensor]:
+    """`class_maps`, and the probability (B, H', W') float32 of each of these classes.
+
+    Both are of one pass; see `probabilities` for networks that return masks. Arguments as in
+    `class_maps`.
+    """
+    with torch.inference_mode():
         scores = label_scores(model, batch, fabric, view, heads)
-        if record_of(model).outputs == "masks":
-            return scores / scores.sum(1, keepdim=True).clamp(min=FAINTEST)
-        return scores.softmax(1)
+        classes = classes_of(scores).to(torch.uint8)
+        # The class with the highest score has the highest probability.
+        return classes, best_of(_shares(scores, model)).score
+
+
+def _shares(scores: Tensor, model: nn.Module) -> Tensor:
+    """Class scores (B, K, H, W) as probabilities, see `probabilities`."""
+    if record_of(model).outputs == "masks":
+        return scores / scores.sum(1, keepdim=True).clamp(min=FAINTEST)
+    return scores.softmax(1)
 
 
 def label_scores(

@@ -17,7 +17,7 @@ from rgbt.data.cache.dataset import cached_layer
 from rgbt.data.domains import TestedHead
 from rgbt.data.loader_settings import LoaderSettings
 from rgbt.dataset import LabelledDataset
-from rgbt.engine.evaluate import class_maps, probabilities
+from rgbt.engine.evaluate import class_maps, confident_class_maps, probabilities
 from rgbt.engine.progress import progress
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.metrics.counts import Counts
@@ -71,6 +71,11 @@ class Predictor:
         """`rgbt.engine.evaluate.class_maps` of a batch on the device."""
         return class_maps(self._model, batch, self._fabric, self.view, self._heads(batch.name))
 
+    def confident_classes(self, batch: Batch) -> tuple[Tensor, Tensor]:
+        """`rgbt.engine.evaluate.confident_class_maps` of a batch on the device."""
+        heads = self._heads(batch.name)
+        return confident_class_maps(self._model, batch, self._fabric, self.view, heads)
+
     def probabilities(self, batch: Batch) -> Tensor:
         """`rgbt.engine.evaluate.probabilities` of a batch on the device."""
         return probabilities(self._model, batch, self._fabric, self.view, self._heads(batch.name))
@@ -112,9 +117,13 @@ def heads_of(
 
 
 def counts_of(
-    data: EvaluationData, split: str, by_name: Mapping[str, NDArray[np.int64]], partition: str
+    data: EvaluationData,
+    split: str,
+    by_name: Mapping[str, NDArray[np.int64]],
+    partition: str,
+    dtype: type[np.integer] = np.int32,
 ) -> Counts:
-    """The counts (R, K, K) of each image as those of a split.
+    """The counts (R, K, K) of each image as those of a split; stored as `dtype`.
 
     Raises:
         InputError: there is none, because no image could be read.
@@ -126,7 +135,7 @@ def counts_of(
             "rgbt check."
         )
     return Counts(
-        counts=np.stack(list(by_name.values())).astype(np.int32),
+        counts=np.stack(list(by_name.values())).astype(dtype),
         names=names,
         night=dataset.nights(names),
         classes=dataset.classes,

@@ -15,6 +15,7 @@ from rgbt.data.domains import TestedHead
 from rgbt.data.label_map import LabelMap
 from rgbt.dataset import LabelledDataset
 from rgbt.evaluation.corruption_request import CorruptionRequest
+from rgbt.metrics.details import Details
 from rgbt.types import VIEWS, View
 
 DEFAULT_VIEW = "default"
@@ -96,6 +97,7 @@ class EvaluationRequest:
         head: which of two heads predicts an image; None: that of the run's configuration.
         corruption: of the images; None: they are clean.
         keep: names of the images that are returned for pictures.
+        details: what else is counted, see `rgbt.metrics.details`.
     """
 
     split: str
@@ -103,6 +105,7 @@ class EvaluationRequest:
     head: TestedHead | None = None
     corruption: CorruptionRequest | None = None
     keep: Collection[str] = ()
+    details: tuple[Details, ...] = ()
 
     @classmethod
     def from_options(
@@ -111,6 +114,7 @@ class EvaluationRequest:
         modality: str,
         head: str = AS_TRAINED,
         corruption: CorruptionRequest | None = None,
+        details: tuple[Details, ...] = (),
     ) -> EvaluationRequest:
         """Make a request from the options of a command.
 
@@ -123,4 +127,5 @@ class EvaluationRequest:
             view=None if modality == DEFAULT_VIEW else cast(View, modality),
             head=None if head == AS_TRAINED else cast(TestedHead, head),
             corruption=corruption,
+            details=details,
         )

@@ -2,32 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import RenderableType
-from torch import nn
+from torch import Tensor, nn
 
 from rgbt.build.load_run import TrainedNetwork
 from rgbt.build.session import Session
 from rgbt.data.loaders import eval_batches
 from rgbt.dataset import LabelledDataset
 from rgbt.engine.progress import progress
+from rgbt.evaluation.details import DetailCounter, DetailedImages, details_counts
 from rgbt.evaluation.prediction import Predictor, counts_of, decode_ahead
 from rgbt.evaluation.request import EvaluationRequest, NetworkRequest
 from rgbt.metrics import scores
 from rgbt.metrics.absent import absent_notes
 from rgbt.metrics.confusion import RegionCounter
 from rgbt.metrics.counts import Counts
+from rgbt.metrics.details import DetailKind
 from rgbt.metrics.metric import Regions
 from rgbt.processes import collected, num_processes
 from rgbt.tracking.pictures import Legend, PanelExample
 from rgbt.tracking.tables import ClassTable, RegionTable, ResultTables
 from rgbt.tracking.terminal import result_view
-from rgbt.types import View
+from rgbt.types import Loadable, View
 
 NUM_PANELS = 6
 """Images of the qualitative panel: the same number by day and by night if the split has both."""
@@ -44,12 +47,14 @@ class EvaluationResult:
     Attributes:
         kept: examples for pictures.
         skipped: names of unreadable files that were skipped.
+        details: kind -> counts of the requested details (`rgbt.metrics.details`).
     """
 
     counts: Counts
     view: View
     kept: tuple[PanelExample, ...]
     skipped: tuple[str, ...]
+    details: Mapping[DetailKind, Counts] = field(default_factory=dict)
 
 
 def evaluate(session: Session, model: nn.Module, request: EvaluationRequest) -> EvaluationResult:
@@ -59,50 +64,76 @@ def evaluate(session: Session, model: nn.Module, request: EvaluationRequest) -> 
 
     Raises:
         InputError: a file cannot be read (data.on_error=raise), or none could be; the network
-            has not the view or the head; a corruption that does not fit the images.
+            has not the view or the head; a corruption that does not fit the images; details that
+            the data set does not have.
     """
     predictor = Predictor(session, model, request)
     if request.corruption is not None:
         session = request.corruption.applied_to(session, request.split)
     dataset = session.dataset
+    detail = DetailCounter(request.details, dataset, session.regions)
     decode_ahead(session, request.split)
     batches = eval_batches(dataset, request.split, session.transform, session.loading)
     counter = RegionCounter(len(dataset.classes), session.regions)
     counted: Counted = {}
+    detailed: DetailedImages = {}
     kept: list[PanelExample] = []
     with progress() as display:
         total = len(dataset.names(request.split))
         task = display.add_task(request.split, total=total, note="images")
         done = 0
         for batch in batches:
-            predicted = predictor.classes(batch.to(session.fabric.device)).cpu()
-            for name, label, classes in zip(batch.name, batch.label, predicted, strict=True):
+            predicted, confidence = _predicted(predictor, batch, session, detail)
+            for index, (name, label) in enumerate(zip(batch.name, batch.label, strict=True)):
+                classes = predicted[index]
                 counted[name] = counter(label, classes)
+                detailed[name] = detail(name, label, classes, confidence[index])
                 is_kept = name in request.keep
                 kept += [_example(session, name, classes.numpy())] if is_kept else []
             done = min(total, done + num_processes() * len(batch.name))
             display.update(task, completed=done)
-    counted, kept, skipped = _of_all_processes(
-        counted, kept, tuple(batches.skipped), dataset.names(request.split)
-    )
-    counts = counts_of(session, request.split, counted, session.regions.name)
-    return EvaluationResult(counts, predictor.view, tuple(kept), skipped)
+    part = _Part(counted, detailed, kept, tuple(batches.skipped))
+    every = _of_all_processes(part, dataset.names(request.split))
+    counts = counts_of(session, request.split, every.counted, session.regions.name)
+    details = details_counts(session, request.split, every.detailed, request.details)
+    return EvaluationResult(counts, predictor.view, tuple(every.kept), every.skipped, details)
 
 
-def _of_all_processes(
-    counted: Counted, kept: list[PanelExample], skipped: tuple[str, ...], names: Sequence[str]
-) -> tuple[Counted, list[PanelExample], tuple[str, ...]]:
-    """What all processes have counted, kept and skipped, in the order of `names`."""
+def _predicted(
+    predictor: Predictor, batch: Loadable, session: Session, detail: DetailCounter
+) -> tuple[Tensor, Sequence[Tensor | None]]:
+    """Classes (B, H, W) of a batch on the CPU, with the probability of each where it is needed."""
+    on_device = batch.to(session.fabric.device)
+    if not detail.needs_confidence:
+        return predictor.classes(on_device).cpu(), [None] * len(batch.name)
+    classes, confidence = predictor.confident_classes(on_device)
+    return classes.cpu(), list(confidence.cpu())
+
+
+class _Part(NamedTuple):
+    """What one process has counted, kept and skipped."""
+
+    counted: Counted
+    detailed: DetailedImages
+    kept: list[PanelExample]
+    skipped: tuple[str, ...]
+
+
+def _of_all_processes(part: _Part, names: Sequence[str]) -> _Part:
+    """The parts of all processes together, in the order of `names`."""
     if num_processes() == 1:
-        return counted, kept, skipped
-    parts = collected((counted, kept, skipped))
+        return part
+    parts = collected(part)
     position = {name: index for index, name in enumerate(names)}
-    merged = {name: counts for part, _, _ in parts for name, counts in part.items()}
-    examples = [example for _, part, _ in parts for example in part]
-    return (
-        {name: merged[name] for name in sorted(merged, key=position.__getitem__)},
+    order = position.__getitem__
+    counted = {name: counts for each in parts for name, counts in each.counted.items()}
+    detailed = {name: counts for each in parts for name, counts in each.detailed.items()}
+    examples = [example for each in parts for example in each.kept]
+    return _Part(
+        {name: counted[name] for name in sorted(counted, key=order)},
+        {name: detailed[name] for name in sorted(detailed, key=order)},
         sorted(examples, key=lambda example: position[example.name]),
-        tuple(sorted((name for *_, part in parts for name in part), key=position.__getitem__)),
+        tuple(sorted((name for each in parts for name in each.skipped), key=order)),
     )
 
 
@@ -157,15 +188,21 @@ def overview(
     opened: TrainedNetwork, request: EvaluationRequest, result: EvaluationResult, path: Path
 ) -> RenderableType:
     """Print the tables of an evaluation and the path of its counts."""
-    session, head, corruption = opened.session, request.head, request.corruption
-    label = f"{opened.label} {session.dataset.name} {result.view}{f' {head} head' if head else ''}"
-    label += f", {corruption.title}" if corruption else ""
+    session, head = opened.session, request.head
+    label = label_of(opened, request, result.view)
     tables = result_tables(result.counts, session.regions, label, opened.step)
     heads = session.domains.heads_in_words(head or session.domains.tested_head)
     lines = [*([("heads", heads)] if heads else []), ("counts", str(path))]
     if result.skipped:
         lines.append(("skipped", f"{len(result.skipped)} images that cannot be read"))
     return result_view(tables, path.parent, lines)
+
+
+def label_of(opened: TrainedNetwork, request: EvaluationRequest, view: View) -> str:
+    """The name of an evaluation in tables."""
+    head, corruption = request.head, request.corruption
+    label = f"{opened.label} {opened.session.dataset.name} {view}{f' {head} head' if head else ''}"
+    return f"{label}, {corruption.title}" if corruption else label
 
 
 def legend_of(dataset: LabelledDataset) -> Legend:

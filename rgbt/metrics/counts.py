@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from rgbt.checks import InputError, nearest
 from rgbt.metrics.archive import Archive
+from rgbt.metrics.details import details_of
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.names import DAY, NIGHT
 
@@ -20,7 +21,7 @@ ARCHIVE = Archive(
     "counts",
     "evaluate the run to write it",
     {
-        **{"counts": "iu N R K K", "names": "U N", "night": "b M", "classes": "U K"},
+        **{"counts": "iu N R J K", "names": "U N", "night": "b M", "classes": "U K"},
         **{"partition": "U", "dataset": "U", "split": "U", "unscored": "U L"},
         "absent": "U",
     },
@@ -34,12 +35,14 @@ class Counts:
 
     Attributes:
         counts: (N, R, K, K) int32 or int64, rows = label, columns = prediction. Of pairs of frames
-            they hold something else: see `rgbt.metrics.pairs`.
+            they hold something else: see `rgbt.metrics.pairs`; and so do those of boundaries,
+            calibration, distance and size, (N, R G, M, K): see `rgbt.metrics.details`.
         names: names of the N images.
         night: whether each image was taken at night; None where the data set does not say.
         classes: names of the K classes.
         partition: name of the regions, e.g. "ring5" (`rgbt.metrics.metric.Regions.name`); of pairs
-            of frames protocol and number of sets, e.g. "aligned3".
+            of frames protocol and number of sets, e.g. "aligned3"; of details their kind and
+            setting too, e.g. "ring5-boundary-0.02".
         dataset: fingerprint of the data set.
         unscored: names of the classes that are left out of every mean over classes. Their pixels
             count as all others do: what is labelled so and predicted as another class is a false
@@ -65,10 +68,17 @@ class Counts:
     def __post_init__(self) -> None:
         shape = self.counts.shape
         classes = len(self.classes)
-        if len(shape) != 4 or shape[0] != len(self.names) or shape[2:] != (classes, classes):
+        details = details_of(self.partition)
+        rows = classes if details is None else details.measures(classes)
+        groups = 1 if details is None else details.groups
+        if len(shape) != 4 or shape[0] != len(self.names) or shape[2:] != (rows, classes):
             raise ValueError(
-                f"counts: expected shape N={len(self.names)} x R x K={classes} x K={classes}, "
+                f"counts: expected shape N={len(self.names)} x R x K={rows} x K={classes}, "
                 f"got {shape}."
+            )
+        if shape[1] % groups:
+            raise ValueError(
+                f"counts: expected a multiple of {groups} rows by {self.partition}, got {shape[1]}."
             )
         if self.night is not None and len(self.night) != len(self.names):
             raise ValueError(

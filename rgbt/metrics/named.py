@@ -2,7 +2,10 @@
 
 ``[day/ or night/]`` and then one of ``mIoU Var mAcc mPrecision mF1 pixel_accuracy``, ``region/<n>``
 (mIoU of region n), ``class/<name>`` (IoU), ``class/<name>/acc``, ``class/<name>/region/<n>``; of
-counts of pairs of frames (`rgbt.metrics.pairs`) ``TC CA CA_released`` and ``class/<name>/TC`` etc.
+counts of pairs of frames (`rgbt.metrics.pairs`) ``TC CA CA_released`` and ``class/<name>/TC`` etc.;
+of details (`rgbt.metrics.details`) ``boundary_mIoU ECE distance/<bin> size/<bin>``, each also after
+``region/<n>/`` and ``class/<name>/`` (there ``boundary_IoU``), as in
+``class/car/region/1/size/64-256``.
 Means are over the scored classes (`Counts.scored`); every single class is available by name.
 """
 
@@ -16,8 +19,12 @@ from numpy.typing import NDArray
 
 from rgbt.checks import InputError, nearest
 from rgbt.metrics import names, pairs
+from rgbt.metrics.boundary import boundary_iou
+from rgbt.metrics.calibration import ece
 from rgbt.metrics.counts import Counts
+from rgbt.metrics.details import DetailKind, Details, details_of, parse_detail
 from rgbt.metrics.metric import Absent
+from rgbt.metrics.scene_counts import object_recall
 from rgbt.metrics.scores import MEANS, Matrices, Scores, class_mean, iou, miou, recall, variance
 
 OF_PAIRS: dict[str, Callable[[Matrices, Absent], Scores]] = {
@@ -30,6 +37,8 @@ OF_PAIRS: dict[str, Callable[[Matrices, Absent], Scores]] = {
 FORMS = (
     *("region/<n>", "class/<name>", "class/<name>/acc", "class/<name>/region/<n>"),
     *(names.of_class("<name>", score) for score in OF_PAIRS),
+    *(names.BOUNDARY_MIOU, names.ECE, f"class/<name>/{names.BOUNDARY_IOU}"),
+    *(names.in_bin(kind, "<low>-<high>") for kind in (names.DISTANCE, names.SIZE)),
 )
 
 
@@ -39,9 +48,11 @@ class ParsedMetric:
 
     Attributes:
         part: "day", "night", or None for all images.
-        score: a mean over classes, "Var", "IoU", "acc", or one of `OF_PAIRS`.
+        score: a mean over classes, "Var", "IoU", "acc", one of `OF_PAIRS`, or the kind of details.
         class_name: of one class alone, or None.
         region: number from 1, or None for the whole image.
+        details: kind of details that have the score; None: other counts.
+        bin: of distance and size, e.g. "10-20".
     """
 
     metric: str
@@ -49,6 +60,8 @@ class ParsedMetric:
     score: str
     class_name: str | None = None
     region: int | None = None
+    details: DetailKind | None = None
+    bin: str = ""
 
 
 def parse(metric: str) -> ParsedMetric:
@@ -59,6 +72,10 @@ def parse(metric: str) -> ParsedMetric:
     """
     words = metric.split("/")
     part = words.pop(0) if words[0] in (names.DAY, names.NIGHT) else None
+    detail = parse_detail(words)
+    if detail is not None:
+        kind = detail.kind
+        return ParsedMetric(metric, part, kind, detail.class_name, detail.region, kind, detail.bin)
     match words:
         case [score] if score in MEANS or score in OF_PAIRS or score == names.VAR:
             return ParsedMetric(metric, part, score)
@@ -99,7 +116,7 @@ def values(
 
     Args:
         parsed: the score; its part (day, night) has been taken by `images_of` before summing.
-        by_region: (..., R, K, K), summed over images.
+        by_region: (..., R, K, K), summed over images; of details (..., R G, M, K).
         like: counts of the same classes, scored ones and partition; nothing else of it is used.
         absent: see `value`.
 
@@ -110,6 +127,9 @@ def values(
         InputError: no such class or region, or a metric that such counts do not have.
     """
     check_kind(parsed, like.partition)
+    details = details_of(like.partition)
+    if details is not None:
+        return _of_details(parsed, details, by_region, like, absent)
     if parsed.score in OF_PAIRS:
         by_class = 100.0 * OF_PAIRS[parsed.score](by_region, absent)
         if parsed.class_name is None:
@@ -119,13 +139,8 @@ def values(
         return variance(miou(by_region, absent, like.scored))
     if parsed.region is None:
         matrices = by_region.sum(-3)
-    elif 1 <= parsed.region <= by_region.shape[-3]:
-        matrices = by_region[..., parsed.region - 1, :, :]
     else:
-        raise InputError(
-            f"'{parsed.metric}': the counts have the regions 1 to {by_region.shape[-3]}; use "
-            "counts of more regions (another file of conf/metric)."
-        )
+        matrices = by_region[..., _row(parsed, by_region.shape[-3]), :, :]
     if parsed.class_name is None:
         return 100.0 * MEANS[parsed.score](matrices, absent, like.scored)
     score = recall if parsed.score == "acc" else iou
@@ -133,11 +148,31 @@ def values(
 
 
 def check_kind(parsed: ParsedMetric, partition: str) -> None:
-    """Refuse a score of pairs of frames from counts of single ones, and the other way round.
+    """Refuse a score of pairs of frames or of details from other counts, and the other way round.
 
     Raises:
         InputError: such counts do not have it.
     """
+    details = details_of(partition)
+    kind = None if details is None else details.kind
+    if parsed.details != kind:
+        counted = f"these counts ({partition})"
+        if parsed.details is not None:
+            raise InputError(
+                f"'{parsed.metric}' is a score of {parsed.details}, which {counted} do not have. "
+                f"Count it with rgbt evaluate run=... details={parsed.details}"
+            )
+        raise InputError(
+            f"'{parsed.metric}' is no score of {counted}. Use scores of {kind}, or name counts "
+            "without details."
+        )
+    if details is not None:
+        if parsed.bin and parsed.bin not in details.bins:
+            raise InputError(
+                f"'{parsed.metric}': the counts have the bins {', '.join(details.bins)}; use one "
+                "of these, or count again with other edges (rgbt evaluate)."
+            )
+        return
     of_pairs = pairs.protocol_of(partition) is not None
     if of_pairs and parsed.score not in OF_PAIRS:
         raise InputError(
@@ -171,6 +206,44 @@ def images_of(parsed: ParsedMetric, counts: Counts) -> Counts:
     return parts[parsed.part]
 
 
+def _of_details(
+    parsed: ParsedMetric, details: Details, by_row: Matrices, like: Counts, absent: Absent
+) -> NDArray[np.float64]:
+    """Percent of counts of details (..., R G, M, K)."""
+    *leading, rows, measures, classes = by_row.shape
+    groups = details.groups
+    by_region = by_row.reshape(*leading, rows // groups, groups, measures, classes)
+    if parsed.region is None:
+        chosen = by_region.sum(-4)
+    else:
+        chosen = by_region[..., _row(parsed, rows // groups), :, :, :]
+    if details.kind == "calibration":
+        if parsed.class_name is not None:
+            at = _class_index(parsed, like.classes)
+            chosen = chosen[..., at : at + 1]
+        return 100.0 * ece(chosen)
+    group = chosen[..., details.bins.index(parsed.bin) if parsed.bin else 0, :, :]
+    if details.kind == "boundary":
+        by_class = boundary_iou(group, absent)
+    elif details.kind == "distance":
+        by_class = iou(group, absent)
+    else:
+        by_class = object_recall(group)
+    if parsed.class_name is None:
+        return 100.0 * class_mean(by_class, like.scored)
+    return _of_class(parsed, 100.0 * by_class, like.classes)
+
+
+def _row(parsed: ParsedMetric, regions: int) -> int:
+    """Index of the region of a metric."""
+    if parsed.region is not None and 1 <= parsed.region <= regions:
+        return parsed.region - 1
+    raise InputError(
+        f"'{parsed.metric}': the counts have the regions 1 to {regions}; use counts of more "
+        "regions (another file of conf/metric)."
+    )
+
+
 def _is_number(text: str) -> bool:
     return text.isdecimal() and int(text) >= 1
 
@@ -179,9 +252,13 @@ def _of_class(
     parsed: ParsedMetric, by_class: NDArray[np.float64], classes: tuple[str, ...]
 ) -> NDArray[np.float64]:
     """(..., K) -> (...)."""
+    return np.asarray(by_class[..., _class_index(parsed, classes)])
+
+
+def _class_index(parsed: ParsedMetric, classes: tuple[str, ...]) -> int:
     if parsed.class_name not in classes:
         raise InputError(
             f"'{parsed.metric}': the data set of the run has no class '{parsed.class_name}'; "
             f"{nearest(str(parsed.class_name), classes)}."
         )
-    return np.asarray(by_class[..., classes.index(parsed.class_name)])
+    return classes.index(parsed.class_name)

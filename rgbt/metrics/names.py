@@ -29,6 +29,18 @@ CA = "CA"
 CA_RELEASED = "CA_released"
 """The same over the union that the Temporal release computes."""
 
+BOUNDARY_MIOU = "boundary_mIoU"
+"""Mean over classes of the boundary IoU (`rgbt.metrics.boundary`)."""
+
+BOUNDARY_IOU = "boundary_IoU"
+"""The same of one class: ``of_class("car", BOUNDARY_IOU)``."""
+
+ECE = "ECE"
+"""Expected calibration error (`rgbt.metrics.calibration`); 0 is best."""
+
+DISTANCE = "distance"
+SIZE = "size"
+
 DAY = "day"
 NIGHT = "night"
 
@@ -51,6 +63,19 @@ def of_class(name: str, score: str) -> str:
     return f"class/{name}/{score}"
 
 
+def in_bin(kind: str, name: str) -> str:
+    """A score of one bin: ``in_bin(DISTANCE, "10-20")``, the mIoU between 10 and 20 metres.
+
+    ``in_bin(SIZE, "64-256")`` is the mean recall of objects of 64 to 256 pixels.
+    """
+    return f"{kind}/{name}"
+
+
+def in_region(number: int, name: str) -> str:
+    """A score of boundaries, calibration, distance or size inside one region."""
+    return f"region/{number}/{name}"
+
+
 def consistency(score: str, protocol: str) -> str:
     """A score of pairs of frames among those of a run, e.g. ``consistency(TC, "aligned")``.
 
@@ -64,7 +89,7 @@ def subset(part: str, name: str) -> str:
     return f"{part}/{name}"
 
 
-FRACTIONS = {MIOU, MACC, MPRECISION, MF1, PIXEL_ACCURACY}
+FRACTIONS = {MIOU, MACC, MPRECISION, MF1, PIXEL_ACCURACY, BOUNDARY_MIOU, BOUNDARY_IOU, ECE}
 
 
 def in_percent(name: str, value: float) -> float:
@@ -89,4 +114,4 @@ def shown(name: str, value: float) -> float:
 
 def _is_fraction(name: str) -> bool:
     first, last = name.split("/")[0], name.split("/")[-1]
-    return last in FRACTIONS or first in ("region", "class", TC, CA)
+    return last in FRACTIONS or first in ("region", "class", TC, CA, DISTANCE, SIZE)

@@ -135,11 +135,10 @@ def request_digest(config: DictConfig, downstream: tuple[str, ...] = ()) -> str:
         value = OmegaConf.select(config, key)
         reference = parse_reference(key, value)
         if reference is not None:
-            experiment, _ = reference
             names = (*downstream, str(plain["name"]))
-            if experiment in names:
+            if reference.experiment in names:
                 raise InputError(f"{key} makes a cycle of upstream runs.")
-            upstream = upstream_config(config, key, experiment)
+            upstream = upstream_config(config, key, reference)
             content[key] = request_digest(upstream, names)
         elif value not in (None, GIVEN, NONE):
             is_file = key == WEIGHTS

@@ -83,11 +83,13 @@ class Dependency:
         key: the setting that names it: "model.weights" or "domains.target.labels".
         run: the upstream run.
         checkpoint: the file that is taken: "best.pt" or "last.pt".
+        is_common: whether the upstream run keeps its own seed and data set.
     """
 
     key: str
     run: RunSpec
     checkpoint: CheckpointFile
+    is_common: bool = False
 
     @property
     def path(self) -> Path:
@@ -267,9 +269,12 @@ class RunSpec:
         )
 
     def with_seed(self, seed: int) -> RunSpec:
-        """The same run with another seed; its upstream runs have that seed too."""
+        """The same run with another seed; its upstream runs have it too, but for common ones."""
         words = [word for word in self.overrides if not word.startswith("seed=")]
-        upstream = (replace(each, run=each.run.with_seed(seed)) for each in self.dependencies)
+        upstream = (
+            each if each.is_common else replace(each, run=each.run.with_seed(seed))
+            for each in self.dependencies
+        )
         return replace(
             self,
             seed=seed,
@@ -339,3 +344,15 @@ SHARED = (
 )
 """Dotted keys that an upstream run has in common with the run that needs it, beside the sizes of
 the scale. A duration is that of the scale unless it was typed."""
+
+SHARED_BY_COMMON = (
+    *(key for key in SHARED if key in NOT_IN_KEY),
+    *(
+        f"{key}.{each}"
+        for key, node in NODES.items()
+        if node.shared is True and key != "dataset"
+        for each in node.outside_key
+    ),
+)
+"""Dotted keys that a common upstream run takes over from the run that needs it first. None of them
+enters the run key, so that it is one run for all seeds and data sets."""

@@ -4,6 +4,9 @@ A run names an upstream run by its experiment: ``model.weights=experiment:NAME/l
 from the last checkpoint of that run; ``domains.target.labels=experiment:NAME/best.pt`` trains on
 the predictions of its network. Both runs share seed, scale and data set
 (`rgbt.spec.run_spec.SHARED`): a run of seed 2 depends on runs of seed 2.
+
+``model.weights=common:NAME/last.pt`` names an upstream run that keeps its own seed and data set:
+all seeds and all methods with the same network start from the same run.
 """
 
 from __future__ import annotations
@@ -11,7 +14,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from functools import cache
-from typing import Any, cast, get_args, get_type_hints
+from typing import Any, NamedTuple, cast, get_args, get_type_hints
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -24,6 +27,7 @@ from rgbt.config.values import check_value
 from rgbt.spec.run_spec import (
     NODES,
     SHARED,
+    SHARED_BY_COMMON,
     VALUES,
     WEIGHTS,
     CheckpointFile,
@@ -33,6 +37,11 @@ from rgbt.spec.run_spec import (
 )
 
 PREFIX = "experiment:"
+COMMON_PREFIX = "common:"
+"""Before the name of an upstream run that keeps its own seed and data set."""
+
+CACHE = "cache_dir"
+"""Setting of an embedded data set: where the generated images are."""
 
 TARGETS = re.compile(r"'_target_': '(\w*)")
 """First part of every target in the text of a node."""
@@ -126,57 +135,81 @@ def _dependencies(
     for key in (WEIGHTS, labels_key("source"), labels_key("target")):
         reference = parse_reference(key, OmegaConf.select(config, key))
         if reference is not None:
-            experiment, checkpoint = reference
+            experiment = reference.experiment
             if experiment in downstream:
                 circle = " -> ".join((*downstream, experiment))
                 raise InputError(f"{key} makes a cycle of upstream runs: {circle}.")
-            typed = [f"+experiment={experiment}", *_shared_overrides(overrides, key)]
-            upstream = upstream_config(config, key, experiment)
+            typed = [f"+experiment={experiment}", *_shared_overrides(overrides, key, reference)]
+            upstream = upstream_config(config, key, reference)
             run = specify(upstream, typed, downstream=downstream)
-            yield Dependency(key, run, checkpoint)
+            yield Dependency(key, run, reference.checkpoint, reference.is_common)
 
 
-def parse_reference(key: str, value: str | None) -> tuple[str, CheckpointFile] | None:
-    """Experiment and checkpoint that "experiment:NAME/last.pt" names; None for any other value.
+class Reference(NamedTuple):
+    """An upstream run as a setting names it.
+
+    Attributes:
+        experiment: its name.
+        checkpoint: the file that is taken: "best.pt" or "last.pt".
+        is_common: whether it keeps its own seed and data set.
+    """
+
+    experiment: str
+    checkpoint: CheckpointFile
+    is_common: bool = False
+
+
+def parse_reference(key: str, value: str | None) -> Reference | None:
+    """What "experiment:NAME/last.pt" or "common:NAME/last.pt" names; None for any other value.
 
     Raises:
-        InputError: the reference is not of this form, or there is no such experiment.
+        InputError: the reference is not of this form, there is no such experiment, or the labels
+            of a domain are those of a common run, which has other images.
     """
-    if value is None or not value.startswith(PREFIX):
+    if value is None or not value.startswith((PREFIX, COMMON_PREFIX)):
         return None
-    name, _, checkpoint = value.removeprefix(PREFIX).rpartition("/")
-    if checkpoint not in get_args(CheckpointFile):
+    prefix, _, rest = value.partition(":")
+    is_common = value.startswith(COMMON_PREFIX)
+    if is_common and key != WEIGHTS:
         raise InputError(
-            f"{key}={value}: expected experiment:NAME/best.pt or experiment:NAME/last.pt."
+            f"{key}={value}: only {WEIGHTS} can name a common run, because its images are others; "
+            "expected experiment:NAME/best.pt."
         )
+    name, _, checkpoint = rest.rpartition("/")
+    if checkpoint not in get_args(CheckpointFile):
+        raise InputError(f"{key}={value}: expected {prefix}:NAME/best.pt or {prefix}:NAME/last.pt.")
     known = available("experiment")
     if name not in known:
         raise InputError(
             f"{key}={value}: there is no experiment '{name}'; {nearest(name, known)}. You can "
             f"also name a run by its folder: runs/<key>/{checkpoint}.{own_folder_hint()}"
         )
-    return name, cast(CheckpointFile, checkpoint)
+    return Reference(name, cast(CheckpointFile, checkpoint), is_common)
 
 
-def upstream_config(config: DictConfig, key: str, experiment: str) -> DictConfig:
+def upstream_config(config: DictConfig, key: str, reference: Reference) -> DictConfig:
     """The configuration of an upstream run: its experiment, with what both runs share.
 
     Shared are `SHARED`, the sizes of the scale and durations that were typed; for weights also the
-    network. Everything else is the experiment's own.
+    network. A common run shares `SHARED_BY_COMMON` instead of `SHARED`. Everything else is the
+    experiment's own.
     """
-    upstream = _composed(experiment, config.scale.name)
+    upstream = _composed(reference.experiment, config.scale.name)
     if key == WEIGHTS:
         own = RUN_SETTINGS["model"]
         upstream.model = {each: upstream.model._get_node(each) for each in own}
-    for each, value in _shared_settings(config, key).items():
+    if reference.is_common and CACHE in config.dataset and CACHE in upstream.dataset:
+        upstream.dataset[CACHE] = config.dataset[CACHE]
+    for each, value in _shared_settings(config, key, reference).items():
         OmegaConf.update(upstream, each, value, merge=False, force_add=True)
     return upstream
 
 
-def _shared_settings(config: DictConfig, key: str) -> dict[str, Any]:
+def _shared_settings(config: DictConfig, key: str, reference: Reference) -> dict[str, Any]:
     """Dotted key -> value, not resolved, of what an upstream run shares."""
     # Its experiment says whether a network has pretrained weights, the scale says all else.
-    shared = [*SHARED, *(f"scale.{each}" for each in config.scale if each != "pretrained")]
+    always = SHARED_BY_COMMON if reference.is_common else SHARED
+    shared = [*always, *(f"scale.{each}" for each in config.scale if each != "pretrained")]
     if key == WEIGHTS:
         own = RUN_SETTINGS["model"]
         shared += [f"model.{each}" for each in config.model if each not in own]
@@ -196,14 +229,19 @@ def _composed(experiment: str, scale: str) -> DictConfig:
     return compose([f"+experiment={experiment}", f"scale={scale}"])
 
 
-def _shared_overrides(overrides: Sequence[str], key: str) -> list[str]:
+def _shared_overrides(overrides: Sequence[str], key: str, reference: Reference) -> list[str]:
     """The typed overrides that the upstream run of the setting `key` shares."""
-    groups = ("scale", "dataset", "metric", *(("model",) if key == WEIGHTS else ()))
+    network = ("model",) if key == WEIGHTS else ()
+    groups = (
+        ("scale", *network) if reference.is_common else ("scale", "dataset", "metric", *network)
+    )
+    always = SHARED_BY_COMMON if reference.is_common else SHARED
     own = (WEIGHTS, "model.fresh", "seed", "runs_dir")
 
     def is_shared(path: str) -> bool:
         in_group = path.replace("/", ".").split(".")[0] in groups
-        return path not in own and (path in SHARED or in_group or path.startswith("data."))
+        of_data = path.startswith("data.") and not reference.is_common
+        return path not in own and (path in always or in_group or of_data)
 
     paths = [word.partition("=")[0].lstrip("+").rpartition("@")[2] for word in overrides]
     return [word for word, path in zip(overrides, paths, strict=True) if is_shared(path)]

@@ -24,10 +24,12 @@ BESIDE_OURS = ("published", "difference")
 
 DASH = "-"
 DOUBTFUL = "The printed value does not agree with the others of its row."
-DEMO = (
-    "scale=demo: data and network are small; compare the verdicts of the claims with the paper, "
+SMALL = (
+    "scale={scale}: data and network are small; compare the verdicts of the claims with the paper, "
     "not the values."
 )
+"""Of every scale but "paper"."""
+
 FORMS: dict[Form, str] = {
     "paper": "Form: every row is run as the text of the paper describes it.",
     "released": "Form: no row of this table has a released form that differs from the text.",
@@ -128,8 +130,8 @@ def _remarks(scored: ScoredTable, extra: Sequence[str]) -> list[str]:
     if scored.cells and printed:
         remarks.append(table.forms.get(scored.form, FORMS[scored.form]))
     remarks += _efficiency_remarks(scored)
-    if scored.seeds and scored.scale == "demo" and printed:
-        remarks.append(DEMO)
+    if scored.seeds and scored.scale != "paper" and printed:
+        remarks.append(SMALL.format(scale=scored.scale))
     if extra:
         remarks.append(f"Every row of ours was run with {' '.join(extra)}.")
     if len(scored.commits) > 1:

@@ -11,6 +11,7 @@ from typing import Protocol
 from rgbt.checks import InputError
 from rgbt.metrics import names
 from rgbt.metrics.counts import Counts
+from rgbt.metrics.details import details_of_metric
 from rgbt.metrics.named import value
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.table.table import Column, Row, Table
@@ -99,12 +100,14 @@ def evaluation_of(column: Column, table: Table) -> ExtraEvaluation | None:
     """The evaluation that the column needs; None: the one that every run makes itself."""
     if column.frames is not None:
         return ExtraEvaluation(frames=column.frames)
+    details = details_of_metric(str(column.metric))
     needed = ExtraEvaluation(
         column.modality,
         table.regions,
         head=column.head,
         corruption=column.corruption,
         severity=column.severity,
+        details=None if details is None else details.kind,
     )
     return None if needed == ExtraEvaluation() else needed
 

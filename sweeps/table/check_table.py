@@ -11,6 +11,7 @@ from omegaconf import OmegaConf
 from rgbt.checks import InputError, check_choice
 from rgbt.config.component import build
 from rgbt.config.compose import available, conf_dir
+from rgbt.metrics.details import default, details_of_metric
 from rgbt.metrics.named import OF_PAIRS
 from sweeps.table.claim import OTHERS, PREVIOUS, Claim
 from sweeps.table.table import Column, ReleasedForm, Row, Table
@@ -92,7 +93,16 @@ def _check_column(column: Column, table: Table, before: Sequence[Column], where:
         )
     if column.corruption is not None:
         _check_corruption(column.corruption, column.severity, where)
+    _check_bin(column, where)
     _check_sources(column, table, before, f"{where}, {given[0]}")
+
+
+def _check_bin(column: Column, where: str) -> None:
+    """Refuse a bin that the evaluations of tables do not count."""
+    details = details_of_metric(column.metric or "")
+    if details is not None and details.bin:
+        known = default(details.kind).bins
+        check_choice(f"{where}, metric: {details.kind}", details.bin, known)
 
 
 def _check_sources(column: Column, table: Table, before: Sequence[Column], where: str) -> None:

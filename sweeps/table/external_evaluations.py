@@ -83,7 +83,8 @@ class ExternalSource:
             words = (*words, *self.data.words("metric", "paper"))
         command = (module, *arguments, *words)
         if extra.frames is None:
-            return replace(plan, command=command, made="counts.npz", out="counts.npz")
+            made = extra.details_path("counts.npz")
+            return replace(plan, command=command, made=made, out="counts.npz")
         return replace(plan, command=command, made=Path(plan.path).name)
 
     def _of_predictions(self, extra: ExtraEvaluation, plan: PlannedEvaluation) -> PlannedEvaluation:

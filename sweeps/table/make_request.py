@@ -10,7 +10,7 @@ from pathlib import Path
 from rgbt.checks import InputError, check_choice, nearest
 from rgbt.config.compose import available
 from sweeps.table.external import ExternalRow, external_rows
-from sweeps.table.load_table import PUBLISHED, load_table, table_names
+from sweeps.table.load_table import PUBLISHED, STUDIES, load_table, table_names
 from sweeps.table.request import PRETRAINED, TableRequest
 from sweeps.table.rows import select_rows
 from sweeps.table.scoring import check_metrics
@@ -27,6 +27,8 @@ def read_named(name: str) -> tuple[str, Table]:
     table = load_table(name)
     if name.endswith((".yaml", ".yml")):
         path, name = Path(name).expanduser(), f"{table.paper}/{Path(name).stem}"
+        if path.resolve().parent == STUDIES:
+            name = path.stem
         if name in table_names(PUBLISHED / "none") and not path.resolve().is_relative_to(PUBLISHED):
             raise InputError(
                 f"table={path}: '{name}' is a published table, whose records it would replace; "

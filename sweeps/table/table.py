@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
 from rgbt.checks import InputError
+from rgbt.config.compose import chosen_scale
 from rgbt.metrics.pairs import Protocol
 from sweeps.evaluation import Head
 from sweeps.table.claim import Claim
@@ -44,7 +45,8 @@ class Column:
 
     Attributes:
         name: as in the rows' `values`.
-        metric: a name of `rgbt.metrics.names`, or class/<name>/acc, class/<name>/region/<n>;
+        metric: a name of `rgbt.metrics.names`, or class/<name>/acc, class/<name>/region/<n>, or of
+            details (`rgbt.metrics.details`) with their default bins, such as distance/10-20;
             ``{key}`` is replaced by that entry of the row's settings.
         minus: (a, b): column a minus column b.
         mean: mean of two or more other columns of the row, e.g. of day and night.
@@ -244,5 +246,5 @@ class Table:
         overrides = row.overrides if chosen.overrides is None else chosen.overrides
         at = row.at if chosen.at is None else chosen.at
         experiment = chosen.experiment or row.experiment
-        shared, own = self.at.get(scale, ()), at.get(scale, ())
+        shared, own = (each.get(chosen_scale(scale, each), ()) for each in (self.at, at))
         return (f"+experiment={experiment}", *shared, *overrides, *own)

@@ -181,7 +181,7 @@ class RunningTrial:
         self.status = f"evaluating {evaluation.label}"
         module, *arguments = evaluation.command
         # Each protocol of consistency has a fixed file inside the run folder.
-        out = f"out={result.folder / evaluation.path}"
+        out = f"out={result.folder / evaluation.out}"
         command = (
             *(module, f"run={result.folder}", *arguments),
             out if evaluation.frames is None else f"runs_dir={result.folder.parent}",

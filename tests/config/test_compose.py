@@ -9,7 +9,7 @@ import pytest
 
 from rgbt.checks import InputError
 from rgbt.config.command import composing
-from rgbt.config.compose import available, compose, groups, searching
+from rgbt.config.compose import available, chosen_scale, compose, groups, searching
 from rgbt.spec.specify import parse_reference, upstream_config
 
 OWN = """# @package _global_
@@ -43,6 +43,15 @@ def test_by_scale_chooses_the_file_of_the_scale(words: list[str], width: int) ->
     assert compose(["+experiment=mfnet", *words]).model.decoder_width == width
 
 
+def test_by_scale_bench_has_the_files_of_the_demo_unless_it_is_named() -> None:
+    bench, demo = (compose(["+experiment=rtfnet", f"scale={name}"]) for name in ("bench", "demo"))
+    assert bench.model.base_width == demo.model.base_width == 16
+    assert bench.optimizer == demo.optimizer
+    assert chosen_scale("bench", {"demo": 1, "paper": 2}) == "demo"
+    assert chosen_scale("bench", {"demo": 1, "bench": 2}) == "bench"
+    assert chosen_scale("paper", {"demo": 1}) == "paper"
+
+
 def test_by_scale_unknown_scale_says_to_choose(own: Path) -> None:
     words = ["+experiment=mfnet", "scale=middle", word(own)]
     with pytest.raises(InputError) as caught, composing(words):
@@ -71,8 +80,9 @@ def test_upstream_experiment_on_the_search_path_is_used(own: Path) -> None:
     with searching([word(own)]):
         config = compose(["+experiment=sh_adversarial"])
         value = "experiment:own_stage/last.pt"
-        assert parse_reference("model.weights", value) == ("own_stage", "last.pt")
-        upstream = upstream_config(config, "domains.target.labels", "own_stage")
+        reference = parse_reference("model.weights", value)
+        assert reference == ("own_stage", "last.pt", False)
+        upstream = upstream_config(config, "domains.target.labels", reference)
     assert (upstream.name, upstream.model.decoder_width) == ("own_stage", 16)
     with pytest.raises(InputError, match=r"no experiment 'own_stage'.*hydra\.searchpath="):
         parse_reference("model.weights", value)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -59,6 +60,7 @@ class FakeResult:
     commit: str | None = "aaaaaaaaaa"
     other_code: str | None = None
     tags: Mapping[str, str] = field(default_factory=dict)
+    folder: Path = Path("nowhere")
 
     def counts(self, path: str = OWN_COUNTS) -> Counts:
         return self.by_path[path]

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from rgbt.config.options import types_of
 from rgbt.consistency import Options as OfConsistency
 from rgbt.evaluate import Options as OfEvaluate
+from rgbt.evaluation.details import details_path as written_beside
 from sweeps.evaluation import ExtraEvaluation
 
 OPTIONS = {"rgbt.evaluate": OfEvaluate, "rgbt.consistency": OfConsistency}
@@ -47,6 +50,18 @@ OPTIONS = {"rgbt.evaluate": OfEvaluate, "rgbt.consistency": OfConsistency}
             "default, ring5, world N+",
         ),
         (
+            ExtraEvaluation("rgb", "ring5", details="boundary"),
+            "rgbt.evaluate modality=rgb regions=ring5 details=boundary,calibration",
+            "table_rgb_ring5-boundary.npz",
+            "rgb, ring5, boundary",
+        ),
+        (
+            ExtraEvaluation("rgb", "ring5", corruption="noise", severity=8.0, details="size"),
+            "rgbt.evaluate modality=rgb regions=ring5 corruption=noise severity=8 details=all",
+            "table_rgb_ring5_noise-8-size.npz",
+            "rgb, ring5, noise-8, size",
+        ),
+        (
             ExtraEvaluation(frames="aligned"),
             "rgbt.consistency frames=virtual",
             "consistency_aligned_test.npz",
@@ -75,3 +90,12 @@ def test_evaluation_has_command_file_and_label(
     assert (evaluation.path, evaluation.label) == (f"evaluations/{file}", label)
     options = {word.partition("=")[0] for word in words if word not in evaluation.dataset}
     assert options <= set(types_of(OPTIONS[module]))
+
+
+def test_details_are_written_beside_the_file_that_the_command_writes() -> None:
+    details = ExtraEvaluation(details="boundary")
+    assert details.out == "evaluations/table_default_as-trained.npz" == ExtraEvaluation().path
+    out, path = Path(details.out), Path(details.path)
+    assert path == written_beside(out, "boundary")
+    for plain in (ExtraEvaluation("rgb"), ExtraEvaluation(frames="next")):
+        assert plain.out == plain.path

@@ -75,7 +75,7 @@ def table_lines(text: str) -> list[str]:
 def test_page_texts_equal_data_equal_pages(data: ReportData, pages: dict[str, str]) -> None:
     assert page_texts(data, SIZES) == pages
     papers = {path.name for path in PUBLISHED.iterdir()}
-    assert set(pages) == {"index.md", "networks.md", *(f"{name}.md" for name in papers)}
+    assert set(pages) == {"index.md", "claims.md", "networks.md", *(f"{p}.md" for p in papers)}
 
 
 def test_page_texts_later_date_changes_only_the_date(
@@ -178,7 +178,8 @@ def test_index_claims_are_counted_by_paper_and_listed_with_a_verdict(
     section = text[text.index("## Verdicts per claim") : text.index("## Speed")]
     assert "| [crm](crm.md) | demo |" in section
     assert "| [temporal](temporal.md) | – | 5 | 0 | 0 | 0 | 5 | 0 | 5 |" in section
-    assert "| The statement called true. (spatialseg, TABLE III) | ✓ holds |" in section
+    stated = "| The statement called true. (spatialseg, TABLE III; demo scale) | ✓ holds |"
+    assert stated in section
     assert "called waiting" not in section
     assert "Not measured yet" not in section
 
@@ -383,7 +384,7 @@ def test_command_markdown_writes_the_pages_and_leaves_others(
     assert code == 0
     assert "index.md" in said
     made = {path.name for path in out.iterdir()}
-    assert made == {"measurements.md", "index.md", "networks.md"} | {
+    assert made == {"measurements.md", "index.md", "claims.md", "networks.md"} | {
         f"{name}.md" for name in load_results_file().papers
     }
     assert (out / "measurements.md").read_text() == "by hand"

@@ -13,6 +13,7 @@ from analysis.uncertainty.intervals import (
     Interval,
     Spread,
     holm,
+    of_gaps,
     over_images,
     over_seeds,
     student,
@@ -166,3 +167,16 @@ def test_holm_by_hand():
     assert holm([]) == []
     assert holm([math.nan, 0.01, 0.03])[1:] == pytest.approx([0.02, 0.03])
     assert math.isnan(holm([math.nan, 0.01])[0])
+
+
+def test_interval_of_absolute_differences_reaches_0_where_all_is_chance() -> None:
+    around = Interval(1.2, 1.6)
+    # Without error: 1 - (1 + sqrt 2) 0.2 = 0.517; with a bias of 0.5 below 0.
+    found = of_gaps(1.0, 0.2, Spread(0.0, 9), around, 0.95)
+    assert (found.low, found.high) == pytest.approx((1 - 0.2 * (1 + 2**0.5), 1.6))
+    assert of_gaps(1.0, 0.5, Spread(0.0, 9), around, 0.95).low == 0.0
+    # Large differences: no bias, Student's t of 9 degrees of freedom is 2.262.
+    found = of_gaps(8.0, -0.1, Spread(0.5, 9), Interval(7.5, 8.5), 0.95)
+    assert (found.low, found.high) == pytest.approx((8 - 2.262 * 0.5, 8.5), abs=1e-3)
+    # Never above the lower quantile.
+    assert of_gaps(8.0, 0.0, Spread(0.0, 9), Interval(7.5, 8.5), 0.95).low == 7.5

@@ -10,7 +10,7 @@ import pytest
 from rich.text import Text as RichText
 
 from sweeps.rendering.file_formats import latex, markdown, tidy_csv
-from sweeps.rendering.rendered_table import COUNTED, DEMO, FORMS, render_table
+from sweeps.rendering.rendered_table import COUNTED, FORMS, SMALL, render_table
 from sweeps.rendering.terminal import terminal
 from sweeps.table.cells import TableCell
 from sweeps.table.scoring import ScoredTable, score, size_marks
@@ -52,7 +52,7 @@ def test_terminal_shows_remarks_below() -> None:
         *("Published: somewhere; percent.", "Ours: scale=demo, of seed 0."),
         FORMS["paper"],
     ]
-    assert DEMO in shown
+    assert SMALL.format(scale="demo") in shown
 
 
 def test_terminal_names_the_form_and_many_seeds() -> None:
@@ -91,7 +91,7 @@ def test_terminal_many_columns_use_separate_lines() -> None:
     assert shown[3] == ["a", "ours", "2", *["50.00", "±", "14.14"] * 4]
     assert shown[4] == ["published", "48.00", "49.25", "-", "-"]
     assert shown[5] == ["difference", "+2.00", "+0.75", "-", "-"]
-    assert DEMO not in lines(wide(STACKED))  # scale=paper
+    assert SMALL.format(scale="paper") not in lines(wide(STACKED))  # scale=paper
 
 
 def test_terminal_wide_table_breaks_names_and_puts_sd_below() -> None:

@@ -4,9 +4,11 @@ import math
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from rgbt.checks import InputError
+from rgbt.metrics.counts import Counts
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.table.cells import TableCell
 from sweeps.table.scoring import ScoredTable, check_metrics, published, score, size_marks
@@ -106,6 +108,38 @@ def test_score_heads_and_corruptions_have_own_counts(
     column = Column(name="other", metric="pixel_accuracy", **settings)
     runs = {("a", 0): outcome("k", {None: right(50), evaluation: right(30)})}
     assert [cell.mean for cell in scored((ACC, column), runs).cells.values()] == [50.0, 30.0]
+
+
+def details_of(partition: str, *rows: list[list[int]]) -> Counts:
+    """Details of one image."""
+    like = counts_of(night=None).select(["00000"])
+    return replace(like, counts=np.array([rows]), partition=partition)
+
+
+def test_score_details_have_own_counts() -> None:
+    columns = (
+        ACC,
+        Column(name="edge", metric="class/{class}/boundary_IoU", modality="rgb"),
+        Column(name="ece", metric="ECE", best="lowest"),
+    )
+    # Road: both 2 of 4 and 3 boundary pixels; car: 1 of 1 and 1.
+    edge = details_of("ring1-boundary-0.02", [[2, 1], [4, 1], [3, 1]])
+    # 10 pixels, of which 7 are right with a confidence of 0.9 on average.
+    bins = [[0, 0]] * 3, [[10, 0], [7, 0], [90_000, 0]]
+    ece = details_of("ring1-calibration-2", *bins)
+    made = {
+        None: right(50),
+        ExtraEvaluation("rgb", details="boundary"): edge,
+        ExtraEvaluation(details="calibration"): ece,
+    }
+    rows = tuple(Row(label=name, settings={"class": name}) for name in ("road", "car"))
+    run = outcome("k", made)
+    found = scored(columns, {("road", 0): run, ("car", 0): run}, rows)
+    values = {place: cell.mean for place, cell in found.cells.items()}
+    assert values["road", "edge"] == pytest.approx(100 * 2 / 5)
+    assert values["car", "edge"] == pytest.approx(100.0)
+    assert values["car", "ece"] == pytest.approx(20.0)
+    assert values["road", "acc"] == 50.0
 
 
 def test_score_regions_of_table_and_placeholders() -> None:

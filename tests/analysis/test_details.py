@@ -1,0 +1,225 @@
+"""Intervals of details over images, and the counts that belong to a method."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from analysis.compare import entry as compare_entry
+from analysis.compare import metrics_of
+from analysis.details import entry
+from analysis.uncertainty import Resampling, compare, estimate
+from analysis.uncertainty.contrasts import Resampler, Term
+from analysis.uncertainty.same_images import aligned, aligned_images
+from rgbt.checks import InputError
+from rgbt.metrics.calibration import ece
+from rgbt.metrics.counts import Counts
+from rgbt.metrics.details import Details
+from rgbt.metrics.named import value
+from tests.analysis.test_results import make_run
+from tests.commands import Call, assert_one_sentence
+
+IMAGES = 40
+SETTINGS = Resampling(resamples=2000, blocks="none")
+BOUNDARY, CALIBRATION = Details("boundary", (0.02,)), Details("calibration", (2.0,))
+SIZE = Details("size", (64.0,))
+
+
+def counts_of(array: np.ndarray, partition: str) -> Counts:
+    return Counts(
+        counts=array,
+        names=tuple(f"{index:05d}" for index in range(len(array))),
+        night=None,
+        classes=("road", "car"),
+        partition=partition,
+        dataset="d",
+        split="test",
+    )
+
+
+def boundaries(seed: int = 0, images: int = IMAGES) -> Counts:
+    """Two regions; the labels are those of seed 0, whatever the seed."""
+    sizes = np.random.default_rng(0).integers(20, 60, (images, 2, 2))
+    rng = np.random.default_rng(seed)
+    both = rng.integers(5, 20, sizes.shape)
+    predicted = both + rng.integers(0, 30, sizes.shape)
+    return counts_of(np.stack([both, sizes, predicted], 2), BOUNDARY.partition("ring2"))
+
+
+def calibrated(seed: int = 0) -> Counts:
+    """One region, 100 pixels an image in the upper bin, of which about 70 are right."""
+    right = np.random.default_rng(seed).binomial(100, 0.7, IMAGES)
+    array = np.zeros((IMAGES, 2, 3, 2), np.int64)
+    array[:, 1, 0, 0], array[:, 1, 1, 0], array[:, 1, 2, 0] = 100, right, 800_000
+    return counts_of(array, CALIBRATION.partition("ring1"))
+
+
+def test_interval_of_equal_images_has_no_width() -> None:
+    one = boundaries(images=1)
+    same = counts_of(np.repeat(one.counts, IMAGES, 0), one.partition)
+    found = estimate([same], ["boundary_mIoU"], SETTINGS)["boundary_mIoU"]
+    assert found.images is not None
+    assert found.images.low == found.images.high == pytest.approx(found.value)
+
+
+def test_interval_is_that_of_images_drawn_again() -> None:
+    counts = boundaries()
+    metric = "class/car/region/2/boundary_IoU"
+    found = estimate([counts], [metric], SETTINGS)[metric]
+    rng = np.random.default_rng(1)
+    drawn = [counts.counts[rng.integers(0, IMAGES, IMAGES)][:, 1, :, 1].sum(0) for _ in range(4000)]
+    scores = [100 * both / (label + predicted - both) for both, label, predicted in drawn]
+    low, high = np.quantile(scores, [0.025, 0.975])
+    assert found.images is not None
+    assert (found.images.low, found.images.high) == pytest.approx((low, high), abs=0.2)
+    assert found.value == value(metric, counts, "released")
+
+
+def test_interval_of_a_calibration_error_is_corrected_and_never_negative() -> None:
+    counts = calibrated()
+    found = estimate([counts], ["ECE"], SETTINGS)["ECE"]
+    right = counts.counts[:, 1, 1, 0].sum()
+    assert found.value == pytest.approx(100 * (0.8 - right / 4000))
+    assert found.images is not None
+    assert 0 <= found.images.low < found.value < found.images.high
+    # Right on average: chance alone makes the error, so that the interval begins at 0.
+    array = counts.counts.copy()
+    array[:, 1, 2, 0] = right * 10_000 // IMAGES
+    fair = estimate([counts_of(array, counts.partition)], ["ECE"], SETTINGS)["ECE"]
+    assert fair.images is not None
+    assert fair.images.low == 0
+
+
+def test_difference_between_two_methods_has_an_interval_and_a_p_value() -> None:
+    better = boundaries(1)
+    array = better.counts.copy()
+    array[:, :, 0] += 5
+    array[:, :, 2] += 5
+    better = replace(better, counts=array)
+    metrics = metrics_of("auto", [better], SETTINGS)
+    assert metrics == ["boundary_mIoU", "region/1/boundary_mIoU", "region/2/boundary_mIoU"]
+    found = compare([boundaries(1)], [better], metrics, SETTINGS).differences[0]
+    assert found.value > 0
+    assert found.images is not None
+    assert found.images.low > 0
+    assert found.p_images < 0.01
+
+
+def test_other_labels_are_refused() -> None:
+    array = boundaries().counts.copy()
+    array[3, 0, 1, 0] += 1  # one more boundary pixel of the label
+    with pytest.raises(InputError, match="'00003' has different labels"):
+        aligned(boundaries(), replace(boundaries(), counts=array))
+    array = calibrated().counts.copy()
+    array[3, 0, 0, 1] += 1  # one more pixel
+    with pytest.raises(InputError, match="'00003' has different labels"):
+        aligned(calibrated(), replace(calibrated(), counts=array))
+    moved = calibrated().counts.copy()
+    moved[:, 0] = moved[:, 1]
+    moved[:, 1] = 0  # another bin, the same pixels
+    aligned(calibrated(), replace(calibrated(), counts=moved))
+    aligned_images(calibrated(), boundaries())  # nothing to compare
+
+
+@pytest.mark.parametrize("blocks", ["none", "auto"])
+def test_contrast_of_two_regions_within_each_run(blocks) -> None:
+    counts = {seed: boundaries(seed) for seed in (1, 2, 3)}
+    keys = {seed: str(seed) for seed in counts}
+    centre, edge = (f"region/{number}/boundary_mIoU" for number in (1, 2))
+    terms = [
+        Term(weight=weight, metric=metric, counts=counts, keys=keys)
+        for weight, metric in ((1.0, edge), (-1.0, centre))
+    ]
+    found = Resampler(Resampling(resamples=200, blocks=blocks)).evidence(terms)
+    expected = [
+        value(edge, each, "released") - value(centre, each, "released") for each in counts.values()
+    ]
+    assert found.values == pytest.approx(expected)
+    assert found.error > 0
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> Path:
+    """A method with two seeds and stored details, a run without any."""
+    runs = tmp_path / "runs"
+    for seed in range(2):
+        folder = make_run(runs, f"plain{seed}", "plain", seed)
+        dataset = Counts.load(folder / "counts_test.npz").dataset
+        for view in ("rgbt", "thermal"):
+            for kind, made in (("boundary", boundaries(seed)), ("calibration", calibrated(seed))):
+                (folder / "evaluations").mkdir(exist_ok=True)
+                name = f"synth_test_{view}_{made.partition.split('-')[0]}-{kind}.npz"
+                replace(made, dataset=dataset).save(folder / "evaluations" / name)
+        replace(boundaries(9), dataset="other").save(
+            folder / "evaluations" / "kitti_test_rgb_ring2-boundary.npz"
+        )
+    make_run(runs, "bare0", "bare", 0)
+    return runs
+
+
+def test_seeds_of_a_method_are_shown_together(call: Call, runs: Path, tmp_path: Path) -> None:
+    words = (f"runs_dir={runs}", "resamples=200", "blocks=none")
+    code, out, err = call(entry, "run=plain", *words, f"out={tmp_path / 'out'}")
+    assert (code, err) == (0, "")
+    assert "intervals over images and seeds" in out
+    rows = list(csv.DictReader((tmp_path / "out" / "details.csv").open()))
+    assert {(row["details"], row["input"]) for row in rows} == {
+        *(("boundary", view) for view in ("rgbt", "thermal")),
+        *(("calibration", view) for view in ("rgbt", "thermal")),
+    }
+    (row,) = (each for each in rows if (each["metric"], each["input"]) == ("ECE", "rgbt"))
+    expected = [value("ECE", calibrated(seed), "released") for seed in range(2)]
+    assert float(row["value"]) == pytest.approx(np.mean(expected))
+    assert float(row["low"]) < float(row["value"]) < float(row["high"])
+    assert row["seeds"] == "2"
+
+    file = runs / "plain0" / "evaluations" / "synth_test_rgbt_ring2-boundary.npz"
+    code, out, err = call(entry, f"run={file}", "resamples=200")
+    assert (code, err) == (0, "")
+    code, out, err = call(
+        compare_entry, f"a={file}", f"b={runs / 'plain1' / 'evaluations' / file.name}", *words[1:]
+    )
+    assert code == 0, err
+    assert "boundary_mIoU" in out
+
+
+def test_missing_details_are_named(call: Call, runs: Path) -> None:
+    code, _, err = call(entry, "run=bare", f"runs_dir={runs}")
+    assert code == 2
+    assert_one_sentence(err, "modality=all details=boundary")
+    (runs / "plain1" / "evaluations" / "synth_test_thermal_ring1-calibration.npz").unlink()
+    code, _, err = call(entry, "run=plain", f"runs_dir={runs}")
+    assert code == 2
+    assert_one_sentence(err, "plain1 has no counts of calibration of split 'test'")
+    code, _, err = call(entry)
+    assert code == 2
+    assert_one_sentence(err, "'run' has no value")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("gap", [0.0, 0.03, 0.1])
+def test_interval_of_a_calibration_error_holds_the_truth(gap: float) -> None:
+    """60 images, bins that are too confident by `gap`, and images that differ."""
+    rng = np.random.default_rng(0)
+    centre = (np.arange(15) + 0.5) / 15
+
+    def drawn(images: int) -> np.ndarray:
+        right = np.clip(centre * (1 - gap) + 0.05 * rng.normal(size=(images, 15)), 0, 1)
+        number = np.full((images, 15), 100)
+        units = np.broadcast_to(np.rint(100 * centre * 10_000), number.shape).astype(np.int64)
+        one = np.stack([number, rng.binomial(number, right), units], 2)[..., None]
+        return np.concatenate([one, np.zeros_like(one)], -1)  # all are predicted as road
+
+    truth = 100 * float(ece(drawn(50_000).sum(0)))
+    settings = Resampling(resamples=300, blocks="none")
+    holds = 0
+    for _ in range(100):
+        counts = counts_of(drawn(60), "ring1-calibration-15")
+        images = estimate([counts], ["ECE"], settings)["ECE"].images
+        assert images is not None
+        holds += truth in images
+    assert holds >= 88  # 95 but for chance
