@@ -41,6 +41,9 @@ SETTINGS = {
 }
 """Overrides at which configurations and keys are recorded."""
 
+SETTINGS_OF_STARTS = {"smoke": ["+debug=smoke"], "bench": ["scale=bench"]}
+"""The same of the common starts: their data sets are embedded, so they have no form at paper scale."""
+
 TEN_STEPS = [
     *("+debug=smoke", "trainer.max_steps=10", "trainer.log_every=1", "trainer.eval_every=10"),
     *("trainer.checkpoint_every=10", "trainer.accelerator=cpu", "trainer.threads=2"),
@@ -102,7 +105,7 @@ def record(runs_dir: Path) -> dict[str, Any]:
     for number, name in enumerate(EXPERIMENTS, 1):
         started = time.monotonic()
         experiments[name] = {
-            "compositions": {setting: composition(name, setting) for setting in SETTINGS},
+            "compositions": {setting: composition(name, setting) for setting in settings_of(name)},
             "training": training(name, runs_dir),
         }
         seconds = time.monotonic() - started
@@ -119,9 +122,14 @@ def machine() -> dict[str, str]:
     }
 
 
+def settings_of(experiment: str) -> dict[str, list[str]]:
+    """Name of each setting at which an experiment is recorded -> its overrides."""
+    return SETTINGS_OF_STARTS if experiment.startswith("start_") else SETTINGS
+
+
 def composition(experiment: str, setting: str) -> dict[str, Any]:
     """Run key and digests of the nodes of a configuration."""
-    overrides = [f"+experiment={experiment}", *SETTINGS[setting]]
+    overrides = [f"+experiment={experiment}", *settings_of(experiment)[setting]]
     config = compose(overrides)
     nodes = {}
     for name, node in config.items():

@@ -23,12 +23,12 @@ import pytest
 from tests.behaviour import (
     EXPERIMENTS,
     RECORDED,
-    SETTINGS,
     archive_digest,
     compare,
     composition,
     composition_differences,
     machine,
+    settings_of,
     training,
     training_differences,
     written,
@@ -50,7 +50,7 @@ def test_every_experiment_is_recorded() -> None:
     [
         pytest.param(name, setting, marks=() if (name, setting) in QUICK else pytest.mark.slow)
         for name in EXPERIMENTS
-        for setting in SETTINGS
+        for setting in settings_of(name)
     ],
 )
 def test_composition_is_the_recorded_one(experiment: str, setting: str) -> None:
