@@ -42,7 +42,7 @@ SETTINGS = {
 """Overrides at which configurations and keys are recorded."""
 
 SETTINGS_OF_STARTS = {"smoke": ["+debug=smoke"], "bench": ["scale=bench"]}
-"""The same of the common starts: their data sets are embedded, so they have no form at paper scale."""
+"""The same of the common starts. Their data sets are embedded: none has a form at paper scale."""
 
 TEN_STEPS = [
     *("+debug=smoke", "trainer.max_steps=10", "trainer.log_every=1", "trainer.eval_every=10"),
