@@ -37,7 +37,10 @@ from tests.commands import (
 
 ROOT = Path(__file__).resolve().parents[1]
 
-ADAPTATION = ("sh_", "multi_head", "heatnet", "rgb_teacher", "thermal_teacher")
+ADAPTATION = (
+    *("sh_", "multi_head", "heatnet", "rgb_teacher", "thermal_teacher"),
+    *("start_deeplabv2", "start_pspnet"),
+)
 """Beginnings of experiments on days and nights: `tests/test_adaptation_run.py`."""
 
 METHODS = ("crm", "grbm", "spatialseg")

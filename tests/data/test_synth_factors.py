@@ -8,18 +8,22 @@ from dataclasses import fields
 
 import pytest
 
-from rgbt.data.synth.factors import SceneFactors, with_factors
+from rgbt.data.synth.factors import NEUTRAL, SceneFactors, with_factors
 
 
-@with_factors("night_share", height=96)
-def made(*, seed: int = 3, factors: SceneFactors) -> tuple[int, SceneFactors]:
+def plain(*, seed: int = 3, factors: SceneFactors) -> tuple[int, SceneFactors]:
     return seed, factors
+
+
+made = with_factors("night_share", height=96)(plain)
 
 
 def test_signature_has_factors_with_types_and_defaults() -> None:
     parameters = inspect.signature(made).parameters
     names = {factor.name for factor in fields(SceneFactors)} - {"night_share"}
-    assert set(parameters) == {"seed"} | names
+    assert set(parameters) == {"seed"} | (names - NEUTRAL)
+    calibrated = with_factors("night_share", calibrated=True)(plain)
+    assert set(inspect.signature(calibrated).parameters) == {"seed"} | names
     assert (parameters["height"].default, parameters["width"].default) == (96, 160)
     hints = typing.get_type_hints(made)
     assert (hints["height"], hints["rgb_noise"], hints["seed"]) == (int, float, int)
