@@ -154,7 +154,7 @@ def _automatic(sequences: Sequence[SequenceFrames], series: NDArray[np.float64])
         shown = f"{len(runs)} blocks of {_range(sizes)} neighbouring frames"
         return _joined(count, runs, shown, f"The names form {said}; each is one block.")
     reason = f"The names form {said}, one of them more than 1/{FEWEST} of all images"
-    length = max(block_length(each, runs) for each in series)
+    length = max(block_length(_levelled(each, sequences), runs) for each in series)
     while length > 1 and sum(math.ceil(size / length) for size in sizes) < FEWEST:
         length -= 1
     if length <= 1:
@@ -162,6 +162,20 @@ def _automatic(sequences: Sequence[SequenceFrames], series: NDArray[np.float64])
         return _singles(count, reason=reason)
     reason += f"; they are cut at {length}, the distance over which scores are correlated."
     return replace(_pieces(runs, length), reason=reason)
+
+
+def _levelled(
+    series: NDArray[np.float64], sequences: Sequence[SequenceFrames]
+) -> NDArray[np.float64]:
+    """(N,) without the mean of each sequence.
+
+    Sequences whose names differ in a word, such as the days and nights of one data set, may score
+    at different levels. That would look like a correlation between all frames of each of them.
+    """
+    levelled = series.copy()
+    for _, places in sequences:
+        levelled[places] -= series[places].mean()
+    return levelled
 
 
 def _range(sizes: Sequence[int]) -> str:

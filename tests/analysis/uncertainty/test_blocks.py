@@ -198,6 +198,14 @@ def test_auto_cuts_runs_of_which_one_is_too_long():
     assert "not shown to be correlated, each image is drawn alone" in alone.reason
 
 
+def test_auto_does_not_take_levels_of_day_and_night_for_correlation():
+    """Without thermal, all nights score low: independent images, two levels."""
+    names = [*mfnet(150), *mfnet(150, "N")]
+    noise = np.random.default_rng(0).normal(size=300)
+    levels = noise + np.repeat([4.0, -4.0], 150)
+    assert make_blocks(names, "auto", levels[None]).said == "300 single images"
+
+
 def test_auto_explains_single_images():
     for names in (["b", "a", "c"], [f"{video}_7" for video in "abcdefghijkl"], mfnet(12)):
         blocks = make_blocks(names, "auto", np.zeros((1, len(names))))
