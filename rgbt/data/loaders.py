@@ -28,6 +28,7 @@ from rgbt.data.reader import (
     SplitReader,
     TrainExamples,
     no_shared_memory,
+    signals_blocked,
     start_worker,
 )
 from rgbt.dataset import LabelledDataset
@@ -125,7 +126,8 @@ def _started(loader: DataLoader[Any], num_workers: int) -> Iterator[Any]:
         # A loader that fails while it starts prints its own traceback. These locks, a few more than
         # it needs, fail earlier.
         _ = [multiprocessing.Lock() for _ in range(LOCKS_PER_WORKER * num_workers)]
-        return iter(loader)
+        with signals_blocked():
+            return iter(loader)
     except OSError as error:
         if error.errno != errno.ENOSPC:
             raise

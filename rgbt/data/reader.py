@@ -9,7 +9,8 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -154,12 +155,26 @@ class BatchReader(Dataset[LoadedBatch]):
         return LoadedBatch(batch, skipped)
 
 
+@contextmanager
+def signals_blocked() -> Iterator[None]:
+    """Within it, processes that are started have the signals of `ENDING` blocked in all threads.
+
+    Some libraries, such as Arrow, start threads of their own in a process as soon as it is forked,
+    before `start_worker` is called.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def start_worker(_: int) -> None:
-    """Settings of a worker process."""
+    """Settings of a worker process; it is started within `signals_blocked`."""
     # There is one process per core; threads of OpenCV would compete with them.
     cv2.setNumThreads(0)
     # A terminal and a cluster signal all processes of a run. The main process needs its workers
-    # to finish its step, and then ends them.
+    # to finish its step, and then ends them. A fork server starts workers without our mask.
     signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import suppress
@@ -15,6 +16,7 @@ import pytest
 from torch.utils.data import DataLoader
 
 from rgbt.config.plain_command import PlainCommand
+from rgbt.data.loaders import _started
 from rgbt.data.reader import start_worker
 from rgbt.engine.checkpoint import State
 from rgbt.engine.trainer import Trainer
@@ -244,18 +246,33 @@ def test_a_closed_terminal_is_no_error(tmp_path: Path) -> None:
     assert (tmp_path / "code").read_text() == "129"
 
 
+@pytest.fixture
+def thread_after_fork() -> Iterator[None]:
+    """As Arrow does: a thread that every forked process starts before its own code runs."""
+    is_wanted = [True]
+
+    def start() -> None:
+        if is_wanted:
+            threading.Thread(target=time.sleep, args=(600,), daemon=True).start()
+
+    os.register_at_fork(after_in_child=start)
+    yield
+    is_wanted.clear()
+
+
+@pytest.mark.usefixtures("thread_after_fork")
 def test_workers_leave_signals_of_a_group_to_the_main_process() -> None:
     """Ctrl-C in a terminal and `killpg` reach them too; the step in progress needs them."""
     loader = DataLoader(
         range(40), batch_size=None, num_workers=1, worker_init_fn=start_worker, prefetch_factor=2
     )
-    found = iter(loader)
+    found = _started(loader, 1)
     assert next(found) == 0
     (worker,) = found._workers  # type: ignore[attr-defined]
     for number in SIGNALS:
         subprocess.run(["kill", f"-{int(number)}", str(worker.pid)], check=True)
     assert list(found) == list(range(1, 40))
-    fresh = iter(loader)
+    fresh = _started(loader, 1)
     assert next(fresh) == 0
     (worker,) = fresh._workers  # type: ignore[attr-defined]
     worker.terminate()
