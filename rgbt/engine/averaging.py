@@ -92,17 +92,17 @@ class AveragedWeights:
         Raises:
             InputError: it is of another network, or of a run with another averaging.
         """
-        begun = self._kind == "ema" or (self._kind == "last" and step > self._before)
-        if begun != (UNAVERAGED in payload):
+        is_averaged = self._kind == "ema" or (self._kind == "last" and step > self._before)
+        if is_averaged != (UNAVERAGED in payload):
             raise InputError(
-                f"{source} is a checkpoint of a run {'without' if begun else 'with'} averaged "
-                f"weights, but trainer.averaging is {self._kind}. Resume with the settings that "
-                "wrote it, or train again in another runs_dir=..."
+                f"{source} is a checkpoint of a run {'without' if is_averaged else 'with'} "
+                f"averaged weights, but trainer.averaging is {self._kind}. Resume with the "
+                "settings that wrote it, or train again in another runs_dir=..."
             )
-        if begun:
+        if is_averaged:
             restore_weights(self._model, payload["model"], source)
             self._average = self._copied()
-        restore_weights(self._model, payload[UNAVERAGED if begun else "model"], source)
+        restore_weights(self._model, payload[UNAVERAGED if is_averaged else "model"], source)
 
     def share_buffers(self) -> None:
         """Give every process the averaged buffers of process 0; called by all processes."""

@@ -68,7 +68,7 @@ def who(line: EffectLine) -> str:
 
 
 def word(line: EffectLine) -> str:
-    """Whether the effect is shown; of the mean of all cells nothing is asked."""
+    """Whether the effect is shown; the mean of all cells is not tested."""
     estimate = line.estimate
     if line.effect == MEAN and not line.against:
         return ABSENT
