@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sweeps.rendering.effects import ASKS, word
+from sweeps.rendering.figure import write_png
 from sweeps.verdicts.effects import MEAN, DesignEffects, EffectLine
 
 if TYPE_CHECKING:
@@ -22,14 +23,7 @@ SPAN = 0.62
 
 def draw_effects(effects: DesignEffects, name: str, path: Path) -> bool:
     """Draw the figure as PNG; whether there was anything to draw."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    figure = effects_figure(effects, name)
-    if figure is None:
-        return False
-    FigureCanvasAgg(figure)
-    figure.savefig(path, dpi=150)
-    return True
+    return write_png(effects_figure(effects, name), path)
 
 
 def shown_lines(effects: DesignEffects) -> list[EffectLine]:

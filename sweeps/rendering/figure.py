@@ -53,9 +53,13 @@ class Series:
 
 def draw_table(scored: ScoredTable, path: Path) -> bool:
     """Draw the figure as PNG; whether there was anything to draw."""
+    return write_png(figure_of(scored), path)
+
+
+def write_png(figure: Figure | None, path: Path) -> bool:
+    """Write a figure; whether there is one."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    figure = figure_of(scored)
     if figure is None:
         return False
     FigureCanvasAgg(figure)

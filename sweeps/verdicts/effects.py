@@ -31,7 +31,7 @@ from sweeps.table.design import Design, DesignMethod, Part, cell_name, sign_of
 from sweeps.table.design_rows import TESTED, TRAINED, tested_label, trained_label
 from sweeps.table.table import Column, Table
 from sweeps.verdicts.contrasts import base_scores
-from sweeps.verdicts.judge import RESAMPLES, CellRunId
+from sweeps.verdicts.judge import RESAMPLES, CellRunId, finished_runs_of
 from sweeps.verdicts.loaded_counts import LoadedCounts
 
 MEAN = "mean of all cells"
@@ -168,13 +168,7 @@ class DesignJudge:
         """
         cells: list[Cell] = []
         for label, world in part.places(method):
-            finished = {
-                seed: run.results[0]
-                for (each, seed), run in runs.items()
-                if each == label and run.state == "finished" and run.results
-            }
-            if not finished:
-                raise InputError(f"row '{label}' has no finished run.")
+            finished = finished_runs_of(label, runs)
             path = self._plain_path
             if world:
                 path = world_evaluations(self.table, self._rows[label])[world].path

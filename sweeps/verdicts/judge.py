@@ -15,7 +15,7 @@ from analysis.uncertainty import Interval, Resampling
 from analysis.uncertainty.contrasts import Evidence, Resampler, Term
 from analysis.uncertainty.verdicts import FixedSeeds, Rule, Verdict, decide
 from rgbt.checks import InputError
-from sweeps.table.cells import CellId, CellRun, counts_path, is_counted, metric_of
+from sweeps.table.cells import CellId, CellRun, ScoredRun, counts_path, is_counted, metric_of
 from sweeps.table.claim import HIGHER, LOWER, Claim
 from sweeps.table.table import Column, Table
 from sweeps.verdicts.contrasts import Contrast, base_scores, contrasts_of, printed_value
@@ -251,13 +251,7 @@ class TableJudge:
         row = self._rows[label]
         if name not in {column.name for column in self.table.columns_of(row)}:
             raise InputError(f"row '{label}' has no score '{name}'.")
-        finished = {
-            seed: run.results[0]
-            for (each, seed), run in runs.items()
-            if each == label and run.state == "finished" and run.results
-        }
-        if not finished:
-            raise InputError(f"row '{label}' has no finished run.")
+        finished = finished_runs_of(label, runs)
         for part, column in base_scores(self.table, row, name):
             if not is_counted(column):
                 raise InputError(f"column '{column.name}' is not a score of images.")
@@ -282,6 +276,22 @@ def _keys(label: str, runs: Mapping[CellRunId, CellRun]) -> frozenset[str]:
     """Keys of the finished runs of a row."""
     found = (run for (each, _), run in runs.items() if each == label)
     return frozenset(result.key for run in found for result in run.results)
+
+
+def finished_runs_of(label: str, runs: Mapping[CellRunId, CellRun]) -> dict[int, ScoredRun]:
+    """The finished runs of a row, by seed.
+
+    Raises:
+        InputError: it has none.
+    """
+    finished = {
+        seed: run.results[0]
+        for (each, seed), run in runs.items()
+        if each == label and run.state == "finished" and run.results
+    }
+    if not finished:
+        raise InputError(f"row '{label}' has no finished run.")
+    return finished
 
 
 def as_claimed(claim: Claim, contrasts: Sequence[float | None]) -> bool | None:
