@@ -200,6 +200,7 @@ class RunSpec:
                     values[domain]["labels"] = self._content(labels_key(domain), each.labels)
             if name == "seeds":  # the seed of the run, typed or not, is the same run
                 values = {k: None if v == self.seed else v for k, v in values.items()}
+                values.pop("start", None)  # the key of the start stands for it
             settings |= node.key_settings(name, values)
         return settings_digest(settings)
 
@@ -269,10 +270,14 @@ class RunSpec:
         )
 
     def with_seed(self, seed: int) -> RunSpec:
-        """The same run with another seed; its upstream runs have it too, but for common ones."""
+        """The same run with another seed; its upstream runs have it too.
+
+        Common ones keep theirs, unless `seeds.start` is "run".
+        """
         words = [word for word in self.overrides if not word.startswith("seed=")]
+        further = seed - self.seed if self.seeds.start == "run" else 0
         upstream = (
-            each if each.is_common else replace(each, run=each.run.with_seed(seed))
+            replace(each, run=each.run.with_seed(each.run.seed + further if each.is_common else seed))
             for each in self.dependencies
         )
         return replace(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from rgbt.ranges import Seed
 
@@ -16,11 +17,15 @@ class Seeds:
         order: order of the training images, and their augmentation.
         masks: all draws of the training steps: masks, dropped layers (stochastic depth), points
             at which masks are compared, and virtual views.
+        start: seed of the common start (``common:NAME/last.pt``). "common": that of its experiment,
+            so that all seeds begin with the same weights; "run": the same plus the seed of the run,
+            so that every seed begins with other weights, and all methods with those of their seed.
     """
 
     weights: Seed | None = None
     order: Seed | None = None
     masks: Seed | None = None
+    start: Literal["common", "run"] = "common"
 
     def filled(self, seed: int) -> SourceSeeds:
         """The seed of every source; `seed`, that of the run, in place of None."""
