@@ -125,6 +125,25 @@ def test_run_with_another_seed_keeps_the_start(experiment: str) -> None:
     assert first_stage(made).seed == 1000
 
 
+@pytest.mark.parametrize("experiment", ["crm", "multi_head_night"])
+def test_start_has_a_seed_for_each_run_on_request(experiment: str) -> None:
+    runs = [spec_of(experiment, "seeds.start=run", f"seed={seed}") for seed in (0, 1, 2)]
+    starts = [first_stage(run) for run in runs]
+    assert [start.seed for start in starts] == [1000, 1001, 1002]
+    assert [start.key for start in starts] == [
+        spec_of(starts[0].name, f"seed={seed}").key for seed in (1000, 1001, 1002)
+    ]
+    assert runs[0].key == spec_of(experiment).key
+    assert runs[1].key != spec_of(experiment, "seed=1").key
+    assert runs[0].with_seed(2).key == runs[2].key
+    assert runs[2].with_seed(0).key == runs[0].key
+
+
+def test_methods_with_the_same_seed_share_its_start() -> None:
+    words = ("seeds.start=run", "seed=4")
+    assert start_of("baseline", *words).key == start_of("crm", *words).key
+
+
 @pytest.mark.parametrize("scale", ["demo", "paper"])
 def test_other_scales_have_no_start(scale: str) -> None:
     root = ["dataset.root=/data"] if scale == "paper" else []
