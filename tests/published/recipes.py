@@ -50,17 +50,12 @@ class Row:
         """The value that the configuration of an experiment must have."""
         return self.sides[self.used[experiment]].value
 
-    @property
-    def published(self) -> bool:
-        """Whether the paper or the release has a value."""
-        return bool({"paper", "release"} & set(self.sides))
-
 
 @dataclass(frozen=True)
 class Section:
-    """Rows of one subject."""
+    """Rows of one subject; `group` is the title of its file."""
 
-    file: str
+    group: str
     title: str
     about: str
     experiments: tuple[str, ...]
@@ -80,7 +75,8 @@ class Unpublished:
 @cache
 def sections() -> tuple[Section, ...]:
     """All sections, in the order of `FILES`."""
-    return tuple(_section(name, each) for name in FILES for each in _file(name)["sections"])
+    files = [_file(name) for name in FILES]
+    return tuple(_section(file["title"], each) for file in files for each in file["sections"])
 
 
 @cache
@@ -141,10 +137,10 @@ def _file(name: str) -> Any:
     return yaml.safe_load((FOLDER / f"{name}.yaml").read_text())
 
 
-def _section(file: str, text: Mapping[str, Any]) -> Section:
+def _section(group: str, text: Mapping[str, Any]) -> Section:
     experiments = _flat(text["experiments"])
     rows = tuple(_row(each, experiments, text["title"]) for each in text["rows"])
-    return Section(file, text["title"], text.get("about", ""), experiments, rows)
+    return Section(group, text["title"], text.get("about", ""), experiments, rows)
 
 
 def _row(text: Mapping[str, Any], experiments: Sequence[str], title: str) -> Row:
@@ -154,7 +150,8 @@ def _row(text: Mapping[str, Any], experiments: Sequence[str], title: str) -> Row
     sides = {name: Side(*text[name]) for name in SIDES if name in text}
     skipped = _matching(experiments, text.get("skip", []), place)
     chosen = _matching(experiments, text.get("for", ["*"]), place) - skipped
-    used = {name: _side(name, text.get("use"), sides, place) for name in chosen}
+    named = [name for name in experiments if name in chosen]
+    used = {name: _side(name, text.get("use"), sides, place) for name in named}
     return Row(text["key"], sides, used)
 
 
