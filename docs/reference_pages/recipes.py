@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import yaml
 
 from reference_pages.markdown import code, page, table
-from tests.published.recipes import Row, Section, Side, missing, sections, unpublished
+from tests.published.recipes import Row, Section, Side, missing, rows_of, sections, unpublished
 
 
 def recipes_page() -> str:
@@ -23,11 +23,10 @@ def recipes_page() -> str:
         "are ours, with the reason. [Paper and release](../explanation/paper-and-release.md) "
         "explains the differences.",
         "## What keeps you from the printed number",
-        "Every row needs the data set and the initial weights, which you provide. Printed values "
-        "are single runs. *Selection* is the split whose images choose the checkpoint.",
+        "You provide the data set and the file of initial weights. Printed values are single runs.",
         table(
-            ["Experiment", "What is missing or not known"],
-            [[f"[`{name}`](experiments.md#{name})", text] for name, text in missing().items()],
+            ["Experiment", "Data", "Initial weights", "What is missing or not known"],
+            [_missing(name, text) for name, text in missing().items()],
         ),
         *_groups(),
         "## Settings without a published value",
@@ -36,6 +35,13 @@ def recipes_page() -> str:
             [[each.name, each.reason, _names(each.keys)] for each in unpublished()],
         ),
     )
+
+
+def _missing(name: str, text: str) -> list[str]:
+    rows = rows_of(name)
+    weights = rows["model.weights"].sides[rows["model.weights"].used[name]]
+    start = code(weights.value) if weights.value else weights.place
+    return [f"[`{name}`](experiments.md#{name})", rows["dataset._target_"].value(name), start, text]
 
 
 def _groups() -> Iterator[str]:
