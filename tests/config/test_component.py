@@ -85,7 +85,8 @@ def test_recipes_of_the_reference_networks() -> None:
         sgd = config.optimizer
         assert (sgd.lr, sgd.momentum, sgd.weight_decay) == (0.01, 0.9, 5e-4)
         assert (config.schedule.factor, config.trainer.clip_norm) == (0.95, None)
-    assert (rtfnet.schedule.epoch_steps, mfnet.trainer.max_steps) == (1568 // 3, 100 * (784 // 8))
+    epochs = (rtfnet.schedule.epoch_steps, mfnet.trainer.max_steps)
+    assert epochs == (1568 // 3 + 1, 100 * (784 // 8))
     assert (cmx.model.inputs.thermal_scale, cmx.model.drop_path_stage2) == (
         *("image_max", "released"),
     )

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from rgbt.config.plain_command import COMMANDS
+from tests.published.recipes import Row, Side, missing, sections
 
 pytestmark = pytest.mark.docs
 
@@ -73,3 +74,42 @@ def test_every_published_table_is_shown_with_its_values(pages: dict[str, str]) -
     for path in (ROOT / "sweeps" / "tables").rglob("*.yaml"):
         assert f"\n## {path.parent.name}/{path.stem}\n" in text
     assert "61.79" in text.partition("\n## spatialseg/table3\n")[2].partition("\n## ")[0]
+
+
+def test_every_published_setting_is_shown_with_its_sources(pages: dict[str, str]) -> None:
+    text = pages["reference/recipes.md"]
+    for section in sections():
+        own = text.partition(f"\n### {section.title}\n")[2].partition("\n### ")[0]
+        for row in section.rows:
+            lines = [line for line in own.splitlines() if line.startswith(f"| `{row.key}` |")]
+            places = [row.sides[each].place for each in ("paper", "release") if each in row.sides]
+            assert any(all(f"({place})" in line for place in places) for line in lines), row.key
+    (decay,) = (
+        line for line in text.splitlines() if "Sec. IV-B" in line and "weight_decay" in line
+    )
+    cells = [cell.strip() for cell in decay.strip("|").split("|")]
+    assert cells[2:4] == ["`0.001` (Sec. IV-B)", "`0.01` (config.py, weight_decay)"]
+    assert cells[4] == "release: `cmx`, `temporal_con_released`; paper: the others"
+
+
+def test_every_experiment_shows_what_keeps_a_user_from_its_number(pages: dict[str, str]) -> None:
+    text = pages["reference/recipes.md"]
+    for name, sentence in missing().items():
+        (line,) = (row for row in text.splitlines() if f"(experiments.md#{name})" in row)
+        assert line.endswith(f" | {sentence} |")
+    (line,) = (row for row in text.splitlines() if "#temporal_con)" in row)
+    assert line.split(" | ")[1:3] == ["MFNet", "your file, mit_b2.pth"]
+    (line,) = (row for row in text.splitlines() if "#sh_adversarial)" in row)
+    assert line.split(" | ")[1:3] == ["Freiburg", "`experiment:sh_source/last.pt`"]
+
+
+def test_the_side_of_a_row_is_named() -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(ROOT / "docs"))
+        from reference_pages.recipes import _here
+    same, other = Side(1, "p"), Side(2, "o")
+    assert _here(Row("k", {"paper": same, "release": same}, {"a": "paper"})) == "both"
+    assert _here(Row("k", {"paper": same, "release": other}, {"a": "release"})) == "release"
+    assert _here(Row("k", {"paper": same, "ours": other}, {"a": "ours"})) == "`2` (o)"
+    both = Row("k", {"paper": same, "ours": other}, {"a": "ours", "b": "paper", "c": "paper"})
+    assert _here(both) == "ours, `2` (o): `a`; paper: the others"

@@ -1,0 +1,228 @@
+"""Every setting of every recipe has its published value, or a reason for having another one."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from omegaconf import OmegaConf
+
+from tests.composed import composed
+from tests.published.recipes import (
+    SIDES,
+    Row,
+    entries,
+    flattened,
+    missing,
+    rows_of,
+    sections,
+    unpublished,
+    words,
+)
+
+CONF = Path(__file__).resolve().parents[2] / "conf"
+EXPERIMENTS = sorted(
+    path.stem
+    for path in (CONF / "experiment").glob("*.yaml")
+    if not path.stem.startswith("start_")  # at scale=bench alone, on embedded scenes
+)
+NOT_OF_A_RECIPE = {
+    "commands, evaluations and stores": "corruption debug hydra label_map search tracking",
+    "images of this project": "dataset/folder dataset/synth camera/synth transform/none",
+    "sizes of scale=demo and scale=bench": "scale/demo scale/bench optimizer/adamw_rtfnet_tiny "
+    "optimizer/sgd_thesis_tiny transform/thesis_96x192 transform/thesis_blur_96x192",
+    "starts of scale=bench": "experiment/start",
+}
+"""Files without a number of a recipe at scale=paper: the beginnings of their paths, by reason.
+Networks whose name ends in "_tiny" are of scale=demo too."""
+
+
+@cache
+def configuration(*overrides: str) -> dict[str, Any]:
+    """Keys and values at scale=paper."""
+    config = composed((*overrides, "scale=paper", "dataset.root=/data"))
+    return dict(flattened(OmegaConf.to_container(config, resolve=True)))  # type: ignore[arg-type]
+
+
+def pinned(entry: str, found: Mapping[str, Any]) -> dict[str, Any]:
+    """The value of each key of an entry by the table."""
+    base = entry.split()[0]
+    inherited = rows_of(base) if base != entry else {}
+    values = {key: row.value(base) for key, row in inherited.items() if key in found}
+    return values | {key: row.value(entry) for key, row in rows_of(entry).items()}
+
+
+def free(entry: str) -> set[str]:
+    """The keys of an entry that need no source."""
+    base = entry.split()[0]
+    groups = (each for each in unpublished() if base in each.experiments or not each.experiments)
+    return {key for group in groups for key in group.keys}
+
+
+def problems_of(entry: str, found: Mapping[str, Any]) -> list[str]:
+    """What the table and a configuration disagree about, one sentence each."""
+    values, others = pinned(entry, found), free(entry)
+    wrong = [
+        f"{entry}: {key} is {found[key]!r}, but the table has {value!r}"
+        for key, value in values.items()
+        if key in found and found[key] != value
+    ]
+    gone = [f"{entry}: the table has {key}, the configuration does not" for key in values]
+    new = [
+        f"{entry}: {key}={value!r} has no source. Add it to a section of tests/published, or to a "
+        "group of `unpublished` with the reason."
+        for key, value in found.items()
+        if key not in values and key not in others
+    ]
+    twice = [f"{entry}: {key} is in a section and in `unpublished`" for key in values]
+    return [
+        *wrong,
+        *(text for text, key in zip(gone, values, strict=True) if key not in found),
+        *new,
+        *(text for text, key in zip(twice, values, strict=True) if key in others),
+    ]
+
+
+@pytest.mark.parametrize("entry", entries())
+def test_every_setting_has_its_published_value(entry: str) -> None:
+    problems = problems_of(entry, configuration(*words(entry)))
+    assert not problems, "\n" + "\n".join(problems)
+
+
+def test_every_experiment_is_in_the_table() -> None:
+    listed = {name for name in entries() if " " not in name}
+    assert not set(EXPERIMENTS) - listed, (
+        "add these experiments to the lists of tests/published that have the experiment that they "
+        "build on, and a row for each key in which they differ"
+    )
+    assert not listed - set(EXPERIMENTS), "conf/experiment has no such file any more"
+
+
+def test_every_experiment_has_a_line_about_what_is_missing() -> None:
+    lines = missing()
+    assert not set(EXPERIMENTS) - set(lines), "add a line to tests/published/missing.yaml"
+    assert not set(lines) - set(EXPERIMENTS), "conf/experiment has no such file any more"
+    assert all(20 < len(text) < 400 and text.endswith(".") for text in lines.values())
+
+
+# ---- mutations ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("entry", "change"),
+    [
+        ("crm", "scheme.nonlocal_weight=0.5"),
+        ("crm_kp", "scheme.modality_weight=2.0"),
+        ("baseline", "loss.dice_weight=2.0"),
+        ("grbm", "loss.no_object_weight=1.0"),
+        ("spatialseg", "loss.spatial.alpha=1.5"),
+        ("multi_head_night", "scheme.weight=0.001"),
+        ("grbm_released", "masker.ratio=0.4"),
+        ("temporal_con", "scheme.view.roll=[-10.0,10.0]"),
+        ("cmx model=cmx_b4", "model.depths=[3,4,18,3]"),
+        ("crm masker=square", "masker.ratio=0.25"),
+        ("sh_source", "dataset.crop=[5,645,320,1600]"),
+    ],
+)
+def test_a_changed_value_is_named(entry: str, change: str) -> None:
+    (problem,) = problems_of(entry, configuration(*words(entry), change))
+    key, _, _ = change.partition("=")
+    assert problem.startswith(f"{entry}: {key} is ")
+
+
+def test_a_number_without_source_is_named() -> None:
+    found = configuration(*words("crm"))
+    (problem,) = problems_of("crm", {**found, "scheme.warm_weight": 0.5})
+    assert problem.startswith("crm: scheme.warm_weight=0.5 has no source.")
+
+
+def test_a_key_that_is_no_more_is_named() -> None:
+    found = dict(configuration(*words("crm")))
+    del found["scheme.nonlocal_weight"]
+    (problem,) = problems_of("crm", found)
+    assert "the table has scheme.nonlocal_weight, the configuration does not" in problem
+
+
+# ---- the table itself -----------------------------------------------------------------------
+
+
+def all_rows() -> list[Row]:
+    return [row for section in sections() for row in section.rows]
+
+
+def test_every_value_has_a_place_or_a_reason() -> None:
+    for row in all_rows():
+        assert row.used, f"{row.key}: for no experiment"
+        for name in SIDES:
+            if side := row.sides.get(name):
+                assert side.place.strip(), f"{row.key}: {name} says no place"
+
+
+def test_no_number_is_read_as_text() -> None:
+    """YAML takes 1e-4 for a word: a number needs a point."""
+    texts = [value for row in all_rows() for side in row.sides.values() for value in [side.value]]
+    assert not [
+        text for text in texts if isinstance(text, str) and re.fullmatch(r"[\d.e+-]+", text)
+    ]
+
+
+def test_a_group_without_source_has_no_key_that_no_experiment_has() -> None:
+    known = {key for name in EXPERIMENTS for key in configuration(*words(name))}
+    stale = {key for group in unpublished() for key in group.keys} - known
+    assert not stale
+    listed = {name for group in unpublished() for name in group.experiments}
+    assert listed <= set(EXPERIMENTS)
+
+
+# ---- files ----------------------------------------------------------------------------------
+
+
+def chosen_files(file: str) -> set[str]:
+    """A file of conf/ and those that its defaults choose at scale=paper, without ".yaml"."""
+    text = yaml.safe_load((CONF / f"{file}.yaml").read_text())
+    folder, found = file.rpartition("/")[0], {file}
+    for entry in (text or {}).get("defaults", []):
+        pairs = entry.items() if isinstance(entry, dict) else [("", entry)]
+        for group, name in pairs:
+            target = "/".join(filter(None, [_group(group), _at_paper_scale(name)]))
+            if not target.startswith("/"):
+                target = f"{folder}/{target}"
+            if (CONF / f"{target.strip('/')}.yaml").is_file():
+                found |= chosen_files(target.strip("/"))
+    return found
+
+
+def _group(text: str) -> str:
+    return text.removeprefix("override ").partition("@")[0]
+
+
+def _at_paper_scale(name: str) -> str:
+    by_scale = re.search(r"paper:([^,}]+)", name)
+    return by_scale[1] if by_scale else name
+
+
+def test_every_file_with_a_number_of_a_recipe_is_in_the_table() -> None:
+    reached = chosen_files("config") | chosen_files("scale/paper")
+    for entry in entries():
+        for word in words(entry):
+            target = word.removeprefix("+").replace("=", "/")
+            if (CONF / f"{target}.yaml").is_file():
+                reached |= chosen_files(target)
+    files = {path.relative_to(CONF).with_suffix("").as_posix() for path in CONF.rglob("*.yaml")}
+    exempt = tuple(each for text in NOT_OF_A_RECIPE.values() for each in text.split())
+    left = {each for each in files - reached if not each.startswith(exempt)}
+    assert {each for each in left if not each.endswith("_tiny")} == set(), (
+        "no experiment of tests/published chooses these files: add one with the override, such as "
+        "'crm masker=square', or name the file in NOT_OF_A_RECIPE"
+    )
+
+
+def test_the_files_of_a_composition_are_followed() -> None:
+    found = chosen_files("experiment/temporal_con_released")
+    assert {"experiment/cmx", "model/cmx_b2", "model/inputs/cmx", "view/released"} <= found
+    assert not {"model/cmx_tiny", "masker/square"} & found
