@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from rgbt.checks import InputError
-from rgbt.spec.run_spec import RunSpec
+from rgbt.spec.run_spec import NOT_IN_KEY, RunSpec
 from rgbt.spec.specify import specify
 from tests.composed import composed
 
@@ -288,3 +288,10 @@ def test_seeds_are_those_of_upstream_runs_too() -> None:
 def test_drawn_with_another_seed_keeps_the_seeds_of_sources() -> None:
     drawn = spec_of("grbm", "seeds.order=7").with_seed(2).drawn
     assert (drawn.weights, drawn.order, drawn.masks) == (2, 7, 2)
+
+
+def test_background_of_a_data_set_is_not_in_the_key() -> None:
+    words = ("grbm", "scale=paper", "dataset=kp", "dataset.root=/data")
+    assert spec_of(*words).dataset.values["background"] == ()
+    assert key_of(*words, "dataset.background=[road]") == key_of(*words)
+    assert "dataset.background" in NOT_IN_KEY
