@@ -12,12 +12,13 @@ ROOT = Path(__file__).resolve().parents[2]
 
 def generated_pages() -> dict[str, str]:
     """Text of every generated page, by its path in docs/."""
-    from reference_pages import commands, configuration, experiments, tables
+    from reference_pages import commands, configuration, experiments, tables, weights
 
     return {
         **configuration.pages(),
         "reference/experiments.md": experiments.experiments_page(),
         "reference/commands.md": commands.commands_page(),
         "reference/tables.md": tables.tables_page(),
+        "reference/weights.md": weights.weights_page(),
         "changelog.md": (ROOT / "CHANGELOG.md").read_text(),
     }
