@@ -105,7 +105,10 @@ STARTS = (
         for digest, since in zip(digests, ("IMAGENET1K_V1", "before 2021"), strict=True)
     ),
     Start(
-        *("DeepLab_resnet_pretrained_init-f81d91e8.pth", "ResNet-101 of DeepLab v2 (pretraining not stated)"),
+        *(
+            "DeepLab_resnet_pretrained_init-f81d91e8.pth",
+            "ResNet-101 of DeepLab v2 (pretraining not stated)",
+        ),
         *("github.com/wasidennis/AdaptSegNet (vllab.ucmerced.edu)", ("deeplabv2",), "f81d91e8"),
     ),
 )

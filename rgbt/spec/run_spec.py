@@ -159,14 +159,14 @@ class RunSpec:
     trainer: TrainerSettings = _node(
         outside_key=(
             *("accelerator", "log_every", "checkpoint_every", "devices", "strategy"),
-            *("activation_checkpointing", "memory_format", "compile"),
+            *("activation_checkpointing", "memory_format", "compile", "log_gradient_shares"),
         ),
         added={"tested": "best", "threads": 2, "batch_norm_parts": 1, "averaging": "none"},
         used_with={"ema_decay": ("averaging", "ema"), "averaged_share": ("averaging", "last")},
         shared=(
             *("max_steps", "eval_every", "checkpoint_every", "log_every"),
             *("precision", "accelerator", "threads", "devices", "strategy", "batch_norm_parts"),
-            *("activation_checkpointing", "memory_format", "compile"),
+            *("activation_checkpointing", "memory_format", "compile", "log_gradient_shares"),
         ),
     )
     metric: Component = _node(shared=True)
