@@ -125,7 +125,9 @@ class RunSpec:
     scale: Scale = _node(in_key=False)
     recipe: Recipe = _node(in_key=False)
     dataset: Component = _node(
-        outside_key=("root", "cache_dir", "palette", "background", "layout", "absent"), shared=True
+        outside_key=("root", "cache_dir", "palette", "background", "layout", "absent"),
+        added={"vignette": 0.18, "whole_shadows": False},
+        shared=True,
     )
     domains: Domains = _node(
         added_as={
