@@ -24,6 +24,8 @@ from rgbt.types import GeneratorOf, Phase
 from tests.commands import Call, logged, only_run, train
 from tests.engine.test_trainer import SETTINGS, batches, halves, make, make_two
 from tests.processes import run_in_processes
+from tests.schemes.linear import network, pairs, trainer
+from tests.schemes.test_adversarial import HEATNET, PAPERS, scheme_of
 
 ON = {"log_gradient_shares": True}
 MEASURED = ("images_per_s", "wait_share", "peak_memory_mib", "gradient_share", "gradient_ratio")
@@ -205,11 +207,49 @@ def two_terms() -> dict[str, float]:
     return terms.shares("")
 
 
+@pytest.mark.slow
 def test_shares_of_several_processes_are_those_of_all() -> None:
     expected = two_terms()
     assert expected[gradient_share("own")] == pytest.approx(9 / 25)
     for found in run_in_processes(two_terms, 2):
         assert found == pytest.approx(expected)
+
+
+CASES = {
+    "one optimizer, both domains": (False, {**PAPERS, "supervise_target": True}),
+    "two heads, apart": (True, {**PAPERS, "gradients": "apart", "supervise_target": True}),
+    "two heads, kept": (True, {**PAPERS, "gradients": "kept", "supervise_target": True}),
+    "two heads, together": (True, {**PAPERS, "gradients": "together"}),
+    "HeatNet, in turn": (False, HEATNET),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("accumulate", [1, 2])
+def test_adaptation_trains_alike_and_shares_add_to_1(
+    tmp_path: Path, case: str, accumulate: int
+) -> None:
+    heads, changes = CASES[case]
+
+    def make_one(more: dict[str, Any]) -> tuple[Any, Any]:
+        model = network(heads)
+        scheme = scheme_of(model, heads, **changes)
+        settings = {"accumulate": accumulate, **more}
+        made = trainer(scheme, model, tmp_path / f"{more}", 4, **settings)
+        log: list[tuple[int, dict[str, float]]] = []
+        made.record = lambda step, values: log.append((step, values))
+        return made, log
+
+    def data() -> Iterator[Any]:
+        return (pair for pair in pairs(confidence=True) for _ in range(accumulate))
+
+    for _, line in assert_no_effect(make_one, data):
+        phases = {key.partition("/")[2] for key in line if key.startswith("grad_norm/")}
+        assert phases
+        for optimizers in phases:
+            prefix = f"gradient_share/{optimizers}/"
+            shares = [value for key, value in line.items() if key.startswith(prefix)]
+            assert sum(shares) == pytest.approx(1.0, abs=1e-5)
 
 
 def test_compiled_networks_are_refused() -> None:
@@ -224,6 +264,7 @@ EXPERIMENTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_runs_log_shares_that_add_to_1_and_train_alike(
     call: Call, data: Path, tmp_path: Path, name: str
