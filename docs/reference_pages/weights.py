@@ -14,7 +14,7 @@ def weights_page() -> str:
         "A recipe is an experiment at `scale=paper`. This page names the public file that each one "
         "starts from. Download the file yourself; `rgbt` never does. Then train:",
         "<!-- needs: MFNet, ImageNet weights -->\n```bash\nrgbt run +experiment=crm scale=paper "
-        "dataset.root=/data/MFNet pretrained=swin_small_patch4_window7_224.pth\n```",
+        "dataset.root=/data/MFNet \\\n  pretrained=swin_small_patch4_window7_224.pth\n```",
         "`pretrained` initialises the network of the run, or that of its first upstream run.",
         "## Files by recipe",
         table(["Recipes", "Networks", "Files", "Source"], [_recipe(each) for each in RECIPES]),

@@ -61,55 +61,58 @@ WINDOW = 7
 """Side of the attention windows of every recipe, in tokens."""
 
 SWIN = "github.com/SwinTransformer/storage, release v1.0.0"
-TORCHVISION = "download.pytorch.org/models"
+SEGFORMER = "github.com/NVlabs/SegFormer"
 IMAGENET = "ImageNet-1K, 224 x 224 pixels"
+RESNETS = {
+    18: ("f37072fd", "5c106cde"),
+    34: ("b627a593", "333f7ec4"),
+    50: ("0676ba61", "19c8e357"),
+    101: ("63fe2227", "5d3b4d8f"),
+    152: ("394f9c45", "b121ed2d"),
+}
+"""Layers -> digests of the file of today and of the one before."""
 
 STARTS = (
     # The digest is that of a public copy of the same name with 114,342,173 bytes.
     Start(
-        *("swin_tiny_patch4_window7_224.pth", f"Swin-T, {IMAGENET}", SWIN),
-        *(("mask2former_swin_t",), "9f71c168"),
+        "swin_tiny_patch4_window7_224.pth",
+        f"Swin-T, {IMAGENET}",
+        SWIN,
+        ("mask2former_swin_t",),
+        "9f71c168",
     ),
     Start(
-        *("swin_small_patch4_window7_224.pth", f"Swin-S, {IMAGENET}", SWIN),
-        ("mask2former_swin_s",),
+        "swin_small_patch4_window7_224.pth", f"Swin-S, {IMAGENET}", SWIN, ("mask2former_swin_s",)
     ),
+    Start("swin_base_patch4_window7_224.pth", f"Swin-B, {IMAGENET}", SWIN, ("mask2former_swin_b",)),
     Start(
-        *("swin_base_patch4_window7_224.pth", f"Swin-B, {IMAGENET}", SWIN),
+        "swin_base_patch4_window7_224_22kto1k.pth",
+        f"Swin-B, ImageNet-22K, then {IMAGENET}",
+        SWIN,
         ("mask2former_swin_b",),
     ),
-    Start(
-        *("swin_base_patch4_window7_224_22kto1k.pth", f"Swin-B, ImageNet-22K, then {IMAGENET}"),
-        *(SWIN, ("mask2former_swin_b",)),
-    ),
     *(
-        Start(
-            *(f"mit_b{size}.pth", f"MiT-B{size}, {IMAGENET}", "github.com/NVlabs/SegFormer"),
-            (f"cmx_b{size}",),
-        )
+        Start(f"mit_b{size}.pth", f"MiT-B{size}, {IMAGENET}", SEGFORMER, (f"cmx_b{size}",))
         for size in range(6)
     ),
     # Since April 2021 (pytorch/vision, pull request 3620) the same weights are stored anew.
     *(
         Start(
-            *(f"resnet{layers}-{digest}.pth", f"ResNet-{layers}, {IMAGENET} ({since})"),
-            *(TORCHVISION, (f"rtfnet_{layers}", *others), digest),
+            f"resnet{layers}-{digest}.pth",
+            f"ResNet-{layers}, {IMAGENET} ({since})",
+            "download.pytorch.org/models",
+            (f"rtfnet_{layers}", *(("deeplabv2",) if layers == 101 else ())),
+            digest,
         )
-        for layers, digests, others in (
-            (18, ("f37072fd", "5c106cde"), ()),
-            (34, ("b627a593", "333f7ec4"), ()),
-            (50, ("0676ba61", "19c8e357"), ()),
-            (101, ("63fe2227", "5d3b4d8f"), ("deeplabv2",)),
-            (152, ("394f9c45", "b121ed2d"), ()),
-        )
+        for layers, digests in RESNETS.items()
         for digest, since in zip(digests, ("IMAGENET1K_V1", "before 2021"), strict=True)
     ),
     Start(
-        *(
-            "DeepLab_resnet_pretrained_init-f81d91e8.pth",
-            "ResNet-101 of DeepLab v2 (pretraining not stated)",
-        ),
-        *("github.com/wasidennis/AdaptSegNet (vllab.ucmerced.edu)", ("deeplabv2",), "f81d91e8"),
+        "DeepLab_resnet_pretrained_init-f81d91e8.pth",
+        "ResNet-101 of DeepLab v2 (pretraining not stated)",
+        "github.com/wasidennis/AdaptSegNet (vllab.ucmerced.edu)",
+        ("deeplabv2",),
+        "f81d91e8",
     ),
 )
 

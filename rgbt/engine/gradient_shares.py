@@ -119,5 +119,6 @@ def shares_sentence(lines: Iterable[Mapping[str, float]]) -> str:
             kind, _, term = name.partition("/")
             if kind == GRADIENT_SHARE:
                 found.setdefault(term, []).append(value)
-    shown = [f"{term} {100 * sum(each) / len(each):.1f} %" for term, each in found.items()]
+    means = {term: round(100 * sum(each) / len(each), 1) for term, each in found.items()}
+    shown = [f"{term} {mean or 0.0:.1f} %" for term, mean in means.items()]  # no minus before 0
     return f"mean share of the gradient by loss term: {', '.join(shown)}" if shown else ""

@@ -243,7 +243,7 @@ class Trainer:
             for index, batch in enumerate(micro, start=step * self.settings.accumulate)
         ]
         values: dict[str, float] = {}
-        shares = {} if self._measures_shares(step) else None
+        shares: dict[str, float] | None = {} if self._measures_shares(step) else None
         try:
             for phase in parts[0]:
                 # A phase of all batches ends before the next one of any begins: that one may

@@ -329,3 +329,4 @@ def test_sentence_has_the_mean_of_each_term() -> None:
     expected = "mean share of the gradient by loss term: a 50.0 %, b 50.0 %"
     assert shares_sentence(lines) == expected
     assert shares_sentence([{"loss": 1.0}]) == ""
+    assert shares_sentence([{"gradient_share/a": -1e-5}]).endswith(": a 0.0 %")
