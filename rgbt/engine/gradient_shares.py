@@ -6,8 +6,8 @@ of its weighted value by the parameters that the phase steps, and g the sum of a
     share_k = <g_k, g> / |g|^2        the projection on the total: all shares add to 1
     ratio_k = |g_k| / |g|             the size; terms that oppose each other may be above 1
 
-A negative share means that the step of the phase raises the term, to first order. Both are of the
-gradient before clipping. What a parameter keeps from an earlier phase is not part of g.
+To first order, a small step against g raises a term with a negative share. Both are of the gradient
+before clipping. What a parameter keeps from an earlier phase is not part of g.
 """
 
 from __future__ import annotations
