@@ -99,6 +99,7 @@ def main(options: Options, overrides: list[str]) -> int:
     from analysis.statistics.collect import MeasurementSettings, collect
     from analysis.statistics.comparison import Resampling, comparison_grids
     from analysis.statistics.data import SpatialStatistics
+    from analysis.statistics.derive import no_background
     from rgbt.tracking.terminal import info, path_lines, print_rich, rich_table
 
     check_out(options.out)
@@ -116,6 +117,8 @@ def main(options: Options, overrides: list[str]) -> int:
     left_out: list[str] = []
     with progress("measuring", len(dataset.names(split))) as advance:
         stats = collect(dataset, split, settings, advance, left_out.append)
+    if not stats.background:
+        info(no_background(stats))
     for sentence in sorted(left_out):
         info(f"left out: {sentence}")
     resampling = Resampling(level, options.blocks, options.resamples, options.seed)

@@ -29,6 +29,8 @@ class LabelledDataset(Protocol):
         classes: names of the K classes.
         palette: their (red, green, blue) colours, 0..255.
         unscored: classes that are counted but left out of every mean over classes.
+        background: classes that are no object: sample occupancy leaves them out and overlays do not
+            paint them; empty: there is none.
     """
 
     root: Path
@@ -37,6 +39,7 @@ class LabelledDataset(Protocol):
     classes: tuple[str, ...]
     palette: tuple[tuple[int, int, int], ...]
     unscored: tuple[str, ...]
+    background: tuple[str, ...]
 
     @property
     def splits(self) -> Mapping[str, str]:
@@ -103,6 +106,7 @@ class DatasetWrapper:
         self.classes = source.classes
         self.palette = source.palette
         self.unscored = source.unscored
+        self.background = source.background
 
     @property
     def record(self) -> Record:
@@ -153,6 +157,11 @@ def layers(dataset: LabelledDataset) -> Iterator[LabelledDataset]:
     while isinstance(dataset, DatasetWrapper):
         dataset = dataset.source
         yield dataset
+
+
+def background_indices(dataset: LabelledDataset) -> tuple[int, ...]:
+    """The class indices of `LabelledDataset.background`."""
+    return tuple(dataset.classes.index(name) for name in dataset.background)
 
 
 def reader_of(dataset: LabelledDataset) -> LabelledDataset:

@@ -61,7 +61,8 @@ def inspect(options: InspectOptions, overrides: list[str]) -> int:
 
     contents = read(options.file)
     facts = recognise(contents)
-    print_rich(facts_view(contents, facts))
+    more = [] if contents.ours else _starts(options.file, facts)
+    print_rich(facts_view(contents, facts, more))
     found = _network(contents, facts, overrides, parse_trust(options.trust))
     if found is None:
         return 0
@@ -70,6 +71,14 @@ def inspect(options: InspectOptions, overrides: list[str]) -> int:
     print_rich(rich_table(TextTable(f"into {name}", PLAN_HEADER, plan_rows(plan))))
     print_rich(Text("".join(f"remark  {remark}\n" for remark in remarks), end=""))
     return 0 if plan.fits else 1
+
+
+def _starts(file: Path, facts: Facts) -> list[tuple[str, str]]:
+    """What `rgbt.checkpoints.starts` says about a file."""
+    from rgbt.checkpoints.starts import start_lines
+    from rgbt.spec.run_key import file_digest
+
+    return start_lines(facts, file.name, file_digest(file), available("experiment"))
 
 
 def _network(

@@ -115,6 +115,7 @@ def statistics(folder: Path) -> Path:
         fingerprint="0123",
         split="train",
         classes=("background", "car"),
+        background=("background",),
         palette=np.array([[0, 0, 0], [1, 2, 3]], np.uint8),
         partition="ring2",
         region_map=rng.integers(0, 2, (6, 8), dtype=np.uint8),
@@ -482,6 +483,7 @@ def read_flow(path: Path) -> Any:
         num_classes=2,
         classes=("a", "b"),
         palette=((0, 0, 0), (1, 1, 1)),
+        background=(),
     )
     return plain(NextFrames(first).source("a", (10, 12)))
 

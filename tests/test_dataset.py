@@ -47,7 +47,8 @@ def test_other_members_are_those_of_source(
     wrapped = WRAPPERS[kind](source, tmp_path)
     # As worker processes get it.
     for each in (wrapped, pickle.loads(pickle.dumps(wrapped)), copy.deepcopy(wrapped)):
-        for key in ("root", "name", "num_classes", "classes", "palette", "unscored", "splits"):
+        members = ("root", "name", "num_classes", "classes", "palette", "unscored", "background")
+        for key in (*members, "splits"):
             assert getattr(each, key) == getattr(source, key)
         assert each.record == source.record
         assert each.names("train") == NAMES

@@ -25,8 +25,8 @@ class ClassRegions:
     """Shares of classes over the regions.
 
     Attributes:
-        classes: K - 1 names, without the background.
-        shares: (K - 1, R) occupancy in percent of the region where the class is most frequent;
+        classes: J names, without the background.
+        shares: (J, R) occupancy in percent of the region where the class is most frequent;
             NaN for a class that occurs nowhere.
         miou: (R,) percent of `method`, or None.
     """
@@ -77,7 +77,8 @@ def class_regions(
     Raises:
         InputError: counts over other regions, or a part without images in data set or counts.
     """
-    shares = 100 * normalised(class_region_occupancy(statistics, part)[1:])
+    objects = list(statistics.objects)
+    shares = 100 * normalised(class_region_occupancy(statistics, part)[objects])
     label, scores = None, None
     if method is not None:
         label, counts = method
@@ -95,7 +96,7 @@ def class_regions(
                 )
         scores = 100 * miou(counts.by_region(), absent, counts.scored)
     return ClassRegions(
-        classes=tuple(statistics.classes[1:]),
+        classes=tuple(statistics.classes[index] for index in objects),
         partition=statistics.partition,
         shares=shares,
         part=part,

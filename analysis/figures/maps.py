@@ -21,7 +21,7 @@ from analysis.figures import style
 from analysis.figures.inputs import FigureInput
 from analysis.predictions.maps import PixelMaps, iou_map
 from analysis.statistics.data import ALL, SpatialStatistics
-from analysis.statistics.derive import occupancy_map, occupancy_of
+from analysis.statistics.derive import check_background, occupancy_map, occupancy_of
 from rgbt.checks import InputError
 from rgbt.metrics.metric import Regions
 from rgbt.metrics.scores import class_mean
@@ -148,7 +148,8 @@ def occupancy_heat(statistics: SpatialStatistics, regions: Regions, part: str = 
         part: "all", "day" or "night".
 
     Raises:
-        InputError: a partition that has no centre, or a part that the data set does not hold.
+        InputError: a partition that has no centre, a part that the data set does not hold, or a
+            data set without a background class.
     """
     values = occupancy_map(statistics, part)
     region_map = ring_map(regions, values.shape)
@@ -174,11 +175,15 @@ def occupancy_over(
 
     Returns:
         (R,) in 0..1, as `analysis.statistics.derive.region_occupancy` for the measured regions.
+
+    Raises:
+        InputError: the data set has no background class.
     """
+    check_background(statistics)
     occupied = statistics.select(part).occupied.sum(0)
     index = region_map.ravel()
     pixels = [np.bincount(index, of_class.ravel()) for of_class in occupied]
-    return occupancy_of(np.stack(pixels, axis=1))
+    return occupancy_of(np.stack(pixels, axis=1), statistics.is_background)
 
 
 def ring_map(regions: Regions, image_hw: Sequence[int]) -> NDArray[np.uint8]:

@@ -16,6 +16,7 @@ from analysis.statistics.data import ALL, MODALITIES, SpatialStatistics
 from analysis.statistics.derive import (
     AVERAGES,
     class_occupancy_of,
+    entropies,
     entropy_of,
     normalised,
     occupancy_of,
@@ -68,7 +69,8 @@ def claims(
         seed: of the draws.
 
     Returns:
-        in the order of the paper; those about noise once per estimator and average.
+        in the order of the paper; those about noise once per estimator and average. Those about
+        sample occupancy, and about entropy without background, need a background class.
 
     Raises:
         InputError: a number out of range.
@@ -77,31 +79,40 @@ def claims(
     drawn = ConsecutiveBlocks(stats, size=blocks, resamples=resamples, seed=seed)
     judge = Judge(stats, drawn, level)
     labels = drawn.mean(stats.labels)
-    occupancy = 100 * occupancy_of(labels)
+    found = _occupancy(judge, labels) if stats.background else []
+    if judge.has_centre:
+        found += _classes(judge, class_occupancy_of(labels))
+    found += _laplacian(judge)
+    for estimator, average in product(stats.noise, AVERAGES):
+        found += _snr(judge, estimator, average)
+    for word, background in entropies(stats) if judge.has_centre else ():
+        entropy = entropy_of(labels if background else labels[..., ~stats.is_background])
+        difference = judge.centre(entropy) - judge.edge(entropy)
+        statement = " ".join(["label entropy", *word.split(), "is higher in the centre"])
+        finding = judge.finding("centre - edge, bits", difference, ABOVE_0)
+        key = "_".join(word.split()) or "all_classes"
+        found.append(_claim(f"entropy/{key}", "III-C.1", statement, finding))
+    return tuple(found)
+
+
+def _occupancy(judge: Judge, labels: Floats) -> list[Claim]:
+    """Sample occupancy from the centre outwards, and of horizontal strips."""
+    stats = judge.stats
     found: list[Claim] = []
+    occupancy = 100 * occupancy_of(labels, stats.is_background)
     if judge.has_centre:
         difference = judge.centre(occupancy) - judge.edge(occupancy)
         statement = "sample occupancy falls from the inner to the outer regions"
         finding = judge.finding("centre - edge, points", difference, ABOVE_0)
         steps = judge.largest_step("largest step outwards, points", occupancy)
         found.append(_claim("occupancy/falls", "III-B.1", statement, finding, steps))
-        found += _classes(judge, class_occupancy_of(labels))
     if stats.partition.startswith("horizontal") and stats.num_regions > 2:
         ends = (occupancy[:, 0] + occupancy[:, -1]) / 2
         above = occupancy[:, stats.num_regions // 2] - ends
         statement = "of horizontal strips the middle has the highest occupancy"
         finding = judge.finding("middle - mean of the ends, points", above, ABOVE_0)
         found.append(_claim("occupancy/middle", "III-B.1", statement, finding))
-    found += _laplacian(judge)
-    for estimator, average in product(stats.noise, AVERAGES):
-        found += _snr(judge, estimator, average)
-    for word in ("with", "without") if judge.has_centre else ():
-        entropy = entropy_of(labels, background=word == "with")
-        difference = judge.centre(entropy) - judge.edge(entropy)
-        statement = f"label entropy {word} background is higher in the centre"
-        finding = judge.finding("centre - edge, bits", difference, ABOVE_0)
-        found.append(_claim(f"entropy/{word}_background", "III-C.1", statement, finding))
-    return tuple(found)
+    return found
 
 
 def check_resampling(blocks: int, resamples: int, level: float) -> None:
@@ -126,7 +137,7 @@ def _classes(judge: Judge, occupancy: Floats) -> list[Claim]:
     """
     labels, classes = judge.stats.labels, judge.stats.classes
     present = np.asarray(labels.any(1))
-    occurs = [index for index in range(1, len(classes)) if present[:, index].any()]
+    occurs = [index for index in judge.stats.objects if present[:, index].any()]
     by_class: dict[str, Finding] = {}
     for index in occurs:
         centre, edge = judge.centre(occupancy[:, index]), judge.edge(occupancy[:, index])

@@ -85,15 +85,8 @@ def collect(
 
     Raises:
         InputError: no such split; a file that cannot be read (without `skip_unreadable`, or all);
-            an image without label or of another size than the first; a data set whose background
-            is not class 0.
+            an image without label or of another size than the first.
     """
-    if dataset.unscored and dataset.unscored[0] != dataset.classes[0]:
-        raise InputError(
-            f"these statistics assume that class 0 is the background, as in MFNet, but class 0 of "
-            f"{dataset.name} is '{dataset.classes[0]}', the background is "
-            f"{' and '.join(dataset.unscored)}; such a data set is not supported."
-        )
     names = dataset.names(split)
     like = _first_readable(dataset, names, settings)
     region_map = settings.regions.map((like.rgb.shape[0], like.rgb.shape[1]))
@@ -128,6 +121,7 @@ def collect(
         fingerprint=dataset.fingerprint(),
         split=split,
         classes=tuple(dataset.classes),
+        background=tuple(dataset.background),
         palette=np.array(dataset.palette, np.uint8),
         partition=settings.regions.name,
         region_map=region_map,

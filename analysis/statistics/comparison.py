@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from analysis.statistics.claims import claims
 from analysis.statistics.data import ALL, MODALITIES, SpatialStatistics
-from analysis.statistics.derive import entropy_of, occupancy_of
+from analysis.statistics.derive import entropies, entropy_of, occupancy_of
 from analysis.statistics.judging import Finding
 from analysis.statistics.resampling import ConsecutiveBlocks, ValueInterval, snr_samples
 from analysis.statistics.tables import SHORT, digits, range_text
@@ -95,6 +95,12 @@ def comparison_grids(
 def _check_alike(first: SpatialStatistics, second: SpatialStatistics) -> None:
     for what, one, other, advice in (
         ("the classes", first.classes, second.classes, "compare data sets with the same classes"),
+        (
+            "the background classes",
+            first.background or "none",
+            second.background or "none",
+            "state the same dataset.background for both",
+        ),
         ("the regions", first.partition, second.partition, "measure both with the same regions"),
         ("the kernel", first.kernel, second.kernel, "measure both with the same kernel"),
         (
@@ -127,13 +133,17 @@ def _levels(
 
     labels = blocks.mean(stats.labels)
     pixels = labels.sum((1, 2))
-    yield "occupancy, %", of(100 * occupancy_of(labels.sum(1)))
-    for index, name in enumerate(stats.classes[1:], 1):
-        yield f"{name}, % of the pixels", of(100 * labels[:, :, index].sum(1) / pixels)
-    for index, name in enumerate(stats.classes[1:], 1):
+    if stats.background:
+        yield "occupancy, %", of(100 * occupancy_of(labels.sum(1), stats.is_background))
+    for index in stats.objects:
+        share = 100 * labels[:, :, index].sum(1) / pixels
+        yield f"{stats.classes[index]}, % of the pixels", of(share)
+    for index in stats.objects:
         shown = stats.labels[:, :, index].sum(1) > 0
-        yield f"{name}, % of the images", of(100 * blocks.mean(shown.astype(float)))
-    yield "label entropy without background, bits", of(entropy_of(labels, background=False).mean(1))
+        yield f"{stats.classes[index]}, % of the images", of(100 * blocks.mean(shown.astype(float)))
+    word = entropies(stats)[-1][0]
+    entropy = entropy_of(labels[..., ~stats.is_background])
+    yield f"{' '.join(['label entropy', *word.split()])}, bits", of(entropy.mean(1))
     for part in stats.subsets()[1:] or (ALL,):
         measures = {
             "mean, grey levels": blocks.mean(stats.mean, part),

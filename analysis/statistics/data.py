@@ -26,17 +26,17 @@ NOISE = "noise/"
 
 ARRAYS = ("palette", "region_map", "labels", "ignored", "occupied", "laplacian", "mean")
 TEXTS = ("dataset", "fingerprint", "split", "partition", "kernel")
-LISTS = ("classes", "names", "parts")
+LISTS = ("classes", "background", "names", "parts")
 
 ARCHIVE = Archive(
-    "rgbt spatial statistics 1",
+    "rgbt spatial statistics 2",
     "statistics",
     "write it with rgbt spatial dataset=... out=...",
     {
         **{"palette": "iu K 3", "region_map": "iu H W", "labels": "iu N R K"},
         **{"ignored": "iu N R", "occupied": "iu P K H W", "laplacian": "f N 2 R"},
         **{"mean": "f N 2 R", "night": "b M", NOISE: "f N 2 R"},
-        **{"classes": "U K", "names": "U N", "parts": "U P"},
+        **{"classes": "U K", "background": "U B", "names": "U N", "parts": "U P"},
         **dict.fromkeys(TEXTS, "U"),
     },
 )
@@ -47,7 +47,8 @@ class SpatialStatistics:
     """Measurements of every image of a split, by region.
 
     Attributes:
-        classes: names of the K classes; class 0 is the background.
+        classes: names of the K classes.
+        background: those that are no object, see `rgbt.dataset.LabelledDataset`.
         palette: (K, 3) uint8, red, green, blue.
         partition: name of the regions, e.g. "ring9" (`rgbt.metrics.metric.Regions.name`).
         region_map: (H, W) uint8, region index 0..R-1 of every pixel.
@@ -71,6 +72,7 @@ class SpatialStatistics:
     fingerprint: str
     split: str
     classes: tuple[str, ...]
+    background: tuple[str, ...]
     palette: NDArray[np.uint8]
     partition: str
     region_map: NDArray[np.uint8]
@@ -107,6 +109,16 @@ class SpatialStatistics:
     def num_regions(self) -> int:
         """R."""
         return int(self.region_map.max()) + 1
+
+    @property
+    def is_background(self) -> NDArray[np.bool_]:
+        """(K,): which classes are background."""
+        return np.array([name in self.background for name in self.classes], bool)
+
+    @property
+    def objects(self) -> tuple[int, ...]:
+        """Indices of the classes that are not background."""
+        return tuple(np.flatnonzero(~self.is_background).tolist())
 
     def subsets(self) -> tuple[str, ...]:
         """Parts of the images: ("all", "day", "night"), or ("all",) without images of both."""
@@ -156,7 +168,7 @@ class SpatialStatistics:
     def save(self, path: Path) -> None:
         """Write one compressed file under a temporary name, then rename: never half a file."""
         values: dict[str, Any] = {key: getattr(self, key) for key in ARRAYS}
-        values |= {key: np.array(getattr(self, key)) for key in (*TEXTS, *LISTS)}
+        values |= {key: np.array(getattr(self, key), dtype=str) for key in (*TEXTS, *LISTS)}
         values |= {f"{NOISE}{name}": noise for name, noise in self.noise.items()}
         # Missing is stored as no value at all: npz without pickles knows no None.
         values["night"] = np.zeros(0, bool) if self.night is None else self.night

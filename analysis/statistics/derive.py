@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from analysis.statistics.data import ALL, MODALITIES, SpatialStatistics
 from analysis.statistics.measure import ESTIMATORS
-from rgbt.checks import check_choice
+from rgbt.checks import InputError, check_choice
 
 EPSILON = 1e-6
 """Eq. 4's "very small number", in grey levels."""
@@ -29,16 +29,20 @@ Floats = NDArray[np.float64]
 
 
 def occupancy_map(stats: SpatialStatistics, part: str = ALL) -> Floats:
-    """Share of images with a class other than background at every pixel (SpatialSeg, Eq. 1).
+    """Share of images with a class that is no background at every pixel (SpatialSeg, Eq. 1).
 
     An ignored pixel is no background: a pixel's share is among the images that have a valid label
     there. The paper divides by all masks, which is the same where nothing is ignored.
 
     Returns:
         (H, W), 0..1; NaN where no image has a valid label.
+
+    Raises:
+        InputError: the data set has no background (`check_background`).
     """
+    check_background(stats)
     occupied = stats.select(part).occupied.sum(0)
-    return _ratio(occupied[1:].sum(0), occupied.sum(0))
+    return _ratio(occupied[~stats.is_background].sum(0), occupied.sum(0))
 
 
 def region_occupancy(stats: SpatialStatistics, part: str = ALL) -> Floats:
@@ -49,8 +53,12 @@ def region_occupancy(stats: SpatialStatistics, part: str = ALL) -> Floats:
 
     Returns:
         (R,), 0..1; NaN where a region has no valid pixel.
+
+    Raises:
+        InputError: the data set has no background (`check_background`).
     """
-    return occupancy_of(stats.labels[stats.chosen(part)].sum(0))
+    check_background(stats)
+    return occupancy_of(stats.labels[stats.chosen(part)].sum(0), stats.is_background)
 
 
 def class_region_occupancy(stats: SpatialStatistics, part: str = ALL) -> Floats:
@@ -122,17 +130,39 @@ def label_entropy(stats: SpatialStatistics, part: str = ALL, background: bool = 
 
     Source: SpatialSeg, Eq. 5 and Sec. III-C.1, applied to the label inside a region.
 
-    Without the background (class 0) the shares are those among the other classes.
+    Without the background classes the shares are those among the other classes.
 
     Returns:
         (R,), 0..log2 K; NaN where a region has no pixel to count.
     """
-    return entropy_of(stats.labels[stats.chosen(part)].sum(0), background=background)
+    labels = stats.labels[stats.chosen(part)].sum(0)
+    return entropy_of(labels if background else labels[..., ~stats.is_background])
 
 
-def occupancy_of(labels: NDArray[np.number]) -> Floats:
-    """(..., R, K) pixels -> (..., R) share that is not class 0."""
-    return _ratio(labels[..., 1:].sum(-1), labels.sum(-1))
+def entropies(stats: SpatialStatistics) -> tuple[tuple[str, bool], ...]:
+    """The label entropies of a data set: a word for each, and whether the background counts."""
+    if not stats.background:
+        return (("", True),)
+    return (("with background", True), ("without background", False))
+
+
+def no_background(stats: SpatialStatistics) -> str:
+    """Why a data set without a background class has no sample occupancy, in one sentence."""
+    return (
+        f"Sample occupancy is not available: no class of {stats.dataset} is stated as background. "
+        "If one is, set dataset.background=[...] and measure again."
+    )
+
+
+def check_background(stats: SpatialStatistics) -> None:
+    """Refuse statistics of a data set without a background class (InputError)."""
+    if not stats.background:
+        raise InputError(no_background(stats))
+
+
+def occupancy_of(labels: NDArray[np.number], is_background: NDArray[np.bool_]) -> Floats:
+    """(..., R, K) pixels -> (..., R) share that is of no background class, marked in (K,)."""
+    return _ratio(labels[..., ~is_background].sum(-1), labels.sum(-1))
 
 
 def class_occupancy_of(labels: NDArray[np.number]) -> Floats:
@@ -140,10 +170,9 @@ def class_occupancy_of(labels: NDArray[np.number]) -> Floats:
     return np.swapaxes(_ratio(labels, labels.sum(-1, keepdims=True)), -1, -2)
 
 
-def entropy_of(labels: NDArray[np.number], *, background: bool) -> Floats:
+def entropy_of(labels: NDArray[np.number]) -> Floats:
     """(..., R, K) pixels -> (..., R) entropy in bits; NaN without a pixel."""
-    counted = labels if background else labels[..., 1:]
-    share = _ratio(counted, counted.sum(-1, keepdims=True))
+    share = _ratio(labels, labels.sum(-1, keepdims=True))
     # 0 log 0 = 0; a share that does not exist stays NaN.
     logarithm = np.log2(np.where(share == 0, 1.0, share))
     return np.asarray(np.abs((share * logarithm).sum(-1)))

@@ -32,15 +32,21 @@ CSV_COLUMNS = (
 
 
 def occupancy_grids(stats: SpatialStatistics) -> tuple[TextTable, ...]:
-    """Sample occupancy by part, by class, and by class relative to its largest region."""
-    rows = [(part, 100 * derive.region_occupancy(stats, part)) for part in stats.subsets()]
+    """Sample occupancy by part, by class, and by class relative to its largest region.
+
+    The first one is left out for a data set without a background class.
+    """
+    parts = stats.subsets() if stats.background else ()
+    rows = [(part, 100 * derive.region_occupancy(stats, part)) for part in parts]
+    names = [stats.classes[index] for index in stats.objects]
     by_class = derive.class_region_occupancy(stats)
     relative = derive.normalised(by_class)
     titles = ("by class, % of the pixels", "by class, % of its largest region (Fig. 3)")
+    whole = (region_grid("sample occupancy rate, % (Eq. 2)", rows),) if rows else ()
     return (
-        region_grid("sample occupancy rate, % (Eq. 2)", rows),
+        *whole,
         *(
-            region_grid(title, list(zip(stats.classes[1:], 100 * values[1:], strict=True)))
+            region_grid(title, list(zip(names, 100 * values[list(stats.objects)], strict=True)))
             for title, values in zip(titles, (by_class, relative), strict=True)
         ),
     )
@@ -77,11 +83,11 @@ def _modality_grid(
 
 
 def entropy_grid(stats: SpatialStatistics) -> TextTable:
-    """Label entropy with and without background by part."""
+    """Label entropy by part, with and without background where there is one."""
     rows = [
-        (f"{part}, {word} background", derive.label_entropy(stats, part, background))
+        (f"{part}, {word}" if word else part, derive.label_entropy(stats, part, background))
         for part in stats.subsets()
-        for word, background in (("with", True), ("without", False))
+        for word, background in derive.entropies(stats)
     ]
     return region_grid("label entropy, bits (Eq. 5)", rows)
 
@@ -147,7 +153,9 @@ def markdown(
     grids += [noise_grid(stats, name) for name in stats.noise if name != first[0]]
     grids += [snr_grid(stats, *way) for way in others]
     grids += [entropy_grid(stats), claims_grid(claims, level), estimator_grid(claims)]
-    return "\n".join([f"# {heading(stats)}", "", *(grid.to_markdown() for grid in grids)])
+    remark = () if stats.background else (derive.no_background(stats), "")
+    lines = [f"# {heading(stats)}", "", *remark, *(grid.to_markdown() for grid in grids)]
+    return "\n".join(lines)
 
 
 def heading(stats: SpatialStatistics) -> str:
@@ -178,15 +186,16 @@ def _quantities(
     stats: SpatialStatistics, part: str
 ) -> Iterator[tuple[tuple[str, ...], NDArray[np.float64]]]:
     """((quantity, modality, class, estimator, average), values by region)."""
-    yield ("occupancy", "", "", "", ""), derive.region_occupancy(stats, part)
+    if stats.background:
+        yield ("occupancy", "", "", "", ""), derive.region_occupancy(stats, part)
     by_class = derive.class_region_occupancy(stats, part)
     relative = derive.normalised(by_class)
     for index, name in enumerate(stats.classes):
         yield ("class_occupancy", "", name, "", ""), by_class[index]
         yield ("class_occupancy_normalised", "", name, "", ""), relative[index]
-    for word, background in (("with", True), ("without", False)):
+    for word, background in derive.entropies(stats):
         values = derive.label_entropy(stats, part, background)
-        yield (f"entropy_{word}_background", "", "", "", ""), values
+        yield ("_".join(["entropy", *word.split()]), "", "", "", ""), values
     for modality in MODALITIES:
         yield ("laplacian", modality, "", "", ""), derive.region_laplacian(stats, modality, part)
         for estimator in stats.noise:

@@ -12,7 +12,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 def generated_pages() -> dict[str, str]:
     """Text of every generated page, by its path in docs/."""
-    from reference_pages import commands, configuration, experiments, recipes, tables
+    from reference_pages import commands, configuration, experiments, recipes, tables, weights
 
     return {
         **configuration.pages(),
@@ -20,5 +20,6 @@ def generated_pages() -> dict[str, str]:
         "reference/recipes.md": recipes.recipes_page(),
         "reference/commands.md": commands.commands_page(),
         "reference/tables.md": tables.tables_page(),
+        "reference/weights.md": weights.weights_page(),
         "changelog.md": (ROOT / "CHANGELOG.md").read_text(),
     }

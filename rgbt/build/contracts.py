@@ -20,8 +20,8 @@ from rgbt.requirements import record_of
 from rgbt.types import IGNORE, GeneratorOf, Output, Phase, Sample
 
 DATASET = (
-    *("root", "name", "num_classes", "classes", "palette", "unscored", "splits"),
-    *("fingerprint", "decoding"),
+    *("root", "name", "num_classes", "classes", "palette", "unscored", "background"),
+    *("splits", "fingerprint", "decoding"),
 )
 DATASET_CALLS = {
     **{"has": ("split",), "names": ("split",), "read": ("name",), "label": ("name",)},
@@ -48,7 +48,7 @@ def is_own(part: object) -> bool:
 def check_dataset(dataset: Any) -> None:
     """Refuse a data set without the members of `rgbt.dataset.LabelledDataset`."""
     check_members("dataset", dataset, DATASET, DATASET_CALLS)
-    for attribute in ("classes", "palette", "unscored"):
+    for attribute in ("classes", "palette", "unscored", "background"):
         value = getattr(dataset, attribute)
         if not isinstance(value, tuple | list):
             raise InputError(

@@ -1,13 +1,15 @@
 """Recognise files of ImageNet backbones, and map them to the networks.
 
-Swin Transformers (the original files, and the pickles that detectron2 reads), MiT (``mit_b0.pth``
-to ``mit_b5.pth``), ResNets of torchvision, and the DeepLab v2 start of AdaptSegNet and ADVENT.
+Swin Transformers (the original files, those of timm, and the pickles that detectron2 reads), MiT
+(``mit_b0.pth`` to ``mit_b5.pth``), ResNets of torchvision, and the DeepLab v2 start of AdaptSegNet
+and ADVENT.
 """
 
 from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 
 from torch import nn
 
@@ -39,6 +41,9 @@ SWINS: dict[tuple[int, tuple[int, ...]], str] = {
 
 SWIN_TITLES = {"swin_t": "Swin-T", "swin_s": "Swin-S", "swin_b": "Swin-B", "swin_l": "Swin-L"}
 LABELS_22K = (21841, 21842)
+MERGING = "layers.{}.downsample.reduction.weight"
+"""Stage -> a name of the patch merging that is saved with it; no file has it in all four."""
+
 TABLE = "layers.0.blocks.0.attn.relative_position_bias_table"
 BRANCHES = ("backbone.RGB_branch.", "backbone.THR_branch.")
 
@@ -53,15 +58,20 @@ def swin_size(shapes: Shapes, prefix: str) -> str:
 
 
 def _recognise_swin(contents: Contents) -> Facts | None:
-    """A file with Swin's names at the top."""
+    """A file with Swin's names at the top.
+
+    timm 0.9 and later (timm/models/swin_transformer.py, `checkpoint_filter_fn`) saves the merging
+    between two stages with the second of them; the original files have it with the first.
+    """
     shapes = shapes_of(contents.tensors)
     if not has_parts(shapes, "patch_embed.proj.", "layers.0.blocks.0.attn.qkv."):
         return None
     size = swin_size(shapes, "")
-    labels = size_at(shapes, "head.weight")
+    is_timm = MERGING.format(3) in shapes and MERGING.format(0) not in shapes
+    labels = size_at(shapes, "head.fc.weight" if is_timm else "head.weight")
     return Facts(
-        layout="swin",
-        what="ImageNet Swin Transformer",
+        layout="swin_timm" if is_timm else "swin",
+        what=f"ImageNet Swin Transformer{' of timm' if is_timm else ''}",
         size=SWIN_TITLES.get(size, ""),
         fits=((f"model=mask2former_{size}",),) if size and size != "swin_l" else (),
         window=_window(size_at(shapes, TABLE)),
@@ -109,6 +119,19 @@ def _swin_rule(family: str, model: nn.Module, facts: Facts) -> Rule | None:
         ),
         stems=("backbone.THR_branch.patch_embed.proj.weight",),
     )
+
+
+def _timm_swin_rule(family: str, model: nn.Module, facts: Facts) -> Rule | None:
+    """As `_swin_rule`; the merging behind stage s is called that of stage s + 1."""
+    rule = _swin_rule(family, model, facts)
+    if rule is None:
+        return None
+
+    def source(entry: str) -> str:
+        later = re.fullmatch(r"layers\.(\d)\.(downsample\..*)", name := rule.source(entry))
+        return f"layers.{int(later[1]) + 1}.{later[2]}" if later else name
+
+    return replace(rule, source=source)
 
 
 MITS: dict[tuple[int, tuple[int, ...]], str] = {
@@ -262,6 +285,7 @@ def _pspnet(model: nn.Module) -> Rule:
 BACKBONES = {
     "mit": Layout(_recognise_mit, _mit_rule),
     "swin": Layout(_recognise_swin, _swin_rule),
+    "swin_timm": Layout(_recognise_swin, _timm_swin_rule),
     "resnet": Layout(_recognise_resnet, _resnet_rule),
 }
 """By name; tried after the whole networks."""

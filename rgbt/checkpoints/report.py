@@ -137,8 +137,10 @@ def count_parameters(tensors: Mapping[str, Tensor]) -> int:
     return sum(trained.values())
 
 
-def facts_view(contents: Contents, facts: Facts) -> RenderableType:
-    """The description of the file, as lines."""
+def facts_view(
+    contents: Contents, facts: Facts, more: Iterable[tuple[str, str]] = ()
+) -> RenderableType:
+    """The description of the file, as lines; `more` follows what it fits."""
     tensors = contents.tensors.values()
     kinds = sorted({str(tensor.dtype).removeprefix("torch.") for tensor in tensors})
     size = contents.path.stat().st_size / MILLION
@@ -154,6 +156,7 @@ def facts_view(contents: Contents, facts: Facts) -> RenderableType:
         ("tensors", f"{len(tensors)} ({', '.join(kinds)})"),
         ("parameters", f"{parameters:,} ({parameters / MILLION:.2f} M)"),
         *(("fits", " ".join(overrides)) for overrides in facts.fits or (("no published size",),)),
+        *more,
         *((("windows", f"{facts.window} x {facts.window} tokens"),) if facts.window else ()),
         *(("remark", remark) for remark in facts.remarks),
         *((f"note {printable(key, 20)}", printable(contents.note[key], 600)) for key in notes),

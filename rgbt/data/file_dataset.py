@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rgbt.checks import InputError, nearest
+from rgbt.checks import InputError, check_choice, nearest
 from rgbt.data.folder.frames import FolderFrame, Patterns
 from rgbt.data.folder.splits import SplitRule
 from rgbt.data.images import PairReader, Range
@@ -70,6 +70,9 @@ class FileDataset:
     unscored: tuple[str, ...] = ()
     """Every class counts in the means, as in the published tables."""
 
+    background: tuple[str, ...] = ()
+    """No class is the background."""
+
     def __init__(
         self,
         root: Path,
@@ -100,6 +103,12 @@ class FileDataset:
     def splits(self) -> dict[str, str]:
         """Split -> its list, or the pattern of its files."""
         return self.rule.splits
+
+    def check_classes(self, **settings: tuple[str, ...]) -> None:
+        """Refuse settings that name what is not one of its classes (InputError)."""
+        for key, chosen in settings.items():
+            for word in chosen:
+                check_choice(f"dataset.{key}", word, self.classes)
 
     def has(self, split: str) -> bool:
         """Whether any sample of `split` exists; InputError if the split is unknown."""

@@ -17,7 +17,7 @@ import numpy as np
 from annotated_types import Interval
 from numpy.typing import NDArray
 
-from rgbt.checks import InputError, check_choice, nearest
+from rgbt.checks import InputError, nearest
 from rgbt.data.file_dataset import FileDataset, SplitNames
 from rgbt.data.folder.frames import FolderFrame
 from rgbt.data.freiburg_layout import TEST, TRAIN, find_frames, inside
@@ -92,6 +92,7 @@ class Freiburg(FileDataset):
         root: folder that holds `train`, `test` or both.
         name: see `FileDataset`, as `num_classes`, `classes` and `palette`.
         unscored: classes that are counted but left out of every mean over classes.
+        background: classes that are no object, see `rgbt.dataset.LabelledDataset`.
         crop: first row, row after the last, first column, column after the last of the part of
             every frame and label that is used; None: whole frames.
         thermal_range: (low, high) counts that become black and white: [21800, 23700] in the thesis,
@@ -117,6 +118,7 @@ class Freiburg(FileDataset):
         classes: Names = CLASSES,
         palette: tuple[Colour, ...] = PALETTE,
         unscored: Names = ("background", "ignore"),
+        background: Names = ("background", "ignore"),
         crop: Crop | None = CROP,
         thermal_range: CountRange = THERMAL_RANGE,
         ignored_test: Names = ("ignore",),
@@ -124,7 +126,9 @@ class Freiburg(FileDataset):
     ) -> None:
         folder = existing_root(root, "that holds train and test")
         super().__init__(folder, name, num_classes, classes, palette)
+        self.check_classes(unscored=unscored, background=background, ignored_test=ignored_test)
         self.unscored = unscored
+        self.background = background
         self.crop = crop
         self.ignored_test = ignored_test
         self.val_sequences = val_sequences
@@ -134,9 +138,6 @@ class Freiburg(FileDataset):
                 f"dataset.root: '{root}' holds neither the folder train nor the folder test; give "
                 "the folder into which both archives were unpacked."
             )
-        for key, chosen in (("unscored", unscored), ("ignored_test", ignored_test)):
-            for word in chosen:
-                check_choice(f"dataset.{key}", word, classes)
         if crop is not None and not (0 <= crop[0] < crop[1] and 0 <= crop[2] < crop[3]):
             raise InputError(
                 "dataset.crop: expected [first row, row after the last, first column, column after "

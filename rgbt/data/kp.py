@@ -82,6 +82,7 @@ class KP(FileDataset):
     Args:
         root: folder that holds `images` and `labels`.
         name: see `FileDataset`, as `num_classes`, `classes` and `palette`.
+        background: classes that are no object, see `rgbt.dataset.LabelledDataset`.
         splits: split -> list file in `root`.
         lists: "files" reads the lists of `splits`; "sets" divides all labels on disk by set number,
             as CRM does; "auto" is "files" if one of the lists exists.
@@ -110,11 +111,14 @@ class KP(FileDataset):
         num_classes: NumClasses = len(CLASSES),
         classes: Names = CLASSES,
         palette: tuple[Colour, ...] = PALETTE,
+        background: Names = (),
         splits: dict[Text, Text] = SPLITS,
         lists: ListSource = "auto",
     ) -> None:
         folder = existing_root(root, "that holds images and labels of KP")
         super().__init__(folder, name, num_classes, classes, palette)
+        self.check_classes(background=background)
+        self.background = background
         self.codes = indices(num_classes, num_classes)  # the value after the last class is void
         if not _holds_kp(folder):
             near = root_nearby(folder, _holds_kp) or "the folder that does"

@@ -60,6 +60,7 @@ class MFNet(FileDataset):
     Args:
         root: folder that holds the split lists.
         name: see `FileDataset`, as `num_classes`, `classes` and `palette`.
+        background: classes that are no object, see `rgbt.dataset.LabelledDataset`.
         splits: split -> list file in `root`; two splits may share one list.
         layout: "packed", "folders", or "auto": the one with existing folders (packed first).
 
@@ -84,11 +85,14 @@ class MFNet(FileDataset):
         num_classes: NumClasses = len(CLASSES),
         classes: Names = CLASSES,
         palette: tuple[Colour, ...] = PALETTE,
+        background: Names = ("unlabeled",),
         splits: dict[Text, Text] = SPLITS,
         layout: Literal["auto"] | Layout = "auto",
     ) -> None:
         folder = existing_root(root, f"that holds {EITHER_LAYOUT} and the split lists")
         super().__init__(folder, name, num_classes, classes, palette)
+        self.check_classes(background=background)
+        self.background = background
         for known, folders in FOLDERS.items():
             if layout in ("auto", known) and all((folder / each).is_dir() for each in folders):
                 self.layout = known

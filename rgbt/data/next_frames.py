@@ -53,6 +53,7 @@ class NextFrames:
             name=f"{first.name}/{FOLDER}",
             num_classes=first.num_classes,
             classes=first.classes,
+            background=first.background,
             palette=first.palette,
             splits=dict(first.splits),
             layout=first.layout,

@@ -53,6 +53,7 @@ class PST900(FileDataset):
     Args:
         root: folder that holds `train` and `test`, or `rgb`, `thermal`, `labels` and the lists.
         name: see `FileDataset`, as `num_classes`, `classes` and `palette`.
+        background: classes that are no object, see `rgbt.dataset.LabelledDataset`.
         val_bags: recordings of the training part that form "val" instead of "train"; (): "val" as
             described above.
 
@@ -81,10 +82,13 @@ class PST900(FileDataset):
         num_classes: NumClasses = len(CLASSES),
         classes: Names = CLASSES,
         palette: tuple[Colour, ...] = PALETTE,
+        background: Names = ("background",),
         val_bags: Bags = (),
     ) -> None:
         folder = existing_root(root, "that holds train and test of PST900")
         super().__init__(folder, name, num_classes, classes, palette)
+        self.check_classes(background=background)
+        self.background = background
         self.codes = indices(num_classes)
         self.val_bags = val_bags
         if val_bags:

@@ -20,16 +20,24 @@ BUCKET_BYTES = 64 * 2**20
 """Gradients are sent in pieces of about this size, so that there is no second copy of all."""
 
 
-@torch.no_grad()
 def average_gradients(parameters: Sequence[nn.Parameter]) -> None:
     """Replace each gradient by its mean over the processes; nothing with one process.
 
     Args:
         parameters: in the same order in all processes, which have gradients for the same ones.
     """
+    average_tensors([each.grad for each in parameters if each.grad is not None])
+
+
+@torch.no_grad()
+def average_tensors(gradients: Sequence[Tensor]) -> None:
+    """Replace each tensor by its mean over the processes; nothing with one process.
+
+    Args:
+        gradients: of the same sizes in the same order in all processes.
+    """
     if num_processes() == 1:
         return
-    gradients = [each.grad for each in parameters if each.grad is not None]
     for bucket in _buckets(gradients):
         flat = torch.cat([gradient.reshape(-1) for gradient in bucket])
         distributed.all_reduce(flat)

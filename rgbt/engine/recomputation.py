@@ -7,8 +7,7 @@ that are recomputed (`rgbt.requirements.Record.recomputed`), so no generator has
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import torch
@@ -77,24 +76,28 @@ class Recomputed:
 
     def _contexts(self) -> tuple[AbstractContextManager[None], AbstractContextManager[None]]:
         """Of the forward pass, and of the recomputation."""
-        return nullcontext(), kept_statistics(self.module)
+        return nullcontext(), KeptStatistics(self.module)
 
 
-@contextmanager
-def kept_statistics(module: nn.Module) -> Iterator[None]:
+class KeptStatistics(AbstractContextManager[None]):
     """Within it, buffers are copies, so that running statistics are updated in the forward alone.
 
     Batch normalisation returns the same, because training normalises by the statistics of the
-    batch.
+    batch. It is entered again in each backward pass through the same graph.
     """
-    kept = [(each, dict(each.named_buffers(recurse=False))) for each in module.modules()]
-    for each, buffers in kept:
-        for name, buffer in buffers.items():
-            setattr(each, name, buffer.clone())
-    try:
-        yield
-    finally:
-        for each, buffers in kept:
+
+    def __init__(self, module: nn.Module) -> None:
+        self.module = module
+
+    def __enter__(self) -> None:
+        modules = self.module.modules()
+        self.kept = [(each, dict(each.named_buffers(recurse=False))) for each in modules]
+        for each, buffers in self.kept:
+            for name, buffer in buffers.items():
+                setattr(each, name, buffer.clone())
+
+    def __exit__(self, *_: object) -> None:
+        for each, buffers in self.kept:
             for name, buffer in buffers.items():
                 setattr(each, name, buffer)
 

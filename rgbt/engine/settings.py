@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 from annotated_types import Interval
 
+from rgbt.checks import InputError
 from rgbt.ranges import (
     BaseWidth,
     BatchSize,
@@ -41,6 +42,9 @@ class TrainerSettings:
             evaluated.
         checkpoint_every: steps between checkpoints; every evaluation writes one too.
         log_every: steps between lines in metrics.jsonl.
+        log_gradient_shares: whether lines of metrics.jsonl hold the share of each loss term in the
+            gradient (`rgbt.engine.gradient_shares`): one more backward pass for each term in the
+            last two steps before a line, the same losses and weights.
         accumulate: batches whose gradients are averaged into one optimiser step.
         clip_norm: largest L2 norm of all gradients together; null disables clipping.
         precision: "32-true" or "bf16-mixed".
@@ -92,6 +96,14 @@ class TrainerSettings:
     activation_checkpointing: bool = False
     memory_format: Literal["contiguous", "channels_last"] = "contiguous"
     compile: Compile = "none"
+    log_gradient_shares: bool = False
+
+    def __post_init__(self) -> None:
+        if self.log_gradient_shares and self.compile != "none":
+            raise InputError(
+                f"trainer.log_gradient_shares=true requires trainer.compile=none, got "
+                f"{self.compile}: a compiled backward pass runs once, but each loss term needs one."
+            )
 
 
 @dataclass(frozen=True, kw_only=True)

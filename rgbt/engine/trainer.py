@@ -19,6 +19,7 @@ from rgbt.checks import InputError, RunError, not_finite
 from rgbt.engine.averaging import AveragedWeights
 from rgbt.engine.checkpoint import State, restore_optimizer, restore_weights, training_payload
 from rgbt.engine.committed import Checkpoints
+from rgbt.engine.gradient_shares import TermGradients
 from rgbt.engine.gradients import average_gradients, check_gradients
 from rgbt.engine.progress import progress
 from rgbt.engine.schedules import Schedule
@@ -242,11 +243,12 @@ class Trainer:
             for index, batch in enumerate(micro, start=step * self.settings.accumulate)
         ]
         values: dict[str, float] = {}
+        shares: dict[str, float] | None = {} if self._measures_shares(step) else None
         try:
             for phase in parts[0]:
                 # A phase of all batches ends before the next one of any begins: that one may
                 # read, or clear, what this one stepped.
-                _add(values, self._run_phase(phase, parts[1:]))
+                _add(values, self._run_phase(phase, parts[1:], shares))
         except RunError as error:
             raise RunError(f"step {step + 1}: {error} {ADVICE}") from error
         elapsed = time.perf_counter() - started
@@ -255,24 +257,43 @@ class Trainer:
             peak = torch.cuda.max_memory_allocated(device) / 2**20
         return {
             **values,
+            **(shares or {}),
             **rates,
             "images_per_s": num_processes() * sum(len(batch.name) for batch in micro) / elapsed,
             WAIT_SHARE: waited / elapsed,
             "peak_memory_mib": peak,
         }
 
-    def _run_phase(self, phase: Phase, others: list[Iterator[Phase]]) -> dict[str, float]:
-        """Backward through a phase of every accumulated batch, then its optimisers' steps."""
+    def _measures_shares(self, step: int) -> bool:
+        """Whether this step is one of the last two before a line of the log.
+
+        A scheme may alternate between two phases, and the line has the last values of each.
+        """
+        settings = self.settings
+        near = (step + 1, step + 2)
+        due = any(each % settings.log_every == 0 or each == settings.max_steps for each in near)
+        return settings.log_gradient_shares and due
+
+    def _run_phase(
+        self, phase: Phase, others: list[Iterator[Phase]], shares: dict[str, float] | None
+    ) -> dict[str, float]:
+        """Backward through a phase of every accumulated batch, then its optimisers' steps.
+
+        Where `shares` are measured, those of the phase are added to it.
+        """
         if phase.clear:
             for optimizer in self.optimizers.values():
                 optimizer.zero_grad()
-        losses = [self._backward(phase)]
-        losses += [self._backward(next(phases)) for phases in others]
         stepped = [self.optimizers[name] for name in phase.optimizers]
         groups = [group["params"] for optimizer in stepped for group in optimizer.param_groups]
         # Once for all of them: what two optimisers share is clipped as one gradient.
         parameters = list({id(each): each for group in groups for each in group}.values())
         names = "+".join(phase.optimizers)
+        terms = None if shares is None else TermGradients(parameters, self.fabric.backward)
+        losses = [self._backward(phase, terms)]
+        losses += [self._backward(next(phases), terms) for phases in others]
+        if shares is not None and terms is not None:
+            shares |= terms.shares("" if len(self.optimizers) == 1 else names)
         if phase.optimizers not in self._checked_phases:  # the first time, by all processes
             check_gradients(parameters, names)
             self._checked_phases.add(phase.optimizers)
@@ -290,10 +311,14 @@ class Trainer:
             optimizer.step()
         return logged
 
-    def _backward(self, phase: Phase) -> tuple[tuple[str, ...], Tensor]:
+    def _backward(
+        self, phase: Phase, terms: TermGradients | None
+    ) -> tuple[tuple[str, ...], Tensor]:
         """Backward through a phase; names and values of its parts, not read from the device yet."""
-        parts = list(phase.parts.values())
-        self.fabric.backward(torch.stack(parts).sum() * (1.0 / self.settings.accumulate))
+        parts, factor = list(phase.parts.values()), 1.0 / self.settings.accumulate
+        if terms is not None:  # before the pass that frees the graph
+            terms.add(phase.parts, factor)
+        self.fabric.backward(torch.stack(parts).sum() * factor)
         values = torch.stack([part.detach().float() for part in parts])
         # Checked after the mean, so that all processes raise the same error.
         return tuple(phase.parts), mean_count(values)

@@ -16,6 +16,7 @@ from rgbt.data.to_predict import ToPredict, of_files, of_path, of_split
 from rgbt.engine.progress import progress
 from rgbt.evaluation.prediction import Predictor
 from rgbt.evaluation.request import EvaluationRequest
+from rgbt.evaluation.segmentation import legend_of
 from rgbt.files.atomic import write_atomic
 from rgbt.tracking.pictures import overlay
 from rgbt.tracking.terminal import info
@@ -61,7 +62,7 @@ def write_images(
     """
     images.check_out(out)
     out.mkdir(parents=True, exist_ok=True)
-    palette = np.array(session.dataset.palette, np.uint8)
+    legend = legend_of(session.dataset)
     predictor = Predictor(session, session.model, request)
     written = 0
     with progress() as display:
@@ -69,7 +70,7 @@ def write_images(
         for sample in images.samples(session.loading.on_error):
             classes = predictor.classes(batch_of(session, sample))[0].cpu().numpy()
             classes = classes if label_map is None else label_map(classes)
-            painted = overlay(sample.rgb, classes, palette)
+            painted = overlay(sample.rgb, classes, legend)
             write_png(out / f"{sample.name}_overlay.png", painted[..., ::-1])
             write_png(out / f"{sample.name}.png", classes)
             written += 1

@@ -203,7 +203,7 @@ def _network(spec: RunSpec) -> str:
     """SHA-256 over the settings of a prediction, without the weights and without paths."""
     plain = spec.plain
     model = {key: value for key, value in plain["model"].items() if key not in ("weights", "fresh")}
-    unimportant = ("root", "cache_dir", "palette", "layout")
+    unimportant = ("root", "cache_dir", "palette", "background", "layout")
     read = {key: value for key, value in plain["dataset"].items() if key not in unimportant}
     decisive = [model, read, plain["domains"], plain["transform"], plain["trainer"]["precision"]]
     text = json.dumps(decisive, sort_keys=True)

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from rgbt.build.load_run import TrainedNetwork
 from rgbt.build.session import Session
 from rgbt.data.loaders import eval_batches
-from rgbt.dataset import LabelledDataset
+from rgbt.dataset import LabelledDataset, background_indices
 from rgbt.engine.progress import progress
 from rgbt.evaluation.details import DetailCounter, DetailedImages, details_counts
 from rgbt.evaluation.prediction import Predictor, counts_of, decode_ahead
@@ -207,7 +207,8 @@ def label_of(opened: TrainedNetwork, request: EvaluationRequest, view: View) -> 
 
 def legend_of(dataset: LabelledDataset) -> Legend:
     """Classes of a data set and their colours."""
-    return Legend(dataset.classes, np.array(dataset.palette, np.uint8))
+    palette = np.array(dataset.palette, np.uint8)
+    return Legend(dataset.classes, palette, background_indices(dataset))
 
 
 def panel_names(dataset: LabelledDataset, split: str) -> tuple[str, ...]:

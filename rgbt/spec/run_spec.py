@@ -125,7 +125,9 @@ class RunSpec:
     scale: Scale = _node(in_key=False)
     recipe: Recipe = _node(in_key=False)
     dataset: Component = _node(
-        outside_key=("root", "cache_dir", "palette", "layout", "absent"), shared=True
+        outside_key=("root", "cache_dir", "palette", "background", "layout", "absent"),
+        added={"vignette": 0.18, "whole_shadows": False},
+        shared=True,
     )
     domains: Domains = _node(
         added_as={
@@ -159,14 +161,14 @@ class RunSpec:
     trainer: TrainerSettings = _node(
         outside_key=(
             *("accelerator", "log_every", "checkpoint_every", "devices", "strategy"),
-            *("activation_checkpointing", "memory_format", "compile"),
+            *("activation_checkpointing", "memory_format", "compile", "log_gradient_shares"),
         ),
         added={"tested": "best", "threads": 2, "batch_norm_parts": 1, "averaging": "none"},
         used_with={"ema_decay": ("averaging", "ema"), "averaged_share": ("averaging", "last")},
         shared=(
             *("max_steps", "eval_every", "checkpoint_every", "log_every"),
             *("precision", "accelerator", "threads", "devices", "strategy", "batch_norm_parts"),
-            *("activation_checkpointing", "memory_format", "compile"),
+            *("activation_checkpointing", "memory_format", "compile", "log_gradient_shares"),
         ),
     )
     metric: Component = _node(shared=True)

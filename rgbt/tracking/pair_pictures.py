@@ -67,9 +67,9 @@ def draw_pairs(examples: Sequence[PairExample], legend: Legend, path: Path) -> N
             example.name,
             (
                 example.first_rgb,
-                overlay(example.first_rgb, example.first, legend.palette),
+                overlay(example.first_rgb, example.first, legend),
                 example.second_rgb,
-                overlay(example.second_rgb, example.second, legend.palette),
+                overlay(example.second_rgb, example.second, legend),
                 colours(np.where(example.seen, example.followed, IGNORE), legend.palette),
                 example.difference(),
             ),

@@ -57,10 +57,12 @@ class Legend:
     Attributes:
         names: K names.
         palette: (K, 3) uint8, RGB.
+        background: indices of the classes that overlays do not paint.
     """
 
     names: tuple[str, ...]
     palette: Image
+    background: tuple[int, ...]
 
 
 def colours(label: Image, palette: Image) -> Image:
@@ -77,15 +79,15 @@ def colours(label: Image, palette: Image) -> Image:
     return np.asarray(table[label])
 
 
-def overlay(rgb: Image, label: Image, palette: Image, alpha: float = 0.6) -> Image:
-    """The image with classes painted over it; class 0 (background) and 255 stay unpainted.
+def overlay(rgb: Image, label: Image, legend: Legend, alpha: float = 0.6) -> Image:
+    """The image with classes painted over it; background classes and 255 stay unpainted.
 
         out = round((1 - alpha) * rgb + alpha * palette[label])
 
     Args:
         rgb: (H, W, 3) uint8, as is what is returned.
         label: (H, W) uint8, class index or 255.
-        palette: (K, 3) uint8.
+        legend: colours and background classes.
         alpha: opacity of the paint in [0, 1].
 
     Raises:
@@ -93,9 +95,9 @@ def overlay(rgb: Image, label: Image, palette: Image, alpha: float = 0.6) -> Ima
     """
     if rgb.shape[:2] != label.shape:
         raise ValueError(f"overlay: expected one size, got image {rgb.shape}, label {label.shape}.")
-    mixed = (1.0 - alpha) * rgb + alpha * colours(label, palette)
-    painted = ((label != 0) & (label != IGNORE))[..., None]
-    return np.where(painted, np.rint(mixed), rgb).astype(np.uint8)
+    mixed = (1.0 - alpha) * rgb + alpha * colours(label, legend.palette)
+    unpainted = np.isin(label, (*legend.background, IGNORE))[..., None]
+    return np.where(unpainted, rgb, np.rint(mixed)).astype(np.uint8)
 
 
 def draw_panel(examples: Sequence[PanelExample], legend: Legend, path: Path) -> None:

@@ -16,6 +16,7 @@ from rgbt.build.training_setup import TrainingSetup, set_up_training
 from rgbt.checks import InputError
 from rgbt.engine.checkpoint import State
 from rgbt.engine.committed import Checkpoints
+from rgbt.engine.gradient_shares import shares_sentence
 from rgbt.engine.trainer import WAIT_SHARE, Trainer
 from rgbt.evaluation.prediction import decode_ahead
 from rgbt.evaluation.request import EvaluationRequest
@@ -183,6 +184,9 @@ class Run:
         self._truncate(state)
         fit(trainer, self.setup, state)
         self._report_waiting(session)
+        lines = (line.values for line in self.folder.lines() if line.kind == "train")
+        if sentence := shares_sentence(lines):
+            info(f"{sentence}.")
         return state
 
     def _truncate(self, state: State) -> None:

@@ -13,6 +13,7 @@ from analysis.statistics.claims import claims
 from analysis.statistics.data import SpatialStatistics
 from analysis.statistics.judging import OPEN
 from tests.commands import Call
+from tests.data.kp_files import write_kp
 
 ROOT = Path(__file__).resolve().parents[2]
 SHARED = Path(os.environ.get("RGBT_SHARED", ROOT.parent / "shared"))
@@ -55,6 +56,25 @@ def test_command_prints_tables_and_writes_files(call: Call, data: Path, tmp_path
     occupancy = found["all", "occupancy", "", "", ""]
     assert float(occupancy["value"]) == pytest.approx(derive.region_occupancy(stats)[3], rel=1e-6)
     assert "**signal to noise (Eq. 4; std, images)**" in (out / "statistics.md").read_text()
+
+
+def test_data_set_without_background_has_no_occupancy(call: Call, tmp_path: Path) -> None:
+    """Class 0 of KP is road."""
+    out = tmp_path / "statistics"
+    root = write_kp(tmp_path / "data")
+    code, printed, said = call(
+        *(entry, "dataset=kp", f"dataset.root={root}", "split=test", "regions=2"),
+        *("resamples=100", f"out={out}"),
+    )
+    assert code == 0, said
+    assert said.count("Sample occupancy is not available: no class of kp is stated") == 1
+    assert "sample occupancy rate" not in printed
+    assert "background" not in printed
+    assert "Sample occupancy is not available" in (out / "statistics.md").read_text()
+    quantities = [line.split(",")[5] for line in (out / "regions.csv").read_text().splitlines()]
+    assert "occupancy" not in quantities
+    assert "entropy" in quantities
+    assert "\n| road |" in (out / "statistics.md").read_text()
 
 
 def test_the_chosen_estimator_is_shown(call: Call, data: Path, tmp_path: Path) -> None:

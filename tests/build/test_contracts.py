@@ -33,7 +33,7 @@ class Own:
 
     root, name, num_classes = "x", "mine", 2
     classes, palette = ("road", "car"), ((0, 0, 0), (1, 1, 1))
-    unscored, splits = (), {"train": "x"}
+    unscored, background, splits = (), (), {"train": "x"}
     sample: Any = SAMPLE
 
     def has(self, split): ...

@@ -39,6 +39,7 @@ class Recorded:
         self.classes = tuple(f"class{index}" for index in range(9))
         self.palette = ((0, 0, 0),) * 9
         self.unscored: tuple[str, ...] = ()
+        self.background: tuple[str, ...] = ()
         self.listed = names
         self.by_night = by_night
         self.sizes = sizes or {}

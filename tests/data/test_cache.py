@@ -35,7 +35,7 @@ SIZES = {"a": (4, 6), "b": (5, 7), "c": (4, 6), "d": (3, 3)}
 class Arrays:
     """Samples as .npy: R, G, B, thermal and, except for "d", label. Records what it decodes."""
 
-    name, num_classes, classes, unscored = "arrays", 2, ("x", "y"), ()
+    name, num_classes, classes, unscored, background = "arrays", 2, ("x", "y"), (), ()
     palette = ((0, 0, 0), (1, 1, 1))
     splits = {"train": "all"}
 

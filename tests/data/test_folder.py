@@ -309,6 +309,7 @@ def test_day_and_night(sound: Path) -> None:
         ({"num_classes": 4}, "num_classes is 4 but dataset.classes has 3"),
         ({"palette": ((0, 0, 0),)}, "num_classes is 3 but dataset.palette has 1"),
         ({"unscored": ("cars",)}, "dataset.unscored: 'cars' is not a valid choice"),
+        ({"background": ("ground",)}, "dataset.background: 'ground' is not a valid choice"),
         ({"classes": ("car", "person", "car")}, "dataset.classes: 'car' occurs twice"),
         ({"thermal_range": (5, 5)}, r"dataset.thermal_range: .* low < high, .* got \[5, 5\]"),
         ({"thermal_range": (5, float("nan"))}, r"dataset.thermal_range: .* got \[5, nan\]"),
@@ -318,6 +319,11 @@ def test_day_and_night(sound: Path) -> None:
 def test_settings_that_cannot_be(sound: Path, keys: dict[str, Any], said: str) -> None:
     with pytest.raises(InputError, match=said):
         folder(sound, **keys)
+
+
+def test_background_is_stated_and_never_guessed(sound: Path) -> None:
+    assert folder(sound).background == ()
+    assert folder(sound, background=("person",)).background == ("person",)
 
 
 def test_fingerprint_and_decoding(tmp_path: Path) -> None:

@@ -73,6 +73,23 @@ EMBEDDED = {
 }
 
 
+BACKGROUND = {
+    "synth": ("unlabeled",),
+    "synth_kp": (),
+    "synth_pst900": ("background",),
+    "synth_freiburg": ("background", "ignore"),
+}
+
+
+@pytest.mark.parametrize("name", BACKGROUND)
+def test_background_is_that_of_the_real_data_set(folder: Path, name: str) -> None:
+    """Class 0 of KP and of Freiburg is road. The YAML of the real data set states the same."""
+    assert EMBEDDED[name].made(folder).background == BACKGROUND[name]
+    real = name.removeprefix("synth").removeprefix("_") or "mfnet"
+    stated = OmegaConf.load(f"conf/dataset/{real}.yaml").background
+    assert tuple(stated) == BACKGROUND[name]
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The cache of all data sets, to be read alone."""

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from rgbt.checks import InputError
-from rgbt.spec.run_spec import RunSpec
+from rgbt.spec.run_spec import NOT_IN_KEY, RunSpec
 from rgbt.spec.specify import specify
 from tests.composed import composed
 
@@ -288,3 +288,27 @@ def test_seeds_are_those_of_upstream_runs_too() -> None:
 def test_drawn_with_another_seed_keeps_the_seeds_of_sources() -> None:
     drawn = spec_of("grbm", "seeds.order=7").with_seed(2).drawn
     assert (drawn.weights, drawn.order, drawn.masks) == (2, 7, 2)
+
+
+def test_background_of_a_data_set_is_not_in_the_key() -> None:
+    words = ("grbm", "scale=paper", "dataset=kp", "dataset.root=/data")
+    assert spec_of(*words).dataset.values["background"] == ()
+    assert key_of(*words, "dataset.background=[road]") == key_of(*words)
+    assert "dataset.background" in NOT_IN_KEY
+
+
+def test_measured_gradient_shares_keep_the_key() -> None:
+    """Those of upstream runs too, which take the setting over."""
+    measured = spec_of("sh_max_squares", "trainer.log_gradient_shares=true")
+    assert measured.key == key_of("sh_max_squares")
+    assert measured.upstream[0].trainer.log_gradient_shares
+
+
+def test_factors_newer_than_the_first_runs_are_in_the_key_where_they_are_set() -> None:
+    plain = key_of("grbm", "dataset=synth_calibrated")
+    assert key_of("grbm", "dataset=synth_calibrated", "dataset.vignette=0.18") == plain
+    changed = [
+        key_of("grbm", "dataset=synth_calibrated", word)
+        for word in ("dataset.vignette=0", "dataset.whole_shadows=true")
+    ]
+    assert len({plain, *changed}) == 3

@@ -26,6 +26,7 @@ from rgbt.tracking.pictures import (
 )
 
 PALETTE = np.array([[0, 0, 0], [64, 0, 128]], np.uint8)
+NAMES = ("unlabelled", "car")
 
 
 def rings() -> np.ndarray:
@@ -44,10 +45,16 @@ def test_colours_by_hand() -> None:
 def test_overlay_by_hand() -> None:
     rgb = np.full((1, 3, 3), 100, np.uint8)
     label = np.array([[0, 1, 255]], np.uint8)
-    # 0.75 * 100 + 0.25 * (64, 0, 128); background and ignored pixels stay.
-    assert overlay(rgb, label, PALETTE, 0.25).tolist() == [[[100] * 3, [91, 75, 107], [100] * 3]]
+    # 0.75 * 100 + 0.25 * (64, 0, 128), or + 0.25 * (0, 0, 0); background and ignored pixels stay.
+    stays, black, violet = [100] * 3, [75] * 3, [91, 75, 107]
+    for background, expected in (
+        ((0,), [stays, violet, stays]),
+        ((1,), [black, stays, stays]),
+        ((), [black, violet, stays]),
+    ):
+        assert overlay(rgb, label, Legend(NAMES, PALETTE, background), 0.25).tolist() == [expected]
     with pytest.raises(ValueError, match="one size"):
-        overlay(rgb, label[:, :2], PALETTE)
+        overlay(rgb, label[:, :2], Legend(NAMES, PALETTE, (0,)))
 
 
 def test_region_values_by_hand() -> None:
@@ -91,7 +98,7 @@ def test_panel_is_drawn_with_every_class_colour(tmp_path: Path) -> None:
     sizes = []
     for count in (1, 3):
         path = tmp_path / f"panel_{count}.png"
-        draw_panel([example] * count, Legend(("unlabelled", "car"), PALETTE), path)
+        draw_panel([example] * count, Legend(NAMES, PALETTE, (0,)), path)
         image = cv2.imread(str(path))
         assert image is not None
         assert (image[..., ::-1] == PALETTE[1]).all(-1).sum() > 1000
@@ -99,7 +106,7 @@ def test_panel_is_drawn_with_every_class_colour(tmp_path: Path) -> None:
     assert sizes[0][1] == sizes[1][1]
     assert sizes[1][0] > 2 * sizes[0][0]
     with pytest.raises(ValueError, match="at least one example"):
-        draw_panel([], Legend(("unlabelled", "car"), PALETTE), tmp_path / "none.png")
+        draw_panel([], Legend(NAMES, PALETTE, (0,)), tmp_path / "none.png")
 
 
 def test_long_names_are_broken_after_underscores() -> None:

@@ -46,6 +46,7 @@ class Folder(FileDataset):
         name: see there.
         palette: None: the colours of `colours`, or colours that differ.
         unscored: classes that are counted but left out of every mean over classes.
+        background: classes that are no object, see `rgbt.dataset.LabelledDataset`.
         folders: split -> value of {split}; None: train, val and test.
         lists: split -> list file in `root`; replaces `folders`.
         shares: split -> share of the frames, 1 in total; replaces `folders`.
@@ -76,6 +77,7 @@ class Folder(FileDataset):
         name: Text = "folder",
         palette: tuple[Colour, ...] | None = None,
         unscored: Names = (),
+        background: Names = (),
         folders: dict[Text, Text] | None = None,
         lists: dict[Text, Text] | None = None,
         shares: dict[Text, Share] | None = None,
@@ -95,13 +97,13 @@ class Folder(FileDataset):
             palette = tuple(own.get(word, colour) for word, colour in generated)
         super().__init__(folder, name, num_classes, classes, palette)
         self.unscored = unscored
+        self.background = background
         self.clipping = thermal_range
         self.night = night
         for word in classes:
             if classes.count(word) > 1:
                 raise InputError(f"dataset.classes: '{word}' occurs twice; rename one.")
-        for word in unscored:
-            check_choice("dataset.unscored", word, classes)
+        self.check_classes(unscored=unscored, background=background)
         check_limits(thermal_range)
         self.codes = label_codes(classes, ids, colours, ignored)
         self.patterns = patterns_of(rgb, thermal, label)

@@ -77,7 +77,7 @@ def synth_calibrated(  # noqa: PLR0913 - each is a key of the configuration
         num_train: scenes of the training split.
         num_val: scenes of the validation split.
         num_test: scenes of the test split.
-        factors: given as keywords, from `height` to `kerb_scale`; see `SceneFactors`.
+        factors: given as keywords, from `height` to `whole_shadows`; see `SceneFactors`.
         ego_forward_m: motion to a second frame, see `synth`.
         ego_yaw_deg: turn of that motion.
 

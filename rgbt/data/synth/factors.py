@@ -70,6 +70,10 @@ class SceneFactors:
         bump_farthest_m: distance of the farthest bumps in metres.
         kerb_share: factor on the share of streets with kerbs.
         kerb_scale: factor on the width and height of kerbs.
+        vignette: share of the light that the lens takes at the corners of RGB; 0: none.
+        whole_shadows: whether an object's shadow by day is drawn although a part of it lies behind
+            the camera; false leaves such shadows out, so that a camera that drives past an object
+            loses them.
     """
 
     height: Side = 120
@@ -103,6 +107,8 @@ class SceneFactors:
     bump_farthest_m: Metres = 11.7
     kerb_share: Share = 1.0
     kerb_scale: Multiple = 1.0
+    vignette: Share = 0.18
+    whole_shadows: bool = False
 
     def values(self) -> dict[str, Any]:
         """All factors by name, without those of `NEUTRAL` that have their default value.

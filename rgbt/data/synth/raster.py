@@ -126,7 +126,20 @@ def _fixed_point(columns_rows: Floats) -> NDArray[np.int32]:
 
 
 def _clipped(polygon: list[list[float]], camera: SynthCamera) -> NDArray[np.int32]:
-    """The part of a polygon beyond the near plane (Sutherland-Hodgman), in fixed point."""
+    """The part of a polygon beyond the near plane, in fixed point."""
+    return _fixed_point(beyond_near(polygon, camera))
+
+
+def beyond_near(polygon: list[list[float]], camera: SynthCamera) -> Floats:
+    """The part of a polygon beyond the near plane (Sutherland-Hodgman).
+
+    Args:
+        polygon: corners (x, y, z) in camera coordinates, at least one beyond the plane.
+        camera: that projects them.
+
+    Returns:
+        (M, 2) float32, (column, row).
+    """
     kept = []
     for start, end in zip(polygon, polygon[1:] + polygon[:1], strict=True):
         if start[2] >= NEAR_M:
@@ -134,4 +147,4 @@ def _clipped(polygon: list[list[float]], camera: SynthCamera) -> NDArray[np.int3
         if (start[2] >= NEAR_M) != (end[2] >= NEAR_M):
             share = (NEAR_M - start[2]) / (end[2] - start[2])
             kept.append([a + share * (b - a) for a, b in zip(start, end, strict=True)])
-    return _fixed_point(camera.project(np.array(kept, np.float32)))
+    return camera.project(np.array(kept, np.float32))

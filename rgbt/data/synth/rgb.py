@@ -161,7 +161,7 @@ def develop(
     sd *= 1 + factors.rgb_noise_dark_gain * (1 - float(image.mean()))
     noisy = generator.standard_normal(image.shape, np.float32)
     noisy *= sd
-    noisy += image * (1 - 0.18 * radius_squared)
+    noisy += image * (1 - factors.vignette * radius_squared)
     return np.asarray(cv2.merge(list(eight_bits(noisy))), np.uint8)
 
 

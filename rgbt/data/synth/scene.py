@@ -110,7 +110,7 @@ def _frame(
     seed, index, frame = key
     facets, light = world.facets, world.light
     drawing = draw(facets, camera)
-    shadow = shadow_map(world.placed, camera, light)
+    shadow = shadow_map(world.placed, camera, light, whole=factors.whole_shadows)
     surface = surface_of(drawing, facets, camera, shadow, (seed, index))
     veil = veil_of(world.placed, camera, light, factors.glare, (seed, index))
     image = rgb.render_rgb(surface, light, world.lamps, veil, factors, seed)

@@ -15,7 +15,7 @@ from rgbt.data.synth.camera import NEAR_M, Floats, SynthCamera, floats
 from rgbt.data.synth.facets import Facets
 from rgbt.data.synth.light import Light
 from rgbt.data.synth.placement import Placed
-from rgbt.data.synth.raster import Drawing
+from rgbt.data.synth.raster import Drawing, beyond_near
 from rgbt.randomness import numpy_generator
 
 _TILE = 256
@@ -163,10 +163,13 @@ def _band(position: Floats, half: Floats | float, blur: Floats) -> Floats:
     return np.asarray(np.clip((half - distance) / np.maximum(blur, 0.02) + 0.5, 0, 1), np.float32)
 
 
-def shadow_map(placed: Sequence[Placed], camera: SynthCamera, light: Light) -> Floats:
+def shadow_map(
+    placed: Sequence[Placed], camera: SynthCamera, light: Light, *, whole: bool = False
+) -> Floats:
     """(H, W) float32: how much of the light an object takes from each ground point, 0..1.
 
     A dark spot below each object, and by day the shadow of its box along the sun's direction.
+    `whole` also draws those of which a part lies behind the camera.
     """
     canvas = np.zeros((camera.height, camera.width), np.uint8)
     casting = [thing for thing in placed if thing.shadow_from >= 0 and thing.z < _LAST_SHADOW_M]
@@ -183,9 +186,22 @@ def shadow_map(placed: Sequence[Placed], camera: SynthCamera, light: Light) -> F
     if light.direct > 0.5:
         for row in np.flatnonzero(ahead.all(1)).tolist():
             cv2.fillConvexPoly(canvas, cv2.convexHull(pixels[row, :8]), 190, cv2.LINE_8, 4)
+        for row in np.flatnonzero(ahead[:, :8].any(1) & ~ahead.all(1) & whole).tolist():
+            _fill_beyond(canvas, points[row, :8], camera, 190)
     for row in np.flatnonzero(ahead[:, 8:].all(1)).tolist():
         cv2.fillConvexPoly(canvas, pixels[row, 8:], 230, cv2.LINE_8, 4)
+    for row in np.flatnonzero(ahead[:, 8:].any(1) & ~ahead[:, 8:].all(1) & whole).tolist():
+        _fill_beyond(canvas, points[row, 8:], camera, 230)
     return np.asarray(cv2.GaussianBlur(canvas, (3, 3), 0.7), np.float32) / 255.0
+
+
+def _fill_beyond(
+    canvas: NDArray[np.uint8], points: Floats, camera: SynthCamera, value: int
+) -> None:
+    """Fill the part beyond the near plane of the hull of points (M, 3) on the ground."""
+    hull = cv2.convexHull(np.ascontiguousarray(points[:, [0, 2]]), returnPoints=False).ravel()
+    outline = beyond_near(camera.to_camera(points[None, hull])[0].tolist(), camera)
+    cv2.fillConvexPoly(canvas, np.rint(outline * 16).astype(np.int32), value, cv2.LINE_8, 4)
 
 
 def _footprints(casting: Sequence[Placed]) -> tuple[Floats, Floats, Floats]:

@@ -55,6 +55,7 @@ def statistics(labels: np.ndarray, regions: Regions, night: np.ndarray | None) -
         fingerprint="fingerprint",
         split="train",
         classes=CLASSES,
+        background=CLASSES[:1],
         palette=PALETTE,
         partition=regions.name,
         region_map=region_map,

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from analysis.figures.classes import class_regions
 from analysis.figures.maps import (
     draw_regions,
     iou_heat,
@@ -19,6 +21,7 @@ from analysis.predictions.maps import PixelMaps
 from analysis.predictions.scoring import ScoringOptions, score_folder
 from analysis.predictions.table import ScoreKey, score_table
 from analysis.statistics.derive import region_occupancy
+from rgbt.checks import InputError
 from rgbt.data.mfnet import MFNet
 from rgbt.metrics.metric import Absent, Regions
 from tests.analysis.figures.drawn import CLASSES, PALETTE, statistics, strips, texts
@@ -90,6 +93,15 @@ def test_occupancy_is_the_share_of_labels_that_are_not_background() -> None:
     assert (heat.centre, heat.edge) == (0.5, 0.25)
     assert heat.whole == pytest.approx((25 * 0.5 + 23 * 0.25) / 48)
     assert heat.source == "toy, train"
+
+
+def test_occupancy_without_background_is_refused(tmp_path: Path) -> None:
+    road = replace(statistics(np.zeros((2, 6, 8), np.uint8), strips(3), None), background=())
+    with pytest.raises(InputError, match="no class of toy is stated as background"):
+        occupancy_heat(road, RINGS)
+    # Class 0 occurs everywhere and is drawn as every other class.
+    assert class_regions(road).classes == road.classes
+    np.testing.assert_allclose(class_regions(road).shares[0], 100)
 
 
 def test_occupancy_over_measured_regions_equals_statistics() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -34,7 +35,8 @@ def tiny(tmp_path: Path) -> MFNet:
         cv2.imwrite(str(root / "labels" / f"{name}.png"), np.array(label, np.uint8))
     (root / "test.txt").write_text("\n".join(LABELS))
     (root / "val.txt").write_text("00003D")
-    return MFNet(str(root), name="tiny", num_classes=3, classes=CLASSES, palette=PALETTE)
+    given: Any = {"num_classes": 3, "classes": CLASSES, "palette": PALETTE}
+    return MFNet(str(root), name="tiny", background=CLASSES[:1], **given)
 
 
 @pytest.fixture

@@ -21,6 +21,7 @@ class InMemory:
     classes = CLASSES
     palette = PALETTE
     unscored: tuple[str, ...] = ()
+    background: tuple[str, ...] = ("unlabeled",)
 
     def __init__(self, samples: list[Sample]) -> None:
         self.samples = {sample.name: sample for sample in samples}
@@ -53,6 +54,7 @@ def made(
     images: int = 40,
     regions: int = 3,
     classes: tuple[str, ...] = ("unlabeled", "car", "curve", "bump"),
+    background: tuple[str, ...] = ("unlabeled",),
     partition: str = "",
     night: bool = True,
     **given: Array,
@@ -73,6 +75,7 @@ def made(
         fingerprint="0" * 64,
         split="train",
         classes=classes,
+        background=background,
         palette=np.zeros((len(classes), 3), np.uint8),
         partition=partition or f"ring{regions}",
         region_map=region_map,

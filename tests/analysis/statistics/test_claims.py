@@ -236,3 +236,15 @@ def test_intervals_cover_the_true_value() -> None:
     print(f"coverage {inside / rounds:.3f}, without blocks {inside_without_blocks / rounds:.3f}")
     assert 0.93 <= inside / rounds <= 0.99
     assert inside_without_blocks / rounds < 0.7
+
+
+def test_without_background_no_claim_is_about_occupancy() -> None:
+    """Road is then a class as the others, and an entropy over all classes is left."""
+    labels = np.full((40, 3, 4), 100, np.int64)
+    stats = made(labels=labels, classes=("road", "car", "curve", "bump"), background=())
+    found = by_key(claims(stats, resamples=100))
+    assert not [key for key in found if key.startswith("occupancy/")]
+    assert [key for key in found if key.startswith("entropy/")] == ["entropy/all_classes"]
+    assert [each.what.partition(":")[0] for each in found["classes/central"].findings] == [
+        *("road", "car", "curve"),
+    ]

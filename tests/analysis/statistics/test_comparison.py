@@ -57,6 +57,10 @@ def test_interval_of_a_ratio_combines_both() -> None:
     ("changed", "said"),
     [
         ({"classes": ("unlabeled", "car", "curve", "cat")}, "the classes differ"),
+        (
+            {"background": ()},
+            "the background classes differ .unlabeled of made, none of made.; state the same",
+        ),
         ({"regions": 5}, "the regions differ .ring3 of made, ring5 of made.; measure both"),
     ],
 )

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -44,6 +45,40 @@ def test_planted_occupancy_is_found() -> None:
         derive.normalised(derive.class_region_occupancy(stats))[1], [1, 0.6, 0.4, 0.1], atol=2e-3
     )
     assert np.isnan(derive.normalised(derive.class_region_occupancy(stats))[2]).all()
+
+
+ROAD_FIRST = ("road", "car", "other", "void")
+
+
+def test_occupancy_leaves_out_the_stated_background() -> None:
+    labels = np.zeros((2, 2, 4), np.int64)
+    labels[:, 0] = 60, 10, 20, 10  # 70 of 100 pixels of region 1 are no background
+    labels[:, 1] = 10, 0, 5, 5  # 10 of 20 of region 2
+    stats = made(
+        images=2, regions=2, classes=ROAD_FIRST, background=("other", "void"), labels=labels
+    )
+    np.testing.assert_allclose(derive.region_occupancy(stats), [0.7, 0.5])
+    # Without background: 6/7 and 1/7, then road alone.
+    bits = -(6 / 7 * math.log2(6 / 7) + 1 / 7 * math.log2(1 / 7))
+    np.testing.assert_allclose(derive.label_entropy(stats, background=False), [bits, 0])
+    occupied = np.zeros((1, 4, 2, 4), np.int32)
+    occupied[0, :, 0, 0] = 1, 2, 4, 1  # of eight images three
+    stats = made(
+        images=8,
+        regions=2,
+        classes=ROAD_FIRST,
+        background=("other", "void"),
+        night=False,
+    )
+    found = derive.occupancy_map(replace(stats, occupied=occupied))
+    assert found[0, 0] == pytest.approx(3 / 8)
+    assert np.isnan(found[1:]).all()
+
+
+@pytest.mark.parametrize("occupancy", [derive.region_occupancy, derive.occupancy_map])
+def test_without_background_there_is_no_occupancy(occupancy) -> None:
+    with pytest.raises(InputError, match="no class of made is stated as background"):
+        occupancy(made(classes=ROAD_FIRST, background=()))
 
 
 def test_an_ignored_pixel_is_no_background() -> None:

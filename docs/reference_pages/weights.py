@@ -1,0 +1,51 @@
+"""The page of published weights: which file each recipe starts from, and what is known of it."""
+
+from __future__ import annotations
+
+from reference_pages.markdown import code, page, table
+from rgbt.checkpoints.starts import RECIPES, STARTS, Recipe
+from rgbt.config.compose import available
+
+
+def weights_page() -> str:
+    """Recipes by the file that they start from, and every file with its digest."""
+    return page(
+        "# Published weights",
+        "A recipe is an experiment at `scale=paper`. This page names the public file that each one "
+        "starts from. Download the file yourself; `rgbt` never does. Then train:",
+        "<!-- needs: MFNet, ImageNet weights -->\n```bash\nrgbt run +experiment=crm scale=paper "
+        "dataset.root=/data/MFNet \\\n  pretrained=swin_small_patch4_window7_224.pth\n```",
+        "`pretrained` initialises the network of the run, or that of its first upstream run.",
+        "## Files by recipe",
+        table(["Recipes", "Networks", "Files", "Source"], [_recipe(each) for each in RECIPES]),
+        "## Files",
+        "A digest is the beginning of the SHA-256, where it is known. `rgbt weights inspect FILE` "
+        "prints the SHA-256 of your file, the recipes that it fits, and a remark where a file of "
+        "that name has another digest.",
+        table(
+            ["File", "Architecture, pretraining", "Published at", "`model=`", "Digest"],
+            [
+                [
+                    *(code(start.file), start.trained_on, start.origin),
+                    *(", ".join(map(code, start.models)), code(start.digest) or "not stated"),
+                ]
+                for start in STARTS
+            ],
+        ),
+        "## No file is converted by hand",
+        "- Swin Transformers load from the original files, from files that timm has saved "
+        "(`model.safetensors` or `pytorch_model.bin` of `timm/swin_*_patch4_window7_224.ms_in1k`, "
+        "or `torch.save(model.state_dict(), ...)`), and from the pickles that detectron2 reads. "
+        "timm 0.9 and later names the patch merging after the stage behind it; this is "
+        "recognised.\n"
+        "- The thermal stem gets the mean of the RGB stem where it has one channel, as released.\n"
+        "- The file may hold the tensors at its top, or below `model` or `state_dict`.\n"
+        "- Files in the names of Hugging Face Transformers (`microsoft/swin-*`, `nvidia/mit-*`) "
+        "and of MMSegmentation are not read. Take the file of the table.",
+    )
+
+
+def _recipe(recipe: Recipe) -> list[str]:
+    names = recipe.named(available("experiment"))
+    files = ", ".join(map(code, recipe.files)) or "none: random values"
+    return [", ".join(map(code, names)), code(f"{recipe.model}*"), files, recipe.source]
