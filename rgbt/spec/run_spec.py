@@ -153,7 +153,7 @@ class RunSpec:
     masker: Component = _node()
     model: Component = _node()
     loss: Component = _node()
-    scheme: Component = _node(added={"resolution": "full"})
+    scheme: Component = _node(added={"resolution": "full", "idle_steps": "none"})
     optimizer: Component = _node()
     schedule: Component = _node()
     trainer: TrainerSettings = _node(
