@@ -26,6 +26,7 @@ from rgbt.data.label_map import LabelMap
 from rgbt.data.loader_settings import LoaderSettings
 from rgbt.dataset import LabelledDataset
 from rgbt.engine.allocator import keep_memory
+from rgbt.engine.prediction import Prediction
 from rgbt.engine.network_settings import place
 from rgbt.engine.settings import TrainerSettings
 from rgbt.engine.threads import fix_threads
@@ -48,6 +49,7 @@ class Session:
         transform: makes examples of them.
         loading: batch sizes, workers, what to do about unreadable files.
         regions: partition of the image and the rule for absent classes.
+        prediction: windows and mirrored images of a prediction, and the size where it is counted.
         consistency: virtual views that TC and CA are measured on, if any.
         trainer: durations, precision, device.
         fabric: device and precision.
@@ -61,6 +63,7 @@ class Session:
     transform: Any
     loading: LoaderSettings
     regions: Regions
+    prediction: Prediction
     consistency: ViewSets
     trainer: TrainerSettings
     fabric: Fabric
@@ -114,6 +117,7 @@ def open_session(
         transform=spec.transform.build(),
         loading=spec.data,
         regions=spec.metric.build(),
+        prediction=spec.prediction,
         consistency=spec.consistency.build(),
         trainer=trainer,
         fabric=fabric,

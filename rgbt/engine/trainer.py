@@ -231,7 +231,8 @@ class Trainer:
         rates = {}
         for name, optimizer in self.optimizers.items():
             for index, group in enumerate(optimizer.param_groups):
-                group["lr"] = rates[f"lr/{name}_{index}"] = group["base_lr"] * factor
+                share = 1.0 if "constant" in group else factor
+                group["lr"] = rates[f"lr/{name}_{index}"] = group["base_lr"] * share
         micro = [next(batches) for _ in range(self.settings.accumulate)]
         waited = time.perf_counter() - started
         device = self.fabric.device
