@@ -18,6 +18,7 @@ from rgbt.checkpoints.plan import Plan
 from rgbt.checkpoints.read import read
 from rgbt.checkpoints.recognise import recognise
 from rgbt.checkpoints.report import count_parameters
+from rgbt.checks import InputError
 from tests.checkpoints.files import holds, like, named, network, released, saved
 from tests.checkpoints.imagenet import mit_file, resnet_file, swin_file
 from tests.models import golden
