@@ -232,7 +232,9 @@ def _resnet_rule(family: str, model: nn.Module, facts: Facts) -> Rule | None:
         )
     if facts.prefix or (facts.what == DEEP_RESNET) != (family == "semseg"):
         return None
-    return {"semseg": _semseg, "rtfnet": _rtfnet, "pspnet": _pspnet}.get(family, lambda _: None)(model)
+    return {"semseg": _semseg, "rtfnet": _rtfnet, "pspnet": _pspnet}.get(family, lambda _: None)(
+        model
+    )
 
 
 def _rtfnet(model: nn.Module) -> Rule:

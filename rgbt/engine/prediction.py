@@ -100,9 +100,7 @@ def label_sized(scores_of: ScoresOf, batch: Batch, settings: Prediction) -> Tens
 def _enlarged(scores: Tensor, size: tuple[int, int], settings: Prediction) -> Tensor:
     if scores.shape[-2:] == size:
         return scores
-    return F.interpolate(
-        scores, size=size, mode="bilinear", align_corners=settings.align_corners
-    )
+    return F.interpolate(scores, size=size, mode="bilinear", align_corners=settings.align_corners)
 
 
 def _resized(batch: Batch, scale: float) -> Batch:

@@ -88,7 +88,9 @@ class Predictor:
         """`rgbt.engine.evaluate.class_maps` of a batch on the device."""
         if self._settings.enlarged == "scores":
             return class_maps(self._model, batch, *self._how(batch))
-        return self._enlarged(class_maps(self._model, _image_sized(batch), *self._how(batch)), batch)
+        return self._enlarged(
+            class_maps(self._model, _image_sized(batch), *self._how(batch)), batch
+        )
 
     def confident_classes(self, batch: Batch) -> tuple[Tensor, Tensor]:
         """`rgbt.engine.evaluate.confident_class_maps` of a batch on the device."""

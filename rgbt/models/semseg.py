@@ -63,7 +63,9 @@ class SemsegPSPNet(nn.Module):
         self.drop_rate = dropout
         width = base_width
         self.layer0 = nn.Sequential(
-            *_conv_norm(3, width, stride=2), *_conv_norm(width, width), *_conv_norm(width, 2 * width)
+            *_conv_norm(3, width, stride=2),
+            *_conv_norm(width, width),
+            *_conv_norm(width, 2 * width),
         )
         self.layer1 = bottleneck_stage(2 * width, width, depths[0])
         self.layer2 = bottleneck_stage(4 * width, 2 * width, depths[1], stride=2)

@@ -89,9 +89,7 @@ def trained(folder: Path, head_rate: Any, stop: int | None = None) -> tuple[Prod
 
 @pytest.mark.parametrize("head_rate", ["scheduled", "released"])
 @pytest.mark.parametrize("stop", [None, 3])
-def test_five_steps_are_those_written_out(
-    tmp_path: Path, head_rate: str, stop: int | None
-) -> None:
+def test_five_steps_are_those_written_out(tmp_path: Path, head_rate: str, stop: int | None) -> None:
     backbone, head, rates = by_hand(head_rate)
     model, log = trained(tmp_path, head_rate, stop)
     assert model.backbone.w.item() == pytest.approx(backbone, abs=1e-6)

@@ -42,9 +42,7 @@ def reference(net: SemsegPSPNet, image: Tensor) -> dict[str, Tensor]:
         name = f"ppm.features.{index}"
         small = plain.normed(f"{name}.1", f"{name}.2", F.adaptive_avg_pool2d(x, bins))
         size = x.shape[2:]
-        joined.append(
-            F.interpolate(small.clamp(min=0), size, mode="bilinear", align_corners=True)
-        )
+        joined.append(F.interpolate(small.clamp(min=0), size, mode="bilinear", align_corners=True))
 
     def scores(head: str, features: Tensor) -> Tensor:
         narrow = plain.normed(f"{head}.0", f"{head}.1", features).clamp(min=0)
