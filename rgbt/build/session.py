@@ -26,8 +26,8 @@ from rgbt.data.label_map import LabelMap
 from rgbt.data.loader_settings import LoaderSettings
 from rgbt.dataset import LabelledDataset
 from rgbt.engine.allocator import keep_memory
-from rgbt.engine.prediction import Prediction
 from rgbt.engine.network_settings import place
+from rgbt.engine.prediction import Prediction
 from rgbt.engine.settings import TrainerSettings
 from rgbt.engine.threads import fix_threads
 from rgbt.metrics.metric import Regions

@@ -69,8 +69,8 @@ class SGD:
         backbone_multiplier: factor of `lr` for what the network counts as pretrained.
         momentum: in [0, 1).
         weight_decay: of every parameter.
-        head_rate: "scheduled", or "released": the rate of what is not pretrained stays `lr`, because
-            the schedule sets the first parameter group alone (thesis' code of maximum squares).
+        head_rate: "scheduled", or "released": the rate of what is not pretrained stays `lr`. The
+            thesis' code of maximum squares schedules the first parameter group alone.
     """
 
     lr: LearningRate

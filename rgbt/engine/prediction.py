@@ -1,4 +1,4 @@
-"""Settings of a prediction: mirrored images, sliding windows, scales, and how scores are enlarged."""
+"""Settings of a prediction: mirrored images, sliding windows, scales, enlargement of scores."""
 
 from __future__ import annotations
 

@@ -54,8 +54,8 @@ class SemsegPSPNet(nn.Module):
         super().__init__()
         if inputs.thermal_channels != 3:
             raise InputError(
-                "model.inputs must repeat thermal for three channels, because the stem takes three; "
-                "choose model/inputs=cmx."
+                "model.inputs must repeat thermal for three channels, because the stem takes "
+                "three; choose model/inputs=cmx."
             )
         self.num_classes = num_classes
         self.record = self.record_from(modalities=modalities)

@@ -106,8 +106,8 @@ class Adversarial:
             )
         if self.idle_steps == "released" and not self.alternates:
             raise InputError(
-                "scheme.idle_steps=released requires scheme.alternates=true, because otherwise both "
-                "optimizers step with their gradients in every step. Set it to none."
+                "scheme.idle_steps=released requires scheme.alternates=true, because otherwise "
+                "both optimizers step with their gradients in every step. Set it to none."
             )
         self.passes = Passes(
             model=self.model, loss=self.loss, domains=self.domains, gradients=self.gradients
