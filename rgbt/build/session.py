@@ -18,6 +18,7 @@ from torch import nn
 
 from rgbt.build.contracts import check_dataset, is_own, watch_model
 from rgbt.build.initial_weights import start_from_weights
+from rgbt.build.requirements import check_requirements
 from rgbt.checkpoints.report import Report
 from rgbt.checks import InputError
 from rgbt.data.cache.dataset import cached_dataset
@@ -109,6 +110,7 @@ def open_session(
         )
     if is_own(model):
         watch_model(model, num_classes)
+    check_requirements({"prediction": spec.prediction, "model": model}, spec.plain)
     weights = start_from_weights(model, spec) if load_weights else None
     return Session(
         spec=spec,

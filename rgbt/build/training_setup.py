@@ -136,7 +136,7 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
     components = {
         **{"scheme": scheme, "loss": loss, "domains": domains, "model": session.model},
         **{"masker": masker, "transform": session.transform, "data": session.loading},
-        **{"dataset": session.dataset, "prediction": session.prediction},
+        "dataset": session.dataset,
     }
     check_requirements(components, spec.plain)
     splits = [domain.split for domain in domains.named.values()]

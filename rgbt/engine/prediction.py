@@ -67,7 +67,8 @@ class Prediction:
     @property
     def record(self) -> Record:
         """Class scores where probabilities are averaged."""
-        cause = "prediction.mirrored=true" if self.mirrored else "prediction.window_hw"
+        keys = {"mirrored": self.mirrored, "window_hw": self.window_hw, "scales": self.averages}
+        cause = f"prediction.{next((key for key, value in keys.items() if value), '')}"
         needed = (Requirement("model", "outputs", "scores", cause),) if self.averages else ()
         return Record(requires=needed)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,11 +14,19 @@ import torch
 from lightning_fabric import Fabric
 from torch import Tensor, nn
 
+from rgbt.build.session import open_session
+from rgbt.checks import InputError
+from rgbt.config.compose import conf_dir
 from rgbt.data.domains import Domain, Domains
 from rgbt.engine.prediction import Prediction
 from rgbt.evaluation.prediction import Predictor
-from rgbt.evaluation.request import EvaluationRequest
+from rgbt.evaluation.request import EvaluationRequest, NetworkRequest
+from rgbt.evaluation.segmentation import evaluate
+from rgbt.spec.load_spec import load_spec
 from rgbt.types import Batch, Output
+from sweeps.table.load_table import load_table
+from tests.composed import composed, specified
+from tests.evaluation.test_details import Decoder, session_of
 
 CLASSES = [[0, 8, 8, 2], [0, 8, 2, 2]]
 """What `Shows` predicts."""
@@ -114,3 +124,97 @@ def test_class_numbers_of_maximum_squares_are_enlarged_as_brightness(mirrored: b
 def test_scores_are_enlarged_by_default() -> None:
     classes = predictor().classes(batch(np.zeros((2, 8)), torch.int64))
     assert set(classes.unique().tolist()) == {0, 2, 8}
+
+
+@pytest.mark.parametrize("label_resize", ["nearest", "bilinear"])
+def test_evaluation_counts_pixels_of_the_smaller_image(data: Path, label_resize: str) -> None:
+    """48 x 64 labels against predictions of 24 x 32 images, one pixel after the other."""
+    session = session_of(data)
+    small = replace(session.transform, test_short_edge=24)
+    settings = Prediction(counted="image", label_resize=label_resize)  # type: ignore[arg-type]
+    session = replace(session, transform=small, prediction=settings)
+    names = session.dataset.names("test")
+    request = EvaluationRequest(split="test", keep=names)
+    result = evaluate(session, Decoder(), request)
+    interpolation = cv2.INTER_NEAREST if label_resize == "nearest" else cv2.INTER_LINEAR
+    for name, counts in zip(result.counts.names, result.counts.counts, strict=True):
+        sample = session.dataset.read(name)
+        assert sample.label is not None
+        label = cv2.resize(sample.label, (32, 24), interpolation=interpolation)
+        seen = small.test(sample).thermal.astype(float)
+        expected = np.zeros((9, 9), int)
+        for row, classes in zip(label, (seen / 28).round().clip(0, 8).astype(int), strict=True):
+            for truth, predicted in zip(row, classes, strict=True):
+                expected[truth, predicted] += 1
+        np.testing.assert_array_equal(counts.sum(0), expected)
+    assert result.counts.counts.sum() == 3 * 24 * 32
+    # Pictures show the label of the file; the prediction is enlarged for them.
+    assert {each.prediction.shape for each in result.kept} == {(48, 64)}
+
+
+def test_predictions_of_a_run_may_be_changed_and_need_a_folder() -> None:
+    options: Any = SimpleNamespace(run="x")
+    network = NetworkRequest(options, ("prediction=released",))
+    with pytest.raises(InputError, match="changes how the run is measured"):
+        network.check_comparable(None)
+    network.check_comparable(Path("out"))
+    stored = composed(["+experiment=mfnet"])
+    stored = {key: value for key, value in stored.items() if key != "prediction"}
+    assert load_spec(stored).prediction == Prediction()  # of a run that is older than the group
+    found = load_spec(stored, ["prediction=released_max_squares", "prediction.scales=[0.5,1.0]"])
+    expected = Prediction(mirrored=True, enlarged="released", scales=(0.5, 1.0))
+    assert found.prediction == expected
+
+
+FILES = {
+    "whole": Prediction(),
+    "released": Prediction(align_corners=True),
+    "released_heatnet": Prediction(counted="image", label_resize="bilinear"),
+    "released_max_squares": Prediction(mirrored=True, enlarged="released"),
+    "heatnet": Prediction(counted="image"),
+    "semseg": Prediction(mirrored=True, window_hw=(473, 473)),
+}
+
+
+def test_files_of_the_group_are_what_they_say() -> None:
+    assert {path.stem for path in (conf_dir() / "prediction").glob("*.yaml")} == set(FILES)
+    for name, settings in FILES.items():
+        words = ["transform=semseg", "model=semseg", "transform.crop_hw=[473,473]"]
+        spec = specified((*words, f"prediction={name}", "loss=cross_entropy"))
+        assert spec.prediction == settings, name
+
+
+def test_networks_of_masks_are_refused_where_probabilities_are_averaged() -> None:
+    causes = {"mirrored": "true", "window_hw": "[16,16]", "scales": "[0.5,1.0]"}
+    for key, setting in causes.items():
+        spec = specified(("+experiment=baseline", "+debug=smoke", f"prediction.{key}={setting}"))
+        with pytest.raises(InputError, match=f"with prediction.{key} requires outputs=scores"):
+            open_session(spec)
+
+
+THESIS = ("multihead/table2", "multihead/table3", "multihead/table4")
+ROWS = {
+    "HeatNet w/o thermal teacher (reproduced)": "released_heatnet",
+    **dict.fromkeys(("HeatNet (reproduced)", "HeatNet*"), "released_heatnet"),
+    **dict.fromkeys(("HeatNet RGB-only (reproduced)", "HeatNet RGB-only*"), "released_heatnet"),
+    "SH-Maximum squares loss": "released_max_squares",
+    **dict.fromkeys(("SH-Adv", "SH-Adv(Seg. on IR)", "Multi-head", "Multi-head*"), "released"),
+    "Multi-head**": "released",
+}
+
+
+@pytest.mark.parametrize("name", THESIS)
+def test_released_rows_of_the_thesis_are_predicted_as_its_code_does(name: str) -> None:
+    table = load_table(name)
+    for row in table.runnable_rows:
+        if row.released is None:
+            continue
+        run = specified((*table.overrides(row, "demo", "released"), "scale=demo"))
+        assert run.prediction == FILES[ROWS[row.label]], row.label
+        scheme, optimizer = run.scheme.values, run.optimizer.values
+        if row.label.startswith("HeatNet") and "critic" in scheme:
+            assert scheme["idle_steps"] == "released"
+        if row.label == "SH-Maximum squares loss":
+            (stage,) = run.upstream
+            rates = {optimizer["head_rate"], stage.optimizer.values["head_rate"]}
+            assert rates == {"released"}
