@@ -80,6 +80,7 @@ class Record:
         camera: scheme and view of a second frame: the `rgbt.geometry.camera.Camera` that draws it.
         hides_cells: masker: whether any cell is ever hidden.
         crop_hw: transform: size of a training example; None where that differs.
+        for_target: transform: the transform of the images of the target domain; None: itself.
         works_on_batches: transform: whether it can augment whole batches on the device.
         target_labels: domains: whether the target has labels.
         target_confidence: domains: whether these carry a confidence.
@@ -110,6 +111,7 @@ class Record:
     camera: Any = None
     hides_cells: bool = True
     crop_hw: tuple[int, int] | None = None
+    for_target: Any = None
     works_on_batches: bool = False
     target_labels: bool = False
     target_confidence: bool = False

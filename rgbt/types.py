@@ -208,11 +208,13 @@ class Phase(NamedTuple):
         optimizers: their names; parameters that two of them share are stepped by each.
         parts: named, weighted loss parts.
         clear: whether all gradients are cleared before; False adds to those of the phase before.
+        idle: names of optimisers that also step, with gradients of 0: their moving averages decay.
     """
 
     optimizers: tuple[str, ...]
     parts: dict[str, Tensor]
     clear: bool = True
+    idle: tuple[str, ...] = ()
 
 
 class AnyMasker(Protocol):

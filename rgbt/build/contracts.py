@@ -244,7 +244,7 @@ class CheckedScheme:
                 raise InputError(
                     f'{kind} yielded {described(phase)}; expected Phase(("main",), parts).'
                 )
-            for name in phase.optimizers:
+            for name in (*phase.optimizers, *phase.idle):
                 if name not in self._optimizers:
                     raise InputError(
                         f"{kind} yielded a phase with the optimizer '{name}'; expected one of: "

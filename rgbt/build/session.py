@@ -18,6 +18,7 @@ from torch import nn
 
 from rgbt.build.contracts import check_dataset, is_own, watch_model
 from rgbt.build.initial_weights import start_from_weights
+from rgbt.build.requirements import check_requirements
 from rgbt.checkpoints.report import Report
 from rgbt.checks import InputError
 from rgbt.data.cache.dataset import cached_dataset
@@ -27,6 +28,7 @@ from rgbt.data.loader_settings import LoaderSettings
 from rgbt.dataset import LabelledDataset
 from rgbt.engine.allocator import keep_memory
 from rgbt.engine.network_settings import place
+from rgbt.engine.prediction import Prediction
 from rgbt.engine.settings import TrainerSettings
 from rgbt.engine.threads import fix_threads
 from rgbt.metrics.metric import Regions
@@ -48,6 +50,7 @@ class Session:
         transform: makes examples of them.
         loading: batch sizes, workers, what to do about unreadable files.
         regions: partition of the image and the rule for absent classes.
+        prediction: windows and mirrored images of a prediction, and the size where it is counted.
         consistency: virtual views that TC and CA are measured on, if any.
         trainer: durations, precision, device.
         fabric: device and precision.
@@ -61,6 +64,7 @@ class Session:
     transform: Any
     loading: LoaderSettings
     regions: Regions
+    prediction: Prediction
     consistency: ViewSets
     trainer: TrainerSettings
     fabric: Fabric
@@ -106,6 +110,7 @@ def open_session(
         )
     if is_own(model):
         watch_model(model, num_classes)
+    check_requirements({"prediction": spec.prediction, "model": model}, spec.plain)
     weights = start_from_weights(model, spec) if load_weights else None
     return Session(
         spec=spec,
@@ -114,6 +119,7 @@ def open_session(
         transform=spec.transform.build(),
         loading=spec.data,
         regions=spec.metric.build(),
+        prediction=spec.prediction,
         consistency=spec.consistency.build(),
         trainer=trainer,
         fabric=fabric,

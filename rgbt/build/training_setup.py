@@ -79,9 +79,11 @@ class TrainingSetup:
         loading = replace(session.loading, augment=_where_to_augment(session))
         # Each domain is shuffled and augmented by draws of its own.
         seeds = {"source": seed, "target": derive(seed, "target domain")}
+        transforms = {"source": session.transform, "target": session.transform}
+        transforms["target"] = record_of(session.transform).for_target or session.transform
         found = [
             train_batches(
-                *(self.datasets[name], split, session.transform, loading),
+                *(self.datasets[name], split, transforms[name], loading),
                 *(seeds[name], steps),
             )
             for name, split in self.splits().items()

@@ -196,6 +196,9 @@ SCALE = "Scale."
 CAFFE = "trained on B, G, R in 0..255 less the mean (model/inputs=caffe) with Caffe's strides"
 STRIDES = "its strides sit on the 3x3 convolutions, this backbone's on the first 1x1"
 FC = (r"fc\.", CLASSIFIER)
+DEEP_RESNET = "ImageNet ResNet of semseg, with three stem convolutions"
+STEM = {"0": "conv1", "1": "bn1", "3": "conv2", "4": "bn2", "6": "conv3", "7": "bn3"}
+"""Number of a layer in semseg's stem -> name in its ImageNet file."""
 
 
 def resnet_layers(shapes: Shapes, prefix: str) -> int | None:
@@ -214,6 +217,13 @@ def _recognise_resnet(contents: Contents) -> Facts | None:
     if not has_parts(shapes, "bn1.", "layer1.0.conv1.", "layer4.0.conv1."):
         return None
     layers = resnet_layers(shapes, "")
+    if has_parts(shapes, "conv3.", "bn3."):
+        return Facts(
+            layout="resnet",
+            what=DEEP_RESNET,
+            size=f"ResNet-{layers}" if layers else "",
+            fits=(("model=semseg",),) if layers == 50 else (),
+        )
     fits: tuple[tuple[str, ...], ...] = ()
     if is_caffe and layers == 101:
         fits = (("model=deeplabv2", "model/inputs=caffe"),)
@@ -243,9 +253,11 @@ def _resnet_rule(family: str, model: nn.Module, facts: Facts) -> Rule | None:
             leftover=(FC, (r"layer5\.", "classifier of the file's own classes")),
             remarks=() if facts.prefix else (STRIDES,),
         )
-    if facts.prefix:
+    if facts.prefix or (facts.what == DEEP_RESNET) != (family == "semseg"):
         return None
-    return {"rtfnet": _rtfnet, "pspnet": _pspnet}.get(family, lambda _: None)(model)
+    return {"semseg": _semseg, "rtfnet": _rtfnet, "pspnet": _pspnet}.get(family, lambda _: None)(
+        model
+    )
 
 
 def _rtfnet(model: nn.Module) -> Rule:
@@ -280,6 +292,18 @@ def _pspnet(model: nn.Module) -> Rule:
         leftover=(FC, *leftover),
         stems=("feats.conv1.weight", "feats.conv1_2.weight"),
     )
+
+
+def _semseg(_: nn.Module) -> Rule:
+    """PSPNet of semseg: its ImageNet file, resnet50_v2.pth, has three stem convolutions.
+
+    Released: hszhao/semseg. The pooling and both heads are drawn.
+    """
+
+    def source(entry: str) -> str:
+        return re.sub(r"^layer0\.(\d)\.", lambda found: f"{STEM[found[1]]}.", entry)
+
+    return Rule(source=source, fresh=((r"(ppm|cls|aux)\.", NOT_IN_FILE),), leftover=(FC,))
 
 
 BACKBONES = {

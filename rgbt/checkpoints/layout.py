@@ -130,6 +130,7 @@ FAMILIES: Mapping[str, str] = {
     "rtfnet": "RTFNet",
     "mfnet": "MFNet",
     "pspnet": "PSPNet (HeatNet)",
+    "semseg": "PSPNet (semseg)",
     "deeplabv2": "DeepLab v2",
 }
 """Module of rgbt.models -> what its network is called."""
@@ -140,6 +141,7 @@ CLASS_PARTS: Mapping[str, tuple[str, ...]] = {
     "rtfnet": ("deconv5.1",),
     "mfnet": ("decode1",),
     "pspnet": ("final",),
+    "semseg": ("cls.4", "aux.4"),
     "deeplabv2": ("heads", "auxiliary"),
 }
 """Parts of a network whose sizes depend on the number of classes."""

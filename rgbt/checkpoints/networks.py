@@ -239,6 +239,26 @@ def released_heatnet(state: Mapping[str, Tensor]) -> dict[str, Any]:
     return OrderedDict((f"{HEATNET_WRAPPED}{HEATNET_PREFIX}{k}", v) for k, v in state.items())
 
 
+SEMSEG = ("model/inputs=cmx",)
+
+
+def _recognise_semseg(contents: Contents) -> Facts | None:
+    """PSPNet as semseg's training script stores it."""
+    shapes = shapes_of(contents.tensors)
+    if not has_parts(shapes, "layer0.6.", "ppm.features.", "cls.4."):
+        return None
+    layers = resnet_layers(shapes, "")
+    return Facts(
+        layout="semseg",
+        what="PSPNet checkpoint of semseg",
+        family="semseg",
+        size=f"ResNet-{layers}" if layers else "",
+        classes=size_at(shapes, "cls.4.weight"),
+        fits=(("model=semseg",),) if layers == 50 else (),
+        convention=SEMSEG,
+    )
+
+
 RELEASES = {
     "mask2former": Layout(
         _recognise_mask2former,
@@ -250,6 +270,7 @@ RELEASES = {
     "cmx": Layout(_recognise_cmx, _own_names((r"voting\.", "never used by the temporal release"))),
     "rtfnet": Layout(_recognise_rtfnet, _own_names()),
     "mfnet": Layout(_recognise_mfnet, _own_names()),
+    "semseg": Layout(_recognise_semseg, _own_names()),
     "heatnet": Layout(
         _recognise_heatnet,
         _own_names((r"critics\.", "a discriminator, which is a separate network here")),

@@ -36,6 +36,11 @@ RELEASED: Mapping[str, Container] = {
     "rtfnet": lambda state, _: OrderedDict(state),
     "mfnet": lambda state, _: OrderedDict(state),
     "pspnet": lambda state, _: networks.released_heatnet(state),
+    "semseg": lambda state, note: {
+        "epoch": 0,
+        "state_dict": OrderedDict((f"module.{key}", value) for key, value in state.items()),
+        NOTE: dict(note),
+    },
 }
 """Family -> value that torch.load returns for its released files."""
 
@@ -46,6 +51,7 @@ CONVENTIONS: Mapping[tuple[str, str], tuple[str, ...]] = {
     ("released", "rtfnet"): networks.RTFNET_RELEASED,
     ("released", "mfnet"): networks.MFNET_RELEASED,
     ("released", "pspnet"): networks.HEATNET_RELEASED,
+    ("released", "semseg"): networks.SEMSEG,
 }
 """Format and family -> how the authors' code feeds and evaluates the network."""
 

@@ -202,8 +202,8 @@ def _by_network(choices: dict[str, Any], *, _root_: DictConfig) -> Any:
     name = str(model._target_).rpartition(".")[2] + heads
     if name not in choices:
         raise InputError(
-            f"scale={_root_.scale.name} has no common start for the network {name}; expected one "
-            f"of {', '.join(choices)}. Name the initial weights with model.weights=..., or set "
+            f"pretrained has no file and no common start for the network {name}; expected one of "
+            f"{', '.join(choices)}. Name the initial weights with model.weights=..., or set "
             "model.weights=null to start from random weights."
         )
     return choices[name]

@@ -8,10 +8,10 @@ from typing import Any
 import torch
 from lightning_fabric import Fabric
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from rgbt.checks import RunError
 from rgbt.class_scores import best_of, classes_of
+from rgbt.engine.prediction import WHOLE, Prediction, label_sized
 from rgbt.requirements import record_of
 from rgbt.types import Batch, View
 
@@ -25,6 +25,7 @@ def class_maps(
     fabric: Fabric,
     view: View | None = None,
     heads: Sequence[str | None] = (),
+    settings: Prediction = WHOLE,
 ) -> Tensor:
     """(B, H', W') uint8: class index of every pixel of the labels of one batch.
 
@@ -37,9 +38,10 @@ def class_maps(
         fabric: precision.
         view: input images of the prediction; None leaves the choice to the network.
         heads: which head predicts each image of the batch; () leaves it to the network.
+        settings: mirrored images, windows and the enlargement of the scores.
     """
     with torch.inference_mode():
-        return classes_of(label_scores(model, batch, fabric, view, heads)).to(torch.uint8)
+        return classes_of(label_scores(model, batch, fabric, view, heads, settings)).to(torch.uint8)
 
 
 def probabilities(
@@ -48,6 +50,7 @@ def probabilities(
     fabric: Fabric,
     view: View | None = None,
     heads: Sequence[str | None] = (),
+    settings: Prediction = WHOLE,
 ) -> Tensor:
     """(B, K, H', W') float32: probabilities of the classes; arguments as in `class_maps`.
 
@@ -61,7 +64,7 @@ def probabilities(
     not tell a pixel that queries of one class hardly claim from one that they claim wholly.
     """
     with torch.inference_mode():
-        return _shares(label_scores(model, batch, fabric, view, heads), model)
+        return _shares(label_scores(model, batch, fabric, view, heads, settings), model)
 
 
 def confident_class_maps(
@@ -70,6 +73,7 @@ def confident_class_maps(
     fabric: Fabric,
     view: View | None = None,
     heads: Sequence[str | None] = (),
+    settings: Prediction = WHOLE,
 ) -> tuple[Tensor, Tensor]:
     """`class_maps`, and the probability (B, H', W') float32 of each of these classes.
 
@@ -77,7 +81,7 @@ def confident_class_maps(
     `class_maps`.
     """
     with torch.inference_mode():
-        scores = label_scores(model, batch, fabric, view, heads)
+        scores = label_scores(model, batch, fabric, view, heads, settings)
         classes = classes_of(scores).to(torch.uint8)
         # The class with the highest score has the highest probability.
         return classes, best_of(_shares(scores, model)).score
@@ -96,6 +100,7 @@ def label_scores(
     fabric: Fabric,
     view: View | None = None,
     heads: Sequence[str | None] = (),
+    settings: Prediction = WHOLE,
 ) -> Tensor:
     """(B, K, H', W') float32 scores at every pixel of the labels; arguments as in `class_maps`.
 
@@ -103,10 +108,9 @@ def label_scores(
         RunError: a score is NaN or infinite.
     """
     with torch.inference_mode(), fabric.autocast():
-        scores = class_scores(model, batch, view, heads).float()
-        label_hw = batch.label.shape[-2:]
-        if scores.shape[-2:] != label_hw:
-            scores = F.interpolate(scores, size=label_hw, mode="bilinear", align_corners=False)
+        scores = label_sized(
+            lambda images: class_scores(model, images, view, heads), batch, settings
+        )
         # One fast pass: a sum is not finite if any score is not. Only then each image is checked.
         if bool(scores.sum().isfinite()):
             return scores

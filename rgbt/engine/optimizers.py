@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import torch
 from annotated_types import Interval
@@ -69,12 +69,15 @@ class SGD:
         backbone_multiplier: factor of `lr` for what the network counts as pretrained.
         momentum: in [0, 1).
         weight_decay: of every parameter.
+        head_rate: "scheduled", or "released": the rate of what is not pretrained stays `lr`. The
+            thesis' code of maximum squares schedules the first parameter group alone.
     """
 
     lr: LearningRate
     backbone_multiplier: NonNegative
     momentum: ShareBelowOne
     weight_decay: Decay
+    head_rate: Literal["scheduled", "released"] = "scheduled"
 
     def __call__(self, model: nn.Module, without: tuple[str, ...] = ()) -> torch.optim.Optimizer:
         """The optimizer of the trainable parameters of `model` (see `parameter_groups`)."""
@@ -83,6 +86,7 @@ class SGD:
             by_part.setdefault(pretrained, []).extend(parameters)
         settings = [
             _group(parameters, self.lr * (self.backbone_multiplier if pretrained else 1.0))
+            | ({"constant": True} if self.head_rate == "released" and not pretrained else {})
             for pretrained, parameters in by_part.items()
         ]
         # On a GPU the default makes a copy of all gradients to add the decay; the fused one none.
@@ -147,7 +151,10 @@ class Adam:
 
 
 def _group(parameters: list[nn.Parameter], lr: float) -> dict[str, Any]:
-    """A parameter group with the base rate (`base_lr`) that a schedule reads."""
+    """A parameter group with the base rate (`base_lr`) that a schedule reads.
+
+    A group with `constant` keeps that rate.
+    """
     return {"params": parameters, "lr": lr, "base_lr": lr}
 
 

@@ -232,7 +232,8 @@ class Trainer:
         rates = {}
         for name, optimizer in self.optimizers.items():
             for index, group in enumerate(optimizer.param_groups):
-                group["lr"] = rates[f"lr/{name}_{index}"] = group["base_lr"] * factor
+                share = 1.0 if "constant" in group else factor
+                group["lr"] = rates[f"lr/{name}_{index}"] = group["base_lr"] * share
         micro = [next(batches) for _ in range(self.settings.accumulate)]
         waited = time.perf_counter() - started
         device = self.fabric.device
@@ -309,6 +310,8 @@ class Trainer:
         logged[key] = _finite_values({"gradient norm": next(numbers)})["gradient norm"]
         for optimizer in stepped:
             optimizer.step()
+        for name in phase.idle:
+            step_without_gradient(self.optimizers[name])
         return logged
 
     def _backward(
@@ -329,6 +332,23 @@ class Trainer:
         logged = {f"loss/{name}": value * share for name, value in values.items()}
         logged["loss"] = sum(values.values()) * share
         return logged
+
+
+def step_without_gradient(optimizer: torch.optim.Optimizer) -> None:
+    """Step the parameters that were stepped before with gradients of 0.
+
+    The moving averages decay, momentum and weight decay act. Released: `zero_grad` up to torch 1.13
+    leaves zeros, so that one optimiser of all parameters also steps those of the other phase.
+    """
+    parameters = [each for group in optimizer.param_groups for each in group["params"]]
+    stepped = [each for each in parameters if optimizer.state.get(each)]
+    for parameter in parameters:
+        parameter.grad = None
+    for parameter in stepped:
+        parameter.grad = torch.zeros_like(parameter)
+    optimizer.step()
+    for parameter in stepped:
+        parameter.grad = None
 
 
 def check_weights(modules: Mapping[str, nn.Module], step: int) -> None:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
+from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from rich.progress import Progress, TaskID
 from torch import Tensor, nn
@@ -23,6 +25,9 @@ from rgbt.evaluation.request import EvaluationRequest
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Regions
 from rgbt.requirements import record_of
+from rgbt.transforms.joint import View as ImageView
+from rgbt.transforms.joint import whole_view
+from rgbt.transforms.thesis import mixed
 from rgbt.transforms.view_sets import ViewSets
 from rgbt.types import Batch, View
 
@@ -66,19 +71,51 @@ class Predictor:
         self._heads = heads_of(session, self.view, request.head)
         self._fabric = session.fabric
         self._model = model.eval()
+        self._settings = session.prediction
+
+    def counted(self, batch: Batch) -> Batch:
+        """A batch from the loader, with labels of the size at which classes are counted."""
+        if self._settings.counted == "label":
+            return batch
+        image_hw = batch.rgb.shape[-2], batch.rgb.shape[-1]
+        resize = mixed if self._settings.label_resize == "bilinear" else ImageView.nearest
+        label_hw = batch.label.shape[-2], batch.label.shape[-1]
+        view = whole_view(label_hw, image_hw)
+        labels = [resize(view, label) for label in batch.label.numpy()]
+        return replace(batch, label=torch.from_numpy(np.stack(labels)))
 
     def classes(self, batch: Batch) -> Tensor:
         """`rgbt.engine.evaluate.class_maps` of a batch on the device."""
-        return class_maps(self._model, batch, self._fabric, self.view, self._heads(batch.name))
+        if self._settings.enlarged == "scores":
+            return class_maps(self._model, batch, *self._how(batch))
+        return self._enlarged(
+            class_maps(self._model, _image_sized(batch), *self._how(batch)), batch
+        )
 
     def confident_classes(self, batch: Batch) -> tuple[Tensor, Tensor]:
         """`rgbt.engine.evaluate.confident_class_maps` of a batch on the device."""
-        heads = self._heads(batch.name)
-        return confident_class_maps(self._model, batch, self._fabric, self.view, heads)
+        classes, confidence = confident_class_maps(self._model, batch, *self._how(batch))
+        return (classes if self._settings.enlarged == "scores" else self.classes(batch)), confidence
 
     def probabilities(self, batch: Batch) -> Tensor:
         """`rgbt.engine.evaluate.probabilities` of a batch on the device."""
-        return probabilities(self._model, batch, self._fabric, self.view, self._heads(batch.name))
+        return probabilities(self._model, batch, *self._how(batch))
+
+    def _how(self, batch: Batch) -> tuple[Any, ...]:
+        return self._fabric, self.view, self._heads(batch.name), self._settings
+
+    def _enlarged(self, classes: Tensor, batch: Batch) -> Tensor:
+        """Class numbers at the size of the labels, interpolated as if they were brightness."""
+        view = whole_view(
+            (classes.shape[1], classes.shape[2]), (batch.label.shape[-2], batch.label.shape[-1])
+        )
+        maps = [view.bilinear(each, np.uint8) for each in classes.cpu().numpy()]
+        return torch.from_numpy(np.stack(maps)).to(classes.device)
+
+
+def _image_sized(batch: Batch) -> Batch:
+    """A batch whose labels have the size of its images, for predictions of that size."""
+    return replace(batch, label=batch.label.new_zeros(len(batch.label), *batch.rgb.shape[-2:]))
 
 
 def view_of(session: Session, view: View | None = None) -> View:

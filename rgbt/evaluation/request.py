@@ -22,7 +22,7 @@ DEFAULT_VIEW = "default"
 BEST = "best"
 """Default values of the options `modality` and `checkpoint`."""
 
-CHANGES = ("transform", "trainer.precision", "metric")
+CHANGES = ("transform", "trainer.precision", "metric", "prediction")
 """Settings that change the counts or scores of the same run."""
 
 

@@ -30,7 +30,8 @@ from rgbt.processes import collected, num_processes
 from rgbt.tracking.pictures import Legend, PanelExample
 from rgbt.tracking.tables import ClassTable, RegionTable, ResultTables
 from rgbt.tracking.terminal import result_view
-from rgbt.types import Loadable, View
+from rgbt.transforms.joint import whole_view
+from rgbt.types import Batch, View
 
 NUM_PANELS = 6
 """Images of the qualitative panel: the same number by day and by night if the split has both."""
@@ -82,7 +83,8 @@ def evaluate(session: Session, model: nn.Module, request: EvaluationRequest) -> 
         total = len(dataset.names(request.split))
         task = display.add_task(request.split, total=total, note="images")
         done = 0
-        for batch in batches:
+        for loaded in batches:
+            batch = predictor.counted(loaded)
             predicted, confidence = _predicted(predictor, batch, session, detail)
             for index, (name, label) in enumerate(zip(batch.name, batch.label, strict=True)):
                 classes = predicted[index]
@@ -100,7 +102,7 @@ def evaluate(session: Session, model: nn.Module, request: EvaluationRequest) -> 
 
 
 def _predicted(
-    predictor: Predictor, batch: Loadable, session: Session, detail: DetailCounter
+    predictor: Predictor, batch: Batch, session: Session, detail: DetailCounter
 ) -> tuple[Tensor, Sequence[Tensor | None]]:
     """Classes (B, H, W) of a batch on the CPU, with the probability of each where it is needed."""
     on_device = batch.to(session.fabric.device)
@@ -140,7 +142,9 @@ def _of_all_processes(part: _Part, names: Sequence[str]) -> _Part:
 def _example(session: Session, name: str, classes: NDArray[np.uint8]) -> PanelExample:
     sample = session.dataset.read(name)
     label = sample.label if sample.label is not None else np.full_like(sample.thermal, 255)
-    return PanelExample(name, sample.rgb, sample.thermal, label, classes)
+    # Classes may be counted at another size than that of the label file.
+    shown = whole_view((classes.shape[0], classes.shape[1]), (label.shape[0], label.shape[1]))
+    return PanelExample(name, sample.rgb, sample.thermal, label, shown.nearest(classes))
 
 
 def result_tables(counts: Counts, regions: Regions, label: str, step: int) -> ResultTables:

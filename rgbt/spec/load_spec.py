@@ -13,9 +13,9 @@ from rgbt.files.yaml_files import parse_yaml
 from rgbt.spec.run_spec import RunSpec
 from rgbt.spec.specify import specify
 
-GROUPS = ("dataset", "metric", "consistency")
+GROUPS = ("dataset", "metric", "prediction", "consistency")
 CHANGEABLE = (
-    *("dataset", "data", "metric", "consistency", "transform.test_short_edge"),
+    *("dataset", "data", "metric", "prediction", "consistency", "transform.test_short_edge"),
     *("trainer.accelerator", "trainer.threads", "trainer.precision"),
 )
 """Settings of a finished run that may be changed: the source of the images and the counting."""

@@ -16,6 +16,7 @@ from rgbt.config.component import Component
 from rgbt.config.stored_config import targets
 from rgbt.data.domains import GIVEN, NONE, Domains
 from rgbt.data.loader_settings import LoaderSettings
+from rgbt.engine.prediction import Prediction
 from rgbt.engine.settings import Recipe, Scale, TrainerSettings
 from rgbt.ranges import Seed, Text
 from rgbt.spec.run_key import file_digest, manifest_of, settings_digest
@@ -155,8 +156,8 @@ class RunSpec:
     masker: Component = _node()
     model: Component = _node()
     loss: Component = _node()
-    scheme: Component = _node(added={"resolution": "full"})
-    optimizer: Component = _node()
+    scheme: Component = _node(added={"resolution": "full", "idle_steps": "none"})
+    optimizer: Component = _node(added={"head_rate": "scheduled"})
     schedule: Component = _node()
     trainer: TrainerSettings = _node(
         outside_key=(
@@ -172,6 +173,14 @@ class RunSpec:
         ),
     )
     metric: Component = _node(shared=True)
+    prediction: Prediction = _node(
+        added_as={
+            "_target_": "rgbt.engine.prediction.Prediction",
+            **{"align_corners": False, "mirrored": False, "scales": [1.0], "window_hw": None},
+            **{"window_stride": 2 / 3, "enlarged": "scores", "counted": "label"},
+            "label_resize": "nearest",
+        }
+    )
     consistency: Component = _node(in_key=False)
     tracking: Component = _node(in_key=False, shared=True)
 

@@ -18,6 +18,7 @@ from rgbt.checkpoints.plan import Plan
 from rgbt.checkpoints.read import read
 from rgbt.checkpoints.recognise import recognise
 from rgbt.checkpoints.report import count_parameters
+from rgbt.checks import InputError
 from tests.checkpoints.files import holds, like, named, network, released, saved
 from tests.checkpoints.imagenet import mit_file, resnet_file, swin_file
 from tests.models import golden
@@ -300,6 +301,31 @@ def test_a_resnet_fills_the_encoder_of_pspnet(tmp_path: Path, modalities: str) -
     assert ("feats.layer3.0.conv1.weight" in plan.fresh) == two
 
 
+def test_the_deep_stem_of_semseg_is_filled_by_its_own_file_alone(tmp_path: Path) -> None:
+    """resnet50_v2.pth: conv1 to conv3 and bn1 to bn3 before the stages."""
+    tensors = resnet_file(50, width=8)
+    norm = ("weight", "bias", "running_mean", "running_var")
+    sizes = {"conv1": (8, 3), "conv2": (8, 8), "conv3": (16, 8)}
+    deep = {f"{name}.weight": (*size, 3, 3) for name, size in sizes.items()}
+    deep |= {f"bn{n}.{end}": (8 * (1 + n // 3),) for n in (1, 2, 3) for end in norm}
+    deep |= {f"layer1.0.{name}.weight": size for name, size in (
+        ("conv1", (8, 16, 1, 1)), ("downsample.0", (32, 16, 1, 1)),
+    )}  # fmt: skip
+    model = network("semseg_tiny", 14, depths="[3,4,6,3]")
+    facts, plan = planned(model, saved(tmp_path, {**tensors, **named(deep)}))
+    assert facts.fits == (("model=semseg",),)
+    assert plan.fits
+    places = {"0": "conv1", "1": "bn1", "3": "conv2", "4": "bn2", "6": "conv3", "7": "bn3"}
+    for number, name in places.items():
+        assert plan.values[f"layer0.{number}.weight"] == f"{name}.weight"
+    assert plan.values["layer3.5.conv2.weight"] == "layer3.5.conv2.weight"
+    assert {name.split(".")[0] for name in plan.fresh} == {"ppm", "cls", "aux"}
+    assert set(plan.leftover) == {"fc.weight", "fc.bias"}
+    for yaml, other in (("semseg_tiny", tensors), ("heatnet_tiny", {**tensors, **named(deep)})):
+        with pytest.raises(InputError):
+            load_weights(network(yaml, 14), saved(tmp_path, other))
+
+
 def test_resnets_fill_the_backbone_of_deeplab(tmp_path: Path) -> None:
     model = on_paper("deeplabv2", 14)
     facts, plan = planned(model, saved(tmp_path, resnet_file(101)))
@@ -324,6 +350,7 @@ WHOLE = [
     ("rtfnet_tiny", "", "RTFNet checkpoint"),
     ("mfnet_tiny", "", "MFNet checkpoint"),
     ("heatnet_tiny", "module.trgb_segnet.", "HeatNet checkpoint"),
+    ("semseg_tiny", "module.", "PSPNet checkpoint of semseg"),
 ]
 
 

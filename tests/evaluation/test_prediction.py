@@ -17,6 +17,7 @@ from rgbt.corruptions.pixels import Noise
 from rgbt.data.cache.dataset import CachedDataset
 from rgbt.data.domains import Domain, Domains
 from rgbt.data.mfnet import MFNet
+from rgbt.engine.prediction import Prediction
 from rgbt.evaluation.corrupted_dataset import CorruptedDataset
 from rgbt.evaluation.prediction import Predictor, decode_ahead, heads_of, view_of
 from rgbt.evaluation.request import EvaluationRequest
@@ -98,6 +99,7 @@ def test_predictor_chooses_heads_by_the_names_of_a_batch() -> None:
 
     session: Any = session_of({"head": "day", "view": "rgb"}, target_is="night")
     session.model, session.fabric = Heads(), Fabric(accelerator="cpu", devices=1)
+    session.prediction = Prediction()
     predictor = Predictor(session, session.model, EvaluationRequest(split="test"))
     batch = Batch(
         rgb=torch.zeros(3, 3, 2, 2),

@@ -17,6 +17,7 @@ from rgbt.models.mask2former.model import Mask2Former
 from rgbt.models.mfnet import MFNet
 from rgbt.models.pspnet import PSPNet
 from rgbt.models.rtfnet import RTFNet
+from rgbt.models.semseg import SemsegPSPNet
 
 NANO: dict[str, tuple[Any, dict[str, Any]]] = {
     "mfnet": (MFNet, {"num_classes": 3, "rgb_widths": (2, 3, 4, 6), "thermal_widths": (3, 2, 3, 4),
@@ -26,6 +27,8 @@ NANO: dict[str, tuple[Any, dict[str, Any]]] = {
     "pspnet": (PSPNet, {"num_classes": 4, "depths": (1, 2, 3, 2), "base_width": 4,
                         "decoder_width": 5, "modalities": "late_fusion", "dropout": (0.3, 0.15),
                         "align_corners": False}),
+    "semseg": (SemsegPSPNet, {"num_classes": 3, "depths": (1, 2, 2, 2), "base_width": 4,
+                              "modalities": "rgb", "dropout": 0.0}),
     "deeplabv2": (DeepLabV2, {"num_classes": 3, "depths": (1, 2, 2, 2), "base_width": 2,
                               "ceil_mode": True, "train_norm": "all", "heads": ("source", "target"),
                               "auxiliary": True, "decoder": "basic", "rates": (2, 4, 6, 8),
@@ -51,7 +54,11 @@ NANO: dict[str, tuple[Any, dict[str, Any]]] = {
 def nano(name: str, seed: int = 0, **changes: Any) -> Any:
     """A small network whose first weights depend on the seed alone."""
     kind, settings = NANO[name]
-    given = {} if name == "critic" else {"inputs": half(3 if name in ("deeplabv2", "cmx") else 1)}
+    given = (
+        {}
+        if name == "critic"
+        else {"inputs": half(3 if name in ("deeplabv2", "cmx", "semseg") else 1)}
+    )
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         return kind(**{**settings, **given, **changes})

@@ -1,0 +1,165 @@
+"""The network PSPNet of semseg: three stem convolutions, narrow pyramid pooling, auxiliary head."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from rgbt.checks import InputError
+from rgbt.models.inputs import Inputs, only_view
+from rgbt.models.parts import drop_channels
+from rgbt.models.pspnet import BINS
+from rgbt.models.resnet import bottleneck_stage
+from rgbt.ranges import BaseWidth, Depths, NumClasses, ShareBelowOne
+from rgbt.requirements import Record
+from rgbt.types import MaskPair, Output, View
+
+
+class SemsegPSPNet(nn.Module):
+    """PSPNet with ResNet-50 as semseg has it: the teachers of the thesis.
+
+    It sees the RGB image or the thermal image, never both. Scores are enlarged to the image with
+    aligned corners; with sides of 8 n + 1 pixels, as semseg requires, that is exactly 8 times.
+    Convolutions of the backbone are drawn as semseg draws them (He et al., fan out); the others
+    keep torch's initialisation.
+
+    Source: PSPNet, Fig. 3; thesis (J. Sun), Sec. V-C.   Released: hszhao/semseg; the names of the
+    weights are its own.
+
+    Args:
+        num_classes: K; 66 for Mapillary Vistas, 14 for Freiburg.
+        depths: bottlenecks per stage: (3, 4, 6, 3) for ResNet-50.
+        base_width: channels of the first two stem convolutions, 64; other widths are multiples.
+        modalities: "rgb" or "thermal".
+        dropout: share of channels dropped before the scores of both heads, 0.1.
+        inputs: normalisation of the images, with three thermal channels.
+
+    Raises:
+        InputError: one thermal channel.
+    """
+
+    def __init__(
+        self,
+        *,
+        num_classes: NumClasses,
+        depths: Depths,
+        base_width: BaseWidth,
+        modalities: Literal["rgb", "thermal"],
+        dropout: ShareBelowOne,
+        inputs: Inputs,
+    ) -> None:
+        super().__init__()
+        if inputs.thermal_channels != 3:
+            raise InputError(
+                "model.inputs must repeat thermal for three channels, because the stem takes "
+                "three; choose model/inputs=cmx."
+            )
+        self.num_classes = num_classes
+        self.record = self.record_from(modalities=modalities)
+        self.modalities = modalities
+        self.drop_rate = dropout
+        width = base_width
+        self.layer0 = nn.Sequential(
+            *_conv_norm(3, width, stride=2),
+            *_conv_norm(width, width),
+            *_conv_norm(width, 2 * width),
+        )
+        self.layer1 = bottleneck_stage(2 * width, width, depths[0])
+        self.layer2 = bottleneck_stage(4 * width, 2 * width, depths[1], stride=2)
+        self.layer3 = bottleneck_stage(8 * width, 4 * width, depths[2], dilations=(2, 2))
+        self.layer4 = bottleneck_stage(16 * width, 8 * width, depths[3], dilations=(4, 4))
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+        self.ppm = SemsegPooling(32 * width, 8 * width)
+        self.cls = _head(64 * width, 8 * width, num_classes)
+        self.aux = _head(16 * width, 4 * width, num_classes)
+        self.inputs = inputs
+
+    @staticmethod
+    def record_from(*, modalities: View, **_: object) -> Record:
+        """Output, view and auxiliary head."""
+        return Record(
+            views=(modalities,),
+            auxiliary=True,
+            pretrained_parts=("layer",),
+            recomputed=("layer1.*", "layer2.*", "layer3.*", "layer4.*"),
+        )
+
+    def forward(
+        self,
+        rgb: Tensor,
+        thermal: Tensor,
+        masks: MaskPair | None = None,
+        *,
+        views: tuple[View, ...] = (),
+        generator: torch.Generator | None = None,
+    ) -> Output:
+        """Class scores at the size of the image, as `rgbt.models` says.
+
+        Returns:
+            logits: (N, K, H, W).
+            aux: "aux_logits" (N, K, H, W) of the third stage.
+        """
+        only_view(views, self.record.views, "SemsegPSPNet")
+        images = self.inputs(rgb, thermal, masks)
+        image = images.rgb if self.modalities == "rgb" else images.thermal
+        x = F.max_pool2d(self.layer0(image), 3, stride=2, padding=1)
+        layer3 = self.layer3(self.layer2(self.layer1(x)))
+        pooled = self.ppm(self.layer4(layer3))
+        size = (rgb.shape[2], rgb.shape[3])
+        logits = self._scores(self.cls, pooled, size, generator)
+        return Output(logits, {"aux_logits": self._scores(self.aux, layer3, size, generator)})
+
+    def _scores(
+        self, head: nn.Module, x: Tensor, size: tuple[int, int], generator: torch.Generator | None
+    ) -> Tensor:
+        """Scores of a head at the size of the image."""
+        *layers, last = head.children()
+        for layer in layers:
+            x = layer(x)
+        scores = last(drop_channels(x, self.drop_rate if self.training else 0.0, generator))
+        return F.interpolate(scores, size=size, mode="bilinear", align_corners=True)
+
+
+class SemsegPooling(nn.Module):
+    """Means over 1, 4, 9 and 36 cells, narrowed, normalised, enlarged, and joined with the map.
+
+    Source: PSPNet, Fig. 3.   Released: hszhao/semseg.
+    """
+
+    def __init__(self, channels: int, narrow: int) -> None:
+        super().__init__()
+        self.features = nn.ModuleList(
+            nn.Sequential(
+                nn.AdaptiveAvgPool2d(bins),
+                nn.Conv2d(channels, narrow, 1, bias=False),
+                nn.BatchNorm2d(narrow),
+                nn.ReLU(),
+            )
+            for bins in BINS
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, C, h, w) -> (N, C + 4 narrow, h, w)."""
+        parts = [
+            F.interpolate(branch(x), size=x.shape[2:], mode="bilinear", align_corners=True)
+            for branch in self.features
+        ]
+        return torch.cat([x, *parts], 1)
+
+
+def _conv_norm(before: int, after: int, *, stride: int = 1) -> tuple[nn.Module, ...]:
+    """3x3 convolution, normalisation, ReLU."""
+    conv = nn.Conv2d(before, after, 3, stride=stride, padding=1, bias=False)
+    return conv, nn.BatchNorm2d(after), nn.ReLU()
+
+
+def _head(channels: int, narrow: int, num_classes: int) -> nn.Sequential:
+    """As semseg numbers the layers: 3 is its dropout, which is drawn in `_scores`."""
+    return nn.Sequential(
+        *_conv_norm(channels, narrow), nn.Identity(), nn.Conv2d(narrow, num_classes, 1)
+    )
