@@ -77,13 +77,18 @@ class _Part:
         """Train to the last step and evaluate the best checkpoint."""
         session = self.setup.session
         folder = session.spec.folder
-        split = session.trainer.selection_split
+        split = session.selection_split
         state = State(seed=session.spec.drawn.masks)
+
+        def validate(step: int) -> float:  # noqa: ARG001
+            assert split is not None, "called only where there is one"
+            return self._evaluate(self.setup.model, split)
+
         trainer = make_trainer(
             self.setup,
             folder,
             record=lambda step, values: None,  # noqa: ARG005
-            validate=lambda step: self._evaluate(self.setup.model, split),  # noqa: ARG005
+            validate=None if split is None else validate,
             writes=False,
         )
         if agreed(False):  # process 0 resumes

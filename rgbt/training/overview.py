@@ -23,6 +23,9 @@ def announce_training(setup: TrainingSetup, name: str, folder: Path) -> None:
     others = "".join(f", {key} {_millions(net)}" for key, net in setup.others.items())
     batch = session.loading.batch_size * trainer.accumulate
     epochs = trainer.max_steps * trainer.accumulate / setup.steps_per_epoch()
+    validated = f"validated every {trainer.eval_every}"
+    if session.selection_split is None:
+        validated = f"not validated: {session.dataset.name} has no {trainer.selection_split}"
     counts = [f"{len(session.dataset.names(each))} {each}" for each in setup.read_splits()]
     lines = [
         ("device", device_line(session)),
@@ -30,8 +33,7 @@ def announce_training(setup: TrainingSetup, name: str, folder: Path) -> None:
         ("images", f"{session.dataset.name}: {', '.join(counts)}"),
         (
             "steps",
-            f"{trainer.max_steps} of batch {batch} ({epochs:.3g} epochs), "
-            f"validated every {trainer.eval_every}",
+            f"{trainer.max_steps} of batch {batch} ({epochs:.3g} epochs), {validated}",
         ),
         ("folder", str(folder)),
     ]

@@ -123,7 +123,7 @@ class Run:
                     "dataset": session.dataset.fingerprint(),
                     "steps": state.step,
                     "best_step": state.best_step,
-                    "best_score": state.best_score,
+                    **({"best_score": state.best_score} if session.selection_split else {}),
                     "seconds_of_last_process": round(time.time() - started, 1),
                     "skipped": state.skipped,
                     **self._scores(session, state, pairs),
@@ -142,13 +142,15 @@ class Run:
     def _scores(
         self, session: Session, state: State, pairs: Mapping[str, ConsistencyTable]
     ) -> dict[str, dict[str, float | None]]:
-        """What the best checkpoint reached on the selection split and on the test split."""
+        """Scores of the best checkpoint on the selection split, if there is one, and on the test."""
         lines = {(line.kind, line.step): line.values for line in self.folder.lines()}
-        val = lines.get(("val", state.best_step))
-        if not val:  # its line was damaged
-            path = self.folder.path / counts_name(session.trainer.selection_split)
-            val = scores.summary(Counts.load(path), session.regions.absent)
-        reached = {"val": val, "test": lines["test", state.step]}
+        reached = {"test": lines["test", state.step]}
+        if session.selection_split is not None:
+            val = lines.get(("val", state.best_step))
+            if not val:  # its line was damaged
+                path = self.folder.path / counts_name(session.selection_split)
+                val = scores.summary(Counts.load(path), session.regions.absent)
+            reached = {"val": val, **reached}
         for kind, table in pairs.items():
             reached[kind] = {**reached[kind], **consistency_values(table)}
         return {kind: without_nan(values) for kind, values in reached.items()}
@@ -223,9 +225,10 @@ class Run:
             )
 
     def _trainer(self, session: Session, state: State) -> Trainer:
-        split = session.trainer.selection_split
+        split = session.selection_split
 
         def validate(step: int) -> float:
+            assert split is not None, "called only where there is one"
             result = evaluate(session, self.setup.model, EvaluationRequest(split=split))
             folder = trainer.checkpoints.begin_evaluation(step)
             result.counts.save(folder / counts_name(split))
@@ -239,7 +242,7 @@ class Run:
             self.setup,
             self.folder.path,
             record=lambda step, values: self.folder.append(step, "train", values),
-            validate=validate,
+            validate=None if split is None else validate,
             committed=self.tracking.update,
             after_step=self.tracking.after_step,
         )
@@ -249,7 +252,9 @@ class Run:
         """TC and CA of the best checkpoint under "val" and "test", as far as requested."""
         tables: dict[str, ConsistencyTable] = {}
         for kind in session.consistency.splits if session.consistency.sets else ():
-            split = session.trainer.selection_split if kind == "val" else kind
+            split = session.selection_split if kind == "val" else kind
+            if split is None:
+                continue
             keep = panel_names(session.dataset, split) if kind == "test" else ()
             try:
                 request = EvaluationRequest(split=split, keep=keep)
