@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -66,8 +68,8 @@ def test_chain_without_validation_split_reports_its_last_checkpoints(
         assert "best_score" not in result
         assert result["test"]["mIoU"] is not None
         assert not (path.parent / "counts_val.npz").exists()
-        kinds = [json.loads(line)["kind"] for line in open(path.parent / "metrics.jsonl")]  # noqa: PTH123, SIM115
-        assert set(kinds) == {"train", "test"}
+        lines = (path.parent / "metrics.jsonl").read_text().splitlines()
+        assert {json.loads(line)["kind"] for line in lines} == {"train", "test"}
     assert err.count("not validated: freiburg has no val") == 2
     again, out, _ = call(main, "+experiment=sh_adversarial", *words)
     assert again == 0
@@ -97,9 +99,6 @@ def test_best_checkpoint_without_validation_split_is_one_sentence(
 def test_search_of_runs_that_are_not_validated_needs_a_score_of_the_test(
     words: tuple[str, ...],
 ) -> None:
-    from types import SimpleNamespace
-    from typing import Any
-
     request: Any = SimpleNamespace(fixed=("+experiment=sh_source", *words), parameters=())
     settings: Any = SimpleNamespace(objectives=(Objective("val/mIoU", "maximize"),))
     with pytest.raises(InputError, match=r"'val/mIoU': the data set has no image of val, so"):

@@ -142,7 +142,7 @@ class Run:
     def _scores(
         self, session: Session, state: State, pairs: Mapping[str, ConsistencyTable]
     ) -> dict[str, dict[str, float | None]]:
-        """Scores of the best checkpoint on the selection split, if there is one, and on the test."""
+        """Scores of the best checkpoint on the selection split, if any, and on the test split."""
         lines = {(line.kind, line.step): line.values for line in self.folder.lines()}
         reached = {"test": lines["test", state.step]}
         if session.selection_split is not None:
