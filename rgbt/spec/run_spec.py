@@ -40,6 +40,8 @@ class Node:
             key where they say that, so that a run keeps its key.
         used_with: settings that have an effect only where another setting has a value -> that
             setting and value; left out of the key elsewhere.
+        renamed: settings of which values have another name now -> the present name -> the name
+            that the key keeps, and that stored configurations may have.
         added_as: the same as `added` for the whole node; None: it is as old as the first runs.
         shared: whether upstream runs take it over from the run that needs them; or which of its
             settings.
@@ -49,6 +51,7 @@ class Node:
     outside_key: tuple[str, ...] = ()
     added: Mapping[str, Any] = field(default_factory=dict)
     used_with: Mapping[str, tuple[str, Any]] = field(default_factory=dict)
+    renamed: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     added_as: Mapping[str, Any] | None = None
     shared: bool | tuple[str, ...] = False
 
@@ -59,6 +62,12 @@ class Node:
         old = [key for key, value in self.added.items() if values.get(key) == value]
         unused = [key for key, (other, v) in self.used_with.items() if values.get(other) != v]
         left_out = {*self.outside_key, *old, *unused}
+        names = {
+            key: self.renamed[key].get(value, value)
+            for key, value in values.items()
+            if key in self.renamed and isinstance(value, str)
+        }
+        values = {**values, **names}
         return {name: {key: values[key] for key in values if key not in left_out}}
 
 
@@ -151,7 +160,7 @@ class RunSpec:
     )
     transform: Component = _node()
     masker: Component = _node()
-    model: Component = _node()
+    model: Component = _node(renamed={"decoder": {"modified_heatnet": "modified_released"}})
     loss: Component = _node()
     scheme: Component = _node(added={"resolution": "full"})
     optimizer: Component = _node()

@@ -274,6 +274,24 @@ def test_averaging_is_in_the_key_with_the_setting_that_it_uses() -> None:
     assert key_of("grbm", "trainer.averaging=last", "trainer.averaged_share=0.5") != last
 
 
+RENAMED = {
+    "multi_head_thermal_stage1_released": "7a9532ea828f",
+    "multi_head_night_stage1_released": "dd8e07e74c11",
+    "multi_head_night_init_stage1_released": "4886ab787b7a",
+}
+"""Keys of the runs of the modified decoder as version 0.1.0 computes them, when the decoder was
+called modified_released."""
+
+
+@pytest.mark.parametrize("experiment", RENAMED)
+def test_renamed_decoder_keeps_the_key(experiment: str) -> None:
+    decoder = "model=deeplabv2_two_heads_modified_tiny"
+    run = spec_of(experiment, decoder)
+    assert run.model.plain["decoder"] == "modified_heatnet"
+    assert run.key == RENAMED[experiment]
+    assert spec_of(experiment, decoder, "model.decoder=modified_thesis").key != run.key
+
+
 def test_seeds_that_are_the_seed_of_the_run_are_not_in_the_key() -> None:
     assert key_of("grbm", "seed=3", "seeds.order=3") == key_of("grbm", "seed=3")
     others = [key_of("grbm", f"seeds.{source}=3") for source in ("weights", "order", "masks")]
