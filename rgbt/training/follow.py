@@ -22,7 +22,13 @@ from rgbt.metrics import names, scores
 from rgbt.processes import agreed, collected
 from rgbt.runtime.member import LOST
 from rgbt.spec.run_spec import RunSpec
-from rgbt.training.common import fit, load_best, make_trainer, target_request
+from rgbt.training.common import (
+    fit,
+    load_best,
+    make_trainer,
+    other_head_request,
+    target_request,
+)
 from rgbt.training.members import NO_MORE
 
 
@@ -97,6 +103,9 @@ class _Part:
         agreed(None)  # process 0 has written the best checkpoint
         load_best(session, folder, state.best_step)
         self._evaluate(session.model, "test")
+        other = other_head_request(session)
+        if other is not None:
+            evaluate(session, session.model, other)
 
     def _evaluate(self, model: nn.Module, split: str) -> float:
         """Predict this part of a split, also in the view of the target; the mIoU of the whole."""

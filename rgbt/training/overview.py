@@ -40,6 +40,14 @@ def announce_training(setup: TrainingSetup, name: str, folder: Path) -> None:
     _write(name, *(f"  {line}" for line in path_lines(lines).plain.splitlines()))
 
 
+def announce_upstream(setup: TrainingSetup, name: str, downstream: str) -> None:
+    """Print an upstream run, its network and steps, and the run that needs it, in one line."""
+    session, trainer = setup.session, setup.session.trainer
+    batch = session.loading.batch_size * trainer.accumulate
+    steps = f"{trainer.max_steps} steps of batch {batch}"
+    _write(f"upstream run {name} for {downstream}: {network_line(session)}, {steps}")
+
+
 def announce_network(network: TrainedNetwork) -> None:
     """Print device, network and checkpoint of a prediction in one line."""
     session = network.session

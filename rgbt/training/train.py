@@ -42,21 +42,31 @@ from rgbt.tracking.run_folder import RunFolder
 from rgbt.tracking.tables import ConsistencyTable, without_nan
 from rgbt.tracking.terminal import info, warn
 from rgbt.tracking.tracker import Tracking
-from rgbt.training.common import fit, load_best, make_trainer, target_request
+from rgbt.training.common import (
+    fit,
+    load_best,
+    make_trainer,
+    other_head_request,
+    target_request,
+)
 from rgbt.training.members import training_together
-from rgbt.training.overview import announce_training
-from rgbt.training.show import finished_run, print_result, show
+from rgbt.training.overview import announce_training, announce_upstream
+from rgbt.training.show import finished_run, print_result, print_upstream_result, show
 
 MUCH_WAITING = 0.3
 """Share of a step spent waiting for images above which a warning is printed."""
 
 
-def train(spec: RunSpec, extra_tags: Mapping[str, str] | None = None) -> None:
+def train(
+    spec: RunSpec, extra_tags: Mapping[str, str] | None = None, upstream_of: str = ""
+) -> None:
     """Train a run to its end, or resume it, and print its result.
 
     Args:
         spec: the run; its upstream runs are finished.
         extra_tags: MLflow tags of the run (see `rgbt.spec.naming.describe`).
+        upstream_of: name of the run that needs this one, which is announced in one line, as is its
+            result; "": the requested run, with all tables.
 
     Raises:
         InputError: the configuration, the data or the run folder do not fit.
@@ -72,16 +82,24 @@ def train(spec: RunSpec, extra_tags: Mapping[str, str] | None = None) -> None:
         return
     description = describe(spec, extra_tags)
     tracking: Tracking = spec.tracking.build()
-    folder = _train_unfinished(spec, tracking, description)
-    print_result(folder, tracking, spec.domains)
+    folder = _train_unfinished(spec, tracking, description, upstream_of)
+    if upstream_of:
+        print_upstream_result(folder, description.name)
+    else:
+        print_result(folder, tracking, spec.domains)
 
 
-def _train_unfinished(spec: RunSpec, tracking: Tracking, description: Description) -> RunFolder:
+def _train_unfinished(
+    spec: RunSpec, tracking: Tracking, description: Description, upstream_of: str
+) -> RunFolder:
     """Train a run, in all processes of the command, and return its folder."""
     with training_together(spec) as start_others:
         # Everything is built before the folder is made: a wrong value leaves nothing behind.
         setup = set_up_training(spec)
-        announce_training(setup, description.name, spec.folder)
+        if upstream_of:
+            announce_upstream(setup, description.name, upstream_of)
+        else:
+            announce_training(setup, description.name, spec.folder)
         decode_ahead(setup.session, *setup.read_splits())
         if spec.is_finished:
             replace_finished(RunFolder(spec.folder), tracking)
@@ -283,12 +301,16 @@ class Run:
         result.counts.save(self.folder.path / counts_name("test"))
         values = scores.summary(result.counts, session.regions.absent)
         of_target = self._of_target(session, session.model, "test", self.folder.path)
-        values |= of_target | ({} if pairs is None else consistency_values(pairs))
+        by_other = self._by_other_head(session)
+        values |= of_target | by_other | ({} if pairs is None else consistency_values(pairs))
         self.folder.append(state.step, "test", values)
         name = self.description.name
         tables = result_tables(result.counts, session.regions, name, state.best_step)
-        # As rows of the table: "thermal", "thermal, day", "thermal, night".
-        parts = {", ".join(each.split("/")[:-1]): value for each, value in of_target.items()}
+        # As rows of the table: "thermal", "thermal, day", "source head, night".
+        parts = {
+            ", ".join(each.replace("_", " ").split("/")[:-1]): value
+            for each, value in (of_target | by_other).items()
+        }
         subsets = {**tables.classes.subset_mious, **parts}
         classes = replace(tables.classes, subset_mious=subsets)
         tables = replace(tables, classes=classes, consistency=pairs)
@@ -303,6 +325,22 @@ class Run:
             ious=tables.regions.region_ious,
         )
         draw_region_heat(heat, self.folder.figure_path("regions"))
+
+    def _by_other_head(self, session: Session) -> dict[str, float]:
+        """The mIoU at night of the head that is not selected for the night, named after the head.
+
+        Its counts are written to the run folder.
+        """
+        request = other_head_request(session)
+        if request is None:
+            return {}
+        assert request.head is not None, "the request names a head"
+        counts = evaluate(session, session.model, request).counts
+        counts.save(self.folder.path / counts_name(f"test_{request.head}_head"))
+        values = scores.summary(counts, session.regions.absent)
+        at_night = names.subset(names.NIGHT, names.MIOU)
+        kept = {at_night: values[at_night]} if at_night in values else {}
+        return {names.by_head(request.head, name): value for name, value in kept.items()}
 
     def _of_target(
         self, session: Session, model: nn.Module, split: str, folder: Path

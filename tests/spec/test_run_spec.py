@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from rgbt.checks import InputError
+from rgbt.spec.naming import GROUP, describe
 from rgbt.spec.run_spec import RunSpec
 from rgbt.spec.specify import specify
 from tests.composed import composed
@@ -196,6 +197,18 @@ def test_upstream_overrides_are_those_that_both_runs_share() -> None:
     silent = ["tracking=none"]  # no name has it
     assert stage.overrides[1:] == (*COMMON, *silent, *model)
     assert teacher.overrides[1:] == (*COMMON, *silent)
+
+
+def test_upstream_runs_of_another_size_or_seed_are_not_in_the_groups_of_the_real_ones() -> None:
+    typed = ("+debug=smoke", "seeds.order=3")
+    (stage,) = spec_of("multi_head_night", *typed).upstream
+    (teacher,) = stage.upstream
+    for each in (stage, teacher):
+        alone = describe(spec_of(each.name, *typed))
+        found = describe(each)
+        assert (found.name, found.tags[GROUP]) == (alone.name, alone.tags[GROUP])
+        assert found.tags[GROUP].startswith(f"{each.name} debug=smoke ")
+        assert found.tags[GROUP].endswith("order=3")
 
 
 @pytest.mark.parametrize(
