@@ -10,7 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 from rgbt.checks import InputError, nearest
 from rgbt.config.compose import SEARCH_PATH, compose, flatten, register_resolvers
 from rgbt.files.yaml_files import parse_yaml
-from rgbt.spec.run_spec import NODES, RunSpec
+from rgbt.spec.run_spec import RENAMED, RunSpec
 from rgbt.spec.specify import specify
 
 GROUPS = ("dataset", "metric", "consistency")
@@ -55,11 +55,9 @@ def load_spec(settings: Mapping[str, Any], overrides: Sequence[str] = ()) -> Run
 
 def _rename(config: DictConfig) -> None:
     """Give values their present names, in place."""
-    for name, node in NODES.items():
-        for key, names in node.renamed.items():
-            for now, before in names.items():
-                if config[name].get(key) == before:
-                    config[name][key] = now
+    for key, now, before in RENAMED:
+        if OmegaConf.select(config, key) == before:
+            OmegaConf.update(config, key, now)
 
 
 def _plain(node: DictConfig) -> dict[str, Any]:

@@ -329,6 +329,14 @@ NODES: dict[str, Node] = {
 }
 """Every node of the configuration with its policy."""
 
+RENAMED = tuple(
+    (f"{key}.{setting}", now, before)
+    for key, node in NODES.items()
+    for setting, names in node.renamed.items()
+    for now, before in names.items()
+)
+"""Dotted key, present and previous name of every value that was renamed."""
+
 VALUES: dict[str, Any] = {
     each.name: each.metadata["value"] for each in fields(RunSpec) if "value" in each.metadata
 }
