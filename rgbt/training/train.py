@@ -272,6 +272,7 @@ class Run:
         for kind in session.consistency.splits if session.consistency.sets else ():
             split = session.selection_split if kind == "val" else kind
             if split is None:
+                info(f"consistency was not measured on val: {session.dataset.name} has none.")
                 continue
             keep = panel_names(session.dataset, split) if kind == "test" else ()
             try:
