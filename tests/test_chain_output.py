@@ -84,7 +84,7 @@ def test_upstream_run_is_printed_in_one_line(chain: Chain) -> None:
     (announced,) = (each for each in chain.err.splitlines() if each.startswith("upstream run "))
     assert announced.endswith(
         " · multi_head_thermal_stage1 for multi_head_night: DeepLabV2, 0.71 M parameters, 2 steps "
-        "of batch 2"
+        f"of batch 2 (1 epochs), not validated: freiburg has no val, {stage.folder}"
     )
     assert chain.err.count("  device ") == 1
 
