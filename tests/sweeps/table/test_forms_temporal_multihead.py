@@ -331,6 +331,9 @@ def test_starred_rows_as_released_are_the_basic_network_in_two_stages(row: str) 
         assert list(run.model.plain["summed_rates"]) == [6, 12]
         assert (run.data.batch_size, run.trainer.max_steps) == (batch_size, steps)
         assert run.scheme.plain["gradients"] == gradients
+    # The first stage is the same run where it is requested by its own name.
+    alone = specified((f"+experiment={first.name}", "scale=paper", "dataset.root=/data"))
+    assert alone.key == first.key
 
 
 def test_parameters_of_the_starred_rows_in_both_forms() -> None:
