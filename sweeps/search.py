@@ -110,10 +110,18 @@ def _probe(request: Search, settings: SweepSettings) -> PlannedRun:
     Both refuse what the runs would: an end of a range that a setting does not accept, a missing
     data set, or an objective that the runs do not measure.
     """
-    specify_run((*request.fixed, *_end_of(request.parameters, "high")))
+    highest = specify_run((*request.fixed, *_end_of(request.parameters, "high")))
     lowest = Planner().plan_run((*request.fixed, *_end_of(request.parameters, "low")))
+    trainer = highest.trainer
+    is_validated = trainer.tested == "best" or highest.dataset.build().has(trainer.selection_split)
     for objective in settings.objectives:
         split = objective.metric.partition("/")[0]
+        if split == "val" and not is_validated:
+            raise InputError(
+                f"objective '{objective.metric}': the data set has no image of "
+                f"{trainer.selection_split}, so the runs are not validated; hold images out, or "
+                "choose test/..."
+            )
         if objective.is_consistency and split not in lowest.consistency_splits:
             splits = ",".join(dict.fromkeys((split, "test")))
             raise InputError(

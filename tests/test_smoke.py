@@ -26,7 +26,7 @@ ON_DISK: dict[str, tuple[Callable[[Path], Path], tuple[str, ...]]] = {
     "mfnet": (lambda root: write_data(root, SPLITS, (24, 32)), ()),
     "pst900": (write_pst900, ()),
     "kp": (write_kp, ()),
-    "freiburg": (write_freiburg, ("dataset.crop=null",)),
+    "freiburg": (write_freiburg, ("dataset.crop=null", "dataset.val_sequences=[seq_04_day]")),
     "folder": (write_folder, OWN),
 }
 EMBEDDED = ("synth", "synth_pst900", "synth_kp", "synth_freiburg")

@@ -40,7 +40,7 @@ def check_own_parts(session: Session) -> None:
     dataset, transform = reader_of(session.dataset), session.transform
     splits = [domain.split for domain in session.domains.named.values()]
     if is_own(dataset):
-        for split in dict.fromkeys((*splits, session.trainer.selection_split, "test")):
+        for split in dict.fromkeys(filter(None, (*splits, session.selection_split, "test"))):
             check_first_sample(dataset, split)
     if is_own(transform):
         sample = first_readable(session, splits[0])

@@ -71,6 +71,20 @@ class Session:
     model: nn.Module
     weights: Report | None
 
+    @property
+    def selection_split(self) -> str | None:
+        """The split that is evaluated during training.
+
+        None where the data set has no image of it and the last checkpoint is tested: that one is
+        not selected, so nothing is evaluated before the test.
+
+        Raises:
+            InputError: the split is unknown.
+        """
+        split = self.trainer.selection_split
+        is_needed = self.trainer.tested == "best" or self.dataset.has(split)
+        return split if is_needed else None
+
 
 def open_session(
     spec: RunSpec, label_map: LabelMap | None = None, *, load_weights: bool = True

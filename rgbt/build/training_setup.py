@@ -63,9 +63,9 @@ class TrainingSetup:
         return {name: domain.split for name, domain in self.session.domains.named.items()}
 
     def read_splits(self) -> tuple[str, ...]:
-        """Every split that the run reads: of the training, of the selection, of the test."""
-        splits = (*self.splits().values(), self.session.trainer.selection_split, "test")
-        return tuple(dict.fromkeys(splits))
+        """Every split that the run reads: of the training, of the selection if any, of the test."""
+        splits = (*self.splits().values(), self.session.selection_split, "test")
+        return tuple(dict.fromkeys(filter(None, splits)))
 
     def steps_per_epoch(self) -> int:
         """Batches of one epoch of the source."""
@@ -139,9 +139,7 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
         "dataset": session.dataset,
     }
     check_requirements(components, spec.plain)
-    splits = [domain.split for domain in domains.named.values()]
-    for split in (*splits, session.trainer.selection_split, "test"):
-        session.dataset.names(split)
+    _check_splits(session)
     datasets = {
         name: session.dataset if labels_key(name) in missing else _labelled(session, name, domain)
         for name, domain in domains.named.items()
@@ -159,6 +157,24 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
     return TrainingSetup(
         session, datasets, model, others, optimizers, scheme, spec.schedule.build()
     )
+
+
+def _check_splits(session: Session) -> None:
+    """Read the lists of all splits of the run, so that one without images is refused first."""
+    for domain in session.domains.named.values():
+        session.dataset.names(domain.split)
+    split = session.selection_split
+    try:
+        if split is not None:
+            session.dataset.names(split)
+    except InputError as error:
+        if session.trainer.tested == "last":
+            raise
+        raise InputError(
+            f"trainer.tested=best selects the checkpoint on {split}: {error} Or set "
+            "trainer.tested=last, which selects none."
+        ) from error
+    session.dataset.names("test")
 
 
 def _report_unpublished_settings(session: Session) -> None:

@@ -74,10 +74,10 @@ class Freiburg(FileDataset):
         test/{day|night}/ImagesRGB/*_rgb.png   ImagesIR/*_ir.png   SegmentationClass/*.npy
 
     Splits: "train_day", "train_night", and "train", which equals "train_day" and is used without
-    domains; "val", day sequences that are not in "train_day"; "test_day",
-    "test_night", and "test", the day followed by the night. Training frames at night have no
-    labels. Those by day, and so those of "val", carry predictions of an RGB network that was
-    trained on Mapillary Vistas; only the test part is labelled by hand.
+    domains; "val", day sequences that are not in "train_day", if `val_sequences` names any;
+    "test_day", "test_night", and "test", the day followed by the night. Training frames at night
+    have no labels. Those by day, and so those of "val", carry predictions of an RGB network that
+    was trained on Mapillary Vistas; only the test part is labelled by hand.
 
     Thermal counts c become grey levels of eight bits, round(255 (min(max(c, low), high) - low) /
     (high - low)), halves upwards; a level is 7.5 counts wide with the thesis' range. The thesis
@@ -100,7 +100,8 @@ class Freiburg(FileDataset):
         ignored_test: classes that are ignored in "val" and "test" (they become 255):
             "ignore" in HeatNet, none in the code of the thesis. In training they stay classes.
         val_sequences: day sequences ("seq_04_day") or pieces of them ("seq_03_day/00") that form
-            "val".
+            "val". (): all 12,170 frames by day are for training, as in the thesis and its port of
+            HeatNet, and there is no "val".
 
     Raises:
         InputError: no such root, neither part in it, an invalid crop, range or class, or numbers of
@@ -122,7 +123,7 @@ class Freiburg(FileDataset):
         crop: Crop | None = CROP,
         thermal_range: CountRange = THERMAL_RANGE,
         ignored_test: Names = ("ignore",),
-        val_sequences: Names = ("seq_04_day",),
+        val_sequences: Names = (),
     ) -> None:
         folder = existing_root(root, "that holds train and test")
         super().__init__(folder, name, num_classes, classes, palette)
@@ -162,10 +163,10 @@ class Freiburg(FileDataset):
     @property
     def splits(self) -> dict[str, str]:
         """Split -> the pattern of its files."""
-        return SPLITS
+        return {key: each for key, each in SPLITS.items() if key != "val" or self.val_sequences}
 
     def has(self, split: str) -> bool:
-        """Whether `split` has frames; InputError if the split is unknown."""
+        """Whether `split` has frames; InputError if the split is unknown ("val" is known)."""
         return bool(self._of(split))
 
     def names(self, split: str) -> tuple[str, ...]:
@@ -175,6 +176,12 @@ class Freiburg(FileDataset):
             InputError: unknown split, no frame of it, a missing sequence of "val".
         """
         frames = self._of(split)
+        if split == "val" and not self.val_sequences:
+            raise InputError(
+                f"{self.name} has no validation split, because dataset.val_sequences=[]; name day "
+                "sequences that are held out of training, such as "
+                "dataset.val_sequences=[seq_04_day]."
+            )
         hint = f"unpack the archive '{split.partition('_')[0]}' there"
         if split in ("train", "train_day", "val"):
             by_day = [each for each in self._frames.values() if _time_of(each) == "train_day"]
@@ -232,7 +239,7 @@ class Freiburg(FileDataset):
     def fingerprint(self) -> str:
         """As `hash_of_files`, with the settings of labels (crop, `ignored_test`)."""
         digest = hashlib.sha256(f"{self.crop} {sorted(self.ignored_test)}\n".encode())
-        for split in sorted(self.splits):
+        for split in sorted(SPLITS):
             names = [frame.name for frame in self._of(split)]
             digest.update(f"{split} {len(names)} {' '.join(names)}\n".encode())
         for name in self._frames:
@@ -284,7 +291,8 @@ class Freiburg(FileDataset):
         return self._frames_and_unused[0]
 
     def _of(self, split: str) -> tuple[FolderFrame, ...]:
-        self.check_split(split)
+        if split != "val":  # empty by choice where no sequence is held out
+            self.check_split(split)
         if split not in self._split_frames:
             wanted = {"train": "train_day", "val": "val_day"}.get(split, split)
             self._split_frames[split] = tuple(

@@ -29,7 +29,8 @@ class State:
 
     Attributes:
         step: optimiser steps done.
-        best_score: highest selection score so far, fraction; -1 before the first evaluation.
+        best_score: highest selection score so far, fraction; -1 before the first evaluation, and
+            in a run without a selection split.
         best_step: the step of the best score.
         seed: from which every generator of a step is derived, together with `step`: `seeds.masks`,
             or the seed of the run.

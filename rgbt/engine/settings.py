@@ -38,8 +38,8 @@ class TrainerSettings:
 
     Attributes:
         max_steps: optimiser steps, >= 1.
-        eval_every: steps between evaluations on the selection split; the last step is always
-            evaluated.
+        eval_every: steps between evaluations on the selection split, if there is one; the last step
+            is always evaluated.
         checkpoint_every: steps between checkpoints; every evaluation writes one too.
         log_every: steps between lines in metrics.jsonl.
         log_gradient_shares: whether lines of metrics.jsonl hold the share of each loss term in the
@@ -53,7 +53,8 @@ class TrainerSettings:
             result depend on it. Older runs (null) used one thread per core.
         selection_split: split whose mIoU selects the best checkpoint. Released: "test".
         tested: checkpoint for the test split: "best", with the highest mIoU on the selection
-            split, or "last", if that split has no images of the target domain.
+            split, or "last", if that split has no images of the target domain. "last" does not need
+            that split: if the data set has no image of it, nothing is evaluated during training.
         averaging: weights that are evaluated and tested. "none": those of the last step, as
             published. "ema": their exponential moving average over the steps. "last": the mean of
             those after each of the last steps; before these begin, the weights of the last step.

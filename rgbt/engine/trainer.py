@@ -80,7 +80,8 @@ class Trainer:
         steps_per_epoch: optimiser steps in one epoch.
         folder: where checkpoints go.
         record: called with (step, values) every `settings.log_every` steps.
-        validate: called with the step; returns the score that selects the best checkpoint.
+        validate: called with the step; returns the score that selects the best checkpoint. None:
+            nothing is evaluated, and the weights of the last step take the place of the best ones.
         committed: called after an evaluation has been committed.
         after_step: called after every step, before its evaluation. A signal interrupts it, and the
             step is saved.
@@ -97,7 +98,7 @@ class Trainer:
     steps_per_epoch: int
     folder: Path
     record: RecordStep
-    validate: Validate
+    validate: Validate | None
     committed: Callable[[], None] = lambda: None
     after_step: Callable[[], None] = lambda: None
     writes: bool = True
@@ -180,12 +181,7 @@ class Trainer:
             with at_once():
                 self.after_step()
             if due:
-                with self.average.in_network(), at_once():
-                    score = self.validate(state.step)
-                if score > state.best_score or self.settings.tested == "last":
-                    self._save_best(state.step)
-                    state.best_score, state.best_step = score, state.step
-                state.evaluated_step = state.step
+                self._select(state, is_last)
             if saves:
                 self._save(state)
             if due:
@@ -196,6 +192,19 @@ class Trainer:
             self._save(state)
             stop.step = state.step
             raise
+
+    def _select(self, state: State, is_last: bool) -> None:
+        """Evaluate, and keep the weights if they are the best so far or if the last are tested."""
+        keeps = is_last
+        if self.validate is not None:
+            with self.average.in_network(), at_once():
+                score = self.validate(state.step)
+            keeps = score > state.best_score or self.settings.tested == "last"
+            state.best_score = score if keeps else state.best_score
+        if keeps:
+            self._save_best(state.step)
+            state.best_step = state.step
+        state.evaluated_step = state.step
 
     def _exchange(self, state: State) -> None:
         """Collect in `state` what every process has by itself, before process 0 saves it."""

@@ -99,9 +99,9 @@ def add_to_result(run: RunFolder, session: Session, split: str, table: Consisten
     """Add the measurement to the result, tables and MLflow run of `run`, as if made by it."""
     result, tables = read_result(run.path), read_tables(run.path)
     kinds = {session.trainer.selection_split: "val", "test": "test"}
-    if result is None or tables is None or split not in kinds or session.consistency.mark:
+    kind = kinds.get(split)
+    if result is None or tables is None or kind not in result or session.consistency.mark:
         return
-    kind = kinds[split]
     result[kind] = {**result[kind], **without_nan(consistency_values(table))}
     if kind == "test":
         run.write_tables(replace(tables, consistency=table))

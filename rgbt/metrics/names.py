@@ -89,6 +89,11 @@ def subset(part: str, name: str) -> str:
     return f"{part}/{name}"
 
 
+def by_head(head: str, name: str) -> str:
+    """Metric `name` as one of two heads predicts: ``by_head("source", "night/mIoU")``."""
+    return f"{head}_head/{name}"
+
+
 FRACTIONS = {MIOU, MACC, MPRECISION, MF1, PIXEL_ACCURACY, BOUNDARY_MIOU, BOUNDARY_IOU, ECE}
 
 

@@ -10,7 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 from rgbt.checks import InputError, nearest
 from rgbt.config.compose import SEARCH_PATH, compose, flatten, register_resolvers
 from rgbt.files.yaml_files import parse_yaml
-from rgbt.spec.run_spec import RunSpec
+from rgbt.spec.run_spec import RENAMED, RunSpec
 from rgbt.spec.specify import specify
 
 GROUPS = ("dataset", "metric", "prediction", "consistency")
@@ -27,7 +27,7 @@ def load_spec(settings: Mapping[str, Any], overrides: Sequence[str] = ()) -> Run
     Args:
         settings: plain values of its configuration, whose targets may be built
             (`rgbt.config.stored_config`). Settings that are newer than the run are added as they
-            were when it was made.
+            were when it was made, and values that were renamed get their present name.
         overrides: of `CHANGEABLE` settings. ``dataset=mfnet`` replaces the whole node by that file
             of ``conf/dataset/``; ``data.eval_batch_size=1`` changes one value.
 
@@ -43,6 +43,7 @@ def load_spec(settings: Mapping[str, Any], overrides: Sequence[str] = ()) -> Run
     for key, value in _plain(defaults.data).items():
         if key not in config.data:
             config.data[key] = value
+    _rename(config)
     if config.trainer.threads is None:  # one thread per core
         config.trainer.threads = defaults.trainer.threads
     if "absent" not in config.dataset:
@@ -50,6 +51,13 @@ def load_spec(settings: Mapping[str, Any], overrides: Sequence[str] = ()) -> Run
     _override(config, overrides)
     config.model.weights = None  # the checkpoint holds them all
     return specify(config, dependencies=())
+
+
+def _rename(config: DictConfig) -> None:
+    """Give values their present names, in place."""
+    for key, now, before in RENAMED:
+        if OmegaConf.select(config, key) == before:
+            OmegaConf.update(config, key, now)
 
 
 def _plain(node: DictConfig) -> dict[str, Any]:

@@ -41,6 +41,8 @@ class Node:
             key where they say that, so that a run keeps its key.
         used_with: settings that have an effect only where another setting has a value -> that
             setting and value; left out of the key elsewhere.
+        renamed: settings of which values have another name now -> the present name -> the name
+            that the key keeps, and that stored configurations may have.
         added_as: the same as `added` for the whole node; None: it is as old as the first runs.
         shared: whether upstream runs take it over from the run that needs them; or which of its
             settings.
@@ -50,6 +52,7 @@ class Node:
     outside_key: tuple[str, ...] = ()
     added: Mapping[str, Any] = field(default_factory=dict)
     used_with: Mapping[str, tuple[str, Any]] = field(default_factory=dict)
+    renamed: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     added_as: Mapping[str, Any] | None = None
     shared: bool | tuple[str, ...] = False
 
@@ -60,6 +63,12 @@ class Node:
         old = [key for key, value in self.added.items() if values.get(key) == value]
         unused = [key for key, (other, v) in self.used_with.items() if values.get(other) != v]
         left_out = {*self.outside_key, *old, *unused}
+        names = {
+            key: self.renamed[key].get(value, value)
+            for key, value in values.items()
+            if key in self.renamed and isinstance(value, str)
+        }
+        values = {**values, **names}
         return {name: {key: values[key] for key in values if key not in left_out}}
 
 
@@ -154,7 +163,7 @@ class RunSpec:
     )
     transform: Component = _node()
     masker: Component = _node()
-    model: Component = _node()
+    model: Component = _node(renamed={"decoder": {"modified_heatnet": "modified_released"}})
     loss: Component = _node()
     scheme: Component = _node(added={"resolution": "full", "idle_steps": "none"})
     optimizer: Component = _node(added={"head_rate": "scheduled"})
@@ -335,6 +344,14 @@ NODES: dict[str, Node] = {
     each.name: each.metadata["node"] for each in fields(RunSpec) if "node" in each.metadata
 }
 """Every node of the configuration with its policy."""
+
+RENAMED = tuple(
+    (f"{key}.{setting}", now, before)
+    for key, node in NODES.items()
+    for setting, names in node.renamed.items()
+    for now, before in names.items()
+)
+"""Dotted key, present and previous name of every value that was renamed."""
 
 VALUES: dict[str, Any] = {
     each.name: each.metadata["value"] for each in fields(RunSpec) if "value" in each.metadata

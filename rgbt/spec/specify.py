@@ -233,17 +233,15 @@ def _composed(experiment: str, scale: str) -> DictConfig:
 
 def _shared_overrides(overrides: Sequence[str], key: str, reference: Reference) -> list[str]:
     """The typed overrides that the upstream run of the setting `key` shares."""
-    network = ("model",) if key == WEIGHTS else ()
-    groups = (
-        ("scale", *network) if reference.is_common else ("scale", "dataset", "metric", *network)
-    )
     always = SHARED_BY_COMMON if reference.is_common else SHARED
+    nodes = [each for each in always if each in NODES]
+    # A file of conf/debug sets sizes of the scale.
+    groups = ("scale", "debug", *(["model"] if key == WEIGHTS else []), *nodes)
     own = (WEIGHTS, "model.fresh", "seed", "runs_dir")
 
     def is_shared(path: str) -> bool:
         in_group = path.replace("/", ".").split(".")[0] in groups
-        of_data = path.startswith("data.") and not reference.is_common
-        return path not in own and (path in always or in_group or of_data)
+        return path not in own and (path in always or in_group)
 
     paths = [word.partition("=")[0].lstrip("+").rpartition("@")[2] for word in overrides]
     return [word for word, path in zip(overrides, paths, strict=True) if is_shared(path)]

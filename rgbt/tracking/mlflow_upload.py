@@ -25,7 +25,7 @@ from rgbt.tracking.mlflow_client import MlflowStore
 from rgbt.tracking.replaced_runs import shown_description, shown_key
 from rgbt.tracking.run_files import Description, read_provenance, read_result, read_tables
 from rgbt.tracking.run_folder import MetricLine, RunFolder
-from rgbt.tracking.tables import ResultTables, result_grids, without_nan
+from rgbt.tracking.tables import ResultTables, result_grids, subset_mious, without_nan
 from rgbt.tracking.tracker import Status
 
 NAME_LENGTH = 250
@@ -330,7 +330,7 @@ def artifact_table(tables: ResultTables) -> dict[str, list[Any]]:
         ("mIoU", 100 * regions.miou, math.nan),
         ("Var", regions.variance, math.nan),
     ]
-    rows += [(f"mIoU {name}", 100 * v, math.nan) for name, v in classes.subset_mious.items()]
+    rows += [(f"mIoU {name}", 100 * v, math.nan) for name, v in subset_mious(classes).items()]
     pairs = zip(tables.region_names, regions.region_ious, strict=True)
     rows += [(f"mIoU {name}", 100 * iou, math.nan) for name, iou in pairs]
     triples = zip(classes.names, classes.ious, classes.accuracies, strict=True)

@@ -1,6 +1,7 @@
 """The tables of a result as data, and as grids of text for the terminal and MLflow.
 
-Nothing is computed here but percentages; the scores come from `rgbt.metrics.scores`.
+Nothing is computed here but percentages and the mean of day and night; the scores come from
+`rgbt.metrics.scores`.
 """
 
 from __future__ import annotations
@@ -9,6 +10,8 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
+
+from rgbt.metrics.names import DAY, NIGHT
 
 ABSENT = "-"
 """Shown for an undefined score, e.g. the IoU of a class that occurs nowhere."""
@@ -169,9 +172,22 @@ def class_grid(tables: ResultTables) -> TextTable:
 
 def subset_grid(tables: ResultTables) -> TextTable:
     """MIoU of all images and of each subset, percent."""
-    subsets = {"all images": tables.regions.miou, **tables.classes.subset_mious}
+    subsets = {"all images": tables.regions.miou, **subset_mious(tables.classes)}
     rows = tuple((name, percent(value)) for name, value in subsets.items())
     return TextTable("mIoU by subset", ("images", "mIoU"), rows)
+
+
+def subset_mious(classes: ClassTable) -> dict[str, float]:
+    """Mean IoU of the subsets, and of day and night their mean, which the thesis prints.
+
+    It is not the mIoU of all images, of which the pixels are pooled.
+    """
+    found: dict[str, float] = {}
+    for name, value in classes.subset_mious.items():
+        found[name] = value
+        if name == NIGHT and DAY in found:
+            found["mean of day and night"] = (found[DAY] + value) / 2
+    return found
 
 
 def consistency_grid(table: ConsistencyTable, title: str) -> TextTable:

@@ -8,6 +8,7 @@ from typing import Any
 
 from rgbt.build.session import Session
 from rgbt.build.training_setup import TrainingSetup
+from rgbt.data.domains import TestedHead
 from rgbt.data.loaders import Batches
 from rgbt.data.pairs import PairedBatches
 from rgbt.engine.checkpoint import State, restore_weights
@@ -53,6 +54,17 @@ def target_request(session: Session, split: str) -> EvaluationRequest | None:
     if target is None or target.view in (None, view_of(session)):
         return None
     return EvaluationRequest(split=split, view=target.view)
+
+
+def other_head_request(session: Session) -> EvaluationRequest | None:
+    """The evaluation of the test split with the head that the run does not select for the night.
+
+    None in a run without a head for the day and another one for the night.
+    """
+    if session.domains.target_is != "night":
+        return None
+    head: TestedHead = "target" if session.domains.tested_head == "source" else "source"
+    return EvaluationRequest(split="test", head=head)
 
 
 def _noting_skipped(batches: Batches[Any] | PairedBatches, state: State) -> Iterator[Loaded]:

@@ -22,7 +22,13 @@ from rgbt.metrics import names, scores
 from rgbt.processes import agreed, collected
 from rgbt.runtime.member import LOST
 from rgbt.spec.run_spec import RunSpec
-from rgbt.training.common import fit, load_best, make_trainer, target_request
+from rgbt.training.common import (
+    fit,
+    load_best,
+    make_trainer,
+    other_head_request,
+    target_request,
+)
 from rgbt.training.members import NO_MORE
 
 
@@ -77,13 +83,18 @@ class _Part:
         """Train to the last step and evaluate the best checkpoint."""
         session = self.setup.session
         folder = session.spec.folder
-        split = session.trainer.selection_split
+        split = session.selection_split
         state = State(seed=session.spec.drawn.masks)
+
+        def validate(step: int) -> float:  # noqa: ARG001
+            assert split is not None, "called only where there is one"
+            return self._evaluate(self.setup.model, split)
+
         trainer = make_trainer(
             self.setup,
             folder,
             record=lambda step, values: None,  # noqa: ARG005
-            validate=lambda step: self._evaluate(self.setup.model, split),  # noqa: ARG005
+            validate=None if split is None else validate,
             writes=False,
         )
         if agreed(False):  # process 0 resumes
@@ -92,6 +103,9 @@ class _Part:
         agreed(None)  # process 0 has written the best checkpoint
         load_best(session, folder, state.best_step)
         self._evaluate(session.model, "test")
+        other = other_head_request(session)
+        if other is not None:
+            evaluate(session, session.model, other)
 
     def _evaluate(self, model: nn.Module, split: str) -> float:
         """Predict this part of a split, also in the view of the target; the mIoU of the whole."""

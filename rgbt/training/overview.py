@@ -21,21 +21,23 @@ def announce_training(setup: TrainingSetup, name: str, folder: Path) -> None:
     """Print device, network, images, steps and run folder of a training."""
     session, trainer = setup.session, setup.session.trainer
     others = "".join(f", {key} {_millions(net)}" for key, net in setup.others.items())
-    batch = session.loading.batch_size * trainer.accumulate
-    epochs = trainer.max_steps * trainer.accumulate / setup.steps_per_epoch()
     counts = [f"{len(session.dataset.names(each))} {each}" for each in setup.read_splits()]
     lines = [
         ("device", device_line(session)),
         ("network", f"{network_line(session)}{others}"),
         ("images", f"{session.dataset.name}: {', '.join(counts)}"),
-        (
-            "steps",
-            f"{trainer.max_steps} of batch {batch} ({epochs:.3g} epochs), "
-            f"validated every {trainer.eval_every}",
-        ),
+        ("steps", f"{trainer.max_steps} {_of_steps(setup)}"),
         ("folder", str(folder)),
     ]
     _write(name, *(f"  {line}" for line in path_lines(lines).plain.splitlines()))
+
+
+def announce_upstream(setup: TrainingSetup, name: str, downstream: str) -> None:
+    """Print an upstream run, the run that needs it, network, steps and folder in one line."""
+    session = setup.session
+    steps = f"{session.trainer.max_steps} steps {_of_steps(setup)}"
+    parts = [network_line(session), steps, str(session.spec.folder)]
+    _write(f"upstream run {name} for {downstream}: {', '.join(parts)}")
 
 
 def announce_network(network: TrainedNetwork) -> None:
@@ -60,6 +62,17 @@ def device_line(session: Session) -> str:
 def network_line(session: Session) -> str:
     """Class and number of parameters: "Mask2Former, 1.23 M parameters"."""
     return f"{type(session.model).__name__}, {_millions(session.model)} parameters"
+
+
+def _of_steps(setup: TrainingSetup) -> str:
+    """Batch, epochs and validation: "of batch 2 (6 epochs), validated every 3"."""
+    session, trainer = setup.session, setup.session.trainer
+    batch = session.loading.batch_size * trainer.accumulate
+    epochs = trainer.max_steps * trainer.accumulate / setup.steps_per_epoch()
+    validated = f"validated every {trainer.eval_every}"
+    if session.selection_split is None:
+        validated = f"not validated: {session.dataset.name} has no {trainer.selection_split}"
+    return f"of batch {batch} ({epochs:.3g} epochs), {validated}"
 
 
 def _write(*lines: str) -> None:

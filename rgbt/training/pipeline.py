@@ -93,9 +93,6 @@ def _naming(spec: RunSpec, run: RunSpec) -> Iterator[None]:
 
 
 def _train_upstream(spec: RunSpec, run: RunSpec) -> None:
-    info(
-        f"{run.name} depends on the upstream run {spec.name}, which is trained first: {spec.folder}"
-    )
     is_waiting = False
     while not spec.is_finished:
         if is_held(spec.folder / "lock"):
@@ -105,7 +102,7 @@ def _train_upstream(spec: RunSpec, run: RunSpec) -> None:
             time.sleep(POLL_S)
             continue
         try:
-            train(spec)
+            train(spec, upstream_of=run.name)
         except InputError:
             # Another process may have started it since the look, and even finished it.
             if is_training_together() or not (spec.is_finished or is_held(spec.folder / "lock")):

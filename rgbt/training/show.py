@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rich.text import Text
+
 from rgbt.checks import InputError
 from rgbt.config.component import Component
 from rgbt.data.domains import Domains
@@ -21,6 +23,7 @@ from rgbt.spec.run_spec import RunSpec
 from rgbt.tracking.other_code import warn_of_result
 from rgbt.tracking.run_files import Description, read_description, read_result, read_tables
 from rgbt.tracking.run_folder import RunFolder
+from rgbt.tracking.tables import percent, subset_mious
 from rgbt.tracking.terminal import info, print_rich, result_view
 from rgbt.tracking.tracker import Tracking
 
@@ -130,6 +133,15 @@ def print_result(folder: RunFolder, tracking: Tracking, domains: Domains) -> Non
     heads = domains.heads_in_words(domains.tested_head)
     links = [*([("heads", heads)] if heads else []), *tracking.links()]
     print_rich(result_view(tables, folder.path, links))
+
+
+def print_upstream_result(folder: RunFolder, name: str) -> None:
+    """Print the scores and the folder of a finished upstream run in one line."""
+    tables = read_tables(folder.path)
+    assert tables is not None, "a finished run has its tables"
+    values = {"mIoU": tables.regions.miou, **subset_mious(tables.classes)}
+    found = ", ".join(f"{part} {percent(value)}" for part, value in values.items())
+    print_rich(Text(f"upstream run {name}: {found}  {folder.path}"))
 
 
 def describe_again(folder: RunFolder, tracking: Tracking, requested: Description) -> None:

@@ -43,21 +43,31 @@ from rgbt.tracking.run_folder import RunFolder
 from rgbt.tracking.tables import ConsistencyTable, without_nan
 from rgbt.tracking.terminal import info, warn
 from rgbt.tracking.tracker import Tracking
-from rgbt.training.common import fit, load_best, make_trainer, target_request
+from rgbt.training.common import (
+    fit,
+    load_best,
+    make_trainer,
+    other_head_request,
+    target_request,
+)
 from rgbt.training.members import training_together
-from rgbt.training.overview import announce_training
-from rgbt.training.show import finished_run, print_result, show
+from rgbt.training.overview import announce_training, announce_upstream
+from rgbt.training.show import finished_run, print_result, print_upstream_result, show
 
 MUCH_WAITING = 0.3
 """Share of a step spent waiting for images above which a warning is printed."""
 
 
-def train(spec: RunSpec, extra_tags: Mapping[str, str] | None = None) -> None:
+def train(
+    spec: RunSpec, extra_tags: Mapping[str, str] | None = None, upstream_of: str = ""
+) -> None:
     """Train a run to its end, or resume it, and print its result.
 
     Args:
         spec: the run; its upstream runs are finished.
         extra_tags: MLflow tags of the run (see `rgbt.spec.naming.describe`).
+        upstream_of: name of the run that needs this one, which is announced in one line, as is its
+            result; "": the requested run, with all tables.
 
     Raises:
         InputError: the configuration, the data or the run folder do not fit.
@@ -73,16 +83,24 @@ def train(spec: RunSpec, extra_tags: Mapping[str, str] | None = None) -> None:
         return
     description = describe(spec, extra_tags)
     tracking: Tracking = spec.tracking.build()
-    folder = _train_unfinished(spec, tracking, description)
-    print_result(folder, tracking, spec.domains)
+    folder = _train_unfinished(spec, tracking, description, upstream_of)
+    if upstream_of:
+        print_upstream_result(folder, description.name)
+    else:
+        print_result(folder, tracking, spec.domains)
 
 
-def _train_unfinished(spec: RunSpec, tracking: Tracking, description: Description) -> RunFolder:
+def _train_unfinished(
+    spec: RunSpec, tracking: Tracking, description: Description, upstream_of: str
+) -> RunFolder:
     """Train a run, in all processes of the command, and return its folder."""
     with training_together(spec) as start_others:
         # Everything is built before the folder is made: a wrong value leaves nothing behind.
         setup = set_up_training(spec)
-        announce_training(setup, description.name, spec.folder)
+        if upstream_of:
+            announce_upstream(setup, description.name, upstream_of)
+        else:
+            announce_training(setup, description.name, spec.folder)
         decode_ahead(setup.session, *setup.read_splits())
         if spec.is_finished:
             replace_finished(RunFolder(spec.folder), tracking)
@@ -124,7 +142,7 @@ class Run:
                     "dataset": session.dataset.fingerprint(),
                     "steps": state.step,
                     "best_step": state.best_step,
-                    "best_score": state.best_score,
+                    **({"best_score": state.best_score} if session.selection_split else {}),
                     "seconds_of_last_process": round(time.time() - started, 1),
                     "skipped": state.skipped,
                     **self._scores(session, state, pairs),
@@ -143,13 +161,15 @@ class Run:
     def _scores(
         self, session: Session, state: State, pairs: Mapping[str, ConsistencyTable]
     ) -> dict[str, dict[str, float | None]]:
-        """What the best checkpoint reached on the selection split and on the test split."""
+        """Scores of the best checkpoint on the selection split, if any, and on the test split."""
         lines = {(line.kind, line.step): line.values for line in self.folder.lines()}
-        val = lines.get(("val", state.best_step))
-        if not val:  # its line was damaged
-            path = self.folder.path / counts_name(session.trainer.selection_split)
-            val = scores.summary(Counts.load(path), session.regions.absent)
-        reached = {"val": val, "test": lines["test", state.step]}
+        reached = {"test": lines["test", state.step]}
+        if session.selection_split is not None:
+            val = lines.get(("val", state.best_step))
+            if not val:  # its line was damaged
+                path = self.folder.path / counts_name(session.selection_split)
+                val = scores.summary(Counts.load(path), session.regions.absent)
+            reached = {"val": val, **reached}
         for kind, table in pairs.items():
             reached[kind] = {**reached[kind], **consistency_values(table)}
         return {kind: without_nan(values) for kind, values in reached.items()}
@@ -227,9 +247,10 @@ class Run:
             )
 
     def _trainer(self, session: Session, state: State) -> Trainer:
-        split = session.trainer.selection_split
+        split = session.selection_split
 
         def validate(step: int) -> float:
+            assert split is not None, "called only where there is one"
             result = evaluate(session, self.setup.model, EvaluationRequest(split=split))
             folder = trainer.checkpoints.begin_evaluation(step)
             result.counts.save(folder / counts_name(split))
@@ -243,7 +264,7 @@ class Run:
             self.setup,
             self.folder.path,
             record=lambda step, values: self.folder.append(step, "train", values),
-            validate=validate,
+            validate=None if split is None else validate,
             committed=self.tracking.update,
             after_step=self.tracking.after_step,
         )
@@ -253,7 +274,10 @@ class Run:
         """TC and CA of the best checkpoint under "val" and "test", as far as requested."""
         tables: dict[str, ConsistencyTable] = {}
         for kind in session.consistency.splits if session.consistency.sets else ():
-            split = session.trainer.selection_split if kind == "val" else kind
+            split = session.selection_split if kind == "val" else kind
+            if split is None:
+                info(f"consistency was not measured on val: {session.dataset.name} has none.")
+                continue
             keep = panel_names(session.dataset, split) if kind == "test" else ()
             try:
                 request = EvaluationRequest(split=split, keep=keep)
@@ -282,12 +306,16 @@ class Run:
         result.counts.save(self.folder.path / counts_name("test"))
         values = scores.summary(result.counts, session.regions.absent)
         of_target = self._of_target(session, session.model, "test", self.folder.path)
-        values |= of_target | ({} if pairs is None else consistency_values(pairs))
+        by_other = self._by_other_head(session)
+        values |= of_target | by_other | ({} if pairs is None else consistency_values(pairs))
         self.folder.append(state.step, "test", values)
         name = self.description.name
         tables = result_tables(result.counts, session.regions, name, state.best_step)
-        # As rows of the table: "thermal", "thermal, day", "thermal, night".
-        parts = {", ".join(each.split("/")[:-1]): value for each, value in of_target.items()}
+        # As rows of the table: "thermal", "thermal, day", "source head, night".
+        parts = {
+            ", ".join(each.replace("_", " ").split("/")[:-1]): value
+            for each, value in (of_target | by_other).items()
+        }
         subsets = {**tables.classes.subset_mious, **parts}
         classes = replace(tables.classes, subset_mious=subsets)
         tables = replace(tables, classes=classes, consistency=pairs)
@@ -302,6 +330,22 @@ class Run:
             ious=tables.regions.region_ious,
         )
         draw_region_heat(heat, self.folder.figure_path("regions"))
+
+    def _by_other_head(self, session: Session) -> dict[str, float]:
+        """The mIoU at night of the head that is not selected for the night, named after the head.
+
+        Its counts are written to the run folder.
+        """
+        request = other_head_request(session)
+        if request is None:
+            return {}
+        assert request.head is not None, "the request names a head"
+        counts = evaluate(session, session.model, request).counts
+        counts.save(self.folder.path / counts_name(f"test_{request.head}_head"))
+        values = scores.summary(counts, session.regions.absent)
+        at_night = names.subset(names.NIGHT, names.MIOU)
+        kept = {at_night: values[at_night]} if at_night in values else {}
+        return {names.by_head(request.head, name): value for name, value in kept.items()}
 
     def _of_target(
         self, session: Session, model: nn.Module, split: str, folder: Path

@@ -63,5 +63,5 @@ def write_freiburg(root: Path) -> Path:
 
 
 def reader(root: Path, **keys: Any) -> Freiburg:
-    """The reader of what `write_freiburg` writes."""
-    return Freiburg(str(root), **{"crop": CROP, **keys})
+    """The reader of what `write_freiburg` writes, with one day sequence held out as "val"."""
+    return Freiburg(str(root), **{"crop": CROP, "val_sequences": ("seq_04_day",), **keys})

@@ -89,13 +89,22 @@ def test_empty_splits_are_one_sentence(tmp_path: Path) -> None:
         assert not dataset.has(split)
         with pytest.raises(InputError, match=said):
             dataset.names(split)
-    with pytest.raises(
-        InputError,
-        match=r"'val' .* is empty: .* dataset.val_sequences is \[\]; name existing day sequences",
-    ):
-        reader(tmp_path, val_sequences=()).names("val")
     with pytest.raises(InputError, match="no split 'tran'; did you mean 'train'"):
         dataset.names("tran")
+
+
+def test_by_default_all_days_are_for_training_and_there_is_no_val(root: Path) -> None:
+    dataset = Freiburg(str(root), crop=files.CROP)
+    assert len(dataset.names("train_day")) == len(dataset.names("train")) == 5
+    assert "val" not in dataset.splits
+    assert not dataset.has("val")
+    said = (
+        r"^freiburg has no validation split, because dataset.val_sequences=\[\]; name day .*\]\.$"
+    )
+    with pytest.raises(InputError, match=said):
+        dataset.names("val")
+    assert not check_dataset(dataset).problems
+    assert dataset.fingerprint() != reader(root).fingerprint()
 
 
 @pytest.mark.parametrize("time", ["day", "night"])
@@ -399,7 +408,7 @@ def test_check_of_a_single_part(tmp_path: Path) -> None:
     files.write_training(tmp_path, "seq_00_day/00", "1_0")
     report = check_dataset(reader(tmp_path, val_sequences=()))
     assert [problem.partition(" of ")[0] for problem in report.problems] == [
-        *("split 'train_night'", "split 'val'", "split 'test_day'", "split 'test_night'"),
+        *("split 'train_night'", "split 'test_day'", "split 'test_night'"),
     ]
     assert [note.partition(" of ")[0] for note in report.notes[:1]] == ["split 'test'"]
     assert len(report.splits) == 2

@@ -272,6 +272,19 @@ def test_which_checkpoint_is_tested(tmp_path: Path, tested: str, kept: int) -> N
     assert same == (tested == "last")
 
 
+def test_without_validation_the_last_weights_take_the_place_of_the_best(tmp_path: Path) -> None:
+    trainer, _ = make(tmp_path, tested="last")
+    trainer.validate = None
+    saved = []
+    trainer.checkpoints.save_best = lambda step, weights: saved.append((step, weights))
+    state = State(seed=0)
+    trainer.fit(batches(0), state)
+    ((step, weights),) = saved  # not at step 3, which is due for an evaluation
+    assert (step, state.best_step, state.evaluated_step, state.best_score) == (6, 6, 6, -1.0)
+    last = load_checkpoint(tmp_path / "last.pt")
+    assert all(torch.equal(value, last["model"][name]) for name, value in weights.items())
+
+
 class Shared:
     """Two optimisers that share everything, in two phases; the mean of images, no noise."""
 

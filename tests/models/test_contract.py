@@ -13,8 +13,8 @@ from rgbt.types import MaskPair
 from tests.models.golden import alone, network
 from tests.models.plain import count, generator, half, images, nano, normal, randomise
 
-RELEASED = {
-    **{"ceil_mode": False, "decoder": "modified_released"},
+MODIFIED = {
+    **{"ceil_mode": False, "decoder": "modified_heatnet"},
     **{"dropout": (0.3, 0.15), "align_corners": False},
 }
 LITERAL = {"ceil_mode": False, "decoder": "modified_thesis", "align_corners": False}
@@ -23,7 +23,7 @@ CASES: list[tuple[str, dict[str, Any]]] = [
     ("rtfnet", {}),
     *(("pspnet", {"modalities": m}) for m in ("late_fusion", "early_fusion", "rgb", "thermal")),
     *(("semseg", changes) for changes in ({"modalities": "thermal"}, {"dropout": 0.5})),
-    *(("deeplabv2", changes) for changes in ({}, RELEASED, LITERAL)),
+    *(("deeplabv2", changes) for changes in ({}, MODIFIED, LITERAL)),
     ("cmx", {}),
     ("cmx", {"drop_path_rate": 0.5, "drop_path_stage2": "released"}),
     ("cmx", {"decoder_dropout": 0.5}),

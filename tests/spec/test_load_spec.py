@@ -50,6 +50,15 @@ def test_override_user_partition_without_absent_is_kept() -> None:
     assert config.metric.absent == "released", "that of the data set"
 
 
+def test_stored_decoder_gets_its_present_name() -> None:
+    config = resolved("+experiment=multi_head_modified_night_stage1")
+    now = load_spec.load_spec(OmegaConf.to_container(config))
+    config.model.decoder = "modified_released"
+    before = load_spec.load_spec(OmegaConf.to_container(config))
+    assert before.model.plain["decoder"] == "modified_heatnet"
+    assert before.plain == now.plain
+
+
 def test_absent_user_data_set_excludes_classes() -> None:
     config = composed(())
     assert config.metric.absent == "released"

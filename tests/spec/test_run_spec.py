@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from rgbt.checks import InputError
+from rgbt.spec.naming import GROUP, describe
 from rgbt.spec.run_spec import NOT_IN_KEY, RunSpec
 from rgbt.spec.specify import specify
 from tests.composed import composed
@@ -198,6 +199,18 @@ def test_upstream_overrides_are_those_that_both_runs_share() -> None:
     assert teacher.overrides[1:] == (*COMMON, *silent)
 
 
+def test_upstream_runs_of_another_size_or_seed_are_not_in_the_groups_of_the_real_ones() -> None:
+    typed = ("+debug=smoke", "seeds.order=3")
+    (stage,) = spec_of("multi_head_night", *typed).upstream
+    (teacher,) = stage.upstream
+    for each in (stage, teacher):
+        alone = describe(spec_of(each.name, *typed))
+        found = describe(each)
+        assert (found.name, found.tags[GROUP]) == (alone.name, alone.tags[GROUP])
+        assert found.tags[GROUP].startswith(f"{each.name} debug=smoke ")
+        assert found.tags[GROUP].endswith("order=3")
+
+
 @pytest.mark.parametrize(
     ("typed", "name"),
     [
@@ -272,6 +285,24 @@ def test_averaging_is_in_the_key_with_the_setting_that_it_uses() -> None:
     assert key_of("grbm", "trainer.averaging=ema", "trainer.ema_decay=0.5") != ema
     assert key_of("grbm", "trainer.averaging=last", "trainer.ema_decay=0.5") == last
     assert key_of("grbm", "trainer.averaging=last", "trainer.averaged_share=0.5") != last
+
+
+RENAMED = {
+    "multi_head_thermal_stage1_released": "7a9532ea828f",
+    "multi_head_night_stage1_released": "dd8e07e74c11",
+    "multi_head_night_init_stage1_released": "4886ab787b7a",
+}
+"""Keys of the runs of the modified decoder as version 0.1.0 computes them, when the decoder was
+called modified_released."""
+
+
+@pytest.mark.parametrize("experiment", RENAMED)
+def test_renamed_decoder_keeps_the_key(experiment: str) -> None:
+    decoder = "model=deeplabv2_two_heads_modified_tiny"
+    run = spec_of(experiment, decoder)
+    assert run.model.plain["decoder"] == "modified_heatnet"
+    assert run.key == RENAMED[experiment]
+    assert spec_of(experiment, decoder, "model.decoder=modified_thesis").key != run.key
 
 
 def test_seeds_that_are_the_seed_of_the_run_are_not_in_the_key() -> None:

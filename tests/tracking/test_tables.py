@@ -20,9 +20,11 @@ from rgbt.tracking.tables import (
     ResultTables,
     class_grid,
     consistency_grid,
+    percent,
     region_grid,
     result_grids,
     subset_grid,
+    subset_mious,
 )
 
 
@@ -86,7 +88,15 @@ def test_class_and_subset_grids(tables: ResultTables) -> None:
     assert grid.header == ("class", "IoU", "Acc", "ring_1", "ring_2")
     assert grid.rows[1] == ("car", "33.33", "66.67", "50.00", "0.00")
     assert grid.rows[-1] == ("mean", "55.56", "", "62.50", "40.00")
-    assert [row[0] for row in subset_grid(tables).rows] == ["all images", "day", "night"]
+    # (0.4 + 0.3) / 2 is not the mIoU of the pooled pixels.
+    assert subset_grid(tables).rows == (
+        ("all images", percent(tables.regions.miou)),
+        ("day", "40.00"),
+        ("night", "30.00"),
+        ("mean of day and night", "35.00"),
+    )
+    without_night = replace(tables.classes, subset_mious={"day": 0.4})
+    assert list(subset_mious(without_night)) == ["day"]
     lines = grid.to_markdown().strip().splitlines()
     assert lines[0] == "**IoU and accuracy by class**"
     assert lines[3] == "| --- | ---: | ---: | ---: | ---: |"

@@ -49,7 +49,12 @@ class Training:
     invalid: tuple[str, ...] = ()
     tags: dict[str, Mapping[str, str] | None] = field(default_factory=dict)
 
-    def train(self, spec: RunSpec, extra_tags: Mapping[str, str] | None = None) -> None:
+    def train(
+        self,
+        spec: RunSpec,
+        extra_tags: Mapping[str, str] | None = None,
+        upstream_of: str = "",
+    ) -> None:
         self.tags[spec.name] = extra_tags
         if extra_tags is not None:  # the requested run
             return
@@ -277,7 +282,12 @@ def test_pipeline_run_finished_by_another_process_is_used(run: Pipeline) -> None
     """Our start is refused, and the other process has finished in the meantime."""
 
     class Late(Training):
-        def train(self, spec: RunSpec, extra_tags: Mapping[str, str] | None = None) -> None:
+        def train(
+            self,
+            spec: RunSpec,
+            extra_tags: Mapping[str, str] | None = None,
+            upstream_of: str = "",
+        ) -> None:
             finish(spec)
             if extra_tags is None:
                 raise InputError("is being trained by process 1; wait for it.")

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from rgbt.checks import InputError
 from rgbt.models.parts import DropRates, UpBlock, enlarge
 
-Decoder = Literal["basic", "modified_released", "modified_thesis"]
+Decoder = Literal["basic", "modified_heatnet", "modified_thesis"]
 
 Rates = Annotated[tuple[Annotated[int, Interval(ge=1, le=1024)], ...], Len(1, 64)]
 """Dilations."""
@@ -25,8 +25,8 @@ class HeadShape:
     Attributes:
         in_channels: of the features.
         num_classes: K.
-        decoder: "basic": the pyramid's K maps; "modified_released": 1024, 256, 64, 64 and K maps
-            at base width 64; "modified_thesis": K maps throughout.
+        decoder: "basic": the pyramid's K maps; "modified_heatnet": 1024, 256, 64, 64 and K maps
+            at base width 64, the widths of HeatNet's decoder; "modified_thesis": K maps throughout.
         rates: dilations of the pyramid.
         summed_rates: those that count.
         dropout: of channels in the modified decoders.
@@ -62,7 +62,7 @@ class HeadShape:
         k, c = self.num_classes, self.in_channels
         widths: dict[str, tuple[int, ...]] = {
             "basic": (k,),
-            "modified_released": (c // 2, c // 8, c // 32, c // 32),
+            "modified_heatnet": (c // 2, c // 8, c // 32, c // 32),
             "modified_thesis": (k, k, k, k),
         }
         return widths[self.decoder]
@@ -101,8 +101,9 @@ class AtrousPyramid(nn.Module):
 class DeepLabHead(nn.Module):
     """A pyramid, and in the modified decoders three up blocks.
 
-    Source: thesis, Sec. III-B and Fig. 5.   Released: the modified decoder ends with a 1x1
-    convolution; see `HeadShape.decoder`.
+    Source: thesis, Sec. III-B and Fig. 5: a modified decoder keeps the number of channels.
+    Released: the training scripts import the network without up blocks. A file that no script
+    imports has a modified decoder of HeatNet's widths, which ends with a 1x1 convolution.
     """
 
     def __init__(self, shape: HeadShape) -> None:
@@ -116,7 +117,7 @@ class DeepLabHead(nn.Module):
         )
         self.final = (
             nn.Conv2d(widths[-1], shape.num_classes, 1)
-            if shape.decoder == "modified_released"
+            if shape.decoder == "modified_heatnet"
             else nn.Identity()
         )
 

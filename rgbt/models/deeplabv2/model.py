@@ -89,8 +89,9 @@ class DeepLabV2(nn.Module):
             "statistics": scale and shift are not, statistics are (AdaptSegNet, ADVENT).
         heads: their names, the first is the default; ("main",), or one per domain.
         auxiliary: a further pyramid on the third stage (AdaptSegNet and MaxSquareLoss).
-        decoder: see `HeadShape`. "modified_thesis" is what the text says, "modified_released"
-            what the code has.
+        decoder: see `HeadShape`. "basic" is what the uploaded training scripts of the thesis run,
+            "modified_thesis" what its text describes, and "modified_heatnet" that of an uploaded
+            network file that no script imports.
         rates: dilations of the pyramid.
         summed_rates: those that count: all (DeepLab v2, ADVENT), or the first two (AdaptSegNet,
             MaxSquareLoss, thesis' code). The parameters are the same.
