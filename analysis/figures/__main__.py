@@ -38,7 +38,7 @@ class Options:
         str | None,
         Help(
             "methods, label:folder,label:folder: output of rgbt score (spatialseg/fig2, fig3), or "
-            "predicted label images (qualitative panels)"
+            "predicted label images (qualitative panels, pairs of frames)"
         ),
     ] = None
     runs: Annotated[
@@ -49,6 +49,15 @@ class Options:
         ),
     ] = None
     runs_dir: Annotated[str | None, Help("folder of runs (default: runs)")] = None
+    pairs: Annotated[
+        str | None,
+        Help(
+            "pairs of frames: folder that rgbt consistency export=... wrote (temporal/fig1, fig6)"
+        ),
+    ] = None
+    view_set: Annotated[
+        Count | None, Help("set of virtual views that is shown of these pairs, from 1 (default: 1)")
+    ] = None
     frames: Annotated[
         Literal["aligned", "released", "next"] | None,
         Help(

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from analysis.bar import progress
 from analysis.figures import style
+from analysis.figures.grid import Texts, draw_grid
 from analysis.figures.inputs import FigureInput
 from analysis.predictions.scoring import ScoringOptions, score_folder
 from rgbt.checks import InputError
@@ -210,38 +211,18 @@ def draw(data: QualitativePanel, layout: str = "rows") -> Figure:
     """Pictures with a white box on the centre; below them the classes."""
     from matplotlib.patches import Rectangle
 
-    plain = ("RGB", "thermal", "ground truth", *data.methods)
-    height, width = data.rows[0].thermal.shape
-    shape = (len(data.rows), len(plain))
-    lines, columns = shape if layout == "rows" else shape[::-1]
-    cell = (style.PAGE - 0.25) / columns
-    legend = style.legend_height(style.PAGE, len(data.classes))
-    titles = [
-        style.folded(title, cell if layout == "rows" else cell * height / width) for title in plain
-    ]
-    folds = 0.14 * max(title.count("\n") for title in titles) if layout == "rows" else 0.0
-    figure = style.new_figure(
-        style.PAGE, lines * (cell * height / width + 0.02) + 0.2 + folds + legend
-    )
-    style.pack(figure)
-    grid = figure.subplots(lines, columns, squeeze=False)
-    axes = grid if layout == "rows" else grid.T
+    titles = ("RGB", "thermal", "ground truth", *data.methods)
+    pictures = []
+    for row in data.rows:
+        thermal = np.repeat(row.thermal[..., None], 3, axis=2)
+        painted = [colours(each, data.palette) for each in (row.label, *row.predictions)]
+        pictures.append((row.rgb, thermal, *painted))
+    names = [row.name for row in data.rows]
+    grid = draw_grid(pictures, Texts(names, titles, data.classes, data.palette), layout)
     box_rows, box_columns = data.box
     corner = (box_columns.start - 0.5, box_rows.start - 0.5)
     size = (box_columns.stop - box_columns.start, box_rows.stop - box_rows.start)
-    for line, row in zip(axes, data.rows, strict=True):
-        thermal = np.repeat(row.thermal[..., None], 3, axis=2)
-        painted = [colours(each, data.palette) for each in (row.label, *row.predictions)]
-        for each, picture in zip(line, (row.rgb, thermal, *painted), strict=True):
-            style.show_image(each, picture)
-            for colour, edge in (("black", 1.4), ("white", 0.8)):
-                box = Rectangle(corner, *size, fill=False, edgecolor=colour, linewidth=edge)
-                each.add_patch(box)
-    names = [row.name for row in data.rows]
-    above, beside = (titles, names) if layout == "rows" else (names, titles)
-    for each, title in zip(grid[0], above, strict=True):
-        each.set_title(title)
-    for each, title in zip(grid[:, 0], beside, strict=True):
-        each.set_ylabel(title, fontsize=style.SMALL)
-    style.class_legend(figure, data.classes, data.palette)
-    return figure
+    for each in (axes for row in grid.cells for axes in row):
+        for colour, edge in (("black", 1.4), ("white", 0.8)):
+            each.add_patch(Rectangle(corner, *size, fill=False, edgecolor=colour, linewidth=edge))
+    return grid.figure

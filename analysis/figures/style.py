@@ -171,12 +171,18 @@ def number(axes: Axes, place: tuple[int, int], text: str) -> None:
     axes.text(place[1], place[0], text, **at)  # type: ignore[arg-type]
 
 
-def class_legend(figure: Figure, names: Sequence[str], palette: NDArray[np.uint8]) -> None:
-    """Names of classes with their colours, below everything."""
-    patches = [
+def class_legend(
+    figure: Figure,
+    names: Sequence[str],
+    palette: NDArray[np.uint8],
+    more: Sequence[Artist] = (),
+) -> None:
+    """Names of classes with their colours, and `more` entries, below everything."""
+    patches: list[Artist] = [
         Patch(facecolor=colour / 255.0, edgecolor="black", linewidth=0.4, label=readable(name))
         for name, colour in zip(names, palette, strict=True)
     ]
+    patches += more
     columns = max(1, min(len(patches), int(figure.get_figwidth() / LEGEND_ENTRY)))
     rows = -(-len(patches) // columns)
     columns = -(-len(patches) // rows)
