@@ -41,6 +41,16 @@ class Options:
             "predicted label images (qualitative panels, pairs of frames)"
         ),
     ] = None
+    without_rgb: Annotated[
+        str | None,
+        Help(
+            "predictions of these methods without RGB (rgbt predict corruption=removed:rgb), "
+            "label:folder,label:folder, for crm/fig2"
+        ),
+    ] = None
+    without_thermal: Annotated[
+        str | None, Help("the same without thermal (rgbt predict corruption=removed:thermal)")
+    ] = None
     runs: Annotated[
         str | None,
         Help(

@@ -122,6 +122,13 @@ FIGURES = {
         ("frames", *OF_RUNS),
     ),
     "temporal/fig6": _pairs("four pairs of frames, real and synthesised, two columns each"),
+    "crm/fig2": FigureSpec(
+        "panels.make_missing",
+        "predictions with both images, without RGB and without thermal",
+        f"{PANELS}; without_rgb= and without_thermal= of the same methods",
+        (*(key for key in PANEL_KEYS if key != "pick"), "without_rgb", "without_thermal"),
+        ("dataset",),
+    ),
     "crm/fig4": _panel("qualitative results"),
     "crm/fig5": FigureSpec(
         "masks.make",

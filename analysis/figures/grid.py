@@ -82,7 +82,7 @@ def draw_grid(
     top = 0.2 + LINE * max(text.count("\n") for text in above)
     legend = style.legend_height(style.PAGE, len(texts.classes) + len(texts.more))
     figure = style.new_figure(style.PAGE, _extent(lines) * (tall + 0.02) + top + legend)
-    style.pack(figure)
+    figure.set_layout_engine("compressed", w_pad=0.02, h_pad=0.02, wspace=0.0, hspace=0.0)
     spec = figure.add_gridspec(
         lines[-1] + 1, columns[-1] + 1, height_ratios=_ratios(lines), width_ratios=_ratios(columns)
     )

@@ -135,7 +135,4 @@ def _outline(axes: Axes, differ: Mask, share: float) -> None:
         axes.contour(*at, padded, levels=[0.5], colors=OUTLINE, linewidths=0.5)
         axes.set_xlim(-0.5, width - 0.5)
         axes.set_ylim(height - 0.5, -0.5)
-    box = {"boxstyle": "square,pad=0.15", "facecolor": "white", "alpha": 0.85, "linewidth": 0}
-    text = "-" if np.isnan(share) else f"{share:.1f} %"
-    at_corner = {"transform": axes.transAxes, "ha": "right", "va": "bottom"}
-    axes.text(0.985, 0.02, text, fontsize=style.SMALL - 2, bbox=box, **at_corner)
+    style.in_corner(axes, "-" if np.isnan(share) else f"{share:.1f} %")

@@ -29,8 +29,8 @@ from rgbt.files.atomic import write_atomic
 COLUMN, PAGE = 3.4, 7.0
 """Width in inches of one column and of a page of two columns (IEEE)."""
 
-SMALL, NORMAL = 7.0, 8.0
-"""Points of the smallest letters (ticks, legends), and of labels and titles."""
+TINY, SMALL, NORMAL = 5.0, 7.0, 8.0
+"""Points of numbers on small pictures, of other small letters (ticks, legends), and of titles."""
 
 LETTERS_PER_INCH = 17
 """Of labels and titles, on average."""
@@ -171,6 +171,13 @@ def number(axes: Axes, place: tuple[int, int], text: str) -> None:
     axes.text(place[1], place[0], text, **at)  # type: ignore[arg-type]
 
 
+def in_corner(axes: Axes, text: str) -> None:
+    """A short text in the lower right corner of a picture, on a white ground."""
+    box = {"boxstyle": "square,pad=0.15", "facecolor": "white", "alpha": 0.85, "linewidth": 0}
+    at: Any = {"transform": axes.transAxes, "ha": "right", "va": "bottom"}
+    axes.text(0.985, 0.02, text, fontsize=TINY, bbox=box, **at)
+
+
 def class_legend(
     figure: Figure,
     names: Sequence[str],
@@ -209,8 +216,9 @@ def log_axis(axes: Axes) -> None:
 
 
 def folded(text: str, inches: float) -> str:
-    """`text` on as many lines as it needs to stand within `inches`."""
-    return textwrap.fill(text, max(8, int(inches * LETTERS_PER_INCH)))
+    """`text` on as many lines as it needs to stand within `inches`; its own lines stay apart."""
+    width = max(8, int(inches * LETTERS_PER_INCH))
+    return "\n".join(textwrap.fill(line, width) for line in text.split("\n"))
 
 
 def series_legend(figure: Figure, axes: Axes, columns: int) -> None:
