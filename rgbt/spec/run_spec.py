@@ -151,7 +151,7 @@ class RunSpec:
     )
     transform: Component = _node()
     masker: Component = _node()
-    model: Component = _node()
+    model: Component = _node(added={"mask_token": "branch"})
     loss: Component = _node()
     scheme: Component = _node(added={"resolution": "full"})
     optimizer: Component = _node()
