@@ -58,7 +58,9 @@ def test_row_masks_match_printed_settings(table: Table, row: Row) -> None:
         "beta": loss.get("beta"),
         "focus": loss.get("spatial", {}).get("focus"),
         "masking_ratio": masker.ratio,
-        "masking": {"indiv": "irm", "rand_comp": "crm"}.get(masker.pairing or ""),
+        "masking": {"indiv": "irm", "rand_comp": "crm", "comp": "crm_pair"}.get(
+            masker.pairing or ""
+        ),
     }
     if masker.sigma_div is not None:
         found["sigma_p"] = "Ny" if masker.sigma_div == 1 else f"Ny/{masker.sigma_div:g}"
