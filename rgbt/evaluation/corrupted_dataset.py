@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from rgbt.checks import InputError
-from rgbt.corruptions.corruption import Corruption, OfTime
+from rgbt.corruptions.corruption import Corruption, OfPixels, OfTime
 from rgbt.dataset import DatasetWrapper, LabelledDataset
 from rgbt.randomness import numpy_generator
 from rgbt.types import Sample
@@ -126,10 +126,8 @@ class CorruptedDataset(DatasetWrapper):
         return found
 
 
-def corrupt(
-    name: str, sample: Sample, corruption: Corruption, severity: float, seed: int
-) -> Sample:
-    """`sample` under a corruption other than one of time; draws depend on seed and name."""
+def corrupt(name: str, sample: Sample, corruption: OfPixels, severity: float, seed: int) -> Sample:
+    """`sample` under a corruption of its pixels; draws depend on seed and name."""
 
     def rng_of(purpose: str) -> np.random.Generator:
         # This word is part of the seed and must not change.

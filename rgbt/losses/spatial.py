@@ -150,7 +150,7 @@ def _distances(batch: Batch, settings: SpatialWeight) -> Tensor:
     if settings.d_max == "crop":
         farthest = distance.amax((1, 2))
 
-    relative = distance / farthest[:, None, None]
+    relative: Tensor = distance / farthest[:, None, None]
     return 1 - relative if settings.focus == "center" else relative
 
 
