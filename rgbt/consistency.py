@@ -118,17 +118,18 @@ def _export(options: Options, overrides: list[str]) -> int:
 def _measure_predictions(options: Options, overrides: list[str]) -> int:
     from rgbt.evaluation.consistency_files import write_pairs
     from rgbt.evaluation.pair_images import FolderPairs
-    from rgbt.evaluation.pair_list import PairList, PairSource, read_list
+    from rgbt.evaluation.pair_list import PairSource, list_pairs
     from rgbt.evaluation.request import EvaluationRequest
     from rgbt.evaluation.segmentation import panel_names
     from rgbt.evaluation.temporal_consistency import count_predicted
+    from rgbt.metrics.pair_list import read_list
     from rgbt.metrics.pairs import file_name
     from rgbt.tracking.terminal import path_lines, print_rich
 
     split, folder, out = options.split, options.predictions, options.out
     assert folder is not None, "the caller has checked it"
     listed, source = read_list(options.pairs or folder), PairSource.compose(overrides)
-    wanted = PairList.of(source, split, options.frames)
+    wanted = list_pairs(source, split, options.frames)
     predictor = FolderPairs(folder, source, listed, wanted, options.format)
     request = EvaluationRequest(split=split, keep=panel_names(source.dataset, split))
     pairs = count_predicted(source, predictor, request, options.frames)

@@ -11,7 +11,14 @@ from pathlib import Path
 from typing import Annotated
 
 from rgbt.checks import InputError
-from rgbt.config.common_options import Head, NetworkOptions, RegionsFile, Split
+from rgbt.config.common_options import (
+    CorruptionName,
+    Head,
+    NetworkOptions,
+    RegionsFile,
+    Severity,
+    Split,
+)
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
 from rgbt.metrics.details import DISTANCES, SIZES, WIDTH
@@ -38,15 +45,8 @@ class Options(NetworkOptions):
     ] = "default"
     regions: RegionsFile = "as trained"
     head: Head = "as trained"
-    corruption: Annotated[
-        str,
-        Help(
-            "corruption of the images, a file of conf/corruption with a severity: "
-            "corruption=noise severity=16. Of one image only: corruption=noise:rgb or "
-            "removed:thermal. `rgbt robustness` measures all corruptions"
-        ),
-    ] = "none"
-    severity: Annotated[str, Help("severity of the corruption")] = ""
+    corruption: CorruptionName = "none"
+    severity: Severity = ""
     details: Annotated[
         str,
         Help(

@@ -12,7 +12,13 @@ from pathlib import Path
 from typing import Annotated
 
 from rgbt.checks import InputError
-from rgbt.config.common_options import Head, Modality, NetworkOptions
+from rgbt.config.common_options import (
+    CorruptionName,
+    Head,
+    Modality,
+    NetworkOptions,
+    Severity,
+)
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
 
@@ -34,6 +40,8 @@ class Options(NetworkOptions):
     thermal: Annotated[str, Help("thermal file of the pair")] = ""
     modality: Modality = "default"
     head: Head = "as trained"
+    corruption: CorruptionName = "none"
+    severity: Severity = ""
     label_map: Annotated[
         str,
         Help(
@@ -59,9 +67,11 @@ class Options(NetworkOptions):
 def main(options: Options, overrides: list[str]) -> int:
     """Write NAME_overlay.png and NAME.png (class indices, 0..K-1) for every input image.
 
-    Overrides such as dataset=mfnet dataset.root=/data/MFNet
+    Overrides such as dataset=mfnet dataset.root=/data/MFNet, and settings of the corruption:
+    corruption.block=16 corruption.seed=1
     """
     from rgbt.evaluation import pseudo_labels
+    from rgbt.evaluation.corruption_request import requested_corruption, split_overrides
     from rgbt.evaluation.images import chosen_images, write_images
     from rgbt.evaluation.request import EvaluationRequest, NetworkRequest
     from rgbt.tracking.terminal import path_lines, print_rich, rich_table
@@ -72,14 +82,24 @@ def main(options: Options, overrides: list[str]) -> int:
             f"threshold={options.threshold:g} requires pseudo_labels=true; class maps and "
             "overlays always show every pixel."
         )
+    if options.pseudo_labels and options.corruption != "none":
+        raise InputError(
+            f"corruption={options.corruption} has no effect on pseudo-labels, which are made of "
+            "clean images; omit one of corruption= and pseudo_labels=."
+        )
     label_map = pseudo_labels.label_map_of(options.label_map)
     labelling = pseudo_labels.Labelling(options.threshold, label_map)
     request = EvaluationRequest.from_options(options.input, options.modality, options.head)
-    opened = NetworkRequest(options, overrides).open(label_map)
+    words, overrides = split_overrides(overrides)
+    network = NetworkRequest(options, overrides)
+    corruption = requested_corruption(options.corruption, options.severity, words, network.trust)
+    opened = network.open(label_map)
     announce_network(opened)
     session, out = opened.session, options.out
     if not options.pseudo_labels:
         images = chosen_images(session, options.input, options.rgb, options.thermal)
+        if corruption is not None:
+            images = corruption.images(images, session, options.input)
         print(write_images(session, images, request, out, label_map))
         return 0
     splits = session.dataset.splits

@@ -117,3 +117,75 @@ def test_new_images_in_two_folders_or_two_files(
         assert said.endswith(f"{3 if number == 0 else 1} images in {out}\n")
         found.append(image(out / "00201D.png"))
     assert all(np.array_equal(each, found[0]) for each in found)
+
+
+def with_missing(data: Path, folder: Path, missing: str) -> Path:
+    """Folders rgb and thermal of the test split, in which one image of each pair is black."""
+    for name in SPLITS["test"]:
+        packed = image(data / "images" / f"{name}.png")
+        for part, pixels in (("rgb", packed[..., :3]), ("thermal", packed[..., 3])):
+            (folder / part).mkdir(parents=True, exist_ok=True)
+            black = np.zeros_like(pixels)
+            cv2.imwrite(str(folder / part / f"{name}.png"), black if part == missing else pixels)
+    return folder
+
+
+def predicted(call: Call, out: Path, *words: str) -> list[np.ndarray]:
+    code, _, err = call(PREDICT, f"out={out}", *words)
+    assert code == 0, err
+    return [image(out / f"{name}.png") for name in SPLITS["test"]]
+
+
+@pytest.mark.parametrize("missing", ["rgb", "thermal"])
+def test_missing_image_is_predicted_as_a_black_one(
+    call: Call, trained: Trained, data: Path, tmp_path: Path, missing: str
+) -> None:
+    run = f"run={trained(*ONE)}"
+    black = with_missing(data, tmp_path / "black", missing)
+    whole = with_missing(data, tmp_path / "whole", "none")
+    wanted = predicted(call, tmp_path / "wanted", run, f"input={black}")
+    clean = predicted(call, tmp_path / "clean", run, "input=test")
+    removed = f"corruption=removed:{missing}"
+    for number, words in enumerate(
+        [("input=test",), (f"input={whole}",), ("input=test", "severity=1")]
+    ):
+        found = predicted(call, tmp_path / f"out{number}", run, removed, *words)
+        assert all(map(np.array_equal, found, wanted))
+        assert not any(map(np.array_equal, found, clean))
+    overlay = image(tmp_path / "out0" / "00201D_overlay.png")
+    assert np.array_equal(overlay, image(tmp_path / "wanted" / "00201D_overlay.png"))
+
+
+def test_corruption_of_time_needs_a_split(
+    call: Call, trained: Trained, data: Path, tmp_path: Path
+) -> None:
+    run, whole = f"run={trained(*ONE)}", with_missing(data, tmp_path / "whole", "none")
+    later = ("corruption=delayed", "severity=1")
+    code, _, err = call(PREDICT, run, f"out={tmp_path / 'no'}", f"input={whole}", *later)
+    assert code == 2
+    assert_one_sentence(err, "corruption=delayed shows an earlier frame of the split")
+    shown = predicted(call, tmp_path / "delayed", run, "input=test", *later)
+    # 00203D is the second image of the day, so its thermal image is that of 00201D.
+    names = ("00203D", "00201D")
+    rgb, thermal = (image(data / "images" / f"{name}.png") for name in names)
+    cv2.imwrite(str(tmp_path / "rgb.png"), rgb[..., :3])
+    cv2.imwrite(str(tmp_path / "thermal.png"), thermal[..., 3])
+    files = (f"rgb={tmp_path / 'rgb.png'}", f"thermal={tmp_path / 'thermal.png'}")
+    assert call(PREDICT, run, f"out={tmp_path / 'one'}", *files)[0] == 0
+    assert np.array_equal(shown[2], image(tmp_path / "one" / "rgb.png"))
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("pseudo_labels=true", "corruption=removed:rgb"), "corruption=removed:rgb has no effect"),
+        (("severity=2",), "'severity' has no effect without corruption=..."),
+        (("corruption=remov",), "corruption"),
+    ],
+)
+def test_corruption_without_effect_is_refused(
+    call: Call, tmp_path: Path, words: tuple[str, ...], sentence: str
+) -> None:
+    code, _, err = call(PREDICT, "run=x", "input=test", f"out={tmp_path / 'out'}", *words)
+    assert code == 2
+    assert_one_sentence(err, sentence)

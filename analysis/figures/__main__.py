@@ -38,8 +38,18 @@ class Options:
         str | None,
         Help(
             "methods, label:folder,label:folder: output of rgbt score (spatialseg/fig2, fig3), or "
-            "predicted label images (qualitative panels)"
+            "predicted label images (qualitative panels, pairs of frames)"
         ),
+    ] = None
+    without_rgb: Annotated[
+        str | None,
+        Help(
+            "predictions of these methods without RGB (rgbt predict corruption=removed:rgb), "
+            "label:folder,label:folder, for crm/fig2"
+        ),
+    ] = None
+    without_thermal: Annotated[
+        str | None, Help("the same without thermal (rgbt predict corruption=removed:thermal)")
     ] = None
     runs: Annotated[
         str | None,
@@ -49,6 +59,15 @@ class Options:
         ),
     ] = None
     runs_dir: Annotated[str | None, Help("folder of runs (default: runs)")] = None
+    pairs: Annotated[
+        str | None,
+        Help(
+            "pairs of frames: folder that rgbt consistency export=... wrote (temporal/fig1, fig6)"
+        ),
+    ] = None
+    view_set: Annotated[
+        Count | None, Help("set of virtual views that is shown of these pairs, from 1 (default: 1)")
+    ] = None
     frames: Annotated[
         Literal["aligned", "released", "next"] | None,
         Help(

@@ -17,6 +17,7 @@ STATISTICS = "statistics= (of rgbt spatial) or dataset="
 SPATIAL = ("statistics", "split")
 DATASET_AND_METRIC = ("dataset", "metric")
 PANELS = "dataset=, methods=label:folder of predictions"
+PAIRS = "dataset=, pairs= (of rgbt consistency export=), methods=label:folder of predictions"
 PANEL_KEYS = ("methods", "names", "pick", "rows", "split", "layout", "format", "suffix")
 RUNS = "runs= (run, group or counts, with labels: label:run)"
 OF_RUNS = ("runs", "runs_dir", "split", "absent")
@@ -50,6 +51,12 @@ class FigureSpec:
 
 def _panel(shows: str) -> FigureSpec:
     return FigureSpec("panels.make", shows, PANELS, PANEL_KEYS, DATASET_AND_METRIC)
+
+
+def _pairs(shows: str) -> FigureSpec:
+    keys = ("pairs", "methods", "view_set", "names", "pick", "rows", "layout", "format")
+    groups = ("dataset", "consistency")
+    return FigureSpec("pairs.make", f"{shows}, with predictions", PAIRS, keys, groups, idle=())
 
 
 def _robustness(shows: str) -> FigureSpec:
@@ -107,13 +114,21 @@ FIGURES = {
     ),
     "spatialseg/fig8": _panel("qualitative results"),
     "spatialseg/fig9": _panel("qualitative results on another data set"),
+    "temporal/fig1": _pairs("a real frame and its synthesised next one, a row each"),
     "temporal/fig5": FigureSpec(
         "consistency.make",
         "TC and CA of variants by class",
         f"{RUNS}, with counts of pairs of frames (rgbt consistency)",
         ("frames", *OF_RUNS),
     ),
-    "temporal/fig6": _panel("qualitative results, one column per image with layout=columns"),
+    "temporal/fig6": _pairs("four pairs of frames, real and synthesised, two columns each"),
+    "crm/fig2": FigureSpec(
+        "panels.make_missing",
+        "predictions with both images, without RGB and without thermal",
+        f"{PANELS}; without_rgb= and without_thermal= of the same methods",
+        (*(key for key in PANEL_KEYS if key != "pick"), "without_rgb", "without_thermal"),
+        ("dataset",),
+    ),
     "crm/fig4": _panel("qualitative results"),
     "crm/fig5": FigureSpec(
         "masks.make",

@@ -102,9 +102,16 @@ class FigureInput:
         made: Regions = self._built("metric")
         return made
 
+    @cached_property
+    def consistency(self) -> Any:
+        """The virtual views (`rgbt.transforms.view_sets.ViewSets`): published unless given."""
+        return self._built("consistency")
+
     def _built(self, node: str) -> Any:
-        chosen = any(word.startswith("metric=") for word in self.overrides)
-        return built(node, [*([] if chosen else [f"metric={self.metric}"]), *self.overrides])
+        usual = {"metric": self.metric, "consistency": "views"}
+        given = {word.partition("=")[0] for word in self.overrides}
+        words = [f"{group}={name}" for group, name in usual.items() if group not in given]
+        return built(node, [*words, *self.overrides])
 
     def names(self, number: int) -> tuple[str, ...]:
         """The images of ``names=``, or the first `number` of the split.

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from analysis.bar import progress
 from analysis.figures import style
+from analysis.figures.grid import Grid, Texts, draw_grid
 from analysis.figures.inputs import FigureInput
 from analysis.predictions.scoring import ScoringOptions, score_folder
 from rgbt.checks import InputError
@@ -38,6 +39,11 @@ ReadPrediction = Callable[[str], Labels]
 """Name of an image -> (H, W) predicted class indices."""
 
 PREDICTIONS = "label:folder of predicted label images, with commas between methods"
+
+MISSING = {"without_rgb": "no RGB", "without_thermal": "no thermal"}
+"""Option with the predictions without an image -> what they are called."""
+
+LINE = "\n"
 
 WHOLE = Regions(partition="ring", regions=1, aspect="image", absent="exclude")
 """The image as one region."""
@@ -77,7 +83,35 @@ class QualitativePanel:
 
 def make(given: FigureInput) -> Figure:
     """Images, ground truth and predictions."""
-    named = given.named("methods", PREDICTIONS)
+    made = _read(given, given.named("methods", PREDICTIONS), 4)
+    return draw(made, given.get("layout", "rows"))
+
+
+def make_missing(given: FigureInput) -> Figure:
+    """CRM, Fig. 2: predictions with both images, without RGB and without thermal.
+
+    Raises:
+        InputError: methods whose three folders are not all named.
+    """
+    folders = {key: given.named(key, PREDICTIONS) for key in ("methods", *MISSING)}
+    for key, named in folders.items():
+        if set(named) != set(folders["methods"]):
+            raise InputError(
+                f"{key} names the predictions of {', '.join(named)}, but methods those of "
+                f"{', '.join(folders['methods'])}; give every method in methods=, without_rgb= and "
+                "without_thermal=."
+            )
+    shown = {"methods": "both", **MISSING}
+    named = {
+        f"{label}\n{shown[key]}": folders[key][label]
+        for label in folders["methods"]
+        for key in shown
+    }
+    return draw(_read(given, named, 2), given.get("layout", "rows"), marks="scores")
+
+
+def _read(given: FigureInput, named: Mapping[str, str], number: int) -> QualitativePanel:
+    """The panel of folders of predictions by label, of `number` images unless they are named."""
     folders = {label: Path(place).expanduser() for label, place in named.items()}
     form: Any = given.get("format", "auto")
     suffix, dataset = given.get("suffix", ""), given.dataset
@@ -97,7 +131,7 @@ def make(given: FigureInput) -> Figure:
 
     if "names" in given.values and ("pick" in given.values or "rows" in given.values):
         raise InputError("names= selects the images; omit pick= and rows=.")
-    names = given.names(given.get("rows", 4))
+    names = given.names(given.get("rows", number))
     if given.get("pick", "first") == "largest_difference":
         split = given.get("split", "test")
         options = ScoringOptions(partitions=("ring",), regions=1, form=form, suffix=suffix)
@@ -106,13 +140,14 @@ def make(given: FigureInput) -> Figure:
             for label, folder in folders.items():
                 (counts,) = score_folder(folder, dataset, split, options, advance).counts
                 mious[label] = image_mious(counts)
-        names = most_different(mious, dataset.names(split), given.get("rows", 4))
+        names = most_different(mious, dataset.names(split), given.get("rows", number))
     readers = {label: reading(folder) for label, folder in folders.items()}
     made = panel(dataset, readers, names, given.regions)
     for row in made.rows:
         scores = zip(made.methods, row.mious, strict=True)
-        info(f"{row.name}: " + ", ".join(f"{label} mIoU {each:.1f}" for label, each in scores))
-    return draw(made, given.get("layout", "rows"))
+        said = (f"{label.replace(LINE, ' ')} mIoU {each:.1f}" for label, each in scores)
+        info(f"{row.name}: {', '.join(said)}")
+    return made
 
 
 def image_mious(counts: Counts) -> dict[str, float]:
@@ -206,42 +241,40 @@ def most_different(
 
 
 @style.styled
-def draw(data: QualitativePanel, layout: str = "rows") -> Figure:
-    """Pictures with a white box on the centre; below them the classes."""
-    from matplotlib.patches import Rectangle
+def draw(
+    data: QualitativePanel, layout: str = "rows", marks: Literal["box", "scores"] = "box"
+) -> Figure:
+    """Pictures; below them the classes.
 
-    plain = ("RGB", "thermal", "ground truth", *data.methods)
-    height, width = data.rows[0].thermal.shape
-    shape = (len(data.rows), len(plain))
-    lines, columns = shape if layout == "rows" else shape[::-1]
-    cell = (style.PAGE - 0.25) / columns
-    legend = style.legend_height(style.PAGE, len(data.classes))
-    titles = [
-        style.folded(title, cell if layout == "rows" else cell * height / width) for title in plain
-    ]
-    folds = 0.14 * max(title.count("\n") for title in titles) if layout == "rows" else 0.0
-    figure = style.new_figure(
-        style.PAGE, lines * (cell * height / width + 0.02) + 0.2 + folds + legend
-    )
-    style.pack(figure)
-    grid = figure.subplots(lines, columns, squeeze=False)
-    axes = grid if layout == "rows" else grid.T
-    box_rows, box_columns = data.box
-    corner = (box_columns.start - 0.5, box_rows.start - 0.5)
-    size = (box_columns.stop - box_columns.start, box_rows.stop - box_rows.start)
-    for line, row in zip(axes, data.rows, strict=True):
+    Args:
+        data: images and predictions.
+        layout: a row or a column per image.
+        marks: a white box on the centre, or the mIoU of every prediction.
+    """
+    titles = ("RGB", "thermal", "ground truth", *data.methods)
+    pictures = []
+    for row in data.rows:
         thermal = np.repeat(row.thermal[..., None], 3, axis=2)
         painted = [colours(each, data.palette) for each in (row.label, *row.predictions)]
-        for each, picture in zip(line, (row.rgb, thermal, *painted), strict=True):
-            style.show_image(each, picture)
-            for colour, edge in (("black", 1.4), ("white", 0.8)):
-                box = Rectangle(corner, *size, fill=False, edgecolor=colour, linewidth=edge)
-                each.add_patch(box)
+        pictures.append((row.rgb, thermal, *painted))
     names = [row.name for row in data.rows]
-    above, beside = (titles, names) if layout == "rows" else (names, titles)
-    for each, title in zip(grid[0], above, strict=True):
-        each.set_title(title)
-    for each, title in zip(grid[:, 0], beside, strict=True):
-        each.set_ylabel(title, fontsize=style.SMALL)
-    style.class_legend(figure, data.classes, data.palette)
-    return figure
+    grid = draw_grid(pictures, Texts(names, titles, data.classes, data.palette), layout)
+    if marks == "scores":
+        for row, cells in zip(data.rows, grid.cells, strict=True):
+            for axes, miou_of_image in zip(cells[3:], row.mious, strict=True):
+                style.in_corner(axes, f"{miou_of_image:.1f}")
+        return grid.figure
+    _box(grid, data.box)
+    return grid.figure
+
+
+def _box(grid: Grid, box: tuple[slice, slice]) -> None:
+    """A white box on the same rows and columns of every picture."""
+    from matplotlib.patches import Rectangle
+
+    box_rows, box_columns = box
+    corner = (box_columns.start - 0.5, box_rows.start - 0.5)
+    size = (box_columns.stop - box_columns.start, box_rows.stop - box_rows.start)
+    for each in (axes for row in grid.cells for axes in row):
+        for colour, edge in (("black", 1.4), ("white", 0.8)):
+            each.add_patch(Rectangle(corner, *size, fill=False, edgecolor=colour, linewidth=edge))

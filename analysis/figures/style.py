@@ -29,8 +29,8 @@ from rgbt.files.atomic import write_atomic
 COLUMN, PAGE = 3.4, 7.0
 """Width in inches of one column and of a page of two columns (IEEE)."""
 
-SMALL, NORMAL = 7.0, 8.0
-"""Points of the smallest letters (ticks, legends), and of labels and titles."""
+TINY, SMALL, NORMAL = 5.0, 7.0, 8.0
+"""Points of numbers on small pictures, of other small letters (ticks, legends), and of titles."""
 
 LETTERS_PER_INCH = 17
 """Of labels and titles, on average."""
@@ -171,12 +171,25 @@ def number(axes: Axes, place: tuple[int, int], text: str) -> None:
     axes.text(place[1], place[0], text, **at)  # type: ignore[arg-type]
 
 
-def class_legend(figure: Figure, names: Sequence[str], palette: NDArray[np.uint8]) -> None:
-    """Names of classes with their colours, below everything."""
-    patches = [
+def in_corner(axes: Axes, text: str) -> None:
+    """A short text in the lower right corner of a picture, on a white ground."""
+    box = {"boxstyle": "square,pad=0.15", "facecolor": "white", "alpha": 0.85, "linewidth": 0}
+    at: Any = {"transform": axes.transAxes, "ha": "right", "va": "bottom"}
+    axes.text(0.985, 0.02, text, fontsize=TINY, bbox=box, **at)
+
+
+def class_legend(
+    figure: Figure,
+    names: Sequence[str],
+    palette: NDArray[np.uint8],
+    more: Sequence[Artist] = (),
+) -> None:
+    """Names of classes with their colours, and `more` entries, below everything."""
+    patches: list[Artist] = [
         Patch(facecolor=colour / 255.0, edgecolor="black", linewidth=0.4, label=readable(name))
         for name, colour in zip(names, palette, strict=True)
     ]
+    patches += more
     columns = max(1, min(len(patches), int(figure.get_figwidth() / LEGEND_ENTRY)))
     rows = -(-len(patches) // columns)
     columns = -(-len(patches) // rows)
@@ -203,8 +216,9 @@ def log_axis(axes: Axes) -> None:
 
 
 def folded(text: str, inches: float) -> str:
-    """`text` on as many lines as it needs to stand within `inches`."""
-    return textwrap.fill(text, max(8, int(inches * LETTERS_PER_INCH)))
+    """`text` on as many lines as it needs to stand within `inches`; its own lines stay apart."""
+    width = max(8, int(inches * LETTERS_PER_INCH))
+    return "\n".join(textwrap.fill(line, width) for line in text.split("\n"))
 
 
 def series_legend(figure: Figure, axes: Axes, columns: int) -> None:

@@ -69,6 +69,7 @@ def _recognise_mask2former(contents: Contents) -> Facts | None:
     fusion = () if joined is None else (f"model.fusion={str(joined).lower()}",)
     start = settings.get("SWIN.SHARE_START_IDX", share_start(contents))
     share = (f"model.share_start={start}",) if start in (0, 1, 2, 3) else ()
+    token = ("model.mask_token=shared",) if are_one(contents, "mask_token") else ()
     unusual = tuple(each for each in fusion if each != "model.fusion=max")
     return Facts(
         layout="mask2former",
@@ -77,7 +78,7 @@ def _recognise_mask2former(contents: Contents) -> Facts | None:
         size=SWIN_TITLES.get(size, ""),
         classes=None if rows is None else rows - 1,
         prefix=prefix,
-        fits=((f"model=mask2former_{size}", *unusual, *share),) if size else (),
+        fits=((f"model=mask2former_{size}", *unusual, *share, *token),) if size else (),
         convention=("model/inputs=crm", *fusion),
     )
 
@@ -85,14 +86,18 @@ def _recognise_mask2former(contents: Contents) -> Facts | None:
 def share_start(contents: Contents) -> int:
     """First stage whose weights are one piece of memory under the names of both branches."""
     for stage in range(4):
-        name = f"layers.{stage}.blocks.0.norm1.weight"
-        rgb, thermal = (
-            next((t for key, t in contents.tensors.items() if key.endswith(f"{b}{name}")), None)
-            for b in (RGB, THERMAL)
-        )
-        if rgb is not None and thermal is not None and rgb.data_ptr() == thermal.data_ptr():
+        if are_one(contents, f"layers.{stage}.blocks.0.norm1.weight"):
             return stage
     return 4
+
+
+def are_one(contents: Contents, name: str) -> bool:
+    """Whether a tensor is one piece of memory under the names of both branches."""
+    rgb, thermal = (
+        next((t for key, t in contents.tensors.items() if key.endswith(f"{b}{name}")), None)
+        for b in (RGB, THERMAL)
+    )
+    return rgb is not None and thermal is not None and rgb.data_ptr() == thermal.data_ptr()
 
 
 def released_mask2former(state: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -109,7 +109,9 @@ def _hint(facts: Facts, plan: Plan, family: str, num_entries: int) -> str:
             f"at random with 'model.fresh=[{','.join(parts)}]'."
         )
     if plan.torn:
-        return ". Build the network as it was trained, for example with model.share_start=4."
+        tokens = all(first.endswith("mask_token") for first, _ in plan.torn)
+        setting = "model.mask_token=branch" if tokens else "model.share_start=4"
+        return f". Build the network as it was trained, for example with {setting}."
     wrong = len(plan.missing) + len(plan.unfit)
     if wrong > ANOTHER_SIZE * num_entries and facts.fits:
         return f". The file fits {' '.join(facts.fits[0])}."

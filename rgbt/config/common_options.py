@@ -34,6 +34,15 @@ Head = Annotated[
     Literal["as trained", "own", "source", "target"],
     Help("head of a network with one head per domain: own, source or target"),
 ]
+CorruptionName = Annotated[
+    str,
+    Help(
+        "corruption of the images, a file of conf/corruption with a severity: "
+        "corruption=noise severity=16. Of one image only: corruption=noise:rgb or "
+        "removed:thermal. `rgbt robustness` measures all corruptions"
+    ),
+]
+Severity = Annotated[str, Help("severity of the corruption")]
 RegionsFile = Annotated[
     str, Help("partition of the image, a file of conf/metric: ring5, ring9, vertical5, horizontal5")
 ]

@@ -10,11 +10,12 @@ from rgbt.build.load_run import TrainedNetwork
 from rgbt.build.session import Session
 from rgbt.checks import InputError
 from rgbt.dataset import LabelledDataset
-from rgbt.evaluation.pair_frames import Frames, frames_mark
+from rgbt.evaluation.pair_frames import frames_mark
 from rgbt.evaluation.request import EvaluationRequest, NetworkRequest, other_images
 from rgbt.evaluation.segmentation import legend_of
 from rgbt.evaluation.temporal_consistency import Pairs, consistency_values
 from rgbt.metrics.counts import Counts
+from rgbt.metrics.pair_list import Frames
 from rgbt.metrics.pairs import Protocol, file_name, partition_name
 from rgbt.tracking.mlflow_upload import read_upload_state
 from rgbt.tracking.pair_pictures import draw_pairs

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from rgbt.checks import InputError
-from rgbt.corruptions.corruption import Corruption, OfTime
+from rgbt.corruptions.corruption import Corruption, OfPixels, OfTime
 from rgbt.dataset import DatasetWrapper, LabelledDataset
 from rgbt.randomness import numpy_generator
 from rgbt.types import Sample
@@ -50,18 +51,26 @@ class CorruptedDataset(DatasetWrapper):
         self._shown = self._other_frames()
 
     def read(self, name: str) -> Sample:
+        """The sample called `name` under the corruption; errors are those of `corrupted`."""
+        return self.corrupted(name, self.source.read)
+
+    def corrupted(self, name: str, read: Callable[[str], Sample]) -> Sample:
         """The sample called `name` under the corruption.
 
+        Args:
+            name: of an image of the split.
+            read: name -> sample; for example one that reads no labels.
+
         Raises:
-            InputError: as the source; images of two sizes where one frame is shown for another; a
+            InputError: as `read`; images of two sizes where one frame is shown for another; a
                 severity that changes nothing of an image of this size.
         """
-        sample = self.source.read(name)
+        sample = read(name)
         if not self.severity:
             return sample
         if isinstance(self.corruption, OfTime):
             other = self.shown(name)
-            thermal = sample.thermal if other == name else self.source.read(other).thermal
+            thermal = sample.thermal if other == name else read(other).thermal
             if thermal.shape != sample.thermal.shape:
                 own, its = (
                     f"{each.shape[0]}x{each.shape[1]}" for each in (sample.thermal, thermal)
@@ -72,12 +81,7 @@ class CorruptedDataset(DatasetWrapper):
                     "split."
                 )
             return replace(sample, thermal=thermal)
-
-        def rng_of(purpose: str) -> np.random.Generator:
-            # This word is part of the seed and must not change.
-            return numpy_generator(self.seed, f"degradation {purpose} of {name}")
-
-        return self.corruption(sample, self.severity, rng_of)
+        return corrupt(name, sample, self.corruption, self.severity, self.seed)
 
     def shown(self, name: str) -> str:
         """Name of the frame whose thermal image `name` shows: itself, or an earlier one.
@@ -120,6 +124,16 @@ class CorruptedDataset(DatasetWrapper):
             for index, name in enumerate(frames):
                 found[name] = frames[self.corruption.shown(index, self.severity)]
         return found
+
+
+def corrupt(name: str, sample: Sample, corruption: OfPixels, severity: float, seed: int) -> Sample:
+    """`sample` under a corruption of its pixels; draws depend on seed and name."""
+
+    def rng_of(purpose: str) -> np.random.Generator:
+        # This word is part of the seed and must not change.
+        return numpy_generator(seed, f"degradation {purpose} of {name}")
+
+    return corruption(sample, severity, rng_of)
 
 
 def settings_of(corruption: Corruption) -> dict[str, Any]:

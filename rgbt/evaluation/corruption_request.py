@@ -23,7 +23,8 @@ from rgbt.config.component import build, constructor, setting_types
 from rgbt.config.compose import conf_dir
 from rgbt.config.stored_config import load_config
 from rgbt.corruptions.corruption import Corruption, OfTime
-from rgbt.evaluation.corrupted_dataset import CorruptedDataset, settings_of
+from rgbt.data.to_predict import ToPredict
+from rgbt.evaluation.corrupted_dataset import CorruptedDataset, corrupt, settings_of
 from rgbt.files.yaml_files import parse_yaml
 from rgbt.spec.corruption_names import row_name
 
@@ -109,14 +110,45 @@ class CorruptionRequest:
     def applied_to(self, session: Session, split: str) -> Session:
         """`session` that reads `split` under this corruption."""
         kind = self.corruption
-        dataset = CorruptedDataset(
-            session.dataset, kind, self.severity, split=split, seed=self.seed
-        )
+        dataset = self.dataset(session, split)
         if is_own(kind) and not isinstance(kind, OfTime):
             first = dataset.names(split)[0]
             returned = f"corruption: {type(kind).__name__}.__call__ returned"
             check_sample(returned, dataset.read(first), first)
         return replace(session, dataset=dataset)
+
+    def dataset(self, session: Session, split: str) -> CorruptedDataset:
+        """The data set of `session`, of which `split` is read under this corruption."""
+        return CorruptedDataset(
+            session.dataset, self.corruption, self.severity, split=split, seed=self.seed
+        )
+
+    def images(self, images: ToPredict, session: Session, source: str) -> ToPredict:
+        """`images` under this corruption.
+
+        Args:
+            images: those of `source`.
+            session: with the data set of the network.
+            source: a split of the data set, or anything else, such as a folder.
+
+        Raises:
+            InputError: a corruption of time, and images without the order of a split.
+        """
+        read, kind = images.read, self.corruption
+        if source in session.dataset.splits:
+            dataset = self.dataset(session, source)
+            return replace(images, read=lambda name: dataset.corrupted(name, read))
+        if not self.severity:
+            return images
+        if isinstance(kind, OfTime):
+            raise InputError(
+                f"corruption={self.name} shows an earlier frame of the split, but these images are "
+                f"no split of {session.dataset.name}; predict a split, or choose another "
+                "corruption."
+            )
+        return replace(
+            images, read=lambda name: corrupt(name, read(name), kind, self.severity, self.seed)
+        )
 
 
 def standard_corruptions() -> list[str]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import zip_longest
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,10 +17,10 @@ from rgbt.data.loaders import eval_batches
 from rgbt.data.next_frames import NextFrames
 from rgbt.evaluation.prediction import EvaluationData
 from rgbt.geometry.warp import Warp
+from rgbt.metrics.pair_list import Frames
 from rgbt.metrics.pairs import Protocol
 from rgbt.types import Batch
 
-Frames = Literal["virtual", "next"]
 PROTOCOLS: dict[Frames, tuple[Protocol, ...]] = {
     "virtual": ("aligned", "released"),
     "next": ("next",),

@@ -26,13 +26,16 @@ from rgbt.data.next_frames import NextFrames
 from rgbt.data.prediction_images import Format, PredictionReader, check_one_kind
 from rgbt.engine.progress import progress
 from rgbt.evaluation.images import write_png
-from rgbt.evaluation.pair_frames import (
+from rgbt.evaluation.pair_frames import next_frames, virtual_frames
+from rgbt.evaluation.pair_list import PairSource, list_pairs
+from rgbt.metrics.pair_list import (
+    PAIR_LIST,
     Frames,
-    next_frames,
-    virtual_frames,
+    PairList,
+    check_same,
+    read_list,
+    second_name,
 )
-from rgbt.evaluation.pair_list import PairList, PairSource, check_same, read_list, second_name
-from rgbt.metrics.pairs import PAIR_LIST
 from rgbt.types import Batch
 
 OVERLAY = "_overlay"
@@ -49,7 +52,7 @@ def write_images(source: PairSource, split: str, frames: Frames, out: Path) -> P
     Raises:
         InputError: `out` holds other files, or an image cannot be read.
     """
-    listed = PairList.of(source, split, frames)
+    listed = list_pairs(source, split, frames)
     _check_out(out, listed)
     out.mkdir(parents=True, exist_ok=True)
     replace(listed, complete=False).write(out)

@@ -20,7 +20,6 @@ from rgbt.data.next_frames import NextFrames
 from rgbt.engine.progress import progress
 from rgbt.evaluation.pair_frames import (
     PROTOCOLS,
-    Frames,
     check_frames,
     frames_mark,
     next_frames,
@@ -32,6 +31,7 @@ from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.named import OF_PAIRS
 from rgbt.metrics.names import CA, TC, consistency
+from rgbt.metrics.pair_list import Frames
 from rgbt.metrics.pairs import HEADLINES, pair_counts, partition_name
 from rgbt.metrics.pairs import Protocol as PairProtocol
 from rgbt.metrics.scores import class_mean

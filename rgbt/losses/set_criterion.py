@@ -95,7 +95,7 @@ class SetCriterion:
             output: `aux` holds "class_logits" (L, P, B, Q, K+1) and "mask_logits"
                 (L, P, B, Q, h, w) of P passes over the same B images; the last of the L layers is
                 the prediction.
-            batch: with `label` (B, H, W), H <= 4h and W <= 4w; the weighted loss reads `position`.
+            batch: with `label` (B, H, W), H <= 4h and W <= 4w; some weights read `position`.
             generator: draws the points (order: `rgbt.losses.points.Points`).
 
         Returns:

@@ -1,5 +1,7 @@
 """Weights by distance from the image centre for the mask losses (SpatialSeg, Eqs. 14-17).
 
+Also the edge-weighted loss that SpatialSeg, Table I compares with: by the boundaries of objects.
+
 Part of the set criterion. The SpatialSeg release holds no code for this loss; every choice that
 the paper leaves open is a named setting here.
 """
@@ -11,12 +13,13 @@ from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from rgbt.checks import InputError, check_shape
 from rgbt.geometry.padding import pad_to
 from rgbt.losses.points import sample
 from rgbt.ranges import NonNegative
-from rgbt.types import Batch
+from rgbt.types import IGNORE, Batch
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,6 +28,11 @@ class SpatialWeight:
 
         w = 1 + alpha d / d_max            focus "edge"    (Eqs. 14, 15)
         w = 1 + alpha (1 - d / d_max)      focus "center"  (Table VI, reversed)
+        w = 1 + alpha b                    focus "boundary" (Table I, edge-weighted loss)
+
+    b is 1 on the boundaries of objects (`boundaries`), and 0 elsewhere; the paper names this loss
+    ("conventional"), and prints neither formula nor numbers. It reads no position: `centre` and
+    `d_max` have no effect.
 
     d is the distance in pixels of the original image. Paper: everything below `focus` is open; the
     first choice of each is the one nearest to the text or to Mask2Former.
@@ -32,11 +40,13 @@ class SpatialWeight:
 
     Attributes:
         alpha: >= 0. Paper: 2.
-        focus: where the weight is largest.
+        focus: where the weight is largest: at the edge of the image, in its centre, or on the
+            boundaries of objects.
         centre: distance from pixel (rows // 2, columns // 2) of the original image, followed
             through resizing, cropping and flipping ("tracked"), or of the crop ("crop").
         d_max: largest distance within the original image or within the crop.
-        padding: weight of the padded rows and columns: as the farthest pixel ("map"), 1, or 0.
+        padding: weight of the padded rows and columns: as the farthest pixel ("map"; without a
+            boundary), 1, or 0.
         normaliser: the weighted cross-entropy is divided by the number of points (Eq. 16: W x H) or
             by the sum of their weights.
         dice_smoothing: 1 in numerator and denominator, as in the unweighted loss, or none (Eq. 17).
@@ -45,7 +55,7 @@ class SpatialWeight:
     """
 
     alpha: NonNegative
-    focus: Literal["none", "edge", "center"]
+    focus: Literal["none", "edge", "center", "boundary"]
     centre: Literal["tracked", "crop"]
     d_max: Literal["original", "crop"]
     padding: Literal["map", "one", "zero"]
@@ -96,6 +106,34 @@ def weight_map(batch: Batch, padded_hw: tuple[int, int], settings: SpatialWeight
     Raises:
         InputError: the batch does not say where its pixels come from.
     """
+    is_boundary = settings.focus == "boundary"
+    relative = boundaries(batch.label).float() if is_boundary else _distances(batch, settings)
+    far = 1.0 + settings.alpha if settings.focus == "edge" else 1.0
+    padding = {"map": far, "one": 1.0, "zero": 0.0}[settings.padding]
+    return pad_to(1 + settings.alpha * relative, padded_hw, padding)[:, None]
+
+
+def boundaries(label: Tensor) -> Tensor:
+    """(B, H, W) bool: labelled pixels with another class among their eight neighbours.
+
+    Both sides of a boundary count, so it is two pixels wide. The border of the image and pixels
+    without a label (255) make no boundary.
+
+    Args:
+        label: (B, H, W) int64.
+    """
+    known = label != IGNORE
+    # Where nothing is known, the largest neighbour is below and the smallest above every class.
+    values = label.float()[:, None]
+    low = values.masked_fill(~known[:, None], torch.inf)
+    high = values.masked_fill(~known[:, None], -torch.inf)
+    largest = F.max_pool2d(high, 3, stride=1, padding=1)[:, 0]
+    smallest = -F.max_pool2d(-low, 3, stride=1, padding=1)[:, 0]
+    return known & (largest > smallest)
+
+
+def _distances(batch: Batch, settings: SpatialWeight) -> Tensor:
+    """(B, H, W) float32: distance from the focus, relative to the largest."""
     if batch.position is None:
         raise InputError(
             "loss.spatial weights pixels by their position in the original image, which this "
@@ -112,12 +150,8 @@ def weight_map(batch: Batch, padded_hw: tuple[int, int], settings: SpatialWeight
     if settings.d_max == "crop":
         farthest = distance.amax((1, 2))
 
-    relative = distance / farthest[:, None, None]
-    if settings.focus == "center":
-        relative = 1 - relative
-    far = 1.0 + settings.alpha if settings.focus == "edge" else 1.0
-    padding = {"map": far, "one": 1.0, "zero": 0.0}[settings.padding]
-    return pad_to(1 + settings.alpha * relative, padded_hw, padding)[:, None]
+    relative: Tensor = distance / farthest[:, None, None]
+    return 1 - relative if settings.focus == "center" else relative
 
 
 class SpatialMap:

@@ -36,9 +36,6 @@ HEADLINES: dict[Protocol, tuple[str, str]] = {
 }
 """The two main scores of a protocol: that of the paper, and that of its release."""
 
-PAIR_LIST = "pairs.json"
-"""File that lists exported pairs of frames; see `rgbt.evaluation.pair_images`."""
-
 Map: TypeAlias = "NDArray[np.integer] | Tensor"
 
 

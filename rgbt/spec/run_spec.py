@@ -163,7 +163,10 @@ class RunSpec:
     )
     transform: Component = _node()
     masker: Component = _node()
-    model: Component = _node(renamed={"decoder": {"modified_heatnet": "modified_released"}})
+    model: Component = _node(
+        added={"mask_token": "branch"},
+        renamed={"decoder": {"modified_heatnet": "modified_released"}},
+    )
     loss: Component = _node()
     scheme: Component = _node(added={"resolution": "full", "idle_steps": "none"})
     optimizer: Component = _node(added={"head_rate": "scheduled"})

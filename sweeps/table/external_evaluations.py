@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from rgbt.metrics.pairs import PAIR_LIST
+from rgbt.metrics.pair_list import PAIR_LIST
 from rgbt.tracking.provenance import without_passwords
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.table.cells import OWN_COUNTS, evaluation_of, is_counted

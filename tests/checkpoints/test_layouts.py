@@ -376,12 +376,14 @@ def test_what_a_configuration_in_the_file_says_is_suggested(tmp_path: Path) -> N
     tensors = {
         **named({f"{b}{name}": shape for b in branches for name, shape in shapes.items()}),
         "network.sem_seg_head.predictor.class_embed.weight": torch.ones(13, 2),
+        **dict.fromkeys((f"{each}mask_token" for each in branches), torch.ones(1, 96, 1, 1)),
     }
     hyper = {"cfg": argparse.Namespace(MODEL={"FUSION": {"AGGREGATION": "ADD"}})}
     path = saved(tmp_path, {"state_dict": tensors, "hyper_parameters": hyper})
     facts = recognise(read(path))
     assert facts.classes == 12
-    assert facts.fits == (("model=mask2former_swin_t", "model.fusion=add"),)
+    wanted = ("model=mask2former_swin_t", "model.fusion=add", "model.mask_token=shared")
+    assert facts.fits == (wanted,)
 
 
 def test_shared_stages_are_seen_in_the_file(tmp_path: Path) -> None:

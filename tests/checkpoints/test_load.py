@@ -211,6 +211,15 @@ def test_stages_that_are_one_in_the_network_and_two_in_the_file(tmp_path: Path) 
         assert torch.equal(shared.state_dict()[key], value)
 
 
+def test_tokens_that_are_one_in_the_network_and_two_in_the_file(tmp_path: Path) -> None:
+    apart = network("mask2former_tiny")
+    shared = network("mask2former_tiny", mask_token="shared")
+    path = saved(tmp_path, {f"network.{k}": v for k, v in apart.state_dict().items()})
+    assert "for example with model.mask_token=branch" in refused(shared, path)
+    state = {f"network.{key}": value for key, value in shared.state_dict().items()}
+    load_weights(network("mask2former_tiny", mask_token="shared"), saved(tmp_path, state))
+
+
 def test_the_sentence_of_a_load(tmp_path: Path) -> None:
     model = network("rtfnet_18", base_width=4)
     tensors = resnet_file(18, counters=False, width=4)

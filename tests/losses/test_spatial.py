@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 import torch
 
-from rgbt.losses.spatial import PLAIN, SpatialMap, weight_map
+from rgbt.checks import InputError
+from rgbt.losses.spatial import PLAIN, SpatialMap, boundaries, weight_map
 from tests.losses.problems import batch_of, whole_image
 
 EDGE = replace(PLAIN, alpha=2.0, focus="edge")
@@ -92,3 +93,44 @@ def test_what_counts_as_active() -> None:
     assert EDGE.active
     assert not replace(EDGE, alpha=0.0).active
     assert not replace(EDGE, focus="none").active
+
+
+def test_boundaries_are_labelled_pixels_beside_another_class() -> None:
+    # One pixel of class 1 at (1, 1), class 2 in the last column, no label at (3, 0) and (4, 1).
+    label = torch.tensor(
+        [
+            [0, 0, 0, 0, 0, 2],
+            [0, 1, 0, 0, 0, 2],
+            [0, 0, 0, 0, 0, 2],
+            [255, 0, 0, 0, 0, 2],
+            [0, 255, 0, 0, 255, 2],
+        ]
+    )
+    # By hand: the eight neighbours of (1, 1) and itself, the last column where a labelled 0 is
+    # beside or diagonal, and column 4 where it is labelled.
+    expected = torch.tensor(
+        [
+            [1, 1, 1, 0, 1, 1],
+            [1, 1, 1, 0, 1, 1],
+            [1, 1, 1, 0, 1, 1],
+            [0, 0, 0, 0, 1, 1],
+            [0, 0, 0, 0, 0, 1],
+        ]
+    ).bool()
+    assert torch.equal(boundaries(label[None])[0], expected)
+
+
+def test_edge_weighted_loss_weights_boundaries_without_a_position() -> None:
+    label = torch.tensor([[[0, 0, 1, 1]]])
+    batch = replace(batch_of(label, whole_image(1, 1, 4)), position=None)
+    settings = replace(EDGE, focus="boundary")
+    # Padding "map" is a pixel without a boundary.
+    expected = torch.tensor([[1.0, 3, 3, 1, 1], [1, 1, 1, 1, 1]])
+    assert torch.equal(weight_map(batch, (2, 5), settings)[0, 0], expected)
+    with pytest.raises(InputError, match="does not track"):
+        weight_map(batch, (2, 5), EDGE)
+
+
+def test_boundaries_of_one_class_or_of_no_label_are_nowhere() -> None:
+    for value in (0, 4, 255):
+        assert not boundaries(torch.full((2, 3, 5), value)).any()

@@ -151,6 +151,23 @@ def test_mask_token_replaces_exactly_the_hidden_tokens() -> None:
                 assert torch.equal(seen[name][:, row, column], expected)
 
 
+def test_shared_mask_token_is_one_parameter_with_the_gradient_of_both() -> None:
+    apart, shared = nano(), nano(mask_token="shared")
+    assert count(apart) - count(shared) == 8  # embed_dim values
+    branches = (shared.backbone.RGB_branch, shared.backbone.THR_branch)
+    assert branches[0].mask_token is branches[1].mask_token
+    # With the same values in both branches of the other network, its two gradients add up.
+    apart.load_state_dict(shared.state_dict())
+    masks = cells(2, 4, 6)
+    for net in (apart, shared):
+        net(*images(2), masks).aux["mask_logits"].square().sum().backward()
+    separate = [
+        branch.mask_token.grad for branch in (apart.backbone.RGB_branch, apart.backbone.THR_branch)
+    ]
+    assert all(each.any() for each in separate)
+    torch.testing.assert_close(branches[0].mask_token.grad, separate[0] + separate[1])
+
+
 @pytest.mark.parametrize(("view", "idle"), [("rgb", "THR_branch"), ("thermal", "RGB_branch")])
 def test_single_modality_does_not_run_the_other_branch(view: str, idle: str) -> None:
     net = nano().eval()

@@ -19,8 +19,8 @@ class RgbtBackbone(nn.Module):
     Source: CRM, Sec. III-B.   Released: batch normalisation of the fused maps only; the maps of
     a single modality leave as the branch normalised them.
 
-    Stages from `share_start` on (0..4) are the RGB branch's own in both branches; embedding, output
-    normalisations and mask token never are. 4 shares nothing.
+    Stages from `share_start` on (0..4) are the RGB branch's own in both branches; embedding and
+    output normalisations never are. 4 shares none. `mask_token`: see `Mask2Former`.
     """
 
     def __init__(
@@ -29,6 +29,7 @@ class RgbtBackbone(nn.Module):
         *,
         share_start: int,
         fusion: Literal["max", "add"],
+        mask_token: Literal["branch", "shared"],
         thermal_channels: int,
     ) -> None:
         super().__init__()
@@ -37,6 +38,8 @@ class RgbtBackbone(nn.Module):
         stages = {i: s for i, s in enumerate(self.RGB_branch.layers) if isinstance(s, Stage)}
         shared = {index: stage for index, stage in stages.items() if index >= share_start}
         self.THR_branch = Swin(thermal_channels, shape=shape, shared=shared)
+        if mask_token == "shared":
+            self.THR_branch.mask_token = self.RGB_branch.mask_token
         self.norm_layers = nn.ModuleDict(
             {
                 level: nn.BatchNorm2d(width)

@@ -42,6 +42,9 @@ class Mask2Former(nn.Module):
         drop_path_rate: stochastic depth of a branch's last block, 0 at the first, in [0, 1).
         share_start: stages from this index on (0..4) are the same in both branches; 4 = none.
         fusion: "max" or "add" of the two branches.
+        mask_token: what hidden cells show: a learned token of each branch (CRM, Eq. 1: L_rgb and
+            L_thr; both releases), or "shared", the same one in both (SpatialSeg, Eqs. 12 and 13:
+            one tau). A token has `embed_dim` values and stands behind the patch embedding.
         hidden_dim: channels of both decoders, a multiple of 32.
         num_queries: Q.
         encoder_layers: deformable layers of the pixel decoder.
@@ -87,6 +90,7 @@ class Mask2Former(nn.Module):
         attention_heads: Channels,
         pixel_decoder_fp32: bool,
         inputs: Inputs,
+        mask_token: Literal["branch", "shared"] = "branch",
     ) -> None:
         super().__init__()
         shape = SwinShape(embed_dim, depths, num_heads, window_size, mlp_ratio, drop_path_rate)
@@ -102,6 +106,7 @@ class Mask2Former(nn.Module):
             shape,
             share_start=share_start,
             fusion=fusion,
+            mask_token=mask_token,
             thermal_channels=inputs.thermal_channels,
         )
         pixel_decoder = PixelDecoder(

@@ -19,6 +19,7 @@ from rgbt.data.mfnet import MFNet
 from rgbt.metrics.counts import Counts
 from tests.analysis.counts import counts_of
 from tests.analysis.figures.drawn import statistics, strips
+from tests.analysis.figures.framed import write_framed
 from tests.analysis.robust_runs import SCORES, write_levels
 from tests.analysis.uncertainty.simulated import pairs_of
 from tests.commands import Call
@@ -53,6 +54,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for method, agree in (("a", 0.5), ("b", 0.7)):
         pairs_of(12, agree).save(folder / method / "pairs.npz")
         write_levels(folder / method / "failing", SCORES)
+    write_framed(folder / "framed")
     return folder
 
 
@@ -87,6 +89,16 @@ def arguments(figure: str, folder: Path) -> list[str]:
         "different": ["pick=largest_difference", "rows=2"],
         "columns": ["layout=columns", "names=00003N,00004D"],
         "patches": ["patches=8,16"],
+        "missing": [
+            f"without_rgb=A:{folder / 'b'},B:{folder / 'b'}",
+            f"without_thermal=A:{folder / 'a'},B:{folder / 'a'}",
+        ],
+        "frames": [
+            *("dataset=mfnet", f"dataset.root={folder / 'framed' / 'mf'}"),
+            f"pairs={folder / 'framed' / 'pairs'}",
+            f"methods=A:{folder / 'framed' / 'a'},B:{folder / 'framed' / 'b'}",
+        ],
+        "two": ["rows=2", "pick=largest_difference"],
     }
     needed = {
         "spatialseg/fig1": ("map folder", "statistics folder"),
@@ -98,7 +110,9 @@ def arguments(figure: str, folder: Path) -> list[str]:
         "spatialseg/fig8": ("dataset", "methods", "different"),
         "spatialseg/fig9": ("dataset", "methods"),
         "temporal/fig5": ("pairs",),
-        "temporal/fig6": ("dataset", "methods", "columns"),
+        "temporal/fig1": ("frames",),
+        "temporal/fig6": ("frames", "two"),
+        "crm/fig2": ("dataset", "methods", "missing", "columns"),
         "crm/fig4": ("dataset", "one"),
         "crm/fig5": ("dataset", "patches"),
         "multihead/fig3": (),
@@ -130,6 +144,9 @@ SAID = {
         "(c) rings (inside to outside)",
     ),
     "spatialseg/fig8": ("RGB", "thermal", "ground truth", "00011N", "car stop"),
+    "temporal/fig1": ("ground truth", "00001N", "synthesised", "predictions of both frames differ"),
+    "temporal/fig6": ("thermal", "00000D", "00001N", "synthesised"),
+    "crm/fig2": ("RGB", "no RGB", "no thermal", "both", "00003N"),
     "temporal/fig5": ("virtual views, first frame warped into the second",),
     "crm/fig5": ("square", "16 x 16 pixels", "thermal"),
     "multihead/fig3": ("entropy minimisation", "maximum squares", "gradient magnitude"),
@@ -227,6 +244,9 @@ def test_bad_input_is_one_sentence(call: Call, figure: str, words: list[str], wo
         ("spatialseg/fig8", ["names=00001N"], "omit pick= and rows="),
         ("spatialseg/fig9", ["rows=13"], "rows=13, but split 'test' has 12 images"),
         ("spatialseg/fig9", ["suffix=_pred"], "no prediction"),
+        ("crm/fig2", ["without_rgb=A:x"], "without_rgb names the predictions of A, but methods"),
+        ("crm/fig2", ["pick=first"], "'pick' has no effect on figure=crm/fig2"),
+        ("temporal/fig1", ["pairs={}/mf"], "pairs.json does not exist; name the folder"),
         (
             "spatialseg/fig2",
             ["regions=3"],

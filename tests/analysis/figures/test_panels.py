@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
 
+from analysis.figures.inputs import FigureInput
 from analysis.figures.panels import (
     QualitativePanel,
     draw,
     image_mious,
+    make_missing,
     most_different,
     panel,
 )
@@ -72,6 +77,35 @@ def test_ours_is_painted_in_the_colours_of_the_data_set(dataset: MFNet) -> None:
     shown = figure.axes[3].images[0].get_array()
     label = dataset.read("00001D").label
     np.testing.assert_array_equal(shown, np.array(dataset.palette, np.uint8)[label])
+
+
+def test_missing_images_are_beside_each_other_with_their_scores(
+    dataset: MFNet, tmp_path: Path
+) -> None:
+    label = dataset.read("00001D").label
+    shifts = {"both": 0, "dark": 1, "cold": 2}  # classes that the prediction is away from the label
+    for folder, shift in shifts.items():
+        (tmp_path / folder).mkdir()
+        wrong = ((label + shift) % 9).astype(np.uint8)
+        cv2.imwrite(str(tmp_path / folder / "00001D.png"), wrong)
+    options = {"methods": "both", "without_rgb": "dark", "without_thermal": "cold"}
+    values = {key: f"CMX:{tmp_path / folder}" for key, folder in options.items()}
+    words = ("dataset=mfnet", f"dataset.root={dataset.root}")
+    figure = make_missing(FigureInput("crm/fig2", values | {"names": "00001D"}, words, "ring5"))
+    shown = [axes.get_title() for axes in figure.axes]
+    assert shown == [
+        "RGB",
+        "thermal",
+        "ground truth",
+        "CMX\nboth",
+        "CMX\nno RGB",
+        "CMX\nno thermal",
+    ]
+    palette = np.array(dataset.palette, np.uint8)
+    for axes, shift in zip(figure.axes[3:], shifts.values(), strict=True):
+        painted = axes.images[0].get_array()
+        np.testing.assert_array_equal(painted, palette[(label + shift) % 9])
+        assert [text.get_text() for text in axes.texts] == ["0.0" if shift else "100.0"]
 
 
 def test_other_sizes_are_refused(dataset: MFNet) -> None:

@@ -78,6 +78,7 @@ CHANGES: dict[str, dict[str, When]] = {
     "crm/table4": {
         "IRM 0.3": {ALWAYS: {"masker.pairing", "masker.ratio"}},
         **each([f"IRM 0.{tenths}" for tenths in (4, 5, 6, 7)], "masker.ratio"),
+        "CRM as written (Eq. 1)": {ALWAYS: {"masker.pairing", "masker.ratio"}},
     },
     "spatialseg/table2": each(
         ["Person", "Bike", "Curve", "Car Stop", "Guardrail", "Color Cone", "Bump"]
@@ -261,3 +262,17 @@ def test_network_of_a_row_is_described_for_an_evaluation(
 def test_rows_with_a_network_are_all_checked() -> None:
     found = {f"{name} {row.label}" for name in NAMES for row in TABLES[name].rows if row.network}
     assert found == {"crm/table1 CMXNet", "crm/table2b MFNet", "crm/table2b RTFNet-152"}
+
+
+@SCALES
+@pytest.mark.parametrize("form", FORMS)
+def test_losses_of_the_study_differ_in_the_place_of_their_weight_alone(
+    form: Form, scale: str
+) -> None:
+    study, table6 = load_table("loss_weighting"), TABLES["spatialseg/table6"]
+    none, boundary, spatial = (spec_of(study, row, scale, form) for row in study.rows)
+    printed = [spec_of(table6, row, scale, form).key for row in table6.rows]
+    assert [none.key, spatial.key] == printed[:2]
+    assert changed(boundary, spatial) == {"loss.spatial.focus"}
+    assert boundary.plain["loss"]["spatial"]["focus"] == "boundary"
+    assert boundary.plain["loss"]["spatial"]["alpha"] == 2

@@ -13,6 +13,7 @@ from sweeps.evaluation import ExtraEvaluation
 from sweeps.table.load_table import load_table, table_names
 from sweeps.table.request import TableRequest
 from sweeps.table.table import Row, Table
+from tests.composed import row_spec, specified
 from tests.sweeps.composed import checked, row_config
 
 TABLES = {name: load_table(name) for name in table_names(Path("none"))}
@@ -57,7 +58,9 @@ def test_row_masks_match_printed_settings(table: Table, row: Row) -> None:
         "beta": loss.get("beta"),
         "focus": loss.get("spatial", {}).get("focus"),
         "masking_ratio": masker.ratio,
-        "masking": {"indiv": "irm", "rand_comp": "crm"}.get(masker.pairing or ""),
+        "masking": {"indiv": "irm", "rand_comp": "crm", "comp": "crm_pair"}.get(
+            masker.pairing or ""
+        ),
     }
     if masker.sigma_div is not None:
         found["sigma_p"] = "Ny" if masker.sigma_div == 1 else f"Ny/{masker.sigma_div:g}"
@@ -229,3 +232,28 @@ def test_rtfnet_backbones_differ_at_paper_scale_only() -> None:
     wanted = [request("temporal/table5", scale) for scale in ("demo", "paper")]
     assert [len(each.points()) for each in wanted] == [2, 4]
     assert wanted[1].models() == {"rtfnet_50", "rtfnet_152"}
+
+
+RTFNET = {
+    "RTFNet (ResNet-50)": ("rtfnet", 3),
+    "Ours-con (ResNet-50)": ("rtfnet_temporal_con", 3),
+    "RTFNet (ResNet-152)": ("rtfnet_152", 2),
+    "Ours-con (ResNet-152)": ("rtfnet_152_temporal_con", 2),
+}
+"""Row of Temporal, Table V -> its experiment, and images of a batch in the release of RTFNet."""
+
+
+@pytest.mark.parametrize("label", RTFNET)
+def test_rtfnet_rows_are_experiments_with_the_recipe_of_their_backbone(label: str) -> None:
+    experiment, batch = RTFNET[label]
+    table = request("temporal/table5").table
+    (row,) = (each for each in table.rows if each.label == label)
+    words = (f"+experiment={experiment}", "scale=paper", "dataset.root=/data")
+    spec = specified(words)
+    assert spec.key == row_spec(table, row, "paper").key
+    epoch = 1568 // batch  # of the training list, which holds every image twice
+    assert spec.plain["data"]["batch_size"] == batch
+    assert spec.plain["schedule"]["epoch_steps"] == epoch
+    assert spec.trainer.max_steps == 100 * epoch
+    assert spec.trainer.eval_every == 5 * epoch
+    assert specified((words[0],)).key == row_spec(table, row, "demo").key

@@ -1,0 +1,116 @@
+"""The list of exported pairs of frames, ``pairs.json``: names, angles, and their origin."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Literal
+
+from rgbt.checks import InputError
+from rgbt.files.atomic import write_atomic
+from rgbt.files.budgets import read_json
+
+PAIR_LIST = "pairs.json"
+"""File that lists exported pairs of frames; see `rgbt.evaluation.pair_images`."""
+
+Frames = Literal["virtual", "next"]
+"""Second frames: virtual views of the first ones, or true ones that were taken after them."""
+
+
+@dataclass(frozen=True)
+class ListedPair:
+    """One pair: names of both images, the set of views (from 1), and its angles in degrees."""
+
+    first: str
+    second: str
+    set: int
+    yaw: float | None = None
+    pitch: float | None = None
+    roll: float | None = None
+
+
+@dataclass(frozen=True)
+class PairList:
+    """The content of ``pairs.json``.
+
+    Attributes:
+        format: version of the file.
+        complete: whether all images are written.
+        dataset: fingerprint of the data set.
+        name: of the data set.
+        split: of the data set.
+        frames: what the second frames are.
+        views: mark of the second frames (`rgbt.evaluation.pair_frames.frames_mark`); "published":
+            the published sets of virtual views.
+        sets: names of the sets of views.
+        pairs: in the order of the split.
+    """
+
+    format: Literal["rgbt pairs 1"]
+    complete: bool
+    dataset: str
+    name: str
+    split: str
+    frames: Frames
+    views: str
+    sets: tuple[str, ...]
+    pairs: tuple[ListedPair, ...]
+
+    @property
+    def images(self) -> tuple[str, ...]:
+        """Names of all images, each once."""
+        names = (name for pair in self.pairs for name in (pair.first, pair.second))
+        return tuple(dict.fromkeys(names))
+
+    def write(self, folder: Path) -> None:
+        """Write ``pairs.json``."""
+        write_atomic(folder / PAIR_LIST, f"{json.dumps(asdict(self), indent=1)}\n".encode())
+
+
+def second_name(first: str, frames: Frames, number: int) -> str:
+    """Name of a second frame; `number` of the set of views, from 0."""
+    return f"{first}_next" if frames == "next" else f"{first}_view{number + 1}"
+
+
+def read_list(place: Path) -> PairList:
+    """The list of pairs in a folder, or at the path of the file itself.
+
+    Raises:
+        InputError: there is none, or it is damaged.
+    """
+    path = place / PAIR_LIST if place.is_dir() else place
+    if not path.is_file():
+        raise InputError(
+            f"{path} does not exist; name the folder of the export with pairs=FOLDER, or copy its "
+            f"{PAIR_LIST} to the predictions."
+        )
+    listed: PairList = read_json(path, PairList, "write the images again with export=...")
+    return listed
+
+
+def check_same(listed: PairList, wanted: PairList) -> None:
+    """Refuse predictions of other images than those that are counted."""
+    if not listed.complete:
+        raise InputError(
+            f"the export of {listed.name} was interrupted; rerun its command, then predict again."
+        )
+    for key in ("split", "frames"):
+        given, expected = getattr(wanted, key), getattr(listed, key)
+        if given != expected:
+            raise InputError(
+                f"the pairs were exported with {key}={expected}, but {key}={given} is counted; "
+                f"set {key}={expected}."
+            )
+    if listed.dataset != wanted.dataset:
+        raise InputError(
+            f"the pairs were exported from other images ({listed.name}, {listed.dataset[:8]}) than "
+            f"those of {wanted.name} ({wanted.dataset[:8]}); name the data set of the export."
+        )
+    if (listed.views, listed.pairs) != (wanted.views, wanted.pairs):
+        sets = ", ".join(listed.sets) or "real frames"
+        raise InputError(
+            f"the pairs were exported with another set of views ({sets}; {listed.views}) than the "
+            f"one that is counted ({', '.join(wanted.sets) or 'real frames'}; {wanted.views}); "
+            "give the consistency settings of the export."
+        )
