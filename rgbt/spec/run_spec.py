@@ -299,9 +299,12 @@ class RunSpec:
         """
         words = [word for word in self.overrides if not word.startswith("seed=")]
         further = seed - self.seed if self.seeds.start == "run" else 0
+
+        def seed_of(each: Dependency) -> int:
+            return each.run.seed + further if each.is_common else seed
+
         upstream = (
-            replace(each, run=each.run.with_seed(each.run.seed + further if each.is_common else seed))
-            for each in self.dependencies
+            replace(each, run=each.run.with_seed(seed_of(each))) for each in self.dependencies
         )
         return replace(
             self,

@@ -142,7 +142,7 @@ def _dependencies(
             typed = [f"+experiment={experiment}", *_shared_overrides(overrides, key, reference)]
             upstream = upstream_config(config, key, reference)
             run = specify(upstream, typed, downstream=downstream)
-            if reference.is_common and config.seeds.start == "run":
+            if reference.is_common and OmegaConf.select(config, "seeds.start") == "run":
                 run = run.with_seed(run.seed + config.seed)
             yield Dependency(key, run, reference.checkpoint, reference.is_common)
 
