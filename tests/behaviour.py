@@ -54,6 +54,9 @@ TEN_STEPS = [
 PATHS = ("runs_dir", "tracking", "dataset.root", "dataset.cache_dir")
 """What is left out of configurations: where things lie."""
 
+NAMING = ("vendor_id", "cpu family", "model", "stepping", "CPU implementer", "CPU part")
+"""Entries of /proc/cpuinfo that tell kinds of processors apart; x86 has the first, ARM the last."""
+
 MEASURED = ("images_per_s", "wait_share", "peak_memory_mib")
 """Logged values that are measured of the machine."""
 
@@ -115,11 +118,25 @@ def record(runs_dir: Path) -> dict[str, Any]:
 
 def machine() -> dict[str, str]:
     """What must agree for two runs to agree bit for bit."""
+    listed = Path("/proc/cpuinfo")
     return {
         "torch": torch.__version__,
         "cpu": torch.backends.cpu.get_cpu_capability(),
+        "processor": processor(listed.read_text()) if listed.is_file() else platform.processor(),
         "platform": f"{platform.system()} {platform.machine()}",
     }
+
+
+def processor(cpuinfo: str) -> str:
+    """Family, model, stepping and a digest of the flags of the first processor that Linux lists.
+
+    Machines whose processors have one name and capability differ in these, and then in the last
+    bits of Mask2Former and CMX.
+    """
+    lines = (line.partition(":") for line in cpuinfo.partition("\n\n")[0].splitlines())
+    found = {key.strip(): value.strip() for key, _, value in lines}
+    flags = found.get("flags", found.get("Features", ""))
+    return " ".join([*(found.get(key, "-") for key in NAMING), digest(flags.encode())])
 
 
 def settings_of(experiment: str) -> dict[str, list[str]]:

@@ -23,8 +23,8 @@ THESIS = [
     name for name in EXPERIMENTS if name.startswith(ADAPTATION) and not name.startswith("start_")
 ]
 QUICK = ("multi_head_modified_night_init", "heatnet_rgb_only", "heatnet_released")
-ON_THE_TEST_IMAGES = {"heatnet_released"}
-"""The port of HeatNet selects the best checkpoint on the test images."""
+ON_THE_TEST_IMAGES = {"heatnet_released", "heatnet_original"}
+"""HeatNet's release and its port select the best checkpoint on the test images."""
 
 
 @pytest.fixture

@@ -1,8 +1,8 @@
 """Every experiment composes, is named and trains as in the recording `tests/behaviour.json`.
 
 Configurations and keys are compared on every machine. Losses, gradients, learning rates and counts
-of ten steps are compared bit for bit where torch, the CPU capability that it uses and the platform
-are those of the recording. Elsewhere the first value of every loss agrees within a relative
+of ten steps are compared bit for bit where torch, the CPU capability that it uses, the kind of
+processor and the platform are those of the recording. Elsewhere the first value of every loss agrees within a relative
 tolerance of 1e-4; later values, which training moves apart, and counts are not compared.
 
 An experiment that is added is recorded by ``python -m tests.behaviour record``; a key that changes
@@ -28,6 +28,7 @@ from tests.behaviour import (
     composition,
     composition_differences,
     machine,
+    processor,
     settings_of,
     training,
     training_differences,
@@ -133,6 +134,37 @@ def test_compare_changed_recording_names_the_change(
     assert sentence in line
     changed["machine"]["cpu"] = "another"
     assert compare(RECORDING, changed) == elsewhere
+
+
+PROCESSOR = """processor\t: {number}
+vendor_id\t: AuthenticAMD
+cpu family\t: {family}
+model\t\t: 17
+model name\t: AMD EPYC
+stepping\t: 1
+cpu MHz\t\t: {speed}
+flags\t\t: {flags}
+
+"""
+
+
+def listed(family: int = 25, speed: float = 2400.0, flags: str = "avx2 avx512f") -> str:
+    """What Linux lists of two processors of one kind."""
+    parts = {"family": family, "flags": flags}
+    return "".join(
+        PROCESSOR.format(number=number, speed=speed + number, **parts) for number in (0, 1)
+    )
+
+
+def test_processors_of_one_name_are_told_apart() -> None:
+    assert processor(listed()).startswith("AuthenticAMD 25 17 1 - - ")
+    assert processor(listed(speed=3100.5)) == processor(listed())
+    assert processor(listed(family=26)) != processor(listed())
+    assert processor(listed(flags="avx2 avx512f avx512_bf16")) != processor(listed())
+    arm = "processor: 0\nFeatures: asimd\nCPU implementer: 0x41\nCPU part: 0xd0c\n"
+    assert processor(arm) != processor(arm.replace("0xd0c", "0xd40"))
+    assert processor(arm) != processor(arm.replace("asimd", "asimd sve"))
+    assert "processor" in machine()
 
 
 def test_archive_digest_depends_only_on_arrays(tmp_path: Path) -> None:

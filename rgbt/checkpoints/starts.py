@@ -114,6 +114,12 @@ STARTS = (
         ("deeplabv2",),
         "f81d91e8",
     ),
+    Start(
+        "resnet50_v2.pth",
+        "ResNet-50 with three stem convolutions, ImageNet-1K",
+        "github.com/hszhao/semseg (initmodel)",
+        ("semseg",),
+    ),
 )
 
 RECIPES = (
@@ -137,7 +143,16 @@ RECIPES = (
         "thesis code: the first, with inputs of its own; the second has other strides",
     ),
     Recipe(
-        ("heatnet*", "rgb_teacher", "thermal_teacher"), "heatnet", (), "HeatNet release: N(0, 0.02)"
+        ("heatnet*", "rgb_teacher", "thermal_teacher", "thermal_teacher_original"),
+        "heatnet",
+        (),
+        "HeatNet release: N(0, 0.02)",
+    ),
+    Recipe(
+        ("rgb_teacher_semseg", "thermal_teacher_semseg"),
+        "semseg",
+        ("resnet50_v2.pth",),
+        "semseg, whose configuration the thesis code has; the thesis names no file",
     ),
     Recipe(("mfnet",), "mfnet", (), "MFNet release"),
 )
