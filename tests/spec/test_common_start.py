@@ -1,4 +1,4 @@
-"""Common starts: runs that all seeds, methods and data sets of one network begin from."""
+"""Common starts: runs that all methods and data sets of one network and seed begin from."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_every_experiment_at_bench_has_a_start_without_weights(experiment: str) 
     run = spec_of(experiment, "seed=3")
     start = first_stage(run)
     assert start.name.startswith("start_")
-    assert (start.weights, start.seed) == (None, 1000)
+    assert (start.weights, start.seed) == (None, 1003)
     assert start.model.target == run.model.target
     assert start.dataset.plain["seed"] != run.dataset.plain["seed"]
 
@@ -70,7 +70,7 @@ def test_methods_with_the_same_network_share_the_start(name: str) -> None:
 
 
 CHANGES = {
-    "seed": ["seed=7"],
+    "seed": ["seed=7", "seeds.start=common"],
     "seeds by source": ["seeds.weights=7", "seeds.order=8"],
     "data set": ["dataset.seed=5", "dataset.rgb_noise=0.1", "dataset.num_train=10"],
     "another data set": ["dataset=synth_pst900"],
@@ -110,8 +110,8 @@ def test_stages_of_a_chain_begin_with_the_start() -> None:
     run = spec_of("multi_head_night", "seed=2", "runs_dir=/none")
     chain = [(each.name, each.seed) for each in topological_order(run)]
     assert chain == [
-        ("start_deeplabv2_heads", 1000),
-        ("start_pspnet", 1000),
+        ("start_deeplabv2_heads", 1002),
+        ("start_pspnet", 1002),
         ("thermal_teacher", 2),
         ("multi_head_night_stage1", 2),
         ("multi_head_night", 2),
@@ -119,29 +119,29 @@ def test_stages_of_a_chain_begin_with_the_start() -> None:
 
 
 @pytest.mark.parametrize("experiment", ["crm", "multi_head_night"])
-def test_run_with_another_seed_keeps_the_start(experiment: str) -> None:
-    made, direct = spec_of(experiment, "seed=0").with_seed(3), spec_of(experiment, "seed=3")
+def test_run_with_another_seed_keeps_the_start_on_request(experiment: str) -> None:
+    one = "seeds.start=common"
+    made, direct = spec_of(experiment, one).with_seed(3), spec_of(experiment, one, "seed=3")
     assert made.key == direct.key
     assert first_stage(made).seed == 1000
 
 
 @pytest.mark.parametrize("experiment", ["crm", "multi_head_night"])
-def test_start_has_a_seed_for_each_run_on_request(experiment: str) -> None:
-    runs = [spec_of(experiment, "seeds.start=run", f"seed={seed}") for seed in (0, 1, 2)]
+def test_start_has_a_seed_for_each_run(experiment: str) -> None:
+    runs = [spec_of(experiment, f"seed={seed}") for seed in (0, 1, 2)]
     starts = [first_stage(run) for run in runs]
     assert [start.seed for start in starts] == [1000, 1001, 1002]
     assert [start.key for start in starts] == [
         spec_of(starts[0].name, f"seed={seed}").key for seed in (1000, 1001, 1002)
     ]
-    assert runs[0].key == spec_of(experiment).key
-    assert runs[1].key != spec_of(experiment, "seed=1").key
+    assert runs[0].key == spec_of(experiment, "seeds.start=common").key
+    assert runs[1].key != spec_of(experiment, "seeds.start=common", "seed=1").key
     assert runs[0].with_seed(2).key == runs[2].key
     assert runs[2].with_seed(0).key == runs[0].key
 
 
 def test_methods_with_the_same_seed_share_its_start() -> None:
-    words = ("seeds.start=run", "seed=4")
-    assert start_of("baseline", *words).key == start_of("crm", *words).key
+    assert start_of("baseline", "seed=4").key == start_of("crm", "seed=4").key
 
 
 @pytest.mark.parametrize("scale", ["demo", "paper"])
@@ -195,7 +195,8 @@ def test_chain_at_bench_passes_validation(experiment: str, tmp_path: Path) -> No
 def test_arms_train_after_their_start(call: Call, tmp_path: Path) -> None:
     words = ["+experiment=mfnet", "scale=bench", *SMOKE, f"runs_dir={tmp_path}"]
     assert call(main, *words)[0] == 0
-    specs = [spec_of("mfnet", *SMOKE, f"runs_dir={tmp_path}", f"seed={seed}") for seed in (0, 1)]
+    words.append("seeds.start=common")
+    specs = [spec_of("mfnet", *words[2:], f"seed={seed}") for seed in (0, 1)]
     start = first_stage(specs[0])
     first = start.folder.stat().st_mtime_ns
     result = json.loads((start.folder / "result.json").read_text())
