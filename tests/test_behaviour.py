@@ -2,8 +2,9 @@
 
 Configurations and keys are compared on every machine. Losses, gradients, learning rates and counts
 of ten steps are compared bit for bit where torch, the CPU capability that it uses, the kind of
-processor and the platform are those of the recording. Elsewhere the first value of every loss agrees within a relative
-tolerance of 1e-4; later values, which training moves apart, and counts are not compared.
+processor and the platform are those of the recording. Elsewhere the first value of every loss
+agrees within a relative tolerance of 1e-4; later values, which training moves apart, and counts are
+not compared.
 
 An experiment that is added is recorded by ``python -m tests.behaviour record``; a key that changes
 means that runs on users' disks are not found again.

@@ -35,7 +35,8 @@ NOT_OF_A_RECIPE = {
     "commands, evaluations and stores": "corruption debug hydra label_map search tracking",
     "images of this project": "dataset/folder dataset/synth camera/synth transform/none",
     "sizes of scale=demo and scale=bench": "scale/demo scale/bench optimizer/adamw_rtfnet_tiny "
-    "optimizer/sgd_thesis_tiny transform/thesis_96x192 transform/thesis_blur_96x192",
+    "optimizer/sgd_thesis_tiny transform/thesis_96x192 transform/thesis_blur_96x192 "
+    "transform/heatnet_96x192 transform/semseg_89x89",
     "starts of scale=bench": "experiment/start",
 }
 """Files without a number of a recipe at scale=paper: the beginnings of their paths, by reason.
