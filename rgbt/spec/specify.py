@@ -5,8 +5,9 @@ from the last checkpoint of that run; ``domains.target.labels=experiment:NAME/be
 the predictions of its network. Both runs share seed, scale and data set
 (`rgbt.spec.run_spec.SHARED`): a run of seed 2 depends on runs of seed 2.
 
-``model.weights=common:NAME/last.pt`` names an upstream run that keeps its own seed and data set:
-all seeds and all methods with the same network start from the same run.
+``model.weights=common:NAME/last.pt`` names an upstream run that keeps its own data set: all methods
+with the same network start from the same run. It also keeps its own seed, unless `seeds.start` says
+that every seed has a start of its own.
 """
 
 from __future__ import annotations
