@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from statistics import median
@@ -34,6 +35,9 @@ from sweeps.table.request import DEFAULT_SCALE
 
 UPSTREAM = re.compile(r"(?:experiment|common):([\w-]+)/")
 """In a setting, the experiment of an upstream run."""
+
+ONE_START = "seeds.start=common"
+"""The override by which all seeds of a table begin with the same weights."""
 
 CHANCE = 0.025
 """Share of claims without an effect that are called holding."""
@@ -221,7 +225,8 @@ def time_sentences(arms: Sequence[Group], runs: Sequence[RunEntry]) -> list[str]
 
 def limits(papers: Sequence[PaperClaims], runs: Sequence[RunEntry]) -> list[str]:
     """What the verdicts do not say, one sentence or two each."""
-    judged = [each.entry for paper in papers for each in paper.judged]
+    claims = [each for paper in papers for each in paper.judged]
+    judged = [each.entry for each in claims]
     scales = sorted({run.scale for run in runs})
     sentences = []
     if "paper" not in scales:
@@ -235,6 +240,13 @@ def limits(papers: Sequence[PaperClaims], runs: Sequence[RunEntry]) -> list[str]
         sentences.append(
             f"**Data:** {synthetic} of {plural(len(runs), 'run')} are on synthetic scenes. What "
             "the scenes lack, no verdict can show."
+        )
+    one_start = sum(ONE_START in shlex.split(each.view.entry.extra) for each in claims)
+    if one_start:
+        sentences.append(
+            f"**Start:** the verdict of {plural(one_start, 'claim')} is from runs that all begin with "
+            f"one common start (`{ONE_START}`). Its interval does not contain the spread between "
+            "starts."
         )
     stopped = sum(each.seeds_needed == float("inf") for each in judged)
     if stopped:

@@ -138,6 +138,14 @@ def test_claims_page_says_what_cannot_be_said() -> None:
     assert "**Not run, CRM, bench scale:** - Table 3 (a): `waits`." in said
 
 
+def test_claims_page_counts_verdicts_about_one_start() -> None:
+    one = table_of("bench", ("b0", "b1"), extra="'rows=A,B (x)' seeds.start=common")
+    said = " ".join(section(page_of(RUNS, one), "What cannot be said").split())
+    assert "**Start:** the verdict of 1 claim is from runs that all begin with one" in said
+    each = section(page_of(RUNS, table_of("bench", ("b0", "b1"))), "What cannot be said")
+    assert "**Start:**" not in each
+
+
 def test_claims_page_names_a_verdict_at_another_scale_beside_a_claim_not_run() -> None:
     bench = table_of("bench", ("b0", "b1"))
     demo = replace(
