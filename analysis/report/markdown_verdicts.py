@@ -244,9 +244,9 @@ def limits(papers: Sequence[PaperClaims], runs: Sequence[RunEntry]) -> list[str]
     one_start = sum(ONE_START in shlex.split(each.view.entry.extra) for each in claims)
     if one_start:
         sentences.append(
-            f"**Start:** the verdict of {plural(one_start, 'claim')} is from runs that all begin with "
-            f"one common start (`{ONE_START}`). Its interval does not contain the spread between "
-            "starts."
+            f"**Start:** the verdict of {plural(one_start, 'claim')} is from runs that all begin "
+            f"with one common start (`{ONE_START}`). Its interval does not contain the spread "
+            "between starts."
         )
     stopped = sum(each.seeds_needed == float("inf") for each in judged)
     if stopped:
