@@ -167,6 +167,7 @@ def test_run_empty_target_split_is_refused_before_its_teacher_is_trained(
             shutil.rmtree(path, ignore_errors=True)
     words = adapted(drawn, tmp_path / "runs", "multi_head_night_stage1")
     own = ["dataset=freiburg", f"dataset.root={root}", "dataset.crop=[1,97,48,240]"]
+    own.append("dataset.val_sequences=[seq_04_day]")
     code, _, err = call(main, *(each for each in words if not each.startswith("dataset")), *own)
     assert code == 2, err
     assert_one_sentence(err, "train_night")

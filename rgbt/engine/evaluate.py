@@ -11,7 +11,8 @@ from torch import Tensor, nn
 
 from rgbt.checks import RunError
 from rgbt.class_scores import best_of, classes_of
-from rgbt.engine.prediction import WHOLE, Prediction, label_sized
+from rgbt.engine.predicted_scores import label_sized
+from rgbt.engine.prediction import WHOLE, Prediction
 from rgbt.requirements import record_of
 from rgbt.types import Batch, View
 

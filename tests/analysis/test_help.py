@@ -28,4 +28,4 @@ def test_help_waits_for_no_heavy_library() -> None:
     ):
         assert line in done.stdout
     assert "one of: ring, vertical, horizontal (default: ring)" in done.stdout
-    assert "  figure       name of the figure" in done.stdout
+    assert "  figure           name of the figure" in done.stdout

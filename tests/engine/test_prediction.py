@@ -13,7 +13,8 @@ from lightning_fabric import Fabric
 from torch import Tensor, nn
 
 from rgbt.engine.evaluate import class_maps, confident_class_maps, probabilities
-from rgbt.engine.prediction import Prediction, windows
+from rgbt.engine.predicted_scores import windows
+from rgbt.engine.prediction import Prediction
 from rgbt.types import Batch, Output
 
 FABRIC = Fabric(accelerator="cpu", devices=1)

@@ -13,7 +13,7 @@ from rgbt.checks import InputError
 from rgbt.models.deeplabv2.model import DeepLabV2
 from tests.models.golden import compose, network
 from tests.models.plain import Plain, count, generator, images, nano, randomise
-from tests.models.test_contract import LITERAL, RELEASED
+from tests.models.test_contract import LITERAL, MODIFIED
 
 
 def test_rates_that_do_not_count_are_parameters_still() -> None:
@@ -85,7 +85,7 @@ def reference(net: DeepLabV2, image: Tensor, head: str, rates: tuple[int, ...]) 
     return [maps[..., : hw[0], : hw[1]] for maps in found]
 
 
-@pytest.mark.parametrize("changes", [{}, RELEASED, LITERAL])
+@pytest.mark.parametrize("changes", [{}, MODIFIED, LITERAL])
 @pytest.mark.parametrize(
     ("rates", "size"), [((2, 4, 6, 8), (96, 120)), ((2, 4), (96, 120)), ((2, 4), (61, 83))]
 )
@@ -125,7 +125,7 @@ def test_one_head_is_trained_alone() -> None:
 
 
 def test_statistics_move_where_norms_are_not_trained() -> None:
-    net = nano("deeplabv2", train_norm="statistics", **RELEASED)
+    net = nano("deeplabv2", train_norm="statistics", **MODIFIED)
     frozen = {name for name, p in net.named_parameters() if not p.requires_grad}
     norms = {
         f"{name}.{part}"
@@ -154,7 +154,7 @@ def test_caffe_inputs() -> None:
 
 
 def test_weights_are_drawn_as_released() -> None:
-    net = nano("deeplabv2", base_width=8, **RELEASED)
+    net = nano("deeplabv2", base_width=8, **MODIFIED)
     drawn = torch.cat([m.weight.flatten() for m in net.modules() if isinstance(m, nn.Conv2d)])
     assert drawn.mean().item() == pytest.approx(0, abs=1e-4)
     assert drawn.std().item() == pytest.approx(0.01, rel=0.01)

@@ -146,6 +146,12 @@ def test_study_rows_vary_one_source_each() -> None:
     }
     assert drawn == {
         **{"weights": (3, 1000, 1000), "order": (1000, 3, 1000), "masks": (1000, 1000, 3)},
-        **{"all": (3, 3, 3), "baseline": (3, 3, 3)},
+        **{"start": (1000, 1000, 1000), "all": (3, 3, 3), "baseline": (3, 3, 3)},
     }
-    assert len({spec.key for spec in specs.values()}) == 5
+    starts = {label: spec.seeds.start for label, spec in specs.items()}
+    assert {label for label, start in starts.items() if start == "run"} == {
+        "start",
+        "all",
+        "baseline",
+    }
+    assert len({spec.key for spec in specs.values()}) == 6
