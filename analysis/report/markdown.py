@@ -45,6 +45,10 @@ STUDY_PAGE = "studies"
 STUDIES = Paper(title="Studies", reference="Tables of this project that no paper prints.")
 
 
+MOST_IN_HEADING = 40
+"""Characters of `rows=...` in the heading of a table."""
+
+
 def write_pages(data: ReportData, networks: Sequence[NetworkEntry], out: Path) -> list[Path]:
     """Write the pages; those that are there are replaced, other files of the folder stay.
 
@@ -261,9 +265,14 @@ def heading(view: TableView) -> str:
     """Heading of a table on its page."""
     entry = view.entry
     scale = "" if entry.scale in ("", DEFAULT_SCALE) else f"{entry.scale} scale"
-    words = shlex.split(entry.extra)  # in a heading without the quotes of a shell
+    words = [_short(word) for word in shlex.split(entry.extra)]  # without the quotes of a shell
     which = ", ".join(filter(None, (scale, view.form, " ".join(words))))
     return f"{entry.number} ({which})" if which else entry.number
+
+
+def _short(word: str) -> str:
+    """An override as a heading shows it: without a long list of rows, which the table has."""
+    return "some rows" if word.startswith("rows=") and len(word) > MOST_IN_HEADING else word
 
 
 def anchor(view: TableView) -> str:
