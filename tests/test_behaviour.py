@@ -157,7 +157,7 @@ def listed(family: int = 25, speed: float = 2400.0, flags: str = "avx2 avx512f")
     )
 
 
-def test_processors_of_one_name_are_told_apart() -> None:
+def test_processors_with_the_same_name_differ() -> None:
     assert processor(listed()).startswith("AuthenticAMD 25 17 1 - - ")
     assert processor(listed(speed=3100.5)) == processor(listed())
     assert processor(listed(family=26)) != processor(listed())

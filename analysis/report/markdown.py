@@ -34,6 +34,9 @@ from sweeps.table.request import DEFAULT_SCALE
 WIDTH = 100
 DIGEST = 12
 
+MOST_IN_HEADING = 40
+"""Characters of `rows=...` in the heading of a table."""
+
 ABSOLUTE = re.compile(r"(?<![\w.:/)\]])/(?:[\w.+@%~-]+/)+([\w.+@%~-]*)")
 """A path from the root of a machine; addresses of pages and relative paths do not match."""
 
@@ -43,10 +46,6 @@ PAGES = ("index", "claims", "networks", "measurements")
 
 STUDY_PAGE = "studies"
 STUDIES = Paper(title="Studies", reference="Tables of this project that no paper prints.")
-
-
-MOST_IN_HEADING = 40
-"""Characters of `rows=...` in the heading of a table."""
 
 
 def write_pages(data: ReportData, networks: Sequence[NetworkEntry], out: Path) -> list[Path]:

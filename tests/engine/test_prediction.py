@@ -48,7 +48,7 @@ def share(grey: float, column: int) -> float:
     return one / (one + other)
 
 
-def found(data: Batch, **settings: Any) -> np.ndarray:
+def predicted(data: Batch, **settings: Any) -> np.ndarray:
     shares = probabilities(Ramp(), data, FABRIC, settings=Prediction(**settings))
     return np.asarray(shares[0, 0])
 
@@ -63,8 +63,8 @@ def test_mirrored_probabilities_are_the_mean_of_both_images() -> None:
         [(share(g, j) + share(g, width - 1 - j)) / 2 for j, g in enumerate(row)]
         for row in (ROW, ROW[::-1])
     ]
-    np.testing.assert_allclose(found(data, mirrored=True), expected, atol=1e-6)
-    assert np.abs(found(data) - expected).max() > 0.05
+    np.testing.assert_allclose(predicted(data, mirrored=True), expected, atol=1e-6)
+    assert np.abs(predicted(data) - expected).max() > 0.05
 
 
 def by_hand(side: int, stride: float) -> list[float]:
@@ -83,7 +83,7 @@ def by_hand(side: int, stride: float) -> list[float]:
 @pytest.mark.parametrize("side", [3, 4, 5, 7])
 def test_windows_are_those_of_semseg(side: int) -> None:
     data = batch([ROW] * 4)
-    shares = found(data, mirrored=True, window_hw=(3, side))
+    shares = predicted(data, mirrored=True, window_hw=(3, side))
     np.testing.assert_allclose(shares, [by_hand(side, 2 / 3)] * 4, atol=1e-6)
 
 
@@ -105,7 +105,7 @@ def test_scales_are_averaged_at_the_size_of_the_label() -> None:
 
     one = enlarged([share(0.5, j) for j in range(2)])
     two = enlarged([share(0.5, j) for j in range(4)])
-    np.testing.assert_allclose(found(data, scales=(1.0, 2.0))[0], (one + two) / 2, atol=1e-6)
+    np.testing.assert_allclose(predicted(data, scales=(1.0, 2.0))[0], (one + two) / 2, atol=1e-6)
 
 
 def test_aligned_corners_enlarge_the_scores() -> None:
@@ -114,7 +114,7 @@ def test_aligned_corners_enlarge_the_scores() -> None:
     difference = np.array([0.0, 2.0 - (1 / 3 + 0.25)])
     for aligned, at in ((True, [0, 1 / 3, 2 / 3, 1]), (False, [0, 0.25, 0.75, 1])):
         expected = 1 / (1 + np.exp(-np.interp(at, [0, 1], difference)))
-        np.testing.assert_allclose(found(data, align_corners=aligned)[0], expected, atol=1e-6)
+        np.testing.assert_allclose(predicted(data, align_corners=aligned)[0], expected, atol=1e-6)
 
 
 def test_classes_and_confidences_agree_with_the_probabilities() -> None:

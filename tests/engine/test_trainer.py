@@ -272,7 +272,7 @@ def test_which_checkpoint_is_tested(tmp_path: Path, tested: str, kept: int) -> N
     assert same == (tested == "last")
 
 
-def test_without_validation_the_last_weights_take_the_place_of_the_best(tmp_path: Path) -> None:
+def test_without_validation_the_best_weights_are_the_last(tmp_path: Path) -> None:
     trainer, _ = make(tmp_path, tested="last")
     trainer.validate = None
     saved = []

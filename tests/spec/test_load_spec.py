@@ -50,7 +50,7 @@ def test_override_user_partition_without_absent_is_kept() -> None:
     assert config.metric.absent == "released", "that of the data set"
 
 
-def test_stored_decoder_gets_its_present_name() -> None:
+def test_stored_decoder_of_a_former_name_is_read() -> None:
     config = resolved("+experiment=multi_head_modified_night_stage1")
     now = load_spec.load_spec(OmegaConf.to_container(config))
     config.model.decoder = "modified_released"

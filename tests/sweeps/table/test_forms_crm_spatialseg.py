@@ -266,9 +266,7 @@ def test_rows_with_a_network_are_all_checked() -> None:
 
 @SCALES
 @pytest.mark.parametrize("form", FORMS)
-def test_losses_of_the_study_differ_in_the_place_of_their_weight_alone(
-    form: Form, scale: str
-) -> None:
+def test_losses_of_the_study_differ_in_their_focus_alone(form: Form, scale: str) -> None:
     study, table6 = load_table("loss_weighting"), TABLES["spatialseg/table6"]
     none, boundary, spatial = (spec_of(study, row, scale, form) for row in study.rows)
     printed = [spec_of(table6, row, scale, form).key for row in table6.rows]
