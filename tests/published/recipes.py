@@ -115,12 +115,11 @@ def rows_of(entry: str) -> dict[str, Row]:
         ValueError: two rows of one key.
     """
     found: dict[str, Row] = {}
-    for section in sections():
-        for row in section.rows:
-            if entry in row.used:
-                if row.key in found:
-                    raise ValueError(f"{entry}: two rows of {row.key}, one in '{section.title}'")
-                found[row.key] = row
+    named = ((part, row) for part in sections() for row in part.rows if entry in row.used)
+    for section, row in named:
+        if row.key in found:
+            raise ValueError(f"{entry}: two rows of {row.key}, one in '{section.title}'")
+        found[row.key] = row
     return found
 
 
@@ -172,12 +171,17 @@ def _side(experiment: str, use: Any, sides: Mapping[str, Side], place: str) -> s
             raise ValueError(f"{place}: the sides differ; `use` says which one counts")
         return next(iter(sides))
     by_side = {use: ["*"]} if isinstance(use, str) else use
-    for side, patterns in by_side.items():
-        if any(fnmatchcase(experiment, pattern) for pattern in patterns):
-            if side not in sides:
-                raise ValueError(f"{place}: `use` names '{side}', which has no value")
-            return str(side)
-    raise ValueError(f"{place}: `use` says nothing about {experiment}")
+    fitting = (
+        name
+        for name, patterns in by_side.items()
+        if any(fnmatchcase(experiment, p) for p in patterns)
+    )
+    side = next(fitting, None)
+    if side is None:
+        raise ValueError(f"{place}: `use` says nothing about {experiment}")
+    if side not in sides:
+        raise ValueError(f"{place}: `use` names '{side}', which has no value")
+    return str(side)
 
 
 def _flat(names: Iterable[Any]) -> tuple[str, ...]:
