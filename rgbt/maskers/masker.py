@@ -17,9 +17,7 @@ from rgbt.ranges import Pixels, Share
 from rgbt.requirements import Record
 from rgbt.types import MaskPair
 
-Sampler = Literal[
-    "none", "uniform", "bernoulli", "square", "gaussian_count", "gaussian_bernoulli"
-]
+Sampler = Literal["none", "uniform", "bernoulli", "square", "gaussian_count", "gaussian_bernoulli"]
 TOKEN = 4
 """Pixels per token side of the networks; a cell holds whole tokens."""
 
@@ -57,11 +55,11 @@ class Masker:
     the crop is open in the paper; the release takes the padded crop (`sigma_height: null`).
 
     Attributes:
-        sampler: "none" hides nothing; "uniform" a fixed number of cells (CRM); "bernoulli" each cell
-            independently with probability `ratio` (MIC); "square" one rectangle (CRM, Fig. 5);
-            "gaussian_count" a fixed number, likelier near the anchor (SpatialSeg as released);
-            "gaussian_bernoulli" each cell independently with the Gaussian as its probability
-            (SpatialSeg, Eq. 9).
+        sampler: "none" hides nothing; "uniform" a fixed number of cells (CRM); "square" one
+            rectangle (CRM, Fig. 5); "gaussian_count" a fixed number, likelier near the anchor
+            (SpatialSeg as released); "gaussian_bernoulli" each cell independently with the
+            Gaussian as its probability (SpatialSeg, Eq. 9); "bernoulli" each cell independently
+            with probability `ratio` (MIC).
         patch_size: side of a cell in pixels, multiple of 4; must divide the padded crop.
         ratio: share of the cells that a mask takes, 0..1; for "bernoulli" their probability, and
             for "square" the share of each side.

@@ -72,14 +72,3 @@ def seen_as(batch: Batch, own: View | None, other: View | None) -> Batch:
         return replace(batch, rgb=batch.thermal.expand_as(batch.rgb))
     luma = batch.rgb.new_tensor(LUMA).view(1, 3, 1, 1)
     return replace(batch, thermal=(batch.rgb * luma).sum(1, keepdim=True))
-
-
-def half(batch: Batch, *, first: bool) -> Batch:
-    """One image of two, the first ones or the last ones; of an odd number, the last have one more.
-
-    Of a batch of one image, both halves are that image.
-    """
-    size = len(batch.label) // 2
-    part = slice(None) if not size else slice(size) if first else slice(size, None)
-    kept = {name: each[part] for name, each in vars(batch).items() if isinstance(each, Tensor)}
-    return replace(batch, **kept, name=batch.name[part])

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from rgbt.losses.pseudo_labels import PseudoLabels, WeightedBy, pseudo_labels
 from rgbt.ranges import NonNegative, Share
 from rgbt.requirements import Record, Requirement
-from rgbt.schemes.class_mix import half, mixed, pasted_pixels, seen_as
+from rgbt.schemes.class_mix import mixed, pasted_pixels, seen_as
 from rgbt.schemes.domains import Passes, SourceAndTarget, scores
 from rgbt.schemes.masks import draw_masks
 from rgbt.schemes.teacher import Normalisation, Teacher
@@ -71,9 +71,9 @@ class SelfTraining:
         ignored_bottom: the same at the bottom.
         mixing: "classes", or "none": the target alone, augmented.
         masked_weight: of the loss of masked images, MIC: 1; 0: there are none.
-        masked_images: "target": all images of the target, augmented; "both": half of the batch of
-            the source with its labels and half of that of the target, not augmented. MIC: "target";
-            from day to night "both" (mask_mode separate).
+        masked_images: "target": the images of the target, augmented; "both": those of the source,
+            with its labels, and of the target, not augmented, each with half of the weight. MIC:
+            "target"; from day to night "both" (mask_mode separate, with one image of each).
     """
 
     model: nn.Module
@@ -130,12 +130,10 @@ class SelfTraining:
     def _source(self, source: Batch, generator_of: GeneratorOf) -> dict[str, Tensor]:
         parts = self.passes.supervised("source", source, generator_of)[1]
         if self.masked_weight and self.masked_images == "both":
-            parts |= self._masked("source", half(source, first=True), generator_of)
+            parts |= self._masked("source", source, generator_of)
         return parts
 
-    def _target(
-        self, source: Batch, target: Batch, generator_of: GeneratorOf
-    ) -> dict[str, Tensor]:
+    def _target(self, source: Batch, target: Batch, generator_of: GeneratorOf) -> dict[str, Tensor]:
         mix = target
         if self.mixing == "classes":
             assert self.passes.target is not None, "the record requires two domains"
@@ -143,11 +141,10 @@ class SelfTraining:
             mix = mixed(shown, target, pasted_pixels(source.label, generator_of("class mix")))
         mix = self._augmented(mix, generator_of("mix augmentation"))
         parts = self.passes.supervised("target", mix, generator_of)[1]
-        if self.masked_weight and self.masked_images == "both":
-            parts |= self._masked("target", half(target, first=False), generator_of)
-        elif self.masked_weight:
-            seen = self._augmented(target, generator_of("masked augmentation"))
-            parts |= self._masked("target", seen, generator_of)
+        if self.masked_weight and self.masked_images == "target":
+            target = self._augmented(target, generator_of("masked augmentation"))
+        if self.masked_weight:
+            parts |= self._masked("target", target, generator_of)
         return parts
 
     def _masked(self, name: str, batch: Batch, generator_of: GeneratorOf) -> dict[str, Tensor]:

@@ -94,5 +94,3 @@ class Teacher(nn.Module):
 def _key(name: str) -> str:
     """The name of the buffer of a parameter; a buffer cannot have a dot."""
     return name.replace(".", "/")
-
-
