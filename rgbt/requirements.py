@@ -74,9 +74,9 @@ class Record:
         shows_views: scheme: whether a domain's view and head are passed on to the network.
         optimizers: scheme: names that its phases use -> beginnings of the names of the parameters
             of the network that this optimizer leaves out.
-        networks: scheme: further networks that are trained, by the names of their optimizers;
-            each is replaced by what Fabric makes of it.
-        builders: scheme: of the optimizers of `networks`.
+        networks: scheme: further modules that are part of a checkpoint, by name; one that is
+            trained is replaced by what Fabric makes of it.
+        builders: scheme: of the optimizers of those `networks` that are trained, by their names.
         camera: scheme and view of a second frame: the `rgbt.geometry.camera.Camera` that draws it.
         hides_cells: masker: whether any cell is ever hidden.
         crop_hw: transform: size of a training example; None where that differs.

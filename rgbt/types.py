@@ -9,8 +9,9 @@ Conventions: RGB order, (row, column) order, labels int64 (uint8 until they are 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, TypeAlias
 
 if TYPE_CHECKING:  # commands that show results import these types without NumPy and torch
@@ -209,12 +210,14 @@ class Phase(NamedTuple):
         parts: named, weighted loss parts.
         clear: whether all gradients are cleared before; False adds to those of the phase before.
         idle: names of optimisers that also step, with gradients of 0: their moving averages decay.
+        logged: named scalars that are logged beside the parts and not trained.
     """
 
     optimizers: tuple[str, ...]
     parts: dict[str, Tensor]
     clear: bool = True
     idle: tuple[str, ...] = ()
+    logged: Mapping[str, Tensor] = MappingProxyType({})
 
 
 class AnyMasker(Protocol):

@@ -38,7 +38,7 @@ from tests.commands import (
 ROOT = Path(__file__).resolve().parents[1]
 
 ADAPTATION = (
-    *("sh_", "multi_head", "heatnet", "rgb_teacher", "thermal_teacher"),
+    *("sh_", "self_training", "multi_head", "heatnet", "rgb_teacher", "thermal_teacher"),
     *("start_deeplabv2", "start_pspnet", "start_semseg"),
 )
 """Beginnings of experiments on days and nights: `tests/test_adaptation_run.py`."""

@@ -283,9 +283,9 @@ def _networks_and_optimizers(
     record = record_of(scheme)
     parts, others = record.optimizers, record.networks
     built = {name: builder(session.model, without=without) for name, without in parts.items()}
-    for name, module in others.items():
-        _share_batch_norm(module, session.trainer)
-        built[name] = record.builders[name](module)
-        others[name] = fabric.setup_module(module)
+    for name in record.builders:
+        _share_batch_norm(others[name], session.trainer)
+        built[name] = record.builders[name](others[name])
+        others[name] = fabric.setup_module(others[name])
     wrapped: Any = {name: fabric.setup_optimizers(each) for name, each in built.items()}
     return others, wrapped

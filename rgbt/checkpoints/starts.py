@@ -137,7 +137,7 @@ RECIPES = (
         "RTFNet release: torchvision's ResNet of its day, now IMAGENET1K_V1",
     ),
     Recipe(
-        ("multi_head_*", "sh_*"),
+        ("multi_head_*", "sh_*", "self_training_*"),
         "deeplabv2",
         ("DeepLab_resnet_pretrained_init-f81d91e8.pth", "resnet101-63fe2227.pth"),
         "thesis code: the first, with inputs of its own; the second has other strides",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import resource
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -74,7 +74,8 @@ class Trainer:
         settings: durations and limits.
         scheme: yields the phases of a step.
         model: the network as Fabric wrapped it.
-        others: further networks that are trained (a discriminator), by their name in checkpoints.
+        others: further modules of the scheme (a discriminator, the weights of a teacher), by their
+            name in checkpoints.
         optimizers: by the names that phases use.
         schedule: learning rate factor per step.
         steps_per_epoch: optimiser steps in one epoch.
@@ -314,7 +315,7 @@ class Trainer:
         logged: dict[str, float] = {}
         for parts, _ in losses:
             values = _finite_values({name: next(numbers) for name in parts})
-            _add(logged, self._logged(values))
+            _add(logged, self._logged(values, phase.logged))
         key = "grad_norm" if len(self.optimizers) == 1 else f"grad_norm/{names}"
         logged[key] = _finite_values({"gradient norm": next(numbers)})["gradient norm"]
         for optimizer in stepped:
@@ -326,20 +327,26 @@ class Trainer:
     def _backward(
         self, phase: Phase, terms: TermGradients | None
     ) -> tuple[tuple[str, ...], Tensor]:
-        """Backward through a phase; names and values of its parts, not read from the device yet."""
+        """Backward through a phase; names and values to log, not read from the device yet."""
         parts, factor = list(phase.parts.values()), 1.0 / self.settings.accumulate
         if terms is not None:  # before the pass that frees the graph
             terms.add(phase.parts, factor)
         self.fabric.backward(torch.stack(parts).sum() * factor)
+        parts += phase.logged.values()
         values = torch.stack([part.detach().float() for part in parts])
         # Checked after the mean, so that all processes raise the same error.
-        return tuple(phase.parts), mean_count(values)
+        return (*phase.parts, *phase.logged), mean_count(values)
 
-    def _logged(self, values: dict[str, float]) -> dict[str, float]:
-        """The share of one accumulated batch in the values of a step."""
+    def _logged(self, values: dict[str, float], beside: Container[str]) -> dict[str, float]:
+        """The share of one accumulated batch in the values of a step.
+
+        `beside` are the names of those that are no parts of the loss.
+        """
         share = 1.0 / self.settings.accumulate
-        logged = {f"loss/{name}": value * share for name, value in values.items()}
-        logged["loss"] = sum(values.values()) * share
+        parts = {name: value for name, value in values.items() if name not in beside}
+        logged = {name: value * share for name, value in values.items() if name in beside}
+        logged |= {f"loss/{name}": value * share for name, value in parts.items()}
+        logged["loss"] = sum(parts.values()) * share
         return logged
 
 

@@ -17,7 +17,7 @@ from rgbt.ranges import Pixels, Share
 from rgbt.requirements import Record
 from rgbt.types import MaskPair
 
-Sampler = Literal["none", "uniform", "square", "gaussian_count", "gaussian_bernoulli"]
+Sampler = Literal["none", "uniform", "bernoulli", "square", "gaussian_count", "gaussian_bernoulli"]
 TOKEN = 4
 """Pixels per token side of the networks; a cell holds whole tokens."""
 
@@ -31,6 +31,7 @@ GAUSSIAN = {"sigma_div", "anchor", "cell_position"}
 NEEDED: dict[str, set[str]] = {
     "none": set(),
     "uniform": CELLS | {"ratio"},
+    "bernoulli": CELLS | {"ratio"},
     "square": CELLS | {"ratio"},
     "gaussian_count": CELLS | GAUSSIAN | {"ratio"},
     "gaussian_bernoulli": CELLS | GAUSSIAN,
@@ -57,16 +58,19 @@ class Masker:
         sampler: "none" hides nothing; "uniform" a fixed number of cells (CRM); "square" one
             rectangle (CRM, Fig. 5); "gaussian_count" a fixed number, likelier near the anchor
             (SpatialSeg as released); "gaussian_bernoulli" each cell independently with the
-            Gaussian as its probability (SpatialSeg, Eq. 9).
+            Gaussian as its probability (SpatialSeg, Eq. 9); "bernoulli" each cell independently
+            with probability `ratio` (MIC).
         patch_size: side of a cell in pixels, multiple of 4; must divide the padded crop.
-        ratio: share of the cells that a mask takes, 0..1; for "square" the share of each side.
+        ratio: share of the cells that a mask takes, 0..1; for "bernoulli" their probability, and
+            for "square" the share of each side.
         sigma_div: M_div, > 0.
         sigma_height: height in pixels that N_y is counted on, ``floor(sigma_height / patch_size)``;
             None: the padded crop.
         anchor: "grid" the middle of the padded crop; "tracked" `centre_yx` of the batch.
         cell_position: "index" or "centre", see above.
         pairing: "comp" RGB hides the mask, thermal its complement; "rand_comp" that, or one of
-            the two alone (see `pattern_probabilities`); "indiv" two independent masks.
+            the two alone (see `pattern_probabilities`); "indiv" two independent masks; "same" one
+            mask for both (MIC has one image).
         pattern_probabilities: of only thermal, only RGB, both hidden, for "rand_comp" alone; None:
             1/3 each.
 
@@ -82,7 +86,7 @@ class Masker:
     sigma_height: Pixels | None
     anchor: Literal["grid", "tracked"] | None
     cell_position: Literal["index", "centre"] | None
-    pairing: Literal["comp", "rand_comp", "indiv"] | None
+    pairing: Literal["comp", "rand_comp", "indiv", "same"] | None
     pattern_probabilities: tuple[Share, Share, Share] | None
 
     @property
@@ -111,6 +115,8 @@ class Masker:
         taken = self._draw(grid_hw, centre_yx, generator)
         if self.pairing == "indiv":
             return MaskPair(taken, self._draw(grid_hw, centre_yx, generator))
+        if self.pairing == "same":
+            return MaskPair(taken, taken.clone())
         if self.pairing == "comp":
             return pattern.complementary(taken)
         shares = self.pattern_probabilities or THIRDS
@@ -141,6 +147,9 @@ class Masker:
             return pattern.bernoulli(self._log_weight(grid_hw, centre_yx), generator)
         if self.sampler == "square":
             return pattern.square(len(centre_yx), grid_hw, self.ratio, generator)
+        if self.sampler == "bernoulli":
+            every = centre_yx.new_full((len(centre_yx), *grid_hw), self.ratio, dtype=torch.float32)
+            return pattern.bernoulli(every.log(), generator)
         if self.sampler == "uniform":
             log_weight = centre_yx.new_zeros((len(centre_yx), *grid_hw), dtype=torch.float32)
         else:

@@ -8,7 +8,7 @@ from typing import Any, Literal, Protocol
 from torch import Tensor, nn
 
 from rgbt.requirements import Record, Requirement
-from rgbt.types import Batch, GeneratorOf, Loss, Output, Phase, View
+from rgbt.types import Batch, GeneratorOf, Loss, MaskPair, Output, Phase, View
 
 Gradients = Literal["apart", "kept", "together"]
 """The gradients with which the optimizers of two heads step their shared parameters.
@@ -58,6 +58,10 @@ class SourceAndTarget(Protocol):
         ...
 
 
+WHOLE_IMAGES = Requirement("masker", "hides_cells", False)
+"""Of a scheme without a masked pass."""
+
+
 class Passes:
     """The passes of both domains through the network, and their losses.
 
@@ -89,15 +93,20 @@ class Passes:
             }
         self.gradients = gradients
 
-    def record_with(self, *requires: Requirement, **provides: Any) -> Record:
-        """Of a scheme of two domains, whole images and class scores, with what else it says."""
+    def record_with(
+        self, *requires: Requirement, masked: Requirement = WHOLE_IMAGES, **provides: Any
+    ) -> Record:
+        """Of a scheme of two domains and class scores, with what else it says.
+
+        `masked` is the requirement of the masker.
+        """
         of_heads = Requirement(
             "domains", "separate_heads", True, f"scheme.gradients={self.gradients}"
         )
         return Record(
             requires=(
                 Requirement("model", "outputs", "scores"),
-                Requirement("masker", "hides_cells", False),
+                masked,
                 Requirement("domains", "num_domains", 2),
                 *((of_heads,) if self.gradients != "apart" else ()),
                 *requires,
@@ -108,13 +117,18 @@ class Passes:
             **provides,
         )
 
-    def output(self, name: str, batch: Batch, generator_of: GeneratorOf) -> Output:
-        """The output of the network for a batch of the domain "source" or "target"."""
+    def output(
+        self, name: str, batch: Batch, generator_of: GeneratorOf, masks: MaskPair | None = None
+    ) -> Output:
+        """The output of the network for a batch of the domain "source" or "target".
+
+        A pass with `masks` has draws of its own.
+        """
         domain = self.source if name == "source" else self.target
         assert domain is not None, "a scheme of two domains has a target"
-        generator = generator_of(f"{name} network")
+        generator = generator_of(f"{name} network" + (" masked" if masks else ""))
         output: Output = self.model(
-            batch.rgb, batch.thermal, generator=generator, **options_of(domain)
+            batch.rgb, batch.thermal, masks, generator=generator, **options_of(domain)
         )
         return output
 

@@ -20,7 +20,8 @@ MILLION = 1e6
 def announce_training(setup: TrainingSetup, name: str, folder: Path) -> None:
     """Print device, network, images, steps and run folder of a training."""
     session, trainer = setup.session, setup.session.trainer
-    others = "".join(f", {key} {_millions(net)}" for key, net in setup.others.items())
+    trained = {key: net for key, net in setup.others.items() if key in setup.optimizers}
+    others = "".join(f", {key} {_millions(net)}" for key, net in trained.items())
     counts = [f"{len(session.dataset.names(each))} {each}" for each in setup.read_splits()]
     lines = [
         ("device", device_line(session)),

@@ -50,7 +50,8 @@ class Noisy:
         if self.calls == self.poison:
             loss = loss * float("nan")
         self.calls += 1
-        yield Phase(("main",), {"fit": loss, "extra": 0 * loss})
+        logged = {"noise/mean": noise.mean()}
+        yield Phase(("main",), {"fit": loss, "extra": 0 * loss}, logged=logged)
 
 
 def batches(start: int, batch_size: int = 4) -> Iterator[Batch]:

@@ -17,7 +17,7 @@ from rgbt.types import MaskPair
 from tests.models.golden import FOLDER
 
 GOLDEN = FOLDER / "losses.npz"
-VARIANTS = ["none", "crm", "irm", "square", "grbm_paper", "grbm_released"]
+VARIANTS = ["none", "crm", "irm", "mic", "square", "grbm_paper", "grbm_released"]
 
 
 def configured(variant: str, scale: str = "paper", **changes: object) -> Masker:
@@ -83,6 +83,18 @@ def test_individual_masks_have_the_ratio_each_and_overlap(ratio) -> None:
     # Independent: both hidden in ratio^2 of the cells.
     both = (masks.rgb & masks.thermal).double().mean().item()
     assert both == pytest.approx(ratio**2, abs=0.02)
+
+
+def test_cells_of_mic_are_independent_and_the_same_in_both_images() -> None:
+    masks = drawn("mic", 4000)
+    assert torch.equal(masks.rgb, masks.thermal)
+    # 80 cells: the variance of their number is 80 * 0.7 * 0.3 = 16.8, with a standard error of 0.4.
+    counts = masks.rgb.sum((1, 2)).double()
+    assert counts.mean().item() / 80 == pytest.approx(0.7, abs=0.005)
+    assert counts.var().item() == pytest.approx(16.8, abs=1.6)
+    apart = drawn("mic", 4000, pairing="indiv")
+    both = (apart.rgb & apart.thermal).double().mean().item()
+    assert both == pytest.approx(0.49, abs=0.01)
 
 
 @pytest.mark.parametrize("variant", ["crm", "square", "grbm_paper", "grbm_released"])

@@ -19,9 +19,10 @@ from rgbt.engine.checkpoint import State
 from rgbt.engine.optimizers import SGD
 from rgbt.engine.settings import TrainerSettings
 from rgbt.engine.trainer import Trainer
+from rgbt.models.inputs import expand_cells
 from rgbt.randomness import torch_generator
 from rgbt.requirements import Record, record_of
-from rgbt.types import Batch, Output, View
+from rgbt.types import Batch, MaskPair, Output, View
 from tests.losses.problems import batch_of
 
 K = 3
@@ -45,7 +46,7 @@ class Linear(nn.Module):
         self,
         rgb: Tensor,
         thermal: Tensor,
-        masks: None = None,
+        masks: MaskPair | None = None,
         *,
         views: tuple[View, ...] = (),
         head: str | None = None,
@@ -53,6 +54,10 @@ class Linear(nn.Module):
     ) -> Output:
         self.calls.append((views, head, self.training))
         three = thermal.expand(-1, 3, -1, -1)
+        if masks is not None:
+            cells = expand_cells(masks, len(rgb), (rgb.shape[2], rgb.shape[3]))
+            rgb = rgb.masked_fill(cells.rgb[:, None], 0.0)
+            three = three.masked_fill(cells.thermal[:, None], 0.0)
         image = {"rgb": rgb, "thermal": three, "rgbt": rgb + three}[(*views, "rgbt")[0]]
         features = self.backbone(image)
         scores = (self.only if head is None else self.heads[head])(features)
@@ -112,7 +117,8 @@ def trainer(scheme: Any, model: nn.Module, folder: Path, steps: int, **changes: 
         name: builder(model, without=parts) for name, parts in record_of(scheme).optimizers.items()
     }
     others = record_of(scheme).networks
-    built |= {name: record_of(scheme).builders[name](module) for name, module in others.items()}
+    builders = record_of(scheme).builders
+    built |= {name: build(others[name]) for name, build in builders.items()}
     settings: dict[str, Any] = {
         **{"max_steps": steps, "eval_every": 1000, "checkpoint_every": 1000, "log_every": 1},
         **{"accumulate": 1, "clip_norm": None, "precision": "32-true", "accelerator": "cpu"},

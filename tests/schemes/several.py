@@ -24,9 +24,11 @@ from rgbt.randomness import torch_generator
 from rgbt.requirements import record_of
 from rgbt.schemes.adversarial import Adversarial
 from rgbt.schemes.crm import CRM
+from rgbt.schemes.self_training import SelfTraining
 from rgbt.schemes.supervised import Supervised
 from rgbt.schemes.temporal import Temporal
 from rgbt.schemes.two_domains import LabelledDomains, UnlabelledTarget
+from rgbt.transforms.strong import StrongAugmentation
 from rgbt.transforms.virtual_view import VirtualView
 from rgbt.types import IGNORE, Batch, TwoDomains
 from tests.losses.problems import batch_of, criterion_of, whole_image
@@ -197,6 +199,24 @@ def unlabelled(loss: Any, *, guidance: float = 0.0, heads: bool = False, **given
     return two_domains(UnlabelledTarget, heads=heads, unlabelled=loss, **weights, **given)
 
 
+def self_training(*, heads: bool = False, **changes: Any) -> Case:
+    settings: dict[str, Any] = {
+        **{"decay": 0.999, "teacher_norm": "batch", "threshold": 0.4, "weighted_by": "batch"},
+        **{"ignored_top": 0.1, "ignored_bottom": 0.2, "mixing": "classes", "masked_weight": 0.5},
+        **{"masked_images": "target", **changes},
+    }
+    augmentation = StrongAugmentation(
+        **{"jitter_probability": 1.0, "jitter_strength": 0.2},
+        **{"blur_probability": 1.0, "blur_sigma": (0.15, 1.15)},
+    )
+    weighted = CrossEntropy(class_weights=(0.5, 1.0, 2.0))
+    return two_domains(
+        SelfTraining,
+        **{"heads": heads, "loss": weighted, "masker": INDEPENDENT},
+        **{"augmentation": augmentation, **settings},
+    )
+
+
 def max_squares(normalisation: Any, ratio: float | None) -> MaxSquares:
     return MaxSquares(weight=0.7, normalisation=normalisation, image_wise_ratio=ratio)
 
@@ -219,6 +239,8 @@ CASES: dict[str, Callable[[], Case]] = {
     "heatnet": lambda: adversarial(**HEATNET, heads=True),
     "max squares": lambda: unlabelled(max_squares("pixels", None), heads=True),
     "max squares image-wise": lambda: unlabelled(max_squares("entries", 0.2), guidance=0.3),
+    "self-training": lambda: self_training(masked_images="both"),
+    "self-training two heads": lambda: self_training(heads=True, weighted_by="image"),
     "entropy": lambda: unlabelled(Entropy(weight=0.7), guidance=0.3),
 }
 """Every scheme and every loss."""

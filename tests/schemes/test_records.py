@@ -15,6 +15,7 @@ from tests.schemes.test_adversarial import HEATNET, scheme_of
 from tests.schemes.test_domains import labelled, unlabelled
 from tests.schemes.test_schemes import Halves, Nothing
 from tests.schemes.test_schemes import scheme as crm
+from tests.schemes.test_self_training import scheme_of as self_training
 from tests.schemes.test_temporal import Net
 from tests.schemes.test_temporal import scheme as temporal
 
@@ -31,6 +32,7 @@ TWO = {
     ("domains", "num_domains"): 2,
 }
 LABELS, HEADS = ("domains", "target_labels"), ("domains", "separate_heads")
+WEIGHED = {**TWO, LABELS: False, ("loss", "weighs_confidence"): True}
 FRAMES = {("loss", "frames"): 2, ("masker", "hides_cells"): False}
 ALL_VIEWS = {("model", "views"): ("rgbt", "rgb", "thermal"), ("model", "stacks_passes"): True}
 OFF = {"complementary_weight": 0.0, "nonlocal_weight": 0.0}
@@ -58,6 +60,14 @@ CASES: dict[str, tuple[Callable[[], Any], dict[tuple[str, str], Any]]] = {
     "HeatNet": (
         lambda: scheme_of(network(False), **HEATNET),
         {**TWO, LABELS: True, ("domains", "target_confidence"): True},
+    ),
+    "self-training": (
+        lambda: self_training(network(False)),
+        {**WEIGHED, ("masker", "hides_cells"): True},
+    ),
+    "self-training without masked images": (
+        lambda: self_training(network(False), masked_weight=0.0),
+        {**WEIGHED, ("masker", "hides_cells"): False},
     ),
     "CRM": (lambda: crm(Halves()), {**ALL_VIEWS, ("masker", "hides_cells"): True}),
     "CRM without masks": (lambda: crm(Nothing(), **OFF), ALL_VIEWS),

@@ -1,0 +1,160 @@
+"""Self-training: a teacher, which is an average of the network, labels the target in every step.
+
+No run of a teacher is needed before (`domains.target.labels=experiment:...` has one).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Literal, Protocol
+
+import torch
+from torch import Tensor, nn
+
+from rgbt.losses.pseudo_labels import PseudoLabels, WeightedBy, pseudo_labels
+from rgbt.ranges import NonNegative, Share
+from rgbt.requirements import Record, Requirement
+from rgbt.schemes.class_mix import mixed, pasted_pixels, seen_as
+from rgbt.schemes.domains import Passes, SourceAndTarget, scores
+from rgbt.schemes.masks import draw_masks
+from rgbt.schemes.teacher import Normalisation, Teacher
+from rgbt.types import AnyMasker, Batch, GeneratorOf, Loss, Phase, TwoDomains
+
+TEACHER = "teacher"
+CONFIDENT_SHARE, CONFIDENCE = "teacher/confident_share", "teacher/confidence"
+"""Names in the log: share of the target's pixels whose highest probability reaches the threshold,
+and the mean of the highest probabilities."""
+
+
+class Augmentation(Protocol):
+    """The interface of an augmentation on the device (`rgbt.transforms.strong`)."""
+
+    def __call__(
+        self, rgb: Tensor, thermal: Tensor, generator: torch.Generator
+    ) -> tuple[Tensor, Tensor]:
+        """Images of the same shapes."""
+        ...
+
+
+@dataclass(kw_only=True, eq=False)
+class SelfTraining:
+    """Cross-entropy of the source, of a mix of both domains, and of masked images.
+
+        L = L_s(source) + L_s(mix) + masked_weight L_s(masked)
+
+    The teacher predicts labels of the unchanged target. The mix is the target, with half of the
+    classes of the source pasted on it, after strong augmentation. Its labels are those of the
+    source where it is pasted, with weight 1, and those of the teacher elsewhere, with the weight q
+    of `rgbt.losses.pseudo_labels`. The masked images hide cells of the target, and are trained with
+    the labels of the teacher.
+
+    Of an RGB-thermal pair, both images are pasted with the same pixels, and masked with the cells
+    that `masker.pairing` gives each. A domain that sees one image pastes what it sees
+    (`rgbt.schemes.class_mix.seen_as`).
+
+    Source: DACS; DAFormer, Eqs. 2 to 6, without feature distance and rare class sampling; MIC,
+    Eqs. 2 to 7.
+    Paper: q is a share of each image (DAFormer, Eq. 4).   Released: of the batch.
+
+    Attributes:
+        model: the network.
+        loss: L_s, of one domain; it weighs pixels by their confidence.
+        masker: draws the hidden cells of the masked images.
+        domains: a labelled source and a target whose labels are "none".
+        augmentation: of the mix, and of masked images of the target.
+        decay: of the teacher (`rgbt.schemes.teacher.Teacher`).
+        teacher_norm: see there.
+        threshold: probability from which a pixel of the teacher is confident.
+        weighted_by: see `rgbt.losses.pseudo_labels`.
+        ignored_top: share of the rows at the top without a pseudo-label.
+        ignored_bottom: the same at the bottom.
+        mixing: "classes", or "none": the target alone, augmented.
+        masked_weight: of the loss of masked images, MIC: 1; 0: there are none.
+        masked_images: "target": the images of the target, augmented; "both": those of the source,
+            with its labels, and of the target, not augmented, each with half of the weight. MIC:
+            "target"; from day to night "both" (mask_mode separate, with one image of each).
+    """
+
+    model: nn.Module
+    loss: Loss
+    masker: AnyMasker
+    domains: SourceAndTarget
+    augmentation: Augmentation
+    decay: Share
+    teacher_norm: Normalisation
+    threshold: Share
+    weighted_by: WeightedBy
+    ignored_top: Share
+    ignored_bottom: Share
+    mixing: Literal["classes", "none"]
+    masked_weight: NonNegative
+    masked_images: Literal["target", "both"]
+
+    def __post_init__(self) -> None:
+        self.passes = Passes(
+            model=self.model, loss=self.loss, domains=self.domains, gradients="apart"
+        )
+        self.teacher = Teacher(self.model, decay=self.decay, normalisation=self.teacher_norm)
+
+    @property
+    def record(self) -> Record:
+        """No labels of the target, weighted pixels, and hidden cells where they are read."""
+        setting = f"scheme.masked_weight={self.masked_weight:g}"
+        return self.passes.record_with(
+            Requirement("domains", "target_labels", False),
+            Requirement("loss", "weighs_confidence", True),
+            masked=Requirement("masker", "hides_cells", bool(self.masked_weight), setting),
+            networks={TEACHER: self.teacher},
+        )
+
+    def phases(self, batch: TwoDomains, generator_of: GeneratorOf) -> Iterator[Phase]:
+        """One phase, or one per optimiser, of images in [0, 1]; see `LabelledDomains.phases`."""
+        self.teacher.update(batch.step)
+        labels = self._labels(batch.target, generator_of)
+        target = replace(batch.target, label=labels.label, confidence=labels.weight)
+        logged = {CONFIDENT_SHARE: labels.confident, CONFIDENCE: labels.confidence}
+        phases = self.passes.phases(
+            lambda: self._source(batch.source, generator_of),
+            lambda: self._target(batch.source, target, generator_of),
+        )
+        for number, phase in enumerate(phases):
+            yield phase._replace(logged={} if number else logged)
+
+    def _labels(self, target: Batch, generator_of: GeneratorOf) -> PseudoLabels:
+        with self.teacher.in_network():
+            output = self.passes.output("target", target, generator_of)
+        ignored = (self.ignored_top, self.ignored_bottom)
+        return pseudo_labels(scores(output), self.threshold, self.weighted_by, ignored)
+
+    def _source(self, source: Batch, generator_of: GeneratorOf) -> dict[str, Tensor]:
+        parts = self.passes.supervised("source", source, generator_of)[1]
+        if self.masked_weight and self.masked_images == "both":
+            parts |= self._masked("source", source, generator_of)
+        return parts
+
+    def _target(self, source: Batch, target: Batch, generator_of: GeneratorOf) -> dict[str, Tensor]:
+        mix = target
+        if self.mixing == "classes":
+            assert self.passes.target is not None, "the record requires two domains"
+            shown = seen_as(source, self.passes.source.view, self.passes.target.view)
+            mix = mixed(shown, target, pasted_pixels(source.label, generator_of("class mix")))
+        mix = self._augmented(mix, generator_of("mix augmentation"))
+        parts = self.passes.supervised("target", mix, generator_of)[1]
+        if self.masked_weight and self.masked_images == "target":
+            target = self._augmented(target, generator_of("masked augmentation"))
+        if self.masked_weight:
+            parts |= self._masked("target", target, generator_of)
+        return parts
+
+    def _masked(self, name: str, batch: Batch, generator_of: GeneratorOf) -> dict[str, Tensor]:
+        """Parts of masked images; those of two domains have half of the weight each."""
+        masks = draw_masks(self.masker, batch, generator_of(f"{name} mask"))
+        output = self.passes.output(name, batch, generator_of, masks)
+        parts = self.loss(output, batch, generator_of(f"{name} masked loss"))
+        weight = self.masked_weight * (0.5 if self.masked_images == "both" else 1.0)
+        return {f"{name}/masked_{part}": weight * values.sum() for part, values in parts.items()}
+
+    def _augmented(self, batch: Batch, generator: torch.Generator) -> Batch:
+        rgb, thermal = self.augmentation(batch.rgb, batch.thermal, generator)
+        return replace(batch, rgb=rgb, thermal=thermal)

@@ -1,0 +1,244 @@
+"""Self-training: the loss of a step by its definition, and a resumed run with the same bits."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from rgbt.engine.checkpoint import State
+from rgbt.losses.cross_entropy import CrossEntropy
+from rgbt.requirements import Record, record_of
+from rgbt.schemes.class_mix import LUMA, pasted_pixels
+from rgbt.schemes.self_training import CONFIDENCE, CONFIDENT_SHARE, SelfTraining
+from rgbt.transforms.strong import StrongAugmentation
+from rgbt.types import Batch, MaskPair, Phase, TwoDomains
+from tests.schemes.linear import (
+    Linear,
+    domains,
+    generator_of,
+    images,
+    network,
+    pairs,
+    trainer,
+)
+
+THRESHOLD = 0.44
+"""Some pixels of the linear network are above it, and some below."""
+
+
+class Halves:
+    """Hides the left half of RGB, and the right half of thermal."""
+
+    record = Record(hides_cells=True)
+
+    def __call__(
+        self, image_hw: tuple[int, int], centre_yx: Tensor, generator: torch.Generator
+    ) -> MaskPair:
+        del image_hw, generator
+        left = torch.tensor([[True, False]] * 2).expand(len(centre_yx), 2, 2)
+        return MaskPair(left, ~left)
+
+
+def augmentation(jitter: float) -> StrongAugmentation:
+    return StrongAugmentation(
+        jitter_probability=jitter,
+        jitter_strength=0.2,
+        blur_probability=jitter,
+        blur_sigma=(0.15, 1.15),
+    )
+
+
+def scheme_of(model: Linear, *, jitter: float = 0.0, **changes: Any) -> Any:
+    settings: dict[str, Any] = {
+        **{"decay": 0.999, "teacher_norm": "batch", "threshold": THRESHOLD},
+        **{"weighted_by": "batch", "ignored_top": 0.0, "ignored_bottom": 0.0},
+        **{"mixing": "classes", "masked_weight": 0.5, "masked_images": "target"},
+        **{"domains": domains(False, labels="none", view="rgb"), "masker": Halves(), **changes},
+    }
+    loss = CrossEntropy(class_weights=None)
+    return SelfTraining(model=model, loss=loss, augmentation=augmentation(jitter), **settings)
+
+
+def batches(step: int = 0) -> TwoDomains:
+    target = images("target", 0).to("cpu")
+    unlabelled = replace(target, label=torch.full_like(target.label, 255))
+    return TwoDomains(images("source", 0).to("cpu"), unlabelled, step)
+
+
+def phase_of(scheme: Any, data: TwoDomains) -> Phase:
+    (phase,) = scheme.phases(data, generator_of)
+    return phase
+
+
+def logits(model: Linear, image: Tensor, head: Any = None) -> Tensor:
+    """(2, K, 4, 4) of three channels, by the definition of the network."""
+    last = model.only if head is None else model.heads[head]
+    assert last is not None
+    weight = last.weight.flatten(1) @ model.backbone.weight.flatten(1)
+    return torch.einsum("kc,bchw->bkhw", weight, image)
+
+
+def cost(scores: Tensor, label: Tensor, weight: Tensor) -> Tensor:
+    """Weighted nats over all pixels, divided by their number."""
+    nats = scores.logsumexp(1) - scores.gather(1, label[:, None])[:, 0]
+    return (weight * nats).sum() / label.numel()
+
+
+def teacher_labels(model: Linear, target: Batch) -> tuple[Tensor, Tensor]:
+    probability, label = logits(model, target.rgb).softmax(1).max(1)
+    return label, (probability >= THRESHOLD).double().mean()
+
+
+def masked(image: Tensor) -> Tensor:
+    """RGB without its left half."""
+    return torch.cat([torch.zeros_like(image[..., :2]), image[..., 2:]], -1)
+
+
+@pytest.mark.parametrize("mixing", ["classes", "none"])
+def test_parts_of_a_step_by_their_definition(mixing: str) -> None:
+    model, data = network(False), batches()
+    phase = phase_of(scheme_of(model, mixing=mixing), data)
+    label, share = teacher_labels(model, data.target)
+    assert 0 < share < 1
+    pasted = pasted_pixels(data.source.label, generator_of("class mix"))
+    assert pasted.any()
+    assert not pasted.all()
+    pasted &= mixing == "classes"
+    image = torch.where(pasted[:, None], data.source.rgb, data.target.rgb)
+    weight = torch.where(pasted, 1.0, share.float())
+    ones = torch.ones(2, 4, 4)
+    expected = {
+        "source/cross_entropy": cost(logits(model, data.source.rgb), data.source.label, ones),
+        "target/cross_entropy": cost(
+            logits(model, image), torch.where(pasted, data.source.label, label), weight
+        ),
+        "target/masked_cross_entropy": 0.5
+        * cost(logits(model, masked(data.target.rgb)), label, share.float() * ones),
+    }
+    assert list(phase.parts) == list(expected)
+    for name, value in expected.items():
+        torch.testing.assert_close(phase.parts[name], value)
+    assert phase.logged[CONFIDENT_SHARE].item() == pytest.approx(share.item())
+    confidence = logits(model, data.target.rgb).softmax(1).amax(1).mean()
+    torch.testing.assert_close(phase.logged[CONFIDENCE], confidence)
+
+
+def test_masked_images_of_both_domains_have_half_of_the_weight_each() -> None:
+    model, data = network(False), batches()
+    phase = phase_of(scheme_of(model, masked_images="both", jitter=1.0), data)
+    label, share = teacher_labels(model, data.target)
+    ones = torch.ones(2, 4, 4)
+    source = cost(logits(model, masked(data.source.rgb)), data.source.label, ones)
+    target = cost(logits(model, masked(data.target.rgb)), label, share.float() * ones)
+    # Not augmented, although the mix is.
+    torch.testing.assert_close(phase.parts["source/masked_cross_entropy"], 0.25 * source)
+    torch.testing.assert_close(phase.parts["target/masked_cross_entropy"], 0.25 * target)
+
+
+def test_mix_and_masked_target_are_augmented_and_pseudo_labels_are_not() -> None:
+    model, data = network(False), batches()
+    plain = phase_of(scheme_of(model), data)
+    strong = phase_of(scheme_of(model, jitter=1.0), data)
+    assert torch.equal(plain.parts["source/cross_entropy"], strong.parts["source/cross_entropy"])
+    for name in ("target/cross_entropy", "target/masked_cross_entropy"):
+        assert not torch.isclose(plain.parts[name], strong.parts[name])
+    assert plain.logged[CONFIDENCE] == strong.logged[CONFIDENCE]
+
+
+def test_without_masked_images_nothing_is_masked() -> None:
+    model, data = network(False), batches()
+    phase = phase_of(scheme_of(model, masked_weight=0.0), data)
+    assert list(phase.parts) == ["source/cross_entropy", "target/cross_entropy"]
+    assert len(model.calls) == 3  # the teacher, the source and the mix
+    assert [trains for _, _, trains in model.calls] == [False, True, True]
+
+
+def test_thermal_target_gets_the_luma_of_a_source_that_sees_rgb() -> None:
+    model, data = network(False), batches()
+    scheme = scheme_of(model, domains=domains(False, labels="none"), masked_weight=0.0)
+    phase = phase_of(scheme, data)
+    thermal = data.target.thermal.expand(-1, 3, -1, -1)
+    probability, label = logits(model, thermal).softmax(1).max(1)
+    share = (probability >= THRESHOLD).float().mean()
+    pasted = pasted_pixels(data.source.label, generator_of("class mix"))
+    luma = torch.einsum("c,bchw->bhw", torch.tensor(LUMA), data.source.rgb)[:, None]
+    image = torch.where(pasted[:, None], luma.expand(-1, 3, -1, -1), thermal)
+    mixed_label = torch.where(pasted, data.source.label, label)
+    expected = cost(logits(model, image), mixed_label, torch.where(pasted, 1.0, share))
+    torch.testing.assert_close(phase.parts["target/cross_entropy"], expected)
+
+
+def test_labels_are_those_of_the_average_of_the_steps_before() -> None:
+    """In step 1 the teacher is the mean of two networks, and the student another one."""
+    model = network(False)
+    scheme = scheme_of(model, masked_weight=0.0)
+    first = [each.detach().clone() for each in model.parameters()]
+    phase_of(scheme, batches(0))
+    with torch.no_grad():
+        for each in model.parameters():
+            each.add_(1.5 * torch.randn(each.shape, generator=generator_of("other")))
+    found = phase_of(scheme, batches(1)).logged[CONFIDENCE]
+    average = network(False)
+    for mean, one, two in zip(average.parameters(), first, model.parameters(), strict=True):
+        mean.data = (one + two.detach()) / 2
+    image = batches().target.rgb
+    torch.testing.assert_close(found, logits(average, image).softmax(1).amax(1).mean())
+    apart = logits(model, image).softmax(1).amax(1).mean() - found
+    assert abs(apart.item()) > 1e-3
+
+
+def test_two_heads_train_each_domain_with_its_own() -> None:
+    model, data = network(True), batches()
+    scheme = scheme_of(model, domains=domains(True, labels="none"))
+    source, target = scheme.phases(data, generator_of)
+    assert (source.optimizers, target.optimizers) == (("source",), ("target",))
+    assert set(source.parts) == {"source/cross_entropy"}
+    assert set(target.parts) == {"target/cross_entropy", "target/masked_cross_entropy"}
+    assert (set(source.logged), set(target.logged)) == ({CONFIDENT_SHARE, CONFIDENCE}, set())
+    heads = [head for _, head, _ in model.calls]
+    assert heads == ["dark", "day", "dark", "dark"]
+
+
+def test_resumed_run_ends_with_the_same_bits(tmp_path: Path) -> None:
+    """Network, teacher, optimizer and every logged value."""
+
+    def fit(folder: Path, steps: int, state: State) -> Any:
+        model = network(False)
+        scheme = scheme_of(model, jitter=0.5, masked_images="both")
+        made = trainer(scheme, model, folder, 6, checkpoint_every=1, max_steps=6)
+        assert made.resume(state) == (state.step > 0 or (folder / "last.pt").exists())
+        made.settings = replace(made.settings, max_steps=steps)
+        made.fit(pairs(first=state.step), state)
+        return made
+
+    straight = fit(tmp_path / "straight", 6, State(seed=0))
+    stopped = fit(tmp_path / "stopped", 3, State(seed=0))
+    shutil.copytree(tmp_path / "stopped", tmp_path / "resumed")
+    resumed = fit(tmp_path / "resumed", 6, State(seed=0))
+    for one, other in ((straight.model, resumed.model), (straight.others, resumed.others)):
+        states = [each["teacher"] if isinstance(each, dict) else each for each in (one, other)]
+        values = [each.state_dict() for each in states]
+        assert values[0].keys() == values[1].keys()
+        assert all(torch.equal(values[0][name], values[1][name]) for name in values[0])
+    before, after = (made.others["teacher"].state_dict() for made in (stopped, straight))
+    assert not all(torch.equal(before[name], after[name]) for name in before)
+    logged = [
+        [{name: line[name] for name in line if name.startswith(("loss", "teacher"))} for line in log]
+        for log in (straight.log, stopped.log + resumed.log)
+    ]
+    assert logged[0] == logged[1]
+    assert len({line[CONFIDENCE] for line in logged[0]}) == 6
+
+
+def test_record_has_the_teacher_and_no_optimizer_of_it() -> None:
+    scheme = scheme_of(network(False))
+    record = record_of(scheme)
+    assert record.networks == {"teacher": scheme.teacher}
+    assert not record.builders
+    assert set(record.optimizers) == {"main"}

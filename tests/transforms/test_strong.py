@@ -1,0 +1,125 @@
+"""Strong augmentation: every change by hand, what stays, and draws that are replayed."""
+
+from __future__ import annotations
+
+import colorsys
+
+import pytest
+import torch
+from torch import Tensor
+
+from rgbt.randomness import torch_generator
+from rgbt.transforms.strong import CHANGES, StrongAugmentation, blurred, jittered
+
+
+def augmentation(jitter: float = 1.0, blur: float = 1.0) -> StrongAugmentation:
+    return StrongAugmentation(
+        jitter_probability=jitter,
+        jitter_strength=0.2,
+        blur_probability=blur,
+        blur_sigma=(0.15, 1.15),
+    )
+
+
+def images(count: int = 3) -> tuple[Tensor, Tensor]:
+    draw = torch_generator(0, "images")
+    return torch.rand(count, 3, 12, 16, generator=draw), torch.rand(count, 1, 12, 16, generator=draw)
+
+
+def pixel(*rgb: float) -> Tensor:
+    return torch.tensor(rgb).view(1, 3, 1, 1)
+
+
+def by(value: float) -> Tensor:
+    return torch.full((1, 1, 1, 1), value)
+
+
+def test_changes_of_one_pixel() -> None:
+    one = pixel(0.2, 0.4, 0.9)
+    torch.testing.assert_close(jittered(one, "brightness", by(0.2)), pixel(0.4, 0.6, 1.0))
+    torch.testing.assert_close(jittered(one, "contrast", by(-0.5)), pixel(0.1, 0.2, 0.45))
+    for change, index, factor in (("saturation", 1, 0.8), ("hue", 0, None)):
+        hsv = list(colorsys.rgb_to_hsv(0.2, 0.4, 0.9))
+        hsv[index] = hsv[index] * factor if factor else (hsv[index] + 0.2) % 1
+        expected = pixel(*colorsys.hsv_to_rgb(*hsv))
+        found = jittered(one, change, by(-0.2 if factor else 0.2))
+        # Hue in steps of two degrees, the rest in 255 steps.
+        torch.testing.assert_close(found, expected, atol=0.03, rtol=0)
+
+
+def test_grey_has_no_colour_to_change() -> None:
+    grey = pixel(0.4, 0.4, 0.4)
+    for change in ("saturation", "hue"):
+        torch.testing.assert_close(jittered(grey, change, by(0.2)), grey, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_changes_stay_in_the_range_and_differ_by_image(change: str) -> None:
+    rgb, _ = images()
+    amounts = torch.tensor([-0.2, 0.0, 0.2]).view(-1, 1, 1, 1)
+    found = jittered(rgb, change, amounts)
+    assert found.min() >= 0
+    assert found.max() <= 1
+    apart = (found - rgb).abs().amax((1, 2, 3))
+    assert apart[0] > 0.05
+    assert apart[1] < 0.03  # the steps of HSV in 8 bits
+    assert apart[2] > 0.05
+
+
+def test_blur_is_the_gaussian_of_each_image() -> None:
+    points = torch.zeros(2, 1, 15, 15)
+    points[:, 0, 7, 7] = 1.0
+    sigma = torch.tensor([0.5, 1.1])
+    found = blurred(points, sigma, 1.15)
+    for image, s in zip(found[:, 0], sigma.tolist(), strict=True):
+        axis = torch.exp(-((torch.arange(15.0) - 7) ** 2) / (2 * s * s))
+        axis[(torch.arange(15) - 7).abs() > 5] = 0
+        axis = axis / axis.sum()
+        torch.testing.assert_close(image, axis[:, None] * axis[None], atol=1e-6, rtol=0)
+    flat = torch.full((2, 3, 4, 4), 0.7)
+    torch.testing.assert_close(blurred(flat, sigma, 1.15), flat)
+
+
+def test_probabilities() -> None:
+    rgb, thermal = images()
+
+    def found(jitter: float, blur: float, number: int = 0) -> tuple[Tensor, Tensor]:
+        return augmentation(jitter, blur)(rgb, thermal, torch_generator(0, "a", number))
+
+    same = found(0.0, 0.0)
+    assert torch.equal(same[0], rgb)
+    assert torch.equal(same[1], thermal)
+    shares = {"jitter": 0, "blur": 0}
+    for number in range(200):
+        shares["jitter"] += not torch.equal(found(0.8, 0.0, number)[1], thermal)
+        shares["blur"] += not torch.equal(found(0.0, 0.5, number)[1], thermal)
+    # Standard errors 0.03 and 0.035.
+    assert shares["jitter"] / 200 == pytest.approx(0.8, abs=0.1)
+    assert shares["blur"] / 200 == pytest.approx(0.5, abs=0.12)
+
+
+def test_thermal_has_draws_of_its_own_and_stays_one_channel() -> None:
+    """Brightness and contrast are linear before the clip: thermal = a x + b for every image."""
+    rgb, thermal = images()
+    found = augmentation(1.0, 0.0)(rgb, 0.3 + 0.2 * thermal, torch_generator(0, "a"))[1]
+    assert found.shape == thermal.shape
+    slopes = []
+    for before, after in zip(0.3 + 0.2 * thermal, found, strict=True):
+        x, y = before.flatten(), after.flatten()
+        slope = (y[1] - y[0]) / (x[1] - x[0])
+        torch.testing.assert_close(y, y[0] + slope * (x - x[0]), atol=1e-5, rtol=0)
+        slopes.append(round(slope.item(), 3))
+    assert len(set(slopes)) == 3
+    assert all(0.8 <= each <= 1.2 for each in slopes)
+
+
+def test_draws_are_replayed_and_their_number_is_fixed() -> None:
+    rgb, thermal = images()
+    ends = []
+    for jitter, blur in ((1.0, 1.0), (0.0, 0.0), (1.0, 1.0)):
+        generator = torch_generator(0, "a")
+        ends.append((augmentation(jitter, blur)(rgb, thermal, generator), generator.get_state()))
+    first, second, third = ends
+    assert torch.equal(first[0][0], third[0][0])
+    assert not torch.equal(first[0][0], second[0][0])
+    assert torch.equal(first[1], second[1])
