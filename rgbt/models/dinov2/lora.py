@@ -26,7 +26,7 @@ class LoraProjection(nn.Module):
         dim: d, width of the tokens.
         rank: r, of every update.
         alpha: factor of the updates before the division by the rank.
-        parts: updated projections; the LoRA paper recommends "q" and "v" (Sec. 4.2, 7.1).
+        parts: updated projections; the LoRA paper updates "q" and "v" (Sec. 7.1).
     """
 
     def __init__(self, dim: int, *, rank: int, alpha: float, parts: tuple[Part, ...]) -> None:
