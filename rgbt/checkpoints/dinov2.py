@@ -30,6 +30,9 @@ SIZES: dict[tuple[int, int], tuple[str, str]] = {
 }
 """Width and blocks -> size in words and network; "" where there is none of that size."""
 
+INPUTS = "model/inputs=cmx"
+"""ImageNet's means and deviations for R, G, B (DINOv2, data/transforms.py)."""
+
 ENCODER = "backbone.encoder."
 TIMM_REGISTERS = "reg_token"
 NOT_OF_ENCODER = "not part of the encoder"
@@ -57,6 +60,7 @@ def _recognise_dinov2(contents: Contents) -> Facts | None:
         what=f"DINOv2 vision transformer{' of timm' if is_timm else ''}",
         size=", ".join(filter(None, (size, f"{registers} registers" if registers else ""))),
         fits=((f"model={model}{'_reg' if registers else ''}",),) if fits else (),
+        convention=(INPUTS, f"model.position_resize={'size' if registers else 'factor'}"),
     )
 
 
