@@ -70,6 +70,7 @@ class Rule:
         leftover: names of the file that the network has no place for.
         stems: entries whose input channels may be others than in the file: for one channel the
             mean over the file's, for further ones behind the file's the same mean.
+        positions: entries whose first position the file may lack; it is 0 then.
         remarks: as in `Facts`.
     """
 
@@ -77,6 +78,7 @@ class Rule:
     fresh: Reasons = ()
     leftover: Reasons = ()
     stems: Collection[str] = ()
+    positions: Collection[str] = ()
     remarks: tuple[str, ...] = ()
 
 
@@ -126,6 +128,7 @@ def count_blocks(names: Collection[str], pattern: str) -> int:
 
 FAMILIES: Mapping[str, str] = {
     "mask2former": "RGB-T Mask2Former",
+    "dinov2": "DINOv2 with Mask2Former's head",
     "cmx": "CMX",
     "rtfnet": "RTFNet",
     "mfnet": "MFNet",
@@ -137,6 +140,7 @@ FAMILIES: Mapping[str, str] = {
 
 CLASS_PARTS: Mapping[str, tuple[str, ...]] = {
     "mask2former": ("sem_seg_head.predictor.class_embed",),
+    "dinov2": ("sem_seg_head.predictor.class_embed",),
     "cmx": ("decode_head.linear_pred",),
     "rtfnet": ("deconv5.1",),
     "mfnet": ("decode1",),

@@ -87,7 +87,7 @@ def make_plan(
         elif why := reason(rule.fresh, entry):
             plan.fresh[entry] = why
         elif name in tensors:
-            difference = _difference(tensors[name], value, is_stem=entry in rule.stems)
+            difference = _difference(tensors[name], value, entry, rule)
             plan.put(entry, name, difference, other_classes=other_classes)
         elif entry.endswith(COUNTER):
             plan.zeros.append(entry)
@@ -106,16 +106,19 @@ def make_plan(
 
 
 def adapted(tensor: Tensor, value: Tensor) -> Tensor:
-    """A file's tensor for an entry of the network: the same, or with other input channels.
+    """A file's tensor for an entry of the network: the same, or of another shape.
 
-    One channel gets the mean over the file's; channels behind the file's get it too.
+    One input channel gets the mean over the file's; channels behind the file's get it too. A first
+    position that the file lacks is 0.
 
     Args:
-        tensor: (C, c, k, k) where the shapes differ.
-        value: (C, c', k, k), c' = 1 or more than c.
+        tensor: (C, c, k, k) or (1, n - 1, d) where the shapes differ.
+        value: (C, c', k, k), c' = 1 or more than c, or (1, n, d).
     """
     if tensor.shape == value.shape:
         return tensor
+    if tensor.dim() == 3:
+        return torch.cat([torch.zeros_like(tensor[:, :1]), tensor], 1)
     mean = tensor.float().mean(1, keepdim=True)
     if value.shape[1] == 1:
         return mean
@@ -141,7 +144,7 @@ def _under(entry: str, parts: tuple[str, ...]) -> bool:
     return any(entry == part or entry.startswith(f"{part.rstrip('.')}.") for part in parts)
 
 
-def _difference(tensor: Tensor, value: Tensor, *, is_stem: bool) -> str:
+def _difference(tensor: Tensor, value: Tensor, entry: str, rule: Rule) -> str:
     """How a file's tensor does not fit an entry, "" where it does."""
     if tensor.is_floating_point() != value.is_floating_point():
         kinds = [str(each.dtype).removeprefix("torch.") for each in (tensor, value)]
@@ -149,7 +152,10 @@ def _difference(tensor: Tensor, value: Tensor, *, is_stem: bool) -> str:
     found, own = tuple(tensor.shape), tuple(value.shape)
     if found == own:
         return ""
-    if is_stem and len(found) == len(own) == 4 and found[1] == 3 and own[1] in (1, 4):
+    is_table = entry in rule.positions and len(found) == len(own) == 3
+    if is_table and (found[0], found[1] + 1, found[2]) == own:
+        return ""
+    if entry in rule.stems and len(found) == len(own) == 4 and found[1] == 3 and own[1] in (1, 4):
         found, own = (found[0], *found[2:]), (own[0], *own[2:])
         if found == own:
             return ""

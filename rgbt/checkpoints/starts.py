@@ -62,6 +62,7 @@ WINDOW = 7
 
 SWIN = "github.com/SwinTransformer/storage, release v1.0.0"
 SEGFORMER = "github.com/NVlabs/SegFormer"
+DINOV2 = "dl.fbaipublicfiles.com/dinov2"
 IMAGENET = "ImageNet-1K, 224 x 224 pixels"
 RESNETS = {
     18: ("f37072fd", "5c106cde"),
@@ -120,6 +121,16 @@ STARTS = (
         "github.com/hszhao/semseg (initmodel)",
         ("semseg",),
     ),
+    *(
+        Start(
+            f"dinov2_vit{size}14{file}_pretrain.pth",
+            f"ViT-{size.upper()}/14{registers}, DINOv2 on LVD-142M",
+            f"{DINOV2}/dinov2_vit{size}14",
+            (f"dinov2_vit{size}14{model}",),
+        )
+        for size in ("s", "b")
+        for file, registers, model in (("", "", ""), ("_reg4", " with four registers", "_reg"))
+    ),
 )
 
 RECIPES = (
@@ -128,6 +139,12 @@ RECIPES = (
         "mask2former",
         tuple(start.file for start in STARTS if start.file.startswith("swin_")),
         "CRM and SpatialSeg releases: Swin-T, -S or -B by the row; 22kto1k for Swin-B on KP alone",
+    ),
+    Recipe(
+        ("dinov2",),
+        "dinov2",
+        tuple(start.file for start in STARTS if start.file.startswith("dinov2_")),
+        "DINOv2 release; the combination with the head of Mask2Former is ours",
     ),
     Recipe(("cmx*", "temporal_*"), "cmx", ("mit_b2.pth",), "CMX and Temporal releases"),
     Recipe(

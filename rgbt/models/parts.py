@@ -1,4 +1,4 @@
-"""Parts that networks share: random drops in training, from a given generator, and up blocks.
+"""Parts that networks share: random drops from a given generator, the MLP, and up blocks.
 
 The up blocks are the decoder of HeatNet and of the modified DeepLab.
 """
@@ -63,6 +63,20 @@ def drop_channels(x: Tensor, rate: float, generator: torch.Generator | None) -> 
     n, channels = x.shape[:2]
     factor = keep_factors(torch.tensor([rate]), (n, channels, 1, 1), generator, x.device)
     return x * factor[0].to(x.dtype)
+
+
+class Mlp(nn.Module):
+    """Linear, exact GELU, linear."""
+
+    def __init__(self, dim: int, hidden: int) -> None:
+        super().__init__()
+        self.fc1 = nn.Linear(dim, hidden)
+        self.fc2 = nn.Linear(hidden, dim)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(..., C) -> (..., C)."""
+        out: Tensor = self.fc2(F.gelu(self.fc1(x)))
+        return out
 
 
 class UpBlock(nn.Module):

@@ -12,6 +12,7 @@ from torch.nn import functional as F
 from rgbt.models.cmx.model import CMX
 from rgbt.models.critic import Critic
 from rgbt.models.deeplabv2.model import DeepLabV2
+from rgbt.models.dinov2.model import DinoMask2Former
 from rgbt.models.inputs import Inputs
 from rgbt.models.mask2former.model import Mask2Former
 from rgbt.models.mfnet import MFNet
@@ -46,6 +47,16 @@ NANO: dict[str, tuple[Any, dict[str, Any]]] = {
                                   "encoder_ffn_dim": 16, "decoder_layers": 3,
                                   "decoder_ffn_dim": 16, "attention_heads": 2,
                                   "pixel_decoder_fp32": True}),
+    "dinov2": (DinoMask2Former, {"num_classes": 4, "patch": 4, "embed_dim": 8, "depth": 4,
+                                 "num_heads": 2, "mlp_ratio": 2.0, "num_registers": 2,
+                                 "position_grid": 5, "position_resize": "size", "token_px": 8,
+                                 "layers": (4,), "tuning": "full", "lora_rank": 2,
+                                 "lora_alpha": 4.0, "lora_parts": ("q", "v"),
+                                 "lora_per_modality": True, "thermal_embedding": True,
+                                 "fusion": "max", "hidden_dim": 32, "num_queries": 5,
+                                 "encoder_layers": 1, "encoder_ffn_dim": 16, "decoder_layers": 3,
+                                 "decoder_ffn_dim": 16, "attention_heads": 2,
+                                 "pixel_decoder_fp32": True}),
     "critic": (Critic, {"in_channels": 2, "base_width": 2, "upsample": False,
                         "align_corners": False}),
 }  # fmt: skip
@@ -57,7 +68,7 @@ def nano(name: str, seed: int = 0, **changes: Any) -> Any:
     given = (
         {}
         if name == "critic"
-        else {"inputs": half(3 if name in ("deeplabv2", "cmx", "semseg") else 1)}
+        else {"inputs": half(3 if name in ("deeplabv2", "cmx", "semseg", "dinov2") else 1)}
     )
     with torch.random.fork_rng():
         torch.manual_seed(seed)

@@ -1,29 +1,22 @@
-"""The network RGB-T Mask2Former: backbone, pixel decoder and query decoder."""
+"""The network RGB-T Mask2Former: two Swin branches, pixel decoder and query decoder."""
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from typing import Annotated, Literal
 
 import torch
 from annotated_types import Interval
 from torch import Tensor, nn
-from torch.nn import functional as F
 
-from rgbt.checks import InputError, check_choice
 from rgbt.geometry.padding import STRIDE, padded_hw
 from rgbt.models.inputs import Inputs, expand_cells
 from rgbt.models.mask2former.backbone import RgbtBackbone
-from rgbt.models.mask2former.decoder import Predictor
-from rgbt.models.mask2former.pixel_decoder import GROUPS, PixelDecoder
+from rgbt.models.mask2former.head import HeadShape, MaskHead, dense_logits, requested
 from rgbt.models.mask2former.swin import PATCH, SwinShape
 from rgbt.models.parts import check_heads
 from rgbt.ranges import Blocks, Channels, Depths, MlpRatio, NumClasses, ShareBelowOne, Widths
 from rgbt.requirements import Record
 from rgbt.types import VIEWS, MaskPair, Output, View
-
-FAINTEST = 1e-6
-"""Smallest semantic score whose logarithm is taken."""
 
 
 class Mask2Former(nn.Module):
@@ -94,11 +87,17 @@ class Mask2Former(nn.Module):
     ) -> None:
         super().__init__()
         shape = SwinShape(embed_dim, depths, num_heads, window_size, mlp_ratio, drop_path_rate)
-        if hidden_dim % GROUPS or hidden_dim % attention_heads:
-            raise InputError(
-                f"model.hidden_dim must be a multiple of {GROUPS} and of model.attention_heads "
-                f"({attention_heads}), got {hidden_dim}."
-            )
+        head = HeadShape(
+            num_classes=num_classes,
+            hidden_dim=hidden_dim,
+            num_queries=num_queries,
+            encoder_layers=encoder_layers,
+            encoder_ffn_dim=encoder_ffn_dim,
+            decoder_layers=decoder_layers,
+            decoder_ffn_dim=decoder_ffn_dim,
+            attention_heads=attention_heads,
+            pixel_decoder_fp32=pixel_decoder_fp32,
+        )
         check_heads(shape.widths, num_heads)
         self.num_classes = num_classes
         self.drop_path_rate = drop_path_rate
@@ -109,24 +108,7 @@ class Mask2Former(nn.Module):
             mask_token=mask_token,
             thermal_channels=inputs.thermal_channels,
         )
-        pixel_decoder = PixelDecoder(
-            shape.widths,
-            hidden_dim=hidden_dim,
-            encoder_layers=encoder_layers,
-            heads=attention_heads,
-            ffn_dim=encoder_ffn_dim,
-            fp32=pixel_decoder_fp32,
-        )
-        predictor = Predictor(
-            num_classes,
-            hidden_dim=hidden_dim,
-            num_queries=num_queries,
-            num_layers=decoder_layers,
-            heads=attention_heads,
-            ffn_dim=decoder_ffn_dim,
-        )
-        parts = {"pixel_decoder": pixel_decoder, "predictor": predictor}
-        self.sem_seg_head = nn.Sequential(OrderedDict(parts))
+        self.sem_seg_head = MaskHead(head, shape.widths)
         self.inputs = inputs
 
     def forward(  # noqa: PLR0913 - what every network takes, and what is stacked
@@ -174,80 +156,24 @@ class Mask2Former(nn.Module):
                 generator where one is needed.
             InputError: mask cells that do not divide the padded image.
         """
-        views = views or VIEWS[:1]
-        if passes < 1 or len(rgb) % passes:
-            raise ValueError(f"{len(rgb)} images are not {passes} stacked passes of one batch.")
-        if len(set(views)) < len(views):
-            raise ValueError(f"views must name each view at most once, got {views}.")
-        for view in views:
-            check_choice("view", view, VIEWS)
-        stacked = len(views) * passes
-        predictions = stacked if num_predictions is None else num_predictions
-        with_masks = predictions if num_masks is None else num_masks
-        if not 1 <= with_masks <= predictions <= stacked:
-            raise ValueError(
-                f"num_predictions={num_predictions} and num_masks={num_masks} do not fit: expected "
-                f"1 <= num_masks <= num_predictions <= {stacked} (views times passes)."
-            )
+        wanted = requested(len(rgb), passes, views, num_predictions, num_masks)
         if self.training and self.drop_path_rate > 0 and generator is None:
             raise ValueError("training with drop_path_rate > 0 requires `generator`, got None.")
         image_hw = rgb.shape[2], rgb.shape[3]
-        full_hw = padded_hw(image_hw)
         images = self.inputs(rgb, thermal, multiple=STRIDE)
-        hidden = None if masks is None else expand_cells(masks, len(rgb), full_hw, PATCH)
+        cells = padded_hw(image_hw)
+        hidden = None if masks is None else expand_cells(masks, len(rgb), cells, PATCH)
         features = self.backbone(
             images,
             hidden,
             passes=passes,
-            views=views,
-            num_predictions=predictions,
+            views=wanted.views,
+            num_predictions=wanted.predictions,
             generator=generator,
         )
-
-        count = len(rgb) // passes
-        pyramid = self.sem_seg_head.get_submodule("pixel_decoder")(features, with_masks * count)
-        classes, mask_logits = self.sem_seg_head.get_submodule("predictor")(pyramid)
-        logits = None
-        if not self.training and stacked == 1:
-            logits = semantic_logits(classes[-1], mask_logits[-1], image_hw, full_hw)
-        aux = {
-            "class_logits": classes.unflatten(1, (predictions, count)),
-            "mask_logits": mask_logits.unflatten(1, (with_masks, count)),
-        }
-        return Output(logits, aux)
+        output: Output = self.sem_seg_head(features, wanted, image_hw)
+        return output
 
     def dense_logits(self, output: Output, image_hw: tuple[int, int]) -> Tensor:
-        """Class scores of every pixel in training, for losses that compare dense predictions.
-
-        `output` is of one pass and view. (B, K, H, W) float32: logarithm of the semantic scores, so
-        that their softmax is the share of a class in the sum over classes.
-        """
-        scores = semantic_logits(
-            output.aux["class_logits"][-1, 0],
-            output.aux["mask_logits"][-1, 0],
-            image_hw,
-            padded_hw(image_hw),
-        )
-        return scores.clamp(min=FAINTEST).log()
-
-
-def semantic_logits(
-    class_logits: Tensor, mask_logits: Tensor, image_hw: tuple[int, int], padded: tuple[int, int]
-) -> Tensor:
-    """Score of every class at every pixel, at the size of the image.
-
-        score(k, pixel) = sum over queries of softmax(class)(k) * sigmoid(mask)(pixel)
-
-    Source: Mask2Former release, semantic inference; the no-object class is dropped.
-
-    (B, Q, K + 1) and (B, Q, h, w), which stands for an image of size `padded` whose top left part
-    is `image_hw`, -> (B, K, H, W) float32, >= 0.
-    """
-    with torch.autocast(class_logits.device.type, enabled=False):
-        masks = F.interpolate(
-            mask_logits.float(), size=padded, mode="bilinear", align_corners=False
-        )
-        masks = masks[..., : image_hw[0], : image_hw[1]].sigmoid()
-        classes = class_logits.float().softmax(-1)[..., :-1]
-        scores = classes.transpose(1, 2) @ masks.flatten(2)
-        return scores.view(*scores.shape[:2], *image_hw)
+        """As `rgbt.models.mask2former.head.dense_logits`."""
+        return dense_logits(output, image_hw)

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.models.parts import add_residual, keep_factors
+from rgbt.models.parts import Mlp, add_residual, keep_factors
 
 PATCH = 4
 
@@ -140,20 +140,6 @@ class WindowAttention(nn.Module):
         out = out.view(n, rows, columns, self.heads, side, side, -1)
         merged: Tensor = out.permute(0, 1, 4, 2, 5, 3, 6).reshape(n, height, width, dim)
         return merged
-
-
-class Mlp(nn.Module):
-    """Linear, exact GELU, linear."""
-
-    def __init__(self, dim: int, hidden: int) -> None:
-        super().__init__()
-        self.fc1 = nn.Linear(dim, hidden)
-        self.fc2 = nn.Linear(hidden, dim)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """(..., C) -> (..., C)."""
-        out: Tensor = self.fc2(F.gelu(self.fc1(x)))
-        return out
 
 
 class SwinBlock(nn.Module):
