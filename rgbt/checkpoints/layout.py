@@ -127,6 +127,7 @@ def count_blocks(names: Collection[str], pattern: str) -> int:
 FAMILIES: Mapping[str, str] = {
     "mask2former": "RGB-T Mask2Former",
     "cmx": "CMX",
+    "cmnext": "CMNeXt",
     "rtfnet": "RTFNet",
     "mfnet": "MFNet",
     "pspnet": "PSPNet (HeatNet)",
@@ -138,6 +139,7 @@ FAMILIES: Mapping[str, str] = {
 CLASS_PARTS: Mapping[str, tuple[str, ...]] = {
     "mask2former": ("sem_seg_head.predictor.class_embed",),
     "cmx": ("decode_head.linear_pred",),
+    "cmnext": ("decode_head.linear_pred",),
     "rtfnet": ("deconv5.1",),
     "mfnet": ("decode1",),
     "pspnet": ("final",),

@@ -223,7 +223,7 @@ def test_rates_reach_the_blocks_of_each_stream() -> None:
 
 
 def test_a_dropped_residual_leaves_the_sample_alone() -> None:
-    block: MitBlock = randomise(MitBlock(4, 2, 1, 8))
+    block: MitBlock = randomise(MitBlock(4, 2, 1, 8, norm_eps=1e-6))
     x = normal(3, 2, 2, 4)
     keep = torch.tensor([[0.0, 1.0, 0.0], [0.0, 1.0, 2.0]]).view(2, 3, 1, 1, 1)
     out = block(x, keep)

@@ -25,7 +25,8 @@ class MlpDecoder(nn.Module):
 
     Source: SegFormer, Sec. 3.2, Eq. (4); CMX, Sec. III-A.
 
-    `dims` are channels of the four maps, the largest first; `dim` is E, the rest as in `CMX`.
+    `dims` are channels of the four maps, the largest first; `dim` is E; `mix_bias`: whether the
+    convolution over the joined maps has a bias, as in CMX; the rest as in `CMX`.
     """
 
     def __init__(
@@ -37,6 +38,7 @@ class MlpDecoder(nn.Module):
         dropout: float,
         norm_eps: float,
         norm_eps_eval: float,
+        mix_bias: bool = True,
     ) -> None:
         super().__init__()
         self.dropout = dropout
@@ -44,7 +46,7 @@ class MlpDecoder(nn.Module):
         self.linear_c1, self.linear_c2, self.linear_c3, self.linear_c4 = (
             nn.Sequential(OrderedDict(proj=nn.Linear(width, dim))) for width in dims
         )
-        fuse = nn.Conv2d(4 * dim, dim, 1)
+        fuse = nn.Conv2d(4 * dim, dim, 1, bias=mix_bias)
         self.linear_fuse = nn.Sequential(fuse, nn.BatchNorm2d(dim, eps=norm_eps), nn.ReLU())
         self.linear_pred = nn.Conv2d(dim, num_classes, 1)
         for convolution in (fuse, self.linear_pred):
@@ -64,9 +66,10 @@ class MlpDecoder(nn.Module):
         """
         # The convolution over the four projected and enlarged maps, (N, E, H_1, W_1). The release
         # joins the maps in the order c4, c3, c2, c1.
-        weight, bias = (self.linear_fuse.get_parameter(f"0.{name}") for name in ("weight", "bias"))
-        part4, part3, part2, part1 = weight.flatten(1).chunk(4, 1)
-        mixed = _projected(self.linear_c1, maps[0], part1, bias)
+        fuse = self.linear_fuse[0]
+        assert isinstance(fuse, nn.Conv2d), "put there by the constructor"
+        part4, part3, part2, part1 = fuse.weight.flatten(1).chunk(4, 1)
+        mixed = _projected(self.linear_c1, maps[0], part1, fuse.bias)
         smaller = (
             _projected(self.linear_c2, maps[1], part2),
             _projected(self.linear_c3, maps[2], part3),
