@@ -110,7 +110,7 @@ def test_feed_forward_sees_its_neighbours_only() -> None:
 
 
 def decoder() -> tuple[MlpDecoder, list[Tensor]]:
-    net = MlpDecoder((3, 4, 5, 6), 2, dim=7, dropout=0.0, norm_eps=1e-3, norm_eps_eval=1e-3)
+    net = MlpDecoder((3, 4, 5, 6), 2, dim=7, dropout=0.0, norm_eps=(1e-3, 1e-3))
     sizes = ((9, 13), (5, 7), (3, 4), (2, 2))
     maps = [normal(2, *hw, 3 + i, seed=i).double() for i, hw in enumerate(sizes)]
     return randomise(net).double(), maps

@@ -103,8 +103,7 @@ class CMNeXt(nn.Module):
             num_classes,
             dim=decoder_dim,
             dropout=decoder_dropout,
-            norm_eps=decoder_norm_eps,
-            norm_eps_eval=decoder_norm_eps,
+            norm_eps=(decoder_norm_eps, decoder_norm_eps),
             mix_bias=False,
         )
         self.apply(partial(mit.initialise, divide_groups=False))

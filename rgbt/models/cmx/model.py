@@ -94,8 +94,7 @@ class CMX(nn.Module):
             num_classes,
             dim=decoder_dim,
             dropout=decoder_dropout,
-            norm_eps=decoder_norm_eps,
-            norm_eps_eval=decoder_norm_eps_eval or decoder_norm_eps,
+            norm_eps=(decoder_norm_eps, decoder_norm_eps_eval or decoder_norm_eps),
         )
         self.inputs = inputs
 
