@@ -285,7 +285,7 @@ def test_tables_not_run_are_listed_with_their_needs(data: ReportData) -> None:
     assert (cell.mean, cell.published, cell.runs) == (None, 61.79, ())
     temporal = table_of(data, "temporal/table4")
     cainet = temporal.cells[temporal.rows.index("CAINet")]
-    assert cainet[0].reason == "XX"
+    assert cainet[0].reason == "shown as published only"
     columns = table_of(data, "temporal/table1").columns
     assert columns[-4:] == ("TC", "CA", "TC aligned", "CA aligned")
     assert "TC aligned: not in the paper." in table_of(data, "temporal/table1").notes

@@ -362,7 +362,12 @@ NETWORKS = {
 }
 MILLIONS = {
     **{"model=cmx_b2": 66.57, "model=cmx_b4": 139.86, "model=rtfnet_50": 185.24},
-    **{"model=cmnext_b4": 116.56, "model=rtfnet_152": 254.51, "model=heatnet": 54.36, "model=heatnet_rgb": 53.32},
+    **{
+        "model=cmnext_b4": 116.56,
+        "model=rtfnet_152": 254.51,
+        "model=heatnet": 54.36,
+        "model=heatnet_rgb": 53.32,
+    },
 }
 """Parameters as the releases have them, with nine or 14 classes."""
 
@@ -390,7 +395,10 @@ def test_rows_of_several_networks_name_theirs_for_initial_weights() -> None:
         number: TableRequest("t", TABLES[f"temporal/table{number}"], "paper", (0,)).models()
         for number in (4, 5)
     }
-    assert found == {4: {"cmx_b2", "cmx_b4", "cmnext_b4", "rtfnet_152"}, 5: {"rtfnet_50", "rtfnet_152"}}
+    assert found == {
+        4: {"cmx_b2", "cmx_b4", "cmnext_b4", "rtfnet_152"},
+        5: {"rtfnet_50", "rtfnet_152"},
+    }
 
 
 @pytest.mark.parametrize("name", TABLES)
