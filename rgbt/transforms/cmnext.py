@@ -113,7 +113,8 @@ def recoloured(image: Pixels8, brightness: float, contrast: float, saturation: f
     """Factors of brightness, contrast and saturation, one after the other.
 
         mix(x, y, f) = f x + (1 - f) y, clipped to 0..255 and truncated
-        x <- mix(x, 0, brightness),  mix(x, mean luma of x, contrast),  mix(x, luma of x, saturation)
+        a = mix(x, 0, brightness),  b = mix(a, mean luma of a, contrast)
+        result = mix(b, luma of b, saturation)
 
     Source: torchvision (adjust_brightness, adjust_contrast, adjust_saturation).
 
