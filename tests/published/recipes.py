@@ -25,7 +25,7 @@ from typing import Any
 import yaml
 
 FOLDER = Path(__file__).parent
-FILES = ("crm", "networks", "thesis", "data", "run")
+FILES = ("crm", "networks", "cmnext", "thesis", "data", "run")
 SIDES = ("paper", "release", "ours")
 ROW_KEYS = {"key", "for", "skip", "use", *SIDES}
 
