@@ -6,14 +6,16 @@ It needs the reference material beside the checkout; skipped where that is missi
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from rgbt.checkpoints.cmnext import released_name
 from rgbt.models.cmnext.model import CMNeXt
+from rgbt.models.cmnext.ppx import PoolingGate
 from rgbt.models.inputs import Images
 from tests.models import golden
 from tests.models.test_cmx_golden import arranged as arranged_as_in_cmx
@@ -107,3 +109,48 @@ def test_every_gradient_equals_the_release(name: str, size: str) -> None:
     wanted = {key for key in recorded.facts["outputs"] if key.startswith(("grad.", "objective"))}
     assert len(wanted) == 23
     golden.check_all(recorded, found, only=wanted, tolerance="tol_abs_float64")
+
+
+def windows_of_nine(net: CMNeXt) -> None:
+    for module in net.modules():
+        if isinstance(module, PoolingGate):
+            module.windows = (3, 7, 9)
+
+
+def another_eps(kind: type[nn.Module], where: str, eps: float) -> Callable[[CMNeXt], None]:
+    def change(net: CMNeXt) -> None:
+        for name, module in net.named_modules():
+            if isinstance(module, kind) and re.match(where, name):
+                module.eps = eps  # type: ignore[assignment]
+
+    return change
+
+
+def thermal_as_rgb(net: CMNeXt) -> None:
+    net.inputs.thermal_mean, net.inputs.thermal_std = net.inputs.rgb_mean, net.inputs.rgb_std
+
+
+def largest_map_first(net: CMNeXt) -> None:
+    weight = net.decode_head.get_parameter("linear_fuse.0.weight")
+    weight.data = torch.cat(weight.data.chunk(4, 1)[::-1], 1)
+
+
+MISTAKES: dict[str, Callable[[CMNeXt], None]] = {
+    "pooling windows": windows_of_nine,
+    "eps of the RGB stream": another_eps(nn.LayerNorm, r"backbone\.(patch|block|norm)", 1e-6),
+    "eps of the thermal maps": another_eps(nn.LayerNorm, r"backbone\.extra_", 1e-5),
+    "eps of the thermal blocks": another_eps(nn.BatchNorm2d, r"backbone\.extra_", 1e-3),
+    "thermal inputs": thermal_as_rgb,
+    "order of the decoder": largest_map_first,
+}
+
+
+@golden.requires_golden
+def test_common_mistakes_are_seen() -> None:
+    """Each of them moves a recorded tensor by more than its tolerance."""
+    for mistake, change in MISTAKES.items():
+        net, recorded = filled("cmnext/cmnext_b0", "b0")
+        change(net)
+        found = record(net, *recorded.image)
+        worst = max(golden.deviation(recorded, key, found[key]) for key in found if key != "argmax")
+        assert worst > 1, mistake
