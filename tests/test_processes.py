@@ -214,7 +214,7 @@ def normalised() -> dict[str, Any]:
 
 def decoder_eps() -> list[float]:
     """Of CMX's decoder, which normalises with another eps in evaluation."""
-    settings = {"dim": 4, "dropout": 0.0, "norm_eps": 1e-3, "norm_eps_eval": 1e-5}
+    settings = {"dim": 4, "dropout": 0.0, "norm_eps": (1e-3, 1e-5)}
     decoder = synchronise_batch_norm(MlpDecoder((3, 4, 5, 6), 2, **settings))  # type: ignore[arg-type]
     return [decoder.train(mode).linear_fuse[1].eps for mode in (True, False)]  # type: ignore[union-attr]
 

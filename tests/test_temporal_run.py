@@ -97,7 +97,8 @@ def take_a_step(call: Call, data: Path, runs: Path, *overrides: str) -> dict[str
 @pytest.mark.parametrize(
     "network",
     [
-        *("+experiment=cmx", "+experiment=rtfnet", "+experiment=mfnet"),
+        *("+experiment=cmx", "+experiment=cmnext"),
+        *("+experiment=rtfnet", "+experiment=mfnet"),
         *("model=heatnet_tiny", "model=deeplabv2_tiny"),
     ],
 )

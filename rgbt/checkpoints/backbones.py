@@ -99,7 +99,7 @@ def _swin_rule(family: str, model: nn.Module, facts: Facts) -> Rule | None:
     own = _window(size_at(shapes_of(model.state_dict()), f"{BRANCHES[0]}{TABLE}"))
     if own != facts.window and facts.window is not None:
         raise InputError(
-            f"{facts.title} with windows of {facts.window} x {facts.window} tokens, while those "
+            f"an {facts.title} with windows of {facts.window} x {facts.window} tokens, while those "
             f"of this network are {own} x {own} and their bias tables cannot be exchanged; use "
             "the file for windows of that size (7 x 7: ImageNet at 224 pixels)."
         )
@@ -162,15 +162,22 @@ def _recognise_mit(contents: Contents) -> Facts | None:
     if not has_parts(shapes, "patch_embed1.", "block1.0.attn."):
         return None
     size = mit_size(shapes, "")
-    fits = ((f"model=cmx_{size}",),) if size else ()
+    fits = ((f"model=cmx_{size}",), (f"model=cmnext_{size}",)) if size else ()
     return Facts(layout="mit", what="ImageNet MiT", size=mit_title(size), fits=fits)
 
 
 def _mit_rule(family: str, _model: nn.Module, _facts: Facts) -> Rule | None:
-    """Both streams get the file; a thermal stem of one channel its mean over the input channels.
+    """Both streams of CMX get the file, and the RGB stream of CMNeXt, whose other one is no MiT.
 
-    Released: CMX and the temporal release feed thermal three times, so that the stem is copied.
+    A thermal stem of one channel gets the mean over the input channels.   Released: CMX and the
+    temporal release feed thermal three times, so that the stem is copied.
     """
+    if family == "cmnext":
+        return Rule(
+            source=lambda entry: entry.removeprefix("backbone."),
+            fresh=((r"backbone\.(extra_|F[RF]Ms\.)", NOT_IN_FILE), (r"decode_head\.", NOT_IN_FILE)),
+            leftover=((r"head\.", CLASSIFIER),),
+        )
     if family != "cmx":
         return None
     return Rule(

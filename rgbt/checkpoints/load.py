@@ -80,7 +80,7 @@ def plan_for(
         try:
             rule = LAYOUTS[facts.layout].rule(family, model, facts)
         except InputError as error:
-            raise InputError(f"{contents.path} is an {error}") from error
+            raise InputError(f"{contents.path} is {error}") from error
     if rule is None and contents.tensors.keys() == model.state_dict().keys():
         rule = Rule()  # with exactly its own names, any network takes the file
     if rule is None:

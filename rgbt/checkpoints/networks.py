@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from rgbt.checkpoints import cmnext
 from rgbt.checkpoints.backbones import (
     SWIN_TITLES,
     mit_size,
@@ -265,6 +266,7 @@ def _recognise_semseg(contents: Contents) -> Facts | None:
 
 
 RELEASES = {
+    **cmnext.LAYOUTS,
     "mask2former": Layout(
         _recognise_mask2former,
         _own_names(

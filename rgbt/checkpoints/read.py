@@ -12,7 +12,7 @@ from torch import Tensor
 from rgbt.checkpoints.pickles import DamagedError, RefusedError, printable
 from rgbt.checkpoints.stored import beginning_of, explained, read_torch_file
 
-WRAPPERS = ("state_dict", "model", "module")
+WRAPPERS = ("state_dict", "model", "module", "model_state_dict")
 """Keys under which releases put their weights."""
 
 PREFIXES = ("module.", "_orig_mod.")

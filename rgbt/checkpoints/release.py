@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rgbt.checkpoints import networks
+from rgbt.checkpoints import cmnext, networks
 from rgbt.checkpoints.layout import FAMILIES
 from rgbt.checkpoints.read import NOTE
 from rgbt.checks import InputError, check_choice
@@ -33,6 +33,7 @@ RELEASED: Mapping[str, Container] = {
         NOTE: dict(note),
     },
     "cmx": lambda state, note: {"model": OrderedDict(state), NOTE: dict(note)},
+    "cmnext": lambda state, _: cmnext.released(state),
     "rtfnet": lambda state, _: OrderedDict(state),
     "mfnet": lambda state, _: OrderedDict(state),
     "pspnet": lambda state, _: networks.released_heatnet(state),
@@ -48,6 +49,7 @@ CONVENTIONS: Mapping[tuple[str, str], tuple[str, ...]] = {
     ("released", "mask2former"): ("model/inputs=crm", "model.fusion=max"),
     ("released", "cmx"): networks.CMX_RELEASED,
     ("released_temporal", "cmx"): networks.CMX_TEMPORAL,
+    ("released", "cmnext"): cmnext.RELEASED,
     ("released", "rtfnet"): networks.RTFNET_RELEASED,
     ("released", "mfnet"): networks.MFNET_RELEASED,
     ("released", "pspnet"): networks.HEATNET_RELEASED,

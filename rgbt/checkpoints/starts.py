@@ -18,7 +18,7 @@ DIGITS = 8
 
 @dataclass(frozen=True)
 class Start:
-    """A published file of backbone weights.
+    """A published file of weights of a backbone, or of a whole network for `model.weights`.
 
     Attributes:
         file: its name.
@@ -93,8 +93,19 @@ STARTS = (
         ("mask2former_swin_b",),
     ),
     *(
-        Start(f"mit_b{size}.pth", f"MiT-B{size}, {IMAGENET}", SEGFORMER, (f"cmx_b{size}",))
+        Start(
+            f"mit_b{size}.pth",
+            f"MiT-B{size}, {IMAGENET}",
+            SEGFORMER,
+            (f"cmx_b{size}", f"cmnext_b{size}"),
+        )
         for size in range(6)
+    ),
+    Start(
+        "cmnext_b4_mfnet_rgbt.pth",
+        "whole CMNeXt-B4, trained on MFNet, its epoch selected on the test images",
+        "github.com/jamycheung/DELIVER (Google Drive)",
+        ("cmnext_b4",),
     ),
     # Since April 2021 (pytorch/vision, pull request 3620) the same weights are stored anew.
     *(
@@ -147,6 +158,12 @@ RECIPES = (
         "DINOv2 release; the combination with the head of Mask2Former is ours",
     ),
     Recipe(("cmx*", "temporal_*"), "cmx", ("mit_b2.pth",), "CMX and Temporal releases"),
+    Recipe(
+        ("cmnext*",),
+        "cmnext",
+        ("mit_b4.pth",),
+        "CMNeXt release (DELIVER): the RGB stream alone; the thermal stream is random",
+    ),
     Recipe(
         ("rtfnet*",),
         "rtfnet",

@@ -13,7 +13,9 @@ from rgbt.ranges import Epsilon, LearningRate, NonNegative, ShareBelowOne
 from rgbt.requirements import record_of
 
 NORMS = (nn.LayerNorm, nn.GroupNorm, nn.modules.batchnorm._BatchNorm)
-UNDECAYED_NAMES = ("relative_position_bias_table",)
+UNDECAYED_NAMES = ("relative_position_bias_table", "layer_scale_1", "layer_scale_2")
+"""Last words of names of parameters that scale or shift; the last two are those of CMNeXt."""
+
 BIASES = ("bias", "in_proj_bias")
 Decay = Annotated[float, Interval(ge=0, le=100)]
 """Weight decay; a step subtracts it times the learning rate."""
@@ -30,8 +32,8 @@ class AdamW:
         lr: learning rate of everything outside the backbone, > 0.
         backbone_multiplier: factor of `lr` for the parameters that the network counts as
             pretrained (`pretrained_parts` of its record).
-        weight_decay: for every parameter except affine parameters of normalisations, embeddings
-            and relative position tables, which get 0.
+        weight_decay: for every parameter except affine parameters of normalisations, embeddings,
+            relative position tables and layer scales, which get 0.
         decay_biases: whether biases are decayed, as in the CRM release; CMX and the temporal
             release leave them out.
         betas: exponential decay rates of the two moments.

@@ -47,6 +47,44 @@ class Poly:
 
 
 @dataclass(frozen=True, kw_only=True)
+class WarmupPoly:
+    """Polynomial decay that begins where a linear warm-up ends, of a run that is counted as longer.
+
+        t < w: start + (1 - start) t / w,   else ((T - t) / (T - w)) ** power
+        T = max_steps counted_epochs / epochs
+
+    Source: CMNeXt release (DELIVER), whose T has one epoch more than are trained.
+
+    Attributes:
+        power: 0.9 there.
+        warmup_steps: w, steps of the linear warm-up.
+        warmup_start: factor of the first step of the warm-up; 0.1 there.
+        epochs: that the run is divided into; 500 there.
+        counted_epochs: that the decay is counted over, >= epochs; 501 there.
+    """
+
+    power: Power
+    warmup_steps: NumStepsOrZero
+    warmup_start: Share
+    epochs: NumSteps
+    counted_epochs: NumSteps
+
+    def __post_init__(self) -> None:
+        if self.counted_epochs < self.epochs:
+            raise InputError(
+                f"schedule.counted_epochs={self.counted_epochs} must be at least "
+                f"schedule.epochs={self.epochs}; see rgbt.engine.schedules.WarmupPoly."
+            )
+
+    def __call__(self, step: int, max_steps: int, steps_per_epoch: int) -> float:  # noqa: ARG002
+        """Factor of the base learning rate at `step`."""
+        if step < self.warmup_steps:
+            return self.warmup_start + (1 - self.warmup_start) * step / self.warmup_steps
+        total = max_steps * self.counted_epochs / self.epochs
+        return float(((total - step) / (total - self.warmup_steps)) ** self.power)
+
+
+@dataclass(frozen=True, kw_only=True)
 class ThesisPoly:
     """``(1 - t / max_steps) ** power``, iterations t counted from 1: the last step has rate 0.
 

@@ -130,3 +130,17 @@ def check_heads(widths: Iterable[int], heads: Iterable[int]) -> None:
                 f"model.num_heads[{stage}] = {number} must divide the {width} channels of the "
                 "stage."
             )
+
+
+def check_hidden(key: str, ratios: Iterable[float], widths: Iterable[int]) -> None:
+    """Refuse a ratio (`key` in the configuration) that leaves a feed-forward network no channel.
+
+    Raises:
+        InputError: naming both.
+    """
+    for ratio, width in zip(ratios, widths, strict=True):
+        if int(width * ratio) < 1:
+            raise InputError(
+                f"{key}={ratio:g} gives 0 channels in a stage of {width} channels "
+                "(model.embed_dims); choose a larger ratio, such as 4."
+            )

@@ -99,7 +99,14 @@ def draw_span(length: int, crop: int, rng: np.random.Generator) -> tuple[int, in
     return first, min(crop, length - first)
 
 
-def padded(example: Example, hw: tuple[int, int], rgb: ArrayLike, thermal: ArrayLike) -> Example:
+def padded(
+    example: Example,
+    hw: tuple[int, int],
+    rgb: ArrayLike,
+    thermal: ArrayLike,
+    *,
+    corner_yx: tuple[int, int] | None = None,
+) -> Example:
     """An example in the middle of padding; of odd padding the larger half is below and right.
 
     Args:
@@ -107,13 +114,14 @@ def padded(example: Example, hw: tuple[int, int], rgb: ArrayLike, thermal: Array
         hw: size of the result in pixels.
         rgb: (3,) colour of the padding, grey levels.
         thermal: () grey level of the padding.
+        corner_yx: pixel of the result where the example begins; None: in the middle.
 
     Returns:
         images of `hw` and dtypes of `example`; padding is 255 in the label and 0 in its confidence,
         and where positions are tracked it has that of the nearest pixel of the image.
     """
     height, width = example.label.shape
-    top, left = (hw[0] - height) // 2, (hw[1] - width) // 2
+    top, left = corner_yx or ((hw[0] - height) // 2, (hw[1] - width) // 2)
     margins = (top, hw[0] - height - top), (left, hw[1] - width - left)
 
     def framed(values: NDArray[Any], padding: ArrayLike) -> NDArray[Any]:

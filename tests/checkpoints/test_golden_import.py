@@ -17,15 +17,21 @@ from rgbt.checkpoints.recognise import recognise
 from rgbt.config.component import build
 from tests.models import golden
 
-FAST = ("mfnet", "cmx_mit_b0", "temporal_cmx_b2")
+FAST = ("mfnet", "cmx_mit_b0", "temporal_cmx_b2", "cmnext_b0")
 SCORES = {"crm": "sem_seg"}
 """Name of the recorded class scores, where it is not "logits"."""
 
 
-@pytest.mark.parametrize(("name", "kind"), golden.recorded(r"(?!losses)([a-z]+).*", fast=FAST))
+RECORDS = [
+    *golden.recorded(r"(?!losses)([a-z]+).*", fast=FAST),
+    *golden.recorded(r"([a-z]+).*", fast=FAST, folder="cmnext/"),
+]
+
+
+@pytest.mark.parametrize(("name", "kind"), RECORDS)
 def test_scores_of_a_released_file(name: str, kind: str, tmp_path: Path) -> None:
     record = golden.load(name)
-    path = tmp_path / f"{name}.pth"
+    path = tmp_path / "file.pth"
     torch.save({"state_dict": released(record)}, path)
     facts = recognise(read(path))
     overrides = [*facts.fits[0], f"model.num_classes={facts.classes}"]

@@ -38,6 +38,12 @@ RELEASES = {
     ),
     "cmx_mit_b0": ("cmx_b0", "CMX checkpoint (MiT-B0, 9 classes)", CMX, 9, 12_114_641, 0),
     "cmx_mit_b2": ("cmx_b2", "CMX checkpoint (MiT-B2, 9 classes)", CMX, 9, 66_565_521, 0),
+    "cmnext/cmnext_b0": (
+        *("cmnext_b0", "CMNeXt checkpoint (MiT-B0, 9 classes)", (), 9, 10_287_337, 0),
+    ),
+    "cmnext/cmnext_b2": (
+        *("cmnext_b2", "CMNeXt checkpoint (MiT-B2, 9 classes)", (), 9, 58_686_017, 0),
+    ),
     "temporal_cmx_b2": (
         *("cmx_b2", "CMX checkpoint of the temporal release (MiT-B2, 9 classes)"),
         *(("model/inputs=temporal",), 9, 66_566_988, 2),
@@ -51,9 +57,16 @@ RELEASES = {
 }
 """The parameters are published or counted ones; of Swin-T four digits are known."""
 
+FAST = ("cmx_mit_b0", "cmnext/cmnext_b0", "mfnet", "heatnet")
+
 WRAPPED = {
     "crm_swin_t": lambda state: {"epoch": 1, "state_dict": state, "hyper_parameters": {}},
     "cmx_mit_b2": lambda state: {"model": state, "optimizer": {}, "epoch": 1, "iteration": 2},
+    "cmnext/cmnext_b0": lambda state: {
+        **{"epoch": 301, "model_state_dict": state, "optimizer_state_dict": {"state": {}}},
+        **{"loss": 0.1, "scheduler_state_dict": {}, "best_miou": 59.9},
+    },
+    "cmnext/cmnext_b2": lambda state: OrderedDict((f"module.{key}", state[key]) for key in state),
     "heatnet": lambda state: OrderedDict((f"module.{key}", state[key]) for key in state),
 }
 
@@ -78,7 +91,7 @@ def slow_but(fast: Iterable[Any], names: Iterable[Any]) -> list[Any]:
 
 
 @requires_golden
-@pytest.mark.parametrize("name", slow_but(("cmx_mit_b0", "mfnet", "heatnet"), RELEASES))
+@pytest.mark.parametrize("name", slow_but(FAST, RELEASES))
 def test_released_networks_are_recognised_and_used_up(tmp_path: Path, name: str) -> None:
     yaml, title, fits, classes, parameters, leftover = RELEASES[name]
     state = released(name)
@@ -211,7 +224,7 @@ def test_imagenet_mit_fills_both_streams(tmp_path: Path, size: str) -> None:
     model = on_paper(f"cmx_{size}")
     facts, plan = planned(model, saved(tmp_path, tensors))
     assert facts.title == f"ImageNet MiT (MiT-{size.upper()})"
-    assert facts.fits == ((f"model=cmx_{size}",),)
+    assert facts.fits == ((f"model=cmx_{size}",), (f"model=cmnext_{size}",))
     assert plan.fits
     assert set(plan.leftover) == {"head.weight", "head.bias"}
     assert len(plan.values) == 2 * (len(tensors) - 2)

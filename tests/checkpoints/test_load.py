@@ -154,6 +154,7 @@ def test_files_that_are_refused(
 CLASS_PARTS = {
     "mask2former_tiny": ("network.", "sem_seg_head.predictor.class_embed"),
     "cmx_tiny": ("", "decode_head.linear_pred"),
+    "cmnext_tiny": ("", "decode_head.linear_pred"),
     "rtfnet_tiny": ("", "deconv5.1"),
     "mfnet_tiny": ("", "decode1"),
     "heatnet_tiny": ("trgb_segnet.", "final"),
@@ -274,7 +275,7 @@ def test_a_class_derived_from_a_network_takes_its_files(tmp_path: Path) -> None:
 
 def test_checkpoints_of_runs(tmp_path: Path) -> None:
     """Both kinds, of a family with a release, of one without, and of another network."""
-    for yaml in ("cmx_tiny", "deeplabv2_tiny"):
+    for yaml in ("cmx_tiny", "cmnext_tiny", "deeplabv2_tiny"):
         model = network(yaml)
         path = saved(tmp_path, {"model": like(model.state_dict()), "step": 240})
         report = load_weights(model, path)

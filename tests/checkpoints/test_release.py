@@ -48,7 +48,10 @@ def check_equal(model: nn.Module, other: nn.Module) -> None:
 
 ROUND_TRIPS = [
     *itertools.product(
-        ("mask2former_tiny", "cmx_tiny", "rtfnet_tiny", "mfnet_tiny", "heatnet_tiny"),
+        (
+            *("mask2former_tiny", "cmx_tiny", "cmnext_tiny"),
+            *("rtfnet_tiny", "mfnet_tiny", "heatnet_tiny"),
+        ),
         ("safetensors", "released"),
     ),
     ("deeplabv2_tiny", "safetensors"),
@@ -94,6 +97,7 @@ def unwrapped(path: Path) -> dict[str, Tensor]:
 
 RELEASED = [
     ("cmx_b0", "cmx_mit_b0", "released", ""),
+    ("cmnext_b0", "cmnext/cmnext_b0", "released", ""),
     ("mfnet", "mfnet", "released", ""),
     pytest.param("cmx_b2", "cmx_mit_b2", "released", "", marks=pytest.mark.slow),
     pytest.param("cmx_b2", "temporal_cmx_b2", "released_temporal", "", marks=pytest.mark.slow),

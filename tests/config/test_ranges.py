@@ -91,6 +91,10 @@ OUTSIDE: dict[str, dict[str, list[Any]]] = {
         **{"padding_rgb": [[0.0, 0.0, 256.0]], "padding_thermal": [[-1.0], []]},
         **{"test_short_edge": [0], "padding_order": ["grb"]},
     },
+    "transforms.cmnext.CmnextTransform": {
+        **{"colour_probability": [1.5], "colour_range": [[1.5, 0.5]], "blur_probability": [-0.1]},
+        **{"blur_deviation": [0.0], "scale_range": [[2.0, 0.5], [0.0, 1.0]]},
+    },
     "transforms.crm.CrmTransform": {
         **{"sizes": [[], [0, 24], [10**6]], "crop_hw": [[0, 10]], "max_size": [0]},
         **{"test_short_edge": [-1], "flip_probability": [2.0], "colour": ["relased"]},

@@ -33,9 +33,10 @@ CASES: list[tuple[str, dict[str, Any]]] = [
     ("cmx", {**DROPS, "decoder_dropout": 0.3}),
     ("mask2former", DROPS),
     ("mask2former", {**DROPS, "share_start": 2}),
+    ("cmnext", {**DROPS, "decoder_dropout": 0.3}),
 ]
 FAMILIES = pytest.mark.parametrize(("name", "changes"), CASES)
-ONE_EACH = ("mfnet", "rtfnet", "pspnet", "deeplabv2", "cmx", "mask2former")
+ONE_EACH = ("mfnet", "rtfnet", "pspnet", "deeplabv2", "cmx", "cmnext", "mask2former")
 
 
 def settings(**changes: Any) -> TrainerSettings:
@@ -161,7 +162,7 @@ def test_star_stands_for_one_part_of_a_name() -> None:
     assert all(parameter.grad is not None for parameter in net.parameters())
 
 
-@pytest.mark.parametrize("name", ["mfnet", "rtfnet", "pspnet", "deeplabv2", "cmx"])
+@pytest.mark.parametrize("name", ["mfnet", "rtfnet", "pspnet", "deeplabv2", "cmx", "cmnext"])
 def test_channels_last_differs_by_rounding_alone(name: str) -> None:
     plain = nano(name).double()
     net = place(copy.deepcopy(plain), CPU, settings(memory_format="channels_last"))

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from rgbt.engine.optimizers import SGD, Adam, AdamW, RMSprop, parameter_groups, trainable
 from rgbt.requirements import Record
+from tests.models.plain import nano
 
 ADAMW: dict[str, Any] = {
     "lr": 0.1,
@@ -139,6 +140,16 @@ def test_adamw_decays_weights_and_neither_norms_nor_embeddings(
     found = {(g["lr"], g["weight_decay"]): sum(p.numel() for p in g["params"]) for g in groups}
     bias = {} if decay_biases else {(0.1, 0.0): 2}
     assert found == {(0.1, 0.5): 6 - sum(bias.values()), (1.0, 0.0): 4 + 6, **bias}
+
+
+def test_adamw_decays_no_tensor_of_one_dimension_of_cmnext() -> None:
+    """The rule of its release: biases, normalisations and layer scales are left out."""
+    model = nano("cmnext")
+    groups = AdamW(**{**ADAMW, "weight_decay": 0.5, "decay_biases": False})(model).param_groups
+    decayed = {id(p): g["weight_decay"] == 0.5 for g in groups for p in g["params"]}
+    found = {name: decayed[id(p)] for name, p in model.named_parameters()}
+    assert found == {name: p.dim() > 1 for name, p in model.named_parameters()}
+    assert sum("layer_scale" in name for name in found) == 10
 
 
 def test_sgd_steps_as_written_and_decays_everything() -> None:

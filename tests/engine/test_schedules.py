@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rgbt.checks import InputError
-from rgbt.engine.schedules import Exponential, LatePoly, Poly, Steps, ThesisPoly
+from rgbt.engine.schedules import Exponential, LatePoly, Poly, Steps, ThesisPoly, WarmupPoly
 
 LR = 6e-5
 STEPS = 200 * 1568  # temporal release
@@ -143,3 +143,38 @@ def test_exponential_falls_by_the_epoch() -> None:
     own, longer = (Exponential(factor=0.5, epoch_steps=steps) for steps in (None, 6))
     assert [own(step, 100, 3) for step in range(7)] == [1, 1, 1, 0.5, 0.5, 0.5, 0.25]
     assert [longer(step, 100, 3) for step in range(7)] == [1] * 6 + [0.5]
+
+
+def cmnext(**changes: Any) -> WarmupPoly:
+    values = {"power": 0.9, "warmup_steps": 490, "warmup_start": 0.1}
+    return WarmupPoly(**{**values, "epochs": 500, "counted_epochs": 501, **changes})
+
+
+def test_warmup_poly_is_that_of_a_loop_over_epochs() -> None:
+    """500 epochs of 49 steps: 10 of warm-up, and a decay that would end with epoch 501."""
+    schedule, found, expected = cmnext(), [], []
+    for epoch in range(500):
+        for iteration in range(49):
+            t = epoch * 49 + iteration
+            if t < 10 * 49:
+                expected.append(LR * (0.1 + 0.9 * t / (10 * 49)))
+            else:
+                expected.append(LR * (1 - (t - 10 * 49) / (501 * 49 - 10 * 49)) ** 0.9)
+            found.append(LR * schedule(t, 24500, 112))
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    assert (found[0], found[490], max(found)) == (LR * 0.1, LR, LR)
+    assert found[-1] == pytest.approx(LR * (50 / (491 * 49)) ** 0.9)
+
+
+def test_warmup_poly_of_another_length_keeps_its_shape() -> None:
+    whole, short = cmnext(), cmnext(warmup_steps=49)
+    for step in range(0, 2450, 49):
+        assert short(step, 2450, 1) == pytest.approx(whole(10 * step, 24500, 1), rel=1e-12)
+    assert cmnext(warmup_steps=0)(0, 10, 1) == 1.0
+    # A run that ends in its warm-up.
+    assert cmnext()(48, 49, 1) == pytest.approx(0.1 + 0.9 * 48 / 490)
+
+
+def test_fewer_counted_epochs_than_a_run_has_are_refused() -> None:
+    with pytest.raises(InputError, match=r"counted_epochs=499 must be at least .*epochs=500"):
+        cmnext(counted_epochs=499)

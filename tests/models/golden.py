@@ -53,14 +53,18 @@ class Golden:
         return image[:, :3], image[:, 3:]
 
 
-def recorded(pattern: str, *, fast: Collection[str]) -> list[Any]:
+def recorded(pattern: str, *, fast: Collection[str], folder: str = "") -> list[Any]:
     """Every record whose name matches: parameters (name, what the group of the pattern matched).
 
-    Records that are not named as `fast` are marked slow. None where the material is missing.
+    Records that are not named as `fast` are marked slow. None where the material is missing. Names
+    of records in a `folder`, such as "cmnext/", begin with it; the pattern does not.
     """
-    found = [(path.stem, re.fullmatch(pattern, path.stem)) for path in FOLDER.glob("*.json")]
+    paths = (FOLDER / folder).glob("*.json")
+    found = [(path.stem, re.fullmatch(pattern, path.stem)) for path in paths]
     return [
-        pytest.param(name, match[1], id=name, marks=() if name in fast else pytest.mark.slow)
+        pytest.param(
+            *(folder + name, match[1]), id=name, marks=() if name in fast else pytest.mark.slow
+        )
         for name, match in sorted(found)
         if match
     ]
@@ -77,7 +81,7 @@ def fill_rule() -> ModuleType:
 
 
 def load(name: str) -> Golden:
-    """The golden file `name`, such as "rtfnet_50"."""
+    """The golden file `name`, such as "rtfnet_50" or "cmnext/cmnext_b0"."""
     with np.load(FOLDER / f"{name}.npz") as archive:
         arrays = dict(archive)
     return Golden(json.loads((FOLDER / f"{name}.json").read_text()), arrays, fill_rule())
@@ -103,14 +107,19 @@ def network(yaml: str, num_classes: int = 9, **changed: Any) -> Any:
 
 
 def fill_network(
-    net: nn.Module, golden: Golden, prefix: str = "", unused: Collection[str] = ()
+    net: nn.Module,
+    golden: Golden,
+    prefix: str = "",
+    unused: Collection[str] = (),
+    *,
+    named: Callable[[str], str] = str,
 ) -> None:
-    """Fill every floating tensor of `net` under its released name, `prefix` + own key.
+    """Fill every floating tensor of `net` under its released name, `prefix` + `named(key)`.
 
     Fails unless the names are those of the release's filled tensors, less `unused` (by prefix).
     """
     state = {
-        key: torch.from_numpy(golden.fill.fill(prefix + key, value.shape))
+        key: torch.from_numpy(golden.fill.fill(prefix + named(key), value.shape))
         for key, value in net.state_dict().items()
         if golden.fill.is_filled(key, str(value.dtype).removeprefix("torch."))
     }
@@ -119,28 +128,38 @@ def fill_network(
         for key, (shape, _, filled, _) in golden.facts["keys"].items()
         if filled and not key.startswith(tuple(unused))
     }
-    assert {prefix + key: list(value.shape) for key, value in state.items()} == released
+    assert {prefix + named(key): list(value.shape) for key, value in state.items()} == released
     net.load_state_dict(state, strict=False)
 
 
-def deviation(golden: Golden, key: str, found: Tensor) -> float:
+def deviation(golden: Golden, key: str, found: Tensor, tolerance: str = "tol_abs") -> float:
     """Largest difference of one recorded tensor, in units of its tolerance."""
     about, value = golden.facts["outputs"][key], found.detach().contiguous().numpy()
     assert list(value.shape) == about["shape"], key
     if about["stored"] == "sampled":
         positions = golden.fill.sample_positions(key, value.size, about["count"])
         value = value.ravel()[positions]
-    return float(np.abs(value - golden.arrays[key]).max() / about["tol_abs"])
+    return float(np.abs(value - golden.arrays[key]).max() / about[tolerance])
 
 
-def check_all(golden: Golden, found: dict[str, Tensor]) -> None:
-    """Fail with the tensors that differ by more than their tolerance; print the worst."""
-    wanted = set(golden.facts["outputs"]) - {"argmax", "network_input", "mask_pair"}
+def check_all(
+    golden: Golden,
+    found: dict[str, Tensor],
+    *,
+    only: Collection[str] | None = None,
+    tolerance: str = "tol_abs",
+) -> None:
+    """Fail with the tensors that differ by more than their tolerance; print the worst.
+
+    All of the record are compared, or `only` some; `tolerance` is the name of that of the record.
+    """
+    about_all = set(golden.facts["outputs"] if only is None else only)
+    wanted = about_all - {"argmax", "network_input", "mask_pair"}
     assert wanted <= found.keys(), f"not computed: {sorted(wanted - found.keys())}"
-    found_deviations = {key: deviation(golden, key, found[key]) for key in sorted(wanted)}
-    worst = max(found_deviations, key=lambda key: found_deviations[key])
-    print(f"{golden.facts['network']}: worst {worst} at {found_deviations[worst]:.2g} of tolerance")
-    assert {key: value for key, value in found_deviations.items() if not value <= 1} == {}
+    deviations = {key: deviation(golden, key, found[key], tolerance) for key in sorted(wanted)}
+    worst = max(deviations, key=lambda key: deviations[key])
+    print(f"{golden.facts['network']}: worst {worst} at {deviations[worst]:.2g} of tolerance")
+    assert {key: value for key, value in deviations.items() if not value <= 1} == {}
 
 
 def hook(net: nn.Module, named: dict[str, str], *, inputs: bool = False) -> dict[str, Tensor]:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from rgbt.models.cmnext.model import CMNeXt
 from rgbt.models.cmx.model import CMX
 from rgbt.models.critic import Critic
 from rgbt.models.deeplabv2.model import DeepLabV2
@@ -40,6 +41,11 @@ NANO: dict[str, tuple[Any, dict[str, Any]]] = {
                   "decoder_dim": 16, "drop_path_rate": 0.0, "drop_path_stage2": "ramp",
                   "decoder_dropout": 0.0, "decoder_norm_eps": 1e-3,
                   "decoder_norm_eps_eval": None}),
+    "cmnext": (CMNeXt, {"num_classes": 4, "embed_dims": (8, 8, 12, 16), "depths": (1, 2, 1, 1),
+                        "num_heads": (1, 2, 3, 4), "sr_ratios": (8, 4, 2, 1), "mlp_ratio": 2.0,
+                        "thermal_mlp_ratios": (3.0, 3.0, 2.0, 2.0), "pool_windows": (3, 7, 11),
+                        "layer_scale": 0.01, "decoder_dim": 16, "drop_path_rate": 0.0,
+                        "decoder_dropout": 0.0, "decoder_norm_eps": 1e-5}),
     "mask2former": (Mask2Former, {"num_classes": 4, "embed_dim": 8, "depths": (1, 1, 2, 1),
                                   "num_heads": (1, 1, 2, 2), "window_size": 3, "mlp_ratio": 2.0,
                                   "drop_path_rate": 0.0, "share_start": 4, "fusion": "max",
@@ -61,6 +67,9 @@ NANO: dict[str, tuple[Any, dict[str, Any]]] = {
                         "align_corners": False}),
 }  # fmt: skip
 
+THREE_THERMAL = ("deeplabv2", "cmx", "cmnext", "semseg", "dinov2")
+"""Networks whose thermal input has three channels."""
+
 
 def nano(name: str, seed: int = 0, **changes: Any) -> Any:
     """A small network whose first weights depend on the seed alone."""
@@ -68,7 +77,7 @@ def nano(name: str, seed: int = 0, **changes: Any) -> Any:
     given = (
         {}
         if name == "critic"
-        else {"inputs": half(3 if name in ("deeplabv2", "cmx", "semseg", "dinov2") else 1)}
+        else {"inputs": half(3 if name in THREE_THERMAL else 1)}
     )
     with torch.random.fork_rng():
         torch.manual_seed(seed)

@@ -110,7 +110,7 @@ def test_feed_forward_sees_its_neighbours_only() -> None:
 
 
 def decoder() -> tuple[MlpDecoder, list[Tensor]]:
-    net = MlpDecoder((3, 4, 5, 6), 2, dim=7, dropout=0.0, norm_eps=1e-3, norm_eps_eval=1e-3)
+    net = MlpDecoder((3, 4, 5, 6), 2, dim=7, dropout=0.0, norm_eps=(1e-3, 1e-3))
     sizes = ((9, 13), (5, 7), (3, 4), (2, 2))
     maps = [normal(2, *hw, 3 + i, seed=i).double() for i, hw in enumerate(sizes)]
     return randomise(net).double(), maps
@@ -223,7 +223,7 @@ def test_rates_reach_the_blocks_of_each_stream() -> None:
 
 
 def test_a_dropped_residual_leaves_the_sample_alone() -> None:
-    block: MitBlock = randomise(MitBlock(4, 2, 1, 8))
+    block: MitBlock = randomise(MitBlock(4, 2, 1, 8, norm_eps=1e-6))
     x = normal(3, 2, 2, 4)
     keep = torch.tensor([[0.0, 1.0, 0.0], [0.0, 1.0, 2.0]]).view(2, 3, 1, 1, 1)
     out = block(x, keep)

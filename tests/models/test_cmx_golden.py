@@ -33,11 +33,11 @@ def classes_of(recorded: golden.Golden) -> int:
     return recorded.classes("decode_head.linear_pred.bias")
 
 
-def places(net: CMX) -> dict[str, str]:
+def places(net: nn.Module) -> dict[str, str]:
     """Name in the record -> module; two outputs of one module share the beginning of a name."""
     paths = {"decoder.linear_fuse": "decode_head.linear_fuse.2"}
     for stage in range(1, 5):
-        last = len(net.backbone.get_submodule(f"block{stage}")) - 1  # type: ignore[arg-type]
+        last = len(net.get_submodule(f"backbone.block{stage}")) - 1  # type: ignore[arg-type]
         for stream, prefix in STREAMS.items():
             for name in ("patch_embed", "norm"):
                 paths[f"{stream}.{name}{stage}"] = f"backbone.{prefix}{name}{stage}"

@@ -27,6 +27,7 @@ CASES: list[tuple[str, dict[str, Any]]] = [
     ("cmx", {}),
     ("cmx", {"drop_path_rate": 0.5, "drop_path_stage2": "released"}),
     ("cmx", {"decoder_dropout": 0.5}),
+    *(("cmnext", changes) for changes in ({}, {"drop_path_rate": 0.5})),
 ]
 NETWORKS = pytest.mark.parametrize(("name", "changes"), CASES)
 DROPS = ("dropout", "drop_path_rate", "decoder_dropout")
@@ -75,7 +76,7 @@ def test_gradient_reaches_every_weight(name: str, changes: dict[str, Any]) -> No
         (scores * normal(*scores.shape, seed=1)).sum().backward()
         assert all(p.grad is not None and p.grad.isfinite().all() for p in net.parameters())
     # In CMX, a softmax takes some biases away again.
-    end = "weight" if name == "cmx" else ""
+    end = "weight" if name in ("cmx", "cmnext") else ""
     idle = [n for n, p in net.named_parameters() if n.endswith(end) and not p.grad.any()]
     assert idle == []
 
@@ -127,6 +128,9 @@ def test_views_and_images_that_do_not_fit_are_refused(name: str, changes: dict[s
         ("semseg", {"inputs": half(1)}, "model/inputs=cmx"),
         ("cmx", {"num_heads": (3, 1, 1, 1)}, "num_heads"),
         ("cmx", {"mlp_ratio": 0.01}, "mlp_ratio"),
+        ("cmnext", {"num_heads": (3, 1, 1, 1)}, "num_heads"),
+        ("cmnext", {"mlp_ratio": 0.01}, "model.mlp_ratio"),
+        ("cmnext", {"thermal_mlp_ratios": (1.0, 1.0, 0.01, 1.0)}, "model.thermal_mlp_ratios"),
         ("mask2former", {"hidden_dim": 48}, "hidden_dim"),
         ("mask2former", {"num_heads": (3, 1, 1, 1)}, "num_heads"),
         ("critic", {"align_corners": True}, "critic.align_corners"),
@@ -174,7 +178,15 @@ AUXILIARY = {"auxiliary": True}
         ("cmx_b3", 9, {}, 106_318_668 - 1_467),
         ("cmx_b4", 9, {}, 139_858_321),
         ("cmx_b5", 9, {}, 181_058_961),
+        # B0, B1 and B3 are commented out in the release.
+        ("cmnext_b0", 9, {}, 10_287_337),
+        ("cmnext_b1", 9, {}, 39_686_825),
+        ("cmnext_b2", 9, {}, 58_686_017),
+        ("cmnext_b3", 9, {}, 90_012_773),
+        ("cmnext_b4", 9, {}, 116_560_396),
+        ("cmnext_b5", 9, {}, 148_971_437),
         # In millions, as printed.
+        ("cmnext_b2", 25, {}, 58.69),
         ("mask2former_swin_t", 9, {}, 74.92),
         ("mask2former_swin_s", 9, {}, 117.56),
         ("mask2former_swin_b", 9, {}, 193.50),
@@ -194,7 +206,9 @@ def test_parameter_counts_are_the_published_ones(
     assert found == expected if isinstance(expected, int) else round(found / 1e6, 2) == expected
 
 
-@pytest.mark.parametrize(("name", "most"), [("mfnet", 2e5), ("rtfnet", 2e6), ("cmx", 1e6)])
+@pytest.mark.parametrize(
+    ("name", "most"), [("mfnet", 2e5), ("rtfnet", 2e6), ("cmx", 1e6), ("cmnext", 1e6)]
+)
 def test_tiny_networks_stay_tiny(name: str, most: float) -> None:
     with torch.device("meta"):
         assert count(network(f"{name}_tiny")) < most
@@ -208,6 +222,8 @@ def test_tiny_networks_stay_tiny(name: str, most: float) -> None:
         ("rtfnet_152", 2070),
         ("cmx_b0", 525),
         ("cmx_b4", 1837),
+        ("cmnext_b2", 896),
+        ("cmnext_b4", 1971),
         # Released: 693 entries; 24 index tables and the class weights are not kept here.
         ("mask2former_swin_t", 693 - 24 - 1),
     ],

@@ -25,7 +25,7 @@ from typing import Any
 import yaml
 
 FOLDER = Path(__file__).parent
-FILES = ("crm", "networks", "dinov2", "thesis", "self_training", "data", "run")
+FILES = ("crm", "networks", "cmnext", "dinov2", "thesis", "self_training", "data", "run")
 SIDES = ("paper", "release", "ours")
 ROW_KEYS = {"key", "for", "skip", "use", *SIDES}
 

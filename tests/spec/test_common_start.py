@@ -57,6 +57,7 @@ def test_every_experiment_at_bench_has_a_start_without_weights(experiment: str) 
 NETWORKS = {
     "mask2former": ("baseline", "crm", "grbm", "spatialseg", "crm_released", "crm_kp"),
     "cmx": ("cmx", "temporal_con", "temporal_dice", "temporal_con_released"),
+    "cmnext": ("cmnext",),
     "rtfnet": ("rtfnet", "rtfnet_temporal_con"),
     "deeplabv2": ("sh_source", "sh_both", "sh_adversarial"),
     "deeplabv2_heads": ("multi_head_night", "multi_head_thermal"),

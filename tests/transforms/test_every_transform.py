@@ -12,6 +12,7 @@ import yaml
 
 from rgbt.config.component import build
 from rgbt.config.compose import conf_dir
+from rgbt.transforms.cmnext import CmnextTransform
 from rgbt.transforms.cmx import CmxTransform, padded
 from rgbt.transforms.crm import CrmTransform
 from rgbt.transforms.example import viewed
@@ -41,7 +42,10 @@ def sample(**changes: Any) -> Sample:
 
 @pytest.fixture(
     scope="module",
-    params=("crm", "crm_released", "flip", "none", "rtfnet_released", "cmx_released", "thesis"),
+    params=(
+        *("crm", "crm_released", "flip", "none"),
+        *("rtfnet_released", "cmx_released", "cmnext_released", "thesis"),
+    ),
 )
 def made(request: pytest.FixtureRequest) -> Any:
     config = compose(f"transform={request.param}", *SIZES, "transform.track_position=true")
@@ -127,6 +131,14 @@ PUBLISHED: dict[str, tuple[Any, dict[str, Any]]] = {
     "cmx_released": (
         CmxTransform,
         {"factors": [0.5, 0.75, 1, 1.25, 1.5, 1.75], "flip_probability": 0.5},
+    ),
+    "cmnext_released": (
+        CmnextTransform,
+        {
+            **dict.fromkeys(("colour_probability", "blur_probability"), 0.2),
+            **{"flip_probability": 0.5, "blur_deviation": 0.8},
+            **{"colour_range": [0.5, 1.5], "scale_range": [0.5, 2.0]},
+        },
     ),
     "thesis": (ThesisTransform, {"flip_probability": 0.5, "label_resize": "nearest"}),
 }

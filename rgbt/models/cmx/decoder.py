@@ -25,7 +25,9 @@ class MlpDecoder(nn.Module):
 
     Source: SegFormer, Sec. 3.2, Eq. (4); CMX, Sec. III-A.
 
-    `dims` are channels of the four maps, the largest first; `dim` is E, the rest as in `CMX`.
+    `dims` are channels of the four maps, the largest first; `dim` is E; `norm_eps` is that of the
+    normalisation in training and in evaluation; `mix_bias`: whether the convolution over the joined
+    maps has a bias, as in CMX; the rest as in `CMX`.
     """
 
     def __init__(
@@ -35,17 +37,17 @@ class MlpDecoder(nn.Module):
         *,
         dim: int,
         dropout: float,
-        norm_eps: float,
-        norm_eps_eval: float,
+        norm_eps: tuple[float, float],
+        mix_bias: bool = True,
     ) -> None:
         super().__init__()
         self.dropout = dropout
-        self.norm_eps, self.norm_eps_eval = norm_eps, norm_eps_eval
+        self.norm_eps = norm_eps
         self.linear_c1, self.linear_c2, self.linear_c3, self.linear_c4 = (
             nn.Sequential(OrderedDict(proj=nn.Linear(width, dim))) for width in dims
         )
-        fuse = nn.Conv2d(4 * dim, dim, 1)
-        self.linear_fuse = nn.Sequential(fuse, nn.BatchNorm2d(dim, eps=norm_eps), nn.ReLU())
+        fuse = nn.Conv2d(4 * dim, dim, 1, bias=mix_bias)
+        self.linear_fuse = nn.Sequential(fuse, nn.BatchNorm2d(dim, eps=norm_eps[0]), nn.ReLU())
         self.linear_pred = nn.Conv2d(dim, num_classes, 1)
         for convolution in (fuse, self.linear_pred):
             nn.init.kaiming_normal_(convolution.weight, nonlinearity="relu")
@@ -54,7 +56,7 @@ class MlpDecoder(nn.Module):
         """Also chooses the eps of the normalisation, of any class that normalises a batch."""
         norm = self.linear_fuse[1]
         assert isinstance(norm, _BatchNorm), "put there by the constructor"
-        norm.eps = self.norm_eps if mode else self.norm_eps_eval
+        norm.eps = self.norm_eps[0 if mode else 1]
         return super().train(mode)
 
     def forward(self, maps: list[Tensor], generator: torch.Generator | None = None) -> Tensor:
@@ -64,9 +66,10 @@ class MlpDecoder(nn.Module):
         """
         # The convolution over the four projected and enlarged maps, (N, E, H_1, W_1). The release
         # joins the maps in the order c4, c3, c2, c1.
-        weight, bias = (self.linear_fuse.get_parameter(f"0.{name}") for name in ("weight", "bias"))
-        part4, part3, part2, part1 = weight.flatten(1).chunk(4, 1)
-        mixed = _projected(self.linear_c1, maps[0], part1, bias)
+        fuse = self.linear_fuse[0]
+        assert isinstance(fuse, nn.Conv2d), "put there by the constructor"
+        part4, part3, part2, part1 = fuse.weight.flatten(1).chunk(4, 1)
+        mixed = _projected(self.linear_c1, maps[0], part1, fuse.bias)
         smaller = (
             _projected(self.linear_c2, maps[1], part2),
             _projected(self.linear_c3, maps[2], part3),

@@ -16,9 +16,8 @@ from torch.nn import functional as F
 
 from rgbt.models.parts import add_residual
 
-BLOCK_NORM_EPS = 1e-6
-"""Of the normalisations in front of attention and feed-forward and after a stage; those of patch
-embeddings and keys have torch's 1e-5."""
+NORM_EPS = 1e-5
+"""Of the normalisations in patch embeddings and of keys, and of all of CMNeXt's RGB stream."""
 
 Stage2 = Literal["ramp", "released"]
 
@@ -43,10 +42,12 @@ def convolve(convolution: nn.Module, x: Tensor) -> Tensor:
 class MitPatchEmbed(nn.Module):
     """One token per patch; neighbouring patches overlap."""
 
-    def __init__(self, in_channels: int, dim: int, *, kernel: int, stride: int) -> None:
+    def __init__(
+        self, in_channels: int, dim: int, *, kernel: int, stride: int, norm_eps: float
+    ) -> None:
         super().__init__()
         self.proj = nn.Conv2d(in_channels, dim, kernel, stride=stride, padding=kernel // 2)
-        self.norm = nn.LayerNorm(dim)
+        self.norm = nn.LayerNorm(dim, eps=norm_eps)
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, H, W, c) -> (N, ceil(H / stride), ceil(W / stride), C)."""
@@ -106,11 +107,13 @@ class MixFfn(nn.Module):
 class MitBlock(nn.Module):
     """Attention and feed-forward, each normalised before and added to its input."""
 
-    def __init__(self, dim: int, heads: int, reduction: int, hidden: int) -> None:
+    def __init__(
+        self, dim: int, heads: int, reduction: int, hidden: int, *, norm_eps: float
+    ) -> None:
         super().__init__()
-        self.norm1 = nn.LayerNorm(dim, eps=BLOCK_NORM_EPS)
+        self.norm1 = nn.LayerNorm(dim, eps=norm_eps)
         self.attn = MitAttention(dim, heads, reduction)
-        self.norm2 = nn.LayerNorm(dim, eps=BLOCK_NORM_EPS)
+        self.norm2 = nn.LayerNorm(dim, eps=norm_eps)
         self.mlp = MixFfn(dim, hidden)
 
     def forward(self, x: Tensor, keep: Tensor | None = None) -> Tensor:
@@ -120,23 +123,35 @@ class MitBlock(nn.Module):
         return add_residual(x, self.mlp(self.norm2(x)), second)
 
 
-def stage_modules(shape: MitShape, stage: int, in_channels: int) -> dict[str, nn.Module]:
+def patch_embed(
+    shape: MitShape, stage: int, in_channels: int, *, norm_eps: float = NORM_EPS
+) -> MitPatchEmbed:
+    """Patch embedding of stage 0..3; `in_channels` are those of the image, for stage 0."""
+    before = shape.embed_dims[stage - 1] if stage else in_channels
+    kernel, stride = (3, 2) if stage else (7, 4)
+    dim = shape.embed_dims[stage]
+    return MitPatchEmbed(before, dim, kernel=kernel, stride=stride, norm_eps=norm_eps)
+
+
+def stage_modules(
+    shape: MitShape, stage: int, *, in_channels: int, norm_eps: float
+) -> dict[str, nn.Module]:
     """Patch embedding, blocks and normalisation of stage 0..3, by their released names.
 
     The release keeps them side by side (`block1`, `extra_block1`), not in one module per stage.
-    `in_channels` are those of the image, for stage 0.
+    `in_channels` are those of the image, for stage 0; `norm_eps` is that of the normalisations in
+    front of attention and feed-forward and after the stage.
     """
     dim = shape.embed_dims[stage]
-    before = shape.embed_dims[stage - 1] if stage else in_channels
-    kernel, stride = (3, 2) if stage else (7, 4)
     hidden = int(dim * shape.mlp_ratio)
     heads, reduction = shape.num_heads[stage], shape.sr_ratios[stage]
     return {
-        "patch_embed": MitPatchEmbed(before, dim, kernel=kernel, stride=stride),
+        "patch_embed": patch_embed(shape, stage, in_channels),
         "block": nn.ModuleList(
-            MitBlock(dim, heads, reduction, hidden) for _ in range(shape.depths[stage])
+            MitBlock(dim, heads, reduction, hidden, norm_eps=norm_eps)
+            for _ in range(shape.depths[stage])
         ),
-        "norm": nn.LayerNorm(dim, eps=BLOCK_NORM_EPS),
+        "norm": nn.LayerNorm(dim, eps=norm_eps),
     }
 
 
@@ -153,16 +168,17 @@ def drop_rates(depths: tuple[int, int, int, int], last: float, stage2: Stage2) -
     return rates
 
 
-def initialise(module: nn.Module) -> None:
+def initialise(module: nn.Module, *, divide_groups: bool = True) -> None:
     """Starting weights of the streams and of what lies between them, before ImageNet's.
 
     Linear: normal with deviation 0.02; convolution: normal with variance 2 / (outputs that one
-    input value reaches); biases 0.   Source: SegFormer and CMX releases.
+    input value reaches); biases 0.   Source: SegFormer and CMX releases.   Released, CMNeXt: the
+    outputs of all groups are counted (`divide_groups` False).
     """
     if isinstance(module, nn.Linear):
         nn.init.trunc_normal_(module.weight, std=0.02)
     elif isinstance(module, nn.Conv2d):
-        reached = module.weight[:, 0].numel() // module.groups
+        reached = module.weight[:, 0].numel() // (module.groups if divide_groups else 1)
         nn.init.normal_(module.weight, std=(2 / reached) ** 0.5)
     else:
         return

@@ -115,7 +115,7 @@ OTHER_METHOD = {
     *("crm/table1 CMXNet", "crm/table1 Ours", "crm/table2a RTFNet", "crm/table2a CMX"),
     *("crm/table2a Ours (Swin-T)", "crm/table2c RTFNet", "crm/table2c CMX"),
     *("crm/table2c Ours (Swin-T)", "spatialseg/table7 CMX", "spatialseg/table7 CRM (Swin-T)"),
-    *("spatialseg/table8 CMX", "spatialseg/table8 CRM (Swin-T)"),
+    *("spatialseg/table7 CMNeXt", "spatialseg/table8 CMX", "spatialseg/table8 CRM (Swin-T)"),
 }
 """Rows whose method is not that of the row above; network, recipe and loss may differ."""
 OF_A_METHOD = {
@@ -128,6 +128,7 @@ RELEASES: dict[str, When] = {
     "crm/table1 CMXNet": {},  # another recipe, checked by its name
     "crm/table2[ac] MFNet": {ALWAYS: {"transform", "trainer.tested"}},
     "* RTFNet": {ALWAYS: {"transform"}},
+    "* CMNeXt": {ALWAYS: {"trainer.selection_split"}},
     "crm/*": {ALWAYS: CRM_RELEASED},
     "spatialseg/table2 *": {ALWAYS: CRM_RELEASED},
     "spatialseg/table3 CRM baseline": {ALWAYS: CRM_RELEASED, AT_PAPER: LENGTH},
