@@ -19,6 +19,7 @@ from rgbt.data.loader_settings import LoaderSettings
 from rgbt.engine.prediction import Prediction
 from rgbt.engine.settings import Recipe, Scale, TrainerSettings
 from rgbt.ranges import Seed, Text
+from rgbt.spec.checkout_code import checkout_code
 from rgbt.spec.run_key import file_digest, manifest_of, settings_digest
 from rgbt.spec.seeds import Seeds, SourceSeeds
 from rgbt.spec.source_code import user_code
@@ -207,8 +208,8 @@ class RunSpec:
 
         Paths, hardware, labels and tracking (`NOT_IN_KEY`) are left out, so that the same method
         with the same seed is the same run on every machine. A file of weights, or a folder of
-        pseudo-labels, counts by its content and not by its path; an upstream run by its key, and it
-        need not exist yet.
+        pseudo-labels, counts by its content and not by its path, and so does the checkout of another
+        author; an upstream run by its key, and it need not exist yet.
 
         Raises:
             InputError: the file of weights or the folder of pseudo-labels does not exist.
@@ -216,6 +217,7 @@ class RunSpec:
         settings: dict[str, Any] = {"seed": self.seed}
         if self.weights is not None:
             settings["weights"] = [self._content(WEIGHTS, self.weights), *self.fresh_parts]
+        code_of_checkout = checkout_code(self.model.plain)
         for name, node in NODES.items():
             values = self.components[name].canonical()
             if name == "domains":
@@ -224,6 +226,8 @@ class RunSpec:
             if name == "seeds":  # the seed of the run, typed or not, is the same run
                 values = {k: None if v == self.seed else v for k, v in values.items()}
                 values.pop("start", None)  # the key of the start stands for it
+            if name == "model" and code_of_checkout:
+                values["checkout"] = dict(code_of_checkout)
             settings |= node.key_settings(name, values)
         return settings_digest(settings)
 
@@ -315,8 +319,12 @@ class RunSpec:
         )
 
     def own_code(self) -> dict[str, str]:
-        """Digest or version of the user's own code in the run, by module (see `user_code`)."""
-        return dict(user_code(targets(self.plain).values()))
+        """Digest or version of the user's own code in the run, by module (see `user_code`).
+
+        That of a checkout is part of it (see `checkout_code`).
+        """
+        own = user_code(targets(self.plain).values())
+        return dict((*own, *checkout_code(self.model.plain)))
 
     def _content(self, key: str, value: str) -> str:
         """The digest or key that represents a file, a folder or an upstream run in the key."""
