@@ -60,7 +60,9 @@ def check_external(session: Session) -> None:
     shown = session.transform.test(first_readable(session, "test"))
     model.eval()
     for hw in dict.fromkeys((example_hw(session), shown.thermal.shape)):
-        rgb, thermal = (torch.zeros(1, count, *hw, device=session.fabric.device) for count in (3, 1))
+        rgb, thermal = (
+            torch.zeros(1, count, *hw, device=session.fabric.device) for count in (3, 1)
+        )
         with torch.no_grad(), session.fabric.autocast():
             model(rgb, thermal)
 

@@ -88,8 +88,8 @@ def check_targets(
     for key, checkout in checkouts(settings).items():
         if not _is_below(checkout, trust):
             raise InputError(
-                f"{source}: '{_shown(key)}' is {_shown(checkout)}, and opening the run executes the "
-                "code in that folder. If you know this code and trust the author of the "
+                f"{source}: '{_shown(key)}' is {_shown(checkout)}, and opening the run executes "
+                "the code in that folder. If you know this code and trust the author of the "
                 f"configuration, add trust={_shown(checkout)}, or name your own checkout with "
                 f"{_shown(key)}=..."
             )

@@ -25,8 +25,8 @@ from rgbt.config.stored_config import targets
 from rgbt.data.domains import GIVEN, NONE
 from rgbt.files.atomic import write_atomic
 from rgbt.files.budgets import read_json, sealed
-from rgbt.spec.run_key import file_digest, manifest_of
 from rgbt.spec.checkout_code import checkout_code
+from rgbt.spec.run_key import file_digest, manifest_of
 from rgbt.spec.run_spec import WEIGHTS, RunSpec, labels_key, weights_file
 from rgbt.spec.source_code import user_code
 from rgbt.spec.specify import parse_reference, upstream_config

@@ -208,8 +208,8 @@ class RunSpec:
 
         Paths, hardware, labels and tracking (`NOT_IN_KEY`) are left out, so that the same method
         with the same seed is the same run on every machine. A file of weights, or a folder of
-        pseudo-labels, counts by its content and not by its path, and so does the checkout of another
-        author; an upstream run by its key, and it need not exist yet.
+        pseudo-labels, counts by its content and not by its path, as the checkout of another author
+        does; an upstream run by its key, and it need not exist yet.
 
         Raises:
             InputError: the file of weights or the folder of pseudo-labels does not exist.

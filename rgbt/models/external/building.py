@@ -32,7 +32,10 @@ class Namespace(dict[str, Any]):
 def namespace(values: Mapping[str, Any]) -> Namespace:
     """The mapping and all mappings in it as namespaces."""
     return Namespace(
-        {key: namespace(each) if isinstance(each, Mapping) else each for key, each in values.items()}
+        {
+            key: namespace(each) if isinstance(each, Mapping) else each
+            for key, each in values.items()
+        }
     )
 
 
@@ -114,7 +117,8 @@ class Builder:
         except (Exception, SystemExit) as error:
             place = line_of(error, self.checkout.folder)
             raise InputError(
-                f"model.constructor={self.constructor} {what}: {reason(error)}{place}.{advice(error)}"
+                f"model.constructor={self.constructor} {what}: {reason(error)}{place}."
+                f"{advice(error)}"
             ) from error
 
 

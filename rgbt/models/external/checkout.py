@@ -48,7 +48,9 @@ class Checkout:
     stubs: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = ()
 
     @classmethod
-    def at(cls, checkout: str, root: str, empty_packages: tuple[str, ...], stubs: Stubs) -> Checkout:
+    def at(
+        cls, checkout: str, root: str, empty_packages: tuple[str, ...], stubs: Stubs
+    ) -> Checkout:
         """The checkout in the folder `checkout`, of which `root` is put on the path.
 
         Raises:

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 _python = importlib.import_module("random")
-_numpy = np.random.mtrand._rand  # type: ignore[attr-defined]  # NumPy's global generator
+_numpy = np.random.mtrand._rand  # NumPy's global generator
 
 
 @contextmanager

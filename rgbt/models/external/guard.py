@@ -124,7 +124,8 @@ def _without_network() -> Iterator[None]:
         refuse(host)
         return lookup(host, *rest, **named)
 
-    socket.socket.connect, socket.getaddrinfo = connects, looks_up  # type: ignore[method-assign]
+    socket.socket.connect = connects  # type: ignore[method-assign, assignment]
+    socket.getaddrinfo = looks_up
     try:
         yield
     finally:

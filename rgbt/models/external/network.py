@@ -152,7 +152,7 @@ class ExternalNetwork(nn.Module):
         with seeded(seed, rgb.device):
             called = self._called(images, edges)
         logits, *auxiliary = (self._at_input(each, hw, rgb.shape[2:]) for each in called)
-        return Output(logits, {"aux_logits": each for each in auxiliary})
+        return Output(logits, {"aux_logits": auxiliary[0]} if auxiliary else {})
 
     def _edges(self, rgb: Tensor, thermal: Tensor, hw: tuple[int, int]) -> Tensor:
         """The edge map at the size of the prepared images."""
@@ -192,8 +192,9 @@ class ExternalNetwork(nn.Module):
             height, width = images.rgb.shape[2:]
             place = line_of(error, self.source.folder)
             raise InputError(
-                f"model.constructor={self.constructor}: the network cannot predict {len(images.rgb)} "
-                f"images of {height} x {width} pixels fed as model.feed={self.feed}: "
+                f"model.constructor={self.constructor}: the network cannot predict "
+                f"{len(images.rgb)} images of {height} x {width} pixels with "
+                f"model.feed={self.feed}: "
                 f"{reason(error)}{place}.{advice(error)}"
             ) from error
 
