@@ -10,14 +10,13 @@ from typing import Any
 from rgbt.build.session import Session, names_key, open_session
 from rgbt.checks import InputError, check_choice
 from rgbt.config.compose import compose
-from rgbt.config.stored_config import check_targets, checkouts, read_settings, targets
+from rgbt.config.stored_config import check_targets, checkouts, read_settings
 from rgbt.data.label_map import LabelMap
 from rgbt.engine.checkpoint import load_checkpoint, restore_weights, step_of
 from rgbt.files.yaml_files import parse_yaml
 from rgbt.metrics.counts import Counts
-from rgbt.spec.checkout_code import checkout_code
+from rgbt.spec.checkout_code import code_of
 from rgbt.spec.load_spec import CHECKOUT, load_spec
-from rgbt.spec.source_code import user_code
 from rgbt.spec.specify import specify
 from rgbt.tracking.run_files import read_marker, read_provenance
 from rgbt.tracking.run_folder import find_run
@@ -156,7 +155,7 @@ def open_run(
 
 def _warn_of_other_code(folder: Path, trained_with: Mapping[str, Any]) -> None:
     """Warn where the user's own code is not the code that the run was trained with."""
-    now = dict((*user_code(targets(trained_with).values()), *checkout_code(trained_with["model"])))
+    now = code_of(trained_with)
     entries = read_provenance(folder / "provenance.json") if now else []
     before = entries[-1].get("own_code") if entries else None
     if before is not None and before != now:

@@ -13,16 +13,15 @@ from typing import Any, Literal, cast
 
 from rgbt.checks import InputError
 from rgbt.config.component import Component
-from rgbt.config.stored_config import targets
+from rgbt.config.stored_config import EXTERNAL
 from rgbt.data.domains import GIVEN, NONE, Domains
 from rgbt.data.loader_settings import LoaderSettings
 from rgbt.engine.prediction import Prediction
 from rgbt.engine.settings import Recipe, Scale, TrainerSettings
 from rgbt.ranges import Seed, Text
-from rgbt.spec.checkout_code import checkout_code
+from rgbt.spec.checkout_code import code_of, content_of
 from rgbt.spec.run_key import file_digest, manifest_of, settings_digest
 from rgbt.spec.seeds import Seeds, SourceSeeds
-from rgbt.spec.source_code import user_code
 
 WEIGHTS = "model.weights"
 """The setting that names the weights that a network starts from."""
@@ -212,12 +211,11 @@ class RunSpec:
         does; an upstream run by its key, and it need not exist yet.
 
         Raises:
-            InputError: the file of weights or the folder of pseudo-labels does not exist.
+            InputError: the file of weights, the folder of pseudo-labels or the checkout is missing.
         """
         settings: dict[str, Any] = {"seed": self.seed}
         if self.weights is not None:
             settings["weights"] = [self._content(WEIGHTS, self.weights), *self.fresh_parts]
-        code_of_checkout = checkout_code(self.model.plain)
         for name, node in NODES.items():
             values = self.components[name].canonical()
             if name == "domains":
@@ -226,8 +224,8 @@ class RunSpec:
             if name == "seeds":  # the seed of the run, typed or not, is the same run
                 values = {k: None if v == self.seed else v for k, v in values.items()}
                 values.pop("start", None)  # the key of the start stands for it
-            if name == "model" and code_of_checkout:
-                values["checkout"] = dict(code_of_checkout)
+            if name == "model" and self.model.target == EXTERNAL:
+                values["checkout"] = content_of(self.model.plain)
             settings |= node.key_settings(name, values)
         return settings_digest(settings)
 
@@ -319,12 +317,8 @@ class RunSpec:
         )
 
     def own_code(self) -> dict[str, str]:
-        """Digest or version of the user's own code in the run, by module (see `user_code`).
-
-        That of a checkout is part of it (see `checkout_code`).
-        """
-        own = user_code(targets(self.plain).values())
-        return dict((*own, *checkout_code(self.model.plain)))
+        """Digest or version of all code in the run that is not ours, by module (see `code_of`)."""
+        return code_of(self.plain)
 
     def _content(self, key: str, value: str) -> str:
         """The digest or key that represents a file, a folder or an upstream run in the key."""
