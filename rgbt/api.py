@@ -271,7 +271,8 @@ def load_run(
         )
     modules = parse_trust(trust)
     folder = find_run(str(run), Path(runs_dir))
-    load_spec(trusted_settings(folder, modules), overrides)  # refused now, and not when it predicts
+    settings = trusted_settings(folder, modules, overrides)
+    load_spec(settings, overrides)  # refused now, and not when it predicts
     return Run(RunResult(folder), tuple(overrides), checkpoint, modules)
 
 

@@ -66,6 +66,9 @@ class Record:
             dot. They draw nothing at random and are not parts of each other.
         drawn_anew: network: beginnings of the names of parameters that are not read from a file
             that has them -> why.
+        author_names: network from elsewhere: beginning of its names in `state_dict`, and what is
+            there instead in its author's files; None: a network whose names are ours.
+        reads_auxiliary: loss: whether it reads `aux["aux_logits"]`.
         weighs_confidence: loss: whether it weighs pixels by the confidence of their labels.
         frames: loss and scheme: how many frames of a scene it takes, 1 or 2.
         reads_warped: loss of two frames: whether it reads the first prediction in the second frame.
@@ -99,6 +102,8 @@ class Record:
     pretrained_parts: tuple[str, ...] = ()
     recomputed: tuple[str, ...] = ()
     drawn_anew: Mapping[str, str] = field(default_factory=dict)
+    author_names: tuple[str, str] | None = None
+    reads_auxiliary: bool = False
     weighs_confidence: bool = False
     frames: Literal[1, 2] = 1
     reads_warped: bool = False

@@ -10,12 +10,13 @@ from typing import Any
 from rgbt.build.session import Session, names_key, open_session
 from rgbt.checks import InputError, check_choice
 from rgbt.config.compose import compose
-from rgbt.config.stored_config import check_targets, read_settings, targets
+from rgbt.config.stored_config import check_targets, checkouts, read_settings
 from rgbt.data.label_map import LabelMap
 from rgbt.engine.checkpoint import load_checkpoint, restore_weights, step_of
+from rgbt.files.yaml_files import parse_yaml
 from rgbt.metrics.counts import Counts
-from rgbt.spec.load_spec import load_spec
-from rgbt.spec.source_code import user_code
+from rgbt.spec.checkout_code import code_of
+from rgbt.spec.load_spec import CHECKOUT, load_spec
 from rgbt.spec.specify import specify
 from rgbt.tracking.run_files import read_marker, read_provenance
 from rgbt.tracking.run_folder import find_run
@@ -85,13 +86,22 @@ def open_trained(
     return TrainedNetwork(session, 0, runs_dir / "evaluations" / name, path.name)
 
 
-def trusted_settings(folder: Path, trust: Collection[str] = ()) -> dict[str, Any]:
+def trusted_settings(
+    folder: Path, trust: Collection[str] = (), overrides: Sequence[str] = ()
+) -> dict[str, Any]:
     """The configuration of a run, whose objects may be built.
 
+    A checkout that `overrides` name instead of the stored one is trusted.
+
     Raises:
-        InputError: not readable, or a target that is not trusted.
+        InputError: not readable, or a target or checkout that is not trusted.
     """
     settings = read_settings(folder / "config.yaml")
+    typed = [word.partition("=")[2] for word in overrides if word.startswith(f"{CHECKOUT}=")]
+    if typed and CHECKOUT in checkouts(settings):
+        named = str(parse_yaml(typed[-1], CHECKOUT))
+        settings["model"]["checkout"] = named
+        trust = (*trust, str(Path(named).expanduser().resolve()))
     check_targets(settings, trust, str(folder / "config.yaml"))
     return settings
 
@@ -116,7 +126,7 @@ def open_run(
         InputError: a target that is not trusted, overrides that do not fit, no checkpoint, other
             classes than trained.
     """
-    trained_with = trusted_settings(folder, trust)
+    trained_with = trusted_settings(folder, trust, overrides)
     spec = load_spec(trained_with, overrides)
     _warn_of_other_code(folder, trained_with)
     check_choice("checkpoint", checkpoint, CHECKPOINTS)
@@ -145,7 +155,7 @@ def open_run(
 
 def _warn_of_other_code(folder: Path, trained_with: Mapping[str, Any]) -> None:
     """Warn where the user's own code is not the code that the run was trained with."""
-    now = dict(user_code(targets(trained_with).values()))
+    now = code_of(trained_with)
     entries = read_provenance(folder / "provenance.json") if now else []
     before = entries[-1].get("own_code") if entries else None
     if before is not None and before != now:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import torch
+
 from rgbt.build.contracts import check_first_sample, check_regions, check_transform, is_own
 from rgbt.build.session import Session
 from rgbt.checks import InputError
 from rgbt.dataset import reader_of
 from rgbt.geometry.camera import Camera
 from rgbt.maskers.contract import check_masker
+from rgbt.models.external.network import ExternalNetwork
 from rgbt.randomness import numpy_generator, torch_generator
 from rgbt.requirements import record_of
 from rgbt.types import AnyMasker, Sample
@@ -47,6 +50,21 @@ def check_own_parts(session: Session) -> None:
         check_transform(transform, sample, numpy_generator(session.spec.seed, "probe"))
     if is_own(session.regions):
         check_regions(session.regions, first_readable(session, "test").thermal.shape)
+
+
+def check_external(session: Session) -> None:
+    """Call another author's network once per size of image, so that it is refused before a run."""
+    model = session.model
+    if not isinstance(model, ExternalNetwork):
+        return
+    shown = session.transform.test(first_readable(session, "test"))
+    model.eval()
+    for hw in dict.fromkeys((example_hw(session), shown.thermal.shape)):
+        rgb, thermal = (
+            torch.zeros(1, count, *hw, device=session.fabric.device) for count in (3, 1)
+        )
+        with torch.no_grad(), session.fabric.autocast():
+            model(rgb, thermal)
 
 
 def check_cells(session: Session, masker: AnyMasker) -> None:

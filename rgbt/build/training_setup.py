@@ -12,6 +12,7 @@ from rgbt.build.contracts import CheckedLoss, CheckedScheme, is_own
 from rgbt.build.probes import (
     check_cameras,
     check_cells,
+    check_external,
     check_own_parts,
     first_readable,
 )
@@ -148,6 +149,7 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
         steps_per_epoch(datasets[name], session.loading, domain.split)
         _check_labelled(session, name, domain)
     check_own_parts(session)
+    check_external(session)
     check_cells(session, masker)
     check_cameras(session, scheme)
     if upstream_finished:

@@ -13,6 +13,7 @@ from rgbt.checkpoints.read import Contents, read
 from rgbt.checkpoints.recognise import LAYOUTS, recognise
 from rgbt.checkpoints.report import Report, counted, refusal
 from rgbt.checks import InputError, not_finite
+from rgbt.requirements import record_of
 
 
 def load_weights(
@@ -81,15 +82,19 @@ def plan_for(
             rule = LAYOUTS[facts.layout].rule(family, model, facts)
         except InputError as error:
             raise InputError(f"{contents.path} is {error}") from error
+    prefix = facts.prefix
     if rule is None and contents.tensors.keys() == model.state_dict().keys():
         rule = Rule()  # with exactly its own names, any network takes the file
+    names = record_of(model).author_names
+    if rule is None and names is not None:
+        rule, prefix = Rule(source=lambda entry: entry.removeprefix(names[0])), names[1]
     if rule is None:
         raise InputError(_another_network(model, contents, facts))
     plan = make_plan(
         model.state_dict(keep_vars=True),
         contents.tensors,
         rule,
-        prefix=facts.prefix,
+        prefix=prefix,
         fresh=fresh,
         other_classes=other_classes,
     )

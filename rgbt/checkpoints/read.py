@@ -100,6 +100,8 @@ def _unwrapped(path: Path, value: Any, container: str) -> Contents:
             f"holds {kind}, not tensors by name; give a file that holds a state_dict()."
         )
     inner = [key for key in WRAPPERS if _is_state(value.get(key))]
+    if not inner and not _is_state(value):  # a key of the author's own
+        inner = [key for key in value if type(key) is str and _is_state(value[key])]
     if len(inner) > 1:
         raise RefusedError(
             f"holds weights under {' and '.join(inner)}; keep one of them in the file."

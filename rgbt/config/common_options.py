@@ -48,7 +48,10 @@ RegionsFile = Annotated[
 ]
 Trust = Annotated[
     str,
-    Help("your own Python modules that the run uses, such as trust=my_lab; their code is executed"),
+    Help(
+        "your own Python modules, and folders of other authors' code, that the run uses, such as "
+        "trust=my_lab,/code/GMNet; their code is executed"
+    ),
 ]
 
 

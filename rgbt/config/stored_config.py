@@ -27,6 +27,12 @@ NAMED = re.compile(r"_target_:\s*[\"']?(rgbt\.[\w.]+)", re.ASCII)
 DOTTED = re.compile(r"[a-z_]\w*(\.[a-z_]\w*)*", re.IGNORECASE | re.ASCII)
 LONGEST_SHOWN = 100
 
+EXTERNAL = "rgbt.models.external.network.ExternalNetwork"
+"""Target that executes code of the folder in its setting `checkout`."""
+
+FOLDERS = ("/", "~", "./", "../")
+"""Beginnings of a trusted folder; everything else is the name of a module."""
+
 
 def load_config(path: Path, trust: Collection[str] = ()) -> DictConfig:
     """A stored configuration whose objects may be built (see `check_targets`)."""
@@ -72,13 +78,21 @@ def check_targets(
 
     Args:
         settings: plain values.
-        trust: modules (or single targets) that the user trusts.
+        trust: modules (or single targets) and folders of checkouts that the user trusts.
         source: where the settings come from, for messages.
         group: a folder of ``conf/`` that alone says what is shipped, such as "masker".
 
     Raises:
         InputError: naming source, key and target, and what to type.
     """
+    for key, checkout in checkouts(settings).items():
+        if not _is_below(checkout, trust):
+            raise InputError(
+                f"{source}: '{_shown(key)}' is {_shown(checkout)}, and opening the run executes "
+                "the code in that folder. If you know this code and trust the author of the "
+                f"configuration, add trust={_shown(checkout)}, or name your own checkout with "
+                f"{_shown(key)}=..."
+            )
     shipped = shipped_targets(group)
     for key, target in targets(settings).items():
         if isinstance(target, str) and (target in shipped or target in trust):
@@ -96,18 +110,27 @@ def targets(settings: Any) -> dict[str, Any]:
     return {key: value for key, value in _walk(settings) if key.rpartition(".")[2] == "_target_"}
 
 
+def checkouts(settings: Any) -> dict[str, str]:
+    """Every folder whose code `EXTERNAL` would execute, by its dotted key."""
+    found = dict(_walk(settings))
+    nodes = (key.rpartition(".")[0] for key, each in found.items() if each == EXTERNAL)
+    keys = (f"{node}.checkout".lstrip(".") for node in nodes)
+    return {key: str(found[key]) for key in keys if key in found}
+
+
 def parse_trust(text: str) -> tuple[str, ...]:
-    """Modules of ``trust=my.module,other``; brackets around them are allowed.
+    """Modules and folders of ``trust=my.module,/code/GMNet``; brackets around them are allowed.
 
     Raises:
-        InputError: a word is not a dotted name.
+        InputError: a word is neither a dotted name nor a folder (`FOLDERS`).
     """
     words = split_list(text, "modules") if text else []
     for word in words:
-        if not DOTTED.fullmatch(word):
+        if not DOTTED.fullmatch(word) and not word.startswith(FOLDERS):
             raise InputError(
-                f"trust={text}: expected names of your own modules, separated by commas, such as "
-                f"trust=my_lab or trust=my_lab.models,other; got '{word}'."
+                f"trust={text}: expected names of your own modules or folders of checkouts, "
+                "separated by commas, such as trust=my_lab, trust=my_lab.models,other or "
+                f"trust=/code/GMNet; got '{word}'."
             )
     return tuple(words)
 
@@ -132,6 +155,13 @@ def _walk(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 def _is_inside(name: str, modules: Collection[str]) -> bool:
     return any(f"{name}.".startswith(f"{module}.") for module in modules)
+
+
+def _is_below(checkout: str, trust: Collection[str]) -> bool:
+    """Whether a folder is a trusted one, or lies in one."""
+    folder = Path(checkout).expanduser().resolve()
+    known = [Path(each).expanduser().resolve() for each in trust if each.startswith(FOLDERS)]
+    return any(folder.is_relative_to(each) for each in known)
 
 
 def _refusal(source: str, key: str, target: Any, home: str | None, group: str) -> str:

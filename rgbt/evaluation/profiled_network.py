@@ -129,7 +129,8 @@ def from_runs(
     """
     networks = []
     for run in split_list(runs, "runs"):
-        spec = load_spec(trusted_settings(find_run(run, runs_dir), trust), overrides)
+        settings = trusted_settings(find_run(run, runs_dir), trust, overrides)
+        spec = load_spec(settings, overrides)
         view = spec.domains.source.view
         networks.append(ProfiledNetwork(run, spec.model, spec.trainer, view, image_hw))
     return networks

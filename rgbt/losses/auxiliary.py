@@ -32,7 +32,7 @@ class WithAuxiliary:
         """That of `loss`, and a network with an auxiliary head."""
         record = record_of(self.loss)
         auxiliary = Requirement("model", "auxiliary", True)
-        return replace(record, requires=(*record.requires, auxiliary))
+        return replace(record, requires=(*record.requires, auxiliary), reads_auxiliary=True)
 
     def __call__(
         self, output: Output, batch: Batch, generator: torch.Generator

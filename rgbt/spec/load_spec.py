@@ -13,12 +13,17 @@ from rgbt.files.yaml_files import parse_yaml
 from rgbt.spec.run_spec import RENAMED, RunSpec
 from rgbt.spec.specify import specify
 
+CHECKOUT = "model.checkout"
+"""Setting that names the folder of another author's code."""
+
 GROUPS = ("dataset", "metric", "prediction", "consistency")
 CHANGEABLE = (
     *("dataset", "data", "metric", "prediction", "consistency", "transform.test_short_edge"),
     *("trainer.accelerator", "trainer.threads", "trainer.precision"),
+    CHECKOUT,
 )
-"""Settings of a finished run that may be changed: the source of the images and the counting."""
+"""Settings of a finished run that may be changed: the source of the images and the counting, and
+where code lies."""
 
 
 def load_spec(settings: Mapping[str, Any], overrides: Sequence[str] = ()) -> RunSpec:

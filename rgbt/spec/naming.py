@@ -29,7 +29,10 @@ VARIED = "rgbt.varied"
 VALUE_LENGTH = 32
 """Characters of a value in a name; a longer one, such as a path, is cut in the middle."""
 
-SILENT = ("experiment", "search", "runs_dir", "tracking", "dataset.root", "name", "seed", "fresh")
+SILENT = (
+    *("experiment", "search", "runs_dir", "tracking", "dataset.root", "model.checkout", "name"),
+    *("seed", "fresh"),
+)
 BESIDE = ("tracking.", "consistency")
 """Extra measurements and trackers are not part of the run."""
 

@@ -21,13 +21,12 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from rgbt.checks import InputError
-from rgbt.config.stored_config import targets
 from rgbt.data.domains import GIVEN, NONE
 from rgbt.files.atomic import write_atomic
 from rgbt.files.budgets import read_json, sealed
+from rgbt.spec.checkout_code import code_of
 from rgbt.spec.run_key import file_digest, manifest_of
 from rgbt.spec.run_spec import WEIGHTS, RunSpec, labels_key, weights_file
-from rgbt.spec.source_code import user_code
 from rgbt.spec.specify import parse_reference, upstream_config
 from rgbt.tracking.provenance import code
 
@@ -124,7 +123,7 @@ def request_digest(config: DictConfig, downstream: tuple[str, ...] = ()) -> str:
     plain = _plain(config)
     content = {
         "config": {**plain, "fresh": False},
-        "own_code": user_code(targets(plain).values()),
+        "own_code": sorted(code_of(plain).items()),
         "sets": [
             file_digest(Path(name).expanduser())
             for name in plain["consistency"].get("sets") or ()

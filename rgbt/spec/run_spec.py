@@ -13,15 +13,15 @@ from typing import Any, Literal, cast
 
 from rgbt.checks import InputError
 from rgbt.config.component import Component
-from rgbt.config.stored_config import targets
+from rgbt.config.stored_config import EXTERNAL
 from rgbt.data.domains import GIVEN, NONE, Domains
 from rgbt.data.loader_settings import LoaderSettings
 from rgbt.engine.prediction import Prediction
 from rgbt.engine.settings import Recipe, Scale, TrainerSettings
 from rgbt.ranges import Seed, Text
+from rgbt.spec.checkout_code import code_of, content_of
 from rgbt.spec.run_key import file_digest, manifest_of, settings_digest
 from rgbt.spec.seeds import Seeds, SourceSeeds
-from rgbt.spec.source_code import user_code
 
 WEIGHTS = "model.weights"
 """The setting that names the weights that a network starts from."""
@@ -207,11 +207,11 @@ class RunSpec:
 
         Paths, hardware, labels and tracking (`NOT_IN_KEY`) are left out, so that the same method
         with the same seed is the same run on every machine. A file of weights, or a folder of
-        pseudo-labels, counts by its content and not by its path; an upstream run by its key, and it
-        need not exist yet.
+        pseudo-labels, counts by its content and not by its path, as the checkout of another author
+        does; an upstream run by its key, and it need not exist yet.
 
         Raises:
-            InputError: the file of weights or the folder of pseudo-labels does not exist.
+            InputError: the file of weights, the folder of pseudo-labels or the checkout is missing.
         """
         settings: dict[str, Any] = {"seed": self.seed}
         if self.weights is not None:
@@ -224,6 +224,8 @@ class RunSpec:
             if name == "seeds":  # the seed of the run, typed or not, is the same run
                 values = {k: None if v == self.seed else v for k, v in values.items()}
                 values.pop("start", None)  # the key of the start stands for it
+            if name == "model" and self.model.target == EXTERNAL:
+                values["checkout"] = content_of(self.model.plain)
             settings |= node.key_settings(name, values)
         return settings_digest(settings)
 
@@ -315,8 +317,8 @@ class RunSpec:
         )
 
     def own_code(self) -> dict[str, str]:
-        """Digest or version of the user's own code in the run, by module (see `user_code`)."""
-        return dict(user_code(targets(self.plain).values()))
+        """Digest or version of all code in the run that is not ours, by module (see `code_of`)."""
+        return code_of(self.plain)
 
     def _content(self, key: str, value: str) -> str:
         """The digest or key that represents a file, a folder or an upstream run in the key."""

@@ -13,7 +13,7 @@ import importlib.util
 import pkgutil
 import sys
 import sysconfig
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -77,14 +77,26 @@ def _follow(module: str) -> Iterator[Used]:
         packages = metadata.packages_distributions().get(module.split(".")[0], ())
         yield from ((name, metadata.version(name)) for name in sorted(set(packages)))
         return
+    yield from modules_from(module, _own_file)
+
+
+def _own_file(name: str) -> Path | None:
+    """The file of a module of the user's own tree; None for all others."""
+    place = None if name.split(".")[0] in RELEASED else _place(name)
+    is_own = place is not None and _is_own(place[0])
+    return Path(str(place[0])) if place is not None and is_own else None
+
+
+def modules_from(module: str, file_of: Callable[[str], Path | None]) -> Iterator[Used]:
+    """A module and everything that it imports, as far as `file_of` gives files, with digests."""
     waiting = [*_with_packages(module)]
     seen: set[str] = set()
     while waiting:
         name = waiting.pop()
-        place = None if name in seen or name.split(".")[0] in RELEASED else _place(name)
+        file = None if name in seen else file_of(name)
         seen.add(name)
-        if place is not None and place[0] is not None and _is_own(place[0]):
-            digest, imported = _read(name, Path(place[0]))
+        if file is not None:
+            digest, imported = _read(name, file)
             waiting += imported
             yield name, digest
 

@@ -15,7 +15,7 @@ from rgbt.build.load_run import open_run
 from rgbt.build.training_setup import validate
 from rgbt.checks import InputError
 from rgbt.config.compose import flatten
-from rgbt.config.stored_config import targets
+from rgbt.config.stored_config import checkouts, targets
 from rgbt.data.pseudo_labels import MANIFEST
 from rgbt.evaluation.pseudo_labels import Labelling, write_pseudo_labels
 from rgbt.evaluation.request import EvaluationRequest
@@ -127,6 +127,8 @@ def _predict_labels(spec: RunSpec, teacher: Dependency) -> None:
     checkpoint = teacher.checkpoint.removesuffix(".pt")
     # Its configuration was composed by this command, so that its targets are the user's own.
     trust = list(targets(teacher.run.plain).values())
+    own = checkouts(teacher.run.plain).items()
+    overrides += [f"{key}={json.dumps(checkout)}" for key, checkout in own]
     session = open_run(teacher.run.folder, overrides, checkpoint, trust=trust).session
     write_pseudo_labels(
         session,

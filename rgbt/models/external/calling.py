@@ -1,0 +1,125 @@
+"""Feed an author's network, and find the class scores in what it returns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from rgbt.checks import InputError, described
+from rgbt.models.inputs import Images
+
+Feed = Literal["stacked", "pair", "pair_and_edges", "list", "dicts", "thermal"]
+"""How a network takes its images; see `FEEDS`."""
+
+Path = tuple[int | str, ...]
+"""Indices, keys and attributes that lead to scores; "*" stacks what follows of every element."""
+
+FEEDS: Mapping[Feed, Callable[[Images, Tensor], tuple[Any, ...]]] = {
+    "stacked": lambda images, _: (torch.cat(images, 1),),
+    "pair": lambda images, _: (images.rgb, images.thermal),
+    "pair_and_edges": lambda images, edges: (images.rgb, images.thermal, edges),
+    "list": lambda images, _: ([images.rgb, images.thermal],),
+    "dicts": lambda images, _: ([{"image": each} for each in torch.cat(images, 1)],),
+    "thermal": lambda images, _: (images.thermal,),
+}
+"""Form -> arguments of the call: of normalised images and of an edge map."""
+
+
+def edge_map(rgb: Tensor, thermal: Tensor) -> Tensor:
+    """Edges of both images, as the mean of their Sobel magnitudes.
+
+        E = (|dx Y| + |dy Y| + |dx T| + |dy T|) / 4, each at most 255, Y = luma of RGB
+
+    Source: EGFNet (Zhou et al., AAAI 2022).   Released: ShaohuaDong2021/EGFNet, sobel.py, which
+    writes the maps as files.
+
+    Args:
+        rgb: (N, 3, H, W) in [0, 1], as `thermal` (N, 1, H, W); not normalised.
+        thermal: see there.
+
+    Returns:
+        (N, H, W) in 0..255.
+    """
+    luma = (rgb * rgb.new_tensor([0.299, 0.587, 0.114]).view(1, 3, 1, 1)).sum(1, keepdim=True)
+    grey = 255 * torch.cat([luma, thermal])
+    across = grey.new_tensor([[-1.0, 0.0, 1.0], [-2.0, 0.0, 2.0], [-1.0, 0.0, 1.0]])
+    kernels = torch.stack([across, across.T])[:, None]
+    slopes = F.conv2d(F.pad(grey, (1, 1, 1, 1), mode="reflect"), kernels).abs().clamp(max=255)
+    return slopes.mean(1).view(2, len(rgb), *rgb.shape[2:]).mean(0)
+
+
+def picked(output: Any, path: Path) -> Any:
+    """What a path leads to.
+
+    Raises:
+        LookupError: it leads nowhere.
+    """
+    for number, step in enumerate(path):
+        if step == "*":
+            return torch.stack([picked(each, path[number + 1 :]) for each in output])
+        try:
+            output = output[step]
+        except (TypeError, IndexError, KeyError):
+            if not isinstance(step, str) or not hasattr(output, step):
+                raise LookupError(step) from None
+            output = getattr(output, step)
+    return output
+
+
+def scores_at(output: Any, paths: Sequence[Path], setting: str, shape: tuple[int, int]) -> Tensor:
+    """The sum of the scores at some paths, (N, K, h, w).
+
+    Args:
+        output: of the network.
+        paths: of the tensors that are added.
+        setting: the key that has the paths, for the message.
+        shape: (N, K) that is expected.
+
+    Raises:
+        InputError: a path leads nowhere or to something else than scores of K classes.
+    """
+    found = []
+    for path in paths:
+        try:
+            value = picked(output, path)
+        except (LookupError, TypeError) as error:
+            raise InputError(
+                f"{setting}: the network returns {structure(output)}, which has nothing at "
+                f"{list(path)}; name the position of the class scores."
+            ) from error
+        if not isinstance(value, Tensor) or value.dim() != 4 or len(value) != shape[0]:
+            raise InputError(
+                f"{setting}: expected class scores ({shape[0]}, {shape[1]}, h, w) at {list(path)} "
+                f"of {structure(output)}, got {described(value)}."
+            )
+        if value.shape[1] != shape[1]:
+            raise InputError(
+                f"{setting}: the network returns scores of {value.shape[1]} classes, but "
+                f"model.num_classes is {shape[1]}; set the argument of its constructor, or choose "
+                "a data set with as many classes."
+            )
+        found.append(value)
+    if len({each.shape for each in found}) > 1:
+        raise InputError(
+            f"{setting}: scores of {' and '.join(described(each) for each in found)} cannot be "
+            "added; choose paths to scores of one size."
+        )
+    return torch.stack(found).sum(0) if len(found) > 1 else found[0]
+
+
+def structure(value: object) -> str:
+    """What a network returned, in words: "tuple (Tensor (2, 9, 4, 6) float32, list of 3)"."""
+    if isinstance(value, tuple | list):
+        inner = [
+            f"{type(each).__name__} of {len(each)}"
+            if isinstance(each, tuple | list)
+            else described(each)
+            for each in value[:4]
+        ]
+        more = ["..."] if len(value) > 4 else []
+        return f"{type(value).__name__} ({', '.join([*inner, *more])})"
+    return described(value)

@@ -1,0 +1,76 @@
+"""Small checkouts of invented authors, one for each form of network."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from rgbt.config.compose import compose
+from rgbt.models.external.network import ExternalNetwork
+from rgbt.models.inputs import Inputs
+
+HEAD = """
+import torch
+from torch import nn
+
+class Base(nn.Module):
+    def __init__(self, n_class, channels=4):
+        super().__init__()
+        self.conv = nn.Conv2d(channels, n_class, 1)
+"""
+
+STACKED = f"""{HEAD}
+class Net(Base):
+    def forward(self, x):
+        return self.conv(x)
+"""
+
+PAIR = f"""{HEAD}
+class Net(Base):
+    def forward(self, rgb, thermal):
+        both = torch.cat([rgb, thermal[:, :1]], 1)
+        return self.conv(both), -self.conv(both)
+"""
+
+
+def write_checkout(folder: Path, files: Mapping[str, str]) -> Path:
+    """A checkout with these files; a name without an ending is a package's folder."""
+    for name, text in files.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    return folder
+
+
+def settings(checkout: Path, **changes: Any) -> dict[str, Any]:
+    """Arguments of an `ExternalNetwork` of three classes, with the defaults of the file."""
+    plain = {
+        **{"num_classes": 3, "checkout": str(checkout), "root": "."},
+        **{"constructor": "model.net:Net", "arguments": {"n_class": 3}, "namespaces": {}},
+        **{"feed": "stacked", "multiple": 1, "size_hw": None, "scores": ((),)},
+        **{"train_scores": None, "auxiliary": None, "resize": False, "one_by_one": False},
+        **{"empty_packages": (), "stubs": {}, "moves_cuda": False, "weights_prefix": ""},
+    }
+    return {**plain, **changes}
+
+
+def external(checkout: Path, *, inputs: str = "unit", **changes: Any) -> ExternalNetwork:
+    """The network of a checkout, with the inputs of a file of ``conf/model/inputs``."""
+    node = compose([f"model/inputs={inputs}", "model=mfnet_tiny"]).model.inputs
+    kinds = {key: value for key, value in node.items() if key != "_target_"}
+    return ExternalNetwork(**settings(checkout, **changes), inputs=Inputs(**kinds))
+
+
+def images(count: int = 2, height: int = 8, width: int = 12) -> tuple[torch.Tensor, torch.Tensor]:
+    """RGB and thermal of seeded noise."""
+    generator = torch.Generator().manual_seed(0)
+    both = torch.rand(count, 4, height, width, generator=generator)
+    return both[:, :3], both[:, 3:]
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    """A generator of a step."""
+    return torch.Generator().manual_seed(seed)

@@ -1,0 +1,80 @@
+"""Recipes of published networks: every file composes, and states what its readers need."""
+
+from __future__ import annotations
+
+import inspect
+import re
+
+import pytest
+import yaml
+from omegaconf import DictConfig
+
+from rgbt.config.component import Component
+from rgbt.config.compose import available, compose, conf_dir
+from rgbt.config.stored_config import EXTERNAL
+from rgbt.models.external.network import ExternalNetwork
+
+FOLDER = conf_dir() / "model" / "external"
+RECIPES = sorted(path.stem for path in FOLDER.glob("*.yaml"))
+
+
+def test_recipes_are_choices_of_the_group() -> None:
+    assert available("model/external") == RECIPES
+    assert "external" in available("model")
+    assert len(RECIPES) == 25
+
+
+@pytest.fixture(scope="module")
+def nodes() -> DictConfig:
+    """All recipes, composed at once: each in a package of its own name."""
+    chosen = [f"+model@{name}=external/{name}" for name in RECIPES]
+    config = compose([*chosen, "model=external", "model.checkout=/code"])
+    for name in RECIPES:
+        config[name].checkout = "/code"
+    return config
+
+
+@pytest.mark.parametrize("classes", [9, 5])
+def test_recipe_has_the_classes_of_the_data_set(nodes: DictConfig, classes: int) -> None:
+    nodes.dataset.num_classes = classes
+    for name in RECIPES:
+        component = Component.from_node(nodes[name])
+        assert component.target == EXTERNAL
+        values = component.values
+        assert values["num_classes"] == classes
+        spaces = [values["arguments"], *values["namespaces"].values()]
+        counts = [each[key] for each in spaces for key in each if re.match(r"n(um)?_class", key)]
+        assert counts == [classes], f"{name}: exactly one argument has the number of classes"
+        assert re.fullmatch(r"[\w.]+:\w+", values["constructor"])
+        assert set(values) == set(inspect.signature(ExternalNetwork).parameters)
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_recipe_needs_only_keys_that_differ(name: str) -> None:
+    defaults = yaml.safe_load((FOLDER.parent / "external.yaml").read_text())
+    own = yaml.safe_load((FOLDER / f"{name}.yaml").read_text())
+    assert "constructor" in own
+    assert {key for key in own if defaults.get(key) == own[key]} <= {"feed"}
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_recipe_states_repository_commit_licence_and_size(name: str) -> None:
+    text = (FOLDER / f"{name}.yaml").read_text()
+    head = " ".join(line[2:] for line in text.splitlines() if line.startswith("# "))
+    assert re.search(r"Repository: [\w.-]+/[\w.-]+ ", head)
+    assert re.search(r"Commit: [0-9a-f]{8} \(20\d\d-\d\d-\d\d\)\. Licence: ", head)
+    assert re.search(r"[\d,]{9,} parameters at (nine|five) classes", head)
+
+
+def test_channels_follow_from_the_form_of_feeding(nodes: DictConfig) -> None:
+    """A stacked tensor has four channels in all recipes; both images apart have three each."""
+    for name in RECIPES:
+        channels = len(nodes[name].inputs.thermal_mean)
+        assert channels == (1 if nodes[name].feed == "stacked" else 3), name
+
+
+def test_inputs_of_a_recipe_can_be_overridden(nodes: DictConfig) -> None:
+    alone = compose(["model=external/gmnet", "model.checkout=/code", "model/inputs=unit"]).model
+    assert list(nodes.gmnet.inputs.thermal_mean) == [114.495] * 3
+    assert list(alone.inputs.thermal_mean) == [0]
+    assert alone.constructor == nodes.gmnet.constructor
