@@ -18,7 +18,7 @@ from rgbt.metrics.counts import Counts, convention
 from rgbt.metrics.details import details_of
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.named import ParsedMetric, images_of, parse, values
-from rgbt.metrics.pairs import protocol_of
+from rgbt.metrics.pairs import HEADLINES, protocol_of
 from rgbt.metrics.score_grid import headlines
 from rgbt.randomness import numpy_generator
 
@@ -182,9 +182,9 @@ def watched(like: Counts) -> tuple[ParsedMetric, ...]:
     """
     if details_of(like.partition) is not None:
         return tuple(map(parse, headlines(like)))
-    of_pairs = protocol_of(like.partition) is not None
-    scores = (names.TC, names.CA) if of_pairs else (names.MIOU, names.PIXEL_ACCURACY)
-    return tuple(map(parse, scores))
+    protocol = protocol_of(like.partition)
+    single = (names.MIOU, names.PIXEL_ACCURACY)
+    return tuple(map(parse, HEADLINES[protocol] if protocol else single))
 
 
 def _influence(single: CommonImages) -> Scores:
