@@ -168,8 +168,8 @@ def video_scenes(
             before = [frame]
             continue
         _check_sizes(before[-1].batch, frame.batch)
-        pair = (images_of(data.dataset, each) for each in (previous_of[name], name))
-        found = frame_flow(*pair, source=flow)
+        images = [images_of(data.dataset, each) for each in (previous_of[name], name)]
+        found = frame_flow(images[0], images[1], flow)
         record = flow_record(name, found, None)
         if record.used < least:
             yield Scenes((name,), {}, (frame.batch.rgb,) * 2, frame.prediction, records=(record,))

@@ -69,7 +69,7 @@ class Pairing:
                 "'flow' has no effect on virtual views, whose motion is known; omit it, or choose "
                 "frames=next or frames=video."
             )
-        if flow in ("default", "exact"):
+        if flow == "default" or flow == "exact":
             return cls(frames, USUAL_FLOW if frames == "video" else None, least_used)
         return cls(frames, flow, least_used)
 

@@ -43,7 +43,7 @@ class FrameFlow(NamedTuple):
 
     def source(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Rows and columns (H, W) of the nearest pixels of the first frame; -1 where not used."""
-        grid = np.stack(np.indices(self.used.shape), axis=-1)
+        grid = np.moveaxis(np.indices(self.used.shape), 0, -1)
         first_yx = np.rint(grid + self.flow).astype(np.int64)
         limit = np.array(self.used.shape) - 1
         first_yx = np.clip(first_yx, 0, limit)
@@ -127,4 +127,5 @@ def _one(first: Gray, second: Gray) -> tuple[Flow, NDArray[np.float32], NDArray[
 
 @cache
 def _search() -> Any:
-    return cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    # OpenCV's type stubs lack this function.
+    return vars(cv2)["DISOpticalFlow_create"](cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
