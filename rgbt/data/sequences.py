@@ -7,7 +7,7 @@ are two neighbours of one sequence.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from itertools import pairwise
 from typing import Protocol, runtime_checkable
 
@@ -87,13 +87,14 @@ def sequences_of_names(names: Iterable[str]) -> Sequences:
     return (*runs, *((name,) for name in others))
 
 
-def consecutive(frames: dict[int, str]) -> Iterator[tuple[str, ...]]:
-    """Frames by number, cut where the step is larger than the smallest one."""
+def consecutive(frames: Mapping[int, str], step: int | None = None) -> Iterator[tuple[str, ...]]:
+    """Frames by number, cut where these are further apart than `step`; None: the smallest step."""
     numbers = sorted(frames)
     steps = [later - number for number, later in pairwise(numbers)]
+    usual = min(steps, default=1) if step is None else step
     run: list[str] = []
-    for number, step in zip(numbers, (*steps, None), strict=True):
+    for number, after in zip(numbers, (*steps, None), strict=True):
         run.append(frames[number])
-        if step is None or step != min(steps):
+        if after != usual:
             yield tuple(run)
             run = []

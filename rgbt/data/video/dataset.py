@@ -14,7 +14,15 @@ from rgbt.data.folder.splits import ByList
 from rgbt.data.images import PairPattern, PairReader, Range, check_limits
 from rgbt.data.labels import LabelValue, label_codes, painted
 from rgbt.data.named_files import existing_root, hash_of_files
-from rgbt.data.video.frames import Gaps, NumberedFrame, by_video, number_of, sequences_of
+from rgbt.data.sequences import consecutive
+from rgbt.data.video.frames import (
+    Gaps,
+    NumberedFrame,
+    by_video,
+    check_whole,
+    number_of,
+    smallest_step,
+)
 from rgbt.ranges import Colour, Names, NumClasses, Text
 
 VIDEO = "video"
@@ -96,11 +104,12 @@ class VideoDataset(FileDataset):
         Raises:
             InputError: a video of the list is empty, or a number is missing in it.
         """
-        return tuple(
-            run
-            for video in self.videos_of(split)
-            for run in sequences_of(video, self.videos[video], self.gaps)
-        )
+        videos = self.videos_of(split)
+        if self.gaps == "refuse":
+            step = smallest_step(self.videos.values())
+            for video in videos:
+                check_whole(video, self.videos[video], step)
+        return tuple(run for video in videos for run in consecutive(self.videos[video]))
 
     def has(self, split: str) -> bool:
         """Whether the list of `split` exists; InputError if the split is unknown."""

@@ -9,7 +9,6 @@ from typing import Literal, NamedTuple
 
 from rgbt.checks import InputError
 from rgbt.data.folder.frames import FolderFrame
-from rgbt.data.sequences import consecutive
 
 Gaps = Literal["refuse", "split"]
 """What a missing number in a video means: an error, or the beginning of another sequence."""
@@ -55,22 +54,18 @@ def by_video(frames: Iterable[NumberedFrame]) -> dict[str, dict[int, str]]:
     return {video: dict(sorted(known.items())) for video, known in videos.items()}
 
 
-def sequences_of(video: str, frames: Mapping[int, str], gaps: Gaps) -> tuple[tuple[str, ...], ...]:
-    """The frames of a video in order.
+def smallest_step(videos: Iterable[Mapping[int, str]]) -> int | None:
+    """The smallest step between the numbers of two frames of one video; None without any."""
+    steps = [later - number for frames in videos for number, later in pairwise(frames)]
+    return min(steps, default=None)
 
-    The step between two numbers is the smallest one of the video.
 
-    Raises:
-        InputError: a number is missing and `gaps` is "refuse".
-    """
-    runs = tuple(consecutive(dict(frames)))
-    if gaps == "refuse" and len(runs) > 1:
-        numbers = tuple(frames)
-        step = min(later - number for number, later in pairwise(numbers))
-        before = next(n for n, later in pairwise(numbers) if later - n != step)
-        raise InputError(
-            f"video '{video}' lacks frame {before + step}, which should follow "
-            f"'{frames[before]}'; restore it, or set dataset.gaps=split to begin another sequence "
-            "after each gap."
-        )
-    return runs
+def check_whole(video: str, frames: Mapping[int, str], step: int | None) -> None:
+    """Refuse a video in which a number is missing; `step` as of `smallest_step`."""
+    for number, later in pairwise(frames):
+        if step is not None and later - number != step:
+            raise InputError(
+                f"video '{video}' lacks frame {number + step}, which should follow "
+                f"'{frames[number]}'; restore it, or set dataset.gaps=split to begin another "
+                "sequence after each gap."
+            )
