@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from itertools import pairwise
+from itertools import pairwise, zip_longest
 from typing import Protocol, runtime_checkable
 
 from rgbt.checks import InputError
@@ -93,7 +93,7 @@ def consecutive(frames: Mapping[int, str], step: int | None = None) -> Iterator[
     steps = [later - number for number, later in pairwise(numbers)]
     usual = min(steps, default=1) if step is None else step
     run: list[str] = []
-    for number, after in zip(numbers, (*steps, None), strict=True):
+    for number, after in zip_longest(numbers, steps):
         run.append(frames[number])
         if after != usual:
             yield tuple(run)

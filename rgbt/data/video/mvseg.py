@@ -39,6 +39,9 @@ FOLDERS = {"visible": "v", "infrared": "i", "label": "l"}
 STEM = re.compile(r"(\d*?)(\d{4})")
 """The frame number is the last four digits before the letter."""
 
+APART = 20_000
+"""Between the numbers of two recordings, so that 10000 does not follow 09999."""
+
 
 class MVSeg(VideoDataset):
     """RGB-thermal videos with about five labelled frames each, in the layout of the MVSeg archive.
@@ -141,7 +144,7 @@ def _frame(folder: Path, stem: str, rgb: Path, thermal: Path) -> NumberedFrame:
         thermal=thermal,
         label=folder / "label" / f"{stem}l.png",
     )
-    return NumberedFrame(video, int(match[2]) + 10_000 * int(match[1] or 0), files)
+    return NumberedFrame(video, int(match[2]) + APART * int(match[1] or 0), files)
 
 
 def _images(folder: Path, letter: str) -> dict[str, Path]:
