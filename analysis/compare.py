@@ -43,16 +43,17 @@ class Options:
         str,
         Help(
             "scores to compare: mIoU,Var,region/1,class/car,night/mIoU ...; auto: mIoU, Var, "
-            "regions, day and night; for pairs of frames: TC,CA,CA_released,class/car/TC,night/TC "
-            "...; auto: TC and CA"
+            "regions, day and night; for pairs of frames: TC,CA,CA_released,warping_error,"
+            "class/car/TC,night/TC ...; auto: TC and CA; for three frames: flicker"
         ),
     ] = "auto"
     split: Annotated[str, Help("split of the runs; default: test")] = ""
     frames: Annotated[
-        Literal["", "aligned", "released", "next"],
+        Literal["", "aligned", "released", "next", "flow", "triples"],
         Help(
             "compare the counts of pairs of frames of the runs (rgbt consistency run=...): aligned "
-            "or released (virtual views), next (consecutive frames); default: single frames"
+            "or released (virtual views), next (known motion), flow (videos), triples (three "
+            "frames of videos); default: single frames"
         ),
     ] = ""
     corruption: Annotated[

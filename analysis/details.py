@@ -1,5 +1,6 @@
 """Show boundary IoU, calibration, distance, size and inputs of a method: ``rgbt details run=...``.
 
+A file of counts of ``rgbt consistency`` shows TC, CA and the changes along the motion.
 The counts are those that ``rgbt evaluate run=... modality=all details=all`` has stored; no network
 is built. Every score has an interval over images.
 """
@@ -61,6 +62,13 @@ class DetailTable:
     grid: ScoreGrid
     estimates: Mapping[str, Estimate]
 
+    @property
+    def is_plain(self) -> bool:
+        """Whether the counts are of single frames without details."""
+        from rgbt.metrics.pairs import protocol_of
+
+        return self.key.kind is None and protocol_of(self.key.regions) is None
+
 
 def main(options: Options, overrides: list[str]) -> int:
     """Show every stored score of a method by region, class, bin and input."""
@@ -88,11 +96,12 @@ def main(options: Options, overrides: list[str]) -> int:
     grids = [*text_tables(tables, label_of(opened))]
     for grid in grids:
         print_rich(rich_table(grid))
-    said = next(iter(tables[0].estimates.values())).said
+    first = next(iter(tables[0].estimates.values()))
+    reason = f" {first.reason}" if first.reason else ""
     seeds = " and seeds" if len(opened) > 1 else ""
     remark = (
-        f"In brackets: {100 * settings.level:g} % intervals over images{seeds} ({said}), "
-        f"{settings.resamples} resamples."
+        f"In brackets: {100 * settings.level:g} % intervals over images{seeds} ({first.said}), "
+        f"{settings.resamples} resamples.{reason}"
     )
     print_rich(remark)
     out = options.out
@@ -120,14 +129,14 @@ def text_tables(tables: Sequence[DetailTable], label: str) -> Iterator[TextTable
 
     plain: dict[str, list[DetailTable]] = {}
     for table in tables:
-        if table.key.kind is None:
+        if table.is_plain:
             plain.setdefault(table.key.regions, []).append(table)
     for regions, group in plain.items():
         rows = [(each.key.view or "mIoU", *_cells(each, each.grid.metrics)) for each in group]
         title = f"{label}: {group[0].grid.title} and input ({regions})"
         yield TextTable(title, ("", *group[0].grid.columns), tuple(rows))
     for each in tables:
-        if each.key.kind is not None:
+        if not each.is_plain:
             rows = [(name, *_cells(each, metrics)) for name, metrics in each.grid.rows]
             of_view = f", {each.key.view}" if each.key.view else ""
             title = f"{label}{of_view}: {each.grid.title} ({each.key.regions})"

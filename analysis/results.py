@@ -24,7 +24,7 @@ SEED = "rgbt.seed"
 RUNS = "runs, files of counts or a group"
 """What a list may contain, for messages."""
 
-Frames = Literal["", "aligned", "released", "next"]
+Frames = Literal["", "aligned", "released", "next", "flow", "triples"]
 """Counts of single frames, or of pairs of frames by one protocol."""
 
 
@@ -190,7 +190,7 @@ def _of_run(run: RunResult, split: str, frames: Frames) -> NamedCounts:
     split = split or "test"
     path = run.folder / file_name(frames, split) if frames else run.counts_path(split)
     if frames and not path.is_file():
-        views = "next" if frames == "next" else "virtual"
+        views = {"next": "next", "flow": "video", "triples": "video"}.get(frames, "virtual")
         raise InputError(
             f"{run.folder} has no counts of pairs of frames {path.relative_to(run.folder)}; "
             f"rgbt consistency run={run.folder} split={split} frames={views} makes them once it is "

@@ -10,6 +10,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
+from annotated_types import Interval as Bounds
+
 from rgbt.checks import InputError
 from rgbt.config.common_options import Modality, NetworkOptions, Split
 from rgbt.config.options import Help
@@ -28,14 +30,33 @@ class Options(NetworkOptions):
     """Options of the command."""
 
     frames: Annotated[
-        Literal["virtual", "next"],
+        Literal["virtual", "next", "video"],
         Help(
             "virtual: virtual views of every image, with three published sets of angles; reported "
             'as "aligned" (the first prediction is warped to the second frame, as in the paper) '
             'and "released" (it is not warped). next: real second frames with known motion '
-            "(dataset=synth dataset.ego_forward_m=0.5, or a data set with a folder next/)"
+            "(dataset=synth dataset.ego_forward_m=0.5, or a data set with a folder next/). video: "
+            "images with consecutive numbers, along an estimated flow; also measures the warping "
+            "error and flicker"
         ),
     ] = "virtual"
+    flow: Annotated[
+        Literal["default", "exact", "rgb", "thermal", "both"],
+        Help(
+            "how points are followed to the next frame: exact (stored beside frames=next, the "
+            "default there), or estimated from rgb, from thermal, or from the better of both at "
+            "each pixel (both, the default of frames=video). With frames=next the estimated flow "
+            "is counted beside the exact one"
+        ),
+    ] = "default"
+    least_used: Annotated[
+        float,
+        Bounds(ge=0, le=1),
+        Help(
+            "frames=video: pairs in which a smaller share of the pixels has a reliable flow are "
+            "left out"
+        ),
+    ] = 0.1
     split: Split = "test"
     modality: Modality = "default"
     export: Annotated[
@@ -79,6 +100,7 @@ def main(options: Options, overrides: list[str]) -> int:
     For a method outside of rgbt: rgbt consistency export=images dataset=mfnet dataset.root=...,
     predict every image in images/rgb and images/thermal, then
     rgbt consistency predictions=predicted pairs=images dataset=mfnet dataset.root=...
+    With frames=video nothing is exported: the predictions are those of the images themselves.
     """
     if not any(item.split("=")[0] == "consistency" for item in overrides):
         overrides = ["consistency=views", *overrides]
@@ -107,6 +129,12 @@ def _export(options: Options, overrides: list[str]) -> int:
     from rgbt.tracking.terminal import path_lines, print_rich
 
     assert options.export is not None, "the caller has checked it"
+    if options.frames == "video":
+        raise InputError(
+            "frames=video compares images of the data set itself; predict these as NAME.png, then "
+            "give predictions=FOLDER."
+        )
+    _check_without(options, ("flow", "least_used"), "export=...")
     listed = write_images(
         PairSource.compose(overrides), options.split, options.frames, options.export
     )
@@ -117,10 +145,10 @@ def _export(options: Options, overrides: list[str]) -> int:
 
 def _measure_predictions(options: Options, overrides: list[str]) -> int:
     from rgbt.evaluation.consistency_files import write_pairs
-    from rgbt.evaluation.pair_images import FolderPairs
+    from rgbt.evaluation.pair_images import FolderFrames, FolderPairs
     from rgbt.evaluation.pair_list import PairSource, list_pairs
+    from rgbt.evaluation.pairing import Pairing
     from rgbt.evaluation.request import EvaluationRequest
-    from rgbt.evaluation.segmentation import panel_names
     from rgbt.evaluation.temporal_consistency import count_predicted
     from rgbt.metrics.pair_list import read_list
     from rgbt.metrics.pairs import file_name
@@ -128,51 +156,68 @@ def _measure_predictions(options: Options, overrides: list[str]) -> int:
 
     split, folder, out = options.split, options.predictions, options.out
     assert folder is not None, "the caller has checked it"
-    listed, source = read_list(options.pairs or folder), PairSource.compose(overrides)
-    wanted = list_pairs(source, split, options.frames)
-    predictor = FolderPairs(folder, source, listed, wanted, options.format)
-    request = EvaluationRequest(split=split, keep=panel_names(source.dataset, split))
-    pairs = count_predicted(source, predictor, request, options.frames)
+    pairing = Pairing.of(options.frames, options.flow, options.least_used)
+    predictor: FolderFrames
+    if pairing.frames == "video":
+        _check_without(options, ("pairs",), "frames=video")
+        source = PairSource.compose(overrides)
+        predictor = FolderFrames(folder, source, pairing.images(source, split), options.format)
+    else:
+        listed, source = read_list(options.pairs or folder), PairSource.compose(overrides)
+        wanted = list_pairs(source, split, pairing.frames)
+        predictor = FolderPairs(folder, source, listed, wanted, options.format)
+    request = EvaluationRequest(split=split, keep=pairing.pictured(source, split))
+    pairs = count_predicted(source, predictor, request, pairing)
     _show(pairs, source, folder.resolve().name, options)
     if out is not None:
-        mark = source.consistency.mark if options.frames == "virtual" else ""
-        paths = {each: out / Path(file_name(each, split, mark)).name for each in pairs.counts}
+        paths = {
+            each: out / Path(file_name(each, split, pairing.file_mark(source, each))).name
+            for each in pairs.counts
+        }
         print_rich(path_lines(write_pairs(pairs, paths, source.dataset)))
     return 0
 
 
 def _show(pairs: Pairs, data: EvaluationData, label: str, options: Options) -> None:
-    """Print TC and CA by class."""
-    from rgbt.evaluation.temporal_consistency import consistency_table
+    """Print TC and CA by class, and what an estimated flow is like."""
+    from rgbt.evaluation.flow_record import flow_sentences
+    from rgbt.evaluation.temporal_consistency import changes_grid, consistency_table
     from rgbt.tracking.tables import consistency_grid
     from rgbt.tracking.terminal import print_rich, rich_table
 
     table = consistency_table(pairs.counts, data.regions.absent)
     views = next(iter(pairs.counts.values())).partition.partition("-")[2] or "published"
+    if options.frames == "video":
+        views = f"{options.split} by consecutive numbers"
     on = f"{data.dataset.name}, {options.split}; {options.frames}: {views}"
     print_rich(rich_table(consistency_grid(table, f"Consistency of {label} ({on})")))
+    if pairs.records:
+        print_rich(rich_table(changes_grid(pairs.counts)))
+        for sentence in flow_sentences(pairs.records, options.least_used):
+            print_rich(sentence)
 
 
 def _measure_network(options: Options, overrides: list[str]) -> int:
     from rgbt.evaluation.consistency_files import PairFiles, add_to_result
+    from rgbt.evaluation.pairing import Pairing
     from rgbt.evaluation.request import EvaluationRequest, NetworkRequest
-    from rgbt.evaluation.segmentation import panel_names
     from rgbt.evaluation.temporal_consistency import consistency_table, count_pairs
     from rgbt.tracking.run_folder import RunFolder
     from rgbt.tracking.terminal import path_lines, print_rich
 
-    split, frames, out = options.split, options.frames, options.out
+    split, out = options.split, options.out
+    pairing = Pairing.of(options.frames, options.flow, options.least_used)
     network = NetworkRequest(options, overrides)
     network.check_comparable(out)
     request = EvaluationRequest.from_options(split, options.modality)
     opened = network.open()
     session = opened.session
-    files = PairFiles(opened, network, request, frames, out)
-    request = replace(request, keep=panel_names(session.dataset, split))
-    pairs = count_pairs(session, session.model, request, frames)
+    files = PairFiles(opened, network, request, pairing, out)
+    request = replace(request, keep=pairing.pictured(session, split))
+    pairs = count_pairs(session, session.model, request, pairing)
     _show(pairs, session, opened.label, options)
     print_rich(path_lines(files.write(pairs)))
-    if frames == "virtual" and options.run and not (out or files.suffixes):
+    if pairing.frames == "virtual" and options.run and not (out or files.suffixes):
         table = consistency_table(pairs.counts, session.regions.absent)
         add_to_result(RunFolder(opened.folder.parent), session, split, table)
     return 0

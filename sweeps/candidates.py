@@ -110,7 +110,7 @@ def score_file(objective: Objective, spec: RunSpec) -> ScoreFile:
         return ScoreFile(metric=score, path=counts_name(split))
     name, _, word = score.partition("/")
     (protocol,) = (each for each in PROTOCOLS if each == word)
-    metric = dict(zip((TC, CA), HEADLINES[protocol], strict=True))[name]
+    metric = dict(zip((TC, CA), HEADLINES[protocol][:2], strict=True))[name]
     mark = str(spec.consistency.build().mark)
     return ScoreFile(metric=metric, path=file_name(protocol, split, mark))
 

@@ -16,6 +16,7 @@ from tests.data.folder_files import PATTERNS, write_folder
 from tests.data.freiburg_files import write_freiburg
 from tests.data.kp_files import write_kp
 from tests.data.pst900_files import write_pst900
+from tests.data.video_files import write_mvseg
 
 OWN = (
     *(f"dataset.{key}='{text}'" for key, text in PATTERNS.items()),
@@ -28,6 +29,7 @@ ON_DISK: dict[str, tuple[Callable[[Path], Path], tuple[str, ...]]] = {
     "kp": (write_kp, ()),
     "freiburg": (write_freiburg, ("dataset.crop=null", "dataset.val_sequences=[seq_04_day]")),
     "folder": (write_folder, OWN),
+    "mvseg": (write_mvseg, ()),
 }
 EMBEDDED = ("synth", "synth_pst900", "synth_kp", "synth_freiburg")
 
@@ -48,7 +50,7 @@ def test_smoke_runs_on_every_data_set(call: Call, tmp_path: Path, dataset: str) 
     assert only_run(tmp_path / "runs")
 
 
-@pytest.mark.parametrize("dataset", ["mfnet", "pst900", "kp", "freiburg", *EMBEDDED])
+@pytest.mark.parametrize("dataset", ["mfnet", "pst900", "kp", "freiburg", "mvseg", *EMBEDDED])
 def test_smoke_fits_every_data_set(dataset: str) -> None:
     root = [] if dataset in EMBEDDED else ["dataset.root=/data"]
     config = compose(["+experiment=grbm", f"dataset={dataset}", *root, "+debug=smoke"])

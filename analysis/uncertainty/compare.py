@@ -92,6 +92,7 @@ def compare(
     settings: Resampling,
     *,
     paired: bool = False,
+    same_pixels: bool = True,
 ) -> Comparison:
     """Compare two methods on the same images.
 
@@ -108,6 +109,7 @@ def compare(
         paired: counts i of `a` and of `b` are of the same training, evaluated in two ways. What
             images and trainings do together is then in both parts of the interval over both, which
             holds the true difference in at least `level` of all cases.
+        same_pixels: whether both must count the same pixels of every image, by the same partition.
 
     Raises:
         InputError: other images, classes, scored classes, regions or labels; fewer than `FEWEST`
@@ -119,7 +121,7 @@ def compare(
     found: dict[str, Difference] = {}
     described: dict[str | None, CommonImages] = {}
     for group in by_part(metrics):
-        images = prepare([a, b], group[0], settings)
+        images = prepare([a, b], group[0], settings, same_pixels=same_pixels)
         if images.blocks.count < FEWEST:
             raise InputError(
                 f"{images.blocks.said} are too few to compare two methods; {FEWEST} are the least."

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.uncertainty.blocks import FEWEST, ImageBlocks, make_blocks
-from analysis.uncertainty.same_images import aligned
+from analysis.uncertainty.same_images import aligned, aligned_images
 from analysis.uncertainty.settings import Resampling
 from rgbt.checks import InputError
 from rgbt.metrics import names
@@ -18,7 +18,7 @@ from rgbt.metrics.counts import Counts, convention
 from rgbt.metrics.details import details_of
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.named import ParsedMetric, images_of, parse, values
-from rgbt.metrics.pairs import protocol_of
+from rgbt.metrics.pairs import HEADLINES, protocol_of
 from rgbt.metrics.score_grid import headlines
 from rgbt.randomness import numpy_generator
 
@@ -136,7 +136,11 @@ class CommonImages:
 
 
 def prepare(
-    methods: Sequence[Sequence[Counts]], metric: ParsedMetric, settings: Resampling
+    methods: Sequence[Sequence[Counts]],
+    metric: ParsedMetric,
+    settings: Resampling,
+    *,
+    same_pixels: bool = True,
 ) -> CommonImages:
     """Counts of the images that `metric` is over, summed inside blocks.
 
@@ -144,13 +148,15 @@ def prepare(
         methods: per method the counts of its seeds; all of the same images, in any order.
         metric: over the images of the day, of the night, or all.
         settings: of the resampling.
+        same_pixels: whether all must count the same pixels, by the same partition.
 
     Raises:
         InputError: counts of other images, classes, scored classes, regions or data; no images of
             that part; blocks that cannot be made.
     """
     like = methods[0][0]
-    alike = [[aligned(like, counts) for counts in seeds] for seeds in methods]
+    join = aligned if same_pixels else aligned_images
+    alike = [[join(like, counts) for counts in seeds] for seeds in methods]
     parts = [[images_of(metric, counts) for counts in seeds] for seeds in alike]
     first = parts[0][0]
     regions, rows, classes = first.counts.shape[1:]
@@ -182,9 +188,9 @@ def watched(like: Counts) -> tuple[ParsedMetric, ...]:
     """
     if details_of(like.partition) is not None:
         return tuple(map(parse, headlines(like)))
-    of_pairs = protocol_of(like.partition) is not None
-    scores = (names.TC, names.CA) if of_pairs else (names.MIOU, names.PIXEL_ACCURACY)
-    return tuple(map(parse, scores))
+    protocol = protocol_of(like.partition)
+    single = (names.MIOU, names.PIXEL_ACCURACY)
+    return tuple(map(parse, HEADLINES[protocol] if protocol else single))
 
 
 def _influence(single: CommonImages) -> Scores:

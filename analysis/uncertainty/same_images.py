@@ -140,6 +140,9 @@ def _labelled(counts: Counts) -> NDArray[np.int64]:
             groups = 1 if details is None else details.groups
             number = array[:, :, calibration.NUMBER].sum(-1, dtype=np.int64)
             labelled = number.reshape(len(array), -1, groups).sum(-1)
+        case "triples":
+            # Every index is a predicted class; only the number of pixels is that of the images.
+            labelled = array.sum((-3, -2, -1), dtype=np.int64)
         case _:
             # Of pairs of frames the label is no row but says which matrix it is.
             labelled = array.sum((-2, -1), dtype=np.int64)

@@ -10,6 +10,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -59,6 +61,28 @@ class NextFrames:
             layout=first.layout,
         )
 
+    def flow(self, name: str, image_hw: tuple[int, int]) -> NDArray[np.float32]:
+        """Offset (H, W, 2) of each pixel of the second frame to its position in the first.
+
+        Args:
+            name: of the frame.
+            image_hw: its size, which the flow must have.
+
+        Returns:
+            (rows, columns); NaN if the point was not visible.
+
+        Raises:
+            InputError: no flow, or one of another size.
+        """
+        path = self._path(name)
+        flow = read_array(path, "one array of rows and columns")
+        if flow.dtype.kind != "f" or flow.shape != (*image_hw, 2):
+            raise InputError(
+                f"{path} must be an array of {image_hw[0]} x {image_hw[1]} x 2 real numbers (rows, "
+                f"columns) like its frame, got {' x '.join(map(str, flow.shape))} {flow.dtype}."
+            )
+        return np.asarray(flow, np.float32)
+
     def source(self, name: str, image_hw: tuple[int, int]) -> tuple[NDArray[np.int64], ...]:
         """Position of each pixel of the second frame in the first frame.
 
@@ -72,22 +96,19 @@ class NextFrames:
         Raises:
             InputError: no flow, one of another size, or one that leads out of the image.
         """
-        path = self.dataset.root / "flow" / f"{name}.npy"
-        flow = read_array(path, "one array of rows and columns")
-        if flow.dtype.kind != "f" or flow.shape != (*image_hw, 2):
-            raise InputError(
-                f"{path} must be an array of {image_hw[0]} x {image_hw[1]} x 2 real numbers (rows, "
-                f"columns) like its frame, got {' x '.join(map(str, flow.shape))} {flow.dtype}."
-            )
-        flow = np.asarray(flow, np.float32)
+        flow = self.flow(name, image_hw)
         rows, columns = np.indices(image_hw)
         grid = np.stack([rows, columns], axis=-1)
         seen = np.isfinite(flow[..., 0]) & np.isfinite(flow[..., 1])
         first_yx = np.rint(np.where(seen[..., None], grid + flow, 0)).astype(np.int64)
         if (first_yx < 0).any() or (first_yx >= image_hw).any():
             raise InputError(
-                f"{path} points outside the first frame of {image_hw[0]}x{image_hw[1]} pixels; "
-                "points that were not visible there must be NaN."
+                f"{self._path(name)} points outside the first frame of "
+                f"{image_hw[0]}x{image_hw[1]} pixels; points that were not visible there must be "
+                "NaN."
             )
         first_yx[~seen] = -1
         return first_yx[..., 0], first_yx[..., 1]
+
+    def _path(self, name: str) -> Path:
+        return self.dataset.root / "flow" / f"{name}.npy"

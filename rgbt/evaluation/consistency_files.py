@@ -10,13 +10,13 @@ from rgbt.build.load_run import TrainedNetwork
 from rgbt.build.session import Session
 from rgbt.checks import InputError
 from rgbt.dataset import LabelledDataset
-from rgbt.evaluation.pair_frames import frames_mark
+from rgbt.evaluation.flow_record import write_records
+from rgbt.evaluation.pairing import Pairing
 from rgbt.evaluation.request import EvaluationRequest, NetworkRequest, other_images
 from rgbt.evaluation.segmentation import legend_of
 from rgbt.evaluation.temporal_consistency import Pairs, consistency_values
 from rgbt.metrics.counts import Counts
-from rgbt.metrics.pair_list import Frames
-from rgbt.metrics.pairs import Protocol, file_name, partition_name
+from rgbt.metrics.pairs import Protocol, file_name
 from rgbt.tracking.mlflow_upload import read_upload_state
 from rgbt.tracking.pair_pictures import draw_pairs
 from rgbt.tracking.run_files import read_marker, read_result, read_tables
@@ -42,18 +42,18 @@ class PairFiles:
         opened: TrainedNetwork,
         network: NetworkRequest,
         request: EvaluationRequest,
-        frames: Frames,
+        pairing: Pairing,
         out: Path | None,
     ) -> None:
         self.suffixes = (*([request.view] if request.view else []), *network.suffixes)
-        self._session, self._split = opened.session, request.split
+        self._session, self._split, self._pairing = opened.session, request.split, pairing
         self._folder = out or opened.folder
-        if frames == "virtual":
+        if pairing.frames != "next":
             marker = None if out else read_marker(opened.folder.parent)
             self.suffixes += other_images(opened.session.dataset, marker)
             return
         path = self.path("next")
-        partition = partition_name("next", 1, frames_mark(opened.session, "next"))
+        partition = pairing.partition(opened.session, "next")(1)
         if path.is_file() and Counts.load(path).partition != partition:
             raise InputError(
                 f"{path} holds counts for second frames of another motion. Choose another folder "
@@ -61,8 +61,8 @@ class PairFiles:
             )
 
     def path(self, protocol: Protocol) -> Path:
-        """File of counts; those of true frames have one name, whatever the motion."""
-        views = "" if protocol == "next" else self._session.consistency.mark
+        """File of counts; those along an exact flow have one name, whatever the motion."""
+        views = self._pairing.file_mark(self._session, protocol)
         usual = Path(file_name(protocol, self._split, views))
         return self._folder / usual.with_stem("_".join([usual.stem, *self.suffixes])).name
 
@@ -88,6 +88,10 @@ def write_pairs(
     for protocol, counts in reversed(pairs.counts.items()):
         counts.save(paths[protocol])
     lines = [(f"counts, {protocol}", str(path)) for protocol, path in paths.items()]
+    if pairs.records:
+        stem = paths["flow"].stem.removeprefix("consistency_")
+        write_records(pairs.records, first.with_name(f"{stem}.csv"))
+        lines.append(("flow of each pair", str(first.with_name(f"{stem}.csv"))))
     if not pairs.kept:
         info("no image of the picture could be read, so it was not drawn.")
         return lines

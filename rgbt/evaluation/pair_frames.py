@@ -18,14 +18,7 @@ from rgbt.data.next_frames import NextFrames
 from rgbt.evaluation.prediction import EvaluationData
 from rgbt.geometry.warp import Warp
 from rgbt.metrics.pair_list import Frames
-from rgbt.metrics.pairs import Protocol
 from rgbt.types import Batch
-
-PROTOCOLS: dict[Frames, tuple[Protocol, ...]] = {
-    "virtual": ("aligned", "released"),
-    "next": ("next",),
-}
-"""Protocols of counting for each kind of second frame."""
 
 
 def check_frames(data: EvaluationData, frames: Frames) -> None:
@@ -36,7 +29,7 @@ def check_frames(data: EvaluationData, frames: Frames) -> None:
     """
     if frames == "next":
         NextFrames(data.dataset)
-    elif not data.consistency.sets:
+    elif frames == "virtual" and not data.consistency.sets:
         raise InputError(
             "consistency.sets is empty. Name sets of angles, such as "
             "consistency.sets=[released_1], or choose consistency=views."
@@ -112,13 +105,3 @@ def next_frames(
                 f"{after.dataset.root}."
             )
         yield batch.to(device), later.to(device)
-
-
-def frames_mark(data: EvaluationData, protocol: Protocol) -> str:
-    """Suffix for second frames: "" for the published views, else six digits of a digest.
-
-    For real second frames it depends on lists and files, so that another motion differs.
-    """
-    if protocol == "next":
-        return NextFrames(data.dataset).dataset.fingerprint()[:6]
-    return data.consistency.mark

@@ -99,45 +99,37 @@ def _check_out(out: Path, listed: PairList) -> None:
         raise InputError(f"export={out} holds other pairs ({PAIR_LIST}); choose another folder.")
 
 
-class FolderPairs:
-    """Both frames predicted by any method, read from its label images.
+class FolderFrames:
+    """Single frames predicted by any method, read from its label images NAME.png.
 
     Args:
-        folder: holds NAME.png and NAME_view1.png, ..., or NAME_next.png.
-        source: data set and views, which must be those of the export.
-        listed: the list of the export.
-        wanted: split and frames that are counted.
+        folder: of the predictions.
+        source: data set.
+        names: of the frames, all of which must be there.
         form: how files are read, see `rgbt.data.prediction_images.PredictionReader`.
 
     Raises:
-        InputError: the export is of other images or incomplete, or files are missing, foreign or
-            of several kinds.
+        InputError: files are missing or of several kinds.
     """
 
     device = CPU
 
     def __init__(
-        self,
-        folder: Path,
-        source: PairSource,
-        listed: PairList,
-        wanted: PairList,
-        form: Format = "auto",
+        self, folder: Path, source: PairSource, names: Sequence[str], form: Format = "auto"
     ) -> None:
-        check_same(listed, wanted)
-        self._folder, self._frames = folder, wanted.frames
-        _check_files(folder, wanted.images)
+        self._folder = folder
+        _check_there(folder, names)
         if form == "auto":
-            check_one_kind(self._path(name) for name in wanted.images)
+            check_one_kind(self._path(name) for name in names)
         self._reader = PredictionReader(source.dataset.classes, source.dataset.palette, form)
 
     def first(self, batch: Batch) -> Tensor:
-        """See `rgbt.evaluation.temporal_consistency.PairPredictor`."""
+        """See `rgbt.evaluation.pair_scenes.PairPredictor`."""
         return self._read(batch.name, batch)
 
-    def second(self, batch: Batch, number: int) -> Tensor:
-        """See `rgbt.evaluation.temporal_consistency.PairPredictor`."""
-        return self._read([second_name(name, self._frames, number) for name in batch.name], batch)
+    def second(self, batch: Batch, number: int) -> Tensor:  # noqa: ARG002 - frames of one video
+        """See `rgbt.evaluation.pair_scenes.PairPredictor`."""
+        return self._read(batch.name, batch)
 
     def _read(self, names: Sequence[str], batch: Batch) -> Tensor:
         wanted, maps = tuple(batch.label.shape[1:]), []
@@ -156,21 +148,63 @@ class FolderPairs:
         return self._folder / f"{name}.png"
 
 
-def _check_files(folder: Path, names: Sequence[str]) -> None:
-    """Refuse a folder without a prediction of every image, or with PNG files of other images."""
+class FolderPairs(FolderFrames):
+    """Both frames of exported pairs predicted by any method.
+
+    Args:
+        folder: holds NAME.png and NAME_view1.png, ..., or NAME_next.png.
+        source: data set and views, which must be those of the export.
+        listed: the list of the export.
+        wanted: split and frames that are counted.
+        form: see `FolderFrames`.
+
+    Raises:
+        InputError: the export is of other images or incomplete, or files are missing, foreign or
+            of several kinds.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        source: PairSource,
+        listed: PairList,
+        wanted: PairList,
+        form: Format = "auto",
+    ) -> None:
+        check_same(listed, wanted)
+        self._frames = wanted.frames
+        _check_foreign(folder, wanted.images)
+        super().__init__(folder, source, wanted.images, form)
+
+    def second(self, batch: Batch, number: int) -> Tensor:
+        """See `rgbt.evaluation.pair_scenes.PairPredictor`."""
+        return self._read([second_name(name, self._frames, number) for name in batch.name], batch)
+
+
+def _names_in(folder: Path) -> set[str]:
+    return {path.relative_to(folder).with_suffix("").as_posix() for path in folder.rglob("*.png")}
+
+
+def _check_there(folder: Path, names: Sequence[str]) -> None:
+    """Refuse a folder without a prediction of every image."""
     if not folder.is_dir():
         raise InputError(
             f"predictions={folder}: there is no such folder; give the one with the predictions."
         )
-    there = {path.relative_to(folder).with_suffix("").as_posix() for path in folder.rglob("*.png")}
+    there = _names_in(folder)
     missing = [name for name in names if name not in there]
     if missing:
         raise InputError(
             f"{folder} lacks the predictions of {len(missing)} of {len(names)} images "
-            f"({_listed(missing)}); predict every image in the folder rgb of the export."
+            f"({_listed(missing)}); predict every image."
         )
+
+
+def _check_foreign(folder: Path, names: Sequence[str]) -> None:
+    """Refuse a folder with PNG files of other images than those of the export."""
+    _check_there(folder, names)
     own = {*names, *(f"{name}{OVERLAY}" for name in names)}
-    foreign = sorted(there - own)
+    foreign = sorted(_names_in(folder) - own)
     if foreign:
         raise InputError(
             f"{folder} holds {len(foreign)} PNG files of no exported image ({_listed(foreign)}); "

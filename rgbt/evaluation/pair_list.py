@@ -12,7 +12,8 @@ from rgbt.config.component import build
 from rgbt.config.compose import SEARCH_PATH, compose
 from rgbt.data.loader_settings import LoaderSettings
 from rgbt.dataset import LabelledDataset
-from rgbt.evaluation.pair_frames import PROTOCOLS, check_frames, frames_mark
+from rgbt.evaluation.pair_frames import check_frames
+from rgbt.evaluation.pairing import Pairing
 from rgbt.metrics.metric import Regions
 from rgbt.metrics.pair_list import Frames, ListedPair, PairList, second_name
 from rgbt.transforms.view_sets import ViewSets
@@ -71,6 +72,7 @@ def list_pairs(source: PairSource, split: str, frames: Frames) -> PairList:
             another one.
     """
     check_frames(source, frames)
+    pairing = Pairing(frames)
     names = tuple(dict.fromkeys(source.dataset.names(split)))
     pairs = tuple(_pairs(source, names, split, frames))
     taken = set(names)
@@ -87,7 +89,7 @@ def list_pairs(source: PairSource, split: str, frames: Frames) -> PairList:
         name=source.dataset.name,
         split=split,
         frames=frames,
-        views=frames_mark(source, PROTOCOLS[frames][0]) or "published",
+        views=pairing.mark(source, pairing.protocols[0]) or "published",
         sets=tuple(source.consistency.sets) if frames == "virtual" else (),
         pairs=pairs,
     )

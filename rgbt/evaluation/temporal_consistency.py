@@ -1,13 +1,12 @@
 """Predict two frames of every scene and count them together, for TC and CA.
 
-The second frame is a virtual view of the first (frames=virtual), or a true one (frames=next).
+See `rgbt.evaluation.pair_scenes` for the second frames.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -16,85 +15,46 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.build.session import Session
-from rgbt.data.next_frames import NextFrames
 from rgbt.engine.progress import progress
-from rgbt.evaluation.pair_frames import (
-    PROTOCOLS,
-    check_frames,
-    frames_mark,
-    next_frames,
-    virtual_frames,
+from rgbt.evaluation.flow_record import FlowRecord
+from rgbt.evaluation.pair_frames import check_frames
+from rgbt.evaluation.pair_scenes import (
+    Compared,
+    PairPredictor,
+    Scenes,
+    next_scenes,
+    video_scenes,
+    virtual_scenes,
 )
+from rgbt.evaluation.pairing import Pairing
 from rgbt.evaluation.prediction import EvaluationData, Predictor, counts_of, decode_ahead
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Absent
-from rgbt.metrics.named import OF_PAIRS
+from rgbt.metrics.named import CHANGES, SCORES_OF, pair_scores, value
 from rgbt.metrics.names import CA, TC, consistency
-from rgbt.metrics.pair_list import Frames
-from rgbt.metrics.pairs import HEADLINES, pair_counts, partition_name
+from rgbt.metrics.pairs import HEADLINES, pair_counts
 from rgbt.metrics.pairs import Protocol as PairProtocol
 from rgbt.metrics.scores import class_mean
 from rgbt.tracking.pair_pictures import PairExample
-from rgbt.tracking.tables import ConsistencyTable
-from rgbt.types import IGNORE, Batch
-
-
-class Compared(NamedTuple):
-    """Class maps (B, H', W') of scenes as one protocol compares them, and labels of the second.
-
-    Attributes:
-        valid: pixels that count; None: all.
-    """
-
-    first: Tensor
-    second: Tensor
-    label: Tensor
-    valid: Tensor | None
-
+from rgbt.tracking.tables import ConsistencyTable, TextTable
+from rgbt.types import Batch
 
 CountsBySet = dict[int, NDArray[np.int64]]
 """Number of the set of views -> (K + 1, K, K) of one scene."""
 
 
-class Scenes(NamedTuple):
-    """A batch of scenes with both predictions.
-
-    Attributes:
-        names: of the B scenes.
-        compared: class maps (B, H', W') by protocol.
-        images: (B, 3, H, W) float in [0, 1], RGB of both frames.
-        first: (B, H', W') prediction of the first frame, in its own pixels.
-        number: of the set of views, from 0.
-    """
-
-    names: tuple[str, ...]
-    compared: dict[PairProtocol, Compared]
-    images: tuple[Tensor, Tensor]
-    first: Tensor
-    number: int = 0
-
-
 @dataclass(frozen=True)
 class Pairs:
-    """Counts of pairs by protocol (`rgbt.metrics.pairs`), and scenes for pictures."""
+    """Counts of pairs by protocol (`rgbt.metrics.pairs`), and scenes for pictures.
+
+    Attributes:
+        records: how reliable the flow of each pair is, where it is estimated.
+    """
 
     counts: dict[PairProtocol, Counts]
     kept: tuple[PairExample, ...]
-
-
-class PairPredictor(Protocol):
-    """Class maps (B, H', W') uint8 of both frames, at the size of their labels."""
-
-    @property
-    def device(self) -> torch.device:
-        """Where batches are expected."""
-
-    def first(self, batch: Batch) -> Tensor:
-        """Of first frames."""
-
-    def second(self, batch: Batch, number: int) -> Tensor:
-        """Of second frames; `number` of the set of views, from 0."""
+    records: tuple[FlowRecord, ...] = ()
 
 
 class NetworkPairs:
@@ -114,31 +74,32 @@ class NetworkPairs:
 
 
 def count_pairs(
-    session: Session, model: nn.Module, request: EvaluationRequest, frames: Frames
+    session: Session, model: nn.Module, request: EvaluationRequest, pairing: Pairing
 ) -> Pairs:
     """Predict both frames of every scene of a split and count, with a progress bar.
 
     Source: Temporal, Fig. 4 (aligned: the first prediction is warped to the second frame) and its
-    release (released: it is not warped). On real second frames points follow their exact flow.
+    release (released: it is not warped). On real second frames points follow their exact flow, and
+    in videos an estimated one.
 
     Args:
         session: its `consistency` says which virtual views.
         model: left in evaluation mode.
         request: split, view, head, and the scenes to return for pictures.
-        frames: what the second frames are.
+        pairing: what the second frames are.
 
     Raises:
         InputError: no sets of views, no second frames, or no image that can be read.
     """
     assert request.corruption is None, "pairs are counted of clean images"
     # Requests that cannot be measured are refused before anything is drawn or predicted.
-    check_frames(session, frames)
+    check_frames(session, pairing.frames)
     decode_ahead(session, request.split)
-    return count_predicted(session, NetworkPairs(session, model, request), request, frames)
+    return count_predicted(session, NetworkPairs(session, model, request), request, pairing)
 
 
 def count_predicted(
-    data: EvaluationData, predictor: PairPredictor, request: EvaluationRequest, frames: Frames
+    data: EvaluationData, predictor: PairPredictor, request: EvaluationRequest, pairing: Pairing
 ) -> Pairs:
     """Count the predictions of both frames of every scene, with a progress bar.
 
@@ -146,34 +107,62 @@ def count_predicted(
         data: images, labels and views.
         predictor: class maps of both frames.
         request: split, and the scenes to return for pictures.
-        frames: what the second frames are.
+        pairing: what the second frames are.
 
     Raises:
-        InputError: an image or a prediction cannot be read.
+        InputError: an image or a prediction cannot be read, or no pair of a video can be used.
     """
-    split = request.split
-    found: dict[PairProtocol, dict[str, CountsBySet]] = {each: {} for each in PROTOCOLS[frames]}
+    split, protocols = request.split, pairing.protocols
+    found: dict[PairProtocol, dict[str, CountsBySet]] = {each: {} for each in protocols}
     kept: dict[str, PairExample] = {}
-    scenes_of = _virtual if frames == "virtual" else _next
+    records: list[FlowRecord] = []
     with progress() as display:
-        total = len(data.dataset.names(split))
-        task = display.add_task(f"{split} pairs", total=total, note="images")
-        for scenes in scenes_of(data, predictor, split):
+        task = display.add_task(f"{split} pairs", total=pairing.number(data, split), note="images")
+        for scenes in _scenes(data, predictor, split, pairing):
+            records += scenes.records
             for protocol, maps in scenes.compared.items():
                 _count(scenes, maps, len(data.dataset.classes), found[protocol])
-            wanted = [name for name in scenes.names if name in request.keep and name not in kept]
-            kept |= {name: _example(scenes, name, PROTOCOLS[frames][0]) for name in wanted}
-            display.update(task, completed=len(found[PROTOCOLS[frames][0]]))
-    counts = {}
-    for protocol, by_name in found.items():
-        joined = {
-            name: np.concatenate([by_set[number] for number in sorted(by_set)])
-            for name, by_set in by_name.items()
-        }
-        sets = max(map(len, by_name.values()), default=0)
-        partition = partition_name(protocol, sets, frames_mark(data, protocol))
-        counts[protocol] = counts_of(data, split, joined, partition)
-    return Pairs(counts, tuple(kept.values()))
+            if scenes.compared:
+                wanted = [name for name in scenes.names if name in request.keep]
+                kept |= {
+                    name: _example(scenes, name, pairing.drawn)
+                    for name in wanted
+                    if name not in kept
+                }
+            done = len(records) if pairing.frames == "video" else len(found[protocols[0]])
+            display.update(task, completed=done)
+    pairing.check_used(records)
+    counts = {
+        protocol: _joined(data, split, by_name, pairing.partition(data, protocol))
+        for protocol, by_name in found.items()
+        if by_name or protocol != "triples"
+    }
+    return Pairs(counts, tuple(kept.values()), tuple(records))
+
+
+def _scenes(
+    data: EvaluationData, predictor: PairPredictor, split: str, pairing: Pairing
+) -> Iterator[Scenes]:
+    if pairing.frames == "virtual":
+        return virtual_scenes(data, predictor, split)
+    if pairing.frames == "next":
+        return next_scenes(data, predictor, split, pairing.flow)
+    assert pairing.flow is not None, "videos have an estimated flow"
+    return video_scenes(data, predictor, split, pairing.flow, pairing.least_used)
+
+
+def _joined(
+    data: EvaluationData,
+    split: str,
+    by_name: Mapping[str, CountsBySet],
+    partition: Callable[[int], str],
+) -> Counts:
+    """The counts of all sets of views, one after the other."""
+    joined = {
+        name: np.concatenate([by_set[number] for number in sorted(by_set)])
+        for name, by_set in by_name.items()
+    }
+    return counts_of(data, split, joined, partition(max(map(len, by_name.values()), default=0)))
 
 
 def _count(scenes: Scenes, maps: Compared, num_classes: int, found: dict[str, CountsBySet]) -> None:
@@ -184,40 +173,6 @@ def _count(scenes: Scenes, maps: Compared, num_classes: int, found: dict[str, Co
         seen = None if valid is None else valid[index]
         counts = pair_counts(first[index], second[index], label[index], num_classes, seen)
         found.setdefault(name, {})[scenes.number] = counts
-
-
-def _virtual(data: EvaluationData, predictor: PairPredictor, split: str) -> Iterator[Scenes]:
-    first = torch.empty(0)
-    for frames in virtual_frames(data, split, predictor.device):
-        if frames.number == 0:
-            first = predictor.first(frames.batch)
-        second = predictor.second(frames.second, frames.number)
-        label = frames.second.label
-        at_label = frames.warp.resized((first.shape[1], first.shape[2]))
-        valid = at_label.inside() & (label != IGNORE)
-        compared: dict[PairProtocol, Compared] = {
-            "aligned": Compared(at_label.nearest(first, 0), second, label, valid),
-            # As released: the first prediction stays where it is, and every pixel counts.
-            "released": Compared(first, second, label, None),
-        }
-        images = (frames.batch.rgb, frames.second.rgb)
-        yield Scenes(frames.batch.name, compared, images, first, frames.number)
-
-
-def _next(data: EvaluationData, predictor: PairPredictor, split: str) -> Iterator[Scenes]:
-    after = NextFrames(data.dataset)
-    for batch, later in next_frames(data, after, split, predictor.device):
-        first, second = predictor.first(batch).cpu(), predictor.second(later, 0).cpu()
-        # The first prediction at the pixels of the second frame, and where it was seen.
-        height, width = first.shape[1:]
-        sources = [np.stack(after.source(name, (height, width))) for name in batch.name]
-        rows, columns = torch.from_numpy(np.stack(sources, 1))
-        seen = rows >= 0
-        flat = (rows * width + columns).clamp(min=0).flatten(1)
-        followed = first.flatten(1).gather(1, flat).view_as(first)
-        label = later.label.cpu()
-        maps = Compared(followed, second, label, seen & (label != IGNORE))
-        yield Scenes(batch.name, {"next": maps}, (batch.rgb, later.rgb), first)
 
 
 def _example(scenes: Scenes, name: str, protocol: PairProtocol) -> PairExample:
@@ -236,6 +191,7 @@ def _example(scenes: Scenes, name: str, protocol: PairProtocol) -> PairExample:
         second=maps.second[number].cpu().numpy(),
         followed=maps.first[number].cpu().numpy(),
         seen=maps.valid[number].cpu().numpy(),
+        flow=scenes.flows[number].flow if scenes.flows else None,
     )
 
 
@@ -248,8 +204,12 @@ def consistency_table(found: Mapping[PairProtocol, Counts], absent: Absent) -> C
     """TC and CA of every class and protocol; means over the scored classes."""
     like = next(iter(found.values()))
     scores = {
-        protocol: [OF_PAIRS[name](counts.by_region(), absent) for name in HEADLINES[protocol]]
+        protocol: [
+            pair_scores(name, counts.by_region(), counts.partition, absent)
+            for name in HEADLINES[protocol][:2]
+        ]
         for protocol, counts in found.items()
+        if TC in HEADLINES[protocol]
     }
     return ConsistencyTable(
         names=like.classes,
@@ -268,3 +228,18 @@ def consistency_values(table: ConsistencyTable) -> dict[str, float]:
         for protocol in table.tc
         for score, means in ((TC, table.mean_tc), (CA, table.mean_ca))
     }
+
+
+def changes_grid(found: Mapping[PairProtocol, Counts]) -> TextTable:
+    """Warping error and flicker of every protocol that has them; percent of the pixels."""
+    scores = (
+        (score, protocol, counts)
+        for protocol, counts in found.items()
+        for score in CHANGES
+        if score in SCORES_OF[protocol]
+    )
+    rows = tuple(
+        (f"{score.replace('_', ' ')}, {protocol}", f"{value(score, counts, counts.absent):.2f}")
+        for score, protocol, counts in scores
+    )
+    return TextTable("Changes of the prediction along the motion", ("", "% of pixels"), rows)

@@ -3,6 +3,7 @@
 ``[day/ or night/]`` and then one of ``mIoU Var mAcc mPrecision mF1 pixel_accuracy``, ``region/<n>``
 (mIoU of region n), ``class/<name>`` (IoU), ``class/<name>/acc``, ``class/<name>/region/<n>``; of
 counts of pairs of frames (`rgbt.metrics.pairs`) ``TC CA CA_released`` and ``class/<name>/TC`` etc.;
+``warping_error`` and ``class/<name>/warping_error``, of three frames ``flicker``;
 of details (`rgbt.metrics.details`) ``boundary_mIoU ECE distance/<bin> size/<bin>``, each also after
 ``region/<n>/`` and ``class/<name>/`` (there ``boundary_IoU``), as in
 ``class/car/region/1/size/64-256``.
@@ -34,9 +35,24 @@ OF_PAIRS: dict[str, Callable[[Matrices, Absent], Scores]] = {
 }
 """Scores by class of (..., S (K + 1), K, K) counts of pairs of frames as fractions (..., K)."""
 
+CHANGES: dict[str, Callable[[Matrices], tuple[Scores, Scores]]] = {
+    names.WARPING_ERROR: pairs.changed,
+    names.FLICKER: pairs.flickered,
+}
+"""Pixels that change and all pixels (..., K), by the class of the first frame."""
+
+SCORES_OF: dict[pairs.Protocol, tuple[str, ...]] = {
+    "aligned": (*OF_PAIRS, names.WARPING_ERROR),
+    "released": tuple(OF_PAIRS),
+    "next": (*OF_PAIRS, names.WARPING_ERROR),
+    "flow": (*OF_PAIRS, names.WARPING_ERROR),
+    "triples": (names.FLICKER,),
+}
+"""Protocol of pairs of frames -> the scores of its counts."""
+
 FORMS = (
     *("region/<n>", "class/<name>", "class/<name>/acc", "class/<name>/region/<n>"),
-    *(names.of_class("<name>", score) for score in OF_PAIRS),
+    *(names.of_class("<name>", score) for score in (*OF_PAIRS, *CHANGES)),
     *(names.BOUNDARY_MIOU, names.ECE, f"class/<name>/{names.BOUNDARY_IOU}"),
     *(names.in_bin(kind, "<low>-<high>") for kind in (names.DISTANCE, names.SIZE)),
 )
@@ -48,7 +64,8 @@ class ParsedMetric:
 
     Attributes:
         part: "day", "night", or None for all images.
-        score: a mean over classes, "Var", "IoU", "acc", one of `OF_PAIRS`, or the kind of details.
+        score: a mean over classes, "Var", "IoU", "acc", one of `OF_PAIRS` or `CHANGES`, or the
+            kind of details.
         class_name: of one class alone, or None.
         region: number from 1, or None for the whole image.
         details: kind of details that have the score; None: other counts.
@@ -77,7 +94,7 @@ def parse(metric: str) -> ParsedMetric:
         kind = detail.kind
         return ParsedMetric(metric, part, kind, detail.class_name, detail.region, kind, detail.bin)
     match words:
-        case [score] if score in MEANS or score in OF_PAIRS or score == names.VAR:
+        case [score] if score in {*MEANS, *OF_PAIRS, *CHANGES, names.VAR}:
             return ParsedMetric(metric, part, score)
         case ["region", number] if _is_number(number):
             return ParsedMetric(metric, part, names.MIOU, region=int(number))
@@ -85,11 +102,11 @@ def parse(metric: str) -> ParsedMetric:
             return ParsedMetric(metric, part, "IoU", name)
         case ["class", name, "acc"] if name:
             return ParsedMetric(metric, part, "acc", name)
-        case ["class", name, score] if name and score in OF_PAIRS:
+        case ["class", name, score] if name and score in {*OF_PAIRS, *CHANGES}:
             return ParsedMetric(metric, part, score, name)
         case ["class", name, "region", number] if name and _is_number(number):
             return ParsedMetric(metric, part, "IoU", name, int(number))
-    known = nearest("/".join(words), [*MEANS, names.VAR, *OF_PAIRS, *FORMS])
+    known = nearest("/".join(words), [*MEANS, names.VAR, *OF_PAIRS, *CHANGES, *FORMS])
     raise InputError(
         f"'{metric}' is not a metric; {known}; each may have the prefix day/ or night/."
     )
@@ -130,8 +147,10 @@ def values(
     details = details_of(like.partition)
     if details is not None:
         return _of_details(parsed, details, by_region, like, absent)
+    if parsed.score in CHANGES:
+        return 100.0 * _share(parsed, *CHANGES[parsed.score](by_region), like.classes)
     if parsed.score in OF_PAIRS:
-        by_class = 100.0 * OF_PAIRS[parsed.score](by_region, absent)
+        by_class = 100.0 * pair_scores(parsed.score, by_region, like.partition, absent)
         if parsed.class_name is None:
             return class_mean(by_class, like.scored)
         return _of_class(parsed, by_class, like.classes)
@@ -145,6 +164,29 @@ def values(
         return 100.0 * MEANS[parsed.score](matrices, absent, like.scored)
     score = recall if parsed.score == "acc" else iou
     return _of_class(parsed, 100.0 * score(matrices, absent), like.classes)
+
+
+def pair_scores(score: str, by_region: Matrices, partition: str, absent: Absent) -> Scores:
+    """A score of `OF_PAIRS` by class, fractions (..., K).
+
+    CA along an estimated flow is over labelled pixels; NaN without any.
+    """
+    if pairs.protocol_of(partition) == "flow" and score != names.TC:
+        known = pairs.only_labelled(by_region)
+        without = np.isnan(known).any((-3, -2, -1), keepdims=True)[..., 0, 0]
+        return np.where(without, np.nan, OF_PAIRS[score](np.nan_to_num(known), absent))
+    return OF_PAIRS[score](by_region, absent)
+
+
+def _share(
+    parsed: ParsedMetric, part: Scores, every: Scores, classes: tuple[str, ...]
+) -> NDArray[np.float64]:
+    """Share (...) of pixels (..., K), of all classes or of one; NaN without pixels."""
+    if parsed.class_name is None:
+        part, every = part.sum(-1), every.sum(-1)
+    else:
+        part, every = (_of_class(parsed, each, classes) for each in (part, every))
+    return np.divide(part, every, out=np.full_like(every, np.nan), where=every > 0)
 
 
 def check_kind(parsed: ParsedMetric, partition: str) -> None:
@@ -173,14 +215,20 @@ def check_kind(parsed: ParsedMetric, partition: str) -> None:
                 "of these, or count again with other edges (rgbt evaluate)."
             )
         return
-    of_pairs = pairs.protocol_of(partition) is not None
-    if of_pairs and parsed.score not in OF_PAIRS:
+    protocol = pairs.protocol_of(partition)
+    is_of_pairs = parsed.score in OF_PAIRS or parsed.score in CHANGES
+    if protocol and is_of_pairs and parsed.score not in SCORES_OF[protocol]:
+        raise InputError(
+            f"'{parsed.metric}' is no score of counts by {partition}; use "
+            f"{', '.join(SCORES_OF[protocol])}."
+        )
+    if protocol and not is_of_pairs:
         raise InputError(
             f"'{parsed.metric}' is a score of single frames, but these counts ({partition}, of "
-            f"rgbt consistency run=...) are of pairs of frames. Use {', '.join(OF_PAIRS)}, or "
-            "name counts of single frames."
+            "rgbt consistency run=...) are of pairs of frames. Use "
+            f"{', '.join(SCORES_OF[protocol])}, or name counts of single frames."
         )
-    if not of_pairs and parsed.score in OF_PAIRS:
+    if not protocol and is_of_pairs:
         raise InputError(
             f"'{parsed.metric}' is a score of pairs of frames, but these counts ({partition}) are "
             "of single frames. Count pairs with rgbt consistency run=..."

@@ -29,6 +29,12 @@ CA = "CA"
 CA_RELEASED = "CA_released"
 """The same over the union that the Temporal release computes."""
 
+WARPING_ERROR = "warping_error"
+"""Share of the pixels seen in both frames whose predicted class changes; 0 is best."""
+
+FLICKER = "flicker"
+"""Share of the pixels seen in three frames whose class changes and changes back; 0 is best."""
+
 BOUNDARY_MIOU = "boundary_mIoU"
 """Mean over classes of the boundary IoU (`rgbt.metrics.boundary`)."""
 
@@ -95,6 +101,7 @@ def by_head(head: str, name: str) -> str:
 
 
 FRACTIONS = {MIOU, MACC, MPRECISION, MF1, PIXEL_ACCURACY, BOUNDARY_MIOU, BOUNDARY_IOU, ECE}
+FRACTIONS |= {WARPING_ERROR, FLICKER}
 
 
 def in_percent(name: str, value: float) -> float:

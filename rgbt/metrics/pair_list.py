@@ -14,8 +14,9 @@ from rgbt.files.budgets import read_json
 PAIR_LIST = "pairs.json"
 """File that lists exported pairs of frames; see `rgbt.evaluation.pair_images`."""
 
-Frames = Literal["virtual", "next"]
-"""Second frames: virtual views of the first ones, or true ones that were taken after them."""
+Frames = Literal["virtual", "next", "video"]
+"""Second frames: virtual views of the first ones, true ones that were taken after them and are
+stored beside them, or the next images of the same video."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ class PairList:
         name: of the data set.
         split: of the data set.
         frames: what the second frames are.
-        views: mark of the second frames (`rgbt.evaluation.pair_frames.frames_mark`); "published":
+        views: mark of the second frames (`rgbt.evaluation.pairing.Pairing`); "published":
             the published sets of virtual views.
         sets: names of the sets of views.
         pairs: in the order of the split.

@@ -9,6 +9,10 @@ partition, e.g. "aligned3", is the protocol and S:
                 frame shows and that have a label (Temporal, Fig. 4).
     "released": the first prediction stays where it is, every pixel counts (Temporal release).
     "next":     as "aligned", between a frame and the one that was taken after it.
+    "flow":     as "next", along an estimated flow; pixels count whose flow is reliable. Labels may
+                be missing: TC is over all these pixels, CA over the labelled ones.
+    "triples":  three frames A, B, C along two estimated flows: y is the class of A, p1 that of B
+                and p2 that of C, at the pixels of C that are reliable in both.
 """
 
 from __future__ import annotations
@@ -26,15 +30,17 @@ from rgbt.metrics.scores import Matrices, Scores, iou, known_mean, ratio
 if TYPE_CHECKING:
     from torch import Tensor
 
-Protocol = Literal["aligned", "released", "next"]
+Protocol = Literal["aligned", "released", "next", "flow", "triples"]
 PROTOCOLS: tuple[Protocol, ...] = get_args(Protocol)
 
-HEADLINES: dict[Protocol, tuple[str, str]] = {
+HEADLINES: dict[Protocol, tuple[str, ...]] = {
     "aligned": (names.TC, names.CA),
     "released": (names.TC, names.CA_RELEASED),
     "next": (names.TC, names.CA),
+    "flow": (names.TC, names.CA, names.WARPING_ERROR),
+    "triples": (names.FLICKER,),
 }
-"""The two main scores of a protocol: that of the paper, and that of its release."""
+"""The main scores of a protocol, TC and CA first: CA of the paper, or that of its release."""
 
 Map: TypeAlias = "NDArray[np.integer] | Tensor"
 
@@ -156,6 +162,41 @@ def ca_released(pairs: Matrices, absent: Absent) -> Scores:
     """
     three, sizes, _ = _triples(pairs)
     return _over_sets(ratio(three, sizes - 2 * three, absent))
+
+
+def only_labelled(pairs: Matrices) -> Scores:
+    """The counts without pixels that have no label; NaN where no pixel has one.
+
+    Shapes as of `tc`, of arguments and result.
+    """
+    by_set = _by_set(pairs).copy()
+    by_set[..., -1, :, :] = 0
+    known = by_set.any((-4, -3, -2, -1), keepdims=True)
+    return np.where(known, by_set, np.nan).reshape(pairs.shape)
+
+
+def changed(pairs: Matrices) -> tuple[Scores, Scores]:
+    """Pixels by the class of the first frame: those with another class in the second, and all.
+
+    Their ratio is the warping error of Lai et al., "Learning Blind Video Temporal Consistency"
+    (ECCV 2018), with classes in place of colours: over pixels that are not occluded, the mean of
+    0 (same class) and 1 (another one).
+
+    Shapes: (..., S (K + 1), K, K) -> (..., K) twice, summed over the S sets.
+    """
+    frames = _by_set(pairs).sum((-4, -3))
+    every = frames.sum(-1)
+    return every - np.diagonal(frames, axis1=-2, axis2=-1), every
+
+
+def flickered(triples: Matrices) -> tuple[Scores, Scores]:
+    """Pixels by the class of frame A: those with it in A and C but not in B, and all.
+
+    Arguments and result as of `changed`, of counts by "triples".
+    """
+    rows = _by_set(triples).sum(-4)[..., :-1, :, :]
+    outer = np.einsum("...aba->...a", rows)
+    return outer - np.einsum("...aaa->...a", rows), rows.sum((-2, -1))
 
 
 def _triples(pairs: Matrices) -> tuple[Scores, Scores, Scores]:

@@ -8,11 +8,14 @@ from dataclasses import dataclass
 from rgbt.metrics import names
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.details import Details, details_of
+from rgbt.metrics.pairs import HEADLINES, protocol_of
 
 IMAGE = "image"
 """Column of the whole image."""
 
 MEAN = "mean"
+
+ALL_IMAGES = "all images"
 
 
 @dataclass(frozen=True)
@@ -36,8 +39,11 @@ class ScoreGrid:
 
 
 def score_grid(counts: Counts) -> ScoreGrid:
-    """The scores of counts of single frames; only their classes and partition are used."""
+    """The scores of counts; only their classes, partition and time of day are used."""
     details = details_of(counts.partition)
+    protocol = protocol_of(counts.partition)
+    if protocol is not None:
+        return _of_pairs(HEADLINES[protocol], counts)
     if details is None:
         regions = range(1, counts.counts.shape[1] + 1)
         row = (*map(names.region, regions), names.MIOU, names.VAR)
@@ -59,6 +65,20 @@ def score_grid(counts: Counts) -> ScoreGrid:
     title = f"Boundary IoU in percent, width {100 * details.setting[0]:g} % of the image diagonal"
     title += ", with the border of the image" if details.with_border else ""
     return ScoreGrid(title, columns, tuple(rows))
+
+
+def _of_pairs(scores: tuple[str, ...], counts: Counts) -> ScoreGrid:
+    """By class, and of all images, of those of the day and of the night."""
+    rows = [
+        (label, tuple(names.of_class(name, score) for score in scores))
+        for name, label in _labels(counts)
+    ]
+    rows.append((ALL_IMAGES, scores))
+    rows += [
+        (part, tuple(names.subset(part, score) for score in scores)) for part in counts.parts()
+    ]
+    columns = tuple(score.replace("_", " ") for score in scores)
+    return ScoreGrid("Consistency of pairs of frames in percent", columns, tuple(rows))
 
 
 def headlines(counts: Counts) -> tuple[str, ...]:

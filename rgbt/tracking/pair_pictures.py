@@ -34,6 +34,7 @@ class PairExample:
         second: (H, W) uint8, its predicted classes.
         followed: (H, W) uint8, the first prediction at the points that the second frame shows.
         seen: (H, W) bool, whether the first frame shows that point too.
+        flow: (H, W, 2) estimated motion from the second frame to the first; None: it is known.
     """
 
     name: str
@@ -43,6 +44,23 @@ class PairExample:
     second: Image
     followed: Image
     seen: NDArray[np.bool_]
+    flow: NDArray[np.float32] | None = None
+
+    def motion(self) -> tuple[Image, ...]:
+        """The flow as a picture: hue is its direction, strength its length; black is not used."""
+        if self.flow is None:
+            return ()
+        from matplotlib.colors import hsv_to_rgb
+
+        rows, columns = self.flow[..., 0].astype(float), self.flow[..., 1].astype(float)
+        length = np.hypot(rows, columns)
+        longest = np.percentile(length[self.seen], 95) if self.seen.any() else 1.0
+        hue = (np.arctan2(rows, columns) / (2 * np.pi)) % 1.0
+        strength = np.clip(length / max(float(longest), 1.0), 0, 1)
+        colour = hsv_to_rgb(np.stack([hue, strength, np.ones_like(hue)], -1))
+        picture = np.rint(255 * colour).astype(np.uint8)
+        picture[~self.seen] = 0
+        return (picture,)
 
     def difference(self) -> Image:
         """(H, W, 3) uint8: red where the two predictions differ, grey where nothing is compared."""
@@ -71,9 +89,11 @@ def draw_pairs(examples: Sequence[PairExample], legend: Legend, path: Path) -> N
                 example.second_rgb,
                 overlay(example.second_rgb, example.second, legend),
                 colours(np.where(example.seen, example.followed, IGNORE), legend.palette),
+                *example.motion(),
                 example.difference(),
             ),
         )
         for example in examples
     ]
-    draw_columns(rows, (*COLUMNS, "differ (grey: not seen)"), legend, path)
+    moving = ("motion (black: not used)",) if examples and examples[0].flow is not None else ()
+    draw_columns(rows, (*COLUMNS, *moving, "differ (grey: not seen)"), legend, path)

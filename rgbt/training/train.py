@@ -18,6 +18,7 @@ from rgbt.engine.checkpoint import State
 from rgbt.engine.committed import Checkpoints
 from rgbt.engine.gradient_shares import shares_sentence
 from rgbt.engine.trainer import WAIT_SHARE, Trainer
+from rgbt.evaluation.pairing import Pairing
 from rgbt.evaluation.prediction import decode_ahead
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.evaluation.segmentation import evaluate, legend_of, panel_names, result_tables
@@ -281,7 +282,7 @@ class Run:
             keep = panel_names(session.dataset, split) if kind == "test" else ()
             try:
                 request = EvaluationRequest(split=split, keep=keep)
-                pairs = count_pairs(session, session.model, request, "virtual")
+                pairs = count_pairs(session, session.model, request, Pairing("virtual"))
             except InputError as error:
                 # The training is done: an error of an extra evaluation must not lose it.
                 info(

@@ -64,7 +64,11 @@ def test_difference_in_tc_has_its_interval_over_images_and_seeds(
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 def test_auto_metrics_are_those_of_the_protocol(protocol):
     counts = replace(pairs_of(IMAGES, 0.5, night=NIGHT), partition=f"{protocol}3")
-    whole = ["TC", "CA_released" if protocol == "released" else "CA"]
+    whole = {
+        "released": ["TC", "CA_released"],
+        "flow": ["TC", "CA", "warping_error"],
+        "triples": ["flicker"],
+    }.get(protocol, ["TC", "CA"])
     parts = [f"{part}/{metric}" for part in ("day", "night") for metric in whole]
     assert metrics_of("auto", [counts], Resampling()) == [*whole, *parts]
 

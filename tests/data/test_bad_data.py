@@ -25,10 +25,11 @@ from rgbt.data.loaders import LoaderSettings, eval_batches, train_batches
 from rgbt.data.mfnet import MFNet
 from rgbt.data.pst900 import PST900
 from rgbt.data.report import check_dataset
+from rgbt.data.video.mvseg import MVSeg
 from rgbt.dataset import LabelledDataset
 from rgbt.transforms.crm import CrmTransform
 from tests.conftest import write_data
-from tests.data import folder_files, freiburg_files, kp_files, pst900_files
+from tests.data import folder_files, freiburg_files, kp_files, pst900_files, video_files
 
 ROOT = Path(__file__).resolve().parents[2]
 NAMES = {"train": ["00001D", "00002N"], "val": ["00003D"], "test": ["00004N"]}
@@ -36,11 +37,15 @@ MF_HW = (12, 16)
 
 
 class Kind(NamedTuple):
-    """A data set: its reader, what writes it, whether folders say which frames there are."""
+    """A data set: its reader, what writes it, whether folders say which frames there are.
+
+    And whether frames may lack their label.
+    """
 
     make: Callable[[Path], LabelledDataset]
     write: Callable[[Path], Path]
     is_listed: bool = False
+    is_sparse: bool = False
 
 
 KINDS = {
@@ -56,6 +61,10 @@ KINDS = {
         lambda root: KP(str(root)), lambda root: kp_files.write_lists(kp_files.write_kp(root))
     ),
     "folder": Kind(folder_files.folder, folder_files.write_folder, is_listed=True),
+    "mvseg": Kind(
+        lambda root: MVSeg(str(root)), video_files.write_mvseg, is_listed=True, is_sparse=True
+    ),
+    "video": Kind(video_files.video, video_files.write_videos, is_listed=True, is_sparse=True),
 }
 
 
@@ -135,8 +144,10 @@ def cases(kind: str, files: tuple[Path, ...]) -> Iterator[tuple[str, Path]]:
     for what in DAMAGES:
         for path in files:
             is_rgb, is_label = path == files[0], path == files[-1]
-            unseen = what == "missing" and is_rgb and KINDS[kind].is_listed
-            own_depth = what == "another depth" and is_label and kind == "folder"
+            unseen = what == "missing" and (
+                (is_rgb and KINDS[kind].is_listed) or (is_label and KINDS[kind].is_sparse)
+            )
+            own_depth = what == "another depth" and is_label and kind in ("folder", "video")
             if not unseen and not own_depth and (is_label or what != "an unknown value"):
                 yield what, path
 

@@ -17,10 +17,11 @@ from rgbt.data.kp import KP
 from rgbt.data.mfnet import MFNet
 from rgbt.data.named_files import hash_of_files
 from rgbt.data.pst900 import PST900
+from rgbt.data.video.mvseg import MVSeg
 from tests.data.test_bad_data import KINDS
 
 ROOT = Path(__file__).resolve().parents[2]
-READERS = {"mfnet": MFNet, "pst900": PST900, "kp": KP, "freiburg": Freiburg}
+READERS = {"mfnet": MFNet, "pst900": PST900, "kp": KP, "freiburg": Freiburg, "mvseg": MVSeg}
 
 
 def made(kind: str, root: Path) -> FileDataset:
@@ -79,7 +80,8 @@ def test_wrong_roots_and_numbers_are_refused(reader: type[FileDataset], tmp_path
         reader("/nowhere")
     with pytest.raises(InputError, match=r"dataset\.(root|num_classes)"):
         reader(str(tmp_path))
-    kind = {MFNet: "mfnet packed", PST900: "pst900", KP: "kp", Freiburg: "freiburg"}[reader]
+    kinds = {MFNet: "mfnet packed", PST900: "pst900", KP: "kp", Freiburg: "freiburg"}
+    kind = {**kinds, MVSeg: "mvseg"}[reader]
     root = str(KINDS[kind].write(tmp_path / "data"))
     with pytest.raises(InputError, match="num_classes is 3 but dataset.classes has"):
         reader(root, num_classes=3)

@@ -19,6 +19,7 @@ from rgbt.build.session import Session, open_session
 from rgbt.checks import InputError
 from rgbt.config.compose import compose
 from rgbt.data.next_frames import NextFrames
+from rgbt.evaluation.pairing import Pairing
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.evaluation.segmentation import evaluate
 from rgbt.evaluation.temporal_consistency import consistency_table, consistency_values, count_pairs
@@ -127,7 +128,7 @@ def test_virtual_counts_equal_a_plain_computation(data: Path) -> None:
     maps = [cv2.resize(each, HW[::-1], interpolation=cv2.INTER_NEAREST) for each in coarse]
     draw(data, maps)
     session = on_mfnet(data)
-    found = count_pairs(session, Decoder(), TEST, "virtual").counts
+    found = count_pairs(session, Decoder(), TEST, Pairing("virtual")).counts
     sets = session.consistency
     for protocol in ("aligned", "released"):
         counts = found[protocol].counts.reshape(3, 3, 10, 9, 9)
@@ -167,7 +168,7 @@ def test_perfect_consistency_scores_100_aligned_and_little_as_released(data: Pat
     scores = {}
     for view in ("paper", "released"):
         session = on_mfnet(data, f"view@consistency.view={view}")
-        found = count_pairs(session, Bands(), TEST, "virtual")
+        found = count_pairs(session, Bands(), TEST, Pairing("virtual"))
         scores[view] = consistency_table(found.counts, "exclude")
     shown = {"unlabeled": 0, "bump": 8}
     for index in shown.values():
@@ -185,7 +186,7 @@ def test_pixels_without_a_label_do_not_count_where_frames_are_aligned(data: Path
     draw(data, [stripes()] * 3)
     for name in SPLITS["test"]:
         write_png(data / "labels" / f"{name}.png", np.full(HW, 255, np.uint8))
-    found = count_pairs(on_mfnet(data), Bands(), TEST, "virtual").counts
+    found = count_pairs(on_mfnet(data), Bands(), TEST, Pairing("virtual")).counts
     assert not found["aligned"].counts.any()
     released = found["released"].counts.reshape(3, 3, 10, 9, 9)
     # What the release's border rule fills in is background, the rest has no label.
@@ -199,7 +200,7 @@ def test_pixels_without_a_label_do_not_count_where_frames_are_aligned(data: Path
 def test_images_may_be_evaluated_at_another_size_than_their_labels(data: Path) -> None:
     draw(data, [stripes()] * 3)
     session = on_mfnet(data, "scale.test_short_edge=96", "view@consistency.view=paper")
-    found = count_pairs(session, Bands(), TEST, "virtual").counts["aligned"]
+    found = count_pairs(session, Bands(), TEST, Pairing("virtual")).counts["aligned"]
     assert found.counts.sum() > 0.97 * 9 * 48 * 64
     by_class = tc(found.by_region(), "exclude")
     assert by_class[0] > 0.9
@@ -208,7 +209,9 @@ def test_images_may_be_evaluated_at_another_size_than_their_labels(data: Path) -
 
 def test_the_size_of_a_batch_does_not_change_the_counts(data: Path) -> None:
     one, two = (
-        count_pairs(on_mfnet(data, f"scale.eval_batch_size={size}"), Decoder(), TEST, "virtual")
+        count_pairs(
+            on_mfnet(data, f"scale.eval_batch_size={size}"), Decoder(), TEST, Pairing("virtual")
+        )
         for size in (1, 2)
     )
     for protocol in ("aligned", "released"):
@@ -216,11 +219,11 @@ def test_the_size_of_a_batch_does_not_change_the_counts(data: Path) -> None:
 
 
 def test_an_unreadable_image_is_left_out(data: Path) -> None:
-    whole = count_pairs(on_mfnet(data), Decoder(), TEST, "virtual").counts["aligned"]
+    whole = count_pairs(on_mfnet(data), Decoder(), TEST, Pairing("virtual")).counts["aligned"]
     path = data / "images" / f"{SPLITS['test'][0]}.png"
     path.write_bytes(path.read_bytes()[:100])
     session = on_mfnet(data, "data.on_error=skip")
-    found = count_pairs(session, Decoder(), TEST, "virtual").counts["aligned"]
+    found = count_pairs(session, Decoder(), TEST, Pairing("virtual")).counts["aligned"]
     assert found.names == tuple(SPLITS["test"][1:])
     # The others keep the angles of their own places in the list.
     assert np.array_equal(found.counts, whole.counts[1:])
@@ -231,7 +234,7 @@ def test_a_name_that_a_list_holds_twice_counts_once(data: Path, size: int) -> No
     first, *others = SPLITS["test"]
     (data / "test.txt").write_text("\n".join([first, *others, first]))
     session = on_mfnet(data, f"scale.eval_batch_size={size}")
-    for counts in count_pairs(session, Decoder(), TEST, "virtual").counts.values():
+    for counts in count_pairs(session, Decoder(), TEST, Pairing("virtual")).counts.values():
         assert counts.names == tuple(SPLITS["test"])
         by_set = counts.counts.reshape(3, 3, 10, 9, 9).sum((2, 3, 4))
         assert (by_set <= 48 * 64).all()
@@ -279,7 +282,7 @@ def test_each_protocol_has_the_accuracy_that_it_is_known_by() -> None:
 def test_counts_say_which_classes_the_data_set_leaves_out_of_means(data: Path) -> None:
     session = on_mfnet(data)
     session.dataset.unscored = ("bump", "unlabeled")
-    for counts in count_pairs(session, Decoder(), TEST, "virtual").counts.values():
+    for counts in count_pairs(session, Decoder(), TEST, Pairing("virtual")).counts.values():
         assert counts.unscored == ("bump", "unlabeled")
     assert evaluate(session, Decoder(), TEST).counts.unscored == ("bump", "unlabeled")
 
@@ -329,7 +332,7 @@ def test_an_oracle_scores_on_true_frames_what_its_labels_do(cache: Path) -> None
             agree[cls] += (one & two).sum()
             union[cls] += (one | two).sum()
             triple[cls] += (one & two).sum()
-    found = count_pairs(session, oracle, TEST, "next").counts["next"]
+    found = count_pairs(session, oracle, TEST, Pairing("next")).counts["next"]
     assert re.fullmatch("next1-[0-9a-f]{6}", found.partition)
     assert found.counts.shape == (3, 10, 9, 9)
     expected = np.where(union > 0, agree / np.maximum(union, 1), np.nan)
@@ -354,25 +357,27 @@ def test_pixels_of_true_frames_without_a_label_do_not_count(tmp_path: Path) -> N
         _, seen = followed(session, name, label)
         expected.append(int((seen & (label != 255)).sum()))
         assert (seen & (label == 255)).any()
-    found = count_pairs(session, Decoder(), TEST, "next").counts["next"]
+    found = count_pairs(session, Decoder(), TEST, Pairing("next")).counts["next"]
     assert not found.counts[:, 9].any()
     assert found.counts.sum((1, 2, 3)).tolist() == expected
 
 
 def test_true_frames_listed_twice_count_once(tmp_path: Path) -> None:
-    once = count_pairs(on_synth(tmp_path), Decoder(), TEST, "next").counts["next"]
+    once = count_pairs(on_synth(tmp_path), Decoder(), TEST, Pairing("next")).counts["next"]
     root = on_synth(tmp_path).dataset.root
     for place in (root, root / "next"):
         listed = (place / "test.txt").read_text().split()
         (place / "test.txt").write_text("\n".join([*listed, listed[0]]))
-    found = count_pairs(on_synth(tmp_path), Decoder(), TEST, "next").counts["next"]
+    found = count_pairs(on_synth(tmp_path), Decoder(), TEST, Pairing("next")).counts["next"]
     assert found.names == once.names
     assert np.array_equal(found.counts, once.counts)
 
 
 def test_second_frames_of_another_motion_are_another_partition(cache: Path) -> None:
     partitions = [
-        count_pairs(on_synth(cache, *more), Decoder(), TEST, "next").counts["next"].partition
+        count_pairs(on_synth(cache, *more), Decoder(), TEST, Pairing("next"))
+        .counts["next"]
+        .partition
         for more in ((), ("seed=1",), ("dataset.ego_forward_m=0.6",))
     ]
     assert partitions[0] == partitions[1] != partitions[2]
@@ -386,13 +391,13 @@ def test_perfect_consistency_on_true_frames_is_100_whatever_is_right(cache: Path
         brought, seen = followed(session, name, noise)
         oracle.learn(session.dataset.read(name).rgb, noise)
         oracle.learn(after.dataset.read(name).rgb, np.where(seen, brought, 0))
-    found = count_pairs(session, oracle, TEST, "next").counts["next"]
+    found = count_pairs(session, oracle, TEST, Pairing("next")).counts["next"]
     assert tc(found.by_region(), "exclude").tolist() == [1.0] * 9
     assert ca(found.by_region(), "exclude").max() < 0.9
     # Noise that does not move with the scene agrees by chance alone.
     for name in session.dataset.names("test"):
         oracle.learn(after.dataset.read(name).rgb, rng.integers(0, 9, HW))
-    found = count_pairs(session, oracle, TEST, "next").counts["next"]
+    found = count_pairs(session, oracle, TEST, Pairing("next")).counts["next"]
     assert tc(found.by_region(), "exclude").max() < 0.12
 
 
@@ -400,7 +405,7 @@ def test_pictures_show_what_was_followed(cache: Path) -> None:
     session = on_synth(cache)
     name = session.dataset.names("test")[1]
     kept = count_pairs(
-        session, Decoder(), EvaluationRequest(split="test", keep=[name]), "next"
+        session, Decoder(), EvaluationRequest(split="test", keep=[name]), Pairing("next")
     ).kept
     (example,) = kept
     assert example.name == name
@@ -453,4 +458,4 @@ def test_second_frames_that_do_not_fit_are_named(
     session = on_synth(tmp_path, "scale.eval_batch_size=1")
     sentence = spoil(session.dataset.root, session.dataset.names("test")[0])
     with pytest.raises(InputError, match=sentence):
-        count_pairs(session, Decoder(), TEST, "next")
+        count_pairs(session, Decoder(), TEST, Pairing("next"))

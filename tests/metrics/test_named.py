@@ -7,7 +7,7 @@ import pytest
 
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
-from rgbt.metrics.named import OF_PAIRS, images_of, parse, value, values
+from rgbt.metrics.named import CHANGES, OF_PAIRS, images_of, parse, value, values
 from tests.sweeps.tabled import DAY, counts_of
 
 
@@ -113,11 +113,12 @@ def test_unknown_metrics_are_refused(metric: str) -> None:
 @pytest.mark.parametrize(
     "metric",
     ["mIoU", "Var", "mAcc", "pixel_accuracy", "region/2", "class/car", "day/class/car/acc"]
-    + ["TC", "CA", "CA_released", "class/car/CA", "night/TC"],
+    + ["TC", "CA", "CA_released", "class/car/CA", "night/TC"]
+    + ["warping_error", "class/car/warping_error"],
 )
 def test_many_sums_at_once_are_each_alone(metric: str) -> None:
     requested = parse(metric)
-    counts = pairs_of() if requested.score in OF_PAIRS else counts_of()
+    counts = pairs_of() if requested.score in {*OF_PAIRS, *CHANGES} else counts_of()
     by_region = images_of(requested, counts).by_region()
     many = np.stack([by_region, 3 * by_region, by_region[..., ::-1]])[:, None]
     found = values(requested, many, counts, "released")
@@ -125,3 +126,31 @@ def test_many_sums_at_once_are_each_alone(metric: str) -> None:
     alone = [values(requested, each[0], counts, "released") for each in many]
     np.testing.assert_allclose(found[:, 0], alone)
     np.testing.assert_allclose(found[0], value(metric, counts, "released"))
+
+
+def test_scores_of_a_protocol_alone() -> None:
+    for protocol, metric, word in (
+        ("triples1", "TC", "'TC' is no score of counts by triples1; use flicker"),
+        ("flow1", "flicker", "use TC, CA, CA_released, warping_error"),
+        ("released1", "warping_error", "use TC, CA, CA_released"),
+    ):
+        with pytest.raises(InputError, match=word):
+            value(metric, replace(pairs_of(), partition=protocol), "released")
+
+
+def test_ca_along_an_estimated_flow_is_of_labelled_pixels() -> None:
+    """What has no label cannot be wrong, and counts for TC and the warping error alone."""
+    labelled = pairs_of()
+    counts = labelled.counts.copy()
+    counts[:, -1] += 7
+    more = replace(labelled, counts=counts, partition="flow1")
+    counts = labelled.counts.copy()
+    counts[:, -1] = 0
+    less = replace(labelled, counts=counts, partition="next1")
+    assert value("CA", more, "released") == value("CA", less, "released") > 0
+    assert value("TC", more, "released") < value("TC", less, "released")
+    none = counts.copy()
+    none[:, :-1] = 0
+    none[:, -1] = 1
+    for absent in ("released", "exclude"):
+        assert np.isnan(value("CA", replace(more, counts=none), absent))

@@ -13,7 +13,10 @@ from rgbt.metrics.pairs import (
     PROTOCOLS,
     ca,
     ca_released,
+    changed,
     file_name,
+    flickered,
+    only_labelled,
     pair_counts,
     partition_name,
     protocol_of,
@@ -262,9 +265,47 @@ def test_all_frames_are_equal_to_the_aligned_reference(golden: Any) -> None:
 def test_the_protocol_is_read_from_the_partition(protocol) -> None:
     assert protocol_of(partition_name(protocol, 3)) == protocol
     assert file_name(protocol, "val") == f"evaluations/consistency_{protocol}_val.npz"
-    assert HEADLINES[protocol][0] == "TC"
+    assert HEADLINES[protocol][0] == ("flicker" if protocol == "triples" else "TC")
 
 
 @pytest.mark.parametrize("partition", ["ring5", "ring9_released_3_4", "vertical3", "aligned", ""])
 def test_regions_are_no_protocol(partition: str) -> None:
     assert protocol_of(partition) is None
+
+
+# Changes along the motion.
+
+
+def test_warping_error_by_hand() -> None:
+    first = np.array([[0, 0, 1, 1], [2, 2, 2, 0]])
+    second = np.array([[0, 1, 1, 0], [2, 2, 1, 0]])
+    label = np.full((2, 4), 255)
+    valid = np.array([[1, 1, 1, 1], [1, 1, 1, 0]], bool)
+    counts = pair_counts(first, second, label, 3, valid)
+    part, every = changed(counts)
+    assert part.tolist() == [1, 1, 1]  # of the classes 0, 1 and 2 of the first frame
+    assert every.tolist() == [2, 2, 3]
+    part, every = changed(np.concatenate([counts, counts]))  # two sets of views
+    assert (part.sum(), every.sum()) == (6, 14)
+
+
+def test_flicker_by_hand() -> None:
+    frames = np.array(
+        [
+            [[0, 0, 1, 1, 2, 2]],  # A
+            [[1, 0, 1, 2, 0, 1]],  # B
+            [[0, 0, 1, 1, 1, 2]],  # C
+        ]
+    )
+    valid = np.array([[1, 1, 1, 1, 1, 0]], bool)
+    part, every = flickered(pair_counts(frames[1], frames[2], frames[0], 3, valid))
+    # Pixels 0 and 3 change and change back; pixel 4 changes twice; pixel 5 does not count.
+    assert part.tolist() == [1, 1, 0]
+    assert every.tolist() == [2, 2, 1]
+
+
+def test_only_labelled_pixels_are_known_by_their_row() -> None:
+    first = second = np.array([[0, 1, 1]])
+    labels = pair_counts(first, second, np.array([[0, 1, 255]]), 2)
+    assert only_labelled(labels).sum() == 2
+    assert np.isnan(only_labelled(pair_counts(first, second, np.full((1, 3), 255), 2))).all()

@@ -1,0 +1,1 @@
+"""Read videos of RGB-thermal frames, of which all, some or none are labelled."""

@@ -1,0 +1,131 @@
+"""Estimate where the points of a frame lie in the frame before it, without training.
+
+Flows are (H, W, 2) float32: for every pixel of one frame, how many (rows, columns) further the same
+point lies in the other. They are estimated in both directions. Pixels count whose two flows agree,
+because a point that is hidden in one of the frames has no partner there.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any, Literal, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rgbt.checks import InputError
+
+FlowSource = Literal["rgb", "thermal", "both"]
+"""Images that the flow is estimated from; "both": at each pixel, the one whose flows agree best."""
+
+SMALLEST = 16
+"""Least height and width of frames in pixels, that of two patches of the estimation."""
+
+RELATIVE, ABSOLUTE = 0.01, 0.5
+"""Limit of the squared disagreement of two flows: 0.01 (|w|^2 + |w'|^2) + 0.5 square pixels."""
+
+Gray = NDArray[np.uint8]
+Flow = NDArray[np.float32]
+
+
+class FrameFlow(NamedTuple):
+    """The estimated motion between two frames, for every pixel of the second one.
+
+    Attributes:
+        flow: (H, W, 2) float32, (rows, columns) from there to the position in the first frame.
+        used: (H, W) bool, whether the flows of both directions agree and the point is inside the
+            first frame.
+    """
+
+    flow: Flow
+    used: NDArray[np.bool_]
+
+    def source(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Rows and columns (H, W) of the nearest pixels of the first frame; -1 where not used."""
+        grid = np.moveaxis(np.indices(self.used.shape), 0, -1)
+        first_yx = np.rint(grid + self.flow).astype(np.int64)
+        limit = np.array(self.used.shape) - 1
+        first_yx = np.clip(first_yx, 0, limit)
+        first_yx[~self.used] = -1
+        return first_yx[..., 0], first_yx[..., 1]
+
+
+def gray_of(rgb: NDArray[np.uint8]) -> Gray:
+    """(H, W) grey levels of RGB (H, W, 3)."""
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2GRAY), np.uint8)
+
+
+def frame_flow(
+    first: dict[str, Gray], second: dict[str, Gray], source: FlowSource = "both"
+) -> FrameFlow:
+    """The motion between two frames.
+
+    Args:
+        first: grey levels (H, W) of the first frame by the name of the image, "rgb" and "thermal".
+        second: the same of the second frame, of equal size.
+        source: images that it is estimated from.
+
+    Raises:
+        InputError: sizes differ, or are below `SMALLEST`.
+    """
+    names = ("rgb", "thermal") if source == "both" else (source,)
+    found = [_one(first[name], second[name]) for name in names]
+    flow, error, used = found[0]
+    for other, other_error, other_used in found[1:]:
+        better = other_error < error
+        flow = np.where(better[..., None], other, flow)
+        used = np.where(better, other_used, used)
+    return FrameFlow(flow, used)
+
+
+def estimate(start: Gray, end: Gray) -> Flow:
+    """Flow from `start` (H, W) to `end` by dense inverse search.
+
+    Source: Kroeger et al., "Fast Optical Flow using Dense Inverse Search", ECCV 2016, in OpenCV
+    with its preset "medium".
+
+    Raises:
+        InputError: sizes differ, or are below `SMALLEST`.
+    """
+    if start.shape != end.shape or min(start.shape) < SMALLEST:
+        sizes = [" x ".join(map(str, each.shape)) for each in (start, end)]
+        raise InputError(
+            f"the flow between two frames needs one size of {SMALLEST} x {SMALLEST} pixels or "
+            f"more, got {sizes[0]} and {sizes[1]}."
+        )
+    columns_rows = _search().calc(start, end, None)
+    return np.ascontiguousarray(columns_rows[..., ::-1], dtype=np.float32)
+
+
+def disagreement(flow: Flow, back: Flow) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """How far `back` misses the start of `flow`, relative to the limit; and what is inside.
+
+        |w(x) + w'(x + w(x))|^2 / (0.01 (|w|^2 + |w'|^2) + 0.5)
+
+    Source: Sundaram, Brox and Keutzer, "Dense Point Trajectories by GPU-accelerated Large
+    Displacement Optical Flow", ECCV 2010, Eq. 5.
+
+    Returns:
+        (H, W), at most 1 where both agree; infinite where the point is outside, (H, W) bool.
+    """
+    height, width = flow.shape[:2]
+    rows, columns = np.indices((height, width), np.float32)
+    rows, columns = rows + flow[..., 0], columns + flow[..., 1]
+    inside = (rows >= -0.5) & (rows <= height - 0.5) & (columns >= -0.5) & (columns <= width - 0.5)
+    there = cv2.remap(back, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    missed = np.square(flow + there).sum(-1)
+    limit = RELATIVE * (np.square(flow).sum(-1) + np.square(there).sum(-1)) + ABSOLUTE
+    return np.where(inside, missed / limit, np.inf).astype(np.float32), inside
+
+
+def _one(first: Gray, second: Gray) -> tuple[Flow, NDArray[np.float32], NDArray[np.bool_]]:
+    flow = estimate(second, first)
+    error, _ = disagreement(flow, estimate(first, second))
+    return flow, error, error <= 1
+
+
+@cache
+def _search() -> Any:
+    # OpenCV's type stubs lack this function.
+    return vars(cv2)["DISOpticalFlow_create"](cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
