@@ -175,8 +175,8 @@ class Mask2Former(nn.Module):
             InputError: mask cells that do not divide the padded image.
         """
         views = views or VIEWS[:1]
-        if passes < 1 or len(rgb) % passes:
-            raise ValueError(f"{len(rgb)} images are not {passes} stacked passes of one batch.")
+        if passes < 1 or rgb.shape[0] % passes:
+            raise ValueError(f"{rgb.shape[0]} images are not {passes} stacked passes of one batch.")
         if len(set(views)) < len(views):
             raise ValueError(f"views must name each view at most once, got {views}.")
         for view in views:
@@ -194,7 +194,7 @@ class Mask2Former(nn.Module):
         image_hw = rgb.shape[2], rgb.shape[3]
         full_hw = padded_hw(image_hw)
         images = self.inputs(rgb, thermal, multiple=STRIDE)
-        hidden = None if masks is None else expand_cells(masks, len(rgb), full_hw, PATCH)
+        hidden = None if masks is None else expand_cells(masks, rgb.shape[0], full_hw, PATCH)
         features = self.backbone(
             images,
             hidden,
@@ -204,7 +204,7 @@ class Mask2Former(nn.Module):
             generator=generator,
         )
 
-        count = len(rgb) // passes
+        count = rgb.shape[0] // passes
         pyramid = self.sem_seg_head.get_submodule("pixel_decoder")(features, with_masks * count)
         classes, mask_logits = self.sem_seg_head.get_submodule("predictor")(pyramid)
         logits = None
