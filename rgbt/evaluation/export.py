@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from rgbt import __version__
+import rgbt
 from rgbt.build.load_run import TrainedNetwork
 from rgbt.build.session import Session
 from rgbt.checks import InputError
@@ -232,7 +232,7 @@ def _description(
     # Where runs are tracked may hold a password and does not change a prediction.
     settings = {key: value for key, value in session.spec.plain.items() if key != "tracking"}
     return Description(
-        version=__version__,
+        version=rgbt.__version__,
         network=type(session.model).__name__,
         run=opened.label if not opened.step else opened.folder.parent.name,
         step=opened.step,

@@ -13,10 +13,12 @@ from typing import Any, NoReturn
 import torch
 from torch import Tensor, nn
 
+import rgbt
 from rgbt.checks import InputError, one_line
 from rgbt.exported.description import Description, require_packages
+from rgbt.exported.graph import OPSET, ScoresOfImages, onnx_bytes, traced
 from rgbt.files.budgets import CONTENT, read_bytes
-from rgbt.requirements import Record
+from rgbt.requirements import Record, record_of
 from rgbt.types import Output, View
 
 INPUTS = {"rgb": 3, "thermal": 1}
@@ -101,6 +103,41 @@ class ExportedNetwork(nn.Module):
 
     def _refuse(self, reason: str) -> NoReturn:
         raise InputError(f"{self._path} {reason}.")
+
+
+def exported_network(
+    network: nn.Module, view: View, image_hw: tuple[int, int], name: str
+) -> ExportedNetwork:
+    """A network that is not of a run, in onnxruntime; nothing is written.
+
+    Args:
+        network: in evaluation mode, on the CPU.
+        view: input images of the prediction.
+        image_hw: height and width of the images.
+        name: for messages.
+
+    Raises:
+        InputError: it cannot be exported.
+    """
+    graph = ScoresOfImages(network, view=view, head=None)
+    program = traced(graph, image_hw)
+    num_classes = program.module()(*program.example_inputs[0]).shape[1]
+    made = Description(
+        version=rgbt.__version__,
+        network=type(network).__name__,
+        run="",
+        step=0,
+        dataset="",
+        fingerprint="",
+        classes=tuple(map(str, range(num_classes))),
+        view=view,
+        head=None,
+        outputs=record_of(network).outputs,
+        image_hw=image_hw,
+        opset=OPSET,
+        settings={},
+    )
+    return ExportedNetwork(onnx_bytes(program, made), Path(name))
 
 
 def _check_content(content: bytes, path: Path) -> None:
