@@ -101,7 +101,7 @@ def export(opened: TrainedNetwork, request: ExportRequest) -> tuple[Description,
     session = opened.session
     names = session.dataset.names(request.split)
     view = view_of(session, request.view)
-    head = _only_head(session, view, request, names)
+    head = only_head(session, view, request.head, names)
     images = list(_images(session, request))
     network = session.model.cpu().float().eval()
     graph = ScoresOfImages(network, view=view, head=head)
@@ -174,11 +174,21 @@ def _scores_of(network: ExportedNetwork) -> ScoresOf:
     return scores_of
 
 
-def _only_head(
-    session: Session, view: View, request: ExportRequest, names: tuple[str, ...]
+def only_head(
+    session: Session, view: View, head: TestedHead | None, names: tuple[str, ...]
 ) -> str | None:
-    """The head of all images; InputError where images of the split have different ones."""
-    heads = set(heads_of(session, view, request.head)(names))
+    """The name of the head that predicts the images `names`; None: the network has one for all.
+
+    Args:
+        session: its domains choose the head of an image.
+        view: input images of the network.
+        head: as in `ExportRequest`.
+        names: of images of the data set.
+
+    Raises:
+        InputError: images have different heads.
+    """
+    heads = set(heads_of(session, view, head)(names))
     if len(heads) > 1:
         raise InputError(
             "the network predicts an image with the head of its domain, but an exported graph has "

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import shutil
 import tempfile
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -74,14 +75,16 @@ def _write(scratch: Path, folder: Path, num_classes: int, identity: tuple[str, s
     for name in FILES:
         shutil.copyfile(folder / name, data / name)
     run_id, model_id = identity
-    mlflow.pyfunc.save_model(
-        str(scratch / "model"),
-        loader_module=LOADER,
-        data_path=str(data),
-        mlflow_model=Model(run_id=run_id, model_id=model_id),
-        signature=_signature(num_classes),
-        pip_requirements=[f"rgbt=={rgbt.__version__}", f"torch=={torch.__version__}"],
-    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # it advises an example of the input beside the signature
+        mlflow.pyfunc.save_model(
+            str(scratch / "model"),
+            loader_module=LOADER,
+            data_path=str(data),
+            mlflow_model=Model(run_id=run_id, model_id=model_id),
+            signature=_signature(num_classes),
+            pip_requirements=[f"rgbt=={rgbt.__version__}", f"torch=={torch.__version__}"],
+        )
     return scratch / "model"
 
 

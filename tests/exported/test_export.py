@@ -7,6 +7,8 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import onnx
@@ -15,7 +17,9 @@ import torch
 from torch import Tensor
 
 from rgbt import evaluate, export, predict
-from rgbt.evaluation.export import Comparison, compare
+from rgbt.config.component import build
+from rgbt.config.compose import compose
+from rgbt.evaluation.export import Comparison, compare, only_head
 from rgbt.exported.onnx_network import ExportedNetwork
 from rgbt.metrics.counts import Counts
 from tests.commands import Call, Trained, assert_one_sentence, code_of, short
@@ -115,6 +119,34 @@ def test_a_run_or_a_view_beside_the_file_is_refused(
     assert code == 2
     assert_one_sentence(err, "modality: 'rgb' is not a valid choice")
     assert not (tmp_path / "out").exists() or not list((tmp_path / "out").iterdir())
+
+
+def test_another_view_or_head_than_that_of_the_graph_is_refused(
+    changed: Callable[[Change], Path],
+) -> None:
+    def of_the_night(proto: onnx.ModelProto) -> None:
+        metadata(proto, "head").value = '"night"'
+
+    network = ExportedNetwork.read(changed(of_the_night))
+    images = torch.rand(1, 3, 48, 64), torch.rand(1, 1, 48, 64)
+    assert network.record.heads == ("night",)
+    assert network(*images, views=("rgbt",), head="night").logits.shape == (1, 9, 48, 64)
+    with pytest.raises(ValueError, match="has the head 'night', but 'day' is requested"):
+        network(*images, head="day")
+    with pytest.raises(ValueError, match="predicts from rgbt alone"):
+        network(*images, views=("rgb",))
+
+
+def test_a_head_for_day_and_one_for_night_must_be_chosen() -> None:
+    domains = build(compose(["domains=day_to_night"]).domains)
+    dataset = SimpleNamespace(nights=lambda names: tuple("N" in name for name in names))
+    session: Any = SimpleNamespace(domains=domains, dataset=dataset)
+    source, target = domains.heads
+    assert only_head(session, "rgbt", "source", ("1D", "2N")) == source
+    assert only_head(session, "rgbt", "target", ("1D", "2N")) == target
+    assert only_head(session, "rgbt", "own", ("1N", "2N")) == target
+    with pytest.raises(ValueError, match="choose it with head=source or head=target"):
+        only_head(session, "rgbt", "own", ("1D", "2N"))
 
 
 def test_damaged_files_are_refused(exported: Path, tmp_path: Path, call: Call) -> None:
