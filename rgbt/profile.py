@@ -57,6 +57,9 @@ class Options:
     measure: Annotated[
         bool, Help("false: count parameters and FLOPs, and measure neither memory nor time")
     ] = True
+    onnx: Annotated[
+        bool, Help("true: measure each network also as ONNX in onnxruntime, on the CPU")
+    ] = False
     runs_dir: RunsDir = Path("runs")
     trust: Trust = ""
     out: Annotated[Path | None, Help("file for the numbers, .json or .csv")] = None
@@ -72,11 +75,14 @@ def main(options: Options, overrides: list[str]) -> int:
     """
     from rgbt.evaluation.profile import ProfileSettings, profile
     from rgbt.evaluation.profile_files import check_out, profile_grid, write_profile
+    from rgbt.evaluation.profiled_network import with_onnx
     from rgbt.tracking.terminal import path_lines, print_rich, rich_table
 
     if options.out is not None:
         check_out(options.out)
     networks = requested_networks(options, overrides)
+    if options.onnx:
+        networks = with_onnx(networks)
     settings = ProfileSettings(
         batch_size=options.batch_size,
         rounds=options.rounds,

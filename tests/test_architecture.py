@@ -20,6 +20,7 @@ SHARED = BASE | {"geometry"}
 COMPONENTS = {"data", "corruptions", "transforms", "maskers", "models", "losses", "metrics"}
 READING = SHARED | {"config", "spec", "tracking", "metrics", "data"}
 BUILDING = READING | COMPONENTS | {"schemes", "engine", "checkpoints", "runtime", "build"}
+BUILDING |= {"exported"}
 MAY_IMPORT = {
     **dict.fromkeys(
         ("types", "checks", "ranges", "randomness", "processes", "class_scores"), set()
@@ -33,6 +34,7 @@ MAY_IMPORT = {
     "schemes": SHARED | {"losses"},
     "checkpoints": SHARED,
     "engine": SHARED | {"checkpoints", "runtime"},
+    "exported": SHARED,
     "tracking": SHARED | {"metrics"},
     "config": BASE | {"runtime"},
     "spec": READING | {"engine"},

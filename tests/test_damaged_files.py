@@ -323,7 +323,7 @@ def resume(path: Path) -> Any:
 
 def marker(folder: Path) -> Path:
     run = run_folder(folder)
-    run.mark("0123456789abcdef", "fedcba9876543210")
+    run.mark({"names": "0123456789abcdef", "files": "fedcba9876543210"})
     return Path(run.path / "dataset.json")
 
 

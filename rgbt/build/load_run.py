@@ -10,9 +10,10 @@ from typing import Any
 from rgbt.build.session import Session, names_key, open_session
 from rgbt.checks import InputError, check_choice
 from rgbt.config.compose import compose
-from rgbt.config.stored_config import check_targets, checkouts, read_settings
+from rgbt.config.stored_config import check_targets, checkouts, read_settings, settings_of
 from rgbt.data.label_map import LabelMap
 from rgbt.engine.checkpoint import load_checkpoint, restore_weights, step_of
+from rgbt.exported.onnx_network import ExportedNetwork
 from rgbt.files.yaml_files import parse_yaml
 from rgbt.metrics.counts import Counts
 from rgbt.spec.checkout_code import code_of
@@ -84,6 +85,41 @@ def open_trained(
     # Copies of a data set in other folders may hold other images.
     name = f"{spec.key}-{session.dataset.fingerprint()[:8]}"
     return TrainedNetwork(session, 0, runs_dir / "evaluations" / name, path.name)
+
+
+def open_exported(
+    path: Path,
+    runs_dir: Path,
+    overrides: Sequence[str],
+    label_map: LabelMap | None = None,
+    trust: Collection[str] = (),
+) -> TrainedNetwork:
+    """The network of a file of `rgbt export`, with the data set and settings that the file names.
+
+    Args:
+        path: of the ONNX file.
+        runs_dir: folder of runs; evaluations are written below it by default.
+        overrides: of its configuration, as of a run.
+        label_map: as in `open_run`.
+        trust: see there.
+
+    Raises:
+        InputError: a file that is refused (`ExportedNetwork`), a target that is not trusted,
+            overrides that do not fit, a data set of other classes.
+    """
+    network = ExportedNetwork.read(path)
+    made = network.description
+    settings = settings_of(made.settings, str(path))
+    check_targets(settings, trust, str(path))
+    session = open_session(load_spec(settings, overrides), label_map, network=network)
+    if label_map is None and made.classes != tuple(session.dataset.classes):
+        raise InputError(
+            f"{path} has the classes {', '.join(made.classes)}, but {session.dataset.name} has "
+            f"{', '.join(session.dataset.classes)}. Choose another data set with dataset=..., or "
+            "map the classes with label_map=..."
+        )
+    folder = runs_dir / "evaluations" / f"{path.stem}-{session.dataset.fingerprint()[:8]}"
+    return TrainedNetwork(session, made.step, folder, path.name)
 
 
 def trusted_settings(

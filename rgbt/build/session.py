@@ -87,7 +87,11 @@ class Session:
 
 
 def open_session(
-    spec: RunSpec, label_map: LabelMap | None = None, *, load_weights: bool = True
+    spec: RunSpec,
+    label_map: LabelMap | None = None,
+    *,
+    load_weights: bool = True,
+    network: nn.Module | None = None,
 ) -> Session:
     """Build data set, transform and network; nothing is trained or evaluated yet.
 
@@ -98,6 +102,7 @@ def open_session(
         spec: the run.
         label_map: from the classes of the network to those of the data set, where they differ.
         load_weights: False: `model.weights` is left out, because an upstream run is not finished.
+        network: used as it is; None: it is built from the settings.
 
     Raises:
         InputError: settings that do not fit each other, the machine or the file of weights.
@@ -108,7 +113,7 @@ def open_session(
     fabric = open_fabric(trainer)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(derive(spec.drawn.weights, "weights"))
-        model: nn.Module = spec.model.build()
+        model: nn.Module = spec.model.build() if network is None else network
     files: LabelledDataset = spec.dataset.build()
     if is_own(files):
         check_dataset(files)
@@ -125,7 +130,7 @@ def open_session(
     if is_own(model):
         watch_model(model, num_classes)
     check_requirements({"prediction": spec.prediction, "model": model}, spec.plain)
-    weights = start_from_weights(model, spec) if load_weights else None
+    weights = start_from_weights(model, spec) if load_weights and network is None else None
     return Session(
         spec=spec,
         dataset=dataset,

@@ -19,6 +19,10 @@ Trained = Annotated[
         "model=mfnet model.weights=final.pth dataset.root=/data/MFNet (implies scale=paper)"
     ),
 ]
+Exported = Annotated[
+    Path | None,
+    Help("ONNX file of `rgbt export`, which onnxruntime computes on the CPU; instead of run"),
+]
 Split = Annotated[str, Help("split of the data set")]
 Checkpoint = Annotated[
     Literal["best", "last"], Help("checkpoint of the run: best (by validation mIoU) or last")
@@ -60,6 +64,7 @@ class NetworkOptions:
     """Options that select a trained network, common to all commands that evaluate one."""
 
     run: Trained = ""
+    exported: Exported = None
     runs_dir: RunsDir = Path("runs")
     checkpoint: Checkpoint = "best"
     trust: Trust = ""

@@ -61,6 +61,7 @@ COMMANDS = {
     "cache": Entry(
         "rgbt.data.cache.__main__", "decode a data set once into a cache, or remove the cache"
     ),
+    "export": Entry("rgbt.export", "write a network as ONNX, compared with the network"),
     "weights": Entry("rgbt.weights", "inspect a file of weights, or export the weights of a run"),
     "sync": Entry("rgbt.tracking.sync", "send run folders to MLflow"),
     "corruptions": Entry("rgbt.corruptions.__main__", "draw the corruptions of one pair of images"),

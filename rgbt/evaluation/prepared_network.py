@@ -17,6 +17,7 @@ from rgbt.engine.allocator import keep_memory
 from rgbt.engine.evaluate import class_maps
 from rgbt.engine.threads import fix_threads
 from rgbt.evaluation.profiled_network import ProfiledNetwork
+from rgbt.exported.onnx_network import exported_network
 from rgbt.randomness import derive, torch_generator
 from rgbt.requirements import record_of
 from rgbt.runtime.resources import is_out_of_memory
@@ -59,7 +60,7 @@ class PreparedNetwork:
         self.parameters = sum(each.numel() for each in model.parameters())
         self.trainable = sum(each.numel() for each in model.parameters() if each.requires_grad)
         # The counter of operations follows gradients otherwise, which a prediction does not have.
-        self._model = model.eval().requires_grad_(False).to(self.device)
+        self._model: nn.Module = model.eval().requires_grad_(False).to(self.device)
         self._view = network.view or record_of(model).views[0]
         self._batch = random_batch(batch_size, network.image_hw).to(self.device)
 
@@ -96,6 +97,15 @@ class PreparedNetwork:
             f"{name} cannot predict images of {size} pixels ({one_line(error)}). Choose another "
             "image_hw."
         )
+
+    def use_onnx(self) -> None:
+        """Predict with onnxruntime from now on.
+
+        Raises:
+            InputError: the network cannot be exported.
+        """
+        name, image_hw = self.network.name, self.network.image_hw
+        self._model = exported_network(self._model, self._view, image_hw, name)
 
     def peak_on_gpu(self) -> int:
         """Bytes on a CUDA device: most that weights, batch and one prediction take together."""

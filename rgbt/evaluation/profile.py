@@ -162,10 +162,12 @@ def _prepare(
     display.update(task, note=network.name)
     prepared = PreparedNetwork(network, settings.batch_size)
     measured = _Measured(prepared, count_flops(prepared.predict))
+    if network.is_onnx:
+        prepared.use_onnx()
     if settings.measure:
         if prepared.device.type == "cuda":
             measured.peak = prepared.peak_on_gpu()
-        elif prepared.device.type == "cpu":
+        elif prepared.device.type == "cpu" and not network.is_onnx:
             measured.peak = peak_on_cpu(network, settings.batch_size)
         for _ in range(settings.warmup):
             prepared.predict()

@@ -24,6 +24,10 @@ ON_CPU = (
     "less the memory of Python and its libraries."
 )
 ON_GPU = "Peak memory: most that PyTorch allocated for weights, batch and one prediction."
+IN_ONNX = (
+    "ONNX: onnxruntime computes the class scores from the exported graph, in float32 and with the "
+    "same number of threads. FLOPs are those of the network in PyTorch; memory is not measured."
+)
 TIMES = (
     "Latency of a batch of {batch}: median and quartiles; rounds: {rounds}, unmeasured predictions "
     "before them: {warmup}. Each round measures every network once, in random order."
@@ -84,6 +88,8 @@ def _notes(profile: Profile) -> list[str]:
     precisions = sorted({each.network.trainer.precision for each in profile.networks})
     if any(each.peak_memory is not None for each in profile.networks):
         notes.append(ON_CPU if profile.kind == "cpu" else ON_GPU)
+    if any(each.network.is_onnx for each in profile.networks):
+        notes.append(IN_ONNX)
     values = {"batch": settings.batch_size, "rounds": settings.rounds, "warmup": settings.warmup}
     notes += [TIMES.format(**values), RATIO.format(first=profile.networks[0].network.name)]
     return [*notes, PREDICTION, f"Precision: {', '.join(precisions)}."]

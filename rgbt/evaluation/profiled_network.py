@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -15,6 +15,7 @@ from rgbt.config.compose import check_keys, compose
 from rgbt.config.values import check_value
 from rgbt.data.domains import Domains
 from rgbt.engine.settings import TrainerSettings
+from rgbt.exported.description import require_packages
 from rgbt.files.yaml_files import read_yaml
 from rgbt.ranges import Size, Text
 from rgbt.spec.load_spec import load_spec
@@ -39,6 +40,7 @@ class ProfiledNetwork:
         view: input images; None: those that the network is designed for.
         image_hw: height and width of the images and of the prediction, pixels.
         overrides: of the configuration that describe the network; () for a finished run.
+        is_onnx: whether onnxruntime computes it from its exported graph, and not PyTorch.
     """
 
     name: str
@@ -47,6 +49,7 @@ class ProfiledNetwork:
     view: View | None
     image_hw: Hw
     overrides: tuple[str, ...] = ()
+    is_onnx: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,6 +137,23 @@ def from_runs(
         view = spec.domains.source.view
         networks.append(ProfiledNetwork(run, spec.model, spec.trainer, view, image_hw))
     return networks
+
+
+def with_onnx(networks: Sequence[ProfiledNetwork]) -> list[ProfiledNetwork]:
+    """Each network followed by its exported form, "NAME, ONNX".
+
+    Raises:
+        InputError: a device other than the CPU, or the packages for ONNX are missing.
+    """
+    require_packages()
+    for network in networks:
+        if network.trainer.accelerator != "cpu":
+            raise InputError(
+                f"onnx=true compares on the CPU, but '{network.name}' has "
+                f"trainer.accelerator={network.trainer.accelerator}; set trainer.accelerator=cpu."
+            )
+    pairs = [(each, replace(each, name=f"{each.name}, ONNX", is_onnx=True)) for each in networks]
+    return [network for pair in pairs for network in pair]
 
 
 def check_networks(networks: Sequence[ProfiledNetwork]) -> None:

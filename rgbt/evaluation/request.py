@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
-from rgbt.build.load_run import TrainedNetwork, open_trained
+from rgbt.build.load_run import TrainedNetwork, open_exported, open_trained
 from rgbt.checks import InputError, check_choice
 from rgbt.config.common_options import AS_TRAINED, NetworkOptions
 from rgbt.config.stored_config import parse_trust
@@ -64,16 +64,24 @@ class NetworkRequest:
             )
 
     def open(self, label_map: LabelMap | None = None) -> TrainedNetwork:
-        """The network with its weights (`rgbt.build.load_run.open_trained`)."""
+        """The network with its weights: of a run, of a file of weights, or an exported one.
+
+        Raises:
+            InputError: as `open_trained` or `open_exported`; or both are named.
+        """
+        options = self.options
         regions = [] if self.regions == AS_TRAINED else [f"metric={self.regions}"]
-        return open_trained(
-            self.options.run,
-            self.options.runs_dir,
-            [*self.overrides, *regions],
-            self.options.checkpoint,
-            label_map,
-            self.trust,
-        )
+        words = [*self.overrides, *regions]
+        if options.exported is None:
+            return open_trained(
+                options.run, options.runs_dir, words, options.checkpoint, label_map, self.trust
+            )
+        if options.run or options.checkpoint != BEST:
+            raise InputError(
+                "exported= is a network with its weights; omit run= and checkpoint=, or omit "
+                "exported=."
+            )
+        return open_exported(options.exported, options.runs_dir, words, label_map, self.trust)
 
 
 def other_images(dataset: LabelledDataset, marker: Mapping[str, Any] | None) -> tuple[str, ...]:

@@ -104,6 +104,18 @@ def quiet_client() -> Any:
     return MlflowClient
 
 
+def started_monitor(uri: str, run_id: str) -> Any:
+    """A thread of MLflow that sends metrics ``system/...`` of this machine until its `finish`.
+
+    It stops by itself if the store fails. A run that resumes continues its steps.
+    """
+    from mlflow.system_metrics.system_metrics_monitor import SystemMetricsMonitor
+
+    monitor = SystemMetricsMonitor(run_id, resume_logging=True, tracking_uri=uri)
+    monitor.start()
+    return monitor
+
+
 def check_reachable(uri: str) -> None:
     """Raise OSError where nobody listens at the address of a database server.
 

@@ -6,16 +6,18 @@ training.
 
 from __future__ import annotations
 
+import importlib.util
 import shlex
 import sys
 import time
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from rgbt.checks import InputError
 from rgbt.ranges import Text
-from rgbt.tracking.mlflow_client import MlflowStore, locked, open_store
+from rgbt.tracking.mlflow_client import MlflowStore, locked, open_store, started_monitor
 from rgbt.tracking.mlflow_server import pages_of, python_command
 from rgbt.tracking.mlflow_upload import (
     UploadState,
@@ -48,17 +50,37 @@ class MlflowTracking(Tracking):
             a database, and the server's own storage for http.
         experiment: its name.
         runs_dir: the folder of all runs.
+        log_model: whether the best checkpoint of a finished run is logged as a model.
+        system_metrics: whether MLflow measures processor, memory and GPU while a run trains.
+
+    Raises:
+        InputError: system metrics without the package that measures them.
     """
 
     def __init__(
-        self, uri: Text | None, *, artifact_uri: Text | None, experiment: Text, runs_dir: Text
+        self,
+        uri: Text | None,
+        *,
+        artifact_uri: Text | None,
+        experiment: Text,
+        runs_dir: Text,
+        log_model: bool = False,
+        system_metrics: bool = False,
     ) -> None:
+        if system_metrics and importlib.util.find_spec("psutil") is None:
+            raise InputError(
+                "tracking.system_metrics=true requires the package psutil; install the extra: "
+                "pip install 'rgbt[system-metrics]'."
+            )
         root = Path(runs_dir).resolve()
         self.uri = f"sqlite:///{root / 'mlflow.db'}" if uri is None else uri
         is_server = self.uri.startswith(("http://", "https://"))
         default_uri = None if is_server else (root / "mlartifacts").as_uri()
         self.artifact_uri = default_uri if artifact_uri is None else artifact_uri
         self.experiment = experiment
+        self.log_model = log_model
+        self._system_metrics = system_metrics
+        self._monitor: Any = None
         self._store: MlflowStore | None = None
         self._folder: RunFolder | None = None
         self._is_connected = False
@@ -104,6 +126,9 @@ class MlflowTracking(Tracking):
 
     def finish(self, status: Status) -> None:
         """Send what is new and close the run."""
+        if self._monitor is not None:
+            self._monitor.finish()  # reports its errors itself
+            self._monitor = None
         self._guarded(status)
 
     def links(self) -> list[Link]:
@@ -130,6 +155,8 @@ class MlflowTracking(Tracking):
         with locked(folder.path / "mlflow.lock"):
             sent = self._sent(folder)
             upload(store, folder, sent, status)
+        if status == "RUNNING" and self._system_metrics and self._monitor is None:
+            self._monitor = started_monitor(self.uri, sent.run_id)
         return sent.run_id
 
     def store(self) -> MlflowStore:
@@ -147,7 +174,10 @@ class MlflowTracking(Tracking):
         """What this store has of the run; nothing if the folder was sent to another one."""
         uri, artifacts = without_passwords(self.uri), self.artifact_uri
         fresh = UploadState(
-            uri, self.experiment, None if artifacts is None else without_passwords(artifacts)
+            uri,
+            self.experiment,
+            None if artifacts is None else without_passwords(artifacts),
+            log_model=self.log_model,
         )
         try:
             sent = read_upload_state(folder)
@@ -158,7 +188,7 @@ class MlflowTracking(Tracking):
         # A version that hid less may have stored it: both are compared as they are hidden now.
         same = sent is not None and without_passwords(sent.uri) == uri
         if sent is not None and same and sent.experiment == self.experiment:
-            return replace(sent, uri=uri)
+            return replace(sent, uri=uri, log_model=self.log_model)
         return fresh
 
     def _guarded(self, status: Status) -> None:

@@ -22,6 +22,8 @@ from rgbt.files.budgets import read_json, sealed
 from rgbt.metrics import names
 from rgbt.metrics.names import shown
 from rgbt.tracking.mlflow_client import MlflowStore
+from rgbt.tracking.mlflow_inputs import inputs_digest, send_inputs
+from rgbt.tracking.mlflow_model import checkpoint_digest, send_model
 from rgbt.tracking.replaced_runs import shown_description, shown_key
 from rgbt.tracking.run_files import Description, read_provenance, read_result, read_tables
 from rgbt.tracking.run_folder import MetricLine, RunFolder
@@ -67,6 +69,9 @@ class UploadState:
         profile: whether the region profile was sent.
         later: scores of the result that no line holds and that were sent, e.g. "test/TC/aligned".
         shown: digest of name, tags, parameters and status that were sent; "" in older records.
+        inputs: what identifies the data set that was sent; "" before.
+        log_model: whether the best checkpoint is sent as a logged model.
+        model: digest of the checkpoint that was sent so; "" before.
     """
 
     uri: str
@@ -79,6 +84,9 @@ class UploadState:
     profile: bool = False
     later: list[str] = field(default_factory=list)
     shown: str = ""
+    inputs: str = ""
+    log_model: bool = False
+    model: str = ""
 
 
 def read_upload_state(folder: RunFolder) -> UploadState | None:
@@ -124,6 +132,12 @@ def upload(store: MlflowStore, folder: RunFolder, sent: UploadState, status: Sta
     sent.steps |= {line.kind: line.step for line in lines}
     sent.later += later
     _send_files(store, folder, sent, tables)
+    if sent.inputs != (inputs := inputs_digest(folder.path)):
+        send_inputs(store.client, sent.run_id, folder.path)
+        sent.inputs = inputs
+    if status == "FINISHED" and tables is not None and _lacks_model(folder, sent):
+        send_model(store, sent.run_id, folder.path, len(tables.classes.names))
+        sent.model = checkpoint_digest(folder.path)
     name = _short(description.name)
     if name != run.info.run_name:
         store.client.update_run(sent.run_id, name=name)
@@ -149,8 +163,15 @@ def is_up_to_date(folder: RunFolder, sent: UploadState, status: Status) -> bool:
         and all(line.step <= sent.steps.get(line.kind, -1) for line in every)
         and (tables is None or tables.split != "test" or sent.profile)
         and not _later(folder, every, sent)
+        and sent.inputs == inputs_digest(folder.path)
+        and not _lacks_model(folder, sent)
         and not list(_changed_files(folder, sent, tables))
     )
+
+
+def _lacks_model(folder: RunFolder, sent: UploadState) -> bool:
+    """Whether the best checkpoint is to be logged as a model and was not."""
+    return sent.log_model and sent.model != checkpoint_digest(folder.path)
 
 
 def _shown(
@@ -195,6 +216,7 @@ def _run_of(
         )
     sent.experiment_id, sent.run_id = store.experiment_id, run.info.run_id
     sent.steps, sent.files, sent.profile, sent.later, sent.shown = {}, {}, False, [], ""
+    sent.inputs = sent.model = ""
     write_upload_state(folder, sent)
     return run
 

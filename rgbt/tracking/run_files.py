@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NotRequired
 
 from typing_extensions import TypedDict  # pydantic takes no other before Python 3.12
 
@@ -39,11 +39,25 @@ class Description:
     params: dict[str, str]
 
 
+class InputForm(TypedDict):
+    """A split that a run uses: its name, what for ("train", "val", "test"), number of images."""
+
+    split: str
+    context: str
+    images: int
+
+
 class MarkerForm(TypedDict):
-    """``dataset.json``: digests of the names of the images, and of the data set's files."""
+    """``dataset.json``: digests of the names of the images, and of the data set's files.
+
+    Its name, folder and splits, for trackers, are not in older files.
+    """
 
     names: str
     files: str
+    name: NotRequired[str]
+    root: NotRequired[str]
+    inputs: NotRequired[list[InputForm]]
 
 
 class ResultForm(TypedDict, total=False):

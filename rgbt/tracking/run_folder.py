@@ -35,7 +35,7 @@ from typing import Any, get_args
 from rgbt.checks import InputError, one_line
 from rgbt.files.atomic import holder_of, holding, is_held, remove_left_behind, write_atomic
 from rgbt.files.budgets import TEXT, parse_json, read_bytes, read_json, sealed
-from rgbt.tracking.run_files import Description, Kind, LineForm, read_provenance
+from rgbt.tracking.run_files import Description, Kind, LineForm, MarkerForm, read_provenance
 from rgbt.tracking.tables import ResultTables
 
 KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -234,9 +234,9 @@ class RunFolder:
         """Mark the run as finished; everything else must be written before."""
         self._write_json("result.json", sealed(result))
 
-    def mark(self, names: str, files: str) -> None:
-        """Write ``dataset.json``: digests of the names of the images and of the files."""
-        self._write_json("dataset.json", sealed({"names": names, "files": files}))
+    def mark(self, marker: MarkerForm) -> None:
+        """Write ``dataset.json``, which identifies the images."""
+        self._write_json("dataset.json", sealed(marker))
 
     def _write_json(self, name: str, value: Any) -> None:
         write_atomic(self.path / name, (json.dumps(value, indent=1) + "\n").encode())

@@ -40,6 +40,13 @@ class Options:
         None
     )
     experiment: Annotated[str | None, Help("experiment of MLflow; default: that of the run")] = None
+    log_model: Annotated[
+        bool | None,
+        Help(
+            "true: log the best checkpoint of finished runs as a model for mlflow.pyfunc; default: "
+            "as the run was started"
+        ),
+    ] = None
 
     def __post_init__(self) -> None:
         if (self.run is None) == (self.runs_dir is None):
@@ -86,6 +93,7 @@ def tracking_of(folder: RunFolder, options: Options) -> MlflowTracking:
         artifact_uri=artifact_uri,
         experiment=options.experiment or (sent.experiment if sent else EXPERIMENT),
         runs_dir=str(runs_dir_of(folder)),
+        log_model=bool(sent and sent.log_model) if options.log_model is None else options.log_model,
     )
 
 
@@ -99,7 +107,7 @@ def status_of(folder: RunFolder) -> Status:
 def main(options: Options, overrides: list[str]) -> int:
     """Send run folders to MLflow. A repeated call sends only data that the store does not have."""
     del overrides  # none is heeded
-    stores: dict[tuple[str, str], MlflowTracking] = {}
+    stores: dict[tuple[str, str, bool], MlflowTracking] = {}
     failed = 0
     busy: dict[str, StoreBusyError] = {}
     # An error in one of many folders must not prevent sending the others.
@@ -107,7 +115,8 @@ def main(options: Options, overrides: list[str]) -> int:
     for folder in folders_of(options):
         try:
             named = tracking_of(folder, options)
-            tracking = stores.setdefault((named.uri, named.experiment), named)
+            key = (named.uri, named.experiment, named.log_model)
+            tracking = stores.setdefault(key, named)
             if named.uri in busy:  # waited for once, not for every run
                 raise busy[named.uri]
             run_id = tracking.sync(folder, status_of(folder))
@@ -121,7 +130,7 @@ def main(options: Options, overrides: list[str]) -> int:
             sys.stderr.write(f"rgbt: {folder.path} was not sent ({reason}).\n")
         else:
             sys.stdout.write(f"{folder.path}  ->  MLflow run {run_id}\n")
-    for uri, _ in stores:
+    for uri in dict.fromkeys(uri for uri, _, _ in stores):
         if not uri.startswith("http"):
             sys.stdout.write(f"open MLflow  {ui_command(uri)}\n")
     return 1 if failed else 0

@@ -11,6 +11,7 @@ from torch import nn
 from rgbt.build.load_run import TrainedNetwork
 from rgbt.build.session import Session
 from rgbt.build.training_setup import TrainingSetup
+from rgbt.exported.onnx_network import ExportedNetwork
 from rgbt.processes import num_processes
 from rgbt.tracking.terminal import path_lines
 
@@ -62,6 +63,8 @@ def device_line(session: Session) -> str:
 
 def network_line(session: Session) -> str:
     """Class and number of parameters: "Mask2Former, 1.23 M parameters"."""
+    if isinstance(session.model, ExportedNetwork):
+        return f"{session.model.description.network} in onnxruntime"
     return f"{type(session.model).__name__}, {_millions(session.model)} parameters"
 
 

@@ -35,11 +35,7 @@ from rgbt.tracking.pair_pictures import draw_pairs
 from rgbt.tracking.pictures import RegionHeat, draw_panel, draw_region_heat
 from rgbt.tracking.provenance import provenance, without_passwords
 from rgbt.tracking.replaced_runs import replace_finished
-from rgbt.tracking.run_files import (
-    Description,
-    counts_name,
-    read_marker,
-)
+from rgbt.tracking.run_files import Description, MarkerForm, counts_name, read_marker
 from rgbt.tracking.run_folder import RunFolder
 from rgbt.tracking.tables import ConsistencyTable, without_nan
 from rgbt.tracking.terminal import info, warn
@@ -50,6 +46,7 @@ from rgbt.training.common import (
     make_trainer,
     other_head_request,
     target_request,
+    used_splits,
 )
 from rgbt.training.members import training_together
 from rgbt.training.overview import announce_training, announce_upstream
@@ -178,7 +175,13 @@ class Run:
     def _claim(self, session: Session) -> None:
         """Write what identifies the run; refuse a folder that was started on other images."""
         dataset = session.dataset
-        now = {"names": names_key(session), "files": dataset.fingerprint()}
+        now: MarkerForm = {
+            "names": names_key(session),
+            "files": dataset.fingerprint(),
+            "name": dataset.name,
+            "root": str(dataset.root),
+            "inputs": used_splits(session),
+        }
         before = read_marker(self.folder.path) or now
         if before["names"] != now["names"]:
             raise InputError(
@@ -188,7 +191,7 @@ class Run:
             )
         if before["files"] != now["files"]:
             info(f"files of {dataset.root} have changed since this run was started.")
-        self.folder.mark(**now)
+        self.folder.mark(now)
         config = OmegaConf.to_yaml(OmegaConf.create(dict(session.spec.plain)))
         self.folder.write_config(without_passwords(config))
         self.folder.add_provenance({**provenance(), "own_code": session.spec.own_code()})

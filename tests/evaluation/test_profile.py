@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,7 @@ from rgbt.evaluation.profiled_network import (
     from_file,
     from_models,
     from_overrides,
+    with_onnx,
 )
 from rgbt.models.mfnet import MFNet
 from tests.commands import Call, assert_one_sentence
@@ -303,3 +305,28 @@ def test_command_refuses_wrong_input(call: Call, words: tuple[str, ...], sentenc
     code, _, err = call(ENTRY, *words)
     assert code == 2
     assert_one_sentence(err, sentence)
+
+
+@pytest.mark.slow
+def test_onnx_is_measured_beside_the_network(without_child: None) -> None:
+    network = tiny(image_hw=(32, 48))
+    made = profile(with_onnx([network]), ProfileSettings(rounds=2, warmup=1))
+    own, onnx = made.networks
+    assert [each.network.name for each in made.networks] == ["mfnet_tiny", "mfnet_tiny, ONNX"]
+    assert onnx.parameters == own.parameters
+    assert onnx.flops.total == own.flops.total > 0
+    assert (own.peak_memory, onnx.peak_memory) == (2**20, None)
+    assert onnx.ratio is not None
+    assert any("same number of threads" in each for each in profile_grid(made).notes)
+
+    prepared = PreparedNetwork(network, batch_size=2)
+    expected = prepared.predict()
+    prepared.use_onnx()
+    assert torch.equal(prepared.predict(), expected)
+
+
+def test_onnx_is_compared_on_the_cpu_alone() -> None:
+    network = tiny()
+    on_gpu = replace(network, trainer=replace(network.trainer, accelerator="cuda"))
+    with pytest.raises(InputError, match=r"onnx=true compares on the CPU, but 'mfnet_tiny'"):
+        with_onnx([on_gpu])

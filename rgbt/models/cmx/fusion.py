@@ -31,7 +31,7 @@ class ChannelWeights(nn.Module):
         # Of equal maxima one has the gradient, as in the release: hidden pixels make such ties.
         pooled = [x.mean(1) for x in maps] + [x.max(1).values for x in maps]
         weights: Tensor = self.mlp(torch.cat(pooled, 1)).sigmoid()
-        return weights.view(len(x1), 2, 1, 1, -1).transpose(0, 1)
+        return weights.view(x1.shape[0], 2, 1, 1, -1).transpose(0, 1)
 
 
 class SpatialWeights(nn.Module):

@@ -63,13 +63,13 @@ class Fusion(nn.ModuleDict):
         by_view: list[tuple[Tensor, ...]] = []
         for view in views:
             if view != "rgbt":
-                by_view.append(maps[view][level].chunk(passes))
+                by_view.append(_parts(maps[view][level], passes))
                 continue
             fused, norm = self.fuse(maps["rgb"][level], maps["thermal"][level]), LEVELS[level]
             # Without batch statistics all passes are one call.
-            parts = fused.chunk(passes) if self.training else (fused,)
+            parts = _parts(fused, passes) if self.training else (fused,)
             normed = [self[norm](part) for part in parts]
-            by_view.append(tuple(normed) if self.training else normed[0].chunk(passes))
+            by_view.append(tuple(normed) if self.training else _parts(normed[0], passes))
         return [part for one_pass in zip(*by_view, strict=True) for part in one_pass]
 
 
@@ -134,3 +134,8 @@ class RgbtBackbone(nn.Module):
             maps, passes=passes, views=views, num_predictions=num_predictions
         )
         return fused
+
+
+def _parts(stacked: Tensor, passes: int) -> tuple[Tensor, ...]:
+    """The passes of a stacked batch; one alone is not split, so that its size may be a symbol."""
+    return (stacked,) if passes == 1 else stacked.chunk(passes)

@@ -158,7 +158,7 @@ class Predictor(nn.Module):
             values = tokens + embed
             memories.append((values + sine_code(hw, values.shape[-1], values.device), values))
         position = self.query_embed.weight
-        queries = self.query_feat.weight.expand(len(pyramid.tokens[0]), -1, -1)
+        queries = self.query_feat.weight.expand(pyramid.tokens[0].shape[0], -1, -1)
         normed: list[Tensor] = [self.decoder_norm(queries)]
         embeds: list[Tensor] = [self.mask_embed(normed[0])]
         layers = zip(
@@ -183,9 +183,9 @@ class Predictor(nn.Module):
 
         # The masks of all layers are one matrix product: no copy, one gradient of the features.
         class_logits = self.class_embed(torch.stack(normed))
-        embed = torch.cat(embeds, dim=1)[: len(pyramid.fine)]
+        embed = torch.cat(embeds, dim=1)[: pyramid.fine.shape[0]]
         masks = _mask_logits(embed, pyramid, pyramid.fine.flatten(2))
-        masks = masks.view(len(masks), len(embeds), -1, *pyramid.fine.shape[-2:])
+        masks = masks.view(masks.shape[0], len(embeds), -1, *pyramid.fine.shape[-2:])
         return Predictions(class_logits, masks.transpose(0, 1))
 
 

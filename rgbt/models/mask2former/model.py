@@ -156,13 +156,13 @@ class Mask2Former(nn.Module):
                 generator where one is needed.
             InputError: mask cells that do not divide the padded image.
         """
-        wanted = requested(len(rgb), passes, views, num_predictions, num_masks)
+        wanted = requested(rgb.shape[0], passes, views, num_predictions, num_masks)
         if self.training and self.drop_path_rate > 0 and generator is None:
             raise ValueError("training with drop_path_rate > 0 requires `generator`, got None.")
         image_hw = rgb.shape[2], rgb.shape[3]
         images = self.inputs(rgb, thermal, multiple=STRIDE)
         cells = padded_hw(image_hw)
-        hidden = None if masks is None else expand_cells(masks, len(rgb), cells, PATCH)
+        hidden = None if masks is None else expand_cells(masks, rgb.shape[0], cells, PATCH)
         features = self.backbone(
             images,
             hidden,

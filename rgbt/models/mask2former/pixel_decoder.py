@@ -146,7 +146,7 @@ class PixelDecoder(nn.Module):
             num_masks: M, how many samples from the first one on have masks. No gradient is computed
                 of the mask features of the others. None: all.
         """
-        count = len(features[0]) if num_masks is None else num_masks
+        count = features[0].shape[0] if num_masks is None else num_masks
         if not self.fp32:
             return self._decode(features, count)
         with torch.autocast(features[0].device.type, enabled=False):
@@ -164,7 +164,7 @@ class PixelDecoder(nn.Module):
         finest = self._finest(fine[:num_masks], stride_8[:num_masks])
         with torch.no_grad():
             reduced = _reduce(finest, levels)
-            if num_masks < len(fine):
+            if num_masks < fine.shape[0]:
                 others = self._finest(fine[num_masks:], stride_8[num_masks:])
                 pairs = zip(reduced, _reduce(others, levels), strict=True)
                 reduced = tuple(torch.cat(pair) for pair in pairs)

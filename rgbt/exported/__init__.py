@@ -1,0 +1,1 @@
+"""Exported networks: their description, the traced graph, and ONNX files that predict."""
