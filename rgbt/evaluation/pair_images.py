@@ -23,7 +23,8 @@ from torch import Tensor
 
 from rgbt.checks import InputError
 from rgbt.data.next_frames import NextFrames
-from rgbt.data.prediction_images import Format, PredictionReader, check_one_kind
+from rgbt.data.prediction_files import OVERLAY, Affixes, find_affixes
+from rgbt.data.prediction_format import FormatOptions, recognise_format
 from rgbt.engine.progress import progress
 from rgbt.evaluation.images import write_png
 from rgbt.evaluation.pair_frames import next_frames, virtual_frames
@@ -37,9 +38,6 @@ from rgbt.metrics.pair_list import (
     second_name,
 )
 from rgbt.types import Batch
-
-OVERLAY = "_overlay"
-"""Ending of the pictures that `rgbt predict` writes beside its predictions."""
 
 CPU = torch.device("cpu")
 SHOWN = 3
@@ -107,7 +105,10 @@ class FolderPairs:
         source: data set and views, which must be those of the export.
         listed: the list of the export.
         wanted: split and frames that are counted.
-        form: how files are read, see `rgbt.data.prediction_images.PredictionReader`.
+        given: what the user says about the files, see `rgbt.data.prediction_format`.
+
+    Attributes:
+        sentence: what the files were read as.
 
     Raises:
         InputError: the export is of other images or incomplete, or files are missing, foreign or
@@ -122,14 +123,15 @@ class FolderPairs:
         source: PairSource,
         listed: PairList,
         wanted: PairList,
-        form: Format = "auto",
+        given: FormatOptions = FormatOptions(),  # noqa: B008 - frozen
     ) -> None:
         check_same(listed, wanted)
         self._folder, self._frames = folder, wanted.frames
-        _check_files(folder, wanted.images)
-        if form == "auto":
-            check_one_kind(self._path(name) for name in wanted.images)
-        self._reader = PredictionReader(source.dataset.classes, source.dataset.palette, form)
+        self._affixes = _checked_files(folder, wanted.images, given.affixes)
+        paths = map(self._path, wanted.images)
+        dataset = source.dataset
+        self._reader, said = recognise_format(paths, dataset.classes, dataset.palette, given)
+        self.sentence = " ".join(filter(None, (said, self._affixes.sentence)))
 
     def first(self, batch: Batch) -> Tensor:
         """See `rgbt.evaluation.temporal_consistency.PairPredictor`."""
@@ -153,29 +155,32 @@ class FolderPairs:
         return torch.stack(maps)
 
     def _path(self, name: str) -> Path:
-        return self._folder / f"{name}.png"
+        return self._folder / f"{self._affixes.file_stem(name)}.png"
 
 
-def _check_files(folder: Path, names: Sequence[str]) -> None:
-    """Refuse a folder without a prediction of every image, or with PNG files of other images."""
+def _checked_files(folder: Path, names: Sequence[str], given: Affixes) -> Affixes:
+    """How the files are named, which are those of all images and of no other ones."""
     if not folder.is_dir():
         raise InputError(
             f"predictions={folder}: there is no such folder; give the one with the predictions."
         )
     there = {path.relative_to(folder).with_suffix("").as_posix() for path in folder.rglob("*.png")}
-    missing = [name for name in names if name not in there]
+    affixes = find_affixes(there, names, given)
+    stems = [affixes.file_stem(name) for name in names]
+    missing = [stem for stem in stems if stem not in there]
     if missing:
         raise InputError(
             f"{folder} lacks the predictions of {len(missing)} of {len(names)} images "
             f"({_listed(missing)}); predict every image in the folder rgb of the export."
         )
-    own = {*names, *(f"{name}{OVERLAY}" for name in names)}
+    own = {*stems, *(f"{name}{OVERLAY}" for name in names)}
     foreign = sorted(there - own)
     if foreign:
         raise InputError(
             f"{folder} holds {len(foreign)} PNG files of no exported image ({_listed(foreign)}); "
             "remove them, or name the export that they belong to with pairs=FOLDER."
         )
+    return affixes
 
 
 def _listed(names: Sequence[str]) -> str:
