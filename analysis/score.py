@@ -17,6 +17,7 @@ from analysis.arguments import MOST, Blocks, Level, check_out, dataset_of
 from analysis.bar import progress
 from rgbt.checks import InputError
 from rgbt.config.command import built
+from rgbt.config.common_options import PredictionFormatOptions
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
 from rgbt.metrics.names import DAY, MIOU, NIGHT, subset
@@ -29,7 +30,8 @@ if TYPE_CHECKING:
     from rgbt.metrics.counts import Counts
 
 OF_A_FOLDER = (
-    *("partition", "regions", "format", "missing", "resize", "suffix", "name", "threads"),
+    *("partition", "regions", "format", "palette", "missing", "resize", "prefix", "suffix"),
+    *("name", "threads"),
 )
 """Options of how a folder is counted; they have no effect on counts of runs."""
 
@@ -44,14 +46,15 @@ OF_PARTS = {"all": MIOU, **{part: subset(part, MIOU) for part in (DAY, NIGHT)}}
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(PredictionFormatOptions):
     """Options of ``rgbt score``."""
 
     predictions: Annotated[
         str,
         Help(
-            "folder of predictions, NAME.png for every image of the split: class indices (8 bit, "
-            "one channel), a palette PNG, or RGB in the colours of dataset.palette"
+            "folder of predictions, or a ZIP file of one, with a PNG file for every image of the "
+            "split: class indices (8 bit, one channel), a palette PNG, or RGB in the colours of a "
+            "palette"
         ),
     ] = ""
     counts: Annotated[
@@ -86,27 +89,17 @@ class Options:
         Interval(ge=1, le=MAX_REGIONS),
         Help("number of regions of equal area (predictions only)"),
     ] = 5
-    format: Annotated[
-        Literal["auto", "index", "colour"],
-        Help(
-            "format of the predictions: index: the stored numbers; colour: the colours shown; "
-            "auto: by the file"
-        ),
-    ] = "auto"
     missing: Annotated[
         Literal["refuse", "leave_out"],
         Help("images without a prediction: refuse, or leave_out: exclude them"),
     ] = "refuse"
     resize: Annotated[
-        Literal["refuse", "nearest"],
+        Literal["refuse", "nearest", "stretch"],
         Help(
-            "predictions of another size than their label: refuse, or nearest: resize them by the "
-            "nearest pixel"
+            "predictions of another size than their label: refuse; nearest: resize them by the "
+            "nearest pixel; stretch: so too where the ratio of height and width differs"
         ),
     ] = "refuse"
-    suffix: Annotated[
-        str, Help("suffix of the file names of predictions, NAME<suffix>.png, such as _pred")
-    ] = ""
     name: Annotated[
         str, Help("name of the method in tables; default: name of the folder of predictions")
     ] = ""
@@ -245,15 +238,20 @@ def _show(tables: Sequence[ScoreTable], remarks: list[str], out: Path | None) ->
 
 def _scored(options: Options, overrides: list[str]) -> FolderScores:
     from analysis.predictions.scoring import PARTITIONS, ScoringOptions, score_folder
+    from rgbt.data.prediction_files import Affixes
+    from rgbt.data.prediction_format import FormatOptions
 
     dataset, absent = dataset_of(overrides), built("metric", overrides).absent
     counting = ScoringOptions(
         partitions=tuple(each for each in PARTITIONS if options.partition in ("all", each)),
         regions=options.regions,
-        form=options.format,
+        format=FormatOptions(
+            form=options.format,
+            palette=options.palette,
+            affixes=Affixes(options.prefix, options.suffix),
+        ),
         missing=options.missing,
         resize=options.resize,
-        suffix=options.suffix,
         name=options.name,
         threads=options.threads,
         absent=absent,

@@ -13,7 +13,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from annotated_types import Interval as Bounds
 
 from rgbt.checks import InputError
-from rgbt.config.common_options import Modality, NetworkOptions, Split
+from rgbt.config.common_options import (
+    Modality,
+    NetworkOptions,
+    PredictionFormatOptions,
+    Split,
+)
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
 
@@ -21,12 +26,15 @@ if TYPE_CHECKING:
     from rgbt.evaluation.prediction import EvaluationData
     from rgbt.evaluation.temporal_consistency import Pairs
 
+OF_PREDICTIONS = ("pairs", "format", "palette", "prefix", "suffix")
+"""Options without effect on a network and on images of pairs."""
+
 OF_A_NETWORK = ("run", "runs_dir", "checkpoint", "modality", "trust")
 """Options without effect on images of pairs and on predictions of another method."""
 
 
 @dataclass(frozen=True)
-class Options(NetworkOptions):
+class Options(NetworkOptions, PredictionFormatOptions):
     """Options of the command."""
 
     frames: Annotated[
@@ -77,10 +85,6 @@ class Options(NetworkOptions):
         Path | None,
         Help("folder of the export of these predictions; default: that of the predictions"),
     ] = None
-    format: Annotated[
-        Literal["auto", "index", "colour"],
-        Help("format of the predictions, as in `rgbt score`"),
-    ] = "auto"
     out: Annotated[
         Path | None,
         Help(
@@ -105,11 +109,11 @@ def main(options: Options, overrides: list[str]) -> int:
     if not any(item.split("=")[0] == "consistency" for item in overrides):
         overrides = ["consistency=views", *overrides]
     if options.export is None and options.predictions is None:
-        _check_without(options, ("pairs", "format"), "a network")
+        _check_without(options, OF_PREDICTIONS, "a network")
         return _measure_network(options, overrides)
     _check_without(options, OF_A_NETWORK, "images of pairs and on predictions")
     if options.predictions is None:
-        _check_without(options, ("pairs", "format", "out"), "export=...")
+        _check_without(options, (*OF_PREDICTIONS, "out"), "export=...")
         return _export(options, overrides)
     if options.export is not None:
         raise InputError("expected one of export=... and predictions=..., got both.")
@@ -144,6 +148,8 @@ def _export(options: Options, overrides: list[str]) -> int:
 
 
 def _measure_predictions(options: Options, overrides: list[str]) -> int:
+    from rgbt.data.prediction_files import Affixes, opened_folder
+    from rgbt.data.prediction_format import FormatOptions
     from rgbt.evaluation.consistency_files import write_pairs
     from rgbt.evaluation.pair_images import FolderFrames, FolderPairs
     from rgbt.evaluation.pair_list import PairSource, list_pairs
@@ -152,22 +158,29 @@ def _measure_predictions(options: Options, overrides: list[str]) -> int:
     from rgbt.evaluation.temporal_consistency import count_predicted
     from rgbt.metrics.pair_list import read_list
     from rgbt.metrics.pairs import file_name
-    from rgbt.tracking.terminal import path_lines, print_rich
+    from rgbt.tracking.terminal import info, path_lines, print_rich
 
     split, folder, out = options.split, options.predictions, options.out
     assert folder is not None, "the caller has checked it"
+    given = FormatOptions(
+        form=options.format,
+        palette=options.palette,
+        affixes=Affixes(options.prefix, options.suffix),
+    )
     pairing = Pairing.of(options.frames, options.flow, options.least_used)
-    predictor: FolderFrames
-    if pairing.frames == "video":
-        _check_without(options, ("pairs",), "frames=video")
-        source = PairSource.compose(overrides)
-        predictor = FolderFrames(folder, source, pairing.images(source, split), options.format)
-    else:
-        listed, source = read_list(options.pairs or folder), PairSource.compose(overrides)
-        wanted = list_pairs(source, split, pairing.frames)
-        predictor = FolderPairs(folder, source, listed, wanted, options.format)
-    request = EvaluationRequest(split=split, keep=pairing.pictured(source, split))
-    pairs = count_predicted(source, predictor, request, pairing)
+    with opened_folder(folder) as opened:
+        predictor: FolderFrames
+        if pairing.frames == "video":
+            _check_without(options, ("pairs",), "frames=video")
+            source = PairSource.compose(overrides)
+            predictor = FolderFrames(opened, source, pairing.images(source, split), given)
+        else:
+            listed, source = read_list(options.pairs or folder), PairSource.compose(overrides)
+            wanted = list_pairs(source, split, pairing.frames)
+            predictor = FolderPairs(opened, source, listed, wanted, given)
+        request = EvaluationRequest(split=split, keep=pairing.pictured(source, split))
+        pairs = count_predicted(source, predictor, request, pairing)
+    info(predictor.sentence)
     _show(pairs, source, folder.resolve().name, options)
     if out is not None:
         paths = {

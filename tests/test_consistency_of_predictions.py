@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from rgbt import consistency, predict
+from rgbt.config.command import built
 from rgbt.files.budgets import read_json
 from rgbt.metrics.counts import Counts
 from rgbt.transforms.view_sets import PUBLISHED
@@ -130,6 +131,26 @@ def test_predictions_of_true_second_frames_count_as_the_network_does(
     assert mine.counts.sum() > 0
     assert np.array_equal(mine.counts, network.counts)
     assert (mine.partition, mine.dataset) == (network.partition, network.dataset)
+
+
+def test_predictions_in_colours_and_with_a_prefix_count_the_same(
+    call: Call, data: Path, exported: Path, predicted: Path, tmp_path: Path
+) -> None:
+    """As an author's script writes them: RGB colours through OpenCV, Pred_weights_NAME.png."""
+    colours = np.array(built("dataset", of(data)).palette, np.uint8)
+    folder = tmp_path / "painted"
+    folder.mkdir()
+    for path in predicted.glob("*.png"):
+        indices = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        cv2.imwrite(str(folder / f"Pred_w_{path.name}"), colours[indices])
+    shown = {}
+    for each in (predicted, folder):
+        words = (f"predictions={each}", f"pairs={exported}", *of(data))
+        code, out, err = call(consistency.entry, *words)
+        assert code == 0, err
+        shown[each] = out.replace(each.name, "NAME")
+    assert shown[predicted] == shown[folder]
+    assert "with red and blue exchanged. Files are named Pred_w_NAME.png." in err
 
 
 def test_predictions_without_out_write_nothing(call: Call, data: Path, predicted: Path) -> None:

@@ -218,8 +218,7 @@ def read_label(path: Path) -> Any:
 def read_prediction(path: Path) -> Any:
     from rgbt.data.prediction_images import PredictionReader
 
-    palette = tuple((n, 2 * n, 3 * n) for n in range(5))
-    return plain(PredictionReader(tuple("abcde"), palette, "index").read(path))
+    return plain(PredictionReader(tuple("abcde")).read(path))
 
 
 def label_array(folder: Path) -> Path:

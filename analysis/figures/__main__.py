@@ -99,6 +99,10 @@ class Options:
         Literal["auto", "index", "colour"] | None,
         Help("format of predictions: auto, index or colour"),
     ] = None
+    palette: Annotated[str | None, Help("palette of coloured predictions, as in `rgbt score`")] = (
+        None
+    )
+    prefix: Annotated[str | None, Help("beginning of the file names of predictions")] = None
     suffix: Annotated[
         str | None, Help("suffix of the file names of predictions, NAME<suffix>.png")
     ] = None

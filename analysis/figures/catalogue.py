@@ -18,7 +18,10 @@ SPATIAL = ("statistics", "split")
 DATASET_AND_METRIC = ("dataset", "metric")
 PANELS = "dataset=, methods=label:folder of predictions"
 PAIRS = "dataset=, pairs= (of rgbt consistency export=), methods=label:folder of predictions"
-PANEL_KEYS = ("methods", "names", "pick", "rows", "split", "layout", "format", "suffix")
+PANEL_KEYS = (
+    *("methods", "names", "pick", "rows", "split", "layout", "format", "palette", "prefix"),
+    "suffix",
+)
 RUNS = "runs= (run, group or counts, with labels: label:run)"
 OF_RUNS = ("runs", "runs_dir", "split", "absent")
 FAILING = "runs= (run, group or folder of rgbt robustness, with labels: label:run)"
@@ -54,7 +57,10 @@ def _panel(shows: str) -> FigureSpec:
 
 
 def _pairs(shows: str) -> FigureSpec:
-    keys = ("pairs", "methods", "view_set", "names", "pick", "rows", "layout", "format")
+    keys = (
+        *("pairs", "methods", "view_set", "names", "pick", "rows", "layout", "format"),
+        "palette",
+    )
     groups = ("dataset", "consistency")
     return FigureSpec("pairs.make", f"{shows}, with predictions", PAIRS, keys, groups, idle=())
 

@@ -16,7 +16,7 @@ from analysis.figures.inputs import FigureInput
 from rgbt.checks import InputError
 from rgbt.data.files import decode, read_rgb
 from rgbt.data.next_frames import NextFrames
-from rgbt.data.prediction_images import PredictionReader
+from rgbt.data.prediction_format import FormatOptions, recognise_format
 from rgbt.metrics.pair_list import ListedPair, PairList, read_list
 from rgbt.types import IGNORE
 
@@ -98,8 +98,9 @@ class Pairs:
         _check(self._listed, self._dataset, self._second_frames())
         named = given.named("methods", PREDICTIONS)
         self.methods = {label: Path(place).expanduser() for label, place in named.items()}
-        form: Any = given.get("format", "auto")
-        self._reader = PredictionReader(self._dataset.classes, self._dataset.palette, form)
+        self._format = FormatOptions(
+            form=given.get("format", "auto"), palette=given.get("palette", "auto")
+        )
         number = given.get("view_set", 1)
         self.listed = {each.first: each for each in self._listed.pairs if each.set == number}
         if not self.listed:
@@ -131,10 +132,10 @@ class Pairs:
         )
         predictions, differ = [], []
         for folder in self.methods.values():
-            both = tuple(self._predicted(folder, each, label) for each in (name, pair.second))
-            predictions.append((both[0], both[1]))
-            brought = both[0][followed.rows, followed.columns]
-            differ.append((brought != both[1]) & followed.compared)
+            first_map, second_map = self._predicted(folder, (name, pair.second), label)
+            predictions.append((first_map, second_map))
+            brought = first_map[followed.rows, followed.columns]
+            differ.append((brought != second_map) & followed.compared)
         return FramePair(
             name, (first, second), tuple(predictions), tuple(differ), followed.compared
         )
@@ -160,20 +161,26 @@ class Pairs:
         seen = warp.inside()[0].numpy() & (label != IGNORE)
         return label, Followed(rows, columns, seen)
 
-    def _predicted(self, folder: Path, name: str, label: Bytes) -> Bytes:
-        path = folder / f"{name}.png"
-        if not path.is_file():
-            raise InputError(
-                f"methods: there is no prediction {path}; predict every image of {self._folder}, "
-                f"for example with rgbt predict input={self._folder} out={folder}."
-            )
-        found = self._reader.read(path)
-        if found.shape != label.shape:
-            sizes = ["x".join(map(str, each.shape)) for each in (found, label)]
-            raise InputError(
-                f"{path} is {sizes[0]} pixels but its image is {sizes[1]}; write predictions at "
-                "the size of the exported images."
-            )
+    def _predicted(self, folder: Path, names: tuple[str, str], label: Bytes) -> list[Bytes]:
+        """The predictions of both frames."""
+        paths = [folder / f"{name}.png" for name in names]
+        for path in paths:
+            if not path.is_file():
+                raise InputError(
+                    f"methods: there is no prediction {path}; predict every image of "
+                    f"{self._folder}, for example with rgbt predict input={self._folder} "
+                    f"out={folder}."
+                )
+        dataset = self._dataset
+        reader, _ = recognise_format(paths, dataset.classes, dataset.palette, self._format)
+        found = [reader.read(path) for path in paths]
+        for path, each in zip(paths, found, strict=True):
+            if each.shape != label.shape:
+                sizes = ["x".join(map(str, shape)) for shape in (each.shape, label.shape)]
+                raise InputError(
+                    f"{path} is {sizes[0]} pixels but its image is {sizes[1]}; write predictions "
+                    "at the size of the exported images."
+                )
         return found
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -21,7 +21,8 @@ from analysis.figures.grid import Grid, Texts, draw_grid
 from analysis.figures.inputs import FigureInput
 from analysis.predictions.scoring import ScoringOptions, score_folder
 from rgbt.checks import InputError
-from rgbt.data.prediction_images import PredictionReader
+from rgbt.data.prediction_files import Affixes, find_affixes
+from rgbt.data.prediction_format import FormatOptions, recognise_format
 from rgbt.metrics.confusion import RegionCounter
 from rgbt.metrics.counts import Counts, scored_classes
 from rgbt.metrics.metric import Regions
@@ -110,38 +111,52 @@ def make_missing(given: FigureInput) -> Figure:
     return draw(_read(given, named, 2), given.get("layout", "rows"), marks="scores")
 
 
+def _reading(
+    folder: Path, names: Sequence[str], dataset: LabelledDataset, described: FormatOptions
+) -> ReadPrediction:
+    """A function that reads the prediction of one of the images.
+
+    Raises:
+        InputError: an image without a prediction, or an unknown format.
+    """
+    stems = {path.stem for path in folder.glob("*.png")}
+    affixes = find_affixes(stems, names, described.affixes)
+    paths = {name: folder / f"{affixes.file_stem(name)}.png" for name in names}
+    for path in paths.values():
+        if not path.is_file():
+            raise InputError(
+                f"methods: there is no prediction {path}; name a folder that holds "
+                f"{affixes.file_stem('NAME')}.png for every image shown, or other images with "
+                "names=..."
+            )
+    reader, _ = recognise_format(paths.values(), dataset.classes, dataset.palette, described)
+    return lambda name: reader.read(paths[name])
+
+
 def _read(given: FigureInput, named: Mapping[str, str], number: int) -> QualitativePanel:
     """The panel of folders of predictions by label, of `number` images unless they are named."""
     folders = {label: Path(place).expanduser() for label, place in named.items()}
-    form: Any = given.get("format", "auto")
-    suffix, dataset = given.get("suffix", ""), given.dataset
-    reader = PredictionReader(dataset.classes, dataset.palette, form)
-
-    def reading(folder: Path) -> ReadPrediction:
-        def read(name: str) -> Labels:
-            path = folder / f"{name}{suffix}.png"
-            if not path.is_file():
-                raise InputError(
-                    f"methods: there is no prediction {path}; name a folder that holds "
-                    f"NAME{suffix}.png for every image shown, or other images with names=..."
-                )
-            return reader.read(path)
-
-        return read
-
+    dataset = given.dataset
+    described = FormatOptions(
+        form=given.get("format", "auto"),
+        palette=given.get("palette", "auto"),
+        affixes=Affixes(given.get("prefix", ""), given.get("suffix", "")),
+    )
     if "names" in given.values and ("pick" in given.values or "rows" in given.values):
         raise InputError("names= selects the images; omit pick= and rows=.")
     names = given.names(given.get("rows", number))
     if given.get("pick", "first") == "largest_difference":
         split = given.get("split", "test")
-        options = ScoringOptions(partitions=("ring",), regions=1, form=form, suffix=suffix)
+        options = ScoringOptions(partitions=("ring",), regions=1, format=described)
         mious = {}
         with progress("comparing", len(folders) * len(dataset.names(split))) as advance:
             for label, folder in folders.items():
                 (counts,) = score_folder(folder, dataset, split, options, advance).counts
                 mious[label] = image_mious(counts)
         names = most_different(mious, dataset.names(split), given.get("rows", number))
-    readers = {label: reading(folder) for label, folder in folders.items()}
+    readers = {
+        label: _reading(folder, names, dataset, described) for label, folder in folders.items()
+    }
     made = panel(dataset, readers, names, given.regions)
     for row in made.rows:
         scores = zip(made.methods, row.mious, strict=True)

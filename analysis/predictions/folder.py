@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from rgbt.checks import InputError
+from rgbt.data.prediction_files import OVERLAY, Affixes, find_affixes
 from rgbt.dataset import LabelledDataset
 
 Missing = Literal["refuse", "leave_out"]
-
-OVERLAY = "_overlay"
-"""Ending of the pictures that `rgbt.predict` writes beside its indices."""
 
 SHOWN = 3
 """Most names that a message lists."""
@@ -26,47 +23,53 @@ class PredictionFiles:
 
     Attributes:
         paths: name of the image -> its prediction, in the order of the split.
+        affixes: how the files are named.
         missing: names of the split without a file.
         extra: names of PNG files that belong to no image of the split (overlays left out).
     """
 
     paths: dict[str, Path]
+    affixes: Affixes
     missing: tuple[str, ...]
     extra: tuple[str, ...]
 
 
 def find(
-    folder: Path, dataset: LabelledDataset, split: str, suffix: str, missing: Missing
+    folder: Path, dataset: LabelledDataset, split: str, given: Affixes, missing: Missing
 ) -> PredictionFiles:
-    """The predictions of a split: files NAME + `suffix` + ".png".
+    """The predictions of a split: files prefix + NAME + suffix + ".png".
 
     Args:
         folder: holds the PNG files.
         dataset: its names are looked up.
         split: of the data set.
-        suffix: between the name and the ending, e.g. "_pred"; "" for none.
+        given: prefix and suffix, see `rgbt.data.prediction_files.find_affixes`.
         missing: "refuse", or "leave_out" to go on without the images that have no file.
 
     Raises:
-        InputError: no such folder, no PNG in it, no file of this split, or files missing.
+        InputError: no such folder, no PNG in it, no file of this split, files missing, or
+            several of an image.
     """
     stems = _stems(folder)
     names = dataset.names(split)
-    there = {name: folder / f"{name}{suffix}.png" for name in names if f"{name}{suffix}" in stems}
+    affixes = find_affixes(stems, names, given)
+    own = {name: affixes.file_stem(name) for name in names}
+    there = {name: folder / f"{stem}.png" for name, stem in own.items() if stem in stems}
     absent = tuple(name for name in names if name not in there)
     if not there:
         raise InputError(
-            f"none of the {len(names)} images of split '{split}' has a file NAME{suffix}.png in "
-            f"{folder}; it contains {listed(sorted(stems), '.png')}{_hint(stems, dataset, suffix)}."
+            f"none of the {len(names)} images of split '{split}' has a file "
+            f"{affixes.file_stem('NAME')}.png in {folder}; it contains "
+            f"{listed(sorted(stems), '.png')}{_hint(stems, dataset, affixes)}."
         )
     if absent and missing == "refuse":
         raise InputError(
             f"{folder} lacks the predictions of {len(absent)} of the {len(names)} images of split "
-            f"'{split}' ({listed(absent, f'{suffix}.png')}); add them, or count the others alone "
-            "with missing=leave_out."
+            f"'{split}' ({listed([own[name] for name in absent], '.png')}); add them, or count the "
+            "others alone with missing=leave_out."
         )
-    own = {f"{name}{suffix}" for name in names} | {f"{name}{OVERLAY}" for name in names}
-    return PredictionFiles(there, absent, tuple(sorted(stems - own)))
+    known = {*own.values(), *(f"{name}{OVERLAY}" for name in names)}
+    return PredictionFiles(there, affixes, absent, tuple(sorted(stems - known)))
 
 
 def listed(names: Sequence[str], ending: str = "") -> str:
@@ -89,17 +92,10 @@ def _stems(folder: Path) -> set[str]:
     return stems
 
 
-def _hint(stems: set[str], dataset: LabelledDataset, suffix: str) -> str:
-    """A hint what the names may be: another split, or the most frequent suffix."""
+def _hint(stems: set[str], dataset: LabelledDataset, affixes: Affixes) -> str:
+    """A hint that the files are those of another split."""
     for split in filter(dataset.has, dataset.splits):
-        names = dataset.names(split)
-        number = sum(f"{name}{suffix}" in stems for name in names)
+        number = sum(affixes.file_stem(name) in stems for name in dataset.names(split))
         if number:
             return f", {number} of them images of split '{split}': give split={split}"
-        pairs = ((stem, name) for stem in stems for name in names if name)
-        after = Counter(stem[len(name) :] for stem, name in pairs if stem.startswith(name))
-        after.pop(OVERLAY, None)
-        if after and after.most_common(1)[0][0]:
-            ending = after.most_common(1)[0][0]
-            return f": give suffix={ending} and split={split} if these are the predictions"
     return ""

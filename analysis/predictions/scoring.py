@@ -15,14 +15,16 @@ from analysis.bar import in_threads
 from analysis.predictions.folder import Missing, PredictionFiles, find
 from analysis.predictions.maps import MapSum, PixelMaps
 from rgbt.checks import InputError, check_choice
-from rgbt.data.prediction_images import Array, Format, PredictionReader, check_one_kind
+from rgbt.data.prediction_files import opened_folder
+from rgbt.data.prediction_format import FormatOptions, RecognisedFormat, recognise_format
+from rgbt.data.prediction_images import Array
 from rgbt.dataset import LabelledDataset
 from rgbt.metrics.confusion import RegionCounter
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Absent, Regions
 from rgbt.metrics.regions import Partition
 
-Resize = Literal["refuse", "nearest"]
+Resize = Literal["refuse", "nearest", "stretch"]
 MOST_STRETCH = 0.05
 """Ratio of the aspects of prediction and label, less 1, up to which one is a resized other."""
 
@@ -36,11 +38,11 @@ class ScoringOptions:
     Attributes:
         partitions: how the image is cut; all are counted in the same pass.
         regions: R of each partition.
-        form: see `rgbt.data.prediction_images.PredictionReader`.
+        format: see `rgbt.data.prediction_format.FormatOptions`.
         missing: "refuse", or "leave_out" to count only the images that have a prediction.
         resize: "refuse" predictions of another size than the label, or take for every pixel of the
-            label the "nearest" one of the prediction (by pixel centres).
-        suffix: files are called NAME + suffix + ".png".
+            label the "nearest" one of the prediction (by pixel centres); "stretch" does so too
+            where the ratio of height and width differs.
         name: of the method; "": the folder's name.
         threads: that read and count; 0: one per core.
         absent: convention for absent classes of the data set, stored with the counts.
@@ -48,10 +50,9 @@ class ScoringOptions:
 
     partitions: tuple[Partition, ...] = PARTITIONS
     regions: int = 5
-    form: Format = "auto"
+    format: FormatOptions = FormatOptions()
     missing: Missing = "refuse"
     resize: Resize = "refuse"
-    suffix: str = ""
     name: str = ""
     threads: int = 0
     absent: Absent = "released"
@@ -59,7 +60,6 @@ class ScoringOptions:
     def __post_init__(self) -> None:
         for partition in self.partitions:
             check_choice("partition", partition, PARTITIONS)
-        check_choice("format", self.form, get_args(Format))
         check_choice("absent", self.absent, get_args(Absent))
         check_choice("missing", self.missing, get_args(Missing))
         check_choice("resize", self.resize, get_args(Resize))
@@ -73,14 +73,17 @@ class FolderScores:
         counts: one per partition, in the order of `ScoringOptions.partitions`.
         maps: counts by pixel; None where the images differ in size.
         found: which files were read, which are missing, which belong to no image.
-        resized: names of images whose prediction had another size.
+        resized: name of an image whose prediction had another size -> both sizes, such as "480x640
+            to 720x1280".
+        format: what the files were read as.
     """
 
     name: str
     counts: tuple[Counts, ...]
     maps: PixelMaps | None
     found: PredictionFiles
-    resized: tuple[str, ...]
+    resized: dict[str, str]
+    format: RecognisedFormat
 
 
 def score_folder(
@@ -96,7 +99,8 @@ def score_folder(
     pixel maps (10 K H W bytes) and one image per thread.
 
     Args:
-        folder: holds NAME.png for every image of the split; other files are not read.
+        folder: holds NAME.png for every image of the split; other files are not read. Or a ZIP file
+            of such a folder.
         dataset: names, labels, classes and colours.
         split: of the data set.
         options: see `ScoringOptions`.
@@ -106,39 +110,50 @@ def score_folder(
         InputError: files missing, unreadable, of another size, or with values that are no class;
             of several, the first in the order of the split.
     """
-    found = find(folder, dataset, split, options.suffix, options.missing)
-    if options.form == "auto":
-        check_one_kind(found.paths.values())
+    with opened_folder(folder) as opened:
+        return _score(opened, dataset, split, options, advance)
+
+
+def _score(
+    folder: Path,
+    dataset: LabelledDataset,
+    split: str,
+    options: ScoringOptions,
+    advance: Callable[[], None],
+) -> FolderScores:
+    found = find(folder, dataset, split, options.format.affixes, options.missing)
+    paths = found.paths.values()
+    form = recognise_format(paths, dataset.classes, dataset.palette, options.format)
     names = tuple(found.paths)
     counters = [
         RegionCounter(dataset.num_classes, _regions(partition, options.regions))
         for partition in options.partitions
     ]
-    reader = PredictionReader(dataset.classes, dataset.palette, options.form)
     maps = MapSum(dataset.num_classes)
 
-    def count(image: str, path: Path) -> tuple[NDArray[np.int64], bool]:
-        """Counts (partitions, R, K, K) and whether it was resized."""
+    def count(image: str, path: Path) -> tuple[NDArray[np.int64], str]:
+        """Counts (partitions, R, K, K), and both sizes if it was resized."""
         label = dataset.label(image)
         if label is None:
             raise InputError(
                 f"'{image}' of {dataset.name} has no label to count predictions against; "
                 "choose a labelled split."
             )
-        prediction = reader.read(path)
-        differs = prediction.shape != label.shape
-        if differs:
+        prediction, sizes = form.reader.read(path), ""
+        if prediction.shape != label.shape:
+            sizes = f"{_size(prediction)} to {_size(label)}"
             prediction = _resized(prediction, label, path, options.resize)
         maps.add(label, prediction)
-        return np.stack([counter(label, prediction) for counter in counters]), differs
+        return np.stack([counter(label, prediction) for counter in counters]), sizes
 
-    size = (len(counters), len(names), options.regions, *[dataset.num_classes] * 2)
-    counts = np.zeros(size, np.int32)
-    resized = []
-    every = in_threads(count, names, found.paths.values(), threads=options.threads)
-    for index, (matrices, was_resized) in enumerate(every):
+    shape = (len(counters), len(names), options.regions, *[dataset.num_classes] * 2)
+    counts = np.zeros(shape, np.int32)
+    resized = {}
+    every = in_threads(count, names, paths, threads=options.threads)
+    for index, (matrices, sizes) in enumerate(every):
         counts[:, index] = matrices
-        resized += [names[index]] if was_resized else []
+        if sizes:
+            resized[names[index]] = sizes
         advance()
     name = options.name or folder.resolve().name
     shared: dict[str, Any] = {"classes": dataset.classes, "unscored": dataset.unscored}
@@ -153,7 +168,7 @@ def score_folder(
         Counts(counts=by_image, partition=counter.regions.name, **shared)
         for by_image, counter in zip(counts, counters, strict=True)
     ]
-    return FolderScores(name, tuple(made), summed, found, tuple(resized))
+    return FolderScores(name, tuple(made), summed, found, resized, form)
 
 
 def _resized(prediction: Array, label: Array, path: Path, resize: Resize) -> Array:
@@ -163,14 +178,18 @@ def _resized(prediction: Array, label: Array, path: Path, resize: Resize) -> Arr
             f"{path} is {height}x{width} pixels but its label is {rows}x{columns}; write "
             "predictions at the size of the label, or count the nearest pixel with resize=nearest."
         )
-    if abs(height / width / (rows / columns) - 1) > MOST_STRETCH:
+    if resize == "nearest" and abs(height / width / (rows / columns) - 1) > MOST_STRETCH:
         raise InputError(
             f"{path} is {height}x{width} pixels and its label {rows}x{columns}, which is another "
-            "shape and no other size; is it turned, or cropped? write predictions of the whole "
-            "image."
+            "shape and no other size; is it turned, or cropped? If the method resized whole images "
+            "to this shape, set resize=stretch."
         )
     nearest = cv2.resize(prediction, (columns, rows), interpolation=cv2.INTER_NEAREST_EXACT)
     return np.asarray(nearest)
+
+
+def _size(image: Array) -> str:
+    return "x".join(map(str, image.shape))
 
 
 def _regions(partition: Partition, regions: int) -> Regions:

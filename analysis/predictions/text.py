@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -94,17 +95,17 @@ def convention_line(table: ScoreTable) -> str:
 
 def remarks_on(scored: FolderScores) -> list[str]:
     """Remarks about the folder that a reader of the numbers needs, one sentence each."""
-    found, remarks = scored.found, []
+    found = scored.found
+    remarks = [" ".join(filter(None, (scored.format.sentence, found.affixes.sentence)))]
     if found.missing:
         number = len(found.missing) + len(found.paths)
         remarks.append(
             f"{len(found.missing)} of {number} images of the split have no prediction and are left "
             f"out of every number ({listed(found.missing)})."
         )
-    if scored.resized:
+    for sizes, number in Counter(scored.resized.values()).items():
         remarks.append(
-            f"{len(scored.resized)} predictions were resized to their label by the nearest pixel "
-            f"({listed(scored.resized)})."
+            f"{number} predictions were resized to their label by the nearest pixel, from {sizes}."
         )
     if found.extra:
         remarks.append(

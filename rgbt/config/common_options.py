@@ -60,6 +60,33 @@ Trust = Annotated[
 
 
 @dataclass(frozen=True, kw_only=True)
+class PredictionFormatOptions:
+    """Options that describe files of predictions, common to all commands that read them."""
+
+    format: Annotated[
+        Literal["auto", "index", "colour"],
+        Help(
+            "format of the predictions: index: the stored numbers; colour: the colours shown; "
+            "auto: by the files"
+        ),
+    ] = "auto"
+    palette: Annotated[
+        str,
+        Help(
+            "palette of coloured predictions: auto: the known one that fits; dataset: "
+            "dataset.palette; a name such as voc; a YAML file with the key palette. -bgr after a "
+            "name exchanges red and blue"
+        ),
+    ] = "auto"
+    prefix: Annotated[
+        str, Help("beginning of the file names of predictions, such as Pred_; default: as found")
+    ] = ""
+    suffix: Annotated[
+        str, Help("end of the file names of predictions, such as _pred; default: as found")
+    ] = ""
+
+
+@dataclass(frozen=True, kw_only=True)
 class NetworkOptions:
     """Options that select a trained network, common to all commands that evaluate one."""
 

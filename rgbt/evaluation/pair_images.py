@@ -23,7 +23,8 @@ from torch import Tensor
 
 from rgbt.checks import InputError
 from rgbt.data.next_frames import NextFrames
-from rgbt.data.prediction_images import Format, PredictionReader, check_one_kind
+from rgbt.data.prediction_files import OVERLAY, Affixes, find_affixes
+from rgbt.data.prediction_format import FormatOptions, recognise_format
 from rgbt.engine.progress import progress
 from rgbt.evaluation.images import write_png
 from rgbt.evaluation.pair_frames import next_frames, virtual_frames
@@ -37,9 +38,6 @@ from rgbt.metrics.pair_list import (
     second_name,
 )
 from rgbt.types import Batch
-
-OVERLAY = "_overlay"
-"""Ending of the pictures that `rgbt predict` writes beside its predictions."""
 
 CPU = torch.device("cpu")
 SHOWN = 3
@@ -106,7 +104,10 @@ class FolderFrames:
         folder: of the predictions.
         source: data set.
         names: of the frames, all of which must be there.
-        form: how files are read, see `rgbt.data.prediction_images.PredictionReader`.
+        given: what the user says about the files, see `rgbt.data.prediction_format`.
+
+    Attributes:
+        sentence: what the files were read as.
 
     Raises:
         InputError: files are missing or of several kinds.
@@ -115,13 +116,18 @@ class FolderFrames:
     device = CPU
 
     def __init__(
-        self, folder: Path, source: PairSource, names: Sequence[str], form: Format = "auto"
+        self,
+        folder: Path,
+        source: PairSource,
+        names: Sequence[str],
+        given: FormatOptions = FormatOptions(),  # noqa: B008 - frozen
     ) -> None:
         self._folder = folder
-        _check_there(folder, names)
-        if form == "auto":
-            check_one_kind(self._path(name) for name in names)
-        self._reader = PredictionReader(source.dataset.classes, source.dataset.palette, form)
+        self._affixes = _found_files(folder, names, given.affixes)
+        paths = map(self._path, names)
+        dataset = source.dataset
+        self._reader, said = recognise_format(paths, dataset.classes, dataset.palette, given)
+        self.sentence = " ".join(filter(None, (said, self._affixes.sentence)))
 
     def first(self, batch: Batch) -> Tensor:
         """See `rgbt.evaluation.pair_scenes.PairPredictor`."""
@@ -145,7 +151,7 @@ class FolderFrames:
         return torch.stack(maps)
 
     def _path(self, name: str) -> Path:
-        return self._folder / f"{name}.png"
+        return self._folder / f"{self._affixes.file_stem(name)}.png"
 
 
 class FolderPairs(FolderFrames):
@@ -156,7 +162,7 @@ class FolderPairs(FolderFrames):
         source: data set and views, which must be those of the export.
         listed: the list of the export.
         wanted: split and frames that are counted.
-        form: see `FolderFrames`.
+        given: see `FolderFrames`.
 
     Raises:
         InputError: the export is of other images or incomplete, or files are missing, foreign or
@@ -169,42 +175,44 @@ class FolderPairs(FolderFrames):
         source: PairSource,
         listed: PairList,
         wanted: PairList,
-        form: Format = "auto",
+        given: FormatOptions = FormatOptions(),  # noqa: B008 - frozen
     ) -> None:
         check_same(listed, wanted)
         self._frames = wanted.frames
-        _check_foreign(folder, wanted.images)
-        super().__init__(folder, source, wanted.images, form)
+        super().__init__(folder, source, wanted.images, given)
+        _check_foreign(folder, wanted.images, self._affixes)
 
     def second(self, batch: Batch, number: int) -> Tensor:
         """See `rgbt.evaluation.pair_scenes.PairPredictor`."""
         return self._read([second_name(name, self._frames, number) for name in batch.name], batch)
 
 
-def _names_in(folder: Path) -> set[str]:
+def _stems_in(folder: Path) -> set[str]:
     return {path.relative_to(folder).with_suffix("").as_posix() for path in folder.rglob("*.png")}
 
 
-def _check_there(folder: Path, names: Sequence[str]) -> None:
-    """Refuse a folder without a prediction of every image."""
+def _found_files(folder: Path, names: Sequence[str], given: Affixes) -> Affixes:
+    """How the files are named, which must include one of every image."""
     if not folder.is_dir():
         raise InputError(
             f"predictions={folder}: there is no such folder; give the one with the predictions."
         )
-    there = _names_in(folder)
-    missing = [name for name in names if name not in there]
+    there = _stems_in(folder)
+    affixes = find_affixes(there, names, given)
+    stems = [affixes.file_stem(name) for name in names]
+    missing = [stem for stem in stems if stem not in there]
     if missing:
         raise InputError(
             f"{folder} lacks the predictions of {len(missing)} of {len(names)} images "
             f"({_listed(missing)}); predict every image."
         )
+    return affixes
 
 
-def _check_foreign(folder: Path, names: Sequence[str]) -> None:
+def _check_foreign(folder: Path, names: Sequence[str], affixes: Affixes) -> None:
     """Refuse a folder with PNG files of other images than those of the export."""
-    _check_there(folder, names)
-    own = {*names, *(f"{name}{OVERLAY}" for name in names)}
-    foreign = sorted(_names_in(folder) - own)
+    own = {*map(affixes.file_stem, names), *(f"{name}{OVERLAY}" for name in names)}
+    foreign = sorted(_stems_in(folder) - own)
     if foreign:
         raise InputError(
             f"{folder} holds {len(foreign)} PNG files of no exported image ({_listed(foreign)}); "

@@ -79,8 +79,11 @@ def _external_row(word: str, kind: Kind, table: Table) -> ExternalRow:
             f"predictions with {KINDS[1]}.{row.label}=FOLDER."
         )
     path = Path(with_home(text)).absolute()
-    if not text or not (path.is_file() if kind == "weights" else path.is_dir()):
-        wanted = "file of weights" if kind == "weights" else "folder of predicted label images"
+    is_archive = path.suffix.lower() == ".zip" and path.is_file()
+    if not text or not (path.is_file() if kind == "weights" else path.is_dir() or is_archive):
+        wanted = "file of weights"
+        if kind == "predictions":
+            wanted = "folder of predicted label images or a ZIP file of one"
         raise InputError(f"'{word}': '{text}' is not a {wanted}; give the path of one.")
     return ExternalRow(row.label, kind, path)
 

@@ -12,9 +12,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from analysis.predictions.maps import PixelMaps
-from analysis.predictions.scoring import score_folder
+from analysis.predictions.scoring import ScoringOptions, score_folder
 from analysis.predictions.table import ScoreKey
 from analysis.score import entry, score_tables
 from analysis.uncertainty import Resampling, estimate
@@ -258,3 +259,34 @@ def test_real_weights_scored_from_their_images_give_the_known_counts(tmp_path: P
     scored = score_folder(tmp_path / "p", MFNet(str(REAL / "mfnet200")), "val")
     for counts in scored.counts:
         np.testing.assert_array_equal(counts.whole(), expected)
+
+
+@pytest.mark.parametrize("kind", ["index", "rgb", "opencv", "palette", "larger"])
+def test_published_predictions_give_the_known_counts_in_every_form(
+    tmp_path: Path, kind: str
+) -> None:
+    """LASNet's maps of 20 real test images, as they are and as other code would write them."""
+    if not (REAL / "predictions20").is_dir():
+        pytest.skip("needs published predictions of real images")
+    dataset = MFNet(str(REAL / "mfnet20"))
+    colours = np.array(dataset.palette, np.uint8)
+    folder = tmp_path / "LASNet"
+    folder.mkdir()
+    for path in sorted((REAL / "predictions20" / "LASNet").glob("*.png")):
+        indices = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        image = Image.fromarray(indices)
+        if kind == "palette":
+            image.putpalette(colours.ravel().tolist())
+        elif kind == "larger":
+            image = image.resize((1280, 960), Image.Resampling.NEAREST)
+        elif kind != "index":
+            image = Image.fromarray(colours[:, :: -1 if kind == "opencv" else 1][indices])
+        image.save(folder / f"Pred_{path.name}")
+    options = ScoringOptions(resize="nearest" if kind == "larger" else "refuse")
+    scored = score_folder(folder, dataset, "test", options)
+    expected = json.loads((REAL / "predictions20" / "expected_confusions.json").read_text())
+    for counts in scored.counts:
+        np.testing.assert_array_equal(counts.whole(), expected["LASNet/test"]["confusion"])
+    words = {"index": "one channel", "rgb": "RGB", "opencv": "exchanged", "palette": "palette PNGs"}
+    assert words.get(kind, "one channel") in scored.format.sentence
+    assert set(scored.resized.values()) == ({"960x1280 to 480x640"} if kind == "larger" else set())

@@ -9,7 +9,9 @@ import pytest
 from PIL import Image
 
 from rgbt.checks import InputError
-from rgbt.data.prediction_images import Format, PredictionReader, check_one_kind, read_header
+from rgbt.data.palettes import Palette
+from rgbt.data.prediction_format import FormatOptions, one_kind, recognise_format
+from rgbt.data.prediction_images import PredictionReader, read_header
 
 CLASSES = ("ground", "car", "person")
 PALETTE = ((0, 0, 0), (64, 0, 128), (64, 64, 0))
@@ -17,8 +19,9 @@ INDICES = np.array([[0, 1, 2], [2, 1, 0]], np.uint8)
 COLOURS = np.array(PALETTE, np.uint8)[INDICES]
 
 
-def reader(form: Format = "auto") -> PredictionReader:
-    return PredictionReader(CLASSES, PALETTE, form)
+def read(path: Path, form: str = "auto") -> np.ndarray:
+    options = FormatOptions(form=form)  # type: ignore[arg-type]
+    return recognise_format([path], CLASSES, PALETTE, options).reader.read(path)
 
 
 def grey(path: Path, values: np.ndarray = INDICES) -> Path:
@@ -44,21 +47,23 @@ def test_three_kinds_of_file_give_equal_counts(tmp_path: Path) -> None:
     ]
     assert read_header(files[3]).bits < 8  # packed pixels of a short palette are indices too
     for file in files:
-        np.testing.assert_array_equal(reader().read(file), INDICES, err_msg=file.name)
+        np.testing.assert_array_equal(read(file), INDICES, err_msg=file.name)
 
 
 def test_format_colour_reads_any_file_and_index_equal_channels(tmp_path: Path) -> None:
     # A palette in another order: the stored numbers are 0, 2, 1 where the colours say 0, 1, 2.
     shuffled = with_palette(tmp_path / "p.png", [PALETTE[0], PALETTE[2], PALETTE[1]])
     swapped = np.array([[0, 2, 1], [1, 2, 0]])
-    np.testing.assert_array_equal(reader("colour").read(shuffled), swapped)
-    np.testing.assert_array_equal(reader("index").read(shuffled), INDICES)
-    with pytest.raises(InputError, match=r"index 1 is shown as \(64, 64, 0\).*car.*format=index"):
-        reader().read(shuffled)
+    np.testing.assert_array_equal(read(shuffled, "colour"), swapped)
+    np.testing.assert_array_equal(read(shuffled, "index"), INDICES)
+    with pytest.raises(
+        InputError, match=r"index 1 is shown as \(64, 64, 0\), .*person.*is car.*format=index"
+    ):
+        read(shuffled)
     three = grey(tmp_path / "three.png", np.dstack([INDICES] * 3))
-    np.testing.assert_array_equal(reader("index").read(three), INDICES)
+    np.testing.assert_array_equal(read(three, "index"), INDICES)
     black = grey(tmp_path / "black.png", np.zeros((2, 2), np.uint8))
-    assert not reader("colour").read(black).any()
+    assert not read(black, "colour").any()
 
 
 def test_a_foreign_palette_is_not_guessed_at(tmp_path: Path) -> None:
@@ -66,9 +71,9 @@ def test_a_foreign_palette_is_not_guessed_at(tmp_path: Path) -> None:
     voc = [(0, 0, 0), (128, 0, 0), (0, 128, 0), (64, 0, 128)]
     path = with_palette(tmp_path / "voc.png", voc, np.array([[0, 3]], np.uint8))
     with pytest.raises(InputError, match=r"only the classes 0 to 2; choose one reading: format="):
-        reader().read(path)
+        read(path)
     unused = with_palette(tmp_path / "unused.png", voc, np.array([[0, 0]], np.uint8))
-    assert not reader().read(unused).any()
+    assert not read(unused).any()
 
 
 @pytest.mark.parametrize(
@@ -84,7 +89,7 @@ def test_a_foreign_palette_is_not_guessed_at(tmp_path: Path) -> None:
         ),
         (
             np.array([[[0, 0, 0], [64, 0, 127]]], np.uint8),
-            r"bad\.png: colour \(64, 0, 127\) at row 0, column 1 .*\(1 such .*car \(64, 0, 128\)",
+            r"bad\.png: colour \(64, 0, 127\) at row 0, .*\(1 such .*is car \(64, 0, 128\)",
         ),
         (np.array([[0, 1]], np.uint16), r"bad\.png: expected 8 bits per channel, got 16"),
         (np.array([[True, False]]), r"bad\.png: expected 8 bits per pixel, got 1"),
@@ -99,25 +104,25 @@ def test_a_foreign_palette_is_not_guessed_at(tmp_path: Path) -> None:
 def test_invalid_predictions_are_refused(tmp_path: Path, values: object, message: str) -> None:
     path = grey(tmp_path / "bad.png", np.asarray(values))
     with pytest.raises(InputError, match=message):
-        reader().read(path)
+        read(path)
 
 
 def test_three_different_channels_are_no_indices(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"three equal ones, got three that differ"):
-        reader("index").read(grey(tmp_path / "a.png", COLOURS))
+        read(grey(tmp_path / "a.png", COLOURS), "index")
 
 
 def test_files_that_are_no_png_or_half_of_one(tmp_path: Path) -> None:
     text = tmp_path / "text.png"
     text.write_text("no picture, but long enough for a header")
     with pytest.raises(InputError, match=r"text\.png is not a PNG file"):
-        reader().read(text)
+        read(text)
     noise = np.random.default_rng(0).integers(0, 3, (64, 64), np.uint8)
     whole = grey(tmp_path / "whole.png", noise).read_bytes()
     half = tmp_path / "half.png"
     half.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(InputError, match=r"half\.png cannot be decoded"):
-        reader().read(half)
+        read(half)
 
 
 def test_a_file_that_claims_too_many_pixels_is_not_decoded(tmp_path: Path) -> None:
@@ -128,19 +133,24 @@ def test_a_file_that_claims_too_many_pixels_is_not_decoded(tmp_path: Path) -> No
     path.write_bytes(content)
     for form in ("index", "colour"):
         with pytest.raises(InputError, match="bomb.png holds 200 million pixels"):
-            reader(form).read(path)  # type: ignore[arg-type]
+            read(path, form)
 
 
 def test_two_classes_of_one_colour_are_refused(tmp_path: Path) -> None:
-    twice = PredictionReader(CLASSES, ((0, 0, 0), (1, 1, 1), (1, 1, 1)))
-    np.testing.assert_array_equal(twice.read(grey(tmp_path / "index.png")), INDICES)
-    with pytest.raises(InputError, match=r"gives car and person the same colour"):
-        twice.read(grey(tmp_path / "colour.png", COLOURS))
+    twice = ((0, 0, 0), (1, 1, 1), (1, 1, 1))
+    index = grey(tmp_path / "index.png")
+    found = recognise_format([index], CLASSES, twice).reader.read(index)
+    np.testing.assert_array_equal(found, INDICES)
+    colour = grey(tmp_path / "colour.png", COLOURS)
+    with pytest.raises(InputError, match=r"the classes 1 and 2 the same colour \(1, 1, 1\)"):
+        recognise_format([colour], CLASSES, twice)
+    with pytest.raises(InputError, match=r"the palette mine gives the classes 1 and 2"):
+        PredictionReader(CLASSES, Palette("mine", twice))
 
 
 def test_files_of_different_kinds_are_refused_together(tmp_path: Path) -> None:
     files = [grey(tmp_path / "a.png"), grey(tmp_path / "b.png")]
-    check_one_kind(files)
+    assert one_kind(files) == "one channel"
     files.append(grey(tmp_path / "c.png", COLOURS))
     with pytest.raises(InputError, match=r"one channel \(.*a\.png\), others with colours \(.*c\.p"):
-        check_one_kind(files)
+        one_kind(files)

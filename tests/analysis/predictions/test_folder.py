@@ -8,6 +8,7 @@ import pytest
 from analysis.predictions.folder import find
 from rgbt.checks import InputError
 from rgbt.data.mfnet import MFNet
+from rgbt.data.prediction_files import Affixes
 
 NAMES = ("00001D", "00002N")
 
@@ -22,26 +23,52 @@ def put(folder: Path, *names: str) -> Path:
 def test_only_names_of_the_split_are_taken(tiny: MFNet, tmp_path: Path) -> None:
     others = ("00003D.png", "00001D_overlay.png", "notes.txt")
     folder = put(tmp_path / "p", "00002N.png", "00001D.png", *others)
-    found = find(folder, tiny, "test", "", "refuse")
+    found = find(folder, tiny, "test", Affixes(), "refuse")
     assert found.paths == {name: folder / f"{name}.png" for name in NAMES}
     assert list(found.paths) == list(NAMES)
     assert found.missing == ()
     assert found.extra == ("00003D",)  # pictures of rgbt.predict are no stray predictions
 
 
-def test_a_suffix_is_part_of_the_names(tiny: MFNet, tmp_path: Path) -> None:
-    folder = put(tmp_path / "p", "00001D_pred.png", "00002N_pred.png")
-    found = find(folder, tiny, "test", "_pred", "refuse")
-    assert found.paths["00002N"] == folder / "00002N_pred.png"
-    with pytest.raises(InputError, match=r"none of the 2 .*00001D_pred\.png.*give suffix=_pred"):
-        find(folder, tiny, "test", "", "refuse")
+@pytest.mark.parametrize(
+    ("form", "affixes"),
+    [
+        ("{}_pred.png", ("", "_pred")),
+        ("Pred_rtfnet_{}.png", ("Pred_rtfnet_", "")),
+        ("a-{}-b.png", ("a-", "-b")),
+    ],
+)
+def test_prefix_and_suffix_are_recognised_or_given(
+    tiny: MFNet, tmp_path: Path, form: str, affixes: tuple[str, str]
+) -> None:
+    folder = put(tmp_path / "p", *map(form.format, NAMES), "00001D_overlay.png", "mean.png")
+    for given in (Affixes(), Affixes(*affixes)):
+        found = find(folder, tiny, "test", given, "refuse")
+        assert found.paths == {name: folder / form.format(name) for name in NAMES}
+        assert found.affixes == affixes
+        assert found.extra == ("mean",)
+    assert form.format("NAME") in found.affixes.sentence
+
+
+def test_names_of_the_images_come_first_and_two_sets_are_ambiguous(
+    tiny: MFNet, tmp_path: Path
+) -> None:
+    both = [f"{kind}_{name}.png" for kind in ("a", "b") for name in NAMES]
+    plain = put(tmp_path / "plain", *both, *(f"{name}.png" for name in NAMES))
+    assert find(plain, tiny, "test", Affixes(), "refuse").affixes == ("", "")
+    several = put(tmp_path / "several", *both)
+    with pytest.raises(InputError, match=r"several files, .*a_NAME\.png.*prefix=a_ or prefix=b_"):
+        find(several, tiny, "test", Affixes(), "refuse")
+    assert find(several, tiny, "test", Affixes(prefix="b_"), "refuse").affixes == ("b_", "")
+    fewer = put(tmp_path / "fewer", *both[:3])
+    assert find(fewer, tiny, "test", Affixes(), "refuse").affixes == ("a_", "")
 
 
 def test_missing_files_are_refused_unless_excluded(tiny: MFNet, tmp_path: Path) -> None:
     folder = put(tmp_path / "p", "00001D.png")
     with pytest.raises(InputError, match=r"lacks .* 1 of the 2 .*\(00002N\.png\).*missing=leave"):
-        find(folder, tiny, "test", "", "refuse")
-    found = find(folder, tiny, "test", "", "leave_out")
+        find(folder, tiny, "test", Affixes(), "refuse")
+    found = find(folder, tiny, "test", Affixes(), "leave_out")
     assert list(found.paths) == ["00001D"]
     assert found.missing == ("00002N",)
 
@@ -50,19 +77,19 @@ def test_missing_files_are_refused_unless_excluded(tiny: MFNet, tmp_path: Path) 
 def test_a_wrong_split_is_named(tiny: MFNet, tmp_path: Path, missing: Any) -> None:
     folder = put(tmp_path / "p", "00001D.png", "00002N.png")
     with pytest.raises(InputError, match=r"none of the 1 .*'val'.*, 2 of them .*give split=test"):
-        find(folder, tiny, "val", "", missing)
+        find(folder, tiny, "val", Affixes(), missing)
     with pytest.raises(InputError, match=r"no split 'tset'; did you mean 'test'"):
-        find(folder, tiny, "tset", "", missing)
+        find(folder, tiny, "tset", Affixes(), missing)
 
 
 def test_folders_without_predictions(tiny: MFNet, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"there is no such folder"):
-        find(tmp_path / "none", tiny, "test", "", "refuse")
+        find(tmp_path / "none", tiny, "test", Affixes(), "refuse")
     with pytest.raises(InputError, match=r"expected PNG files named NAME\.png, but it is empty"):
-        find(put(tmp_path / "empty"), tiny, "test", "", "refuse")
+        find(put(tmp_path / "empty"), tiny, "test", Affixes(), "refuse")
     arrays = put(tmp_path / "npy", *(f"{name}.npy" for name in NAMES))
     with pytest.raises(InputError, match=r"but it contains 00001D\.npy, 00002N\.npy"):
-        find(arrays, tiny, "test", "", "refuse")
+        find(arrays, tiny, "test", Affixes(), "refuse")
     foreign = put(tmp_path / "foreign", "a.png", "b.png", "c.png", "d.png", "e.png")
     with pytest.raises(InputError, match=r"contains a\.png, b\.png, c\.png and 2 more\.$"):
-        find(foreign, tiny, "test", "", "refuse")
+        find(foreign, tiny, "test", Affixes(), "refuse")

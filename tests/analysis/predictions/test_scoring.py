@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -8,8 +10,10 @@ import pytest
 
 from analysis.predictions.maps import iou_map
 from analysis.predictions.scoring import ScoringOptions, score_folder
+from analysis.predictions.text import remarks_on
 from rgbt.checks import InputError
 from rgbt.data.mfnet import MFNet
+from rgbt.data.prediction_format import FormatOptions
 from rgbt.metrics.metric import Regions
 from tests.analysis.predictions.conftest import LABELS, PALETTE, PREDICTIONS, Write
 
@@ -63,9 +67,9 @@ def test_how_files_are_read_and_called_can_be_chosen(tiny: MFNet, write: Write) 
     three = np.dstack([np.array(PREDICTIONS["00002N"], np.uint8)] * 3)
     cv2.imwrite(str(folder / "00002N_out.png"), three)
     with pytest.raises(InputError, match=r"one channel \(.*00001D_out.*others with colours"):
-        score_folder(folder, tiny, "test", ScoringOptions(regions=2, suffix="_out"))
+        score_folder(folder, tiny, "test", ScoringOptions(regions=2))
     chosen = ScoringOptions(
-        partitions=("vertical",), regions=2, suffix="_out", form="index", name="mine"
+        partitions=("vertical",), regions=2, format=FormatOptions(form="index"), name="mine"
     )
     scored = score_folder(folder, tiny, "test", chosen)
     np.testing.assert_array_equal(scored.counts[0].whole().sum(0), [26, 4, 1])
@@ -135,14 +139,21 @@ def test_another_size_is_refused_or_read_at_the_nearest_pixel(tiny: MFNet, write
     # Each predicted pixel stands for 2 x 2: all of the car, all of the person are right.
     first = scored.counts[0].counts[0]
     np.testing.assert_array_equal(first.sum(0), [[8, 0, 0], [0, 4, 0], [0, 0, 3]])
-    assert scored.resized == tuple(LABELS)
+    assert scored.resized == dict.fromkeys(LABELS, "2x2 to 4x4")
+    assert remarks_on(scored) == [
+        "Read as class indices (one channel).",
+        "2 predictions were resized to their label by the nearest pixel, from 2x2 to 4x4.",
+    ]
 
 
 def test_a_turned_prediction_is_no_resized_one(tiny: MFNet, write: Write) -> None:
     folder = write({name: np.zeros((8, 4), np.uint8) for name in ("00001D", "00002N")})
     options = ScoringOptions(partitions=("vertical",), regions=2, resize="nearest")
-    with pytest.raises(InputError, match="is 8x4 pixels and its label 4x4, which is another shape"):
+    with pytest.raises(InputError, match=r"is 8x4 pixels and its label 4x4, .*resize=stretch"):
         score_folder(folder, tiny, "test", options)
+    scored = score_folder(folder, tiny, "test", replace(options, resize="stretch"))
+    assert scored.resized == dict.fromkeys(LABELS, "8x4 to 4x4")
+    assert scored.counts[0].counts.sum((1, 2, 3)).tolist() == [15, 16]
 
 
 def test_the_nearest_pixel_is_nearest_by_centres(tiny: MFNet, write: Write) -> None:
@@ -168,7 +179,21 @@ def test_images_of_different_sizes_have_counts_but_no_map(tiny: MFNet, write: Wr
     assert scored.counts[0].counts.sum((1, 2, 3)).tolist() == [15, 48]
 
 
-@pytest.mark.parametrize("wrong", [{"form": "color"}, {"missing": "leave"}, {"resize": "linear"}])
+@pytest.mark.parametrize("wrong", [{"missing": "leave"}, {"resize": "linear"}])
 def test_unknown_choices_are_refused(wrong) -> None:
     with pytest.raises(InputError, match="is not a valid choice"):
         ScoringOptions(**wrong)
+
+
+def test_a_zip_file_is_its_folder(tiny: MFNet, write: Write, tmp_path: Path) -> None:
+    folder = write(PREDICTIONS)
+    for name in ("__MACOSX/pred/._00001D.png", "pred/notes.txt"):
+        (tmp_path / "zipped" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "zipped" / name).write_text("no image")
+    shutil.copytree(folder, tmp_path / "zipped" / "pred", dirs_exist_ok=True)
+    packed = Path(shutil.make_archive(str(tmp_path / "mine"), "zip", tmp_path / "zipped"))
+    scored = score_folder(packed, tiny, "test", STRIPS)
+    expected = score_folder(folder, tiny, "test", STRIPS)
+    assert scored.name == "mine"
+    for found, counts in zip(scored.counts, expected.counts, strict=True):
+        np.testing.assert_array_equal(found.counts, counts.counts)

@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hydra._internal import defaults_list
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+
+from rgbt.config import compose as composing
+from rgbt.config import quick_hydra
+
+MERGE = quick_hydra._merge_one_by_one
+EMBED = quick_hydra._embed_copy
+WORDS = (
+    ["+experiment=grbm", "scale=paper", "dataset=mfnet"],
+    ["+experiment=temporal_con", "scale=bench"],
+    ["+search=grbm", "dataset=synth"],
+    # One file in two packages, of which one is changed; and a package that is deleted.
+    ["+scheme@first=crm", "+scheme@second=crm", "second.modality_weight=2"],
+    ["~masker", "+masker@first=grbm_paper", "+masker@first.inner=grbm_paper"],
+)
+
+
+@pytest.fixture
+def hydra_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hydra as it is installed."""
+    quick_hydra.make_hydra_quick()
+    monkeypatch.setattr(defaults_list, "_create_interpolation_map", quick_hydra._every_choice)
+    monkeypatch.setattr(quick_hydra, "make_hydra_quick", lambda: None)
+    monkeypatch.setattr("rgbt.config.compose.make_hydra_quick", lambda: None)
+    loader = ConfigLoaderImpl
+    monkeypatch.setattr(loader, "_compose_config_from_defaults_list", MERGE)
+    monkeypatch.setattr(loader, "_embed_result_config", staticmethod(EMBED))
+
+
+def described(words: list[str]) -> tuple[str, list[Any]]:
+    """Values, the order of keys, and the flags of every node; or the error."""
+    try:
+        config = composing._composed_by_hydra(words)
+    except HydraException as error:
+        return repr(error), []
+    nodes, flags = [config], []
+    for node in nodes:
+        flags.append(node._metadata.flags)
+        if OmegaConf.is_dict(node) and not node._is_none() and not node._is_interpolation():
+            children = [node._get_node(key) for key in node]
+            nodes += [child for child in children if OmegaConf.is_config(child)]
+            assert all(child._get_parent() is node for child in children)
+    return OmegaConf.to_yaml(config), flags
+
+
+@pytest.mark.parametrize("words", WORDS, ids=" ".join)
+def test_quick_composition_is_that_of_hydra(
+    words: list[str], request: pytest.FixtureRequest
+) -> None:
+    quick = described(words)
+    request.getfixturevalue("hydra_itself")
+    assert described(words) == quick
+    assert quick[1]
+
+
+def test_refused_file_is_named(tmp_path: Path, request: pytest.FixtureRequest) -> None:
+    (tmp_path / "experiment").mkdir()
+    (tmp_path / "experiment" / "wrong.yaml").write_text(
+        "# @package _global_\nscale: [1]\n"  # a list in the place of a mapping
+    )
+    words = ["+experiment=wrong", f"hydra.searchpath=[file://{tmp_path}]"]
+    quick = described(words)[0]
+    assert "In 'experiment/wrong'" in quick
+    request.getfixturevalue("hydra_itself")
+    assert described(words)[0] == quick
+
+
+def test_files_are_merged_and_moved_only_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the replacement is for: one merge for all files, and tables of choices for few."""
+    merges, tables = [], []
+    merge, table = type(OmegaConf.create()).merge_with, quick_hydra._every_choice
+
+    def counted(self: Any, *others: Any) -> None:
+        merges.append(len(others))
+        merge(self, *others)
+
+    monkeypatch.setattr(type(OmegaConf.create()), "merge_with", counted)
+    monkeypatch.setattr(
+        quick_hydra, "_every_choice", lambda *given: tables.append(1) or table(*given)
+    )
+    composing._composed_by_hydra(["+experiment=grbm"])
+    assert sorted(merges)[-1] > 20
+    assert len(merges) <= 3
+    assert len(tables) < sorted(merges)[-1] / 4
