@@ -25,7 +25,8 @@ _embed_copy = config_loader_impl.ConfigLoaderImpl._embed_result_config
 def make_hydra_quick() -> None:
     """Replace these functions of Hydra in this process."""
     loader: Any = config_loader_impl.ConfigLoaderImpl
-    defaults_list._create_interpolation_map = _choices
+    lists: Any = defaults_list
+    lists._create_interpolation_map = _choices
     loader._compose_config_from_defaults_list = _merged
     loader._embed_result_config = staticmethod(_embedded)
 

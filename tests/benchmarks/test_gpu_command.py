@@ -188,15 +188,16 @@ def test_equality_covers_every_scheme_loss_and_network() -> None:
 def test_equality_reports_no_difference_on_one_device(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(step_equality, "SMOKE", ("mfnet", "sh_adversarial"))
+    monkeypatch.setattr(step_equality, "SMOKE", ("mfnet",))
     task = task_in(tmp_path)
     step_equality.measure(task)
     rows = lines_of(task, "row")
-    assert [row["experiment"] for row in rows] == ["mfnet", "sh_adversarial"]
+    assert [row["experiment"] for row in rows] == ["mfnet"]
     assert all(row["loss difference"] == row["pixels differing"] == 0 for row in rows)
     assert all(row["loss on the CPU"] > 0 for row in rows)
 
 
+@pytest.mark.slow
 def test_training_reports_speed_memory_and_share(tmp_path: Path) -> None:
     task = task_in(tmp_path)
     step_training.measure(task)

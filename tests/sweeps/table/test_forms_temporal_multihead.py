@@ -14,7 +14,7 @@ from rgbt.spec.run_spec import RunSpec
 from sweeps.table.efficiency import million_parameters
 from sweeps.table.load_table import load_table, table_names
 from sweeps.table.request import TableRequest
-from sweeps.table.table import Form
+from sweeps.table.table import Form, Row, Table
 from sweeps.worker.planner import specify_run
 from tests.sweeps.composed import specified
 
@@ -205,12 +205,12 @@ scale=paper too | at scale=demo too. A component that is replaced by another is 
 def runs(name: str, form: Form, scale: str) -> Mapping[str, RunSpec]:
     """The run of every row of a table that can be run, by its label, in the order of the table."""
     table = TABLES[name]
+    return {row.label: run_of(table, row, form, scale) for row in table.runnable_rows}
+
+
+def run_of(table: Table, row: Row, form: Form, scale: str) -> RunSpec:
     rooted = ("dataset.root=/data",) if scale == "paper" else ()
-    words = {row.label: table.overrides(row, scale, form) for row in table.runnable_rows}
-    return {
-        label: specified((*overrides, f"scale={scale}", *rooted))
-        for label, overrides in words.items()
-    }
+    return specified((*table.overrides(row, scale, form), f"scale={scale}", *rooted))
 
 
 def upstream_names(run: RunSpec) -> set[str]:
@@ -332,7 +332,8 @@ def test_starred_rows_as_released_are_the_basic_network_in_two_stages(row: str) 
     """The scripts import the basic network; the modified decoder is that of the paper's form."""
     name, *stages = STARRED[row]
     label = row.split()[0]
-    found = {form: runs(name, form, "paper")[label] for form in FORMS}
+    (chosen,) = (each for each in TABLES[name].runnable_rows if each.label == label)
+    found = {form: run_of(TABLES[name], chosen, form, "paper") for form in FORMS}
     assert found["paper"].model.plain["decoder"] == "modified_heatnet"
     second = found["released"]
     (first,) = (each.run for each in second.dependencies if each.key == "model.weights")
