@@ -109,6 +109,13 @@ ADAPTATION = [
     ("sh_both scheme=supervised", "requires num_domains=2 of the scheme"),
     ("sh_adversarial scheme.supervise_target=true", "requires target_labels=true of the domains"),
     ("sh_adversarial domains.target.labels=given", "requires target_labels=false of the domains"),
+    ("self_training_night masker=none", "requires hides_cells=true of the masker"),
+    ("self_training_night scheme.masked_weight=0", "requires hides_cells=false of the masker"),
+    (
+        "self_training_night domains.target.labels=experiment:thermal_teacher/best.pt",
+        "requires target_labels=false of the domains",
+    ),
+    ("self_training_thermal scheme.augmentation.jitter_strength=0.6", "must be a number from 0"),
     ("sh_source domains.source.labels=none", "every scheme requires labels of the source"),
     ("multi_head_thermal_stage1 domains.source.head=left", "requires heads=left of the model"),
     ("sh_source model.heads=[source,target]", "requires heads=source,target of the domains"),

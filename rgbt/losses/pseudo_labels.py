@@ -42,7 +42,7 @@ def pseudo_labels(
     q weighs every pixel, confident or not. It is a number of the batch, or of each image. Rows at
     the top and bottom of the image have weight 0.
 
-    Source: DACS; DAFormer, Eqs. 3 and 4 (of each image).   Released: of the batch.
+    Source: DACS; DAFormer, Sec. 3.1 (of each image).   Released: of the batch.
 
     Args:
         scores: (B, K, H, W), any float dtype; no gradient passes.

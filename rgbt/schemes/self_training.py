@@ -53,9 +53,8 @@ class SelfTraining:
     that `masker.pairing` gives each. A domain that sees one image pastes what it sees
     (`rgbt.schemes.class_mix.seen_as`).
 
-    Source: DACS; DAFormer, Eqs. 2 to 6, without feature distance and rare class sampling; MIC,
-    Eqs. 2 to 7.
-    Paper: q is a share of each image (DAFormer, Eq. 4).   Released: of the batch.
+    Source: DACS; DAFormer, Sec. 3.1, without feature distance and rare class sampling; MIC.
+    Paper: q is a share of each image (DAFormer).   Released: of the batch.
 
     Attributes:
         model: the network.

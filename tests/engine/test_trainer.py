@@ -134,6 +134,11 @@ def test_loss_falls(tmp_path: Path) -> None:
     trainer.fit(batches(0), State(seed=0))
     assert log[-1][1]["loss"] < 0.1 * log[0][1]["loss"]
     assert {"loss/fit", "loss/extra", "grad_norm", "lr/main_0", "images_per_s"} <= set(log[0][1])
+    # Values beside the loss: logged under their own name, and no part of it.
+    noise = torch.randn(4, 3, 8, 8, generator=torch_generator(0, "noise", 0))
+    assert log[0][1]["noise/mean"] == pytest.approx(noise.mean().item())
+    assert log[0][1]["loss"] == log[0][1]["loss/fit"]
+    assert "loss/noise/mean" not in log[0][1]
 
 
 def halves() -> Iterator[Batch]:

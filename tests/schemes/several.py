@@ -163,7 +163,9 @@ def two_domains(
         **given,
     )
     data = TwoDomains(batch(3, "source"), batch(3, "target", confidence=pseudo), step)
-    return Case(scheme, {"model": net, **record_of(scheme).networks}, data)
+    record = record_of(scheme)
+    trained = {name: record.networks[name] for name in record.builders}
+    return Case(scheme, {"model": net, **trained}, data)
 
 
 def adversarial(*, heads: bool = False, step: int = 1, **changes: Any) -> Case:

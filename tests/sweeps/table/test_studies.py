@@ -64,3 +64,28 @@ def test_missing_image_claims_are_the_contrasts_that_they_state() -> None:
     assert labels["night_needs_thermal"] == [
         "Baseline, night_loss_no_thermal - day_loss_no_thermal"
     ]
+
+
+@pytest.mark.parametrize("task", ["night", pytest.param("thermal", marks=pytest.mark.slow)])
+def test_self_training_is_compared_with_as_many_steps_of_the_same_start(task: str) -> None:
+    """All second stages of one head start from one run, the source alone among them."""
+    name = f"self_training_{task}"
+    words = TableWords(seeds=(0,), scale="bench")
+    request, _ = make_request(name, load_table(name), words)
+    planner = Planner()
+    specs = {
+        row.label: planner.specify(request.overrides(row.label, 0)) for row in request.trained_rows
+    }
+    first = specs.pop("Source only")
+    assert specs.pop("Two heads").upstream
+    assert len(specs) == 6
+    assert {each.plain["trainer"]["max_steps"] for each in specs.values()} == {160}
+    for spec in specs.values():
+        assert [each.key for each in spec.upstream] == [first.key]
+        assert spec.plain["optimizer"] == first.plain["optimizer"]
+        assert spec.plain["data"]["batch_size"] == first.plain["data"]["batch_size"]
+    schemes = [spec.plain["scheme"]["_target_"].rpartition(".")[2] for spec in specs.values()]
+    assert schemes == ["Supervised", "Adversarial", *["SelfTraining"] * 4]
+    views = {label: spec.plain["domains"]["target"] for label, spec in specs.items()}
+    view = {"night": "rgb", "thermal": "thermal"}[task]
+    assert {each["view"] for each in views.values() if each is not None} == {view}
