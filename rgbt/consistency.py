@@ -206,7 +206,8 @@ def _show(pairs: Pairs, data: EvaluationData, label: str, options: Options) -> N
     print_rich(rich_table(consistency_grid(table, f"Consistency of {label} ({on})")))
     if pairs.records:
         print_rich(rich_table(changes_grid(pairs.counts)))
-        for sentence in flow_sentences(pairs.records, options.least_used):
+        least_used = options.least_used if options.frames == "video" else 0.0
+        for sentence in flow_sentences(pairs.records, least_used):
             print_rich(sentence)
 
 

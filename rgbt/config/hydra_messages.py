@@ -147,7 +147,8 @@ def _unknown_key(full_key: str, overrides: Sequence[str]) -> str:
     if full_key == "dataset.root" and "cache_dir" in config.dataset:
         return (
             "'dataset.root' is not a key of an embedded data set. Choose the data set that the "
-            "folder contains: dataset=mfnet (or pst900, kp, freiburg, folder) dataset.root=..."
+            "folder contains: dataset=mfnet (or pst900, kp, freiburg, mvseg, video, folder) "
+            "dataset.root=..."
         )
     known = _settings(OmegaConf.select(config, ".".join(parents)) if parents else config)
     hint = f"{nearest(last, known)}." if parents else _key_hint(config, last, known)

@@ -66,7 +66,7 @@ def flow_sentences(records: Sequence[FlowRecord], least_used: float) -> Iterator
     """What a user should know of the flow of all pairs."""
     counted = [each for each in records if each.used >= least_used]
     used = 100 * np.mean([each.used for each in counted])
-    length = np.median([each.displacement_px for each in counted])
+    length = np.median([each.displacement_px for each in counted if each.used > 0] or [np.nan])
     yield (
         f"Flow of {len(counted)} pairs: {used:.1f} % of the pixels are used (both directions agree "
         f"there); the median displacement is {length:.1f} pixels."
@@ -81,7 +81,7 @@ def flow_sentences(records: Sequence[FlowRecord], least_used: float) -> Iterator
         )
     errors = [each.end_point_error_px for each in counted if each.end_point_error_px >= 0]
     if errors:
-        hidden = 100 * np.mean([each.hidden for each in counted])
+        hidden = 100 * np.nanmean([each.hidden for each in counted])
         yield (
             f"Distance from the exact flow: {np.mean(errors):.2f} pixels on average; {hidden:.1f} "
             "% of the used pixels are hidden in the first frame."

@@ -173,7 +173,7 @@ def pair_scores(score: str, by_region: Matrices, partition: str, absent: Absent)
     """
     if pairs.protocol_of(partition) == "flow" and score != names.TC:
         known = pairs.only_labelled(by_region)
-        without = np.isnan(known).any((-3, -2, -1), keepdims=True)[..., 0, 0]
+        without = np.isnan(known[..., :1, 0, 0])
         return np.where(without, np.nan, OF_PAIRS[score](np.nan_to_num(known), absent))
     return OF_PAIRS[score](by_region, absent)
 

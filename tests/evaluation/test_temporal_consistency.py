@@ -318,6 +318,28 @@ def followed(session: Session, name: str, values: np.ndarray) -> tuple[np.ndarra
     return found, seen
 
 
+def test_the_estimated_flow_is_counted_beside_the_exact_one(cache: Path) -> None:
+    session = on_synth(cache)
+    exact = count_pairs(session, Decoder(), TEST, Pairing("next")).counts
+    found = count_pairs(session, Decoder(), TEST, Pairing("next", "both"))
+    assert set(found.counts) == {"next", "flow"}
+    assert np.array_equal(found.counts["next"].counts, exact["next"].counts)
+    assert re.fullmatch("flow1-[0-9a-f]{6}", found.counts["flow"].partition)
+    names = session.dataset.names("test")
+    assert [record.name for record in found.records] == list(names)
+    after = NextFrames(session.dataset)
+    for record, counts in zip(found.records, found.counts["flow"].counts, strict=True):
+        # All pixels of these scenes have a label, so that all used pixels are counted.
+        assert counts.sum() == round(record.used * HW[0] * HW[1])
+        flow = after.flow(record.name, HW)
+        length = np.nanmedian(np.linalg.norm(flow, axis=-1))
+        assert record.displacement_px == pytest.approx(length, rel=0.5)
+        assert 0 < record.end_point_error_px < length
+        assert 0 <= record.hidden < 0.2
+    rgb = count_pairs(session, Decoder(), TEST, Pairing("next", "rgb")).counts["flow"]
+    assert rgb.partition != found.counts["flow"].partition
+
+
 def test_an_oracle_scores_on_true_frames_what_its_labels_do(cache: Path) -> None:
     session = on_synth(cache)
     after, oracle = NextFrames(session.dataset), Oracle()
