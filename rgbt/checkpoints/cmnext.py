@@ -54,19 +54,18 @@ def _recognise(contents: Contents) -> Facts | None:
     if not has_parts(shapes, "backbone.patch_embed", "backbone.extra_block1.0.c_nets."):
         return None
     size = mit_size(shapes, "backbone.")
-    classes = size_at(shapes, "decode_head.linear_pred.weight")
-    details = {"family": "cmnext", "size": mit_title(size)}
     thermal = count_blocks(shapes, rf"{re.escape(EMBED)}0\.norm\.ln_(\d+)\.")
+    layout, what = "cmnext" if thermal else "cmnext_renamed", "CMNeXt checkpoint"
     if thermal > 1:
-        what = f"CMNeXt checkpoint of {thermal + 1} modalities"
-        return Facts(layout="cmnext_several", what=what, classes=classes, **details)
+        layout, what = "cmnext_several", f"{what} of {thermal + 1} modalities"
     return Facts(
-        layout="cmnext" if thermal else "cmnext_renamed",
-        what="CMNeXt checkpoint",
-        classes=classes,
-        fits=((f"model=cmnext_{size}",),) if size else (),
+        layout=layout,
+        what=what,
+        family="cmnext",
+        size=mit_title(size),
+        classes=size_at(shapes, "decode_head.linear_pred.weight"),
+        fits=((f"model=cmnext_{size}",),) if size and thermal <= 1 else (),
         convention=RELEASED,
-        **details,
     )
 
 

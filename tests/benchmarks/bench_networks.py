@@ -32,6 +32,7 @@ ROUNDS = 3
 NETWORKS = (
     *("mask2former_tiny", "mask2former_swin_t", "mask2former_swin_s", "mask2former_swin_b"),
     *("cmx_tiny", "cmx_b0", "cmx_b2", "cmx_b4", "rtfnet_tiny", "rtfnet_50", "rtfnet_152"),
+    *("cmnext_tiny", "cmnext_b0", "cmnext_b2", "cmnext_b4"),
     *("mfnet_tiny", "mfnet", "heatnet_tiny", "heatnet"),
     *("deeplabv2_tiny", "deeplabv2"),
 )

@@ -169,7 +169,7 @@ def test_prepared_network_predicts_the_class_of_every_pixel() -> None:
 
 def test_prepared_network_names_a_size_that_the_network_refuses() -> None:
     network = PreparedNetwork(tiny("cmx_tiny", image_hw=(3, 3)), batch_size=1)
-    with pytest.raises(InputError, match=r"cmx_tiny: CMX .* got 3 x 3"):
+    with pytest.raises(InputError, match=r"cmx_tiny: these model.sr_ratios .* got 3 x 3"):
         network.predict()
 
 
@@ -296,7 +296,7 @@ def test_command_prints_and_writes(call: Call, tmp_path: Path) -> None:
         (("model=mfnet", "out=a.txt"), "expected a file name that ends in .json or .csv"),
         (("model=mfnet", "image_hw=480"), "image_hw"),
         (("model=mfnet", "masker=grbm_paper"), "'masker' has no effect here"),
-        (("model=cmx_tiny", "image_hw=3,3", "measure=false", *CPU), "cmx_tiny: CMX"),
+        (("model=cmx_tiny", "image_hw=3,3", "measure=false", *CPU), "cmx_tiny: these model.sr_ratios"),
         (("run=nothing",), "nothing"),
         (("networks=nothing.yaml",), "does not exist"),
     ],
