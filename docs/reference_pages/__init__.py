@@ -12,13 +12,22 @@ ROOT = Path(__file__).resolve().parents[2]
 
 def generated_pages() -> dict[str, str]:
     """Text of every generated page, by its path in docs/."""
-    from reference_pages import commands, configuration, experiments, recipes, tables, weights
+    from reference_pages import (
+        commands,
+        configuration,
+        experiments,
+        external,
+        recipes,
+        tables,
+        weights,
+    )
 
     return {
         **configuration.pages(),
         "reference/experiments.md": experiments.experiments_page(),
         "reference/recipes.md": recipes.recipes_page(),
         "reference/commands.md": commands.commands_page(),
+        "reference/external-networks.md": external.external_page(),
         "reference/tables.md": tables.tables_page(),
         "reference/weights.md": weights.weights_page(),
         "changelog.md": (ROOT / "CHANGELOG.md").read_text(),

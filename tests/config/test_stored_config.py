@@ -219,3 +219,27 @@ def test_a_corruption_file_of_others_runs_nothing(tmp_path: Path, lab: Path) -> 
     with pytest.raises(InputError, match="Plain has no attribute"):  # it was built
         choose_corruption(str(path), trust=("my_lab",))
     assert not (tmp_path / "marker").exists()
+
+
+EXTERNAL_NODE = {
+    "_target_": "rgbt.models.external.network.ExternalNetwork",
+    "checkout": "/code/authors/GMNet",
+}
+
+
+@pytest.mark.parametrize(
+    "trust", [("/code/authors/GMNet",), ("/code/authors/../authors/",), ("my_lab", "/code")]
+)
+def test_code_of_a_checkout_needs_a_trusted_folder(trust: tuple[str, ...]) -> None:
+    check_targets({"model": EXTERNAL_NODE}, trust, "store")
+    for other in ((), ("my_lab",), ("/code/authors/GM",), ("/code/authors/GMNet/deeper",)):
+        with pytest.raises(InputError, match=r"'model\.checkout' is /code/authors/GMNet, .*trust"):
+            check_targets({"model": EXTERNAL_NODE}, other, "store")
+    with pytest.raises(InputError, match=r"'scheme\.critics\.0\.checkout' is"):
+        check_targets({"scheme": {"critics": [EXTERNAL_NODE]}}, ("my_lab",), "store")
+
+
+def test_trust_is_also_a_list_of_folders() -> None:
+    assert parse_trust("my_lab,/code/GMNet,~/x,./y,../z") == (
+        *("my_lab", "/code/GMNet", "~/x", "./y", "../z"),
+    )

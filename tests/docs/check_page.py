@@ -29,7 +29,7 @@ REPOSITORY_PATH = re.compile(
     r"(?:rgbt|sweeps|analysis|conf|docs|tests|hydra_plugins)/[\w./-]+\.(?:py|yaml|md|j2|js|css|csv)"
 )
 GENERATED = re.compile(
-    r"docs/(reference/(configuration/[\w-]+|experiments|commands|metrics|recipes|tables|weights)|results/.*)\.md"
+    r"docs/(reference/(configuration/[\w-]+|experiments|external-networks|commands|metrics|recipes|tables|weights)|results/.*)\.md"
 )
 """Pages that exist only in the built site; `make docs` checks the links to them."""
 

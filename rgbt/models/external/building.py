@@ -91,8 +91,8 @@ class Builder:
                 f"model.constructor={self.constructor}: the module {name} is not in the checkout "
                 f"{self.checkout.folder}; name a module of the checkout."
             )
-        found = vars(module).get(attribute)
-        if not callable(found):
+        found: Callable[..., Any] | None = vars(module).get(attribute)
+        if found is None or not callable(found):
             own = [key for key, each in vars(module).items() if _is_defined_in(each, name)]
             raise InputError(
                 f"model.constructor={self.constructor}: {module.__file__} has no class or function "

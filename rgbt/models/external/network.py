@@ -217,7 +217,7 @@ class ExternalNetwork(nn.Module):
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> ExternalNetwork:  # noqa: FBT001, FBT002 - as in torch
         """Move the parameters; with `moves_cuda` also plain tensors that modules hold."""
-        super()._apply(fn, recurse)
+        super()._apply(fn, recurse)  # type: ignore[no-untyped-call]
         for module in self.network.modules() if self.moves_cuda else ():
             plain = {key: each for key, each in vars(module).items() if isinstance(each, Tensor)}
             vars(module).update({key: fn(each) for key, each in plain.items()})

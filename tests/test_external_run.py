@@ -1,0 +1,169 @@
+"""Networks of other authors with the commands, on invented checkouts."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from rgbt import evaluate, predict, profile
+from rgbt.build.load_run import open_run
+from rgbt.checks import InputError
+from rgbt.engine.checkpoint import load_checkpoint
+from rgbt.models.external.network import ExternalNetwork
+from rgbt.types import Output
+from tests.commands import SPLITS, Call, assert_one_sentence, losses, only_run, short, train
+from tests.conftest import write_data
+from tests.models.external.standins import PAIR, STACKED, write_checkout
+
+DROPPING = STACKED.replace(
+    "self.conv(x)", "self.conv(nn.functional.dropout(x, 0.3, self.training))"
+)
+FILES = {"model/__init__.py": "", "model/net.py": DROPPING}
+
+
+def words(checkout: Path, *more: str) -> list[str]:
+    return [
+        *("+experiment=mfnet", "model=external", f"model.checkout={checkout}"),
+        *("masker.patch_size=null", "scale.train_sizes=[48]"),
+        *("model.constructor=model.net:Net", "+model.arguments.n_class=${model.num_classes}"),
+        *more,
+    ]
+
+
+@pytest.mark.slow
+def test_run_resumes_with_equal_losses_and_averages(
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = write_data(tmp_path / "mf", SPLITS, (48, 64))
+    averaged = (*words(write_checkout(tmp_path / "code", FILES)), *short(6))
+    averaged = (*averaged, "trainer.averaging=ema")
+    steps, forward = 0, ExternalNetwork.forward
+
+    def stopped(self: ExternalNetwork, *images: Any, **options: Any) -> Output:
+        nonlocal steps
+        steps += self.training
+        if steps == 4:
+            raise KeyboardInterrupt
+        return forward(self, *images, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ExternalNetwork, "forward", stopped)
+        assert train(call, data, tmp_path / "stopped", *averaged)[0] == 130
+    code, _, err = train(call, data, tmp_path / "stopped", *averaged)
+    assert code == 0, err
+    assert "resumes at step" in err
+    assert train(call, data, tmp_path / "straight", *averaged)[0] == 0
+    ends = [only_run(tmp_path / name) for name in ("stopped", "straight")]
+    assert losses(ends[0]) == losses(ends[1])
+    assert len(losses(ends[0])) == 6
+    first, second = (load_checkpoint(each / "last.pt") for each in ends)
+    for part in ("model", "unaveraged"):
+        pairs = zip(first[part].values(), second[part].values(), strict=True)
+        assert all(torch.equal(*pair) for pair in pairs)
+    assert list(first["model"]) == ["network.conv.weight", "network.conv.bias"]
+    assert not [name for name in sys.modules if name.partition(".")[0] == "model"]
+
+
+def test_stored_run_executes_a_checkout_only_if_it_is_trusted(call: Call, tmp_path: Path) -> None:
+    data = write_data(tmp_path / "mf", SPLITS, (48, 64))
+    marked = f"open({str(tmp_path / 'executed')!r}, 'a').write('x')\n{DROPPING}"
+    checkout = write_checkout(tmp_path / "code", {**FILES, "model/net.py": marked})
+    code, _, err = train(call, data, tmp_path / "runs", *words(checkout, *short(1)))
+    assert code == 0, err
+    run = only_run(tmp_path / "runs")
+    moved = checkout.rename(tmp_path / "moved")
+    (tmp_path / "executed").unlink()
+    named = (f"run={run}", f"dataset.root={data}", "data.num_workers=0")
+    for trust in ((), ("trust=my_lab",), (f"trust={tmp_path / 'other'}",)):
+        code, _, err = call(evaluate.entry, *named, *trust)
+        assert code == 2
+        assert_one_sentence(err, f"add trust={checkout}, or name your own checkout with model.")
+    assert not (tmp_path / "executed").exists()
+    code, _, err = call(evaluate.entry, *named, f"trust={checkout}")
+    assert code == 2
+    assert "does not exist; name the folder of the author's repository" in err
+    code, _, err = call(evaluate.entry, *named, f"model.checkout={moved}")
+    assert code == 0, err
+    moved.rename(checkout)
+    session = open_run(run, [f"dataset.root={data}"], trust=(str(tmp_path),)).session
+    assert session.model.constructor == "model.net:Net"
+    with pytest.raises(InputError, match="executes the code in that folder"):
+        open_run(run, [f"dataset.root={data}"])
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        (("model.constructor=model.net:Other",), "has no class or function 'Other'"),
+        (("model.checkout=nowhere",), "expected a folder that has the module of"),
+        (("model.arguments.n_class=4",), "scores of 4 classes, but model.num_classes is 9"),
+        (("model.feed=pair",), "takes 2 positional arguments but 3 were given"),
+        (("model/inputs=unit_three",), "to have 4 channels, but got 6 channels"),
+        (("model.scores=[[0]]",), "expected class scores (1, 9, h, w) at [0]"),
+        pytest.param(
+            *(("model.auxiliary=[]",), "requires reads_auxiliary=true of the loss"),
+            marks=pytest.mark.slow,  # all losses that fit are named
+        ),
+        (("model.feed=six",), "'model.feed' must be 'stacked', 'pair'"),
+        (("model.weights=nothing.pth",), "the file nothing.pth does not exist"),
+    ],
+)
+def test_mistakes_are_refused_before_a_run_folder_is_made(
+    call: Call, tmp_path: Path, changes: tuple[str, ...], reason: str
+) -> None:
+    data = write_data(tmp_path / "mf", SPLITS, (48, 64))
+    checkout = write_checkout(tmp_path / "code", FILES)
+    path = list(sys.path)
+    code, out, err = train(call, data, tmp_path / "runs", *words(checkout, *short(1), *changes))
+    assert (code, out) == (2, "")
+    assert_one_sentence(err, reason)
+    assert not list((tmp_path / "runs").glob("*/*"))
+    assert sys.path == path
+
+
+def test_auxiliary_scores_are_trained_with_a_loss_that_reads_them(
+    call: Call, tmp_path: Path
+) -> None:
+    data = write_data(tmp_path / "mf", SPLITS, (48, 64))
+    checkout = write_checkout(tmp_path / "code", {"model/net.py": PAIR})
+    both = ("model.feed=pair", "model.scores=[[0]]", "model.auxiliary=[1]")
+    code, _, err = train(
+        *(call, data, tmp_path / "runs"),
+        *words(checkout, *short(1), *both, "loss=cross_entropy_auxiliary", "loss.weight=1"),
+    )
+    assert code == 0, err
+    (step,) = losses(only_run(tmp_path / "runs"))
+    assert {name for name in step if name.endswith("_aux")}
+
+
+@pytest.mark.slow
+def test_two_frames_are_trained_and_measured(call: Call, tmp_path: Path) -> None:
+    data = write_data(tmp_path / "mf", SPLITS, (48, 64))
+    checkout = write_checkout(tmp_path / "code", FILES)
+    temporal = (
+        *words(checkout),
+        "scheme=temporal_paper",
+        "loss=temporal_paper",
+        "consistency=views",
+    )
+    code, _, err = train(call, data, tmp_path / "runs", *temporal, *short(1))
+    assert code == 0, err
+    run = only_run(tmp_path / "runs")
+    named = (f"run={run}", f"dataset.root={data}", f"trust={checkout}")
+    code, _, err = call(predict.entry, *named, "input=test", f"out={tmp_path / 'maps'}")
+    assert code == 0, err
+    assert len(list((tmp_path / "maps").rglob("*.png"))) >= len(SPLITS["test"])
+
+
+@pytest.mark.slow
+def test_profile_builds_the_network_again_in_a_fresh_process(call: Call, tmp_path: Path) -> None:
+    checkout = write_checkout(tmp_path / "code", FILES)
+    without_masker = [word for word in words(checkout) if not word.startswith("masker")]
+    few = ("image_hw=16,24", "rounds=1", "warmup=1", "dataset.root=/none", "dataset=mfnet")
+    code, out, err = call(profile.entry, *without_masker, *few)
+    assert code == 0, err
+    assert "flop" in out.lower()
