@@ -62,10 +62,12 @@ def device_line(session: Session) -> str:
 
 
 def network_line(session: Session) -> str:
-    """Class and number of parameters: "Mask2Former, 1.23 M parameters"."""
+    """Class and number of parameters: "Mask2Former, 1.23 M parameters", and of trained ones."""
     if isinstance(session.model, ExportedNetwork):
         return f"{session.model.description.network} in onnxruntime"
-    return f"{type(session.model).__name__}, {_millions(session.model)} parameters"
+    every, trained = _millions(session.model), _millions(session.model, only_trained=True)
+    of_which = f", {trained} trained" if trained != every else ""
+    return f"{type(session.model).__name__}, {every} parameters{of_which}"
 
 
 def _of_steps(setup: TrainingSetup) -> str:
@@ -84,5 +86,6 @@ def _write(*lines: str) -> None:
     sys.stderr.write("".join(f"{line}\n" for line in lines))
 
 
-def _millions(network: nn.Module) -> str:
-    return f"{sum(each.numel() for each in network.parameters()) / MILLION:.2f} M"
+def _millions(network: nn.Module, *, only_trained: bool = False) -> str:
+    parameters = (p for p in network.parameters() if p.requires_grad or not only_trained)
+    return f"{sum(each.numel() for each in parameters) / MILLION:.2f} M"
