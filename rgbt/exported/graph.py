@@ -57,7 +57,7 @@ def traced(graph: ScoresOfImages, image_hw: tuple[int, int]) -> torch.export.Exp
         InputError: the network depends on values of the images or of the batch in Python.
     """
     # Two images: PyTorch would take a batch of one for a constant.
-    images = tuple(torch.rand(2, channels, *image_hw) for channels in (3, 1))
+    images = tuple(torch.full((2, channels, *image_hw), 0.5) for channels in (3, 1))
     batch = torch.export.Dim("batch", min=1)
     with torch.no_grad(), _quiet():
         # What networks keep per image size is made before: in the trace it would have no values.
