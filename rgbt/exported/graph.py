@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from rgbt.checks import InputError, one_line
 from rgbt.exported.description import Description
+from rgbt.exported.seal import sealed
 from rgbt.types import View
 
 OPSET = 18
@@ -75,7 +76,7 @@ def traced(graph: ScoresOfImages, image_hw: tuple[int, int]) -> torch.export.Exp
 
 
 def onnx_bytes(program: torch.export.ExportedProgram, description: Description) -> bytes:
-    """The content of an ONNX file with the description as its metadata.
+    """The content of an ONNX file with the description as its metadata, and a checksum.
 
     Raises:
         InputError: the network has an operator that ONNX does not have.
@@ -99,10 +100,11 @@ def onnx_bytes(program: torch.export.ExportedProgram, description: Description) 
             ) from error
     assert made is not None, "dynamo=True returns the program"
     proto = made.model_proto
+    for each in (*proto.graph.node, *proto.graph.value_info, *proto.graph.initializer):
+        del each.metadata_props[:]  # lines of code with paths of this machine
     for name, value in description.to_metadata().items():
         proto.metadata_props.add(key=name, value=value)
-    content: bytes = proto.SerializeToString()
-    return content
+    return sealed(proto.SerializeToString())
 
 
 def torch_bytes(program: torch.export.ExportedProgram, description: Description) -> bytes:
