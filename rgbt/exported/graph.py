@@ -100,8 +100,10 @@ def onnx_bytes(program: torch.export.ExportedProgram, description: Description) 
             ) from error
     assert made is not None, "dynamo=True returns the program"
     proto = made.model_proto
-    for each in (*proto.graph.node, *proto.graph.value_info, *proto.graph.initializer):
-        del each.metadata_props[:]  # lines of code with paths of this machine
+    body = proto.graph
+    values = (*body.input, *body.output, *body.value_info, *body.initializer)
+    for each in (body, *body.node, *values):
+        del each.metadata_props[:]  # notes of the exporter, with paths of this machine
     for name, value in description.to_metadata().items():
         proto.metadata_props.add(key=name, value=value)
     return sealed(proto.SerializeToString())
