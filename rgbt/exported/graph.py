@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from rgbt.checks import InputError, one_line
 from rgbt.exported.description import Description
+from rgbt.exported.seal import sealed
 from rgbt.types import View
 
 OPSET = 18
@@ -57,7 +58,7 @@ def traced(graph: ScoresOfImages, image_hw: tuple[int, int]) -> torch.export.Exp
         InputError: the network depends on values of the images or of the batch in Python.
     """
     # Two images: PyTorch would take a batch of one for a constant.
-    images = tuple(torch.rand(2, channels, *image_hw) for channels in (3, 1))
+    images = tuple(torch.full((2, channels, *image_hw), 0.5) for channels in (3, 1))
     batch = torch.export.Dim("batch", min=1)
     with torch.no_grad(), _quiet():
         # What networks keep per image size is made before: in the trace it would have no values.
@@ -75,7 +76,7 @@ def traced(graph: ScoresOfImages, image_hw: tuple[int, int]) -> torch.export.Exp
 
 
 def onnx_bytes(program: torch.export.ExportedProgram, description: Description) -> bytes:
-    """The content of an ONNX file with the description as its metadata.
+    """The content of an ONNX file with the description as its metadata, and a checksum.
 
     Raises:
         InputError: the network has an operator that ONNX does not have.
@@ -99,10 +100,13 @@ def onnx_bytes(program: torch.export.ExportedProgram, description: Description) 
             ) from error
     assert made is not None, "dynamo=True returns the program"
     proto = made.model_proto
+    body = proto.graph
+    values = (*body.input, *body.output, *body.value_info, *body.initializer)
+    for each in (body, *body.node, *values):
+        del each.metadata_props[:]  # notes of the exporter, with paths of this machine
     for name, value in description.to_metadata().items():
         proto.metadata_props.add(key=name, value=value)
-    content: bytes = proto.SerializeToString()
-    return content
+    return sealed(proto.SerializeToString())
 
 
 def torch_bytes(program: torch.export.ExportedProgram, description: Description) -> bytes:

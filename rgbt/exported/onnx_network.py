@@ -7,6 +7,7 @@ within a budget, and a graph whose constants are in other files is refused.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -17,6 +18,7 @@ import rgbt
 from rgbt.checks import InputError, one_line
 from rgbt.exported.description import Description, require_packages
 from rgbt.exported.graph import OPSET, ScoresOfImages, onnx_bytes, traced
+from rgbt.exported.seal import is_damaged
 from rgbt.files.budgets import CONTENT, read_bytes
 from rgbt.requirements import Record, record_of
 from rgbt.types import Output, View
@@ -46,7 +48,8 @@ class ExportedNetwork(nn.Module):
         self._path = path
         _check_content(content, path)
         self._graph = _session(content, path)
-        metadata = self._graph.get_modelmeta().custom_metadata_map
+        with _explained(path):
+            metadata = self._graph.get_modelmeta().custom_metadata_map
         self.description = Description.from_metadata(path, metadata)
         _check_graph(self._graph, self.description, path)
 
@@ -88,7 +91,8 @@ class ExportedNetwork(nn.Module):
             self._refuse(f"takes images of {own} pixels, but got {got}; export with image_hw=...")
         images = {"rgb": rgb, "thermal": thermal}
         arrays = {name: image.float().cpu().numpy() for name, image in images.items()}
-        (scores,) = self._graph.run(["scores"], arrays)
+        with _explained(self._path):
+            (scores,) = self._graph.run(["scores"], arrays)
         return Output(torch.from_numpy(scores).to(rgb.device), {})
 
     def _check_request(self, views: tuple[View, ...], head: str | None) -> None:
@@ -145,6 +149,8 @@ def _check_content(content: bytes, path: Path) -> None:
     import onnx
     from google.protobuf.message import DecodeError
 
+    if is_damaged(content):
+        raise InputError(f"{path} is damaged: it does not match its checksum; {AGAIN}.")
     try:
         graph = onnx.load_model_from_string(content)
     except DecodeError as error:
@@ -167,16 +173,30 @@ def _constants(bodies: Iterable[Any]) -> Iterator[Any]:
 def _session(content: bytes, path: Path) -> Any:
     """The graph, ready to compute."""
     import onnxruntime
-    from onnxruntime.capi import onnxruntime_pybind11_state as state
 
     settings = onnxruntime.SessionOptions()
     settings.intra_op_num_threads = torch.get_num_threads()
     settings.inter_op_num_threads = 1
     settings.log_severity_level = 4  # errors are raised
+    with _explained(path):
+        return onnxruntime.InferenceSession(
+            content,
+            settings,
+            providers=["CPUExecutionProvider"],
+            enable_fallback=0,  # it prints, and tries the same again
+        )
+
+
+@contextmanager
+def _explained(path: Path) -> Iterator[None]:
+    """Turn what onnxruntime raises into an InputError."""
+    from onnxruntime.capi import onnxruntime_pybind11_state as state
+
     kinds = [each for each in vars(state).values() if isinstance(each, type)]
-    raised = tuple(each for each in kinds if issubclass(each, Exception))
+    errors = tuple(each for each in kinds if issubclass(each, Exception))
+    raised: tuple[type[Exception], ...] = (*errors, UnicodeDecodeError)
     try:
-        return onnxruntime.InferenceSession(content, settings, providers=["CPUExecutionProvider"])
+        yield
     except raised as error:
         raise InputError(
             f"{path} cannot be used by onnxruntime ({one_line(error)}); {AGAIN}."

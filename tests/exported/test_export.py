@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from rgbt import evaluate, export, predict
+from rgbt.checks import InputError
 from rgbt.config.component import build
 from rgbt.config.compose import compose
 from rgbt.evaluation.export import Comparison, compare, only_head
@@ -87,6 +88,7 @@ def test_metadata_of_the_file(exported: Path, trained: Trained) -> None:
     assert found["rgbt.classes"][:2] == ["unlabeled", "car"]
     assert (found["rgbt.view"], found["rgbt.head"], found["rgbt.step"]) == ("rgbt", None, 1)
     assert "tracking" not in found["rgbt.settings"], "its address may hold a password"
+    assert b"stack_trace" not in exported.read_bytes(), "it names paths of this machine"
     assert [each.version for each in proto.opset_import if not each.domain] == [18]
 
 
@@ -165,6 +167,36 @@ def test_damaged_files_are_refused(exported: Path, tmp_path: Path, call: Call) -
     code, _, err = call(PREDICT, "exported=none.onnx", "input=test", f"out={tmp_path / 'out'}")
     assert code == 2
     assert_one_sentence(err, "there is no such file")
+
+
+def test_any_changed_byte_is_found(exported: Path) -> None:
+    """Also one in a constant, which is a valid number after the change."""
+    content = exported.read_bytes()
+    rng = np.random.default_rng(0)
+    for position in [0, len(content) - 1, *rng.integers(0, len(content), 100).tolist()]:
+        damaged = bytearray(content)
+        damaged[position] ^= 0x10
+        with pytest.raises(ValueError, match=r"model\.onnx"):
+            ExportedNetwork(bytes(damaged), exported)
+
+
+def test_bytes_changed_by_another_program_raise_one_sentence_or_none(
+    changed: Callable[[Change], Path],
+) -> None:
+    """Without the checksum, onnxruntime has to judge."""
+    path = changed(lambda proto: None)
+    content = path.read_bytes()
+    rng = np.random.default_rng(0)
+    messages = []
+    for position in rng.integers(0, 4000, 40).tolist():
+        damaged = bytearray(content)
+        damaged[position] = int(rng.integers(0, 256))
+        try:
+            ExportedNetwork(bytes(damaged), path)
+        except InputError as error:
+            messages.append(str(error))
+    assert messages
+    assert all(str(path) in each for each in messages)
 
 
 def test_a_file_above_the_budget_is_refused(
