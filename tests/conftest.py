@@ -24,6 +24,7 @@ from hydra._internal.hydra import Hydra
 from rgbt.randomness import numpy_generator
 from rgbt.runtime.signals import WORDS
 from tests.commands import SPLITS, Call, Trained, only_run, without_pictures, words_of
+from tests.quick_hydra import make_hydra_quick
 
 WriteMFNet = Callable[..., Path]
 
@@ -64,6 +65,7 @@ def composed_once() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Hydra, "get_mode", get_mode)
+        make_hydra_quick()
         yield
 
 

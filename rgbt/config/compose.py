@@ -19,7 +19,6 @@ from omegaconf import DictConfig, OmegaConf
 from rgbt.checks import InputError, nearest
 from rgbt.config.compose_cache import compose_cached
 from rgbt.config.config_source import parse_interpolations_once, parsing_once
-from rgbt.config.quick_hydra import make_hydra_quick
 
 SEARCH_PATH = "hydra.searchpath"
 """Override that names the folders of a user's own files for one command."""
@@ -178,7 +177,6 @@ def register_resolvers() -> None:
     ``${scenes:600,6}``: 600 scenes of an embedded data set, or 6 where the scale takes a few.
     """
     parse_interpolations_once()
-    make_hydra_quick()
     for name, resolve in (
         *(("by_scale", _by_scale), ("px", _scaled_pixels), ("scenes", _num_scenes)),
         ("by_network", _by_network),

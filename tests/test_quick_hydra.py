@@ -10,7 +10,7 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
 from rgbt.config import compose as composing
-from rgbt.config import quick_hydra
+from tests import quick_hydra
 
 MERGE = quick_hydra._merge_one_by_one
 EMBED = quick_hydra._embed_copy
@@ -27,10 +27,7 @@ WORDS = (
 @pytest.fixture
 def hydra_itself(monkeypatch: pytest.MonkeyPatch) -> None:
     """Hydra as it is installed."""
-    quick_hydra.make_hydra_quick()
     monkeypatch.setattr(defaults_list, "_create_interpolation_map", quick_hydra._every_choice)
-    monkeypatch.setattr(quick_hydra, "make_hydra_quick", lambda: None)
-    monkeypatch.setattr("rgbt.config.compose.make_hydra_quick", lambda: None)
     loader = ConfigLoaderImpl
     monkeypatch.setattr(loader, "_compose_config_from_defaults_list", MERGE)
     monkeypatch.setattr(loader, "_embed_result_config", staticmethod(EMBED))
