@@ -252,7 +252,7 @@ def test_peak_on_cpu_grows_with_the_image() -> None:
     assert large is not None
     # The first convolution alone has 32-bit values of at least four channels at every pixel.
     assert large - small > 4 * 4 * (480 * 640 - 64 * 64)
-    with pytest.raises(InputError, match="CMX"):
+    with pytest.raises(InputError, match="cmx_tiny: these model.sr_ratios"):
         peak_on_cpu(tiny("cmx_tiny", image_hw=(3, 3)), 1)
 
 
