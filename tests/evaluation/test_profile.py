@@ -294,7 +294,10 @@ def test_command_prints_and_writes(call: Call, tmp_path: Path) -> None:
         (("model=mfnet", "out=a.txt"), "expected a file name that ends in .json or .csv"),
         (("model=mfnet", "image_hw=480"), "image_hw"),
         (("model=mfnet", "masker=grbm_paper"), "'masker' has no effect here"),
-        (("model=cmx_tiny", "image_hw=3,3", "measure=false", *CPU), "cmx_tiny: these model.sr_ratios"),
+        (
+            ("model=cmx_tiny", "image_hw=3,3", "measure=false", *CPU),
+            "cmx_tiny: these model.sr_ratios",
+        ),
         (("run=nothing",), "nothing"),
         (("networks=nothing.yaml",), "does not exist"),
     ],
