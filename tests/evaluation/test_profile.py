@@ -254,7 +254,7 @@ def test_peak_on_cpu_grows_with_the_image() -> None:
     assert large is not None
     # The first convolution alone has 32-bit values of at least four channels at every pixel.
     assert large - small > 4 * 4 * (480 * 640 - 64 * 64)
-    with pytest.raises(InputError, match="CMX"):
+    with pytest.raises(InputError, match="cmx_tiny: these model.sr_ratios"):
         peak_on_cpu(tiny("cmx_tiny", image_hw=(3, 3)), 1)
 
 
@@ -296,7 +296,10 @@ def test_command_prints_and_writes(call: Call, tmp_path: Path) -> None:
         (("model=mfnet", "out=a.txt"), "expected a file name that ends in .json or .csv"),
         (("model=mfnet", "image_hw=480"), "image_hw"),
         (("model=mfnet", "masker=grbm_paper"), "'masker' has no effect here"),
-        (("model=cmx_tiny", "image_hw=3,3", "measure=false", *CPU), "cmx_tiny: these model.sr_ratios"),
+        (
+            ("model=cmx_tiny", "image_hw=3,3", "measure=false", *CPU),
+            "cmx_tiny: these model.sr_ratios",
+        ),
         (("run=nothing",), "nothing"),
         (("networks=nothing.yaml",), "does not exist"),
     ],
