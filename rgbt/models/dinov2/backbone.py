@@ -123,7 +123,9 @@ class DinoBackbone(nn.Module):
                 for owner in (owners if settings.tuning == "lora" else ())
             }
         )
-        pyramids = {modality: Pyramid(shape.embed_dim, token_px) for modality in MODALITIES}
+        pyramids: dict[str, Pyramid] = {
+            modality: Pyramid(shape.embed_dim, token_px) for modality in MODALITIES
+        }
         self.pyramids = nn.ModuleDict(pyramids)
         self.widths = pyramids["rgb"].widths
         self.norm_layers = Fusion(self.widths, fusion=fusion)
