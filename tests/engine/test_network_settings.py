@@ -33,6 +33,8 @@ CASES: list[tuple[str, dict[str, Any]]] = [
     ("cmx", {**DROPS, "decoder_dropout": 0.3}),
     ("mask2former", DROPS),
     ("mask2former", {**DROPS, "share_start": 2}),
+    ("dinov2", {}),
+    ("dinov2", {"tuning": "lora"}),
 ]
 FAMILIES = pytest.mark.parametrize(("name", "changes"), CASES)
 ONE_EACH = ("mfnet", "rtfnet", "pspnet", "deeplabv2", "cmx", "mask2former")
@@ -44,7 +46,7 @@ def settings(**changes: Any) -> TrainerSettings:
 
 def loss_of(net: nn.Module, step: int, *, dtype: torch.dtype | None = None) -> Tensor:
     """Two forward passes before one backward pass, as with two frames or two domains."""
-    options = {"views": ALL_VIEWS, "passes": 2} if type(net).__name__ == "Mask2Former" else {}
+    options = {"views": ALL_VIEWS, "passes": 2} if net.record.outputs == "masks" else {}
     parts = []
     for part in range(2):
         with torch.autocast("cpu", dtype or torch.bfloat16, enabled=dtype is not None):
