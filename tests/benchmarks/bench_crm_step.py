@@ -128,7 +128,9 @@ def reference_loss(
     for hidden in (None, expand_cells(masks, len(batch.rgb), full_hw, PATCH)):
         features = network.backbone(images, hidden, views=VIEWS)
         for view in range(3):
-            outputs.append(network.sem_seg_head([level.chunk(3)[view] for level in features]))
+            head = network.sem_seg_head
+            pyramid = head.pixel_decoder([level.chunk(3)[view] for level in features])
+            outputs.append(head.predictor(pyramid))
     total = outputs[0][0].new_zeros(())
     for index, (classes, mask_logits) in enumerate(outputs[:4]):
         alone = Output(

@@ -34,6 +34,8 @@ CASES: list[tuple[str, dict[str, Any]]] = [
     ("mask2former", DROPS),
     ("mask2former", {**DROPS, "share_start": 2}),
     ("cmnext", {**DROPS, "decoder_dropout": 0.3}),
+    ("dinov2", {}),
+    ("dinov2", {"tuning": "lora"}),
 ]
 FAMILIES = pytest.mark.parametrize(("name", "changes"), CASES)
 ONE_EACH = ("mfnet", "rtfnet", "pspnet", "deeplabv2", "cmx", "cmnext", "mask2former")
@@ -45,7 +47,7 @@ def settings(**changes: Any) -> TrainerSettings:
 
 def loss_of(net: nn.Module, step: int, *, dtype: torch.dtype | None = None) -> Tensor:
     """Two forward passes before one backward pass, as with two frames or two domains."""
-    options = {"views": ALL_VIEWS, "passes": 2} if type(net).__name__ == "Mask2Former" else {}
+    options = {"views": ALL_VIEWS, "passes": 2} if net.record.outputs == "masks" else {}
     parts = []
     for part in range(2):
         with torch.autocast("cpu", dtype or torch.bfloat16, enabled=dtype is not None):

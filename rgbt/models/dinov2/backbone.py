@@ -64,10 +64,15 @@ class Pyramid(nn.ModuleList):
     Source: ViTDet (Li et al., ECCV 2022), Sec. 3, "simple feature pyramid"; layers as in detectron2
     (`modeling/backbone/vit.py`, SimpleFeaturePyramid). Its last 1x1 and 3x3 convolutions of each
     level are left out, because Mask2Former's pixel decoder begins with convolutions of its own.
+
+    `widths` are the channels of the four maps.
     """
 
     def __init__(self, dim: int, token_px: int) -> None:
-        super().__init__(Level(dim, token_px=token_px, stride=stride) for stride in STRIDES)
+        levels = [Level(dim, token_px=token_px, stride=stride) for stride in STRIDES]
+        super().__init__(levels)
+        first, second, third, last = (level.width for level in levels)
+        self.widths = first, second, third, last
 
     def forward(self, maps: Maps) -> Maps:
         """One (N, d, h, w), or one for each level, to four (N, C_s, H/s, W/s)."""
@@ -118,9 +123,11 @@ class DinoBackbone(nn.Module):
                 for owner in (owners if settings.tuning == "lora" else ())
             }
         )
-        self.pyramids = nn.ModuleDict({m: Pyramid(shape.embed_dim, token_px) for m in MODALITIES})
-        first, second, third, last = (level.width for level in self.pyramids["rgb"].children())
-        self.widths = first, second, third, last
+        pyramids: dict[str, Pyramid] = {
+            modality: Pyramid(shape.embed_dim, token_px) for modality in MODALITIES
+        }
+        self.pyramids = nn.ModuleDict(pyramids)
+        self.widths = pyramids["rgb"].widths
         self.norm_layers = Fusion(self.widths, fusion=fusion)
 
     def forward(

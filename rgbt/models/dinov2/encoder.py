@@ -133,7 +133,7 @@ def resized_positions(
     grid = round((positions.shape[1] - 1) ** 0.5)
     if hw == (grid, grid):
         return positions
-    patches = positions[:, 1:].float().unflatten(1, (grid, grid)).permute(0, 3, 1, 2)
+    patches = positions[:, 1:].float().reshape(1, grid, grid, -1).permute(0, 3, 1, 2)
     if position_resize == "factor":
         factor = tuple((side + OFFSET) / grid for side in hw)
         patches = F.interpolate(patches, scale_factor=factor, mode="bicubic")
