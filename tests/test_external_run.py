@@ -11,6 +11,7 @@ import torch
 
 from rgbt import evaluate, predict, profile
 from rgbt.build.load_run import open_run
+from rgbt.checkpoints.release import save
 from rgbt.checks import InputError
 from rgbt.engine.checkpoint import load_checkpoint
 from rgbt.models.external.network import ExternalNetwork
@@ -167,3 +168,10 @@ def test_profile_builds_the_network_again_in_a_fresh_process(call: Call, tmp_pat
     code, out, err = call(profile.entry, *without_masker, *few)
     assert code == 0, err
     assert "flop" in out.lower()
+
+
+def test_trained_weights_are_exported_under_the_names_of_the_author(tmp_path: Path) -> None:
+    state = {"network.conv.weight": torch.ones(2), "network.network.bias": torch.zeros(1)}
+    save(tmp_path / "author.pth", "released", "external", state, {})
+    found = torch.load(tmp_path / "author.pth", weights_only=True)
+    assert list(found) == ["conv.weight", "network.bias"]

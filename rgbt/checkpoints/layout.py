@@ -136,6 +136,7 @@ FAMILIES: Mapping[str, str] = {
     "pspnet": "PSPNet (HeatNet)",
     "semseg": "PSPNet (semseg)",
     "deeplabv2": "DeepLab v2",
+    "external": "a network of another author",
 }
 """Module of rgbt.models -> what its network is called."""
 

@@ -35,6 +35,9 @@ from rgbt.checkpoints.layout import (
 )
 from rgbt.checkpoints.read import Contents
 
+EXTERNAL_PREFIX = "network."
+"""Before the names of a network from elsewhere (`rgbt.models.external.network`)."""
+
 
 def _own_names(*leftover: tuple[str, str]) -> RuleOf:
     """The rule of files whose names are the network's, less some (see `Rule.leftover`)."""
@@ -284,6 +287,11 @@ RELEASES = {
     ),
 }
 """By name."""
+
+
+def released_external(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The author's names of a network from elsewhere, without the beginning that they have here."""
+    return OrderedDict((name.removeprefix(EXTERNAL_PREFIX), each) for name, each in state.items())
 
 
 def _recognise_own(contents: Contents) -> Facts | None:

@@ -37,6 +37,7 @@ RELEASED: Mapping[str, Container] = {
     "rtfnet": lambda state, _: OrderedDict(state),
     "mfnet": lambda state, _: OrderedDict(state),
     "pspnet": lambda state, _: networks.released_heatnet(state),
+    "external": lambda state, _: networks.released_external(state),
     "semseg": lambda state, note: {
         "epoch": 0,
         "state_dict": OrderedDict((f"module.{key}", value) for key, value in state.items()),

@@ -49,7 +49,10 @@ def test_every_option_of_every_group_passes_the_check(
     needed = {} if group != "dataset" or made else {"root": "unused"}
     if option == "folder":
         needed |= {"num_classes": 2, "classes": "[a,b]", "rgb": "a", "thermal": "b", "label": "c"}
-    chosen = alone(f"{group}/{option}", *(f"dataset.{key}={needed[key]}" for key in needed))
+    words = [f"dataset.{key}={needed[key]}" for key in needed]
+    if option == "external":
+        words = ["model.checkout=unused", "model.constructor=a:B"]
+    chosen = alone(f"{group}/{option}", *words)
     usual = default[group]
     try:
         default[group] = chosen[group]

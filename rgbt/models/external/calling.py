@@ -30,26 +30,28 @@ FEEDS: Mapping[Feed, Callable[[Images, Tensor], tuple[Any, ...]]] = {
 
 
 def edge_map(rgb: Tensor, thermal: Tensor) -> Tensor:
-    """Edges of both images, as the mean of their Sobel magnitudes.
+    """Edges of both images, as EGFNet writes them to files.
 
-        E = (|dx Y| + |dy Y| + |dx T| + |dy T|) / 4, each at most 255, Y = luma of RGB
+        E = (e(Y) + e(T)) mod 256, e(X) = round((|dx X| + |dy X|) / 2), slopes at most 255
 
-    Source: EGFNet (Zhou et al., AAAI 2022).   Released: ShaohuaDong2021/EGFNet, sobel.py, which
-    writes the maps as files.
+    Y is the luma of RGB (BT.601) and T thermal, in whole grey levels; dx and dy are 3 x 3 Sobel
+    operators. Source: ShaohuaDong2021/EGFNet, sobel.py, whose conversion to bytes wraps sums above
+    255.
 
     Args:
         rgb: (N, 3, H, W) in [0, 1], as `thermal` (N, 1, H, W); not normalised.
         thermal: see there.
 
     Returns:
-        (N, H, W) in 0..255.
+        (N, H, W), whole numbers in 0..255.
     """
     luma = (rgb * rgb.new_tensor([0.299, 0.587, 0.114]).view(1, 3, 1, 1)).sum(1, keepdim=True)
-    grey = 255 * torch.cat([luma, thermal])
+    grey = (255 * torch.cat([luma, thermal])).round()
     across = grey.new_tensor([[-1.0, 0.0, 1.0], [-2.0, 0.0, 2.0], [-1.0, 0.0, 1.0]])
     kernels = torch.stack([across, across.T])[:, None]
     slopes = F.conv2d(F.pad(grey, (1, 1, 1, 1), mode="reflect"), kernels).abs().clamp(max=255)
-    return slopes.mean(1).view(2, len(rgb), *rgb.shape[2:]).mean(0)
+    of_rgb, of_thermal = slopes.mean(1).round().chunk(2)
+    return (of_rgb + of_thermal) % 256
 
 
 def picked(output: Any, path: Path) -> Any:
