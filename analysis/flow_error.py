@@ -1,6 +1,6 @@
 """Show how far scores along an estimated flow are from those along the exact flow.
 
-``python -m analysis.flow_error folder=measured`` reads what ``rgbt consistency frames=next
+``rgbt flow folder=measured`` reads what ``rgbt consistency frames=next
 flow=rgb out=measured`` wrote, on the embedded data set or another one with known motion.
 """
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Options:
-    """Options of the command."""
+    """Options of ``rgbt flow``."""
 
     folder: Annotated[
         str,

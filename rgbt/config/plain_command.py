@@ -51,6 +51,7 @@ COMMANDS = {
     "details": Entry(
         "analysis.details", "show boundary IoU, calibration, distance and size with intervals"
     ),
+    "flow": Entry("analysis.flow_error", "compare scores along an estimated and the exact flow"),
     "score": Entry("analysis.score", "score predictions of any method by region"),
     "spatial": Entry("analysis.spatial", "measure the statistics of a data set by region"),
     "figures": Entry("analysis.figures.__main__", "draw a figure of the papers"),

@@ -66,5 +66,5 @@ def test_absent_user_data_set_excludes_classes() -> None:
     assert config.metric.absent == "exclude"
     for path in sorted((conf_dir() / "dataset").glob("*.yaml")):
         text = path.read_text()
-        expected = "exclude" if path.stem == "folder" else "released"
+        expected = "exclude" if path.stem in ("folder", "video") else "released"
         assert f"\nabsent: {expected}" in text or "_target_" not in text, path
