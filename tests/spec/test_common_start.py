@@ -58,7 +58,7 @@ NETWORKS = {
     "mask2former": ("baseline", "crm", "grbm", "spatialseg", "crm_released", "crm_kp"),
     "cmx": ("cmx", "temporal_con", "temporal_dice", "temporal_con_released"),
     "rtfnet": ("rtfnet", "rtfnet_temporal_con"),
-    "deeplabv2": ("sh_source", "sh_both", "sh_adversarial"),
+    "deeplabv2": ("sh_source", "sh_both", "sh_adversarial", "self_training_night"),
     "deeplabv2_heads": ("multi_head_night", "multi_head_thermal"),
 }
 
