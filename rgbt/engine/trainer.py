@@ -74,8 +74,7 @@ class Trainer:
         settings: durations and limits.
         scheme: yields the phases of a step.
         model: the network as Fabric wrapped it.
-        others: further modules of the scheme (a discriminator, the weights of a teacher), by their
-            name in checkpoints.
+        others: further modules of the scheme (such as a discriminator), by name in checkpoints.
         optimizers: by the names that phases use.
         schedule: learning rate factor per step.
         steps_per_epoch: optimiser steps in one epoch.
@@ -338,15 +337,10 @@ class Trainer:
         return (*phase.parts, *phase.logged), mean_count(values)
 
     def _logged(self, values: dict[str, float], beside: Container[str]) -> dict[str, float]:
-        """The share of one accumulated batch in the values of a step.
-
-        `beside` are the names of those that are no parts of the loss.
-        """
+        """The share of an accumulated batch in the values of a step; `beside` are not losses."""
         share = 1.0 / self.settings.accumulate
-        parts = {name: value for name, value in values.items() if name not in beside}
-        logged = {name: value * share for name, value in values.items() if name in beside}
-        logged |= {f"loss/{name}": value * share for name, value in parts.items()}
-        logged["loss"] = sum(parts.values()) * share
+        logged = {n if n in beside else f"loss/{n}": v * share for n, v in values.items()}
+        logged["loss"] = sum(v for n, v in values.items() if n not in beside) * share
         return logged
 
 

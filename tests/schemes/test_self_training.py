@@ -229,7 +229,10 @@ def test_resumed_run_ends_with_the_same_bits(tmp_path: Path) -> None:
     before, after = (made.others["teacher"].state_dict() for made in (stopped, straight))
     assert not all(torch.equal(before[name], after[name]) for name in before)
     logged = [
-        [{name: line[name] for name in line if name.startswith(("loss", "teacher"))} for line in log]
+        [
+            {name: line[name] for name in line if name.startswith(("loss", "teacher"))}
+            for line in log
+        ]
         for log in (straight.log, stopped.log + resumed.log)
     ]
     assert logged[0] == logged[1]

@@ -59,7 +59,7 @@ NETWORKS = {
     "cmx": ("cmx", "temporal_con", "temporal_dice", "temporal_con_released"),
     "cmnext": ("cmnext",),
     "rtfnet": ("rtfnet", "rtfnet_temporal_con"),
-    "deeplabv2": ("sh_source", "sh_both", "sh_adversarial"),
+    "deeplabv2": ("sh_source", "sh_both", "sh_adversarial", "self_training_night"),
     "deeplabv2_heads": ("multi_head_night", "multi_head_thermal"),
 }
 

@@ -23,7 +23,9 @@ def augmentation(jitter: float = 1.0, blur: float = 1.0) -> StrongAugmentation:
 
 def images(count: int = 3) -> tuple[Tensor, Tensor]:
     draw = torch_generator(0, "images")
-    return torch.rand(count, 3, 12, 16, generator=draw), torch.rand(count, 1, 12, 16, generator=draw)
+    return torch.rand(count, 3, 12, 16, generator=draw), torch.rand(
+        count, 1, 12, 16, generator=draw
+    )
 
 
 def pixel(*rgb: float) -> Tensor:
