@@ -205,9 +205,9 @@ class Encoder(nn.Module):
         if added is not None:
             x = x + added
         positions = resized_positions(self.pos_embed, hw, self.shape.position_resize)
-        first = [(self.cls_token + positions[:, :1]).expand(len(x), -1, -1)]
+        first = [(self.cls_token + positions[:, :1]).expand(x.shape[0], -1, -1)]
         if self.shape.num_registers:  # registers have no position
-            first.append(self.register_tokens.expand(len(x), -1, -1))
+            first.append(self.register_tokens.expand(x.shape[0], -1, -1))
         x = torch.cat([*first, x + positions[:, 1:]], dim=1)
 
         maps, skipped = [], 1 + self.shape.num_registers

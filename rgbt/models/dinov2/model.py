@@ -166,12 +166,12 @@ class DinoMask2Former(nn.Module):
         and the mask token of the encoder takes the place of its tokens. Nothing is drawn from
         `generator`.
         """
-        wanted = requested(len(rgb), passes, views, num_predictions, num_masks)
+        wanted = requested(rgb.shape[0], passes, views, num_predictions, num_masks)
         image_hw = rgb.shape[2], rgb.shape[3]
         images = self.inputs(rgb, thermal, masks, multiple=STRIDE)
         hidden = None
         if masks is not None:
-            hidden = expand_cells(masks, len(rgb), padded_hw(image_hw), self.token_px)
+            hidden = expand_cells(masks, rgb.shape[0], padded_hw(image_hw), self.token_px)
         features = self.backbone(
             images,
             hidden,
