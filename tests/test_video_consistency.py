@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import os
 from pathlib import Path
 
 import cv2
@@ -16,6 +17,8 @@ from rgbt.randomness import numpy_generator
 from tests.commands import Call, assert_one_sentence
 from tests.conftest import write_png
 
+ROOT = Path(__file__).resolve().parents[1]
+REAL = Path(os.environ.get("RGBT_SHARED", ROOT.parent / "shared")) / "realdata"
 HW = (48, 64)
 STEP = 4
 """Columns by which everything moves to the left from frame to frame."""
@@ -174,3 +177,23 @@ def test_images_of_videos_are_not_exported(call: Call, drive: Path, tmp_path: Pa
     assert code == 2
     assert_one_sentence(err, "predict these as NAME.png, then give predictions=FOLDER")
     assert not (tmp_path / "pairs").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not REAL.is_dir(), reason="needs real frames")
+def test_published_maps_of_real_frames_have_the_documented_scores(
+    call: Call, tmp_path: Path
+) -> None:
+    place = ("dataset=mfnet", f"dataset.root={REAL / 'mfnet20'}", "frames=video")
+    lists = ("dataset.splits.train=test.txt", "dataset.splits.val=test.txt")
+    folder = REAL / "predictions20" / "LASNet"
+    code, shown, err = call(
+        consistency.entry, f"predictions={folder}", *place, *lists, f"out={tmp_path / 'out'}"
+    )
+    assert code == 0, err
+    assert "2 pairs are left out" in " ".join(shown.split())
+    found = Counts.load(tmp_path / "out" / "consistency_flow_test.npz")
+    # Another version of OpenCV may estimate another flow.
+    assert value("TC", found, "released") == pytest.approx(31.29, abs=1)
+    assert value("CA", found, "released") == pytest.approx(25.77, abs=1)
+    assert value("warping_error", found, "released") == pytest.approx(2.91, abs=0.3)

@@ -10,9 +10,11 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from rgbt.checks import InputError
 from rgbt.config.compose import compose
+from sweeps.table.cells import evaluation_of
 from sweeps.table.external import ExternalRow, external_rows
 from sweeps.table.external_data import as_typed, data_of
 from sweeps.table.external_evaluations import content_hash
+from sweeps.table.load_table import load_table
 from sweeps.table.table import Column, Row, Table
 
 COLUMN = Column(name="mIoU", metric="mIoU")
@@ -137,3 +139,15 @@ def test_content_hash_covers_names_and_contents(tmp_path: Path) -> None:
     (folder / ".DS_Store").write_bytes(b"")
     moved = folder.rename(tmp_path / "moved")
     assert content_hash(moved) == before
+
+
+def test_table_iv_of_temporal_has_tc_and_ca_of_both_protocols() -> None:
+    """A row of predictions gets them from the folder of its mIoU."""
+    table = load_table("temporal/table4")
+    counted = {column.name: evaluation_of(column, table) for column in table.columns}
+    frames = {name: each.frames for name, each in counted.items() if each is not None}
+    assert frames == {
+        **{"TC": "released", "CA": "released"},
+        **{"TC aligned": "aligned", "CA aligned": "aligned"},
+    }
+    assert not any(column.printed for column in table.columns if column.name in frames)
