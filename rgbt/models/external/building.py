@@ -85,11 +85,14 @@ class Builder:
             InputError: its module is not in the checkout or cannot be imported, or lacks the name.
         """
         name, _, attribute = self.constructor.partition(":")
-        module = self._attempt(lambda: importlib.import_module(name), "cannot be imported")
-        if not self.checkout.has(module):
+        module = None
+        if self.checkout.holds(name):
+            module = self._attempt(lambda: importlib.import_module(name), "cannot be imported")
+        if module is None or not self.checkout.has(module):
             raise InputError(
                 f"model.constructor={self.constructor}: the module {name} is not in the checkout "
-                f"{self.checkout.folder}; name a module of the checkout."
+                f"{self.checkout.folder}; name a module of the checkout, or the right folder with "
+                "model.checkout=... and model.root=..."
             )
         found: Callable[..., Any] | None = vars(module).get(attribute)
         if found is None or not callable(found):

@@ -78,6 +78,11 @@ class Checkout:
         folders = (path for path in self.folder.iterdir() if path.is_dir())
         return frozenset(files | {each.name for each in folders if next(each.rglob("*.py"), None)})
 
+    def holds(self, name: str) -> bool:
+        """Whether there is a file for a module of this dotted name."""
+        place = self.folder.joinpath(*name.split("."))
+        return place.with_name(f"{place.name}.py").is_file() or (place / "__init__.py").is_file()
+
     def has(self, module: ModuleType) -> bool:
         """Whether a module lies in the checkout; one without a file by where it is searched."""
         file = getattr(module, "__file__", None)
