@@ -74,11 +74,7 @@ THREE_THERMAL = ("deeplabv2", "cmx", "cmnext", "semseg", "dinov2")
 def nano(name: str, seed: int = 0, **changes: Any) -> Any:
     """A small network whose first weights depend on the seed alone."""
     kind, settings = NANO[name]
-    given = (
-        {}
-        if name == "critic"
-        else {"inputs": half(3 if name in THREE_THERMAL else 1)}
-    )
+    given = {} if name == "critic" else {"inputs": half(3 if name in THREE_THERMAL else 1)}
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         return kind(**{**settings, **given, **changes})
