@@ -60,7 +60,7 @@ MISSING: list[tuple[Requirement, str]] = [
     (Requirement("masker", "hides_cells", False), "choose masker=none."),
     (Requirement("transform", "works_on_batches", True), "choose transform=crm, flip, none."),
     (Requirement("domains", "target_confidence", True), "choose domains=heatnet."),
-    (Requirement("model", "outputs", "masks"), "choose model=mask2former_"),
+    (Requirement("model", "outputs", "masks"), "choose model=dinov2_tiny, "),
     (Requirement("masker", "shift", True), "provides shift=false; change asking or masker."),
 ]
 

@@ -38,6 +38,9 @@ NOT_OF_A_RECIPE = {
     "optimizer/sgd_thesis_tiny transform/thesis_96x192 transform/thesis_blur_96x192 "
     "transform/heatnet_96x192 transform/semseg_89x89",
     "starts of scale=bench": "experiment/start",
+    "networks of other authors": "model/external model/inputs/dformer model/inputs/imagenet_449 "
+    "model/inputs/unit_three",
+    "videos, which no paper here has": "dataset/video dataset/mvseg",
 }
 """Files without a number of a recipe at scale=paper: the beginnings of their paths, by reason.
 Networks whose name ends in "_tiny" are of scale=demo too."""

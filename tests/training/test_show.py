@@ -65,6 +65,7 @@ def test_a_finished_run_is_shown_without_torch_and_mlflow(
 
 def record_as_sent(folder: Path) -> None:
     """Let ``mlflow.json`` say that the store on port 9 has everything of the run."""
+    from rgbt.tracking.mlflow_inputs import inputs_digest
     from rgbt.tracking.mlflow_upload import UploadState, _changed_files, _shown, write_upload_state
     from rgbt.tracking.run_files import read_tables
 
@@ -75,6 +76,7 @@ def record_as_sent(folder: Path) -> None:
     sent.steps = {line.kind: line.step for line in run.lines()}
     sent.files = dict(_changed_files(run, sent, tables))
     sent.shown = _shown(run, known, tables, "FINISHED")
+    sent.inputs = inputs_digest(folder)
     write_upload_state(run, sent)
 
 

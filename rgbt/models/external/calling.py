@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
+from annotated_types import Interval, Len
 from torch import Tensor
 from torch.nn import functional as F
 
 from rgbt.checks import InputError, described
 from rgbt.models.inputs import Images
+from rgbt.ranges import Text
 
 Feed = Literal["stacked", "pair", "pair_and_edges", "list", "dicts", "thermal"]
 """How a network takes its images; see `FEEDS`."""
 
-Path = tuple[int | str, ...]
+Index = Annotated[int, Interval(ge=-1000, le=1000)]
+Path = Annotated[tuple[Index | Text, ...], Len(0, 16)]
 """Indices, keys and attributes that lead to scores; "*" stacks what follows of every element."""
 
 FEEDS: Mapping[Feed, Callable[[Images, Tensor], tuple[Any, ...]]] = {
