@@ -170,8 +170,8 @@ def _range(limits: list[Any]) -> str:
     """Bounds of a number, or of how much a list or text holds."""
     bound = {type(each): each for each in limits}
     least, most = bound.get(MinLen), bound.get(MaxLen)
-    if least and most:
-        return f" of {least.min_length} to {most.max_length}"
+    if most:  # `Len(0, ...)` has no `MinLen`
+        return f" of {least.min_length if least else 0} to {most.max_length}"
     ends = {kind: getattr(bound[kind], kind.__name__.lower()) for kind in BOUNDS if kind in bound}
     shown = {kind: str(end) if isinstance(end, int) else f"{end:g}" for kind, end in ends.items()}
     if Ge in shown and Le in shown:

@@ -85,9 +85,9 @@ class ExternalNetwork(nn.Module):
         resize: bool,
         one_by_one: bool,
         empty_packages: Names,
-        stubs: dict[str, dict[str, str]],
+        stubs: dict[str, dict[str, Text]],
         moves_cuda: bool,
-        weights_prefix: str,
+        weights_prefix: Annotated[str, Len(0, 4096)],
     ) -> None:
         super().__init__()
         if size_hw is not None and multiple > 1:
