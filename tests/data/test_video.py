@@ -143,3 +143,12 @@ def test_videos_with_mistakes_are_refused(tmp_path: Path) -> None:
     (root / "z" / "rgb").mkdir(parents=True)
     with pytest.raises(InputError, match="video 'z' is empty: .*rgb holds nothing"):
         video(root)
+
+
+def test_a_frame_in_another_case_is_refused(tmp_path: Path) -> None:
+    root = write_videos(tmp_path)
+    assert video(root).sequences("test")[0] == ("x_1", "x_2", "x_3")
+    last = root / "x" / "rgb" / "3.png"
+    last.rename(last.with_suffix(".PNG"))
+    with pytest.raises(InputError, match=r"3\.PNG differs from dataset\.rgb=.* rename it"):
+        video(root)

@@ -199,7 +199,7 @@ class Video(VideoDataset):
 
     Raises:
         InputError: no such root, patterns that match nothing, an empty video, frames without
-            numbers, or invalid settings.
+            numbers or in another case, or invalid settings.
     """
 
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
@@ -236,6 +236,7 @@ class Video(VideoDataset):
         )
         self.patterns = patterns_of(rgb, thermal, label)
         _check_no_empty_video(self.patterns.rgb, folder)
+        _check_case(self.patterns.rgb, folder)
         self.add(_numbered(folder, self.patterns))
 
 
@@ -249,6 +250,20 @@ def _numbered(root: Path, patterns: Patterns) -> Iterator[NumberedFrame]:
     for frame in find_frames(root, patterns).values():
         video = frame.values.get(VIDEO, "")
         yield NumberedFrame(video, number_of(frame.values[NAME], video), frame)
+
+
+def _check_case(rgb: Pattern, root: Path) -> None:
+    """Refuse frames that differ from the pattern in upper and lower case alone.
+
+    They would be missing from their video, at its end even without a gap.
+    """
+    read = {match.path for match in rgb.files(root)}
+    for match in rgb.files(root, any_case=True):
+        if match.path not in read:
+            raise InputError(
+                f"{match.path} differs from dataset.rgb='{rgb.text}' in upper and lower case, so "
+                "it would not be read; rename it."
+            )
 
 
 def _check_no_empty_video(rgb: Pattern, root: Path) -> None:

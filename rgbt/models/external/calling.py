@@ -95,8 +95,8 @@ def scores_at(output: Any, paths: Sequence[Path], setting: str, shape: tuple[int
             ) from error
         if not _is_scores(value) or len(value) != shape[0]:
             raise InputError(
-                f"{setting}: expected class scores ({shape[0]}, {shape[1]}, h, w) float at {list(path)} "
-                f"of {structure(output)}, got {described(value)}."
+                f"{setting}: expected class scores ({shape[0]}, {shape[1]}, h, w) float at "
+                f"{list(path)} of {structure(output)}, got {described(value)}."
             )
         if value.shape[1] != shape[1]:
             raise InputError(
