@@ -78,6 +78,11 @@ class Builder:
                 f"model.constructor={self.constructor} returned {described(network)}; expected a "
                 "torch.nn.Module."
             )
+        if any(each.is_meta for each in (*network.parameters(), *network.buffers())):
+            raise InputError(
+                f"model.constructor={self.constructor} builds parameters without values (device "
+                "meta); remove torch.set_default_device from the checkout."
+            )
         return network
 
     def _function(self) -> Callable[..., Any]:
