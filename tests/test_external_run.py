@@ -23,7 +23,12 @@ from tests.models.external.standins import PAIR, STACKED, write_checkout
 DROPPING = STACKED.replace(
     "self.conv(x)", "self.conv(nn.functional.dropout(x, 0.3, self.training))"
 )
-FILES = {"model/__init__.py": "", "model/net.py": DROPPING}
+FROZEN = """
+class Frozen(Net):
+    def forward(self, x):
+        return super().forward(x).detach()
+"""
+FILES = {"model/__init__.py": "", "model/net.py": DROPPING + FROZEN}
 
 
 def words(checkout: Path, *more: str) -> list[str]:
@@ -104,7 +109,9 @@ def test_stored_run_executes_a_checkout_only_if_it_is_trusted(call: Call, tmp_pa
         (("model.arguments.n_class=4",), "scores of 4 classes, but model.num_classes is 9"),
         (("model.feed=pair",), "takes 2 positional arguments but 3 were given"),
         (("model/inputs=unit_three",), "to have 4 channels, but got 6 channels"),
-        (("model.scores=[[0]]",), "expected class scores (1, 9, h, w) at [0]"),
+        (("model.scores=[[0]]",), "expected class scores (1, 9, h, w) float at [0]"),
+        (("model.train_scores=[[0]]",), "model.train_scores: expected class scores (2, 9, h, w)"),
+        (("model.constructor=model.net:Frozen",), "no gradient in training, so that it cannot be"),
         pytest.param(
             *(("model.auxiliary=[]",), "requires reads_auxiliary=true of the loss"),
             marks=pytest.mark.slow,  # all losses that fit are named

@@ -53,18 +53,41 @@ def check_own_parts(session: Session) -> None:
 
 
 def check_external(session: Session) -> None:
-    """Call another author's network once per size of image, so that it is refused before a run."""
+    """Call another author's network once per size of image, so that it is refused before a run.
+
+    In training too, as its output may have another form there; its statistics do not change.
+
+    Raises:
+        InputError: it refuses the images, returns something else, or scores without gradients.
+    """
     model = session.model
     if not isinstance(model, ExternalNetwork):
         return
     shown = session.transform.test(first_readable(session, "test"))
+    train_hw = example_hw(session)
     model.eval()
-    for hw in dict.fromkeys((example_hw(session), shown.thermal.shape)):
-        rgb, thermal = (
-            torch.zeros(1, count, *hw, device=session.fabric.device) for count in (3, 1)
-        )
+    for hw in dict.fromkeys((train_hw, shown.thermal.shape)):
         with torch.no_grad(), session.fabric.autocast():
-            model(rgb, thermal)
+            model(*_black(session, 1, hw))
+    before = {name: value.clone() for name, value in model.named_buffers()}
+    model.train()
+    with session.fabric.autocast():
+        images = _black(session, min(2, session.loading.batch_size), train_hw)
+        drawn = torch_generator(session.spec.seed, "probe")
+        learns = model(*images, generator=drawn).logits.requires_grad
+    for name, value in model.named_buffers():
+        value.copy_(before[name])
+    if not learns:
+        raise InputError(
+            f"model.constructor={model.constructor}: the class scores of the network have no "
+            "gradient in training, so that it cannot be trained; remove .detach(), torch.no_grad() "
+            "or the conversion of its output, or choose other scores with model.train_scores."
+        )
+
+
+def _black(session: Session, count: int, hw: tuple[int, ...]) -> list[torch.Tensor]:
+    device = session.fabric.device
+    return [torch.zeros(count, channels, *hw, device=device) for channels in (3, 1)]
 
 
 def check_cells(session: Session, masker: AnyMasker) -> None:

@@ -73,6 +73,9 @@ class FileDataset:
     background: tuple[str, ...] = ()
     """No class is the background."""
 
+    splits_key = "dataset.splits"
+    """Setting that names the splits, for messages."""
+
     def __init__(
         self,
         root: Path,
@@ -134,7 +137,7 @@ class FileDataset:
         """Refuse a split that is not one of `splits`."""
         if split not in self.splits:
             raise InputError(
-                f"dataset.splits has no split '{split}'; {nearest(split, self.splits)}."
+                f"{self.splits_key} has no split '{split}'; {nearest(split, self.splits)}."
             )
 
     def files(self, name: str) -> tuple[Path, ...]:

@@ -192,6 +192,19 @@ class PairReader:
         return np.asarray((values.sum(axis=-1, dtype=np.uint16) + 1) // 3, np.uint8)
 
 
+def reader_of_patterns(layout: PairPattern, thermal_range: Range | None) -> PairReader:
+    """The reader of a user's own files, whose messages name the settings of their data set."""
+    return PairReader(
+        layouts=(layout,),
+        thermal_range=thermal_range,
+        advice="grey levels must have 8 bits in one channel or in three equal channels; "
+        "other values require dataset.thermal_range=[low, high], the values that "
+        "become black and white",
+        packed_advice="give dataset.thermal a separate pattern",
+        rgb_advice="dataset.thermal with the same pattern reads a fourth channel as thermal",
+    )
+
+
 def grey(values: NDArray[Any], limits: Range | None, path: Path) -> Array:
     """Grey levels of thermal values: round(255 (min(max(v, low), high) - low) / (high - low)).
 

@@ -101,7 +101,8 @@ def opened_folder(path: Path) -> Iterator[Path]:
         path: a folder, or a file with the ending ".zip".
 
     Raises:
-        InputError: a damaged archive, more than `CONTENT` allows, or PNG files of several folders.
+        InputError: a damaged or encrypted archive, more than `CONTENT` allows, two files of one
+            name, or PNG files of several folders.
     """
     if path.suffix.lower() != ".zip" or path.is_dir():
         yield path
@@ -135,12 +136,22 @@ def _extract(path: Path, folder: Path) -> None:
         CONTENT.check(path, sum(each.file_size for each in entries))
         if len(entries) > MOST_FILES:
             raise InputError(f"{path} holds more than {MOST_FILES:,} PNG files.")
+        if locked := next((each for each in entries if each.flag_bits & 1), None):
+            raise InputError(
+                f"{path}: {locked.filename} is encrypted; unpack it with its password and give the "
+                "folder."
+            )
         folders = sorted({str(PurePosixPath(each.filename).parent) for each in entries})
         if len(folders) != 1:
             few = f"in several folders ({', '.join(folders[:3])})" if folders else "nowhere"
             raise InputError(
                 f"{path}: expected the PNG files of one folder, found them {few}; unpack it and "
                 "give one folder."
+            )
+        names = Counter(PurePosixPath(each.filename).name for each in entries)
+        if twice := next((name for name, count in names.items() if count > 1), None):
+            raise InputError(
+                f"{path} holds several files called {twice}; pack it again with one of each."
             )
         for each in entries:
             # `read` ends at the size that the archive announces, which was checked above.

@@ -162,8 +162,7 @@ def _check_frames(column: Column, where: str) -> None:
 
 def _check_row(row: Row, table: Table, where: str) -> None:
     names = [column.name for column in table.columns]
-    if row.experiment is not None:
-        check_choice(f"{where}, experiment", row.experiment, available("experiment"))
+    _check_experiment(row, where)
     _check_scales(row.at, where)
     if row.released is not None:
         _check_released(row, row.released, f"{where}, released")
@@ -184,6 +183,16 @@ def _check_row(row: Row, table: Table, where: str) -> None:
     if row.x is not None:
         _check_x(row.x, table, where)
     _check_image(row.settings.get("image_hw", (1, 1)), where)
+
+
+def _check_experiment(row: Row, where: str) -> None:
+    if row.experiment is not None:
+        check_choice(f"{where}, experiment", row.experiment, available("experiment"))
+    elif row.overrides:
+        raise InputError(
+            f"{where}: the row has no experiment; add one, or remove 'overrides', which have no "
+            "effect without it."
+        )
 
 
 def _check_image(value: Any, where: str) -> None:

@@ -49,6 +49,22 @@ def test_a_zip_file_without_one_folder_is_refused(
         pass
 
 
+def test_a_zip_file_with_two_files_of_one_name_is_refused(tmp_path: Path) -> None:
+    with pytest.warns(UserWarning, match="Duplicate name"):
+        path = archive(tmp_path / "p.zip", "a/1.png", "a/2.png", "a/1.png")
+    with pytest.raises(InputError, match="several files called 1.png"), opened_folder(path):
+        pass
+
+
+def test_an_encrypted_zip_file_is_refused_by_name(tmp_path: Path) -> None:
+    path = archive(tmp_path / "p.zip", "a/1.png")
+    data = bytearray(path.read_bytes())
+    data[data.index(b"PK\1\2") + 8] |= 1  # the flag of the entry
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=r"zip: a/1.png is encrypted; unpack"), opened_folder(path):
+        pass
+
+
 def test_a_zip_file_larger_than_the_budget_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -143,3 +143,21 @@ def test_videos_with_mistakes_are_refused(tmp_path: Path) -> None:
     (root / "z" / "rgb").mkdir(parents=True)
     with pytest.raises(InputError, match="video 'z' is empty: .*rgb holds nothing"):
         video(root)
+
+
+def test_a_frame_in_another_case_is_refused(tmp_path: Path) -> None:
+    root = write_videos(tmp_path)
+    assert video(root).sequences("test")[0] == ("x_1", "x_2", "x_3")
+    last = root / "x" / "rgb" / "3.png"
+    last.rename(last.with_suffix(".PNG"))
+    with pytest.raises(InputError, match=r"3\.PNG differs from dataset\.rgb=.* rename it"):
+        video(root)
+
+
+def test_messages_name_the_settings_of_a_video(tmp_path: Path) -> None:
+    root = write_videos(tmp_path)
+    write_png(root / "x" / "ir" / "1.png", np.full(HW, 30000, np.uint16))
+    with pytest.raises(InputError, match=r"got uint16; .* require dataset\.thermal_range=\[low"):
+        video(root).read("x_1")
+    with pytest.raises(InputError, match=r"dataset\.lists has no split 'train'; known: test"):
+        video(root, lists=None).names("train")

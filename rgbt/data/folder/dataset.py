@@ -21,7 +21,7 @@ from rgbt.data.file_dataset import FileDataset, SplitNames
 from rgbt.data.folder.frames import FolderFrame, check_partners, find_frames, patterns_of
 from rgbt.data.folder.pattern import SPLIT
 from rgbt.data.folder.splits import FOLDERS, ByFolder, ByList, ByShare, SplitRule
-from rgbt.data.images import PairPattern, PairReader, Range, check_limits
+from rgbt.data.images import PairPattern, Range, check_limits, reader_of_patterns
 from rgbt.data.labels import LabelValue, each_colour, label_codes, painted
 from rgbt.data.named_files import existing_root, hash_of_files
 from rgbt.ranges import Colour, Names, NumClasses, Seed, Share, Text
@@ -107,15 +107,7 @@ class Folder(FileDataset):
         check_limits(thermal_range)
         self.codes = label_codes(classes, ids, colours, ignored)
         self.patterns = patterns_of(rgb, thermal, label)
-        self.images = PairReader(
-            layouts=(PairPattern(rgb, thermal, label),),
-            thermal_range=thermal_range,
-            advice="grey levels must have 8 bits in one channel or in three equal channels; "
-            "other values require dataset.thermal_range=[low, high], the values that "
-            "become black and white",
-            packed_advice="give dataset.thermal a separate pattern",
-            rgb_advice="dataset.thermal with the same pattern reads a fourth channel as thermal",
-        )
+        self.images = reader_of_patterns(PairPattern(rgb, thermal, label), thermal_range)
         self.frames: Mapping[str, FolderFrame] = find_frames(self.root, self.patterns)
         self.rule = self._rule_of(folders, lists, shares, (shares_seed, block))
         self.unlabelled = unlabelled

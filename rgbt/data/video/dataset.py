@@ -11,7 +11,7 @@ from rgbt.data.file_dataset import FileDataset, SplitNames
 from rgbt.data.folder.frames import FolderFrame, Patterns, find_frames, patterns_of
 from rgbt.data.folder.pattern import NAME, Pattern, what_is_in
 from rgbt.data.folder.splits import ByList
-from rgbt.data.images import PairPattern, PairReader, Range, check_limits
+from rgbt.data.images import PairPattern, Range, check_limits, reader_of_patterns
 from rgbt.data.labels import LabelValue, label_codes, painted
 from rgbt.data.named_files import existing_root, hash_of_files
 from rgbt.data.sequences import consecutive
@@ -48,6 +48,8 @@ class VideoDataset(FileDataset):
         frames: name -> frame.
         videos: name of a video -> number -> name of the frame.
     """
+
+    splits_key = "dataset.lists"
 
     def __init__(  # noqa: PLR0913 - settings of every data set of videos
         self,
@@ -199,7 +201,7 @@ class Video(VideoDataset):
 
     Raises:
         InputError: no such root, patterns that match nothing, an empty video, frames without
-            numbers, or invalid settings.
+            numbers or in another case, or invalid settings.
     """
 
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
@@ -228,14 +230,10 @@ class Video(VideoDataset):
         check_limits(thermal_range)
         self.unscored, self.background, self.clipping = unscored, background, thermal_range
         self.codes = label_codes(classes, ids, None, ignored)
-        self.images = PairReader(
-            layouts=(PairPattern(rgb, thermal, label),),
-            thermal_range=thermal_range,
-            packed_advice="give dataset.thermal a separate pattern",
-            rgb_advice="dataset.thermal with the same pattern reads a fourth channel as thermal",
-        )
+        self.images = reader_of_patterns(PairPattern(rgb, thermal, label), thermal_range)
         self.patterns = patterns_of(rgb, thermal, label)
         _check_no_empty_video(self.patterns.rgb, folder)
+        _check_case(self.patterns.rgb, folder)
         self.add(_numbered(folder, self.patterns))
 
 
@@ -249,6 +247,20 @@ def _numbered(root: Path, patterns: Patterns) -> Iterator[NumberedFrame]:
     for frame in find_frames(root, patterns).values():
         video = frame.values.get(VIDEO, "")
         yield NumberedFrame(video, number_of(frame.values[NAME], video), frame)
+
+
+def _check_case(rgb: Pattern, root: Path) -> None:
+    """Refuse frames that differ from the pattern in upper and lower case alone.
+
+    They would be missing from their video, at its end even without a gap.
+    """
+    read = {match.path for match in rgb.files(root)}
+    for match in rgb.files(root, any_case=True):
+        if match.path not in read:
+            raise InputError(
+                f"{match.path} differs from dataset.rgb='{rgb.text}' in upper and lower case, so "
+                "it would not be read; rename it."
+            )
 
 
 def _check_no_empty_video(rgb: Pattern, root: Path) -> None:

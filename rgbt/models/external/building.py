@@ -18,6 +18,7 @@ from rgbt.models.external.checkout import Checkout
 from rgbt.models.external.cuda_calls import cuda_calls_to
 from rgbt.models.external.draws import seeded
 from rgbt.models.external.guard import without_weights
+from rgbt.models.external.settings import kept_settings
 
 
 class Namespace(dict[str, Any]):
@@ -61,6 +62,7 @@ class Builder:
         """
         seed = int(torch.randint(2**31, (), generator=torch.default_generator, device="cpu"))
         with (
+            kept_settings(),
             self.checkout.imported(),
             without_weights() as replace,
             cuda_calls_to("cpu" if self.moves_cuda else None),
@@ -75,6 +77,11 @@ class Builder:
             raise InputError(
                 f"model.constructor={self.constructor} returned {described(network)}; expected a "
                 "torch.nn.Module."
+            )
+        if any(each.is_meta for each in (*network.parameters(), *network.buffers())):
+            raise InputError(
+                f"model.constructor={self.constructor} builds parameters without values (device "
+                "meta); remove torch.set_default_device from the checkout."
             )
         return network
 
@@ -117,7 +124,9 @@ class Builder:
         """The result of foreign code; any error of it in one sentence."""
         try:
             return call()
-        except (Exception, SystemExit) as error:
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # SystemExit too, which modules of scripts raise
             place = line_of(error, self.checkout.folder)
             raise InputError(
                 f"model.constructor={self.constructor} {what}: {reason(error)}{place}."

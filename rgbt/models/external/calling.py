@@ -96,10 +96,10 @@ def scores_at(output: Any, paths: Sequence[Path], setting: str, shape: tuple[int
                 f"{setting}: the network returns {structure(output)}, which has nothing at "
                 f"{list(path)}; name the position of the class scores."
             ) from error
-        if not isinstance(value, Tensor) or value.dim() != 4 or len(value) != shape[0]:
+        if not _is_scores(value) or len(value) != shape[0]:
             raise InputError(
-                f"{setting}: expected class scores ({shape[0]}, {shape[1]}, h, w) at {list(path)} "
-                f"of {structure(output)}, got {described(value)}."
+                f"{setting}: expected class scores ({shape[0]}, {shape[1]}, h, w) float at "
+                f"{list(path)} of {structure(output)}, got {described(value)}."
             )
         if value.shape[1] != shape[1]:
             raise InputError(
@@ -114,6 +114,10 @@ def scores_at(output: Any, paths: Sequence[Path], setting: str, shape: tuple[int
             "added; choose paths to scores of one size."
         )
     return torch.stack(found).sum(0) if len(found) > 1 else found[0]
+
+
+def _is_scores(value: object) -> bool:
+    return isinstance(value, Tensor) and value.dim() == 4 and value.is_floating_point()
 
 
 def structure(value: object) -> str:

@@ -54,9 +54,15 @@ class Checkout:
         """The checkout in the folder `checkout`, of which `root` is put on the path.
 
         Raises:
-            InputError: no such folder, or no folder of an empty package.
+            InputError: no such folder, one outside of the checkout, or no folder of an empty
+                package.
         """
-        folder = Path(checkout).expanduser() / root
+        place = Path(checkout).expanduser()
+        folder = place / root
+        if not folder.resolve().is_relative_to(place.resolve()):  # the user trusts `checkout`
+            raise InputError(
+                f"model.root={root} leads out of model.checkout={checkout}; name a folder in it."
+            )
         if not folder.is_dir():
             raise InputError(
                 f"model.checkout={checkout}: the folder {folder} does not exist; name the folder "

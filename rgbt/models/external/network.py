@@ -186,16 +186,26 @@ class ExternalNetwork(nn.Module):
         try:
             with cuda_calls_to(images.rgb.device if self.moves_cuda else None):
                 return self.network(*arguments)
-        except (torch.OutOfMemoryError, RunError):
+        except (torch.OutOfMemoryError, RunError, KeyboardInterrupt):
             raise
-        except Exception as error:
+        except BaseException as error:  # SystemExit would end the command without a word
             height, width = images.rgb.shape[2:]
+            self._check_not_importing(error)
             place = line_of(error, self.source.folder)
             raise InputError(
                 f"model.constructor={self.constructor}: the network cannot predict "
                 f"{len(images.rgb)} images of {height} x {width} pixels with "
                 f"model.feed={self.feed}: "
                 f"{reason(error)}{place}.{advice(error)}"
+            ) from error
+
+    def _check_not_importing(self, error: BaseException) -> None:
+        """Refuse an import inside `forward` of what the checkout has."""
+        if isinstance(error, ImportError) and str(error.name).split(".")[0] in self.source.names:
+            raise InputError(
+                f"model.constructor={self.constructor}: the network imports '{error.name}' of its "
+                f"checkout while it is called{line_of(error, self.source.folder)}; move the import "
+                "to the top of that module."
             ) from error
 
     def _at_input(

@@ -32,6 +32,12 @@ def test_namespaces_have_attributes_and_keys(tmp_path: Path) -> None:
     assert not hasattr(namespace({"a": 1}), "b")
 
 
+HOLLOW = """
+def hollow(n_class):
+    return Net(n_class).to("meta")
+"""
+
+
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
@@ -46,6 +52,7 @@ def test_namespaces_have_attributes_and_keys(tmp_path: Path) -> None:
         ({"arguments": {}}, "missing a required argument: 'n_class'"),
         ({"arguments": {"n_class": "x"}}, r"cannot be built: TypeError: .*model/net.py, line 8"),
         ({"constructor": "model.stops:Net"}, "cannot be imported: SystemExit: 2"),
+        ({"constructor": "model.net:hollow"}, r"builds parameters without values \(device meta"),
         ({"constructor": "model.wrong:Net"}, r"cannot be imported: SyntaxError: .*"),
     ],
 )
@@ -54,7 +61,7 @@ def test_mistakes_are_one_sentence(tmp_path: Path, changes: dict[str, object], r
         tmp_path,
         {
             "model/__init__.py": "",
-            "model/net.py": f"{STACKED}\ndef build():\n    return 3\n",
+            "model/net.py": f"{STACKED}\ndef build():\n    return 3\n{HOLLOW}",
             "model/stops.py": "raise SystemExit(2)",
             "model/wrong.py": "def",
         },

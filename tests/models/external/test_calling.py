@@ -108,6 +108,8 @@ def test_scores_are_added_and_checked() -> None:
         ({"out": 1}, (("in",),), r"returns dict with out, which has nothing at \['in'\]"),
         (torch.ones(2, 5, 4, 5), ((),), r"scores of 5 classes, but model\.num_classes is 3"),
         (torch.ones(1, 3, 4, 5), ((),), r"expected class scores \(2, 3, h, w\)"),
+        (torch.ones(2, 3, 4, 5, dtype=torch.int64), ((),), r"got Tensor \(2, 3, 4, 5\) int64"),
+        (torch.ones(2, 3, 4, 5, dtype=torch.complex64), ((),), "got Tensor .* complex64"),
         (
             (torch.ones(2, 3, 4, 5), torch.ones(2, 3, 2, 2)),
             ((0,), (1,)),

@@ -121,3 +121,18 @@ def test_checkout_that_does_not_exist_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="elsewhere does not exist"):
         external(tmp_path, root="elsewhere")
     assert Checkout.at(str(tmp_path), ".", (), {}).names == {"model"}
+
+
+@pytest.mark.parametrize("root", ["../evil", "link", "{}/evil"])
+def test_a_root_outside_of_the_checkout_is_not_executed(tmp_path: Path, root: str) -> None:
+    executed = tmp_path / "executed"
+    marked = f"open({str(executed)!r}, 'w')\n{STACKED}"
+    write_checkout(tmp_path / "evil", {"model/net.py": marked})
+    folder = write_checkout(
+        tmp_path / "code", {"model/net.py": STACKED, "src/model/net.py": STACKED}
+    )
+    (folder / "link").symlink_to(tmp_path / "evil")
+    with pytest.raises(InputError, match="leads out of model.checkout=.*code; name a folder in it"):
+        external(folder, root=root.format(tmp_path))
+    assert not executed.exists()
+    external(folder, root="src")

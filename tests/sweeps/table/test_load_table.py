@@ -66,6 +66,7 @@ def test_own_table_needs_no_printed_values(tmp_path: Path) -> None:
     [
         ({"colums": []}, "'colums' is not a key; did you mean 'columns'"),
         (row(overides=["a=1"]), "row 'small': 'overides' is not a key; did you mean 'overrides'"),
+        (row(overrides=["a=1"]), "row 'small': the row has no experiment; add one, or remove"),
         (row(origin="own_methode"), "row 'small': 'origin': input should be 'own_method'"),
         (
             row(values={"mIuO": 1}),
