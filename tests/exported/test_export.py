@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -285,10 +286,22 @@ def test_files_of_torch_export_are_not_read(tmp_path: Path) -> None:
         ExportedNetwork.read(tmp_path / "model.pt2")
 
 
+def test_a_read_only_folder_is_refused_before_the_run_is_opened(
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The system lets an administrator write everywhere.
+    monkeypatch.setattr(os, "access", lambda path, mode: not (path == tmp_path and mode & os.W_OK))
+    code, _, err = call(EXPORT, "run=none", f"out={tmp_path / 'new' / 'model.onnx'}")
+    assert code == 2
+    assert_one_sentence(err, f"{tmp_path} is not a folder in which files can be written")
+    assert not list(tmp_path.iterdir())
+
+
 def test_out_is_checked_before_the_run_is_opened(exported: Path, call: Call) -> None:
     for out, sentence in (
         (exported, "overwrites no file"),
         (exported.with_suffix(".pth"), "expected a file name that ends in .onnx"),
+        (exported / "new" / "model.onnx", f"{exported} is not a folder"),
     ):
         code, _, err = call(EXPORT, "run=none", f"out={out}")
         assert code == 2
