@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -122,10 +123,11 @@ def export(opened: TrainedNetwork, request: ExportRequest) -> tuple[Description,
 
 
 def check_out(out: Path) -> None:
-    """Refuse a file that exists or has an unknown ending, before a network is opened.
+    """Refuse a file that cannot be written, before a network is opened.
 
     Raises:
-        InputError: such a file, or the packages for ONNX are missing.
+        InputError: an unknown ending, an existing file, a folder that does not take files, or the
+            packages for ONNX are missing.
     """
     if out.suffix not in (ONNX, TORCH):
         raise InputError(
@@ -135,6 +137,12 @@ def check_out(out: Path) -> None:
     if out.exists():
         raise InputError(
             f"out={out} exists, and an export overwrites no file; choose another name."
+        )
+    folder = next(each for each in out.absolute().parents if each.exists())
+    if not (folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)):
+        raise InputError(
+            f"out={out}: {folder} is not a folder in which files can be written; choose another "
+            "folder."
         )
     if out.suffix == ONNX:
         require_packages()

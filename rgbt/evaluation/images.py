@@ -61,7 +61,6 @@ def write_images(
         InputError: an input image would be overwritten, or cannot be read.
     """
     images.check_out(out)
-    out.mkdir(parents=True, exist_ok=True)
     legend = legend_of(session.dataset)
     predictor = Predictor(session, session.model, request)
     written = 0

@@ -88,7 +88,11 @@ class ExportedNetwork(nn.Module):
         self._check_request(views, head)
         if tuple(rgb.shape[-2:]) != made.image_hw:
             own, got = (" x ".join(map(str, hw)) for hw in (made.image_hw, rgb.shape[-2:]))
-            self._refuse(f"takes images of {own} pixels, but got {got}; export with image_hw=...")
+            height, width = rgb.shape[-2:]
+            self._refuse(
+                f"takes images of {own} pixels, but got {got}; export the network with "
+                f"image_hw={height},{width}, or change the size of the images"
+            )
         images = {"rgb": rgb, "thermal": thermal}
         arrays = {name: image.float().cpu().numpy() for name, image in images.items()}
         with _explained(self._path):

@@ -7,6 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from rgbt.checks import InputError
 from rgbt.processes import mean_count, own_draw
 from rgbt.types import Batch, View
 
@@ -48,7 +49,17 @@ def mixed(source: Batch, target: Batch, pasted: Tensor) -> Batch:
     """The target with the pixels `pasted` (B, H, W) of the source in both images and the label.
 
     Pasted pixels have weight 1; the others keep the confidence of the target, which it must have.
+
+    Raises:
+        InputError: images of another size.
     """
+    sizes = [tuple(batch.rgb.shape[-2:]) for batch in (source, target)]
+    if sizes[0] != sizes[1]:
+        own, other = (" x ".join(map(str, size)) for size in sizes)
+        raise InputError(
+            f"scheme.mixing=classes requires source and target images of one size, got {own} and "
+            f"{other} pixels; choose a transform that crops to one size, or scheme.mixing=none."
+        )
     assert target.confidence is not None, "pseudo-labels have a weight"
     return replace(
         target,

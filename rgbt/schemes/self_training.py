@@ -12,6 +12,7 @@ from typing import Literal, Protocol
 import torch
 from torch import Tensor, nn
 
+from rgbt.checks import InputError
 from rgbt.losses.pseudo_labels import PseudoLabels, WeightedBy, pseudo_labels
 from rgbt.ranges import NonNegative, Share
 from rgbt.requirements import Record, Requirement
@@ -91,6 +92,12 @@ class SelfTraining:
     masked_images: Literal["target", "both"]
 
     def __post_init__(self) -> None:
+        if self.ignored_top + self.ignored_bottom >= 1:
+            raise InputError(
+                f"scheme.ignored_top={self.ignored_top:g} and scheme.ignored_bottom="
+                f"{self.ignored_bottom:g} leave no row for pseudo-labels; their sum must be below "
+                "1."
+            )
         self.passes = Passes(
             model=self.model, loss=self.loss, domains=self.domains, gradients="apart"
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -107,7 +108,9 @@ def test_another_size_of_the_images_is_refused(exported: Path, call: Call, tmp_p
     words = ("transform.test_short_edge=24", "input=test", f"out={tmp_path / 'out'}")
     code, _, err = call(PREDICT, f"exported={exported}", *words)
     assert code == 2
-    assert_one_sentence(err, "takes images of 48 x 64 pixels, but got 24 x 32")
+    assert_one_sentence(err, "takes images of 48 x 64 pixels, but got 24 x 32; export the network")
+    assert "image_hw=24,32" in err
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_run_or_a_view_beside_the_file_is_refused(
@@ -120,7 +123,7 @@ def test_a_run_or_a_view_beside_the_file_is_refused(
     code, _, err = call(PREDICT, *words, "modality=rgb")
     assert code == 2
     assert_one_sentence(err, "modality: 'rgb' is not a valid choice")
-    assert not (tmp_path / "out").exists() or not list((tmp_path / "out").iterdir())
+    assert not (tmp_path / "out").exists()
 
 
 def test_another_view_or_head_than_that_of_the_graph_is_refused(
@@ -285,10 +288,22 @@ def test_files_of_torch_export_are_not_read(tmp_path: Path) -> None:
         ExportedNetwork.read(tmp_path / "model.pt2")
 
 
+def test_a_read_only_folder_is_refused_before_the_run_is_opened(
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The system lets an administrator write everywhere.
+    monkeypatch.setattr(os, "access", lambda path, mode: not (path == tmp_path and mode & os.W_OK))
+    code, _, err = call(EXPORT, "run=none", f"out={tmp_path / 'new' / 'model.onnx'}")
+    assert code == 2
+    assert_one_sentence(err, f"{tmp_path} is not a folder in which files can be written")
+    assert not list(tmp_path.iterdir())
+
+
 def test_out_is_checked_before_the_run_is_opened(exported: Path, call: Call) -> None:
     for out, sentence in (
         (exported, "overwrites no file"),
         (exported.with_suffix(".pth"), "expected a file name that ends in .onnx"),
+        (exported / "new" / "model.onnx", f"{exported} is not a folder"),
     ):
         code, _, err = call(EXPORT, "run=none", f"out={out}")
         assert code == 2

@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from rgbt.checks import InputError
 from rgbt.randomness import torch_generator
 from rgbt.schemes.class_mix import mixed, pasted_pixels, seen_as
 from rgbt.types import Batch
@@ -82,3 +83,9 @@ def test_views_that_differ_paste_what_the_source_sees() -> None:
     assert torch.equal(rgb, torch.ones_like(rgb))
     for views in (("rgb", "rgb"), ("thermal", "thermal"), (None, None), ("rgbt", "rgb")):
         assert seen_as(batch, *views) is batch  # type: ignore[arg-type]
+
+
+def test_images_of_another_size_are_refused() -> None:
+    source, target = images(0.5, 1), images(0.5, 1, height=4)
+    with pytest.raises(InputError, match="got 2 x 3 and 4 x 3 pixels; choose a transform"):
+        mixed(source, target, torch.ones(1, 4, 3, dtype=torch.bool))

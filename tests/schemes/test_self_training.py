@@ -11,6 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from rgbt.checks import InputError
 from rgbt.engine.checkpoint import State
 from rgbt.losses.cross_entropy import CrossEntropy
 from rgbt.requirements import Record, record_of
@@ -157,6 +158,12 @@ def test_without_masked_images_nothing_is_masked() -> None:
     assert list(phase.parts) == ["source/cross_entropy", "target/cross_entropy"]
     assert len(model.calls) == 3  # the teacher, the source and the mix
     assert [trains for _, _, trains in model.calls] == [False, True, True]
+
+
+def test_ignored_rows_leave_rows_for_pseudo_labels() -> None:
+    scheme_of(network(False), ignored_top=0.5, ignored_bottom=0.4)
+    with pytest.raises(InputError, match="their sum must be below 1"):
+        scheme_of(network(False), ignored_top=0.5, ignored_bottom=0.5)
 
 
 def test_thermal_target_gets_the_luma_of_a_source_that_sees_rgb() -> None:
