@@ -199,8 +199,9 @@ def test_mlflow_loads_the_best_checkpoint_in_a_fresh_process(
     subprocess.run([sys.executable, "-c", FRESH, uri, sent.run_id, *files], check=True)
     expected = _load_pyfunc(str(path)).predict(images(2))
     found = np.load(tmp_path / "found.npz")
-    assert np.array_equal(found["labels"], expected["labels"])
-    assert np.array_equal(found["scores"], expected["scores"])
+    # Processes with other numbers of threads round otherwise.
+    np.testing.assert_allclose(found["scores"], expected["scores"], rtol=1e-5, atol=1e-6)
+    assert np.array_equal(found["labels"], found["scores"].argmax(1))
 
 
 def test_system_metrics_run_from_the_first_step_to_the_end(
