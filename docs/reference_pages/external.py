@@ -32,8 +32,8 @@ def external_page() -> str:
             ["`model=external/`", "Network", "Published", "Repository", "Commit", "Licence"],
             [_origin(each) for each in files],
         ),
-        "Published figures are those of the README, or of the paper where that is said; those of "
-        "papers were not compared with the text.",
+        "Published figures are those of the README, or of the paper if the column names it. "
+        "Figures of papers were not compared with the text.",
         "## How they are called",
         table(
             ["`model=external/`", "Constructor", "Feed", "Inputs", "Sizes", "Scores"],

@@ -158,7 +158,7 @@ def _is_inside(name: str, modules: Collection[str]) -> bool:
 
 
 def _is_below(checkout: str, trust: Collection[str]) -> bool:
-    """Whether a folder is a trusted one, or lies in one."""
+    """Whether a folder is a trusted one, or below one."""
     folder = Path(checkout).expanduser().resolve()
     known = [Path(each).expanduser().resolve() for each in trust if each.startswith(FOLDERS)]
     return any(folder.is_relative_to(each) for each in known)

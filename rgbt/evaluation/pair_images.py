@@ -123,7 +123,7 @@ class FolderFrames:
         given: FormatOptions = FormatOptions(),  # noqa: B008 - frozen
     ) -> None:
         self._folder = folder
-        self._affixes = _found_files(folder, names, given.affixes)
+        self._affixes = _affixes_of_all(folder, names, given.affixes)
         paths = map(self._path, names)
         dataset = source.dataset
         self._reader, said = recognise_format(paths, dataset.classes, dataset.palette, given)
@@ -191,7 +191,7 @@ def _stems_in(folder: Path) -> set[str]:
     return {path.relative_to(folder).with_suffix("").as_posix() for path in folder.rglob("*.png")}
 
 
-def _found_files(folder: Path, names: Sequence[str], given: Affixes) -> Affixes:
+def _affixes_of_all(folder: Path, names: Sequence[str], given: Affixes) -> Affixes:
     """How the files are named, which must include one of every image."""
     if not folder.is_dir():
         raise InputError(

@@ -90,7 +90,7 @@ class Checkout:
         return place.with_name(f"{place.name}.py").is_file() or (place / "__init__.py").is_file()
 
     def has(self, module: ModuleType) -> bool:
-        """Whether a module lies in the checkout; one without a file by where it is searched."""
+        """Whether a module belongs to the checkout: its file, or where a package is searched."""
         file = getattr(module, "__file__", None)
         places = [file] if file else list(getattr(module, "__path__", ()))
         return any(f"{place}/".startswith(f"{self.folder}/") for place in places)
