@@ -24,6 +24,9 @@ TOKEN = "rgbt.token"
 REASON = "rgbt.reason"
 """Why the trial failed, was pruned or dropped, in one sentence."""
 
+REPLACES = "rgbt.replaces"
+"""Of a trial that was enqueued again: number of the trial that its driver left unfinished."""
+
 DROPPED = "rgbt.dropped"
 """True: the trial does not count, another one has the same point."""
 

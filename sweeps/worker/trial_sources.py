@@ -332,7 +332,7 @@ class SamplerSource:
         """Copy a complete trial of the same point, or drop this one for a running trial of it."""
         for other in same:
             reason = f"the same point as trial {other.number}"
-            if other.number == trial.number:
+            if other.number in (trial.number, trial.user_attrs.get(names.REPLACES)):
                 continue
             if other.state.name == "COMPLETE":
                 notes = {

@@ -167,7 +167,7 @@ class TrialStore:
             others = [
                 other.number
                 for other in self.by_key()[trial.user_attrs[names.KEY]]
-                if other.number != trial.number
+                if other.number not in (trial.number, trial.user_attrs.get(names.REPLACES))
                 and (
                     other.state.name in CLAIMING_STATES
                     or (other.state.name == "WAITING" and other.number < trial.number)
@@ -228,6 +228,8 @@ class TrialStore:
         if requeue and key is not None and key not in waiting:
             kept = (names.KEY, names.LABEL, names.OVERRIDES, names.RUNS)
             attributes = {name: trial.user_attrs[name] for name in kept if name in trial.user_attrs}
+            # Until the old trial is dropped below, a driver that is fast enough sees both.
+            attributes[names.REPLACES] = number
             self.study.enqueue_trial(dict(trial.params), user_attrs=attributes)
         self.drop(number, reason)
 

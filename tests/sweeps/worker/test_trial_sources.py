@@ -176,6 +176,23 @@ def test_sampler_source_drops_running_duplicate(tmp_path: Path, quick: None) -> 
     assert desk.numbers("COMPLETE") == [0, desk.store.trials()[1].number]
 
 
+def test_sampler_source_takes_requeued_point_before_old_trial_is_dropped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    desk = search_desk(tmp_path, trials=1)
+    task = taken(desk)
+    drop, again = desk.store.drop, []
+
+    def take_first(*arguments: Any) -> None:
+        again.append(desk.driver.source.next())
+        drop(*arguments)
+
+    monkeypatch.setattr(desk.store, "drop", take_first)
+    desk.store.release(task.number, "its driver had ended", requeue=True)
+    assert again[0] is not None, "the point was lost"
+    assert again[0].plan.key == task.plan.key
+
+
 def test_sampler_source_wrong_point_fails_and_is_reported(tmp_path: Path) -> None:
     desk = search_desk(tmp_path, planner=PickyPlanner(), trials=1)
     assert desk.driver.source.next() is None

@@ -248,6 +248,27 @@ def test_ask_drops_second_requeued_trial() -> None:
     assert states(store) == ["RUNNING"]
 
 
+def test_release_keeps_point_that_another_driver_takes_before_the_drop(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    storage = memory()
+    number, x = taken(searching(storage, GONE), 1)
+    slow, fast = searching(storage), searching(storage)
+    drop, asked = slow.drop, []
+
+    def ask_first(*arguments: Any) -> None:
+        asked.append(fast.ask(1))
+        drop(*arguments)
+
+    monkeypatch.setattr(slow, "drop", ask_first)
+    slow.release(number, "its driver had ended", requeue=True)
+    (again,) = asked
+    assert again is not None, "the point was lost"
+    assert again.suggest_float("x", 0, 1) == x
+    assert states(slow) == ["RUNNING"]
+    assert fast.ask(1) is None
+
+
 @pytest.mark.parametrize("finished", [False, True], ids=["runs there", "is finished there"])
 def test_release_of_resumed_trial_enqueues_nothing(finished: bool) -> None:
     storage = memory()
