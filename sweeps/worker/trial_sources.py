@@ -292,7 +292,9 @@ class SamplerSource:
             self.rejected += 1
             self.on_reject(point.label, str(error))
             return None
-        if self._resolve_duplicate(trial, self.store.by_key().get(plan.key, [])):
+        # A trial that was enqueued again has won its point in `ask`.
+        is_new = names.KEY not in trial.user_attrs
+        if is_new and self._resolve_duplicate(trial, self.store.by_key().get(plan.key, [])):
             return None
         self.store.set_attributes(trial.number, trial_attributes(plan))
         return ClaimedTrial(plan, trial.number, self._pruning_callback(trial))
@@ -332,7 +334,7 @@ class SamplerSource:
         """Copy a complete trial of the same point, or drop this one for a running trial of it."""
         for other in same:
             reason = f"the same point as trial {other.number}"
-            if other.number in (trial.number, trial.user_attrs.get(names.REPLACES)):
+            if other.number == trial.number:
                 continue
             if other.state.name == "COMPLETE":
                 notes = {

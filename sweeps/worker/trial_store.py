@@ -163,14 +163,16 @@ class TrialStore:
         trial = self.study.ask()
         self.set_attributes(trial.number, self._heartbeat())
         if names.KEY in trial.user_attrs:
-            # Two drivers may enqueue the trial of a dead one at the same time.
+            # Two drivers may enqueue the trial of a dead one at the same time, and take both up at
+            # the same time: the lower number wins. The old trial may not be dropped yet.
+            old = trial.user_attrs.get(names.REPLACES)
             others = [
                 other.number
                 for other in self.by_key()[trial.user_attrs[names.KEY]]
-                if other.number not in (trial.number, trial.user_attrs.get(names.REPLACES))
+                if other.number not in (trial.number, old)
                 and (
-                    other.state.name in CLAIMING_STATES
-                    or (other.state.name == "WAITING" and other.number < trial.number)
+                    other.state.name in ("COMPLETE", "PRUNED")
+                    or (other.state.name in ("RUNNING", "WAITING") and other.number < trial.number)
                 )
             ]
             if others:
@@ -228,7 +230,6 @@ class TrialStore:
         if requeue and key is not None and key not in waiting:
             kept = (names.KEY, names.LABEL, names.OVERRIDES, names.RUNS)
             attributes = {name: trial.user_attrs[name] for name in kept if name in trial.user_attrs}
-            # Until the old trial is dropped below, a driver that is fast enough sees both.
             attributes[names.REPLACES] = number
             self.study.enqueue_trial(dict(trial.params), user_attrs=attributes)
         self.drop(number, reason)

@@ -248,6 +248,30 @@ def test_ask_drops_second_requeued_trial() -> None:
     assert states(store) == ["RUNNING"]
 
 
+def test_ask_at_once_for_a_point_requeued_twice_keeps_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    storage = memory()
+    number, x = taken(searching(storage, GONE), 1)
+    a, b = searching(storage), searching(storage)
+    a.release(number, "gone", requeue=True)
+    a.study.enqueue_trial({"x": x}, user_attrs={names.KEY: f"x={x}", names.REPLACES: number})
+    by_key, drop = a.by_key, b.drop
+    seen, asked = [], []
+
+    def drop_after_a_looked(*arguments: Any) -> None:
+        seen.append(by_key())
+        drop(*arguments)
+
+    def look_when_b_has_asked() -> Any:
+        asked.append(b.ask(1))
+        return seen.pop()
+
+    monkeypatch.setattr(b, "drop", drop_after_a_looked)
+    monkeypatch.setattr(a, "by_key", look_when_b_has_asked)
+    asked.append(a.ask(1))
+    assert [trial is None for trial in asked].count(False) == 1, "the point was lost"
+    assert states(a) == ["RUNNING"]
+
+
 def test_release_keeps_point_that_another_driver_takes_before_the_drop(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
