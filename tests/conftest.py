@@ -43,15 +43,24 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     return True if is_left_out else None
 
 
+WRITES_NO_BYTECODE = sys.dont_write_bytecode
+
+
 def pytest_collection() -> None:
-    """Search for no garbage: the collection makes millions of objects that stay."""
+    """Search for no garbage: the collection makes millions of objects that stay.
+
+    Keep the compiled modules, also where images of containers forbid it: the processes that tests
+    start would compile all of them again.
+    """
     gc.disable()
+    sys.dont_write_bytecode = False
 
 
 def pytest_collection_finish() -> None:
     """Search for garbage again, but not in what the collection made."""
     gc.freeze()
     gc.enable()
+    sys.dont_write_bytecode = WRITES_NO_BYTECODE
 
 
 @pytest.fixture(scope="session", autouse=True)

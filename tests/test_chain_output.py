@@ -12,13 +12,13 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
+from rgbt.config.compose import compose
 from rgbt.evaluate import entry as evaluate
 from rgbt.metrics.counts import Counts
 from rgbt.run import main
 from rgbt.spec.run_spec import RunSpec
 from rgbt.spec.specify import specify
 from tests.commands import Call
-from tests.composed import composed
 from tests.data.freiburg_files import write_freiburg
 
 
@@ -51,7 +51,7 @@ def chain(tmp_path_factory: pytest.TempPathFactory) -> Chain:
     arguments = patch("sys.argv", ["rgbt", *words])
     with arguments, redirect_stdout(out), redirect_stderr(err), suppress(SystemExit):
         main()
-    return Chain(specify(composed(words), words), out.getvalue(), err.getvalue())
+    return Chain(specify(compose(words), words), out.getvalue(), err.getvalue())
 
 
 def miou(path: Path, night: bool) -> float:

@@ -6,12 +6,15 @@ from typing import Any
 import pytest
 from hydra._internal import defaults_list
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
-from omegaconf import OmegaConf
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
 
 from rgbt.config import compose as composing
 from tests import quick_hydra
 
+LOAD = quick_hydra._load
 MERGE = quick_hydra._merge_one_by_one
 EMBED = quick_hydra._embed_copy
 WORDS = (
@@ -31,12 +34,13 @@ def hydra_itself(monkeypatch: pytest.MonkeyPatch) -> None:
     loader = ConfigLoaderImpl
     monkeypatch.setattr(loader, "_compose_config_from_defaults_list", MERGE)
     monkeypatch.setattr(loader, "_embed_result_config", staticmethod(EMBED))
+    monkeypatch.setattr(loader, "_load_configuration_impl", LOAD)
 
 
-def described(words: list[str]) -> tuple[str, list[Any]]:
+def described(words: list[str], *, command: bool = False) -> tuple[str, list[Any]]:
     """Values, the order of keys, and the flags of every node; or the error."""
     try:
-        config = composing._composed_by_hydra(words)
+        config = composed_command(words) if command else composing._composed_by_hydra(words)
     except HydraException as error:
         return repr(error), []
     nodes, flags = [config], []
@@ -49,6 +53,15 @@ def described(words: list[str]) -> tuple[str, list[Any]]:
     return OmegaConf.to_yaml(config), flags
 
 
+def composed_command(words: list[str]) -> DictConfig:
+    """With what Hydra notes about a command that is called with these words."""
+    with composing.own_hydra():
+        hydra: Any = GlobalHydra.instance().hydra
+        words = ["hydra/sweeper=basic", *words]
+        config: DictConfig = hydra.compose_config("config", words, RunMode.RUN)
+        return config
+
+
 @pytest.mark.parametrize("words", WORDS, ids=" ".join)
 def test_quick_composition_is_that_of_hydra(
     words: list[str], request: pytest.FixtureRequest
@@ -57,6 +70,43 @@ def test_quick_composition_is_that_of_hydra(
     request.getfixturevalue("hydra_itself")
     assert described(words) == quick
     assert quick[1]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        *(["seed=2", "+experiment=grbm", "masker.sigma_div=2"], ["masker=square", "seed='a, b'"]),
+        *(["masker.wrong=1", "seed=1"], ["seed=1", "experiment=none"], ["seed=[1"]),
+        *(["seed=1,2"], ["~seed"], ["+recipe={a:1}"], ["hydra.verbose=true", "seed=1"]),
+    ],
+    ids=" ".join,
+)
+def test_command_composed_again_is_that_of_hydra(
+    words: list[str],
+    request: pytest.FixtureRequest,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    monkeypatch.setattr(quick_hydra, "_commands", {})
+    described([word for word in words if "." not in word], command=True)
+    monkeypatch.chdir(tmp_path)
+    quick = described(words, command=True)
+    request.getfixturevalue("hydra_itself")
+    assert described(words, command=True) == quick
+
+
+def test_files_of_a_command_are_composed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    loads: list[list[str]] = []
+
+    def counted(loader: Any, name: str, words: list[str], *given: Any) -> DictConfig:
+        loads.append(words)
+        return LOAD(loader, name, words, *given)
+
+    monkeypatch.setattr(quick_hydra, "_commands", {})
+    monkeypatch.setattr(quick_hydra, "_load", counted)
+    for word in ("seed=1", "seed=2", "trainer.threads=1"):
+        composed_command(["masker=square", word])
+    assert loads == [["hydra/sweeper=basic", "masker=square"]]
 
 
 def test_refused_file_is_named(tmp_path: Path, request: pytest.FixtureRequest) -> None:

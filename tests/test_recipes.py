@@ -10,13 +10,12 @@ import pytest
 from omegaconf import DictConfig, OmegaConf
 
 from rgbt.build.training_setup import _report_unpublished_settings
-from rgbt.config.compose import conf_dir
+from rgbt.config.compose import compose, conf_dir
 from rgbt.data import kp, pst900
 from rgbt.metrics.counts import Counts
 from rgbt.requirements import Record
 from rgbt.run import main
 from tests.commands import SMALL, Call, only_run, short
-from tests.composed import composed
 from tests.test_run import ELSEWHERE
 
 FOLDER = conf_dir() / "recipe"
@@ -67,7 +66,7 @@ def test_every_recipe_holds_the_crop_of_the_demo_in_images_of_its_data_set() -> 
 
 
 def test_an_experiment_on_another_data_set_takes_its_recipe() -> None:
-    found = composed(["+experiment=grbm_pst900", "scale=paper", "dataset.root=unused"])
+    found = compose(["+experiment=grbm_pst900", "scale=paper", "dataset.root=unused"])
     assert found.recipe.dataset == found.dataset.name == "pst900"
     assert (found.data.batch_size, found.trainer.max_steps, found.trainer.eval_every) == (
         *(12, 35000, 245),
@@ -75,18 +74,18 @@ def test_an_experiment_on_another_data_set_takes_its_recipe() -> None:
     assert list(found.transform.crop_hw) == [224, 320]
     assert found.transform.sizes[-1] == 1440
     assert (found.transform.max_size, found.masker.patch_size) == (1920, 32)
-    found = composed(["+experiment=spatialseg_kp", "scale=paper", "dataset.root=unused"])
+    found = compose(["+experiment=spatialseg_kp", "scale=paper", "dataset.root=unused"])
     assert found.recipe.dataset == found.dataset.name == "kp"
     assert (found.data.batch_size, found.masker.patch_size) == (12, 64)
     assert found.loss.spatial.alpha == 2.0
 
 
 def test_a_recipe_is_chosen_against_that_of_an_experiment() -> None:
-    found = composed(
+    found = compose(
         ["+experiment=grbm", "scale=paper", "dataset=kp", "recipe=kp", "dataset.root=unused"]
     )
     assert (found.data.batch_size, found.trainer.max_steps) == (12, 35000)
-    found = composed(["+experiment=crm_kp", "recipe.demo_steps=3"])
+    found = compose(["+experiment=crm_kp", "recipe.demo_steps=3"])
     assert list(found.transform.sizes) == [128, 140, 152, 164, 176, 188]
     assert found.trainer.max_steps == 3
 

@@ -26,7 +26,6 @@ from rgbt.spec.run_spec import RunSpec
 from rgbt.spec.specify import specify
 from rgbt.types import Batch
 from tests.commands import SPLITS, Call, assert_one_sentence, words_of
-from tests.composed import composed as composed_once
 
 SIZES = (
     *("dataset=synth_freiburg", "dataset.num_train_day=3", "dataset.num_train_night=2"),
@@ -221,7 +220,7 @@ def cached(data: Path, tmp_path: Path) -> RunSpec:
     model = ("model=mfnet_tiny", "loss=cross_entropy", "masker=none")
     place = (f"data.cache={tmp_path / 'cache'}", "data.num_workers=0")
     words = [word for word in words_of(data, tmp_path / "runs", *model) if "masker." not in word]
-    return specify(composed_once((*words, *place)))
+    return specify(compose((*words, *place)))
 
 
 def test_all_that_is_read_is_decoded_before_the_first_step(

@@ -20,12 +20,11 @@ from rgbt.checkpoints.recognise import recognise
 from rgbt.checkpoints.starts import DIGITS, RECIPES, STARTS
 from rgbt.checks import InputError
 from rgbt.config.component import build
-from rgbt.config.compose import available
+from rgbt.config.compose import available, compose
 from rgbt.weights import entry
 from tests.checkpoints.files import network, saved
 from tests.checkpoints.imagenet import mit_file, resnet_file, swin_file
 from tests.commands import Call
-from tests.composed import composed
 
 SIZES = {"embed_dim": 32, "depths": [1, 1, 2, 1], "num_heads": [1, 2, 4, 8], "window_size": 5}
 RGB, THERMAL = "backbone.RGB_branch.", "backbone.THR_branch."
@@ -132,13 +131,13 @@ def test_every_experiment_has_one_recipe() -> None:
         if name.startswith("start_"):  # of scale=bench alone
             continue
         (recipe,) = (r for r in RECIPES if any(fnmatchcase(name, each) for each in r.experiments))
-        config = composed([f"+experiment={name}", "scale=paper"])
+        config = compose([f"+experiment={name}", "scale=paper"])
         family = family_named(config.model._target_)
         with torch.device("meta"):
             takes = config.scale.pretrained and record_of(build(config.model)).pretrained_parts
         assert bool(recipe.files) == bool(takes), name
         models = {model for file in recipe.files for model in starts[file].models}
-        found = [composed([f"model={model}", "scale=paper"]).model for model in sorted(models)]
+        found = [compose([f"model={model}", "scale=paper"]).model for model in sorted(models)]
         sizes = ("depths", "embed_dim", "layers", "dims")
         assert not found or any(
             family_named(each._target_) == family

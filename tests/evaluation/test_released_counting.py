@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from rgbt.build.session import open_session
 from rgbt.checks import InputError
-from rgbt.config.compose import conf_dir
+from rgbt.config.compose import compose, conf_dir
 from rgbt.data.domains import Domain, Domains
 from rgbt.engine.prediction import Prediction
 from rgbt.evaluation.prediction import Predictor
@@ -25,7 +25,7 @@ from rgbt.evaluation.segmentation import evaluate
 from rgbt.spec.load_spec import load_spec
 from rgbt.types import Batch, Output
 from sweeps.table.load_table import load_table
-from tests.composed import composed, specified
+from tests.composed import specified
 from tests.evaluation.test_details import Decoder, session_of
 
 CLASSES = [[0, 8, 8, 2], [0, 8, 2, 2]]
@@ -158,7 +158,7 @@ def test_predictions_of_a_run_may_be_changed_and_need_a_folder() -> None:
     with pytest.raises(InputError, match="changes how the run is measured"):
         network.check_comparable(None)
     network.check_comparable(Path("out"))
-    stored = composed(["+experiment=mfnet"])
+    stored = compose(["+experiment=mfnet"])
     stored = {key: value for key, value in stored.items() if key != "prediction"}
     assert load_spec(stored).prediction == Prediction()  # of a run that is older than the group
     found = load_spec(stored, ["prediction=released_max_squares", "prediction.scales=[0.5,1.0]"])

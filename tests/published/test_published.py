@@ -12,7 +12,7 @@ import pytest
 import yaml
 from omegaconf import OmegaConf
 
-from tests.composed import composed
+from rgbt.config.compose import compose
 from tests.published.recipes import (
     SIDES,
     Row,
@@ -49,7 +49,7 @@ Networks whose name ends in "_tiny" are of scale=demo too."""
 @cache
 def configuration(*overrides: str) -> dict[str, Any]:
     """Keys and values at scale=paper."""
-    config = composed((*overrides, "scale=paper", "dataset.root=/data"))
+    config = compose((*overrides, "scale=paper", "dataset.root=/data"))
     return dict(flattened(OmegaConf.to_container(config, resolve=True)))  # type: ignore[arg-type]
 
 

@@ -10,26 +10,20 @@ from omegaconf import OmegaConf
 
 from rgbt.build.training_setup import validate
 from rgbt.checks import InputError
+from rgbt.config.compose import compose
 from rgbt.run import main
 from rgbt.spec.run_spec import WEIGHTS, RunSpec
 from rgbt.spec.specify import specify
 from rgbt.training.pipeline import topological_order
 from tests.commands import Call
-from tests.composed import composed
 
 EXPERIMENTS = sorted(path.stem for path in Path("conf/experiment").glob("*.yaml"))
 ARMS = [name for name in EXPERIMENTS if not name.startswith("start_")]
 
 
-@pytest.fixture(autouse=True)
-def composed_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Most of the time of these tests is composing the same again and again."""
-    monkeypatch.setattr("rgbt.spec.specify.compose", composed)
-
-
 def spec_of(experiment: str, *overrides: str, scale: str = "bench") -> RunSpec:
     words = [f"+experiment={experiment}", f"scale={scale}", *overrides]
-    return specify(composed(words), words)
+    return specify(compose(words), words)
 
 
 def first_stage(run: RunSpec) -> RunSpec:
@@ -175,7 +169,7 @@ def test_common_reference_wrong_is_refused(typed: list[str], sentence: str) -> N
 
 
 def test_network_without_a_start_is_refused() -> None:
-    config = composed(["+experiment=mfnet", "scale=bench"])
+    config = compose(["+experiment=mfnet", "scale=bench"])
     config.model._target_ = "own.Network"
     with pytest.raises(Exception, match=r"no common start for the network Network.*model\.weights"):
         OmegaConf.select(config, "pretrained", throw_on_missing=True)

@@ -5,14 +5,13 @@ from __future__ import annotations
 import pytest
 from omegaconf import DictConfig, OmegaConf
 
-from rgbt.config.compose import conf_dir
+from rgbt.config.compose import compose, conf_dir
 from rgbt.spec import load_spec
-from tests.composed import composed
 
 
 def resolved(*overrides: str) -> DictConfig:
     """A configuration as a run stores it."""
-    config = OmegaConf.create(OmegaConf.to_container(composed(overrides), resolve=True))
+    config = OmegaConf.create(OmegaConf.to_container(compose(overrides), resolve=True))
     assert isinstance(config, DictConfig)
     return config
 
@@ -60,7 +59,7 @@ def test_stored_decoder_of_a_former_name_is_read() -> None:
 
 
 def test_absent_user_data_set_excludes_classes() -> None:
-    config = composed(())
+    config = compose(())
     assert config.metric.absent == "released"
     del config.dataset.absent
     assert config.metric.absent == "exclude"

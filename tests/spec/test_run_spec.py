@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 from rgbt.checks import InputError
+from rgbt.config.compose import compose
 from rgbt.spec.naming import GROUP, describe
 from rgbt.spec.run_spec import NOT_IN_KEY, RunSpec
 from rgbt.spec.specify import specify
-from tests.composed import composed
 
 DEPENDENT = (
     *("sh_adversarial", "sh_adversarial_seg", "sh_max_squares"),
@@ -22,15 +22,9 @@ DEPENDENT = (
 """Experiments with upstream runs, each in another way."""
 
 
-@pytest.fixture(autouse=True)
-def composed_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Most of the time of these tests is composing the same again and again."""
-    monkeypatch.setattr("rgbt.spec.specify.compose", composed)
-
-
 def spec_of(experiment: str, *overrides: str) -> RunSpec:
     words = [f"+experiment={experiment}", *overrides]
-    return specify(composed(words), words)
+    return specify(compose(words), words)
 
 
 def key_of(experiment: str, *overrides: str) -> str:
@@ -160,7 +154,7 @@ def test_circle_of_two_experiments_is_refused() -> None:
     with pytest.raises(
         InputError, match="cycle of upstream runs: sh_adversarial -> sh_adversarial"
     ):
-        specify(composed(words), words)
+        specify(compose(words), words)
 
 
 def test_weights_upstream_run_gets_the_network() -> None:

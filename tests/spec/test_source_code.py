@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
+from rgbt.config.compose import compose
 from rgbt.spec import source_code
 from rgbt.spec.source_code import counted_modules, user_code
 from rgbt.spec.specify import specify
-from tests.composed import composed
 
 Write = Callable[..., None]
 LOSS = """from . import helper
@@ -107,7 +107,7 @@ def test_user_code_of_released_targets_and_the_standard_library_is_empty() -> No
 
 
 def test_run_key_counts_the_code_of_own_targets_alone(write: Write) -> None:
-    config = composed(["+experiment=baseline"])
+    config = compose(["+experiment=baseline"])
     released = specify(config).key
     masker = {
         "my_masker.py": "class Mine:\n    def __init__(self, *, cell: int = 4):\n        pass\n"

@@ -16,6 +16,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from rgbt.checks import InputError, RunError
+from rgbt.config.compose import compose
 from rgbt.files.atomic import holding
 from rgbt.metrics.counts import Counts
 from rgbt.run import main
@@ -25,13 +26,6 @@ from rgbt.spec.specify import specify
 from rgbt.tracking.run_folder import RunFolder
 from rgbt.training import pipeline
 from tests.commands import Call, Trained, short
-from tests.composed import composed
-
-
-@pytest.fixture(autouse=True)
-def composed_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Most of the time of these tests is composing the same again and again."""
-    monkeypatch.setattr("rgbt.spec.specify.compose", composed)
 
 
 @dataclass
@@ -79,7 +73,7 @@ Pipeline = Callable[..., Training]
 
 def spec_of(experiment: str, *overrides: str) -> RunSpec:
     words = [f"+experiment={experiment}", *overrides]
-    return specify(composed(words), words)
+    return specify(compose(words), words)
 
 
 def finish(spec: RunSpec) -> None:
@@ -206,7 +200,6 @@ def test_pipeline_predicts_and_validates_for_unfinished_labels(
     def opened(*given: Any, trust: Any) -> None:
         raise KeyError(given[0])
 
-    monkeypatch.setattr("rgbt.spec.specify.compose", composed)
     monkeypatch.setattr(pipeline, "open_run", opened)
     monkeypatch.setattr(pipeline, "validate", lambda spec: None)
     monkeypatch.setattr(pipeline, "train", lambda spec, tags: None)

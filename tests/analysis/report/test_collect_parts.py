@@ -19,11 +19,10 @@ from analysis.report.store import MlflowRun, RunFiles
 from analysis.report.studies import pareto_front, read_study
 from analysis.report.tables_recorded import CSV_FILE, read_recorded, reproduce_command
 from rgbt.checks import InputError
-from rgbt.config.compose import flatten
+from rgbt.config.compose import compose, flatten
 from rgbt.metrics.counts import Counts
 from sweeps.table.load_table import load_table
 from tests.analysis.report.stores import DATASET, MASKER, counts_of, files_of
-from tests.composed import composed as configuration
 
 
 def stored(files: RunFiles, **tags: str) -> MlflowRun:
@@ -245,7 +244,7 @@ def test_a_table_is_run_with_its_seeds(seeds: tuple[int, ...], words: str) -> No
 
 def composed(choice: Choice, side: Side) -> dict[str, Any]:
     assert side.setting is not None
-    return flatten(configuration([*choice.base, side.setting]))
+    return flatten(compose([*choice.base, side.setting]))
 
 
 @pytest.mark.parametrize("choice", load_choices(), ids=lambda choice: choice.topic)

@@ -16,7 +16,7 @@ from sweeps.table.load_table import load_table, table_names
 from sweeps.table.request import TableRequest
 from sweeps.table.table import Form, Row, Table
 from sweeps.worker.planner import specify_run
-from tests.sweeps.composed import specified
+from tests.composed import specified
 
 TABLES = {
     name: load_table(name)

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from rgbt.checks import InputError
+from rgbt.config.compose import compose
 from rgbt.spec.specify import specify
 from sweeps.rendering.variance import variance_csv, variance_grids
 from sweeps.table.check_table import check_table
@@ -17,7 +18,6 @@ from sweeps.table.table import Row, Table
 from sweeps.table.variance import Variance
 from sweeps.verdicts.judge import TableJudge
 from sweeps.verdicts.variance import VarianceBudget, variance_budget
-from tests.composed import composed
 from tests.sweeps.tabled import outcome, right, table
 from tests.sweeps.verdicts.accuracies import planted
 
@@ -136,7 +136,7 @@ def test_study_rows_vary_one_source_each() -> None:
     assert study == load_table(str(STUDIES / "variance.yaml"))
     request = TableRequest("variance", study, "demo", (3,))
     specs = {
-        label: specify(composed(words), words)
+        label: specify(compose(words), words)
         for label, seed in request.row_seeds()
         if (words := request.overrides(label, seed))
     }
