@@ -35,8 +35,8 @@ _merge_one_by_one = config_loader_impl.ConfigLoaderImpl._compose_config_from_def
 _embed_copy = config_loader_impl.ConfigLoaderImpl._embed_result_config
 _load = config_loader_impl.ConfigLoaderImpl._load_configuration_impl
 
-SWEEPER = "hydra/sweeper="
-"""Beginning of the one word about Hydra itself that every command has."""
+HYDRAS = ("hydra/sweeper=", "hydra.mode=")
+"""Beginnings of the words about Hydra itself that every command has."""
 
 _commands: dict[tuple[Any, ...], bytes] = {}
 """Configurations of commands before values are set, by the files and the words that choose them."""
@@ -112,12 +112,12 @@ def _loaded(
 ) -> DictConfig:
     """The configuration of a command: its values are set in a copy of what its files give."""
     given = (run_mode, from_shell, validate_sweep_overrides)
-    sweeper = [word for word in overrides if word.startswith(SWEEPER)]
-    others = tuple(word for word in overrides if word not in sweeper)
+    hydras = [word for word in overrides if word.startswith(HYDRAS)]
+    others = tuple(word for word in overrides if word not in hydras)
     divided = _divided(others, frozenset(top_level()[1]))
     if divided is None or not from_shell or run_mode != RunMode.RUN or own_folders():
         return _load(loader, config_name, overrides, *given)
-    chosen, values = [*sweeper, *divided[0]], divided[1]
+    chosen, values = [*hydras, *divided[0]], divided[1]
     searched = [(each.provider, each.path) for each in loader.get_search_path().get_path()]
     key = (config_name, *chosen, *searched, *_states(str(conf_dir())))
     try:

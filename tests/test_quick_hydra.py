@@ -57,7 +57,7 @@ def composed_command(words: list[str]) -> DictConfig:
     """With what Hydra notes about a command that is called with these words."""
     with composing.own_hydra():
         hydra: Any = GlobalHydra.instance().hydra
-        words = ["hydra/sweeper=basic", *words]
+        words = ["hydra/sweeper=basic", *words, "hydra.mode=RUN"]
         config: DictConfig = hydra.compose_config("config", words, RunMode.RUN)
         return config
 
@@ -106,7 +106,7 @@ def test_files_of_a_command_are_composed_once(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(quick_hydra, "_load", counted)
     for word in ("seed=1", "seed=2", "trainer.threads=1"):
         composed_command(["masker=square", word])
-    assert loads == [["hydra/sweeper=basic", "masker=square"]]
+    assert loads == [["hydra/sweeper=basic", "hydra.mode=RUN", "masker=square"]]
 
 
 def test_refused_file_is_named(tmp_path: Path, request: pytest.FixtureRequest) -> None:
