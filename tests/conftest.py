@@ -82,6 +82,14 @@ def composed_once() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="session", autouse=True)
+def no_flush_to_disk() -> Iterator[None]:
+    """No test cuts the power: thirty waits for the disk in each run would take as long as it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda descriptor: None)
+        yield
+
+
 @pytest.fixture(autouse=True)
 def same_signal_handlers() -> Iterator[None]:
     """No command leaves a signal ignored, which later tests' processes would inherit."""

@@ -4,7 +4,8 @@ For every file, Hydra makes the table of choices that interpolations in its defa
 also where the list has none. It copies the content of every file into its package, also where
 nothing else uses it. And it corrects the parents of all nodes after each of about 34 files is
 merged, where once at the end is enough. A command that is called in this process composes its files
-once, as `rgbt.config.compose_cache` does for all other compositions.
+once, as `rgbt.config.compose_cache` does for all other compositions. OmegaConf copies the types and
+flags of every node as it copies any object.
 
 Only tests use this, which compose some thousand times: it replaces private functions of the version
 that `constraints.txt` names. `tests/test_quick_hydra.py` compares with Hydra itself.
@@ -25,6 +26,7 @@ from hydra.errors import HydraException
 from hydra.plugins.config_source import ConfigResult
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, flag_override
+from omegaconf.base import Metadata
 from omegaconf.errors import OmegaConfBaseException
 
 from rgbt.config.compose import conf_dir, own_folders, top_level
@@ -50,6 +52,19 @@ def make_hydra_quick() -> None:
     loader._compose_config_from_defaults_list = _merged
     loader._embed_result_config = staticmethod(_embedded)
     loader._load_configuration_impl = _loaded
+    metadata: Any = Metadata
+    metadata.__deepcopy__ = _copied
+
+
+def _copied(metadata: Metadata, memo: dict[int, Any]) -> Metadata:
+    """A copy of what OmegaConf knows about a node: types, flags and values of resolvers.
+
+    A node is copied with it, and a configuration has some hundred nodes.
+    """
+    copied = copy.copy(metadata)
+    copied.flags = dict(metadata.flags or {})
+    copied.resolver_cache = copy.deepcopy(metadata.resolver_cache, memo)
+    return copied
 
 
 def _choices(overrides: Any, defaults: list[InputDefault], self_added: bool) -> DictConfig:

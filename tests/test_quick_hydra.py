@@ -10,6 +10,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.base import Metadata
 
 from rgbt.config import compose as composing
 from tests import quick_hydra
@@ -35,6 +36,7 @@ def hydra_itself(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(loader, "_compose_config_from_defaults_list", MERGE)
     monkeypatch.setattr(loader, "_embed_result_config", staticmethod(EMBED))
     monkeypatch.setattr(loader, "_load_configuration_impl", LOAD)
+    monkeypatch.delattr(Metadata, "__deepcopy__")
 
 
 def described(words: list[str], *, command: bool = False) -> tuple[str, list[Any]]:

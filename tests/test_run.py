@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -50,9 +51,26 @@ ELSEWHERE = [f"{method}_{dataset}" for method in METHODS for dataset in ("kp", "
 EXPERIMENTS = sorted(path.stem for path in (ROOT / "conf" / "experiment").glob("*.yaml"))
 
 
+LIKE_ANOTHER = (
+    *("crm", "grbm_released", "spatialseg", "cmx_released", "temporal_con"),
+    *("rtfnet_152", "rtfnet_152_temporal_con"),
+)
+"""Experiments with the network, scheme and loss of one that is trained here or in tests below, and
+other values. Common starts are their network's experiment on other scenes. Both are slow."""
+
+
+def trained_here(name: str) -> Any:
+    is_slow = name in LIKE_ANOTHER or name.startswith("start_")
+    return pytest.param(name, marks=pytest.mark.slow if is_slow else ())
+
+
 @pytest.mark.parametrize(
     "experiment",
-    [name for name in EXPERIMENTS if not name.startswith(ADAPTATION) and name not in ELSEWHERE],
+    [
+        trained_here(name)
+        for name in EXPERIMENTS
+        if not name.startswith(ADAPTATION) and name not in ELSEWHERE
+    ],
 )
 def test_every_experiment_trains_evaluates_and_writes_its_folder(
     call: Call, data: Path, tmp_path: Path, experiment: str
@@ -113,7 +131,7 @@ def test_seeds_of_every_source_together_are_the_seed(
     assert losses(only_run(tmp_path / "masks")) != first
 
 
-@pytest.mark.parametrize("averaging", ["none", "ema"])
+@pytest.mark.parametrize("averaging", [pytest.param("none", marks=pytest.mark.slow), "ema"])
 def test_killed_run_resumed_equals_uninterrupted(
     call: Call, data: Path, tmp_path: Path, averaging: str
 ) -> None:

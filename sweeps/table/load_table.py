@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import fields
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -77,7 +78,7 @@ def load_table(name: str, folder: Path = OWN) -> Table:
     plain = read_yaml(path)
     try:  # Read as JSON: a list may be a tuple, but a number is no text and text no number.
         text = json.dumps(plain, default=str)
-        table = pydantic.TypeAdapter(Table).validate_json(text, strict=True)
+        table = _adapter().validate_json(text, strict=True)
     except pydantic.ValidationError as error:
         raise InputError(f"{path}, {_sentence(error.errors()[0], plain)}") from None
     if "rows" not in plain and table.design is None:
@@ -85,6 +86,14 @@ def load_table(name: str, folder: Path = OWN) -> Table:
     table = with_design_rows(table, str(path))
     check_table(table, str(path))
     return table
+
+
+@cache
+def _adapter() -> Any:
+    """What reads a table; made once, because that takes ten times as long as to read a table."""
+    import pydantic
+
+    return pydantic.TypeAdapter(Table)
 
 
 def _find(name: str, folder: Path) -> Path:

@@ -242,6 +242,7 @@ def test_a_configuration_that_fails_does_not_stop_the_others(
     assert "failed: RuntimeError: no kernel image (" in lines_of(task, "note")[0]
 
 
+@pytest.mark.slow
 def test_waits_are_counted_by_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The code for a GPU, with a CPU that warns as CUDA does."""
     from rgbt.engine import trainer

@@ -62,7 +62,9 @@ def test_random_numbers_need_a_generator_of_the_device() -> None:
         assert drawn.tolist() == torch.rand(4, generator=torch.Generator().manual_seed(3)).tolist()
 
 
-@pytest.mark.parametrize("experiment", SOME)
+@pytest.mark.parametrize(
+    "experiment", ["crm", pytest.param("temporal_con", marks=pytest.mark.slow), "sh_adversarial"]
+)
 def test_steps_and_classes_are_those_of_the_cpu(experiment: str, tmp_path: Path) -> None:
     words = words_of(experiment, "device" if experiment == "crm" else "loader")
     here, found = on_cpu(words, tmp_path), simulated(words, tmp_path)
