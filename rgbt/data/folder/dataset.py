@@ -18,7 +18,13 @@ from annotated_types import Interval
 
 from rgbt.checks import InputError, check_choice
 from rgbt.data.file_dataset import FileDataset, SplitNames
-from rgbt.data.folder.frames import FolderFrame, check_partners, find_frames, patterns_of
+from rgbt.data.folder.frames import (
+    FolderFrame,
+    check_partners,
+    find_frames,
+    patterns_of,
+    without_rgb,
+)
 from rgbt.data.folder.pattern import SPLIT
 from rgbt.data.folder.splits import FOLDERS, ByFolder, ByList, ByShare, SplitRule
 from rgbt.data.images import PairPattern, Range, check_limits, reader_of_patterns
@@ -154,9 +160,8 @@ class Folder(FileDataset):
 
     def unused(self, lists: SplitNames) -> Iterable[Path]:  # noqa: ARG002 - as every data set
         """Thermal images and labels without an RGB image."""
-        used = {path for each in self.frames.values() for path in each[2:]}
-        partners = [pattern for pattern in self.patterns[1:] if pattern is not None]
-        return {match.path for each in partners for match in each.files(self.root)} - used
+        matches = without_rgb(self.root, self.patterns[1:], self.frames.values())
+        return {match.path for match in matches}
 
     def own_notes(self, lists: SplitNames) -> list[str]:
         """Frames of no split."""
