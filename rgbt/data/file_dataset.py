@@ -99,8 +99,12 @@ class FileDataset:
 
     @property
     def record(self) -> Record:
-        """The number of its classes."""
-        return Record(num_classes=self.num_classes)
+        """The number of its classes, and what the first one is."""
+        is_background = self.classes[0] in self.background
+        return Record(
+            num_classes=self.num_classes,
+            first_class="background" if is_background else "object",
+        )
 
     @property
     def splits(self) -> dict[str, str]:

@@ -150,6 +150,12 @@ def test_one_video_of_packed_images_without_labels(tmp_path: Path) -> None:
         dataset.names("train")
 
 
+def test_first_class_is_background_if_the_data_set_says_so(tmp_path: Path) -> None:
+    root = write_videos(tmp_path)
+    found = [video(root, background=each).record for each in ((), ("car",), ("background",))]
+    assert [each.first_class for each in found] == ["object", "object", "background"]
+
+
 def test_videos_with_mistakes_are_refused(tmp_path: Path) -> None:
     root = write_videos(tmp_path / "data")
     (root / "x" / "rgb" / "2.png").rename(root / "x" / "rgb" / "02.png")
