@@ -22,12 +22,11 @@ from rgbt.data.folder.frames import (
     FolderFrame,
     check_partners,
     find_frames,
-    patterns_of,
     without_rgb,
 )
 from rgbt.data.folder.pattern import SPLIT
 from rgbt.data.folder.splits import FOLDERS, ByFolder, ByList, ByShare, SplitRule
-from rgbt.data.images import PairPattern, Range, check_limits, reader_of_patterns
+from rgbt.data.images import PairPattern, Range
 from rgbt.data.labels import LabelValue, each_colour, label_codes, painted
 from rgbt.data.named_files import existing_root, hash_of_files
 from rgbt.ranges import Colour, Names, NumClasses, Seed, Share, Text
@@ -101,19 +100,17 @@ class Folder(FileDataset):
             own = {word: each_colour(colour)[0] for word, colour in (colours or {}).items()}
             generated = zip(classes, painted(num_classes), strict=False)
             palette = tuple(own.get(word, colour) for word, colour in generated)
-        super().__init__(folder, name, num_classes, classes, palette)
-        self.unscored = unscored
-        self.background = background
-        self.clipping = thermal_range
+        super().__init__(
+            *(folder, name, num_classes, classes, palette),
+            background=background,
+            unscored=unscored,
+        )
         self.night = night
         for word in classes:
             if classes.count(word) > 1:
                 raise InputError(f"dataset.classes: '{word}' occurs twice; rename one.")
-        self.check_classes(unscored=unscored, background=background)
-        check_limits(thermal_range)
         self.codes = label_codes(classes, ids, colours, ignored)
-        self.patterns = patterns_of(rgb, thermal, label)
-        self.images = reader_of_patterns(PairPattern(rgb, thermal, label), thermal_range)
+        self.follow(PairPattern(rgb, thermal, label), thermal_range)
         self.frames: Mapping[str, FolderFrame] = find_frames(self.root, self.patterns)
         self.rule = self._rule_of(folders, lists, shares, (shares_seed, block))
         self.unlabelled = unlabelled

@@ -12,12 +12,11 @@ from rgbt.data.folder.frames import (
     FolderFrame,
     Patterns,
     find_frames,
-    patterns_of,
     without_rgb,
 )
 from rgbt.data.folder.pattern import NAME, Pattern, what_is_in
 from rgbt.data.folder.splits import ByList
-from rgbt.data.images import PairPattern, Range, check_limits, reader_of_patterns
+from rgbt.data.images import PairPattern, Range
 from rgbt.data.labels import LabelValue, label_codes, painted
 from rgbt.data.named_files import existing_root, hash_of_files
 from rgbt.data.sequences import consecutive
@@ -46,7 +45,8 @@ class VideoDataset(FileDataset):
 
     Args:
         root: its folder.
-        name: see `FileDataset`, as `num_classes`, `classes` and `palette`.
+        name: see `FileDataset`, as `num_classes`, `classes`, `palette`, `background` and
+            `unscored`.
         lists: split -> list of names of videos in `root`; None: the split "test" is all videos.
         gaps: what a missing number in a video means.
 
@@ -64,10 +64,17 @@ class VideoDataset(FileDataset):
         num_classes: int,
         classes: tuple[str, ...],
         palette: tuple[tuple[int, int, int], ...],
+        *,
         lists: dict[str, str] | None,
         gaps: Gaps,
+        background: tuple[str, ...],
+        unscored: tuple[str, ...] = (),
     ) -> None:
-        super().__init__(root, name, num_classes, classes, palette)
+        super().__init__(
+            *(root, name, num_classes, classes, palette),
+            background=background,
+            unscored=unscored,
+        )
         self._lists = None if lists is None else ByList(root, dict(lists))
         self.gaps = gaps
         self.frames: dict[str, NumberedFrame] = {}
@@ -262,13 +269,15 @@ class Video(VideoDataset):
     ) -> None:
         folder = existing_root(root, f"that dataset.rgb='{rgb}' starts from")
         colours = painted(num_classes) if palette is None else palette
-        super().__init__(folder, name, num_classes, classes, colours, lists, gaps)
-        self.check_classes(unscored=unscored, background=background)
-        check_limits(thermal_range)
-        self.unscored, self.background, self.clipping = unscored, background, thermal_range
+        super().__init__(
+            *(folder, name, num_classes, classes, colours),
+            lists=lists,
+            gaps=gaps,
+            background=background,
+            unscored=unscored,
+        )
         self.codes = label_codes(classes, ids, None, ignored)
-        self.images = reader_of_patterns(PairPattern(rgb, thermal, label), thermal_range)
-        self.patterns = patterns_of(rgb, thermal, label)
+        self.follow(PairPattern(rgb, thermal, label), thermal_range)
         _check_no_empty_video(self.patterns.rgb, folder)
         _check_case(self.patterns.rgb, folder)
         self.add(_numbered(folder, self.patterns), self.patterns[1:])

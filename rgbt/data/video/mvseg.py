@@ -95,11 +95,14 @@ class MVSeg(VideoDataset):
         gaps: Gaps = "split",
     ) -> None:
         folder = existing_root(root, "that holds the lists of MVSeg and the folder data")
-        super().__init__(folder, name, num_classes, classes, palette, lists, gaps)
-        self.check_classes(background=background)
+        super().__init__(
+            *(folder, name, num_classes, classes, palette),
+            lists=lists,
+            gaps=gaps,
+            background=background,
+        )
         if unlabelled_is == "ground":
             self.check_classes(unlabelled_is=("ground",))
-        self.background = background
         rest = IGNORE if unlabelled_is == "ignored" else classes.index("ground")
         self.codes = LabelCodes({**{value: value for value in range(num_classes)}, IGNORE: rest})
         if not (folder / "data").is_dir():
