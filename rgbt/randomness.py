@@ -14,6 +14,8 @@ import numpy as np
 if TYPE_CHECKING:
     import torch
 
+    from rgbt.types import GeneratorOf
+
 
 def derive(seed: int, purpose: str, *index: int) -> int:
     """63-bit seed that depends on every argument (SHA-256), the same on every machine.
@@ -34,6 +36,11 @@ def torch_generator(
     import torch  # not at the top: data sets are read without it
 
     return torch.Generator(device=device).manual_seed(derive(seed, purpose, *index))
+
+
+def generators_of_step(seed: int, step: int, device: torch.device) -> GeneratorOf:
+    """Purpose -> generator of one step (see `rgbt.types.GeneratorOf`)."""
+    return lambda purpose: torch_generator(seed, purpose, step, device=device)
 
 
 def numpy_generator(seed: int, purpose: str, *index: int) -> np.random.Generator:

@@ -10,7 +10,7 @@ object from its settings.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from rgbt.checks import InputError, described
@@ -43,6 +43,10 @@ class Requirement:
         if isinstance(provided, tuple):
             return set(self.value) <= set(provided)
         return provided is None or bool(provided == self.value)
+
+    def inside(self, node: str) -> Requirement:
+        """The same of a part of the component at `node`; `setting` is then relative to that."""
+        return replace(self, setting=f"{node}.{self.setting}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,6 +93,7 @@ class Record:
         target_confidence: domains: whether these carry a confidence.
         separate_heads: domains: whether source and target have a head each.
         num_classes: data set: K.
+        first_class: data set: whether class 0 is its background or an object.
         others: further values that a user's own components share, by name.
     """
 
@@ -122,6 +127,7 @@ class Record:
     target_confidence: bool = False
     separate_heads: bool = False
     num_classes: int | None = None
+    first_class: Literal["background", "object"] | None = None
     others: Mapping[str, Any] = field(default_factory=dict)
 
     def get(self, key: str) -> Any:

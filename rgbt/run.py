@@ -22,10 +22,14 @@ def main(config: DictConfig) -> int:
     from rgbt.spec.naming import tags_from_environment
     from rgbt.spec.request import note_request
     from rgbt.spec.specify import specify
+    from rgbt.spec.unused import unused_sentences
+    from rgbt.tracking.terminal import warn
     from rgbt.training.show import is_launched, report_pretrained, show_known
     from rgbt.training.start import start
 
     overrides, tags = list(HydraConfig.get().overrides.task), tags_from_environment()
+    for sentence in () if is_launched() else unused_sentences(config, overrides):
+        warn(sentence)
     if show_known(config, overrides, tags):
         return 0
     # torch is imported from here on, after --help and after finished runs

@@ -169,6 +169,7 @@ def test_mistakes_are_one_sentence_and_write_nothing(
     refused("2.png cannot be decoded")
     for number in (2, 3, 4):
         (drive / f"{number}.png").unlink()
+    (drive / "label" / "3.png").unlink()
     refused("no two consecutive frames among its 1 frame(s)")
 
 

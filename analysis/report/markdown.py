@@ -271,7 +271,8 @@ def heading(view: TableView) -> str:
 
 def _short(word: str) -> str:
     """An override as a heading shows it: without a long list of rows, which the table has."""
-    return "some rows" if word.startswith("rows=") and len(word) > MOST_IN_HEADING else word
+    is_long = word.startswith("rows=") and len(word) > MOST_IN_HEADING
+    return "some rows" if is_long else f"`{word}`"
 
 
 def anchor(view: TableView) -> str:

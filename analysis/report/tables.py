@@ -6,7 +6,6 @@ import math
 import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, get_args
 
 from analysis.report.claims import claim_entries, forms_entry, judge_of, seeds_were_added
@@ -26,7 +25,7 @@ from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from sweeps.table.load_table import load_table, study_names, table_names
 from sweeps.table.request import DEFAULT_SCALE
-from sweeps.table.scoring import ScoredTable, published, score
+from sweeps.table.scoring import published
 from sweeps.table.table import Column, Form, Row, Table
 from sweeps.verdicts.judge import TableJudge
 
@@ -151,7 +150,7 @@ def _resampled(
 def cell_of(draft: RescoredTable, row: Row, column: Column, intervals: Intervals) -> CellEntry:
     """One cell of a table that was run."""
     scored, place = draft.scored, (row.label, column.name)
-    plain = replace(_printed(scored, row, column), values=draft.values(row, column))
+    plain = replace(_printed(row, column), values=draft.values(row, column))
     line, cell = draft.line(row, column), scored.cells.get(place)
     if cell is None or cell.seeds < line.seeds:
         return _as_recorded(plain, line)
@@ -176,12 +175,10 @@ def cell_of(draft: RescoredTable, row: Row, column: Column, intervals: Intervals
     return replace(entry, low=low, high=high, covers=found.covers)
 
 
-def _printed(scored: ScoredTable, row: Row, column: Column) -> CellEntry:
+def _printed(row: Row, column: Column) -> CellEntry:
     """What is known of a cell without any run."""
-    needs = column.needs or row.needs or scored.table.needs or ""
-    if not needs and row.experiment is None:
-        needs = "shown as published only"
-    return CellEntry(published=published(row, column), reason=needs)
+    reason = "shown as published only" if row.experiment is None else ""
+    return CellEntry(published=published(row, column), reason=reason)
 
 
 def _as_recorded(plain: CellEntry, line: RecordedCell) -> CellEntry:
@@ -240,13 +237,9 @@ def _entry(draft: RescoredTable, intervals: Intervals, remarks: list[str]) -> Ta
 
 def _notes(table: Table) -> tuple[str, ...]:
     """What the file says beside its values, one sentence each."""
-    needed = [f"Cannot be run yet, needs {table.needs}."] if table.needs else []
     columns = [f"{each.name}: not in the paper." for each in table.columns if not each.printed]
-    columns += [
-        f"{each.name}: not computed, needs {each.needs}." for each in table.columns if each.needs
-    ]
     rows = [f"{row.label}: {remark}" for row in table.rows for remark in row.remarks]
-    return (*needed, *table.remarks, *columns, *rows)
+    return (*table.remarks, *columns, *rows)
 
 
 def _form_notes(draft: RescoredTable) -> Iterable[str]:
@@ -283,7 +276,7 @@ def _waiting(name: str, table: Table) -> TableEntry:
     return _laid_out(
         name,
         table,
-        partial(_printed, score(name, table, {}, scale="")),
+        _printed,
         scale="",
         claims=claim_entries(TableJudge(name, table)),
         notes=_notes(table),

@@ -137,7 +137,7 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
     components = {
         **{"scheme": scheme, "loss": loss, "domains": domains, "model": session.model},
         **{"masker": masker, "transform": session.transform, "data": session.loading},
-        "dataset": session.dataset,
+        **{"dataset": session.dataset, "consistency": session.consistency},
     }
     check_requirements(components, spec.plain)
     _check_splits(session)

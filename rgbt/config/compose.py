@@ -203,8 +203,8 @@ def _by_network(choices: dict[str, Any], *, _root_: DictConfig) -> Any:
     if name not in choices:
         raise InputError(
             f"pretrained has no file and no common start for the network {name}; expected one of "
-            f"{', '.join(choices)}. Name the initial weights with model.weights=..., or set "
-            "model.weights=null to start from random weights."
+            f"{', '.join(choices)}. Set pretrained=FILE, or pretrained=null to start from random "
+            "weights."
         )
     return choices[name]
 

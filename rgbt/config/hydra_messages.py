@@ -30,6 +30,9 @@ from rgbt.config.compose import (
 ADDED = ("experiment", "search", "debug")
 """Groups that are not in the defaults list; a command adds them with a plus."""
 
+OF_RESOLVER = "InputError raised while resolving interpolation: "
+"""What OmegaConf writes before the message of a resolver of ours."""
+
 
 def check_words(words: Sequence[str]) -> None:
     """Refuse words of a command that Hydra would misread or ignore with a warning.
@@ -80,6 +83,9 @@ def hydra_sentence(error: Exception, overrides: Sequence[str]) -> str:
     if isinstance(error, OverrideParseException):
         return _no_override(str(error.override))
     text = " ".join(str(error.__cause__ or error).split())
+    _, is_own, sentence = text.partition(OF_RESOLVER)
+    if is_own:
+        return re.sub(r" full_key:.*", "", sentence)
     key = re.search(r"Key '([^']+)' is not in struct full_key: (\S+)", text)
     if key:
         return _unknown_key(key[2], overrides)

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError, check_choice, nearest
-from rgbt.data.folder.frames import FolderFrame, Patterns
+from rgbt.data.folder.frames import FolderFrame, Patterns, patterns_of
 from rgbt.data.folder.splits import SplitRule
-from rgbt.data.images import PairReader, Range
+from rgbt.data.images import PairPattern, PairReader, Range, check_limits, reader_of_patterns
 from rgbt.data.labels import LabelCodes
 from rgbt.data.named_files import check_size, existing_file, hash_of_files
 from rgbt.requirements import Record
@@ -51,6 +51,9 @@ class FileDataset:
         num_classes: number of classes; other nodes of the configuration interpolate it.
         classes: their names, in order of the class index.
         palette: their (red, green, blue) colours, 0..255.
+        unscored: classes that are counted but left out of every mean over classes; (): every class
+            counts, as in the published tables.
+        background: classes that are no object, see `rgbt.dataset.LabelledDataset`.
 
     Attributes:
         images: how its images, and new ones of any folder, are read.
@@ -59,7 +62,7 @@ class FileDataset:
         rule: divides its frames into splits, where a subclass does not.
 
     Raises:
-        InputError: numbers of classes, names and colours differ.
+        InputError: numbers of classes, names and colours differ, or a class that is not one.
     """
 
     images: PairReader
@@ -67,22 +70,19 @@ class FileDataset:
     patterns: Patterns
     rule: SplitRule
 
-    unscored: tuple[str, ...] = ()
-    """Every class counts in the means, as in the published tables."""
-
-    background: tuple[str, ...] = ()
-    """No class is the background."""
-
     splits_key = "dataset.splits"
     """Setting that names the splits, for messages."""
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - settings of every data set
         self,
         root: Path,
         name: str,
         num_classes: int,
         classes: tuple[str, ...],
         palette: tuple[tuple[int, int, int], ...],
+        *,
+        background: tuple[str, ...],
+        unscored: tuple[str, ...] = (),
     ) -> None:
         for key, length in (("classes", len(classes)), ("palette", len(palette))):
             if length != num_classes:
@@ -95,12 +95,18 @@ class FileDataset:
         self.num_classes = num_classes
         self.classes = classes
         self.palette = palette
+        self.check_classes(unscored=unscored, background=background)
+        self.unscored, self.background = unscored, background
         self._names: dict[str, tuple[str, ...]] = {}
 
     @property
     def record(self) -> Record:
-        """The number of its classes."""
-        return Record(num_classes=self.num_classes)
+        """The number of its classes, and what the first one is."""
+        is_background = self.classes[0] in self.background
+        return Record(
+            num_classes=self.num_classes,
+            first_class="background" if is_background else "object",
+        )
 
     @property
     def splits(self) -> dict[str, str]:
@@ -112,6 +118,13 @@ class FileDataset:
         for key, chosen in settings.items():
             for word in chosen:
                 check_choice(f"dataset.{key}", word, self.classes)
+
+    def follow(self, layout: PairPattern, thermal_range: Range | None) -> None:
+        """Read images by the patterns of a user's configuration; InputError for invalid ones."""
+        check_limits(thermal_range)
+        self.clipping = thermal_range
+        self.patterns = patterns_of(*layout)
+        self.images = reader_of_patterns(layout, thermal_range)
 
     def has(self, split: str) -> bool:
         """Whether any sample of `split` exists; InputError if the split is unknown."""

@@ -126,10 +126,12 @@ class Freiburg(FileDataset):
         val_sequences: Names = (),
     ) -> None:
         folder = existing_root(root, "that holds train and test")
-        super().__init__(folder, name, num_classes, classes, palette)
-        self.check_classes(unscored=unscored, background=background, ignored_test=ignored_test)
-        self.unscored = unscored
-        self.background = background
+        super().__init__(
+            *(folder, name, num_classes, classes, palette),
+            background=background,
+            unscored=unscored,
+        )
+        self.check_classes(ignored_test=ignored_test)
         self.crop = crop
         self.ignored_test = ignored_test
         self.val_sequences = val_sequences

@@ -116,9 +116,7 @@ class KP(FileDataset):
         lists: ListSource = "auto",
     ) -> None:
         folder = existing_root(root, "that holds images and labels of KP")
-        super().__init__(folder, name, num_classes, classes, palette)
-        self.check_classes(background=background)
-        self.background = background
+        super().__init__(folder, name, num_classes, classes, palette, background=background)
         self.codes = indices(num_classes, num_classes)  # the value after the last class is void
         if not _holds_kp(folder):
             near = root_nearby(folder, _holds_kp) or "the folder that does"

@@ -90,9 +90,7 @@ class MFNet(FileDataset):
         layout: Literal["auto"] | Layout = "auto",
     ) -> None:
         folder = existing_root(root, f"that holds {EITHER_LAYOUT} and the split lists")
-        super().__init__(folder, name, num_classes, classes, palette)
-        self.check_classes(background=background)
-        self.background = background
+        super().__init__(folder, name, num_classes, classes, palette, background=background)
         for known, folders in FOLDERS.items():
             if layout in ("auto", known) and all((folder / each).is_dir() for each in folders):
                 self.layout = known

@@ -86,9 +86,7 @@ class PST900(FileDataset):
         val_bags: Bags = (),
     ) -> None:
         folder = existing_root(root, "that holds train and test of PST900")
-        super().__init__(folder, name, num_classes, classes, palette)
-        self.check_classes(background=background)
-        self.background = background
+        super().__init__(folder, name, num_classes, classes, palette, background=background)
         self.codes = indices(num_classes)
         self.val_bags = val_bags
         if val_bags:

@@ -17,10 +17,16 @@ import torch
 from torch import Tensor, nn
 
 from rgbt.checkpoints.stored import ZIP, explained, plain, read_torch_file
-from rgbt.checks import InputError
+from rgbt.checks import InputError, RunError, not_finite
 
 UNAVERAGED = "unaveraged"
 """Entry of a checkpoint with the weights of the last step, where "model" has averaged ones."""
+
+ADVICE = (
+    "The last checkpoint is kept. Lower optimizer.lr, or use trainer.precision=32-true if the "
+    "precision was mixed."
+)
+"""Advice for numbers that are not finite."""
 
 
 @dataclass
@@ -183,3 +189,23 @@ def restore_weights(model: nn.Module, weights: dict[str, Tensor], source: Path) 
 def _some(what: str, keys: list[str]) -> str:
     shown = ", ".join(keys[:2] + ["..."] * (len(keys) > 2))
     return f"{len(keys)} keys {what}" + (f" ({shown})" if keys else "")
+
+
+def check_weights(modules: Mapping[str, nn.Module], step: int) -> None:
+    """Refuse to evaluate or save parameters and buffers that are not finite.
+
+    Args:
+        modules: by the name that they have in checkpoints.
+        step: optimiser steps done, for the message.
+
+    Raises:
+        RunError: naming the first tensor with NaN or infinity.
+    """
+    for module in modules.values():
+        tensors = module.state_dict()
+        broken = not_finite(tensors)
+        if broken:
+            raise RunError(
+                f"step {step}: '{broken[0]}' holds NaN or infinity ({len(broken)} of "
+                f"{len(tensors)} tensors do). {ADVICE}"
+            )

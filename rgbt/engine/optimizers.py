@@ -201,3 +201,20 @@ def trainable(model: nn.Module, without: tuple[str, ...] = ()) -> list[nn.Parame
     """All parameters of `parameter_groups` in one list."""
     groups = parameter_groups(model, (), without)
     return [parameter for group in groups.values() for parameter in group]
+
+
+def step_without_gradient(optimizer: torch.optim.Optimizer) -> None:
+    """Step the parameters that were stepped before with gradients of 0.
+
+    The moving averages decay, momentum and weight decay act. Released: `zero_grad` up to torch 1.13
+    leaves zeros, so that one optimiser of all parameters also steps those of the other phase.
+    """
+    parameters = [each for group in optimizer.param_groups for each in group["params"]]
+    stepped = [each for each in parameters if optimizer.state.get(each)]
+    for parameter in parameters:
+        parameter.grad = None
+    for parameter in stepped:
+        parameter.grad = torch.zeros_like(parameter)
+    optimizer.step()
+    for parameter in stepped:
+        parameter.grad = None

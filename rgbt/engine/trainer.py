@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 import resource
 import time
-from collections.abc import Callable, Container, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Protocol
 
@@ -15,17 +14,25 @@ import torch
 from lightning_fabric import Fabric
 from torch import Tensor, nn
 
-from rgbt.checks import InputError, RunError, not_finite
+from rgbt.checks import InputError, RunError
 from rgbt.engine.averaging import AveragedWeights
-from rgbt.engine.checkpoint import State, restore_optimizer, restore_weights, training_payload
+from rgbt.engine.checkpoint import (
+    ADVICE,
+    State,
+    check_weights,
+    restore_optimizer,
+    restore_weights,
+    training_payload,
+)
 from rgbt.engine.committed import Checkpoints
 from rgbt.engine.gradient_shares import TermGradients
 from rgbt.engine.gradients import average_gradients, check_gradients
+from rgbt.engine.optimizers import step_without_gradient
 from rgbt.engine.progress import progress
 from rgbt.engine.schedules import Schedule
 from rgbt.engine.settings import TrainerSettings
 from rgbt.processes import collected, mean_count, num_processes
-from rgbt.randomness import torch_generator
+from rgbt.randomness import generators_of_step
 from rgbt.runtime.signals import Stopped, at_once, deferred
 from rgbt.types import Batch, GeneratorOf, Phase, TwoDomains
 
@@ -35,13 +42,6 @@ StepData = Batch | TwoDomains
 
 WAIT_SHARE = "wait_share"
 """Share of the time of a step that the loop waited for its images, 0..1."""
-
-
-ADVICE = (
-    "The last checkpoint is kept. Lower optimizer.lr, or use trainer.precision=32-true if the "
-    "precision was mixed."
-)
-"""Advice for numbers that are not finite."""
 
 
 class Loaded(Protocol):
@@ -247,9 +247,7 @@ class Trainer:
         waited = time.perf_counter() - started
         device = self.fabric.device
         parts = [
-            self.scheme.phases(
-                batch.to(device), partial(torch_generator_of, seed=seed, index=index, device=device)
-            )
+            self.scheme.phases(batch.to(device), generators_of_step(seed, index, device))
             for index, batch in enumerate(micro, start=step * self.settings.accumulate)
         ]
         values: dict[str, float] = {}
@@ -342,50 +340,6 @@ class Trainer:
         logged = {n if n in beside else f"loss/{n}": v * share for n, v in values.items()}
         logged["loss"] = sum(v for n, v in values.items() if n not in beside) * share
         return logged
-
-
-def step_without_gradient(optimizer: torch.optim.Optimizer) -> None:
-    """Step the parameters that were stepped before with gradients of 0.
-
-    The moving averages decay, momentum and weight decay act. Released: `zero_grad` up to torch 1.13
-    leaves zeros, so that one optimiser of all parameters also steps those of the other phase.
-    """
-    parameters = [each for group in optimizer.param_groups for each in group["params"]]
-    stepped = [each for each in parameters if optimizer.state.get(each)]
-    for parameter in parameters:
-        parameter.grad = None
-    for parameter in stepped:
-        parameter.grad = torch.zeros_like(parameter)
-    optimizer.step()
-    for parameter in stepped:
-        parameter.grad = None
-
-
-def check_weights(modules: Mapping[str, nn.Module], step: int) -> None:
-    """Refuse to evaluate or save parameters and buffers that are not finite.
-
-    Args:
-        modules: by the name that they have in checkpoints.
-        step: optimiser steps done, for the message.
-
-    Raises:
-        RunError: naming the first tensor with NaN or infinity.
-    """
-    for module in modules.values():
-        tensors = module.state_dict()
-        broken = not_finite(tensors)
-        if broken:
-            raise RunError(
-                f"step {step}: '{broken[0]}' holds NaN or infinity ({len(broken)} of "
-                f"{len(tensors)} tensors do). {ADVICE}"
-            )
-
-
-def torch_generator_of(
-    purpose: str, *, seed: int, index: int, device: torch.device
-) -> torch.Generator:
-    """The generator of one purpose in one step (see `rgbt.types.GeneratorOf`)."""
-    return torch_generator(seed, purpose, index, device=device)
 
 
 def _add(values: dict[str, float], more: dict[str, float]) -> None:

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from rgbt.build.requirements import check_requirements
 from rgbt.checks import InputError
 from rgbt.data.loaders import eval_batches
 from rgbt.data.next_frames import NextFrames
@@ -25,7 +26,8 @@ def check_frames(data: EvaluationData, frames: Frames) -> None:
     """Refuse to measure without second frames.
 
     Raises:
-        InputError: the data set has none, or there are no sets of views.
+        InputError: the data set has none, there are no sets of views, or they paint the background
+            of a data set without one.
     """
     if frames == "next":
         NextFrames(data.dataset)
@@ -34,6 +36,8 @@ def check_frames(data: EvaluationData, frames: Frames) -> None:
             "consistency.sets is empty. Name sets of angles, such as "
             "consistency.sets=[released_1], or choose consistency=views."
         )
+    elif frames == "virtual":
+        check_requirements({"consistency": data.consistency, "dataset": data.dataset}, {})
 
 
 class VirtualFrames(NamedTuple):

@@ -62,11 +62,16 @@ class TemporalLoss:
 
     @property
     def record(self) -> Record:
-        """The requirements of the loss of each frame, and a scheme of two frames."""
-        of_frames = Requirement("scheme", "frames", 2)
+        """The requirements of the loss of each frame, and a scheme of two frames.
+
+        As released, Dice and con_acc leave out class 0.
+        """
+        own = [Requirement("scheme", "frames", 2)]
+        if self.form == "released" and (self.alpha or self.second in ("dice", "con_acc")):
+            own += [Requirement("dataset", "first_class", "background", "loss.form=released")]
         compares = self.second in ("con", "con_acc")
         return Record(
-            requires=(*record_of(self.segmentation).requires, of_frames),
+            requires=(*record_of(self.segmentation).requires, *own),
             frames=2,
             reads_warped=compares,
             compares_half=compares,

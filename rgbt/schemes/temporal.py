@@ -89,6 +89,7 @@ class Temporal:
                 Requirement("masker", "hides_cells", False),
                 *((Requirement("model", "dense_logits", True),) if makes_masks else ()),
                 *((half,) if self.resolution == "half" else ()),
+                *(each.inside("scheme") for each in record_of(self.view).requires),
             ),
             frames=2,
             camera=record_of(self.view).camera,

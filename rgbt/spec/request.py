@@ -25,8 +25,8 @@ from rgbt.data.domains import GIVEN, NONE
 from rgbt.files.atomic import write_atomic
 from rgbt.files.budgets import read_json, sealed
 from rgbt.spec.checkout_code import code_of
-from rgbt.spec.run_key import file_digest, manifest_of
-from rgbt.spec.run_spec import WEIGHTS, RunSpec, labels_key, weights_file
+from rgbt.spec.run_key import file_digest, manifest_of, weights_file
+from rgbt.spec.run_spec import WEIGHTS, RunSpec, labels_key
 from rgbt.spec.specify import parse_reference, upstream_config
 from rgbt.tracking.provenance import code
 

@@ -1,4 +1,4 @@
-"""Digests from which the key of a run is computed."""
+"""Digests from which the key of a run is computed, and the files that they are of."""
 
 from __future__ import annotations
 
@@ -47,3 +47,19 @@ def manifest_of(key: str, folder: str) -> dict[str, Any]:
             "rgbt predict ... pseudo_labels=true has written."
         )
     return manifest
+
+
+def weights_file(named: str) -> Path:
+    """The file that `model.weights` names; of a run folder its best checkpoint.
+
+    Raises:
+        InputError: there is no such file.
+    """
+    path = Path(named).expanduser()
+    path = path / "best.pt" if path.is_dir() else path
+    if not path.is_file():
+        raise InputError(
+            f"model.weights={named}: the file {path} does not exist; give a file of weights, "
+            "or a run folder."
+        )
+    return path

@@ -11,7 +11,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, cast
 
-from rgbt.checks import InputError
 from rgbt.config.component import Component
 from rgbt.config.stored_config import EXTERNAL
 from rgbt.data.domains import GIVEN, NONE, Domains
@@ -20,7 +19,8 @@ from rgbt.engine.prediction import Prediction
 from rgbt.engine.settings import Recipe, Scale, TrainerSettings
 from rgbt.ranges import Seed, Text
 from rgbt.spec.checkout_code import code_of, content_of
-from rgbt.spec.run_key import file_digest, manifest_of, settings_digest
+from rgbt.spec.node import Node, node_field
+from rgbt.spec.run_key import file_digest, manifest_of, settings_digest, weights_file
 from rgbt.spec.seeds import Seeds, SourceSeeds
 
 WEIGHTS = "model.weights"
@@ -29,56 +29,9 @@ WEIGHTS = "model.weights"
 CheckpointFile = Literal["best.pt", "last.pt"]
 
 
-@dataclass(frozen=True)
-class Node:
-    """How the run key and the upstream runs use a node of the configuration.
-
-    Attributes:
-        in_key: whether it is part of the run key.
-        outside_key: settings of it that are not: paths, hardware, labels, and what other settings
-            take up.
-        added: settings that are newer than the first runs -> what these runs did: left out of the
-            key where they say that, so that a run keeps its key.
-        used_with: settings that have an effect only where another setting has a value -> that
-            setting and value; left out of the key elsewhere.
-        renamed: settings of which values have another name now -> the present name -> the name
-            that the key keeps, and that stored configurations may have.
-        added_as: the same as `added` for the whole node; None: it is as old as the first runs.
-        shared: whether upstream runs take it over from the run that needs them; or which of its
-            settings.
-    """
-
-    in_key: bool = True
-    outside_key: tuple[str, ...] = ()
-    added: Mapping[str, Any] = field(default_factory=dict)
-    used_with: Mapping[str, tuple[str, Any]] = field(default_factory=dict)
-    renamed: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
-    added_as: Mapping[str, Any] | None = None
-    shared: bool | tuple[str, ...] = False
-
-    def key_settings(self, name: str, values: Mapping[str, Any]) -> dict[str, Any]:
-        """The part of a node's canonical `values` that enters the run key, below its `name`."""
-        if not self.in_key or values == self.added_as:
-            return {}
-        old = [key for key, value in self.added.items() if values.get(key) == value]
-        unused = [key for key, (other, v) in self.used_with.items() if values.get(other) != v]
-        left_out = {*self.outside_key, *old, *unused}
-        names = {
-            key: self.renamed[key].get(value, value)
-            for key, value in values.items()
-            if key in self.renamed and isinstance(value, str)
-        }
-        values = {**values, **names}
-        return {name: {key: values[key] for key in values if key not in left_out}}
-
-
 def labels_key(domain: str) -> str:
     """The setting that names the labels of a domain."""
     return f"domains.{domain}.labels"
-
-
-def _node(**policy: Any) -> Any:
-    return field(metadata={"node": Node(**policy)})
 
 
 def _value(annotation: Any, *, shared: bool = False, is_label: bool = False) -> Any:
@@ -132,14 +85,14 @@ class RunSpec:
     pretrained: str | None = _value(Text | None, shared=True)
     out: str | None = _value(Text | None, is_label=True)
 
-    scale: Scale = _node(in_key=False)
-    recipe: Recipe = _node(in_key=False)
-    dataset: Component = _node(
+    scale: Scale = node_field(in_key=False)
+    recipe: Recipe = node_field(in_key=False)
+    dataset: Component = node_field(
         outside_key=("root", "cache_dir", "palette", "background", "layout", "absent"),
         added={"vignette": 0.18, "whole_shadows": False},
         shared=True,
     )
-    domains: Domains = _node(
+    domains: Domains = node_field(
         added_as={
             "_target_": "rgbt.data.domains.Domains",
             "source": {
@@ -150,28 +103,28 @@ class RunSpec:
             **{"target": None, "target_is": None, "tested_head": "own"},
         }
     )
-    seeds: Seeds = _node(
+    seeds: Seeds = node_field(
         added_as={
             "_target_": "rgbt.spec.seeds.Seeds",
             **{"weights": None, "order": None, "masks": None},
         },
         shared=True,
     )
-    data: LoaderSettings = _node(
+    data: LoaderSettings = node_field(
         outside_key=("num_workers", "on_error", "eval_batch_size", "prefetch", "augment", "cache"),
         shared=True,
     )
-    transform: Component = _node()
-    masker: Component = _node()
-    model: Component = _node(
+    transform: Component = node_field()
+    masker: Component = node_field()
+    model: Component = node_field(
         added={"mask_token": "branch"},
         renamed={"decoder": {"modified_heatnet": "modified_released"}},
     )
-    loss: Component = _node()
-    scheme: Component = _node(added={"resolution": "full", "idle_steps": "none"})
-    optimizer: Component = _node(added={"head_rate": "scheduled"})
-    schedule: Component = _node()
-    trainer: TrainerSettings = _node(
+    loss: Component = node_field()
+    scheme: Component = node_field(added={"resolution": "full", "idle_steps": "none"})
+    optimizer: Component = node_field(added={"head_rate": "scheduled"})
+    schedule: Component = node_field()
+    trainer: TrainerSettings = node_field(
         outside_key=(
             *("accelerator", "log_every", "checkpoint_every", "devices", "strategy"),
             *("activation_checkpointing", "memory_format", "compile", "log_gradient_shares"),
@@ -184,8 +137,8 @@ class RunSpec:
             *("activation_checkpointing", "memory_format", "compile", "log_gradient_shares"),
         ),
     )
-    metric: Component = _node(shared=True)
-    prediction: Prediction = _node(
+    metric: Component = node_field(shared=True)
+    prediction: Prediction = node_field(
         added_as={
             "_target_": "rgbt.engine.prediction.Prediction",
             **{"align_corners": False, "mirrored": False, "scales": [1.0], "window_hw": None},
@@ -193,8 +146,8 @@ class RunSpec:
             "label_resize": "nearest",
         }
     )
-    consistency: Component = _node(in_key=False)
-    tracking: Component = _node(in_key=False, shared=True)
+    consistency: Component = node_field(in_key=False)
+    tracking: Component = node_field(in_key=False, shared=True)
 
     overrides: tuple[str, ...] = ()
     plain: Mapping[str, Any] = field(repr=False)
@@ -330,22 +283,6 @@ class RunSpec:
             assert path is not None, "model.weights has a value"
             return file_digest(path)
         return value if value in (GIVEN, NONE) else str(manifest_of(key, value)["digest"])
-
-
-def weights_file(named: str) -> Path:
-    """The file that `model.weights` names; of a run folder its best checkpoint.
-
-    Raises:
-        InputError: there is no such file.
-    """
-    path = Path(named).expanduser()
-    path = path / "best.pt" if path.is_dir() else path
-    if not path.is_file():
-        raise InputError(
-            f"model.weights={named}: the file {path} does not exist; give a file of weights, "
-            "or a run folder."
-        )
-    return path
 
 
 NODES: dict[str, Node] = {

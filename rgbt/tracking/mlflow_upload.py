@@ -19,14 +19,13 @@ from typing import Any
 
 from rgbt.files.atomic import write_atomic
 from rgbt.files.budgets import read_json, sealed
-from rgbt.metrics import names
-from rgbt.metrics.names import shown
 from rgbt.tracking.mlflow_client import MlflowStore
 from rgbt.tracking.mlflow_inputs import inputs_digest, send_inputs
+from rgbt.tracking.mlflow_metrics import later_scores, metrics_of, metrics_of_pairs, profile_of
 from rgbt.tracking.mlflow_model import checkpoint_digest, send_model
 from rgbt.tracking.replaced_runs import shown_description, shown_key
 from rgbt.tracking.run_files import Description, read_provenance, read_result, read_tables
-from rgbt.tracking.run_folder import MetricLine, RunFolder
+from rgbt.tracking.run_folder import RunFolder
 from rgbt.tracking.tables import ResultTables, result_grids, subset_mious, without_nan
 from rgbt.tracking.tracker import Status
 
@@ -122,12 +121,12 @@ def upload(store: MlflowStore, folder: RunFolder, sent: UploadState, status: Sta
     tables = read_tables(folder.path)
     every = folder.lines()
     lines = [line for line in every if line.step > sent.steps.get(line.kind, -1)]
-    metrics = list(_metrics(lines))
+    metrics = list(metrics_of(lines))
     if tables is not None and tables.split == "test" and not sent.profile:
-        metrics += _profile(tables, every)
+        metrics += profile_of(tables, every)
         sent.profile = True
-    later = _later(folder, every, sent)
-    metrics += _later_metrics(later, every)
+    later = later_scores(folder, every, sent.later)
+    metrics += metrics_of_pairs(later, every)
     _send(store, folder, sent, (metrics, set(run.data.params), description, tables))
     sent.steps |= {line.kind: line.step for line in lines}
     sent.later += later
@@ -162,7 +161,7 @@ def is_up_to_date(folder: RunFolder, sent: UploadState, status: Status) -> bool:
         sent.shown == _shown(folder, description, tables, status)
         and all(line.step <= sent.steps.get(line.kind, -1) for line in every)
         and (tables is None or tables.split != "test" or sent.profile)
-        and not _later(folder, every, sent)
+        and not later_scores(folder, every, sent.later)
         and sent.inputs == inputs_digest(folder.path)
         and not _lacks_model(folder, sent)
         and not list(_changed_files(folder, sent, tables))
@@ -277,65 +276,6 @@ def _tags(
         tags["mlflow.note.content"] = "\n".join(g.to_markdown() for g in result_grids(tables))
         tags["mlflow.loggedArtifacts"] = json.dumps([{"path": TABLE_FILE, "type": "table"}])
     return tags
-
-
-def _metrics(lines: list[MetricLine]) -> Iterator[Any]:
-    """Finite values as MLflow metrics.
-
-    The time is the line's own: MLflow's databases drop a metric that is equal in every field, so
-    that a batch sent again after a crash leaves no duplicate.
-    """
-    from mlflow.entities import Metric
-
-    # The compare page draws the metric that came first: scores before losses.
-    for line in sorted(lines, key=lambda line: ("test", "val", "train").index(line.kind)):
-        last = line.kind == "test"
-        prefix = "" if last else f"{line.kind}/"
-        # The pages draw bars over runs for a metric that has step 0 only, else a line over steps.
-        step = 0 if last else line.step
-        for name, value in line.values.items():
-            if math.isfinite(value):
-                yield Metric(f"{prefix}{name}", shown(name, value), round(1000 * line.time), step)
-
-
-def _later(folder: RunFolder, lines: list[MetricLine], sent: UploadState) -> dict[str, float]:
-    """Scores of pairs of frames in the result that no line holds and that were not sent yet.
-
-    Those of the selection split, and those that `rgbt.consistency` added to a finished run; by
-    split and name.
-    """
-    result = read_result(folder.path) or {}
-    known = {f"test/{name}" for line in lines if line.kind == "test" for name in line.values}
-    found = {}
-    for kind in ("val", "test"):
-        for name, value in (result.get(kind) or {}).items():
-            key = f"{kind}/{name}"
-            is_pairs = name.split("/")[0] in (names.TC, names.CA)
-            if is_pairs and value is not None and key not in known and key not in sent.later:
-                found[key] = value
-    return found
-
-
-def _later_metrics(later: dict[str, float], lines: list[MetricLine]) -> Iterator[Any]:
-    """Scores as MLflow metrics: those of the test split by their name alone."""
-    from mlflow.entities import Metric
-
-    for key, value in later.items():
-        name = key.partition("/")[2]
-        label = name if key.startswith("test/") else key
-        yield Metric(label, shown(name, value), round(1000 * lines[-1].time), 0)
-
-
-def _profile(tables: ResultTables, lines: list[MetricLine]) -> list[Any]:
-    """IoU over the regions as a line: the step is the region's number."""
-    from mlflow.entities import Metric
-
-    last = lines[-1].time if lines else time.time()
-    return [
-        Metric(names.REGION_PROFILE, round(100 * iou, 2), round(1000 * last), region)
-        for region, iou in enumerate(tables.regions.region_ious, start=1)
-        if math.isfinite(iou)
-    ]
 
 
 def artifact_table(tables: ResultTables) -> dict[str, list[Any]]:

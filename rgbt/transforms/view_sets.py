@@ -15,6 +15,7 @@ from torch import Tensor
 from rgbt.checks import InputError, nearest, one_line
 from rgbt.files.budgets import TEXT, read_bytes
 from rgbt.ranges import Names
+from rgbt.requirements import Record, record_of
 from rgbt.transforms.virtual_view import VirtualView
 
 HEADER = "yaw,pitch,roll"
@@ -59,6 +60,12 @@ class ViewSets:
                 view.check(triples)
             except InputError as error:
                 raise InputError(f"consistency.sets: {name}: {error}") from error
+
+    @property
+    def record(self) -> Record:
+        """What its views require of the data set."""
+        requires = record_of(self.view).requires if self.sets else ()
+        return Record(requires=tuple(each.inside("consistency") for each in requires))
 
     @cached_property
     def mark(self) -> str:

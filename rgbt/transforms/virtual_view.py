@@ -21,7 +21,7 @@ from rgbt.geometry.homography import Order, homography
 from rgbt.geometry.rectangle import Rule, check_rectangle, inner_rectangle
 from rgbt.geometry.warp import Resampling, Warp
 from rgbt.ranges import rising
-from rgbt.requirements import Record
+from rgbt.requirements import Record, Requirement
 from rgbt.types import IGNORE, Batch
 
 Angle = Annotated[float, Interval(ge=-60, le=60), doc("degrees")]
@@ -89,8 +89,12 @@ class VirtualView:
 
     @property
     def record(self) -> Record:
-        """Its camera."""
-        return Record(camera=self.camera)
+        """Its camera; class 0 is painted where nothing is seen, if that is the background."""
+        painted = Requirement("dataset", "first_class", "background", "view.outside=background")
+        return Record(
+            requires=() if self.outside == "ignore" else (painted,),
+            camera=self.camera,
+        )
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """(count, 3) float64: yaw, pitch, roll in degrees, on the device of `generator`."""

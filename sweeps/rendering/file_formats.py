@@ -94,12 +94,11 @@ def tidy_csv(scored: ScoredTable) -> str:
     for row in scored.table.rows:
         for column in scored.table.columns:
             cell = scored.cells.get((row.label, column.name), nothing)
-            reason = cell.reason or column.needs or row.needs or scored.table.needs or ""
             printed = published(row, column)
             ours = (_plain(cell.mean), _plain(cell.sd), cell.seeds)
             theirs = ("" if printed is None else printed, _plain(scored.difference(row, column)))
             cell_id = (scored.name, row.label, column.name)
-            rows.append((*cell_id, *ours, *theirs, reason, " ".join(cell.keys)))
+            rows.append((*cell_id, *ours, *theirs, cell.reason, " ".join(cell.keys)))
     return csv_text(rows)
 
 

@@ -53,7 +53,7 @@ def tables_grid(
 
 
 def summary(request: TableRequest, outcomes: Sequence[Outcome], workers: int) -> list[str]:
-    """Sentences below the runs: numbers, time left, what cannot be run."""
+    """Sentences below the runs: numbers, time left, what needs no run."""
     states = Counter(outcome.state for outcome in outcomes)
     counted = ", ".join(f"{states[state]} {state}" for state in STATES if states[state])
     lines = [f"{len(outcomes)} runs: {counted or 'none'}."]
@@ -64,14 +64,7 @@ def summary(request: TableRequest, outcomes: Sequence[Outcome], workers: int) ->
         lines.append(f"Time left with workers={workers}: {known}.")
     lines += [line for line in (other_code_line(outcomes),) if line]
     lines += _evaluations(request, outcomes)
-    if request.table.needs is not None:
-        lines.append(f"The table cannot be run yet; it needs {request.table.needs}.")
-    for row in request.table.rows:
-        if row.needs is not None:
-            lines.append(f"Row '{row.label}' cannot be run yet; it needs {row.needs}.")
     for column in request.table.columns:
-        if column.needs is not None:
-            lines.append(f"Column '{column.name}' is not computed yet; it needs {column.needs}.")
         if column.efficiency is not None:
             verb = "measured" if column.efficiency in MEASURED else "counted"
             lines.append(f"Column '{column.name}' is {verb} at scale={SCALE}, without any run.")

@@ -105,7 +105,7 @@ class RenderedTable:
 def render_table(scored: ScoredTable, extra: Sequence[str] = ()) -> RenderedTable:
     """Format a computed table; `extra` are overrides that the user added to every row."""
     table, builder = scored.table, _LineBuilder(scored)
-    title_notes = builder.notes(table.needs and f"Cannot be run yet: {table.needs}", *table.remarks)
+    title_notes = builder.notes(*table.remarks)
     header = builder.header()
     lines = [line for row in table.rows for line in builder.row(row)]
     return RenderedTable(
@@ -188,8 +188,7 @@ class _LineBuilder:
         """Above the fields of a line: the names of the columns."""
         names = []
         for column in self.columns:
-            ours = None if column.printed else NOT_PRINTED
-            notes = self.notes(ours, column.needs and f"Not computed: {column.needs}")
+            notes = self.notes(None if column.printed else NOT_PRINTED)
             names.append(TextCell(column.name, notes=notes))
         if not self.on_one_line:
             return (TextCell(), TextCell("seeds"), *names)
@@ -204,10 +203,8 @@ class _LineBuilder:
     def row(self, row: Row) -> list[TableLine]:
         """The lines of one row: a single one for few columns."""
         columns = self.columns
-        is_run = any((row.label, column.name) in self.scored.cells for column in columns)
-        needs = f"Cannot be run yet: {row.needs}" if row.needs and not is_run else None
         remarks = row.remarks if not row.doubtful else ()
-        label = TextCell(row.label, notes=self.notes(needs, self._same_runs(row), *remarks))
+        label = TextCell(row.label, notes=self.notes(self._same_runs(row), *remarks))
         if self.on_one_line:
             texts = []
             for column in columns:

@@ -140,7 +140,7 @@ def is_counted(column: Column) -> bool:
 
 def is_of_runs(column: Column) -> bool:
     """Whether the column has values of runs."""
-    return column.needs is None and column.efficiency is None
+    return column.efficiency is None
 
 
 def row_cells(table: Table, row: Row, outcomes: Mapping[int, CellRun]) -> dict[CellId, TableCell]:
@@ -167,9 +167,6 @@ def _values(table: Table, row: Row, outcome: CellRun) -> dict[str, Value]:
         if path not in counts:
             counts[path] = _counts(outcome, path)
         values[column.name] = _value(metric_of(column, row), counts[path], table)
-    for column in columns:
-        if column.needs is not None:
-            values[column.name] = column.needs
     for column in columns:
         if column.sources:
             values[column.name] = derived(column, [values[name] for name in column.sources])

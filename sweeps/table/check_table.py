@@ -17,7 +17,7 @@ from sweeps.table.claim import OTHERS, PREVIOUS, Claim
 from sweeps.table.table import Column, ReleasedForm, Row, Table
 from sweeps.table.variance import Variance
 
-KINDS = ("metric", "minus", "mean", "efficiency", "needs")
+KINDS = ("metric", "minus", "mean", "efficiency")
 """Keys of a column that define its values; a column has one of them."""
 
 
@@ -229,7 +229,7 @@ def _check_claim(claim: Claim, table: Table, where: str) -> None:
             check_choice(f"{where}, against", label, labels)
         elif len(claim.against) > 1:
             raise InputError(f"{where}, against: '{label}' stands alone; remove the other entries.")
-    names = [column.name for column in table.columns if column.needs is None]
+    names = [column.name for column in table.columns]
     for name in (*claim.columns, *([claim.minus_column] if claim.minus_column else [])):
         check_choice(f"{where}, column", name, names)
     if not claim.columns or not any(True for _ in claim.pairs(labels)):

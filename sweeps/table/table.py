@@ -53,7 +53,6 @@ class Column:
         efficiency: of the row's network, counted or measured without any run and always at
             scale=paper (`sweeps.table.efficiency`); discriminators are not part of it. The images
             have the size `settings.image_hw` of the row, or 480 x 640.
-        needs: missing part of the project without which the column cannot be computed.
         modality: what is predicted from; "default": what the network is made for.
         frames: of a consistency metric: which two predictions it compares, see
             `rgbt.metrics.pairs`.
@@ -73,7 +72,6 @@ class Column:
     minus: tuple[str, str] | None = None
     mean: tuple[str, ...] | None = None
     efficiency: Efficiency | None = None
-    needs: str | None = None
     modality: Literal["default", "rgbt", "rgb", "thermal"] = "default"
     frames: Protocol | None = None
     head: Head = "as trained"
@@ -141,7 +139,6 @@ class Row:
         network: overrides that describe the row's network for an evaluation with a file of weights;
             (): those of `experiment`, if there is one.
         x: where the row lies on the axis of `Table.factor`.
-        needs: missing part of the project without which the row cannot be run.
         without: columns that the row's network has no score for; columns computed from them are
             left out too.
         tested_in: name -> overrides of the data set with which the row's network is tested too.
@@ -164,7 +161,6 @@ class Row:
     same_as: str | None = None
     network: tuple[str, ...] = ()
     x: float | None = None
-    needs: str | None = None
     without: tuple[str, ...] = ()
     tested_in: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     values: Mapping[str, float | None] = field(default_factory=dict)
@@ -186,7 +182,6 @@ class Table:
         regions: a file of ``conf/metric`` the table is evaluated with, or "as trained".
         absent: how a class without a pixel scores, see `rgbt.metrics.scores`; None: by the
             convention of the data set (`rgbt.metrics.counts.Counts.absent`).
-        needs: missing part of the project without which no row can be run.
         columns: in order.
         factor: x axis of the figure; None: no figure over a factor.
         variance: rows that measure the variance of a score by source; None: there are none.
@@ -207,7 +202,6 @@ class Table:
     at: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     regions: str = "as trained"
     absent: Literal["released", "exclude"] | None = None
-    needs: str | None = None
     columns: tuple[Column, ...]
     factor: Factor | None = None
     variance: Variance | None = None
@@ -217,14 +211,10 @@ class Table:
     design: Design | None = None
     rows: tuple[Row, ...] = ()
 
-    def runnable(self, row: Row) -> bool:
-        """Whether the project can run the row today."""
-        return row.experiment is not None and row.needs is None and self.needs is None
-
     @property
     def runnable_rows(self) -> list[Row]:
         """The rows that the project can run today."""
-        return [row for row in self.rows if self.runnable(row)]
+        return [row for row in self.rows if row.experiment is not None]
 
     def columns_of(self, row: Row) -> tuple[Column, ...]:
         """The columns of the row, in their order: without `Row.without`."""

@@ -52,7 +52,7 @@ class Contrast:
 
 def contrasts_of(claim: Claim, table: Table) -> list[Contrast]:
     """The contrasts that a claim is made of, column by column."""
-    labels = [row.label for row in table.rows if table.runnable(row) or row.values]
+    labels = [row.label for row in table.rows if row.experiment is not None or row.values]
     return [
         Contrast(row, other, column, claim.minus_column)
         for column in claim.columns

@@ -106,6 +106,31 @@ def test_a_missing_thermal_image_is_named(mvseg: Path) -> None:
         MVSeg(str(mvseg)).read("d_00238")
 
 
+@pytest.mark.parametrize("gone", ["visible/00239v.png", "infrared/00238i.png"])
+def test_a_frame_without_its_partner_is_reported(mvseg: Path, gone: str) -> None:
+    path = mvseg / "data" / "d" / gone
+    path.unlink()
+    kind = "RGB" if "visible" in gone else "thermal"
+    found = [each for each in MVSeg(str(mvseg)).own_problems({}) if f"no {kind} image" in each]
+    # Without its RGB image, the thermal image and the label are left over.
+    assert len(found) == (2 if kind == "RGB" else 1)
+    assert all(path.stem[:-1] in each for each in found)
+    assert MVSeg(str(mvseg)).sequences("test")
+    dataset = MVSeg(str(mvseg), gaps="refuse")
+    assert dataset.sequences("train")
+    with pytest.raises(InputError, match=f"no {kind} image.*; restore it, or set dataset.gaps"):
+        dataset.sequences("test")
+
+
+def test_the_last_frame_without_rgb_image_is_reported(tmp_path: Path) -> None:
+    root = write_videos(tmp_path)
+    (root / "y" / "rgb" / "10.png").unlink()
+    problems = check_dataset(video(root)).problems
+    assert problems[-1] == f"{root}/y/ir/10.png has no RGB image."
+    with pytest.raises(InputError, match=r"10\.png has no RGB image"):
+        video(root).sequences("test")
+
+
 def test_fingerprint_covers_frames_without_a_label(mvseg: Path) -> None:
     before = MVSeg(str(mvseg)).fingerprint()
     write_png(mvseg / "data" / "d" / "infrared" / "00238i.png", np.zeros(HW, np.uint8))
@@ -123,6 +148,12 @@ def test_one_video_of_packed_images_without_labels(tmp_path: Path) -> None:
     assert dataset.nights(("9",)) is None
     with pytest.raises(InputError, match="no split 'train'"):
         dataset.names("train")
+
+
+def test_first_class_is_background_if_the_data_set_says_so(tmp_path: Path) -> None:
+    root = write_videos(tmp_path)
+    found = [video(root, background=each).record for each in ((), ("car",), ("background",))]
+    assert [each.first_class for each in found] == ["object", "object", "background"]
 
 
 def test_videos_with_mistakes_are_refused(tmp_path: Path) -> None:

@@ -28,10 +28,13 @@ PROSE_COLUMNS = 120
 REPOSITORY_PATH = re.compile(
     r"(?:rgbt|sweeps|analysis|conf|docs|tests|hydra_plugins)/[\w./-]+\.(?:py|yaml|md|j2|js|css|csv)"
 )
+NAMED = re.findall(r"- (\S+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE)
+MADE = [re.escape(each) for each in NAMED if not (ROOT / "docs" / each).exists()]
 GENERATED = re.compile(
-    r"docs/(reference/(configuration/[\w-]+|experiments|external-networks|commands|metrics|recipes|tables|weights)|results/.*)\.md"
+    rf"docs/({'|'.join(MADE)}|reference/configuration/[\w-]+\.md|results/.*\.md)"
 )
-"""Pages that exist only in the built site; `make docs` checks the links to them."""
+"""Pages of the navigation that exist only in the built site, those of the groups of the
+configuration, and results; `make docs` checks the links to them."""
 
 
 def problems_of(page: Page, folder: Path) -> list[str]:

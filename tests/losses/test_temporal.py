@@ -287,3 +287,19 @@ def test_printed_numbers_of_a_small_case() -> None:
     assert paper["con_acc"].item() == pytest.approx(0.992046, abs=1e-6)
     p = first.logits.softmax(1)
     assert con(p, p, valid, "released").item() == pytest.approx(0.881330, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("changes", "requires"),
+    [
+        ({}, False),
+        ({"form": "released", "alpha": 0.0}, False),  # con reads no label
+        ({"form": "released", "alpha": 0.0, "second": "con_acc"}, True),
+        ({"form": "released"}, True),
+    ],
+)
+def test_released_sums_require_class_0_to_be_the_background(
+    changes: dict[str, Any], requires: bool
+) -> None:
+    keys = [each.key for each in loss_of(**changes).record.requires]
+    assert ("first_class" in keys) == requires

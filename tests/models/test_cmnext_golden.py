@@ -36,7 +36,7 @@ def filled(name: str, size: str) -> tuple[CMNeXt, golden.Golden]:
 
 def places(net: CMNeXt) -> dict[str, str]:
     """Name in the record -> module."""
-    paths = places_of_cmx(net) | {"decoder.logits_quarter": "decode_head"}
+    paths = places_of_cmx(net) | {"decoder.logits_quarter": "decode_head.linear_pred"}
     for stage in range(1, 5):
         block = f"backbone.extra_block{stage}.0"
         paths |= {f"x.block{stage}.0": block, f"x.block{stage}.0.attn": f"{block}.attn"}

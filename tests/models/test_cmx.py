@@ -109,6 +109,9 @@ def test_feed_forward_sees_its_neighbours_only() -> None:
             torch.testing.assert_close(layer(x)[0, r, c], layer.fc2(gelu), rtol=1e-4, atol=1e-5)
 
 
+IMAGE = (36, 50)
+
+
 def decoder() -> tuple[MlpDecoder, list[Tensor]]:
     net = MlpDecoder((3, 4, 5, 6), 2, dim=7, dropout=0.0, norm_eps=(1e-3, 1e-3))
     sizes = ((9, 13), (5, 7), (3, 4), (2, 2))
@@ -122,13 +125,14 @@ def in_released_order(net: MlpDecoder, maps: list[Tensor]) -> Tensor:
     for number in (4, 3, 2, 1):
         small = net.get_submodule(f"linear_c{number}.proj")(maps[number - 1]).permute(0, 3, 1, 2)
         joined.append(F.interpolate(small, size=(9, 13), mode="bilinear", align_corners=False))
-    return net.linear_pred(net.linear_fuse(torch.cat(joined, 1)))
+    scores = net.linear_pred(net.linear_fuse(torch.cat(joined, 1)))
+    return F.interpolate(scores.float(), size=IMAGE, mode="bilinear", align_corners=False)
 
 
 @pytest.mark.parametrize("training", [False, True])
 def test_decoder_equals_the_released_order(training: bool) -> None:
     (ours, maps), (theirs, _) = decoder(), decoder()
-    found = ours.train(training)(maps)
+    found = ours.train(training)(maps, IMAGE)
     expected = in_released_order(theirs.train(training), maps)
     torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-10)
 
@@ -239,7 +243,7 @@ def test_decoder_drops_whole_channels() -> None:
     maps = [normal(2, 8 // s, 8 // s, d) for s, d in ((1, 8), (2, 8), (4, 12), (8, 16))]
     wholes: list[Tensor] = []
     head.linear_fuse[2].register_forward_hook(lambda _m, _i, out: wholes.append(out))
-    head(maps, seeded(0))
+    head(maps, (32, 32), seeded(0))
     (whole,) = wholes
     dropped = ~seen[0].flatten(2).any(-1) & whole.flatten(2).any(-1)
     assert 0 < int(dropped.sum()) < dropped.numel()

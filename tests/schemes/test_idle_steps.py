@@ -16,8 +16,7 @@ from torch import Tensor, nn
 
 from rgbt.checks import InputError
 from rgbt.engine.checkpoint import State
-from rgbt.engine.optimizers import RMSprop
-from rgbt.engine.trainer import step_without_gradient
+from rgbt.engine.optimizers import RMSprop, step_without_gradient
 from rgbt.types import Phase
 from tests.composed import specified
 from tests.schemes.linear import Values, assert_same, network, pairs, trainer, values_of

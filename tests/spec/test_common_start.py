@@ -10,6 +10,7 @@ from omegaconf import OmegaConf
 
 from rgbt.build.training_setup import validate
 from rgbt.checks import InputError
+from rgbt.config.command import composing
 from rgbt.config.compose import compose
 from rgbt.run import main
 from rgbt.spec.run_spec import WEIGHTS, RunSpec
@@ -171,8 +172,16 @@ def test_common_reference_wrong_is_refused(typed: list[str], sentence: str) -> N
 def test_network_without_a_start_is_refused() -> None:
     config = compose(["+experiment=mfnet", "scale=bench"])
     config.model._target_ = "own.Network"
-    with pytest.raises(Exception, match=r"no common start for the network Network.*model\.weights"):
+    sentence = r"^pretrained has no .*common start for the network Network;.*pretrained=null"
+    with pytest.raises(InputError, match=sentence), composing([]):
         OmegaConf.select(config, "pretrained", throw_on_missing=True)
+
+
+@pytest.mark.parametrize("experiment", ["heatnet", "thermal_teacher"])
+def test_bench_without_a_common_start_has_random_weights(experiment: str) -> None:
+    config = composed([f"+experiment={experiment}", "scale=bench"])
+    config.pretrained = None
+    assert config.model.weights is None
 
 
 SMOKE = ("+debug=smoke", "trainer.accelerator=cpu", "tracking=none")

@@ -32,7 +32,7 @@ columns:
 rows:
   - {label: one, experiment: grbm, overrides: [masker.sigma_div=1], values: {acc: 60.5}}
   - {label: two, experiment: grbm, overrides: [masker.sigma_div=2], values: {acc: 61.5}}
-  - {label: later, experiment: grbm, needs: flow, values: {acc: 62.0}}
+  - {label: theirs, values: {acc: 62.0}}
 """
 
 Asked = list[tuple[PointList, SweepSettings]]
@@ -96,7 +96,6 @@ def test_a_whole_table(call: Call, place: Path, driven: Driven) -> None:
     ]
     rows = list(csv.DictReader((folder / "table.csv").open()))
     assert [row["mean"] for row in rows] == ["41.0", "42.0", ""]
-    assert rows[2]["reason"] == "flow"
 
 
 def test_reproduce_variance_prints_and_writes_the_budget(
@@ -193,7 +192,6 @@ def test_dry_run_lists_the_cells_and_writes_nothing(
     ]
     assert "it broke" in out
     assert "2 runs: 1 failed, 1 waiting." in out
-    assert "Row 'later' cannot be run yet; it needs flow." in out
     assert not (place / "runs").exists()
 
 

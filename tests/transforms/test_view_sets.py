@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from rgbt.checks import InputError
+from rgbt.requirements import Record
 from rgbt.transforms.view_sets import ViewSets, read_angles
 from tests.transforms.test_virtual_view import CAMERA, released
 
@@ -145,3 +146,14 @@ def test_unknown_sets_are_named(tmp_path: Path) -> None:
         sets("released_4")
     with pytest.raises(InputError, match="is neither a published set of angles nor a file"):
         sets(str(tmp_path))
+
+
+def test_views_that_paint_the_background_require_class_0_to_be_that() -> None:
+    (required,) = sets("released_1").record.requires
+    assert (required.node, required.setting) == ("dataset", "consistency.view.outside=background")
+    assert required.is_met_by(Record(first_class="background"))
+    assert not required.is_met_by(Record(first_class="object"))
+    assert not sets().record.requires
+    assert not ViewSets(
+        view=released(outside="ignore"), sets=("released_1",), splits=("test",)
+    ).record.requires

@@ -18,10 +18,15 @@ from annotated_types import Interval
 
 from rgbt.checks import InputError, check_choice
 from rgbt.data.file_dataset import FileDataset, SplitNames
-from rgbt.data.folder.frames import FolderFrame, check_partners, find_frames, patterns_of
+from rgbt.data.folder.frames import (
+    FolderFrame,
+    check_partners,
+    find_frames,
+    without_rgb,
+)
 from rgbt.data.folder.pattern import SPLIT
 from rgbt.data.folder.splits import FOLDERS, ByFolder, ByList, ByShare, SplitRule
-from rgbt.data.images import PairPattern, Range, check_limits, reader_of_patterns
+from rgbt.data.images import PairPattern, Range
 from rgbt.data.labels import LabelValue, each_colour, label_codes, painted
 from rgbt.data.named_files import existing_root, hash_of_files
 from rgbt.ranges import Colour, Names, NumClasses, Seed, Share, Text
@@ -95,19 +100,17 @@ class Folder(FileDataset):
             own = {word: each_colour(colour)[0] for word, colour in (colours or {}).items()}
             generated = zip(classes, painted(num_classes), strict=False)
             palette = tuple(own.get(word, colour) for word, colour in generated)
-        super().__init__(folder, name, num_classes, classes, palette)
-        self.unscored = unscored
-        self.background = background
-        self.clipping = thermal_range
+        super().__init__(
+            *(folder, name, num_classes, classes, palette),
+            background=background,
+            unscored=unscored,
+        )
         self.night = night
         for word in classes:
             if classes.count(word) > 1:
                 raise InputError(f"dataset.classes: '{word}' occurs twice; rename one.")
-        self.check_classes(unscored=unscored, background=background)
-        check_limits(thermal_range)
         self.codes = label_codes(classes, ids, colours, ignored)
-        self.patterns = patterns_of(rgb, thermal, label)
-        self.images = reader_of_patterns(PairPattern(rgb, thermal, label), thermal_range)
+        self.follow(PairPattern(rgb, thermal, label), thermal_range)
         self.frames: Mapping[str, FolderFrame] = find_frames(self.root, self.patterns)
         self.rule = self._rule_of(folders, lists, shares, (shares_seed, block))
         self.unlabelled = unlabelled
@@ -154,9 +157,8 @@ class Folder(FileDataset):
 
     def unused(self, lists: SplitNames) -> Iterable[Path]:  # noqa: ARG002 - as every data set
         """Thermal images and labels without an RGB image."""
-        used = {path for each in self.frames.values() for path in each[2:]}
-        partners = [pattern for pattern in self.patterns[1:] if pattern is not None]
-        return {match.path for each in partners for match in each.files(self.root)} - used
+        matches = without_rgb(self.root, self.patterns[1:], self.frames.values())
+        return {match.path for match in matches}
 
     def own_notes(self, lists: SplitNames) -> list[str]:
         """Frames of no split."""

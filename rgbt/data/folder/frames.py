@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rgbt.checks import InputError, nearest
-from rgbt.data.folder.pattern import NAME, Pattern, WordValues, in_order, what_is_in
+from rgbt.data.folder.pattern import NAME, PathMatch, Pattern, WordValues, in_order, what_is_in
 
 
 class FolderFrame(NamedTuple):
@@ -126,6 +126,15 @@ def check_partners(pattern: Pattern, frames: Iterable[FolderFrame], root: Path) 
             f"{paths[0]}, but {paths[0].parent.name} holds {what_is_in(paths[0].parent)}; correct "
             "the pattern."
         )
+
+
+def without_rgb(
+    root: Path, partners: Iterable[Pattern | None], frames: Iterable[FolderFrame]
+) -> list[PathMatch]:
+    """Files of the patterns of thermal images and labels that belong to no frame."""
+    used = {path for each in frames for path in (each.rgb, each.thermal, each.label)}
+    matches = [match for each in partners if each is not None for match in each.files(root)]
+    return [match for match in matches if match.path not in used]
 
 
 def _check_shared(pattern: Pattern, frames: dict[str, FolderFrame], root: Path) -> None:

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 
 from rgbt.checks import InputError
 from rgbt.data.file_dataset import FileDataset, SplitNames
-from rgbt.data.folder.frames import FolderFrame, Patterns, find_frames, patterns_of
+from rgbt.data.folder.frames import (
+    FolderFrame,
+    Patterns,
+    find_frames,
+    without_rgb,
+)
 from rgbt.data.folder.pattern import NAME, Pattern, what_is_in
 from rgbt.data.folder.splits import ByList
-from rgbt.data.images import PairPattern, Range, check_limits, reader_of_patterns
+from rgbt.data.images import PairPattern, Range
 from rgbt.data.labels import LabelValue, label_codes, painted
 from rgbt.data.named_files import existing_root, hash_of_files
 from rgbt.data.sequences import consecutive
@@ -40,7 +45,8 @@ class VideoDataset(FileDataset):
 
     Args:
         root: its folder.
-        name: see `FileDataset`, as `num_classes`, `classes` and `palette`.
+        name: see `FileDataset`, as `num_classes`, `classes`, `palette`, `background` and
+            `unscored`.
         lists: split -> list of names of videos in `root`; None: the split "test" is all videos.
         gaps: what a missing number in a video means.
 
@@ -58,17 +64,28 @@ class VideoDataset(FileDataset):
         num_classes: int,
         classes: tuple[str, ...],
         palette: tuple[tuple[int, int, int], ...],
+        *,
         lists: dict[str, str] | None,
         gaps: Gaps,
+        background: tuple[str, ...],
+        unscored: tuple[str, ...] = (),
     ) -> None:
-        super().__init__(root, name, num_classes, classes, palette)
+        super().__init__(
+            *(root, name, num_classes, classes, palette),
+            background=background,
+            unscored=unscored,
+        )
         self._lists = None if lists is None else ByList(root, dict(lists))
         self.gaps = gaps
         self.frames: dict[str, NumberedFrame] = {}
         self.videos: dict[str, dict[int, str]] = {}
 
-    def add(self, frames: Iterable[NumberedFrame]) -> None:
-        """Use these frames; InputError if two have one number."""
+    def add(self, frames: Iterable[NumberedFrame], partners: Sequence[Pattern | None]) -> None:
+        """Use these frames, which have thermal images and labels of the patterns `partners`.
+
+        InputError if two have one number.
+        """
+        self._partners = partners
         self.frames = {
             frame.files.name: frame._replace(files=_with_existing_label(frame.files))
             for frame in frames
@@ -104,13 +121,20 @@ class VideoDataset(FileDataset):
         """Names of all frames of a split, one tuple for each run without a gap.
 
         Raises:
-            InputError: a video of the list is empty, or a number is missing in it.
+            InputError: a video of the list is empty, or it lacks a number, an RGB image or a
+                thermal image.
         """
         videos = self.videos_of(split)
         if self.gaps == "refuse":
             step = smallest_step(self.videos.values())
             for video in videos:
                 check_whole(video, self.videos[video], step)
+            problems = self._unpaired(videos)
+            if problems:
+                raise InputError(
+                    f"{problems[0]}; restore it, or set dataset.gaps=split and remove the rest of "
+                    "that frame."
+                )
         return tuple(run for video in videos for run in consecutive(self.videos[video]))
 
     def has(self, split: str) -> bool:
@@ -162,8 +186,28 @@ class VideoDataset(FileDataset):
         return hash_of_files(listed, self.files)
 
     def unused(self, lists: SplitNames) -> Iterable[Path]:  # noqa: ARG002 - as every data set
-        """None: frames without a label belong to a video."""
+        """None: frames without a label belong to a video, for the rest see `own_problems`."""
         return ()
+
+    def own_problems(self, lists: SplitNames) -> list[str]:
+        """Frames without an RGB image, or without a thermal image, of any split."""
+        return [f"{each}." for each in self._unpaired(self.videos, set().union(*lists.values()))]
+
+    def _unpaired(self, videos: Collection[str], read: Collection[str] = ()) -> list[str]:
+        """What videos lack, as beginnings of sentences; frames that are `read` report it."""
+        files = [each.files for each in self.frames.values()]
+        no_rgb = [
+            f"{path} has no RGB image"
+            for path, values in without_rgb(self.root, self._partners, files)
+            if values.get(VIDEO, "") in videos
+        ]
+        no_thermal = [
+            f"the frame '{name}' has no thermal image {frame.files.thermal}"
+            for name, frame in self.frames.items()
+            if frame.video in videos and name not in read
+            if not os.path.lexists(frame.files.thermal)
+        ]
+        return no_rgb + no_thermal
 
     def own_notes(self, lists: SplitNames) -> list[str]:
         """Numbers of videos and frames of each split."""
@@ -225,16 +269,18 @@ class Video(VideoDataset):
     ) -> None:
         folder = existing_root(root, f"that dataset.rgb='{rgb}' starts from")
         colours = painted(num_classes) if palette is None else palette
-        super().__init__(folder, name, num_classes, classes, colours, lists, gaps)
-        self.check_classes(unscored=unscored, background=background)
-        check_limits(thermal_range)
-        self.unscored, self.background, self.clipping = unscored, background, thermal_range
+        super().__init__(
+            *(folder, name, num_classes, classes, colours),
+            lists=lists,
+            gaps=gaps,
+            background=background,
+            unscored=unscored,
+        )
         self.codes = label_codes(classes, ids, None, ignored)
-        self.images = reader_of_patterns(PairPattern(rgb, thermal, label), thermal_range)
-        self.patterns = patterns_of(rgb, thermal, label)
+        self.follow(PairPattern(rgb, thermal, label), thermal_range)
         _check_no_empty_video(self.patterns.rgb, folder)
         _check_case(self.patterns.rgb, folder)
-        self.add(_numbered(folder, self.patterns))
+        self.add(_numbered(folder, self.patterns), self.patterns[1:])
 
 
 def _with_existing_label(files: FolderFrame) -> FolderFrame:

@@ -9,7 +9,7 @@ from typing import Literal
 
 from rgbt.checks import InputError
 from rgbt.data.folder.frames import FolderFrame
-from rgbt.data.folder.pattern import in_order, what_is_in
+from rgbt.data.folder.pattern import Pattern, in_order, what_is_in
 from rgbt.data.images import PairPattern, PairReader
 from rgbt.data.labels import LabelCodes
 from rgbt.data.named_files import existing_root
@@ -35,6 +35,9 @@ LISTS = {split: f"{split}.txt" for split in ("train", "val", "test", "test_day",
 
 FOLDERS = {"visible": "v", "infrared": "i", "label": "l"}
 """Folder of a video -> last letter of the names of its files."""
+
+PARTNERS = ("data/{video}/infrared/{name}i.{suffix}", "data/{video}/label/{name}l.png")
+"""Thermal images and labels."""
 
 STEM = re.compile(r"(\d*?)(\d{4})")
 """The frame number is the last four digits before the letter."""
@@ -92,11 +95,14 @@ class MVSeg(VideoDataset):
         gaps: Gaps = "split",
     ) -> None:
         folder = existing_root(root, "that holds the lists of MVSeg and the folder data")
-        super().__init__(folder, name, num_classes, classes, palette, lists, gaps)
-        self.check_classes(background=background)
+        super().__init__(
+            *(folder, name, num_classes, classes, palette),
+            lists=lists,
+            gaps=gaps,
+            background=background,
+        )
         if unlabelled_is == "ground":
             self.check_classes(unlabelled_is=("ground",))
-        self.background = background
         rest = IGNORE if unlabelled_is == "ignored" else classes.index("ground")
         self.codes = LabelCodes({**{value: value for value in range(num_classes)}, IGNORE: rest})
         if not (folder / "data").is_dir():
@@ -104,7 +110,7 @@ class MVSeg(VideoDataset):
                 f"dataset.root: '{root}' does not hold the folder data; give the folder of the "
                 "data set itself."
             )
-        self.add(_frames(folder))
+        self.add(_frames(folder), [Pattern(each, "dataset.root") for each in PARTNERS])
 
 
 def _frames(root: Path) -> Iterator[NumberedFrame]:

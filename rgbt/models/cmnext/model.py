@@ -8,7 +8,6 @@ from typing import Annotated
 import torch
 from annotated_types import Interval, Len, Predicate, doc
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from rgbt.models.cmnext import ppx
 from rgbt.models.cmx import mit
@@ -128,7 +127,5 @@ class CMNeXt(nn.Module):
         """
         images = self.inputs(rgb, thermal, masks, multiple=1)
         only_view(views, self.record.views, "CMNeXt")
-        fused = self.backbone(images, generator)
-        quarter = self.decode_head(fused, generator).float()
-        logits = F.interpolate(quarter, size=rgb.shape[2:], mode="bilinear", align_corners=False)
-        return Output(logits, {})
+        maps = self.backbone(images, generator)
+        return Output(self.decode_head(maps, rgb.shape[2:], generator), {})

@@ -1,4 +1,4 @@
-"""MLP decoder: four maps of different size to class scores at a quarter of the image."""
+"""MLP decoder: four maps of different size to class scores of the image."""
 
 from __future__ import annotations
 
@@ -59,9 +59,15 @@ class MlpDecoder(nn.Module):
         norm.eps = self.norm_eps[0 if mode else 1]
         return super().train(mode)
 
-    def forward(self, maps: list[Tensor], generator: torch.Generator | None = None) -> Tensor:
-        """Class scores (N, K, H_1, W_1) of four (N, H_i, W_i, C_i), the largest first.
+    def forward(
+        self,
+        maps: list[Tensor],
+        image_hw: tuple[int, int],
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
+        """Class scores (N, K, H, W) float32 of four (N, H_i, W_i, C_i), the largest first.
 
+        They are computed at the size of the first map, a quarter of the image, and enlarged.
         `generator` draws the dropped channels, in training mode with a rate above 0 alone.
         """
         # The convolution over the four projected and enlarged maps, (N, E, H_1, W_1). The release
@@ -82,8 +88,8 @@ class MlpDecoder(nn.Module):
         mixed = self.linear_fuse[1:](mixed)
         if self.training and self.dropout > 0:
             mixed = drop_channels(mixed, self.dropout, generator)
-        logits: Tensor = self.linear_pred(mixed)
-        return logits
+        scores = self.linear_pred(mixed).float()
+        return F.interpolate(scores, size=image_hw, mode="bilinear", align_corners=False)
 
 
 def _projected(

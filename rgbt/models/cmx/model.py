@@ -8,7 +8,6 @@ from typing import Annotated
 import torch
 from annotated_types import Interval
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from rgbt.models.cmx.decoder import MlpDecoder
 from rgbt.models.cmx.encoder import CmxEncoder
@@ -117,7 +116,5 @@ class CMX(nn.Module):
         """
         images = self.inputs(rgb, thermal, masks, multiple=1)
         only_view(views, self.record.views, "CMX")
-        fused = self.backbone(images, generator)
-        quarter = self.decode_head(fused, generator).float()
-        logits = F.interpolate(quarter, size=rgb.shape[2:], mode="bilinear", align_corners=False)
-        return Output(logits, {})
+        maps = self.backbone(images, generator)
+        return Output(self.decode_head(maps, rgb.shape[2:], generator), {})

@@ -44,7 +44,7 @@ columns:
   - {name: Var, metric: Var, best: lowest}
   - {name: rgb, metric: mIoU, modality: rgb}
   - {name: drop, minus: [rgb, mIoU], best: none}
-  - {name: TC, needs: the consistency metrics}
+  - {name: size, efficiency: parameters}
 remarks: [A remark of the table.]
 forms: {paper: As the text describes it.}
 claims:

@@ -220,13 +220,11 @@ def test_the_table_has_marks_and_notes(data: ReportData) -> None:
     assert [cell_of(data, row, "Var").rank for row in "ABC"] == [0, 0, 0]
     assert table.notes == (
         "A remark of the table.",
-        "TC: not computed, needs the consistency metrics.",
         "B: Odd.",
         "As the text describes it.",
         "Every row of ours was run with trainer.max_steps=9.",
     )
     assert table.command == ("rgbt reproduce table=own/t seeds=3 scale=paper trainer.max_steps=9")
-    assert cell_of(data, "A", "TC").reason == "the consistency metrics"
     assert cell_of(data, "C", "mIoU") == CellEntry(published=50.0, reason="shown as published only")
 
 
@@ -277,7 +275,7 @@ def test_seeds_added_until_decided_widen_the_intervals(changeable: Path) -> None
     assert [cell_of(found, row, "mIoU").rank for row in "AB"] == [0, 0]
 
 
-def test_tables_not_run_are_listed_with_their_needs(data: ReportData) -> None:
+def test_tables_not_run_are_listed_with_their_command(data: ReportData) -> None:
     table = table_of(data, "spatialseg/table3")
     assert table.scale == ""
     assert table.command == "rgbt reproduce table=spatialseg/table3 seeds=3 scale=demo"

@@ -122,17 +122,17 @@ def test_a_mean_of_columns_has_values_and_no_interval(tmp_path: Path) -> None:
 
 def test_counted_parameters_are_as_recorded_and_have_no_marks(tmp_path: Path) -> None:
     path = tmp_path / "t.yaml"
-    path.write_text(TABLE.replace("needs: the consistency metrics", "efficiency: parameters"))
+    path.write_text(TABLE)
     lines = {
-        ("A", "TC"): RecordedCell(54.36, None, 0, None, "", ()),
-        ("B", "TC"): RecordedCell(44.56, None, 0, None, "", ()),
-        ("C", "TC"): RecordedCell(None, None, 0, None, "", ()),
+        ("A", "size"): RecordedCell(54.36, None, 0, None, "", ()),
+        ("B", "size"): RecordedCell(44.56, None, 0, None, "", ()),
+        ("C", "size"): RecordedCell(None, None, 0, None, "", ()),
     }
     recorded = RecordedTable(name="own/t", scale="demo", seeds=(0,), lines=lines)
     found = score_again(recorded, load_table(str(path)), {})
     assert {place: cell.mean for place, cell in found.scored.cells.items()} == {
-        ("A", "TC"): 54.36,
-        ("B", "TC"): 44.56,
+        ("A", "size"): 54.36,
+        ("B", "size"): 44.56,
     }
     row, column = found.scored.table.rows[0], found.scored.table.columns[-1]
     cell = cell_of(found, row, column, {})
@@ -153,7 +153,7 @@ def test_column_of_frames_is_scored_from_its_file(tmp_path: Path) -> None:
     for seed, run in enumerate(runs.values()):
         run._evaluations["evaluations/consistency_aligned_test.npz"] = pairs_of(seed)
     ours = "{name: TC, metric: class/car/TC, frames: aligned, printed: false}"
-    text = TABLE.replace("{name: TC, needs: the consistency metrics}", ours)
+    text = TABLE.replace("{name: size, efficiency: parameters}", ours)
     found = draft(tmp_path, 2, runs, text)
     row, column = found.scored.table.rows[0], found.scored.table.columns[-1]
     expected = [value("class/car/TC", pairs_of(seed), "released") for seed in range(2)]

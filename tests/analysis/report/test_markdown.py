@@ -184,10 +184,10 @@ def test_index_claims_are_counted_by_paper_and_listed_with_a_verdict(
     assert "Not measured yet" not in section
 
 
-def test_page_heading_of_selected_rows_has_no_quotes() -> None:
+def test_page_heading_has_overrides_as_code_without_quotes() -> None:
     made = replace(table_entry("crm/table3a", {}), extra="'rows=Baseline,Ours (x)' a=1")
     text = page_texts(replace(report(0), tables=(made,)), ())["crm.md"]
-    assert "## Table 3 (a) (rows=Baseline,Ours (x) a=1)" in text
+    assert "## Table 3 (a) (`rows=Baseline,Ours (x)` `a=1`)" in text
 
 
 def test_page_differences_of_the_forms_are_a_table() -> None:

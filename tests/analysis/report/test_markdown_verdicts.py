@@ -186,4 +186,4 @@ def test_record_of_a_study_is_judged_by_its_file(tmp_path: Any) -> None:
     assert (made.paper, made.scale) == ("studies", "bench")
     assert not [remark for remark in remarks if "no file" in remark]
     pages = page_texts(replace(report(0), tables=(made,)), ())
-    assert "## Missing image (bench scale, rows=Baseline,CRM)" in pages["studies.md"]
+    assert "## Missing image (bench scale, `rows=Baseline,CRM`)" in pages["studies.md"]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,8 @@ from torch import Tensor
 from rgbt.build.training_setup import TrainingSetup, set_up_training
 from rgbt.config.compose import compose
 from rgbt.engine.checkpoint import State
-from rgbt.engine.trainer import Trainer, torch_generator_of
+from rgbt.engine.trainer import Trainer
+from rgbt.randomness import generators_of_step
 from rgbt.spec.run_spec import RunSpec
 from rgbt.spec.specify import specify
 from rgbt.types import Batch
@@ -159,7 +159,7 @@ class Training:
 def loss_of(setup: TrainingSetup, batch: Any, index: int = 0) -> Tensor:
     """The sum of all parts of one step, after its backward passes; no optimizer steps."""
     device = setup.session.fabric.device
-    generator_of = partial(torch_generator_of, seed=0, index=index, device=device)
+    generator_of = generators_of_step(0, index, device)
     total = torch.zeros((), device=device)
     for phase in setup.scheme.phases(batch, generator_of):
         loss = torch.stack(list(phase.parts.values())).sum()

@@ -100,7 +100,8 @@ assert find_spec("absent") is not None
 
 def test_a_stub_does_not_replace_an_installed_package(tmp_path: Path) -> None:
     code = "import numpy as np\nassert np.ones(2).sum() == 2\n" + STACKED
-    external(write_checkout(tmp_path, {"model/net.py": code}), stubs={"numpy": {}})
+    network = external(write_checkout(tmp_path, {"model/net.py": code}), stubs={"numpy": {}})
+    assert network.eval()(*images()).logits.shape == (2, 3, 8, 12)
 
 
 def test_prints_and_log_handlers_are_dropped(

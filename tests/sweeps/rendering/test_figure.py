@@ -90,7 +90,7 @@ def test_png_holds_both_colours(tmp_path: Path) -> None:
 
 
 def test_nothing_to_draw(tmp_path: Path) -> None:
-    scored = score("t", table((Row(label="a", needs="flow"),)), {}, scale="demo")
+    scored = score("t", table((Row(label="a"),)), {}, scale="demo")
     assert not draw_table(scored, tmp_path / "figure.png")
     assert not (tmp_path / "figure.png").exists()
 

@@ -10,7 +10,7 @@ import pytest
 from rich.text import Text as RichText
 
 from sweeps.rendering.file_formats import latex, markdown, tidy_csv
-from sweeps.rendering.rendered_table import COUNTED, FORMS, SMALL, render_table
+from sweeps.rendering.rendered_table import COUNTED, FORMS, NOT_PRINTED, SMALL, render_table
 from sweeps.rendering.terminal import terminal
 from sweeps.table.cells import TableCell
 from sweeps.table.scoring import ScoredTable, score, size_marks
@@ -134,25 +134,24 @@ def test_terminal_styles_best_where_shown() -> None:
 
 
 def test_render_table_numbers_and_shares_footnotes() -> None:
-    columns = (*STACKED[:3], Column(name="TC", needs="flow"))
+    columns = (*STACKED[:3], Column(name="TC", metric="TC", frames="aligned", printed=False))
     rows = (
         Row(label="a", experiment="crm", remarks=("of a",)),
-        Row(label="b", experiment="crm", needs="a part"),
+        Row(label="b", experiment="crm"),
         Row(label="c", values={"name_0": 3.0}, doubtful=("name_0",), remarks=("doubtful",)),
         Row(label="d", values={"name_1": 3.0}, doubtful=("name_1",)),
     )
-    made = table(rows, columns, remarks=("of the table",), needs="a thing")
+    made = table(rows, columns, remarks=("of the table",))
     sheet = render_table(score("t", made, {("a", 0): failed("broke.")}, scale="demo"))
     assert sheet.notes == (
-        *("Cannot be run yet: a thing", "of the table", "Not computed: flow", "of a"),
-        *("seed 0: broke.", "Cannot be run yet: a part", "doubtful"),
+        *("of the table", NOT_PRINTED, "of a", "seed 0: broke.", "doubtful"),
         "The printed value does not agree with the others of its row.",
     )
     shown = [line.split() for line in str(terminal(sheet, plain=True)).splitlines()]
-    assert shown[0][-1].endswith("[1][2]")
-    assert shown[3] == ["a[4]", "ours", "0", *["failed[5]"] * 3, "-"]
-    assert shown[4][0] == "b[6]"
-    assert shown[5] == ["c", "published", "3[7]", "-", "-", "-"]
+    assert shown[0][-1].endswith("[1]")
+    assert shown[3] == ["a[3]", "ours", "0", *["failed[4]"] * 4]
+    assert shown[4][0] == "b"
+    assert shown[5] == ["c", "published", "3[5]", "-", "-", "-"]
 
 
 def test_render_table_notes_shared_runs_and_commits() -> None:
@@ -214,7 +213,7 @@ def test_latex_escapes_and_omits_differences() -> None:
 def test_csv_read_back() -> None:
     rows = (
         Row(label="a, b", experiment="crm", values={"acc": 48.0}),
-        Row(label="later", needs="flow", values={"acc": 4.0}),
+        Row(label="theirs", values={"acc": 4.0}),
     )
     runs = {("a, b", 0): outcome("k0", right(40)), ("a, b", 1): outcome("k1", right(45))}
     first, second = csv.DictReader(
@@ -225,4 +224,4 @@ def test_csv_read_back() -> None:
         **{"n": "2", "published": "48.0", "difference": "-5.5", "reason": "", "runs": "k0 k1"},
     }
     assert second["mean"] == second["runs"] == ""
-    assert (second["n"], second["published"], second["reason"]) == ("0", "4.0", "flow")
+    assert (second["n"], second["published"], second["reason"]) == ("0", "4.0", "")

@@ -91,8 +91,8 @@ def test_own_table_needs_no_printed_values(tmp_path: Path) -> None:
         ({"absent": "exlude"}, "'absent': input should be 'released' or 'exclude'"),
         (column(metric="Var", name="mIoU"), "columns: 'mIoU' is used twice"),
         (column(metric="Var", best="low"), "column 'b': 'best': input should be 'highest'"),
-        (column(), "expected one of metric, minus, mean, efficiency and needs, got none"),
-        (column(metric="Var", needs="a part"), "got metric and needs"),
+        (column(), "expected one of metric, minus, mean and efficiency, got none"),
+        (column(metric="Var", efficiency="latency"), "got metric and efficiency"),
         (column(minus=["mIoU"]), "column 'b': 'minus[1]' has no value"),
         (column(minus=["mIoU", "IoU"]), "column 'b', minus: 'IoU' is not a valid choice"),
         (column(mean=["mIoU", "IoU"]), "column 'b', mean: 'IoU' is not a valid choice"),
@@ -110,7 +110,10 @@ def test_own_table_needs_no_printed_values(tmp_path: Path) -> None:
         (column(metric="Var", corruption="noise"), "needs a severity (grey levels (std)); one of"),
         (column(metric="Var", corruption="noise", severity=300), "'b': severity (standard dev"),
         (column(metric="Var", severity=8), "'severity' needs a corruption; add corruption"),
-        (column(needs="x", corruption="removed:rgb"), "only for scores of single frames; remove"),
+        (
+            column(efficiency="latency", corruption="removed:rgb"),
+            "only for scores of single frames; remove",
+        ),
         (column(metric="TC", frames="aligned", corruption="removed:rgb"), "remove corruption: re"),
         (
             column(metric="distance/0-15"),

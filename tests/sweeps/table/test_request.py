@@ -17,13 +17,11 @@ COLUMNS = (
     Column(name="night", metric="mIoU", modality="thermal"),
     Column(name="cold", metric="Var", modality="thermal"),
     Column(name="less", minus=("night", "mIoU")),
-    Column(name="TC", needs="flow"),
 )
 ROWS = (
     Row(label="small", experiment="crm", at={"paper": ("model=mask2former_swin_s",)}),
     Row(label="large", experiment="crm", at={"paper": ("model=mask2former_swin_b",)}),
     Row(label="other", experiment="grbm", overrides=("masker.sigma_div=2",)),
-    Row(label="later", experiment="grbm", needs="flow"),
     Row(label="theirs", values={"mIoU": 3.0}),
 )
 

@@ -62,7 +62,6 @@ def test_score_derived_columns_are_per_seed() -> None:
     ("column", "reason"),
     [
         (Column(name="x", metric="class/bus"), "no class 'bus'"),
-        (Column(name="x", needs="flow"), "flow"),
         (Column(name="x", metric="TC", frames="aligned"), "rgbt consistency run=..."),
     ],
 )
@@ -75,20 +74,19 @@ def test_score_missing_values_have_reason(column: Column, reason: str) -> None:
 
 
 def test_score_omitted_rows_and_columns_have_no_cell() -> None:
-    later = Column(name="TC", needs="flow")
     rows = (
         *(Row(label="a", without=("rgb",)), Row(label="b")),
-        Row(label="theirs", values={"acc": 3.0, "TC": None}),
+        Row(label="theirs", values={"acc": 3.0, "rgb": None}),
     )
     both = {None: right(50), ExtraEvaluation("rgb"): right(30)}
     runs = {("a", 0): outcome("k", right(40)), ("b", 0): outcome("l", both)}
     mean = Column(name="both", mean=("acc", "rgb"))
-    found = scored((ACC, RGB, LESS, mean, later), runs, rows)
+    found = scored((ACC, RGB, LESS, mean), runs, rows)
     assert {place: cell.mean for place, cell in found.cells.items()} == {
         ("a", "acc"): 40.0,
         **{("b", "acc"): 50.0, ("b", "rgb"): 30.0, ("b", "less"): -20.0, ("b", "both"): 40.0},
     }
-    assert published(rows[2], later) is None
+    assert published(rows[2], RGB) is None
     assert math.isnan(found.difference(rows[2], ACC))
 
 
