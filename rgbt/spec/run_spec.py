@@ -159,7 +159,16 @@ class RunSpec:
     )
     data: LoaderSettings = _node(
         outside_key=("num_workers", "on_error", "eval_batch_size", "prefetch", "augment", "cache"),
-        shared=True,
+        added={"sampling": "shuffled"},
+        used_with={
+            "class_temperature": ("sampling", "rare_classes"),
+            "min_class_pixels": ("sampling", "rare_classes"),
+            "min_crop_ratio": ("sampling", "rare_classes"),
+        },
+        shared=(
+            *("batch_size", "eval_batch_size", "num_workers", "prefetch", "augment", "cache"),
+            "on_error",
+        ),
     )
     transform: Component = _node()
     masker: Component = _node()
@@ -168,7 +177,9 @@ class RunSpec:
         renamed={"decoder": {"modified_heatnet": "modified_released"}},
     )
     loss: Component = _node()
-    scheme: Component = _node(added={"resolution": "full", "idle_steps": "none"})
+    scheme: Component = _node(
+        added={"resolution": "full", "idle_steps": "none", "feature_distance": None}
+    )
     optimizer: Component = _node(added={"head_rate": "scheduled"})
     schedule: Component = _node()
     trainer: TrainerSettings = _node(
