@@ -79,9 +79,7 @@ def test_unscored_classes_are_not_drawn(dataset: MFNet) -> None:
 
 
 def test_class_without_an_image_is_refused(dataset: MFNet) -> None:
-    with pytest.raises(
-        InputError, match=r"pixels=60: no image of .* 'person', at most 6"
-    ):
+    with pytest.raises(InputError, match=r"pixels=60: no image of .* 'person', at most 6"):
         count_rare_classes(dataset, "train", settings(min_class_pixels=60))
     dataset.unscored = dataset.classes
     with pytest.raises(InputError, match="no pixel of a class; set data.sampling=shuffled"):
