@@ -162,7 +162,9 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
     check_cameras(session, scheme)
     if upstream_finished:
         _report_unpublished_settings(session)
-    rare = None if labels_key("source") in missing else _rare_classes(session, datasets["source"])
+    rare = None
+    if session.loading.sampling == "rare_classes" and labels_key("source") not in missing:
+        rare = count_rare_classes(datasets["source"], domains.source.split, session.loading)
     others, optimizers = _networks_and_optimizers(session, scheme)
     scheme = CheckedScheme(scheme, tuple(optimizers)) if is_own(scheme) else scheme
     return TrainingSetup(
@@ -216,15 +218,6 @@ def _report_unpublished_settings(session: Session) -> None:
                 f"{len(data.names(picked))} images are test images, so the best checkpoint is "
                 "selected on images that are also reported."
             )
-
-
-def _rare_classes(session: Session, dataset: LabelledDataset) -> RareClasses | None:
-    """How images of the source are drawn by class; None where each is taken once per epoch."""
-    if session.loading.sampling == "shuffled":
-        return None
-    rare = count_rare_classes(dataset, session.domains.source.split, session.loading)
-    info(rare.sentence())
-    return rare
 
 
 def _where_to_augment(session: Session) -> Literal["loader", "device"]:

@@ -67,7 +67,7 @@ def test_images_are_drawn_with_the_frequencies_of_their_classes(dataset: MFNet) 
     for image, share in enumerate(expected):
         assert drawn[image] / count == pytest.approx(share, abs=4 * (share / count) ** 0.5)
     assert rare.classes == (0, 1, 2)
-    assert rare.sentence().startswith("rare class sampling draws images of: person 0.4")
+    assert rare.shares() == "person 0.473, car 0.444, unlabeled 0.083"
 
 
 def test_unscored_classes_are_not_drawn(dataset: MFNet) -> None:
