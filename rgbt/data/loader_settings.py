@@ -11,6 +11,12 @@ from rgbt.checks import InputError
 from rgbt.ranges import BatchSize, NonNegative, Positive, Text, Workers
 from rgbt.requirements import Record, Requirement
 
+LOADING = ("num_workers", "on_error", "eval_batch_size", "prefetch", "augment", "cache")
+"""Settings that do not change the samples of a batch."""
+
+OF_RARE_CLASSES = ("class_temperature", "min_class_pixels", "min_crop_ratio")
+"""Settings that have an effect with `sampling` "rare_classes" alone."""
+
 
 @dataclass(frozen=True)
 class LoaderSettings:

@@ -15,9 +15,9 @@ from rgbt.checks import InputError
 from rgbt.config.component import Component
 from rgbt.config.stored_config import EXTERNAL
 from rgbt.data.domains import GIVEN, NONE, Domains
-from rgbt.data.loader_settings import LoaderSettings
+from rgbt.data.loader_settings import LOADING, OF_RARE_CLASSES, LoaderSettings
 from rgbt.engine.prediction import Prediction
-from rgbt.engine.settings import Recipe, Scale, TrainerSettings
+from rgbt.engine.settings import OF_MACHINE, Recipe, Scale, TrainerSettings
 from rgbt.ranges import Seed, Text
 from rgbt.spec.checkout_code import code_of, content_of
 from rgbt.spec.run_key import file_digest, manifest_of, settings_digest
@@ -158,17 +158,10 @@ class RunSpec:
         shared=True,
     )
     data: LoaderSettings = _node(
-        outside_key=("num_workers", "on_error", "eval_batch_size", "prefetch", "augment", "cache"),
+        outside_key=LOADING,
         added={"sampling": "shuffled"},
-        used_with={
-            "class_temperature": ("sampling", "rare_classes"),
-            "min_class_pixels": ("sampling", "rare_classes"),
-            "min_crop_ratio": ("sampling", "rare_classes"),
-        },
-        shared=(
-            *("batch_size", "eval_batch_size", "num_workers", "prefetch", "augment", "cache"),
-            "on_error",
-        ),
+        used_with=dict.fromkeys(OF_RARE_CLASSES, ("sampling", "rare_classes")),
+        shared=("batch_size", *LOADING),
     )
     transform: Component = _node()
     masker: Component = _node()
@@ -183,17 +176,10 @@ class RunSpec:
     optimizer: Component = _node(added={"head_rate": "scheduled"})
     schedule: Component = _node()
     trainer: TrainerSettings = _node(
-        outside_key=(
-            *("accelerator", "log_every", "checkpoint_every", "devices", "strategy"),
-            *("activation_checkpointing", "memory_format", "compile", "log_gradient_shares"),
-        ),
+        outside_key=OF_MACHINE,
         added={"tested": "best", "threads": 2, "batch_norm_parts": 1, "averaging": "none"},
         used_with={"ema_decay": ("averaging", "ema"), "averaged_share": ("averaging", "last")},
-        shared=(
-            *("max_steps", "eval_every", "checkpoint_every", "log_every"),
-            *("precision", "accelerator", "threads", "devices", "strategy", "batch_norm_parts"),
-            *("activation_checkpointing", "memory_format", "compile", "log_gradient_shares"),
-        ),
+        shared=("max_steps", "eval_every", "precision", "threads", "batch_norm_parts", *OF_MACHINE),
     )
     metric: Component = _node(shared=True)
     prediction: Prediction = _node(
