@@ -30,12 +30,14 @@ class Requirement:
         value: the required value; where the record holds a tuple, the values that it must contain.
         setting: the setting that causes the requirement, "scheme.guidance_weight=0.01"; "" where
             the component always requires it.
+        advice: what a user does to meet it, where that is not to choose another file of ``conf/``.
     """
 
     node: str
     key: str
     value: Any
     setting: str = ""
+    advice: str = ""
 
     def is_met_by(self, record: Record) -> bool:
         """Whether a component with this record meets it; None in a record is not compared."""
@@ -59,6 +61,7 @@ class Record:
         views: network: the input images it can predict from; it is evaluated with the first one.
         heads: network and domains: names of the heads.
         auxiliary: network: whether it returns `aux["aux_logits"]`.
+        features: network: whether it returns `aux["features"]`, see `rgbt.models`.
         stacks_passes: network: whether `forward` takes `passes` of a batch, each as its own call;
             one that returns masks also takes `num_predictions` and `num_masks`, see
             `rgbt.models.mask2former.model.Mask2Former.forward`.
@@ -68,6 +71,7 @@ class Record:
         recomputed: network: names of the modules that `trainer.activation_checkpointing` computes
             again in the backward pass, each on its own; * stands for a part of a name without a
             dot. They draw nothing at random and are not parts of each other.
+        pretrained: `model.weights`: whether a file or an upstream run is named.
         drawn_anew: network: beginnings of the names of parameters that are not read from a file
             that has them -> why.
         author_names: network from elsewhere: beginning of its names in `state_dict`, and what is
@@ -102,10 +106,12 @@ class Record:
     views: tuple[View, ...] = VIEWS
     heads: tuple[str, ...] = ()
     auxiliary: bool = False
+    features: bool = False
     stacks_passes: bool = False
     dense_logits: bool = False
     pretrained_parts: tuple[str, ...] = ()
     recomputed: tuple[str, ...] = ()
+    pretrained: bool = False
     drawn_anew: Mapping[str, str] = field(default_factory=dict)
     author_names: tuple[str, str] | None = None
     reads_auxiliary: bool = False

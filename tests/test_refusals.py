@@ -115,6 +115,10 @@ ADAPTATION = [
         "self_training_night domains.target.labels=experiment:thermal_teacher/best.pt",
         "requires target_labels=false of the domains",
     ),
+    (
+        "self_training_night scheme=self_training_distance model.weights=null",
+        "requires pretrained=true of the model.weights",
+    ),
     ("self_training_thermal scheme.augmentation.jitter_strength=0.6", "must be a number from 0"),
     ("sh_source domains.source.labels=none", "every scheme requires labels of the source"),
     ("multi_head_thermal_stage1 domains.source.head=left", "requires heads=left of the model"),

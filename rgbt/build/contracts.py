@@ -184,6 +184,8 @@ def _check_output(module: nn.Module, shape: torch.Size, found: object, num_class
         raise InputError(
             f"{returned} aux without `aux_logits`, but its record says auxiliary=True."
         )
+    if record.features and "features" not in found.aux:
+        raise InputError(f"{returned} aux without `features`, but its record says features=True.")
     if found.logits is None and module.training and record.outputs == "masks":
         return  # its loss reads `aux`
     wanted = (shape[0], num_classes, *shape[2:])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from omegaconf import OmegaConf
@@ -14,8 +15,21 @@ from rgbt.checkpoints.report import Report
 from rgbt.checks import InputError
 from rgbt.config.compose import compose
 from rgbt.config.stored_config import read_settings
+from rgbt.requirements import Record
 from rgbt.spec.run_spec import WEIGHTS, RunSpec
 from rgbt.tracking.terminal import info
+
+
+@dataclass(frozen=True)
+class InitialWeights:
+    """`model.weights` as a component whose record others can require; `named` is its value."""
+
+    named: str | None
+
+    @property
+    def record(self) -> Record:
+        """Whether weights are named."""
+        return Record(pretrained=self.named is not None)
 
 
 def start_from_weights(model: nn.Module, spec: RunSpec) -> Report | None:

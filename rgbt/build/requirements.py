@@ -51,7 +51,8 @@ def check_requirements(components: Mapping[str, Any], plain: Mapping[str, Any]) 
     candidates = list(_candidates((wanted.node, node), components, plain))
     # Where no single file helps with everything, those that help with this.
     options = _options(failures, records, candidates) or _options(failures[:1], both, candidates)
-    advice = [f"choose {', or '.join(options)}"] if options else []
+    advice = [wanted.advice] if wanted.advice else []
+    advice += [f"choose {', or '.join(options)}"] if options else []
     advice += [f"change {wanted.setting.partition('=')[0]}"] if wanted.setting else []
     subject = _name(components[node]) + (f" with {wanted.setting}" if wanted.setting else "")
     provided = records[wanted.node].get(wanted.key)

@@ -9,6 +9,7 @@ import torch
 from torch import nn
 
 from rgbt.build.contracts import CheckedLoss, CheckedScheme, is_own
+from rgbt.build.initial_weights import InitialWeights
 from rgbt.build.probes import (
     check_cameras,
     check_cells,
@@ -24,6 +25,7 @@ from rgbt.data.domains import GIVEN, NONE, Domain
 from rgbt.data.loaders import Batches, steps_per_epoch, train_batches
 from rgbt.data.pairs import PairedBatches
 from rgbt.data.pseudo_labels import PseudoLabelled, Unlabelled
+from rgbt.data.rare_classes import RareClasses, count_rare_classes
 from rgbt.dataset import LabelledDataset
 from rgbt.engine.network_settings import prepare_training
 from rgbt.engine.schedules import Schedule
@@ -47,6 +49,7 @@ class TrainingSetup:
         model: the network as Fabric wrapped it.
         others: further networks that are trained, wrapped, by name.
         optimizers: by the names that the scheme's phases use.
+        rare: how images of the source are drawn by class; None: each once per epoch.
         scheme: yields the phases of a step.
         schedule: learning rate factor per step.
     """
@@ -56,6 +59,7 @@ class TrainingSetup:
     model: nn.Module
     others: dict[str, nn.Module]
     optimizers: dict[str, torch.optim.Optimizer]
+    rare: RareClasses | None
     scheme: Scheme
     schedule: Schedule
 
@@ -86,6 +90,7 @@ class TrainingSetup:
             train_batches(
                 *(self.datasets[name], split, transforms[name], loading),
                 *(seeds[name], steps),
+                self.rare if name == "source" else None,
             )
             for name, split in self.splits().items()
         ]
@@ -133,11 +138,15 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
     model = session.fabric.setup_module(session.model)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(derive(spec.drawn.weights, "scheme weights"))  # of networks of its own
-        scheme: Any = spec.scheme.build(model=model, loss=checked, masker=masker, domains=domains)
+        scheme: Any = spec.scheme.build(
+            **{"model": model, "loss": checked, "masker": masker, "domains": domains},
+            dataset=session.dataset,
+        )
     components = {
         **{"scheme": scheme, "loss": loss, "domains": domains, "model": session.model},
         **{"masker": masker, "transform": session.transform, "data": session.loading},
         **{"dataset": session.dataset, "consistency": session.consistency},
+        WEIGHTS: InitialWeights(spec.weights),
     }
     check_requirements(components, spec.plain)
     _check_splits(session)
@@ -154,10 +163,13 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
     check_cameras(session, scheme)
     if upstream_finished:
         _report_unpublished_settings(session)
+    rare = None
+    if session.loading.sampling == "rare_classes" and labels_key("source") not in missing:
+        rare = count_rare_classes(datasets["source"], domains.source.split, session.loading)
     others, optimizers = _networks_and_optimizers(session, scheme)
     scheme = CheckedScheme(scheme, tuple(optimizers)) if is_own(scheme) else scheme
     return TrainingSetup(
-        session, datasets, model, others, optimizers, scheme, spec.schedule.build()
+        session, datasets, model, others, optimizers, rare, scheme, spec.schedule.build()
     )
 
 

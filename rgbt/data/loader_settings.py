@@ -7,8 +7,15 @@ from typing import Annotated, Literal
 
 from annotated_types import Interval
 
-from rgbt.ranges import BatchSize, Text, Workers
+from rgbt.checks import InputError
+from rgbt.ranges import BatchSize, NonNegative, Positive, Text, Workers
 from rgbt.requirements import Record, Requirement
+
+LOADING = ("num_workers", "on_error", "eval_batch_size", "prefetch", "augment", "cache")
+"""Settings that do not change the samples of a batch."""
+
+OF_RARE_CLASSES = ("class_temperature", "min_class_pixels", "min_crop_ratio")
+"""Settings that have an effect with `sampling` "rare_classes" alone."""
 
 
 @dataclass(frozen=True)
@@ -27,6 +34,17 @@ class LoaderSettings:
             (`rgbt.data.cache`); "auto": in the folder of the user's cache; None: no such files.
         on_error: "raise" stops at an unreadable file; "skip" reports it once and uses the next
             readable sample of the list instead (training) or skips it (evaluation).
+        sampling: "shuffled": every image of the source once per epoch; "rare_classes": images of
+            the source drawn by their classes (`rgbt.data.rare_classes`). The images of a target are
+            always shuffled.
+        class_temperature: sampling=rare_classes: T, > 0; DAFormer: 0.01.
+        min_class_pixels: the same: an image is drawn for a class with more pixels of it than that,
+            in the label as stored; DAFormer: 3000.
+        min_crop_ratio: the same: a crop is drawn again, up to 10 times, until it has more than this
+            share of `min_class_pixels`; 0: never. DAFormer: 0.5; HRDA and MIC: 2.
+
+    Raises:
+        InputError: rare classes are drawn and images are augmented on the device.
     """
 
     batch_size: BatchSize
@@ -36,12 +54,21 @@ class LoaderSettings:
     augment: Literal["auto", "loader", "device"] = "auto"
     cache: Text | None = None
     on_error: Literal["raise", "skip"] = "raise"
+    sampling: Literal["shuffled", "rare_classes"] = "shuffled"
+    class_temperature: Positive = 0.01
+    min_class_pixels: Annotated[int, Interval(ge=0, le=10**8)] = 3000
+    min_crop_ratio: NonNegative = 0.5
 
     def __post_init__(self) -> None:
         if self.cache is not None:
             from rgbt.data.cache.dataset import check_cache  # only here: it imports OpenCV
 
             check_cache("data.cache", self.cache)
+        if self.sampling == "rare_classes" and self.augment == "device":
+            raise InputError(
+                "data.sampling=rare_classes draws crops again by their labels, which the loader "
+                "must augment; set data.augment=auto instead of device."
+            )
 
     @property
     def record(self) -> Record:

@@ -11,21 +11,25 @@ import errno
 import logging
 import multiprocessing
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from typing import Any, TypeVar, cast
 
+import numpy as np
 import torch
 from torch.utils.data import DataLoader
 
 from rgbt.checks import InputError, RunError
 from rgbt.data.batches import BatchTransform, Transform, collate
 from rgbt.data.loader_settings import LoaderSettings as LoaderSettings  # as conf/ names it
+from rgbt.data.rare_classes import RareClasses, RareClassExamples
 from rgbt.data.reader import (
     BatchReader,
     EvalExamples,
     LoadedBatch,
+    MakeExample,
     SplitReader,
+    Stack,
     TrainExamples,
     no_shared_memory,
     signals_blocked,
@@ -134,13 +138,14 @@ def _started(loader: DataLoader[Any], num_workers: int) -> Iterator[Any]:
         raise InputError(no_shared_memory(str(error.strerror))) from None  # not a disk
 
 
-def train_batches(
+def train_batches(  # noqa: PLR0913 - most trainings draw no classes
     dataset: LabelledDataset,
     split: str,
     transform: Transform,
     settings: LoaderSettings,
     seed: int,
     steps: range,
+    rare: RareClasses | None = None,
 ) -> Batches[Loadable]:
     """Augmented training batches of the global steps in `steps`, made by ``transform.train``.
 
@@ -151,6 +156,9 @@ def train_batches(
     So ``steps=range(10, 20)`` continues ``range(10)`` exactly. With ``augment="device"`` the
     transform is a `BatchTransform`, which augments batches when they are moved to the device.
 
+    With `rare`, sample i of epoch e is drawn by its class from (seed, "rare class", e, i) instead;
+    the loader augments, because crops are drawn again by their labels.
+
     Raises:
         InputError: the split is smaller than a batch, or, with on_error="skip", unreadable; the
             processes cannot share a batch equally.
@@ -158,16 +166,20 @@ def train_batches(
     per_epoch = steps_per_epoch(dataset, settings, split)
     names = dataset.names(split)
     source = SplitReader(dataset, names, transform, settings.on_error == "skip")
-    if settings.augment == "device":
+    make: MakeExample = TrainExamples(source, transform.train, seed)
+    stack: Stack = partial(collate, advice=CROP_ADVICE)
+    if rare is not None:
+        make = RareClassExamples(source, transform.train, seed, rare)
+    elif settings.augment == "device":
         work = cast(BatchTransform, transform)
-        reader = BatchReader(TrainExamples(source, work.drawn, seed), work.stack)
-    else:
-        stack = partial(collate, advice=CROP_ADVICE)
-        reader = BatchReader(TrainExamples(source, transform.train, seed), stack)
-    whole_batches = _train_keys(len(names), settings.batch_size, per_epoch, seed, steps)
+        make, stack = TrainExamples(source, work.drawn, seed), work.stack
+    order = partial(numpy_generator, seed, "order")
+    whole_batches = _train_keys(
+        len(names), settings.batch_size, per_epoch, steps, None if rare else order
+    )
     own_samples = slice(rank(), None, num_processes())
     keys = (keys[own_samples] for keys in whole_batches)
-    return Batches(reader, keys=keys, settings=settings)
+    return Batches(BatchReader(make, stack), keys=keys, settings=settings)
 
 
 def eval_batches(
@@ -221,15 +233,19 @@ def check_batch_size(settings: LoaderSettings, processes: int) -> None:
 
 
 def _train_keys(
-    size: int, batch_size: int, per_epoch: int, seed: int, steps: range
+    size: int,
+    batch_size: int,
+    per_epoch: int,
+    steps: range,
+    rng_of: Callable[[int], np.random.Generator] | None,
 ) -> Iterator[list[tuple[int, int]]]:
-    """(epoch, index in the split) of every sample of every step."""
+    """(epoch, index in the split) of every sample of every step; numbers without `rng_of`."""
     drawn = -1
-    order: list[int] = []
+    order = list(range(size))
     for step in steps:
         epoch, position = divmod(step, per_epoch)
-        if epoch != drawn:
-            order = numpy_generator(seed, "order", epoch).permutation(size).tolist()
+        if rng_of is not None and epoch != drawn:
+            order = rng_of(epoch).permutation(size).tolist()
             drawn = epoch
         start = position * batch_size
         yield [(epoch, index) for index in order[start : start + batch_size]]

@@ -9,7 +9,7 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
@@ -64,6 +64,21 @@ class SplitReader:
             skipped[name] = str(error)
             return None
 
+    def first_readable(self, names: Sequence[str], skipped: dict[str, str]) -> Sample:
+        """The first of these samples that can be read.
+
+        Raises:
+            InputError: there is none.
+        """
+        for name in names:
+            sample = self.read(name, skipped)
+            if sample is not None:
+                return sample
+        raise InputError(
+            f"none of the {len(names)} training samples of {self.dataset.name} can be read; the "
+            f"first one: {skipped[names[0]]}"
+        )
+
 
 @dataclass(frozen=True)
 class TrainExamples:
@@ -87,15 +102,8 @@ class TrainExamples:
         """
         epoch, index = key
         names = self.source.names
-        rng = numpy_generator(self.seed, "augment", epoch, index)
-        for name in (*names[index:], *names[:index]):
-            sample = self.source.read(name, skipped)
-            if sample is not None:
-                return self.make(sample, rng)
-        raise InputError(
-            f"none of the {len(names)} training samples of {self.source.dataset.name} can be read; "
-            f"the first one: {skipped[names[0]]}"
-        )
+        sample = self.source.first_readable((*names[index:], *names[:index]), skipped)
+        return self.make(sample, numpy_generator(self.seed, "augment", epoch, index))
 
 
 @dataclass(frozen=True)

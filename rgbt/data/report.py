@@ -18,11 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError
+from rgbt.data.class_pixels import PixelCounts, label_pixels
 from rgbt.data.file_dataset import Expected, FileDataset, SplitNames
 from rgbt.data.images import plain
-from rgbt.types import IGNORE
-
-PixelCounts = NDArray[np.int64]
 
 
 class ThermalStatistics(NamedTuple):
@@ -186,9 +184,7 @@ def _content(dataset: FileDataset, name: str) -> _Content:
     height, width = sample.thermal.shape
     if sample.label is None:
         return _Content((height, width), None, thermal)
-    counts = np.bincount(sample.label.ravel(), minlength=IGNORE + 1)
-    pixels = np.append(counts[: dataset.num_classes], counts[IGNORE])
-    return _Content((height, width), pixels, thermal)
+    return _Content((height, width), label_pixels(sample.label, dataset.num_classes), thermal)
 
 
 def _report_split(

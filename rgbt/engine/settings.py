@@ -31,6 +31,12 @@ Precision = Literal["32-true", "bf16-mixed"]
 Compile = Literal["none", "default", "max-autotune"]
 Averaging = Literal["none", "ema", "last"]
 
+OF_MACHINE = (
+    *("accelerator", "log_every", "checkpoint_every", "devices", "strategy"),
+    *("activation_checkpointing", "memory_format", "compile", "log_gradient_shares"),
+)
+"""Settings of the training loop that do not change the result."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class TrainerSettings:

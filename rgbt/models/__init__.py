@@ -10,6 +10,8 @@ except from the generator it is handed. All are called alike; each `forward` say
     views      what is predicted from, one of the record's; () is its first
     generator  of all that is dropped at random in training; where nothing is, it is not drawn from
     -> logits  (N, K, H, W) class scores
+       aux     named intermediates; where the record says so, "features" (N, C, h, w): the last
+               stage of the encoder, of the image padded at the bottom and right
 
 ValueError: shapes that do not fit each other, or no generator where one is needed. InputError:
 another view, or mask cells that do not divide the padded image.

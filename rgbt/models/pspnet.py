@@ -97,6 +97,7 @@ class PSPNet(nn.Module):
         """Output and views."""
         return Record(
             views=(VIEW_OF[modalities],),
+            features=True,
             pretrained_parts=("feats.",),
             recomputed=("feats.layer*.*", "up_*"),
         )
@@ -114,16 +115,16 @@ class PSPNet(nn.Module):
 
         Returns:
             logits: (N, K, H, W).
-            aux: maps for discriminators, besides the logits. With w = base_width, branches
-                concatenated, sides H and W rounded up to multiples of 8 and then divided by s:
-                "layer4" (32 w, s = 8), "layer3" (16 w, s = 8), "layer2" (8 w per branch, s = 8),
-                "layer1" (4 w per branch, s = 4), "stem" (w per branch, s = 4).
+            aux: maps of the encoder. With w = base_width, branches concatenated, sides H and W
+                rounded up to multiples of 8 and then divided by s: "features" (32 w, s = 8),
+                "layer3" (16 w, s = 8), "layer2" (8 w per branch, s = 8), "layer1" (4 w per branch,
+                s = 4), "stem" (w per branch, s = 4).
         """
         only_view(views, self.record.views, "PSPNet")
         images = self.inputs(rgb, thermal, masks, multiple=STRIDE)
         features = self.feats(self._seen(images))
         rates = self.dropout if self.training else (0.0, 0.0)
-        x = self.psp(features["layer4"])
+        x = self.psp(features["features"])
         x = enlarge(x, (self.up_1, self.up_2, self.up_3), rates, generator)
         logits = self.final(x)[..., : rgb.shape[2], : rgb.shape[3]]
         return Output(logits, features)
@@ -169,7 +170,7 @@ class PSPNetEncoder(nn.Module):
         )
         layer3 = self.layer3(layer2)
         layer4 = self.layer4(layer3)
-        names = ("layer4", "layer3", "layer2", "layer1", "stem")
+        names = ("features", "layer3", "layer2", "layer1", "stem")
         return dict(zip(names, (layer4, layer3, layer2, layer1, stem), strict=True))
 
     def _branch(self, end: str, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -135,6 +135,7 @@ class RTFNet(nn.Module):
         reason = "drawn anew with model.thermal_stem=xavier"
         return Record(
             views=("rgbt",),
+            features=True,
             pretrained_parts=("encoder_",),
             recomputed=("encoder_*_layer*.*", "deconv*.*"),
             drawn_anew={"encoder_thermal_conv1.": reason} if thermal_stem == "xavier" else {},
@@ -149,9 +150,12 @@ class RTFNet(nn.Module):
         views: tuple[View, ...] = (),
         generator: torch.Generator | None = None,  # noqa: ARG002 - nothing is dropped at random
     ) -> Output:
-        """Class scores from both images, as `rgbt.models` says; `aux` is empty.
+        """Class scores from both images, as `rgbt.models` says.
 
-        They are >= 0 where `final_relu`.
+        Returns:
+            logits: (N, K, H, W), >= 0 where `final_relu`.
+            aux: "features" (N, C, h, w) of the fourth stage of the RGB encoder, with those of the
+                thermal one added.
         """
         only_view(views, self.record.views, "RTFNet")
         images = self.inputs(rgb, thermal, masks, multiple=STRIDE)
@@ -167,9 +171,10 @@ class RTFNet(nn.Module):
             y = unit(f"thermal_layer{number}", y)
             x = unit(f"rgb_layer{number}", x) + y
 
+        features = x
         for number in range(1, 6):
             x = self.get_submodule(f"deconv{number}")(x)
-        return Output(x[..., : rgb.shape[2], : rgb.shape[3]], {})
+        return Output(x[..., : rgb.shape[2], : rgb.shape[3]], {"features": features})
 
     def _start(self) -> None:
         """Initial weights: torchvision's in the encoders, Xavier's (uniform) in the decoder."""

@@ -85,6 +85,7 @@ class SemsegPSPNet(nn.Module):
         return Record(
             views=(modalities,),
             auxiliary=True,
+            features=True,
             pretrained_parts=("layer",),
             recomputed=("layer1.*", "layer2.*", "layer3.*", "layer4.*"),
         )
@@ -102,17 +103,19 @@ class SemsegPSPNet(nn.Module):
 
         Returns:
             logits: (N, K, H, W).
-            aux: "aux_logits" (N, K, H, W) of the third stage.
+            aux: "features" (N, 32 w, h, w) of the fourth stage, with w = base_width; "aux_logits"
+                (N, K, H, W) of the third stage.
         """
         only_view(views, self.record.views, "SemsegPSPNet")
         images = self.inputs(rgb, thermal, masks)
         image = images.rgb if self.modalities == "rgb" else images.thermal
         x = F.max_pool2d(self.layer0(image), 3, stride=2, padding=1)
         layer3 = self.layer3(self.layer2(self.layer1(x)))
-        pooled = self.ppm(self.layer4(layer3))
+        layer4 = self.layer4(layer3)
         size = (rgb.shape[2], rgb.shape[3])
-        logits = self._scores(self.cls, pooled, size, generator)
-        return Output(logits, {"aux_logits": self._scores(self.aux, layer3, size, generator)})
+        logits = self._scores(self.cls, self.ppm(layer4), size, generator)
+        auxiliary = self._scores(self.aux, layer3, size, generator)
+        return Output(logits, {"features": layer4, "aux_logits": auxiliary})
 
     def _scores(
         self, head: nn.Module, x: Tensor, size: tuple[int, int], generator: torch.Generator | None

@@ -13,19 +13,27 @@ import torch
 from torch import Tensor, nn
 
 from rgbt.checks import InputError
+from rgbt.losses.feature_distance import FeatureDistance
 from rgbt.losses.pseudo_labels import PseudoLabels, WeightedBy, pseudo_labels
 from rgbt.ranges import NonNegative, Share
 from rgbt.requirements import Record, Requirement
 from rgbt.schemes.class_mix import mixed, pasted_pixels, seen_as
 from rgbt.schemes.domains import Passes, SourceAndTarget, scores
 from rgbt.schemes.masks import draw_masks
-from rgbt.schemes.teacher import Normalisation, Teacher
+from rgbt.schemes.network_copy import NetworkCopy, Normalisation
+from rgbt.schemes.teacher import Teacher
 from rgbt.types import AnyMasker, Batch, GeneratorOf, Loss, Phase, TwoDomains
 
 TEACHER = "teacher"
 CONFIDENT_SHARE, CONFIDENCE = "teacher/confident_share", "teacher/confidence"
 """Names in the log: share of the target's pixels whose highest probability reaches the threshold,
 and the mean of the highest probabilities."""
+
+
+class DatasetClasses(Protocol):
+    """What is read of a data set (`rgbt.dataset.LabelledDataset`)."""
+
+    classes: tuple[str, ...]
 
 
 class Augmentation(Protocol):
@@ -42,7 +50,7 @@ class Augmentation(Protocol):
 class SelfTraining:
     """Cross-entropy of the source, of a mix of both domains, and of masked images.
 
-        L = L_s(source) + L_s(mix) + masked_weight L_s(masked)
+        L = L_s(source) + L_s(mix) + masked_weight L_s(masked) + feature distance(source)
 
     The teacher predicts labels of the unchanged target. The mix is the target, with half of the
     classes of the source pasted on it, after strong augmentation. Its labels are those of the
@@ -54,7 +62,11 @@ class SelfTraining:
     that `masker.pairing` gives each. A domain that sees one image pastes what it sees
     (`rgbt.schemes.class_mix.seen_as`).
 
-    Source: DACS; DAFormer, Sec. 3.1, without feature distance and rare class sampling; MIC.
+    The feature distance (`rgbt.losses.feature_distance`) compares the last stage of the encoder, of
+    the unchanged source, with that of the network as it was when training started: with the weights
+    and running statistics of `model.weights`, in evaluation mode.
+
+    Source: DACS; DAFormer, Sec. 3.1 and 3.3 (rare class sampling: `rgbt.data.rare_classes`); MIC.
     Paper: q is a share of each image (DAFormer).   Released: of the batch.
 
     Attributes:
@@ -74,6 +86,11 @@ class SelfTraining:
         masked_images: "target": the images of the target, augmented; "both": those of the source,
             with its labels, and of the target, not augmented, each with half of the weight. MIC:
             "target"; from day to night "both" (mask_mode separate, with one image of each).
+        feature_distance: its settings; None: there is none.
+        dataset: names the classes for the feature distance.
+
+    Raises:
+        InputError: no row is left for pseudo-labels; an unknown thing class.
     """
 
     model: nn.Module
@@ -90,6 +107,8 @@ class SelfTraining:
     mixing: Literal["classes", "none"]
     masked_weight: NonNegative
     masked_images: Literal["target", "both"]
+    feature_distance: FeatureDistance | None = None
+    dataset: DatasetClasses | None = None
 
     def __post_init__(self) -> None:
         if self.ignored_top + self.ignored_bottom >= 1:
@@ -102,16 +121,23 @@ class SelfTraining:
             model=self.model, loss=self.loss, domains=self.domains, gradients="apart"
         )
         self.teacher = Teacher(self.model, decay=self.decay, normalisation=self.teacher_norm)
+        self.initial: NetworkCopy | None = None
+        if self.feature_distance is not None:
+            assert self.dataset is not None, "a run has a data set"
+            self.feature_distance.indices(self.dataset.classes)
+            self.initial = NetworkCopy(self.model, normalisation="running", buffers=True)
 
     @property
     def record(self) -> Record:
-        """No labels of the target, weighted pixels, and hidden cells where they are read."""
+        """No labels of the target, weighted pixels, and what is read of masks and features."""
         setting = f"scheme.masked_weight={self.masked_weight:g}"
+        distance = self.feature_distance
         return self.passes.record_with(
             Requirement("domains", "target_labels", False),
             Requirement("loss", "weighs_confidence", True),
+            *(() if distance is None else distance.requires),
             masked=Requirement("masker", "hides_cells", bool(self.masked_weight), setting),
-            networks={TEACHER: self.teacher},
+            networks={TEACHER: self.teacher.average},
         )
 
     def phases(self, batch: TwoDomains, generator_of: GeneratorOf) -> Iterator[Phase]:
@@ -134,10 +160,24 @@ class SelfTraining:
         return pseudo_labels(scores(output), self.threshold, self.weighted_by, ignored)
 
     def _source(self, source: Batch, generator_of: GeneratorOf) -> dict[str, Tensor]:
-        parts = self.passes.supervised("source", source, generator_of)[1]
+        initial = self._initial_features(source, generator_of)
+        output, parts = self.passes.supervised("source", source, generator_of)
         if self.masked_weight and self.masked_images == "both":
             parts |= self._masked("source", source, generator_of)
+        if initial is not None:
+            assert self.feature_distance is not None
+            assert self.dataset is not None
+            parts["source/feature_distance"] = self.feature_distance(
+                output.aux["features"], initial, source.label, self.dataset.classes
+            )
         return parts
+
+    def _initial_features(self, source: Batch, generator_of: GeneratorOf) -> Tensor | None:
+        """(B, C, h, w) of the initial network; None without feature distance."""
+        if self.initial is None:
+            return None
+        with self.initial.in_network():
+            return self.passes.output("source", source, generator_of).aux["features"]
 
     def _target(self, source: Batch, target: Batch, generator_of: GeneratorOf) -> dict[str, Tensor]:
         mix = target

@@ -14,9 +14,9 @@ from typing import Any, Literal, cast
 from rgbt.config.component import Component
 from rgbt.config.stored_config import EXTERNAL
 from rgbt.data.domains import GIVEN, NONE, Domains
-from rgbt.data.loader_settings import LoaderSettings
+from rgbt.data.loader_settings import LOADING, OF_RARE_CLASSES, LoaderSettings
 from rgbt.engine.prediction import Prediction
-from rgbt.engine.settings import Recipe, Scale, TrainerSettings
+from rgbt.engine.settings import OF_MACHINE, Recipe, Scale, TrainerSettings
 from rgbt.ranges import Seed, Text
 from rgbt.spec.checkout_code import code_of, content_of
 from rgbt.spec.node import Node, node_field
@@ -111,8 +111,10 @@ class RunSpec:
         shared=True,
     )
     data: LoaderSettings = node_field(
-        outside_key=("num_workers", "on_error", "eval_batch_size", "prefetch", "augment", "cache"),
-        shared=True,
+        outside_key=LOADING,
+        added={"sampling": "shuffled"},
+        used_with=dict.fromkeys(OF_RARE_CLASSES, ("sampling", "rare_classes")),
+        shared=("batch_size", *LOADING),
     )
     transform: Component = node_field()
     masker: Component = node_field()
@@ -121,21 +123,16 @@ class RunSpec:
         renamed={"decoder": {"modified_heatnet": "modified_released"}},
     )
     loss: Component = node_field()
-    scheme: Component = node_field(added={"resolution": "full", "idle_steps": "none"})
+    scheme: Component = node_field(
+        added={"resolution": "full", "idle_steps": "none", "feature_distance": None}
+    )
     optimizer: Component = node_field(added={"head_rate": "scheduled"})
     schedule: Component = node_field()
     trainer: TrainerSettings = node_field(
-        outside_key=(
-            *("accelerator", "log_every", "checkpoint_every", "devices", "strategy"),
-            *("activation_checkpointing", "memory_format", "compile", "log_gradient_shares"),
-        ),
+        outside_key=OF_MACHINE,
         added={"tested": "best", "threads": 2, "batch_norm_parts": 1, "averaging": "none"},
         used_with={"ema_decay": ("averaging", "ema"), "averaged_share": ("averaging", "last")},
-        shared=(
-            *("max_steps", "eval_every", "checkpoint_every", "log_every"),
-            *("precision", "accelerator", "threads", "devices", "strategy", "batch_norm_parts"),
-            *("activation_checkpointing", "memory_format", "compile", "log_gradient_shares"),
-        ),
+        shared=("max_steps", "eval_every", "precision", "threads", "batch_norm_parts", *OF_MACHINE),
     )
     metric: Component = node_field(shared=True)
     prediction: Prediction = node_field(

@@ -19,7 +19,10 @@ MILLION = 1e6
 
 
 def announce_training(setup: TrainingSetup, name: str, folder: Path) -> None:
-    """Print device, network, images, steps and run folder of a training."""
+    """Print device, network, images, steps and run folder of a training.
+
+    With rare class sampling, also the probability of each class.
+    """
     session, trainer = setup.session, setup.session.trainer
     trained = {key: net for key, net in setup.others.items() if key in setup.optimizers}
     others = "".join(f", {key} {_millions(net)}" for key, net in trained.items())
@@ -28,6 +31,7 @@ def announce_training(setup: TrainingSetup, name: str, folder: Path) -> None:
         ("device", device_line(session)),
         ("network", f"{network_line(session)}{others}"),
         ("images", f"{session.dataset.name}: {', '.join(counts)}"),
+        *([("drawn", setup.rare.shares())] if setup.rare else []),
         ("steps", f"{trainer.max_steps} {_of_steps(setup)}"),
         ("folder", str(folder)),
     ]

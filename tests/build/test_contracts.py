@@ -140,6 +140,7 @@ REFUSED: list[tuple[Callable[[], Any], str]] = [
     (lambda: passed(Output(torch.zeros(2, 5, 2, 3), {})), "logits Tensor (2, 5, 2, 3) float32"),
     (lambda: passed(Output(None, {})), "returned logits None; expected"),
     (lambda: passed(Output(RGB, {}), auxiliary=True), "aux without `aux_logits`"),
+    (lambda: passed(Output(RGB, {}), features=True), "aux without `features`"),
     (
         lambda: contracts.watch_model(nn.Linear(1, 1), 5),
         "Linear.forward must accept the call forward(rgb,",

@@ -57,6 +57,11 @@ MISSING: list[tuple[Requirement, str]] = [
         "provides compares_half=false; choose loss=temporal_paper, temporal_released, or change "
         "scheme.resolution.",
     ),
+    (
+        Requirement("loss", "reads_warped", True, "scheme.pairs=2", advice="name a flow"),
+        "provides reads_warped=false; name a flow, or choose loss=temporal_paper, "
+        "temporal_released, or change scheme.pairs.",
+    ),
     (Requirement("masker", "hides_cells", False), "choose masker=none."),
     (Requirement("transform", "works_on_batches", True), "choose transform=crm, flip, none."),
     (Requirement("domains", "target_confidence", True), "choose domains=heatnet."),

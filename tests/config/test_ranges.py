@@ -36,6 +36,8 @@ OUTSIDE: dict[str, dict[str, list[Any]]] = {
     "data.label_map.LabelMap": {"num_source": [0], "targets": [[]]},
     "data.loaders.LoaderSettings": {
         **{"batch_size": [0, 10**9], "num_workers": [-1, 10**6], "on_error": ["skpi"]},
+        **{"sampling": ["rare"], "class_temperature": [0], "min_class_pixels": [-1]},
+        "min_crop_ratio": [-0.1],
     },
     "data.synth.dataset.synth": {
         **{"height": [8, 10**6], "night_share": [1.5], "num_val": [0], "ego_forward_m": [9.0]},
@@ -55,6 +57,9 @@ OUTSIDE: dict[str, dict[str, list[Any]]] = {
     },
     "geometry.camera.Camera": {"fx": [0.0], "fy": [float("nan")], "height": [0]},
     "losses.cross_entropy.CrossEntropy": {"class_weights": [[], [1.0, -1.0]]},
+    "losses.feature_distance.FeatureDistance": {
+        **{"weight": [0], "things": [[]], "min_share": [0.5, 1.1]},
+    },
     "losses.set_criterion.SetCriterion": {
         **{"num_points": [0], "oversample_ratio": [0.5], "importance_ratio": [1.5]},
         "mask_weight": [-1],

@@ -43,6 +43,7 @@ def test_forward_returns_scores_of_every_pixel(
         out = net.train(training)(*images(2, *size), generator=generator())
         assert out.logits.shape == (2, net.num_classes, *size)
         assert out.logits.dtype == torch.float32
+        assert net.record.features == ("features" in out.aux)
         assert not net.record.auxiliary or out.aux["aux_logits"].shape == out.logits.shape
 
 

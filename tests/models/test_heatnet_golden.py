@@ -12,7 +12,7 @@ from tests.models import golden
 NETWORK, CRITIC = "trgb_segnet.", "critics.0."
 ENCODER = ("conv1", "conv1_2", "layer1", "layer1_2", "layer2", "layer2_2", "layer3", "layer4")
 RECORDED_AS = {
-    "layer4": "layer4",
+    "features": "layer4",
     "layer3": "layer3",
     "layer2": "layer2_concat",
     "layer1": "layer1_concat",

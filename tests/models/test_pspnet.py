@@ -29,7 +29,7 @@ def test_modalities_decide_what_is_seen_and_returned(modalities: str) -> None:
         sees_thermal = not torch.equal(before.logits, net(rgb, 1 - thermal).logits)
     assert (sees_rgb, sees_thermal) == (modalities != "thermal", modalities != "rgb")
     assert {name: tuple(x.shape[1:]) for name, x in before.aux.items()} == {
-        "layer4": (128, 8, 11),
+        "features": (128, 8, 11),
         "layer3": (64, 8, 11),
         "layer2": (32 * branches, 8, 11),
         "layer1": (16 * branches, 16, 22),
@@ -54,7 +54,7 @@ def reference(net: PSPNet, rgb: Tensor, thermal: Tensor) -> dict[str, Tensor]:
         found["layer2"].append(plain.stage(f"feats.layer2{end}", x, strides=(1, 2)))
     maps = {name: torch.cat(parts, 1) for name, parts in found.items()}
     maps["layer3"] = plain.stage("feats.layer3", maps["layer2"], dilations=(1, 2))
-    maps["layer4"] = x = plain.stage("feats.layer4", maps["layer3"], dilations=(1, 4))
+    maps["features"] = x = plain.stage("feats.layer4", maps["layer3"], dilations=(1, 4))
 
     pooled = [F.adaptive_avg_pool2d(x, bins) for bins in (1, 2, 3, 6)]
     small = [plain.conv(f"psp.stages.{index}.1", y) for index, y in enumerate(pooled)]

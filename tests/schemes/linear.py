@@ -62,7 +62,7 @@ class Linear(nn.Module):
         features = self.backbone(image)
         scores = (self.only if head is None else self.heads[head])(features)
         aux = {} if self.auxiliary is None else {"aux_logits": self.auxiliary(features)}
-        return Output(scores, aux)
+        return Output(scores, {"features": features, **aux})
 
 
 def cross_entropy(output: Output, batch: Batch, generator: torch.Generator) -> Values:

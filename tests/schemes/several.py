@@ -34,6 +34,7 @@ from rgbt.types import IGNORE, Batch, TwoDomains
 from tests.losses.problems import batch_of, criterion_of, whole_image
 from tests.models.plain import nano
 from tests.schemes.linear import Nothing, domains, network
+from tests.schemes.test_self_training import DISTANCE
 
 B, K = 4, 4
 HW = (32, 64)
@@ -212,11 +213,14 @@ def self_training(*, heads: bool = False, **changes: Any) -> Case:
         **{"blur_probability": 1.0, "blur_sigma": (0.15, 1.15)},
     )
     weighted = CrossEntropy(class_weights=(0.5, 1.0, 2.0))
-    return two_domains(
+    case = two_domains(
         SelfTraining,
         **{"heads": heads, "loss": weighted, "masker": INDEPENDENT},
         **{"augmentation": augmentation, **settings},
     )
+    for each in () if case.scheme.initial is None else case.scheme.initial.buffers():
+        each.mul_(0.5)  # as if the network had been trained since
+    return case
 
 
 def max_squares(normalisation: Any, ratio: float | None) -> MaxSquares:
@@ -241,7 +245,7 @@ CASES: dict[str, Callable[[], Case]] = {
     "heatnet": lambda: adversarial(**HEATNET, heads=True),
     "max squares": lambda: unlabelled(max_squares("pixels", None), heads=True),
     "max squares image-wise": lambda: unlabelled(max_squares("entries", 0.2), guidance=0.3),
-    "self-training": lambda: self_training(masked_images="both"),
+    "self-training": lambda: self_training(masked_images="both", **DISTANCE),
     "self-training two heads": lambda: self_training(heads=True, weighted_by="image"),
     "entropy": lambda: unlabelled(Entropy(weight=0.7), guidance=0.3),
 }

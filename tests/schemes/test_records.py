@@ -15,6 +15,7 @@ from tests.schemes.test_adversarial import HEATNET, scheme_of
 from tests.schemes.test_domains import labelled, unlabelled
 from tests.schemes.test_schemes import Halves, Nothing
 from tests.schemes.test_schemes import scheme as crm
+from tests.schemes.test_self_training import DISTANCE
 from tests.schemes.test_self_training import scheme_of as self_training
 from tests.schemes.test_temporal import Net
 from tests.schemes.test_temporal import scheme as temporal
@@ -68,6 +69,13 @@ CASES: dict[str, tuple[Callable[[], Any], dict[tuple[str, str], Any]]] = {
     "self-training without masked images": (
         lambda: self_training(network(False), masked_weight=0.0),
         {**WEIGHED, ("masker", "hides_cells"): False},
+    ),
+    "self-training with feature distance": (
+        lambda: self_training(network(False), **DISTANCE),
+        {
+            **{**WEIGHED, ("masker", "hides_cells"): True, ("model", "features"): True},
+            ("model.weights", "pretrained"): True,
+        },
     ),
     "CRM": (lambda: crm(Halves()), {**ALL_VIEWS, ("masker", "hides_cells"): True}),
     "CRM without masks": (lambda: crm(Nothing(), **OFF), ALL_VIEWS),

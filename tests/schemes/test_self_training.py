@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,6 +15,7 @@ from torch import Tensor
 from rgbt.checks import InputError
 from rgbt.engine.checkpoint import State
 from rgbt.losses.cross_entropy import CrossEntropy
+from rgbt.losses.feature_distance import FeatureDistance
 from rgbt.requirements import Record, record_of
 from rgbt.schemes.class_mix import LUMA, pasted_pixels
 from rgbt.schemes.self_training import CONFIDENCE, CONFIDENT_SHARE, SelfTraining
@@ -64,6 +66,12 @@ def scheme_of(model: Linear, *, jitter: float = 0.0, **changes: Any) -> Any:
     }
     loss = CrossEntropy(class_weights=None)
     return SelfTraining(model=model, loss=loss, augmentation=augmentation(jitter), **settings)
+
+
+DISTANCE: dict[str, Any] = {
+    "feature_distance": FeatureDistance(weight=0.005, things=("b", "c"), min_share=0.75),
+    "dataset": SimpleNamespace(classes=("a", "b", "c")),
+}
 
 
 def batches(step: int = 0) -> TwoDomains:
@@ -160,6 +168,23 @@ def test_without_masked_images_nothing_is_masked() -> None:
     assert [trains for _, _, trains in model.calls] == [False, True, True]
 
 
+def test_feature_distance_is_that_to_the_start_on_things_of_the_source() -> None:
+    model, data = network(False), batches()
+    scheme = scheme_of(model, **DISTANCE)
+    start = model.backbone.weight.detach().clone()
+    with torch.no_grad():
+        model.backbone.weight.add_(torch.randn(start.shape, generator=generator_of("other")))
+    phase = phase_of(scheme, data)
+    weight = (model.backbone.weight - start).flatten(1)
+    apart = torch.einsum("kc,bchw->bkhw", weight, data.source.rgb).norm(dim=1)
+    expected = 0.005 * apart[data.source.label > 0].mean()
+    torch.testing.assert_close(phase.parts["source/feature_distance"], expected)
+    parts = phase_of(scheme_of(model), data).parts
+    assert set(phase.parts) - set(parts) == {"source/feature_distance"}
+    assert all(torch.equal(phase.parts[name], parts[name]) for name in parts)
+    assert set(record_of(scheme).networks) == {"teacher"}
+
+
 def test_ignored_rows_leave_rows_for_pseudo_labels() -> None:
     scheme_of(network(False), ignored_top=0.5, ignored_bottom=0.4)
     with pytest.raises(InputError, match="their sum must be below 1"):
@@ -212,12 +237,13 @@ def test_two_heads_train_each_domain_with_its_own() -> None:
     assert heads == ["dark", "day", "dark", "dark"]
 
 
-def test_resumed_run_ends_with_the_same_bits(tmp_path: Path) -> None:
+@pytest.mark.parametrize("changes", [{}, DISTANCE])
+def test_resumed_run_ends_with_the_same_bits(tmp_path: Path, changes: dict[str, Any]) -> None:
     """Network, teacher, optimizer and every logged value."""
 
     def fit(folder: Path, steps: int, state: State) -> Any:
         model = network(False)
-        scheme = scheme_of(model, jitter=0.5, masked_images="both")
+        scheme = scheme_of(model, jitter=0.5, masked_images="both", **changes)
         made = trainer(scheme, model, folder, 6, checkpoint_every=1, max_steps=6)
         assert made.resume(state) == (state.step > 0 or (folder / "last.pt").exists())
         made.settings = replace(made.settings, max_steps=steps)
@@ -249,6 +275,6 @@ def test_resumed_run_ends_with_the_same_bits(tmp_path: Path) -> None:
 def test_record_has_the_teacher_and_no_optimizer_of_it() -> None:
     scheme = scheme_of(network(False))
     record = record_of(scheme)
-    assert record.networks == {"teacher": scheme.teacher}
+    assert record.networks == {"teacher": scheme.teacher.average}
     assert not record.builders
     assert set(record.optimizers) == {"main"}

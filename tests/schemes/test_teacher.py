@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from rgbt.models.parts import drop_channels
+from rgbt.schemes.network_copy import NetworkCopy
 from rgbt.schemes.teacher import Teacher
 
 
@@ -40,7 +41,7 @@ def test_average_follows_its_recursion() -> None:
         teacher.update(step)
         share = min(1 - 1 / (step + 1), 0.6)
         expected = share * expected + (1 - share) * value
-        assert teacher.get_buffer("weight").item() == pytest.approx(expected, abs=1e-12)
+        assert teacher.average.get_buffer("weight").item() == pytest.approx(expected, abs=1e-12)
     # After steps 0 and 1 it is their mean, 3; then 0.6 and 0.4.
     by_hand = 0.6 * (0.6 * (0.6 * 3 + 0.4 * 4) + 0.4 * 2) + 0.4 * 8
     assert expected == pytest.approx(by_hand)
@@ -51,19 +52,19 @@ def test_first_update_is_a_copy_and_the_second_of_a_step_does_nothing() -> None:
     teacher = teacher_of(network)
     network.weight.data.fill_(-7.5)
     teacher.update(0)
-    assert teacher.get_buffer("weight").item() == -7.5
+    assert teacher.average.get_buffer("weight").item() == -7.5
     network.weight.data.fill_(1.0)
     teacher.update(0)
-    assert teacher.get_buffer("weight").item() == -7.5
+    assert teacher.average.get_buffer("weight").item() == -7.5
     teacher.update(1)
-    assert teacher.get_buffer("weight").item() == -3.25
+    assert teacher.average.get_buffer("weight").item() == -3.25
 
 
 def test_state_has_the_averages_alone() -> None:
     """No buffer of the network, and not the network itself."""
     teacher = teacher_of(Net())
-    assert set(teacher.state_dict()) == {"norm/weight", "norm/bias", "weight"}
-    assert not list(teacher.parameters())
+    assert set(teacher.average.state_dict()) == {"norm/weight", "norm/bias", "weight"}
+    assert not list(teacher.average.parameters())
 
 
 @pytest.mark.parametrize("norm", ["batch", "running"])
@@ -100,6 +101,22 @@ def test_frozen_normalisation_stays_frozen() -> None:
     assert not network.norm.training
 
 
+def test_copy_with_buffers_is_the_network_as_it_was() -> None:
+    """Weight 2, mean 3 and variance 4, whatever the network has become."""
+    network = Net()
+    network.norm.running_mean.fill_(3.0)
+    network.norm.running_var.fill_(4.0)
+    copied = NetworkCopy(network, normalisation="running", buffers=True)
+    network.weight.data.fill_(5.0)
+    network(images(), torch.Generator())
+    before = {name: each.clone() for name, each in network.state_dict().items()}
+    with copied.in_network():
+        found = network(images())
+    torch.testing.assert_close(found, 2 * (images() - 3) / (4 + network.norm.eps) ** 0.5)
+    after = network.state_dict()
+    assert all(torch.equal(before[name], after[name]) for name in before)
+
+
 def test_an_error_leaves_the_network_as_it_was() -> None:
     network = Net()
     teacher = teacher_of(network)
@@ -126,4 +143,4 @@ def test_optimizer_steps_the_network_after_the_teacher() -> None:
     (network.weight * 3).backward()
     optimizer.step()
     assert network.weight.item() == 0.5
-    assert teacher.get_buffer("weight").item() == 2.0
+    assert teacher.average.get_buffer("weight").item() == 2.0

@@ -179,7 +179,7 @@ def test_network_without_a_start_is_refused() -> None:
 
 @pytest.mark.parametrize("experiment", ["heatnet", "thermal_teacher"])
 def test_bench_without_a_common_start_has_random_weights(experiment: str) -> None:
-    config = composed([f"+experiment={experiment}", "scale=bench"])
+    config = compose([f"+experiment={experiment}", "scale=bench"])
     config.pretrained = None
     assert config.model.weights is None
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from rgbt.config.compose import compose
 from rgbt.spec.unused import unused_sentences
-from tests.composed import composed
 
 EMA = "trainer.ema_decay=0.9"
 CASES = {
@@ -22,7 +22,7 @@ CASES = {
 @pytest.mark.parametrize(("typed", "unused"), CASES.values(), ids=CASES)
 def test_unused_setting_is_named_in_one_sentence(typed: tuple[str, ...], unused: str) -> None:
     words = ("+experiment=mfnet", *typed)
-    found = list(unused_sentences(composed(words), words))
+    found = list(unused_sentences(compose(words), words))
     assert [sentence.partition(" has no effect ")[0] for sentence in found] == [
         *([unused] if unused else [])
     ]

@@ -164,6 +164,7 @@ class DeepLabV2(nn.Module):
             views=("rgb", "thermal"),
             heads=heads,
             auxiliary=auxiliary,
+            features=True,
             pretrained_parts=("backbone.",),
             recomputed=("backbone.layer*.*",),
         )
@@ -184,7 +185,8 @@ class DeepLabV2(nn.Module):
 
         Returns:
             logits: (N, K, H, W).
-            aux: "aux_logits" (N, K, H, W) of the auxiliary head, where there is one.
+            aux: "features" (N, 32 w, h, w) of the fourth stage; "aux_logits" (N, K, H, W) of the
+                auxiliary head, where there is one.
         """
         view = only_view(views, self.record.views, "DeepLabV2")
         name = next(iter(self.heads)) if head is None else head
@@ -193,7 +195,7 @@ class DeepLabV2(nn.Module):
         layer3, layer4 = self.backbone(images.rgb if view == "rgb" else images.thermal)
 
         image_hw = rgb.shape[2], rgb.shape[3]
-        aux = {}
+        aux = {"features": layer4}
         if self.auxiliary is not None:
             aux["aux_logits"] = self._at_image(self.auxiliary(layer3), image_hw)
         scores = self.heads[name](layer4, generator)

@@ -1,0 +1,156 @@
+"""Rare class sampling: training images drawn by a class that they show, rare classes more often.
+
+It replaces the permutation of the split in every epoch (`data.sampling=rare_classes`), for the
+labelled images of any training. Each sample has draws of its own (seed, purpose, epoch, number), so
+that batches depend neither on loader processes nor on where a run resumes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rgbt.checks import InputError
+from rgbt.data.class_pixels import PixelCounts, class_pixels
+from rgbt.data.loader_settings import LoaderSettings
+from rgbt.data.reader import SplitReader
+from rgbt.dataset import LabelledDataset
+from rgbt.randomness import numpy_generator
+from rgbt.types import Example, Sample
+
+MOST_REDRAWS = 10
+"""Times that a crop is drawn again. Released: DAFormer, mmseg/datasets/uda_dataset.py."""
+
+
+def class_probabilities(pixels: PixelCounts, temperature: float) -> NDArray[np.float64]:
+    """Probability that each class is drawn, highest for the rarest.
+
+        P(c) proportional to exp((1 - f_c) / T),   f_c the share of all pixels
+
+    Source: DAFormer (Hoyer et al., CVPR 2022), Sec. 3.3.   Released: lhoyer/DAFormer (e6f6e04),
+    mmseg/datasets/uda_dataset.py, get_rcs_class_probs: of the classes that occur; T = 0.01, in
+    configs/daformer/gta2cs_uda_warm_fdthings_rcs_croppl_a999_daformer_mitb5_s0.py.
+
+    Args:
+        pixels: (C,) of each class, of which one at least is above 0.
+        temperature: T, > 0; a high one draws all classes alike.
+
+    Returns:
+        (C,) that sum to 1.
+    """
+    scaled = (1 - pixels / pixels.sum()) / temperature
+    weights = np.exp(scaled - scaled.max())
+    found: NDArray[np.float64] = weights / weights.sum()
+    return found
+
+
+@dataclass(frozen=True)
+class RareClasses:
+    """How the images of a split are drawn.
+
+    Attributes:
+        classes: indices of the C classes that are drawn.
+        names: their names.
+        probabilities: (C,) float64, of each.
+        images: for each, places in the list of the split of the images that show enough of it.
+        min_crop_pixels: a crop with as many pixels of its class or fewer is drawn again.
+    """
+
+    classes: tuple[int, ...]
+    names: tuple[str, ...]
+    probabilities: NDArray[np.float64]
+    images: tuple[NDArray[np.int64], ...]
+    min_crop_pixels: float
+
+    def draw(self, rng: np.random.Generator) -> tuple[int, NDArray[np.int64]]:
+        """A class, and places of its images, of which the first is drawn and the others follow."""
+        number = int(rng.choice(len(self.classes), p=self.probabilities))
+        images = self.images[number]
+        return self.classes[number], np.roll(images, -int(rng.integers(len(images))))
+
+    def shares(self) -> str:
+        """The probability of each class, highest first: "fence 0.265, terrain 0.202"."""
+        order = np.argsort(-self.probabilities, kind="stable")
+        return ", ".join(f"{self.names[n]} {self.probabilities[n]:.3f}" for n in order)
+
+
+def count_rare_classes(
+    dataset: LabelledDataset, split: str, settings: LoaderSettings
+) -> RareClasses:
+    """Count the labels of a split, and how its images are drawn.
+
+    An image is drawn for a class if it has more than `min_class_pixels` pixels of it, in the label
+    as stored. Classes that never occur are not drawn. Neither are those that no score has
+    (`LabelledDataset.unscored`), whose pixels count as ignored ones.
+
+    Paper: an image that contains the class.   Released: one with more than 3000 of its pixels,
+    counted before the image is resized and cropped.
+
+    Raises:
+        InputError: a label cannot be read (on_error="raise"); a class occurs, but no image has
+            enough of it; nothing is labelled.
+    """
+    names = dataset.names(split)
+    pixels = class_pixels(dataset, names, skip_errors=settings.on_error == "skip")
+    scored = np.array([name not in dataset.unscored for name in dataset.classes])
+    classes = np.flatnonzero(scored & pixels.any(0))
+    if not classes.size:
+        raise InputError(
+            f"data.sampling=rare_classes: the labels of {split} of {dataset.name} have no pixel of "
+            "a class; set data.sampling=shuffled."
+        )
+    least = settings.min_class_pixels
+    for index in classes:
+        if pixels[:, index].max() <= least:
+            raise InputError(
+                f"data.min_class_pixels={least}: no image of {split} of {dataset.name} has more "
+                f"pixels of '{dataset.classes[index]}', at most {pixels[:, index].max()}; set a "
+                "lower number."
+            )
+    return RareClasses(
+        classes=tuple(classes.tolist()),
+        names=tuple(dataset.classes[index] for index in classes),
+        probabilities=class_probabilities(pixels.sum(0)[classes], settings.class_temperature),
+        images=tuple(np.flatnonzero(pixels[:, index] > least) for index in classes),
+        min_crop_pixels=settings.min_crop_ratio * least,
+    )
+
+
+@dataclass(frozen=True)
+class RareClassExamples:
+    """Augmented examples of drawn classes; a key is (epoch, number of the sample in it).
+
+    Attributes:
+        source: reads samples.
+        make: (sample, generator) -> example: the transform's `train`.
+        seed: run seed.
+        rare: how images are drawn.
+    """
+
+    source: SplitReader
+    make: Callable[[Sample, np.random.Generator], Example]
+    seed: int
+    rare: RareClasses
+
+    def __call__(self, key: Sequence[int], skipped: dict[str, str]) -> Example:
+        """The example of `key`: of a drawn image, or of the next readable one of the class.
+
+        It is augmented again, up to `MOST_REDRAWS` times, until it has more than
+        `min_crop_pixels` pixels of the class; the last one is kept in any case. Released: more than
+        half of 3000 pixels (DAFormer), or twice as many (HRDA, MIC); never again at a ratio of 0.
+
+        Raises:
+            InputError: no image of the class can be read.
+        """
+        drawn, places = self.rare.draw(numpy_generator(self.seed, "rare class", *key))
+        sample = self.source.first_readable([self.source.names[each] for each in places], skipped)
+        rng = numpy_generator(self.seed, "augment", *key)
+        example = self.make(sample, rng)
+        for _ in range(MOST_REDRAWS if self.rare.min_crop_pixels else 0):
+            if np.count_nonzero(example.label == drawn) > self.rare.min_crop_pixels:
+                break
+            example = self.make(sample, rng)
+        return example
