@@ -68,10 +68,12 @@ def _rule(family: str, model: nn.Module, facts: Facts) -> Rule | None:
     """The encoder gets the file; everything behind it is drawn anew.
 
     Raises:
-        InputError: an encoder with registers for a file without, or the other way round.
+        InputError: an encoder of DINOv3, or one with registers for a file without, or the other way
+            round.
     """
     if family != "dinov2":
         return None
+    check_generation(shapes_of(model.state_dict()), facts, "DINOv2")
     _check_registers(shapes_of(model.state_dict()), facts)
     is_timm = facts.layout == "dinov2_timm"
 
@@ -90,15 +92,32 @@ def _rule(family: str, model: nn.Module, facts: Facts) -> Rule | None:
     )
 
 
+def check_generation(own: Shapes, facts: Facts, generation: str) -> None:
+    """Refuse a file of the other generation: DINOv2 learns positions, DINOv3 rotates by them.
+
+    Raises:
+        InputError: naming the network that fits.
+    """
+    mine = "DINOv3" if f"{ENCODER}rope_embed.periods" in own else "DINOv2"
+    if mine != generation:
+        raise InputError(
+            f"{facts.title}: a file of {generation}, while the encoder of this network is one of "
+            f"{mine}{_fitting(facts)}."
+        )
+
+
+def _fitting(facts: Facts) -> str:
+    return f"; use {facts.fits[0][0]}" if facts.fits else ""
+
+
 def _check_registers(own: Shapes, facts: Facts) -> None:
     has_own = f"{ENCODER}register_tokens" in own
     if has_own == ("registers" in facts.size):
         return
     words = ("without", "with") if has_own else ("with", "without")
-    fits = f"; use {facts.fits[0][0]}" if facts.fits else ""
     raise InputError(
         f"{facts.title}: a file {words[0]} registers, while this network is one {words[1]} "
-        f"registers{fits}."
+        f"registers{_fitting(facts)}."
     )
 
 

@@ -93,10 +93,13 @@ class Layout:
     Attributes:
         recognise: what a file is, None where it is of another layout.
         rule: see `RuleOf`.
+        converted: tensors of the file -> under the names that the rule has as sources; for files
+            that split tensors of the network.
     """
 
     recognise: Callable[[Contents], Facts | None]
     rule: RuleOf
+    converted: Callable[[Mapping[str, Tensor]], Mapping[str, Tensor]] = dict
 
 
 def reason(reasons: Reasons, name: str) -> str | None:
@@ -128,7 +131,7 @@ def count_blocks(names: Collection[str], pattern: str) -> int:
 
 FAMILIES: Mapping[str, str] = {
     "mask2former": "RGB-T Mask2Former",
-    "dinov2": "DINOv2 with Mask2Former's head",
+    "dinov2": "DINOv2 or DINOv3 with Mask2Former's head",
     "cmx": "CMX",
     "cmnext": "CMNeXt",
     "rtfnet": "RTFNet",

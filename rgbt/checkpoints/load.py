@@ -40,7 +40,7 @@ def load_weights(
     state = model.state_dict()
     if not plan.fits:
         raise InputError(refusal(contents.path, facts, plan, family_of(type(model)), len(state)))
-    broken = not_finite({name: contents.tensors[name] for name in plan.values.values()})
+    broken = not_finite({name: plan.tensors[name] for name in plan.values.values()})
     if broken:
         raise InputError(
             f"{contents.path}: '{broken[0]}' holds NaN or infinity ({len(broken)} of "
@@ -49,7 +49,7 @@ def load_weights(
         )
     with torch.no_grad():
         for entry, name in plan.values.items():
-            state[entry].copy_(adapted(contents.tensors[name], state[entry]))
+            state[entry].copy_(adapted(plan.tensors[name], state[entry]))
         for entry in plan.zeros:
             state[entry].zero_()
     return Report(
@@ -75,13 +75,14 @@ def plan_for(
     """
     facts = recognise(contents)
     family = family_of(type(model))
-    rule = None
+    rule, tensors = None, contents.tensors
     of_any = not facts.family or (facts.layout == "own" and not family)
     if facts.layout in LAYOUTS and (of_any or facts.family == family):
         try:
             rule = LAYOUTS[facts.layout].rule(family, model, facts)
         except InputError as error:
             raise InputError(f"{contents.path} is {error}") from error
+        tensors = tensors if rule is None else LAYOUTS[facts.layout].converted(tensors)
     prefix = facts.prefix
     if rule is None and contents.tensors.keys() == model.state_dict().keys():
         rule = Rule()  # with exactly its own names, any network takes the file
@@ -92,13 +93,13 @@ def plan_for(
         raise InputError(_another_network(model, contents, facts))
     plan = make_plan(
         model.state_dict(keep_vars=True),
-        contents.tensors,
+        tensors,
         rule,
         prefix=prefix,
         fresh=fresh,
         other_classes=other_classes,
     )
-    kinds = sorted({str(contents.tensors[name].dtype) for name in plan.values.values()})
+    kinds = sorted({str(plan.tensors[name].dtype) for name in plan.values.values()})
     short = [kind.removeprefix("torch.") for kind in kinds if kind.endswith("float16")]
     converted = (f"{' and '.join(short)} converted",) if short else ()
     return facts, plan, (*rule.remarks, *converted)

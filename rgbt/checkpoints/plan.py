@@ -21,6 +21,7 @@ class Plan:
     """The effect of a file on a network.
 
     Attributes:
+        tensors: of the file, by name.
         values: entry of the network -> name in the file.
         zeros: counters of batch normalisation that the file lacks; they begin at 0.
         fresh: entry that keeps its initial value -> why.
@@ -31,6 +32,7 @@ class Plan:
         torn: pairs of entries that share one tensor in the network but differ in the file.
     """
 
+    tensors: Mapping[str, Tensor] = field(default_factory=dict)
     values: dict[str, str] = field(default_factory=dict)
     zeros: list[str] = field(default_factory=list)
     fresh: dict[str, str] = field(default_factory=dict)
@@ -79,7 +81,7 @@ def make_plan(
         InputError: a part in `fresh` that the network does not have.
     """
     check_parts(fresh, state)
-    plan, explained = Plan(), {}
+    plan, explained = Plan(tensors), {}
     for entry, value in state.items():
         name = prefix + rule.source(entry)
         if _under(entry, fresh):

@@ -9,12 +9,13 @@ from types import MappingProxyType
 
 from rgbt.checkpoints.backbones import BACKBONES
 from rgbt.checkpoints.dinov2 import DINOV2
+from rgbt.checkpoints.dinov3 import DINOV3
 from rgbt.checkpoints.layout import Facts, Layout
 from rgbt.checkpoints.networks import NETWORKS
 from rgbt.checkpoints.pickles import printable
 from rgbt.checkpoints.read import Contents
 
-LAYOUTS: Mapping[str, Layout] = MappingProxyType(NETWORKS | BACKBONES | DINOV2)
+LAYOUTS: Mapping[str, Layout] = MappingProxyType(NETWORKS | BACKBONES | DINOV2 | DINOV3)
 """By name, in the order they are tried: whole networks before backbones."""
 
 UNKNOWN = Facts("unknown", "file of weights in an unknown layout")

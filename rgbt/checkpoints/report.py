@@ -123,6 +123,7 @@ def _hint(facts: Facts, plan: Plan, family: str, num_entries: int) -> str:
 NOT_TRAINED = (
     *("running_mean", "running_var", "num_batches_tracked"),
     *("relative_position_index", "attn_mask", "empty_weight"),
+    *("rope_embed.periods", "qkv.bias_mask"),
 )
 """Last words of the names of buffers."""
 

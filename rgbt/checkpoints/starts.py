@@ -63,6 +63,7 @@ WINDOW = 7
 SWIN = "github.com/SwinTransformer/storage, release v1.0.0"
 SEGFORMER = "github.com/NVlabs/SegFormer"
 DINOV2 = "dl.fbaipublicfiles.com/dinov2"
+DINOV3 = "ai.meta.com/resources/models-and-libraries/dinov3-downloads (a link by mail)"
 IMAGENET = "ImageNet-1K, 224 x 224 pixels"
 RESNETS = {
     18: ("f37072fd", "5c106cde"),
@@ -142,6 +143,20 @@ STARTS = (
         for size in ("s", "b")
         for file, registers, model in (("", "", ""), ("_reg4", " with four registers", "_reg"))
     ),
+    *(
+        Start(
+            f"dinov3_{model}_pretrain_lvd1689m-{digest}.pth",
+            f"{size}/16, DINOv3 on LVD-1689M",
+            DINOV3,
+            (f"dinov3_{model}",),
+            digest,
+        )
+        for model, size, digest in (
+            ("vits16", "ViT-S", "08c60483"),
+            ("vits16plus", "ViT-S+", "4057cbaa"),
+            ("vitb16", "ViT-B", "73cec8be"),
+        )
+    ),
 )
 
 RECIPES = (
@@ -156,6 +171,12 @@ RECIPES = (
         "dinov2",
         tuple(start.file for start in STARTS if start.file.startswith("dinov2_")),
         "DINOv2 release; the combination with the head of Mask2Former is ours",
+    ),
+    Recipe(
+        ("dinov3",),
+        "dinov3",
+        tuple(start.file for start in STARTS if start.file.startswith("dinov3_")),
+        "DINOv3 release; the combination with the head of Mask2Former is ours",
     ),
     Recipe(("cmx*", "temporal_*"), "cmx", ("mit_b2.pth",), "CMX and Temporal releases"),
     Recipe(

@@ -172,7 +172,7 @@ def register_resolvers() -> None:
 
     ``${by_scale:{demo:cmx_tiny,paper:cmx_b2}}``: the entry of the scale, also in a defaults list.
     ``${by_network:{CMX:start_cmx}}``: the entry of the class of the network; with several heads it
-    ends with ``_heads``.
+    ends with ``_heads``, with rotary positions with ``_rotary``.
     ``${px:64}``: 64 pixels of the paper's images, scaled to the images of the scale.
     ``${scenes:600,6}``: 600 scenes of an embedded data set, or 6 where the scale takes a few.
     """
@@ -199,7 +199,8 @@ def chosen_scale(scale: str, choices: Iterable[str]) -> str:
 def _by_network(choices: dict[str, Any], *, _root_: DictConfig) -> Any:
     model = _root_.model
     heads = "_heads" if len(model.get("heads", ())) > 1 else ""
-    name = str(model._target_).rpartition(".")[2] + heads
+    rotary = "_rotary" if model.get("rope_base") else ""
+    name = str(model._target_).rpartition(".")[2] + heads + rotary
     if name not in choices:
         raise InputError(
             f"pretrained has no file and no common start for the network {name}; expected one of "

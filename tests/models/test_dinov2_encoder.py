@@ -18,7 +18,8 @@ from tests.models.plain import count, normal, randomise
 def encoder(**changes: Any) -> Encoder:
     sizes = {"patch": 4, "embed_dim": 12, "depth": 3, "num_heads": 3, "mlp_ratio": 4.0}
     positions = {"num_registers": 2, "position_grid": 5, "position_resize": "size"}
-    net = Encoder(ViTShape(**{**sizes, **positions, **changes})).eval()
+    form = {"rope_base": None, "norm_eps": 1e-6, "key_bias": True, "mlp": "gelu"}
+    net = Encoder(ViTShape(**{**sizes, **positions, **form, **changes})).eval()
     randomise(net)
     return net
 

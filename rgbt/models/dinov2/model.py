@@ -1,4 +1,4 @@
-"""The network: a plain vision transformer of DINOv2's form and Mask2Former's head."""
+"""The network: a plain vision transformer of DINOv2 or DINOv3, and Mask2Former's head."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from torch import Tensor, nn
 from rgbt.checks import InputError
 from rgbt.geometry.padding import STRIDE, padded_hw
 from rgbt.models.dinov2.backbone import STRIDES, DinoBackbone, Tuning, TuningSettings
-from rgbt.models.dinov2.encoder import PositionResize, ViTShape
+from rgbt.models.dinov2.encoder import MlpForm, PositionResize, ViTShape
 from rgbt.models.dinov2.lora import Part
 from rgbt.models.inputs import Inputs, expand_cells
 from rgbt.models.mask2former.head import HeadShape, MaskHead, dense_logits, requested
-from rgbt.ranges import Blocks, Channels, MlpRatio, NumClasses, Positive
+from rgbt.ranges import Blocks, Channels, Epsilon, MlpRatio, NumClasses, Positive
 from rgbt.requirements import Record
 from rgbt.types import VIEWS, MaskPair, Output, View
 
@@ -23,9 +23,12 @@ from rgbt.types import VIEWS, MaskPair, Output, View
 class DinoMask2Former(nn.Module):
     """RGB and thermal through one vision transformer, fused as in CRM, with Mask2Former's head.
 
-    Sources: encoder: DINOv2 (Oquab et al., TMLR 2024); pyramid: ViTDet, Sec. 3; fusion: CRM,
-    Sec. III-B; head: Mask2Former, Sec. 3.2. The combination is ours. With the weights of a
-    published file, the patch tokens of an RGB image are those of its network.
+    Sources: encoder: DINOv2 (Oquab et al., TMLR 2024) or DINOv3 (Siméoni et al., 2025); pyramid:
+    ViTDet, Sec. 3; fusion: CRM, Sec. III-B; head: Mask2Former, Sec. 3.2. The combination is ours.
+    With the weights of a published file, the patch tokens of an RGB image are those of its network.
+
+    The settings with a default are those of DINOv3. Configurations of DINOv2 are older and do not
+    name them, so that the keys of their runs are unchanged.
 
     Args:
         num_classes: K, without the no-object class.
@@ -35,9 +38,10 @@ class DinoMask2Former(nn.Module):
         num_heads: its attention heads.
         mlp_ratio: width of a block's MLP divided by the width of the block.
         num_registers: its register tokens; 4 in the files with registers, else 0.
-        position_grid: side of the grid of its position embedding; 37 in the published files.
+        position_grid: side of the grid of its position embedding, 37 in the files of DINOv2; None:
+            positions are rotary.
         position_resize: how positions are resized: "factor" without and "size" with registers
-            (`rgbt.models.dinov2.encoder.resized_positions`).
+            (`rgbt.models.dinov2.encoder.resized_positions`); None: positions are rotary.
         token_px: pixels of the image per token and side. Images, padded to multiples of 32, are
             resized by patch / token_px, so that the tokens fit the strides 4 to 32 of the head.
         layers: numbers of the blocks whose tokens are used, rising: one for all levels, or four.
@@ -59,6 +63,13 @@ class DinoMask2Former(nn.Module):
         attention_heads: heads of both decoders.
         pixel_decoder_fp32: keep the pixel decoder in single precision under autocast.
         inputs: normalisation of the images, with three thermal channels.
+        rope_base: base of the periods of rotary positions
+            (`rgbt.models.dinov2.rotary.RotaryPositions`), 100 in DINOv3; None: positions are
+            learned.
+        norm_eps: epsilon of the layer normalisations of the encoder; 1e-6 in DINOv2, 1e-5 in
+            DINOv3.
+        key_bias: whether keys have a bias; not in DINOv3.
+        mlp: MLP of a block, "gelu" or the gated "swiglu".
 
     Raises:
         InputError: settings that do not fit each other.
@@ -87,8 +98,8 @@ class DinoMask2Former(nn.Module):
         num_heads: Channels,
         mlp_ratio: MlpRatio,
         num_registers: Annotated[int, Interval(ge=0, le=1024)],
-        position_grid: Annotated[int, Interval(ge=1, le=1024)],
-        position_resize: PositionResize,
+        position_grid: Annotated[int, Interval(ge=1, le=1024)] | None,
+        position_resize: PositionResize | None,
         token_px: Literal[8, 16],
         layers: Annotated[tuple[Blocks, ...], Len(1, 4)],
         tuning: Tuning,
@@ -107,6 +118,10 @@ class DinoMask2Former(nn.Module):
         attention_heads: Channels,
         pixel_decoder_fp32: bool,
         inputs: Inputs,
+        rope_base: Annotated[float, Interval(gt=1, le=1e6)] | None = None,
+        norm_eps: Epsilon = 1e-6,
+        key_bias: bool = True,
+        mlp: MlpForm = "gelu",
     ) -> None:
         super().__init__()
         shape = ViTShape(
@@ -118,6 +133,10 @@ class DinoMask2Former(nn.Module):
             num_registers=num_registers,
             position_grid=position_grid,
             position_resize=position_resize,
+            rope_base=rope_base,
+            norm_eps=norm_eps,
+            key_bias=key_bias,
+            mlp=mlp,
         )
         settings = TuningSettings(
             tuning=tuning,
