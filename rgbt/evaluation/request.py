@@ -95,7 +95,7 @@ def other_images(dataset: LabelledDataset, marker: Mapping[str, Any] | None) -> 
     return (f"{dataset.name}-{found[:8]}",)
 
 
-Recomputed = Literal["recomputed", "adabn", "batch"]
+Statistics = Literal["recomputed", "adabn", "batch"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,7 +109,7 @@ class BatchNormRequest:
         splits: whose images they are computed from; (): the evaluated split.
     """
 
-    kind: Recomputed
+    kind: Statistics
     splits: tuple[str, ...] = ()
 
     @classmethod
@@ -127,7 +127,7 @@ class BatchNormRequest:
         if kind == AS_TRAINED:
             return None
         named = tuple(split_list(splits, "batch_norm_splits")) if splits else ()
-        return cls(kind=cast(Recomputed, kind), splits=named)
+        return cls(kind=cast(Statistics, kind), splits=named)
 
     @property
     def file_stem(self) -> str:

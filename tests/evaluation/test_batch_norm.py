@@ -1,4 +1,4 @@
-"""Statistics of batch normalisation: their values, which images they are of, and what they change."""
+"""Statistics of batch normalisation: their values, their images, and the counts with them."""
 
 from __future__ import annotations
 
