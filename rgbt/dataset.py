@@ -151,6 +151,24 @@ class DatasetWrapper:
         return self.source.fingerprint()
 
 
+class Subset(DatasetWrapper):
+    """A data set of which only some images are read.
+
+    Args:
+        source: the wrapped data set.
+        chosen: names of the images; every split has these.
+    """
+
+    def __init__(self, source: LabelledDataset, chosen: tuple[str, ...]) -> None:
+        super().__init__(source)
+        self._chosen = chosen
+
+    def names(self, split: str) -> tuple[str, ...]:
+        """The chosen names, whatever the split."""
+        del split
+        return self._chosen
+
+
 def layers(dataset: LabelledDataset) -> Iterator[LabelledDataset]:
     """`dataset` and every data set behind it; the one that reads files is the last."""
     yield dataset

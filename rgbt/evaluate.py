@@ -12,6 +12,8 @@ from typing import Annotated
 
 from rgbt.checks import InputError
 from rgbt.config.common_options import (
+    BatchNorm,
+    BatchNormSplits,
     CorruptionName,
     Head,
     NetworkOptions,
@@ -47,6 +49,8 @@ class Options(NetworkOptions):
     head: Head = "as trained"
     corruption: CorruptionName = "none"
     severity: Severity = ""
+    batch_norm: BatchNorm = "as trained"
+    batch_norm_splits: BatchNormSplits = ""
     details: Annotated[
         str,
         Help(
@@ -77,7 +81,12 @@ def main(options: Options, overrides: list[str]) -> int:
     """
     from rgbt.evaluation.corruption_request import requested_corruption, split_overrides
     from rgbt.evaluation.details import save_details, score_table, views_table
-    from rgbt.evaluation.request import DEFAULT_VIEW, EvaluationRequest, NetworkRequest
+    from rgbt.evaluation.request import (
+        DEFAULT_VIEW,
+        BatchNormRequest,
+        EvaluationRequest,
+        NetworkRequest,
+    )
     from rgbt.evaluation.segmentation import counts_path, evaluate, label_of, overview
     from rgbt.metrics.details import requested
     from rgbt.requirements import record_of
@@ -94,11 +103,12 @@ def main(options: Options, overrides: list[str]) -> int:
     request = EvaluationRequest.from_options(
         options.split, modality, options.head, corruption, details
     )
+    batch_norm = BatchNormRequest.from_options(options.batch_norm, options.batch_norm_splits)
     opened = network.open()
     announce_network(opened)
     views = record_of(opened.session.model).views if options.modality == ALL else (request.view,)
     by_view = {}
-    for each in (replace(request, view=view) for view in views):
+    for each in (replace(request, view=view, batch_norm=batch_norm) for view in views):
         result = evaluate(opened.session, opened.session.model, each)
         by_view[result.view] = result.counts
         path = options.out or counts_path(opened, network, each, result)

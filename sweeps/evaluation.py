@@ -14,6 +14,9 @@ from rgbt.tracking.run_result import RunResult
 Head = Literal["as trained", "own", "source", "target"]
 """The head that predicts: that of the domain of each image, or that of one domain for all."""
 
+BatchNorm = Literal["as trained", "recomputed", "adabn", "batch"]
+"""Statistics of batch normalisation, see `rgbt.evaluation.request.BatchNormRequest`."""
+
 
 @dataclass(frozen=True)
 class ExtraEvaluation:
@@ -27,6 +30,8 @@ class ExtraEvaluation:
         corruption: of the images, NAME or NAME:IMAGE with a file of ``conf/corruption``; None:
             clean, as the evaluation that the run makes itself.
         severity: of the corruption; None: the only one that it has.
+        batch_norm: see `BatchNorm`; of single frames alone.
+        batch_norm_splits: splits whose images give its statistics; (): the evaluated one.
         details: kind of counts beside the confusion matrices, see `rgbt.metrics.details`.
         world: name of the images where they are not the run's own, e.g. "O-N+"; "" where they are.
         dataset: overrides of the data set that make this world.
@@ -38,6 +43,8 @@ class ExtraEvaluation:
     head: Head = "as trained"
     corruption: str | None = None
     severity: float | None = None
+    batch_norm: BatchNorm = "as trained"
+    batch_norm_splits: tuple[str, ...] = ()
     details: DetailKind | None = None
     world: str = ""
     dataset: tuple[str, ...] = ()
@@ -57,7 +64,8 @@ class ExtraEvaluation:
         head = [] if self.head == "as trained" else [f"{self.head} head"]
         details = [] if self.details is None else [self.details]
         world = [f"world {self.world}"] if self.world else []
-        return ", ".join([self.modality, self.regions, *head, *self._corrupted, *details, *world])
+        changes = [*head, *self._corrupted, *self._normalised, *details, *world]
+        return ", ".join([self.modality, self.regions, *changes])
 
     @property
     def command(self) -> tuple[str, ...]:
@@ -72,6 +80,9 @@ class ExtraEvaluation:
         words += [] if self.head == "as trained" else [f"head={self.head}"]
         words += [] if self.corruption is None else [f"corruption={self.corruption}"]
         words += [] if self.severity is None else [f"severity={self.severity:g}"]
+        words += [] if self.batch_norm == "as trained" else [f"batch_norm={self.batch_norm}"]
+        if self.batch_norm_splits:
+            words.append(f"batch_norm_splits={','.join(self.batch_norm_splits)}")
         if self.details is not None:
             words.append(
                 f"details={'all' if self.details in OF_SCENES else 'boundary,calibration'}"
@@ -97,7 +108,8 @@ class ExtraEvaluation:
         # By the overrides and not by the name, whose overrides may change.
         digest = hashlib.sha256("\n".join(self.dataset).encode()).hexdigest()[:8]
         world = [f"world-{digest}"] if self.dataset else []
-        name = "_".join(["table", self.modality, regions, *head, *self._corrupted, *world])
+        changes = [*head, *self._corrupted, *self._normalised, *world]
+        name = "_".join(["table", self.modality, regions, *changes])
         return f"evaluations/{name}.npz"
 
     @property
@@ -105,3 +117,10 @@ class ExtraEvaluation:
         """The corruption with its severity, as part of a name; [] without one."""
         severity = "" if self.severity is None else f"-{self.severity:g}"
         return [f"{row_name(self.corruption)}{severity}"] if self.corruption else []
+
+    @property
+    def _normalised(self) -> list[str]:
+        """The statistics of batch normalisation, as part of a name; [] as trained."""
+        if self.batch_norm == "as trained":
+            return []
+        return ["-".join(("norm", self.batch_norm, *self.batch_norm_splits))]

@@ -143,6 +143,19 @@ def test_schemes_that_no_experiment_chooses(run: Runs, scheme: str) -> None:
     assert (folder / "counts_test.npz").exists()
 
 
+def test_statistics_of_each_domain_change_the_counts_and_not_the_run(run: Runs, call: Call) -> None:
+    folder = run("multi_head_night")
+    files = {path: path.read_bytes() for path in folder.glob("*") if path.is_file()}
+    code, out, err = call(evaluate.entry, f"run={folder}", "batch_norm=adabn")
+    assert code == 0, err
+    assert "AdaBN, of 2 images by day and 2 images at night (test), in batches of 4" in out
+    found = Counts.load(folder / "evaluations" / "synth_freiburg_test_rgb_ring5_norm-adabn.npz")
+    stored = Counts.load(folder / "counts_test.npz")
+    assert (found.names, found.night) == (stored.names, stored.night)
+    assert not np.array_equal(found.counts, stored.counts)
+    assert {path: path.read_bytes() for path in folder.glob("*") if path.is_file()} == files
+
+
 # ---- heads ----------------------------------------------------------------------------------
 
 

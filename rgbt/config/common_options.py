@@ -47,6 +47,21 @@ CorruptionName = Annotated[
     ),
 ]
 Severity = Annotated[str, Help("severity of the corruption")]
+BatchNorm = Annotated[
+    Literal["as trained", "recomputed", "adabn", "batch"],
+    Help(
+        "statistics of batch normalisation: recomputed: over all images of batch_norm_splits; "
+        "adabn: the same for day and night separately; batch: those of each batch. No label is "
+        "read for them"
+    ),
+]
+BatchNormSplits = Annotated[
+    str,
+    Help(
+        "splits whose images give these statistics, such as train_day,train_night; default: the "
+        "evaluated split"
+    ),
+]
 RegionsFile = Annotated[
     str, Help("partition of the image, a file of conf/metric: ring5, ring9, vertical5, horizontal5")
 ]

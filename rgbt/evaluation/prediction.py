@@ -60,6 +60,7 @@ class Predictor:
     """Predicts batches with `model`, left in evaluation mode; each image by its head.
 
     Attributes:
+        model: the network.
         view: input images of the prediction.
 
     Raises:
@@ -70,7 +71,7 @@ class Predictor:
         self.view = view_of(session, request.view)
         self._heads = heads_of(session, self.view, request.head)
         self._fabric = session.fabric
-        self._model = model.eval()
+        self.model = model.eval()
         self._settings = session.prediction
 
     def counted(self, batch: Batch) -> Batch:
@@ -87,19 +88,17 @@ class Predictor:
     def classes(self, batch: Batch) -> Tensor:
         """`rgbt.engine.evaluate.class_maps` of a batch on the device."""
         if self._settings.enlarged == "scores":
-            return class_maps(self._model, batch, *self._how(batch))
-        return self._enlarged(
-            class_maps(self._model, _image_sized(batch), *self._how(batch)), batch
-        )
+            return class_maps(self.model, batch, *self._how(batch))
+        return self._enlarged(class_maps(self.model, _image_sized(batch), *self._how(batch)), batch)
 
     def confident_classes(self, batch: Batch) -> tuple[Tensor, Tensor]:
         """`rgbt.engine.evaluate.confident_class_maps` of a batch on the device."""
-        classes, confidence = confident_class_maps(self._model, batch, *self._how(batch))
+        classes, confidence = confident_class_maps(self.model, batch, *self._how(batch))
         return (classes if self._settings.enlarged == "scores" else self.classes(batch)), confidence
 
     def probabilities(self, batch: Batch) -> Tensor:
         """`rgbt.engine.evaluate.probabilities` of a batch on the device."""
-        return probabilities(self._model, batch, *self._how(batch))
+        return probabilities(self.model, batch, *self._how(batch))
 
     def _how(self, batch: Batch) -> tuple[Any, ...]:
         return self._fabric, self.view, self._heads(batch.name), self._settings

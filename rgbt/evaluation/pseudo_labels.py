@@ -36,7 +36,7 @@ from rgbt.data.pseudo_labels import (
     label_path,
     read_pair,
 )
-from rgbt.dataset import DatasetWrapper, LabelledDataset
+from rgbt.dataset import Subset
 from rgbt.engine.progress import progress
 from rgbt.evaluation.images import write_png
 from rgbt.evaluation.prediction import Predictor, decode_ahead, view_of
@@ -165,18 +165,6 @@ def _percent(fraction: float | None) -> str:
     return percent(float("nan") if fraction is None else fraction)
 
 
-class _Subset(DatasetWrapper):
-    """A data set of which only some names are read."""
-
-    def __init__(self, source: LabelledDataset, chosen: tuple[str, ...]) -> None:
-        super().__init__(source)
-        self._chosen = chosen
-
-    def names(self, split: str) -> tuple[str, ...]:
-        del split
-        return self._chosen
-
-
 def _settings(
     session: Session, teacher: str, request: EvaluationRequest, labelling: Labelling
 ) -> dict[str, Any]:
@@ -268,7 +256,7 @@ def _predict(
         return {}
     label_map = labelling.label_map
     decode_ahead(session, request.split)
-    subset = _Subset(session.dataset, missing)
+    subset = Subset(session.dataset, missing)
     batches = eval_batches(subset, request.split, session.transform, session.loading)
     predictor = Predictor(session, session.model, request)
     with progress() as display:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 from rgbt.build.load_run import TrainedNetwork, open_exported, open_trained
-from rgbt.checks import InputError, check_choice
+from rgbt.checks import InputError, check_choice, split_list
 from rgbt.config.common_options import AS_TRAINED, NetworkOptions
 from rgbt.config.stored_config import parse_trust
 from rgbt.data.domains import TestedHead
@@ -95,6 +95,56 @@ def other_images(dataset: LabelledDataset, marker: Mapping[str, Any] | None) -> 
     return (f"{dataset.name}-{found[:8]}",)
 
 
+Statistics = Literal["recomputed", "adabn", "batch"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class BatchNormRequest:
+    """Statistics of batch normalisation that replace those of the training; no label is read.
+
+    Attributes:
+        kind: "recomputed": mean and variance over all images; "adabn": those of the images by day
+            for images by day, and those of the night for the night; "batch": those of each batch,
+            whose images are all by day or all of the night.
+        splits: whose images they are computed from; (): the evaluated split.
+    """
+
+    kind: Statistics
+    splits: tuple[str, ...] = ()
+
+    @classmethod
+    def from_options(cls, kind: str, splits: str) -> BatchNormRequest | None:
+        """Make a request from the options of a command; None for "as trained".
+
+        Raises:
+            InputError: splits that have no effect.
+        """
+        if splits and kind in (AS_TRAINED, "batch"):
+            raise InputError(
+                f"batch_norm_splits={splits} has no effect with batch_norm={kind}; set "
+                "batch_norm=adabn or batch_norm=recomputed, or omit it."
+            )
+        if kind == AS_TRAINED:
+            return None
+        named = tuple(split_list(splits, "batch_norm_splits")) if splits else ()
+        return cls(kind=cast(Statistics, kind), splits=named)
+
+    @property
+    def file_stem(self) -> str:
+        """For file names: "norm-adabn", "norm-adabn-train_day-train_night"."""
+        return "-".join(("norm", self.kind, *self.splits))
+
+    @property
+    def title(self) -> str:
+        """For people: "AdaBN"."""
+        titles = {
+            "recomputed": "recomputed statistics",
+            "adabn": "AdaBN",
+            "batch": "statistics of the batch",
+        }
+        return titles[self.kind]
+
+
 @dataclass(frozen=True, kw_only=True)
 class EvaluationRequest:
     """One evaluation of a network: segmentation, consistency, corrupted images or pseudo-labels.
@@ -106,6 +156,7 @@ class EvaluationRequest:
         corruption: of the images; None: they are clean.
         keep: names of the images that are returned for pictures.
         details: what else is counted, see `rgbt.metrics.details`.
+        batch_norm: statistics of batch normalisation; None: those of the training.
     """
 
     split: str
@@ -114,6 +165,7 @@ class EvaluationRequest:
     corruption: CorruptionRequest | None = None
     keep: Collection[str] = ()
     details: tuple[Details, ...] = ()
+    batch_norm: BatchNormRequest | None = None
 
     @classmethod
     def from_options(

@@ -15,8 +15,9 @@ from torch import Tensor, nn
 from rgbt.build.load_run import TrainedNetwork
 from rgbt.build.session import Session
 from rgbt.data.loaders import eval_batches
-from rgbt.dataset import LabelledDataset, background_indices
+from rgbt.dataset import LabelledDataset, Subset, background_indices
 from rgbt.engine.progress import progress
+from rgbt.evaluation.batch_norm import normalised, parts_of_split, statistics_in_words
 from rgbt.evaluation.details import DetailCounter, DetailedImages, details_counts
 from rgbt.evaluation.prediction import Predictor, counts_of, decode_ahead
 from rgbt.evaluation.request import EvaluationRequest, NetworkRequest
@@ -66,22 +67,41 @@ def evaluate(session: Session, model: nn.Module, request: EvaluationRequest) -> 
     Raises:
         InputError: a file cannot be read (data.on_error=raise), or none could be; the network
             has not the view or the head; a corruption that does not fit the images; details that
-            the data set does not have.
+            the data set does not have; statistics that cannot be computed (`normalised`).
     """
     predictor = Predictor(session, model, request)
     if request.corruption is not None:
         session = request.corruption.applied_to(session, request.split)
-    dataset = session.dataset
-    detail = DetailCounter(request.details, dataset, session.regions)
-    decode_ahead(session, request.split)
+    names = session.dataset.names(request.split)
+    detail = DetailCounter(request.details, session.dataset, session.regions)
+    wanted = request.batch_norm
+    decode_ahead(session, request.split, *(wanted.splits if wanted is not None else ()))
+    parts = []
+    for part in parts_of_split(session.dataset, request):
+        with normalised(session, predictor, request, part):
+            parts.append(_count(session, predictor, request, part.names, detail))
+    every = _joined([each for part in parts for each in collected(part)], names)
+    counts = counts_of(session, request.split, every.counted, session.regions.name)
+    details = details_counts(session, request.split, every.detailed, request.details)
+    return EvaluationResult(counts, predictor.view, tuple(every.kept), every.skipped, details)
+
+
+def _count(
+    session: Session,
+    predictor: Predictor,
+    request: EvaluationRequest,
+    names: tuple[str, ...],
+    detail: DetailCounter,
+) -> _Part:
+    """Predict the images `names` of the split, or the part of this process, and count."""
+    dataset = Subset(session.dataset, names)
     batches = eval_batches(dataset, request.split, session.transform, session.loading)
     counter = RegionCounter(len(dataset.classes), session.regions)
     counted: Counted = {}
     detailed: DetailedImages = {}
     kept: list[PanelExample] = []
     with progress() as display:
-        total = len(dataset.names(request.split))
-        task = display.add_task(request.split, total=total, note="images")
+        task = display.add_task(request.split, total=len(names), note="images")
         done = 0
         for loaded in batches:
             batch = predictor.counted(loaded)
@@ -92,13 +112,9 @@ def evaluate(session: Session, model: nn.Module, request: EvaluationRequest) -> 
                 detailed[name] = detail(name, label, classes, confidence[index])
                 is_kept = name in request.keep
                 kept += [_example(session, name, classes.numpy())] if is_kept else []
-            done = min(total, done + num_processes() * len(batch.name))
+            done = min(len(names), done + num_processes() * len(batch.name))
             display.update(task, completed=done)
-    part = _Part(counted, detailed, kept, tuple(batches.skipped))
-    every = _of_all_processes(part, dataset.names(request.split))
-    counts = counts_of(session, request.split, every.counted, session.regions.name)
-    details = details_counts(session, request.split, every.detailed, request.details)
-    return EvaluationResult(counts, predictor.view, tuple(every.kept), every.skipped, details)
+    return _Part(counted, detailed, kept, tuple(batches.skipped))
 
 
 def _predicted(
@@ -113,7 +129,7 @@ def _predicted(
 
 
 class _Part(NamedTuple):
-    """What one process has counted, kept and skipped."""
+    """What one process has counted, kept and skipped of the images of one domain, or of all."""
 
     counted: Counted
     detailed: DetailedImages
@@ -121,11 +137,10 @@ class _Part(NamedTuple):
     skipped: tuple[str, ...]
 
 
-def _of_all_processes(part: _Part, names: Sequence[str]) -> _Part:
-    """The parts of all processes together, in the order of `names`."""
-    if num_processes() == 1:
-        return part
-    parts = collected(part)
+def _joined(parts: Sequence[_Part], names: Sequence[str]) -> _Part:
+    """The parts of all processes and domains together, in the order of `names`."""
+    if len(parts) == 1:
+        return parts[0]
     position = {name: index for index, name in enumerate(names)}
     order = position.__getitem__
     counted = {name: counts for each in parts for name, counts in each.counted.items()}
@@ -185,6 +200,7 @@ def counts_path(
     words = [opened.session.dataset.name, request.split, result.view, result.counts.partition]
     words += [] if request.head is None else [f"{request.head}-head"]
     words += [] if request.corruption is None else [request.corruption.file_stem]
+    words += [] if request.batch_norm is None else [request.batch_norm.file_stem]
     return opened.folder / f"{'_'.join([*words, *network.suffixes])}.npz"
 
 
@@ -196,7 +212,12 @@ def overview(
     label = label_of(opened, request, result.view)
     tables = result_tables(result.counts, session.regions, label, opened.step)
     heads = session.domains.heads_in_words(head or session.domains.tested_head)
-    lines = [*([("heads", heads)] if heads else []), ("counts", str(path))]
+    statistics = statistics_in_words(session, request)
+    lines = [
+        *([("heads", heads)] if heads else []),
+        *([("batch norm", statistics)] if statistics else []),
+        ("counts", str(path)),
+    ]
     if result.skipped:
         lines.append(("skipped", f"{len(result.skipped)} images that cannot be read"))
     return result_view(tables, path.parent, lines)
@@ -204,9 +225,9 @@ def overview(
 
 def label_of(opened: TrainedNetwork, request: EvaluationRequest, view: View) -> str:
     """The name of an evaluation in tables."""
-    head, corruption = request.head, request.corruption
-    label = f"{opened.label} {opened.session.dataset.name} {view}{f' {head} head' if head else ''}"
-    return f"{label}, {corruption.title}" if corruption else label
+    head = f" {request.head} head" if request.head else ""
+    changes = [each.title for each in (request.corruption, request.batch_norm) if each is not None]
+    return ", ".join([f"{opened.label} {opened.session.dataset.name} {view}{head}", *changes])
 
 
 def legend_of(dataset: LabelledDataset) -> Legend:

@@ -107,6 +107,8 @@ def evaluation_of(column: Column, table: Table) -> ExtraEvaluation | None:
         head=column.head,
         corruption=column.corruption,
         severity=column.severity,
+        batch_norm=column.batch_norm,
+        batch_norm_splits=column.batch_norm_splits,
         details=None if details is None else details.kind,
     )
     return None if needed == ExtraEvaluation() else needed

@@ -78,14 +78,16 @@ def _check_column(column: Column, table: Table, before: Sequence[Column], where:
         check_choice(f"{where}, {given[0]}", name, [each.name for each in table.columns])
     _check_frames(column, where)
     is_of_frames = column.metric is not None and column.frames is None
-    if column.head != "as trained" and not is_of_frames:
+    for key in () if is_of_frames else ("head", "corruption", "batch_norm"):
+        if getattr(column, key) not in (None, "as trained"):
+            raise InputError(
+                f"{where}: '{key}' is only for scores of single frames; remove {key}: "
+                f"{getattr(column, key)}."
+            )
+    if column.batch_norm_splits and column.batch_norm in ("as trained", "batch"):
         raise InputError(
-            f"{where}: 'head' is only for scores of single frames; remove head: {column.head}."
-        )
-    if column.corruption is not None and not is_of_frames:
-        raise InputError(
-            f"{where}: 'corruption' is only for scores of single frames; remove corruption: "
-            f"{column.corruption}."
+            f"{where}: 'batch_norm_splits' needs batch_norm: adabn or recomputed; add it, or "
+            "remove it."
         )
     if column.corruption is None and column.severity is not None:
         raise InputError(

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal
 from rgbt.checks import InputError
 from rgbt.config.compose import chosen_scale
 from rgbt.metrics.pairs import Protocol
-from sweeps.evaluation import Head
+from sweeps.evaluation import BatchNorm, Head
 from sweeps.table.claim import Claim
 from sweeps.table.design import Design
 from sweeps.table.variance import Variance
@@ -61,6 +61,8 @@ class Column:
         corruption: of the images, NAME or NAME:IMAGE with a file of ``conf/corruption``; None: they
             are clean.
         severity: of the corruption; may be omitted if the corruption has a single one.
+        batch_norm: statistics of batch normalisation, see `sweeps.evaluation.BatchNorm`.
+        batch_norm_splits: splits whose images give them; (): the test split.
         printed: whether the paper has the column; false: ours alone.
         best: which value of the column is marked.
     """
@@ -77,6 +79,8 @@ class Column:
     head: Head = "as trained"
     corruption: str | None = None
     severity: float | None = None
+    batch_norm: BatchNorm = "as trained"
+    batch_norm_splits: tuple[str, ...] = ()
     printed: bool = True
     best: Literal["highest", "lowest", "none"] = "highest"
 

@@ -17,11 +17,11 @@ from rgbt.config.compose import compose
 from rgbt.data.mfnet import MFNet
 from rgbt.dataset import DatasetWrapper
 from rgbt.evaluation.request import EvaluationRequest
-from rgbt.evaluation.segmentation import _of_all_processes, _Part, evaluate
+from rgbt.evaluation.segmentation import _joined, _Part, evaluate
 from rgbt.metrics.boundary import BoundaryCounter
 from rgbt.metrics.details import KINDS, OF_SCENES, DetailKind, default
 from rgbt.metrics.named import value
-from rgbt.processes import rank
+from rgbt.processes import collected, rank
 from rgbt.requirements import Record
 from rgbt.spec.specify import specify
 from rgbt.types import Output, SceneMaps
@@ -170,7 +170,7 @@ def _merged() -> tuple[list[str], dict[str, dict[DetailKind, np.ndarray]]]:
     own = NAMES[rank() :: 2]
     counted = {name: np.full((1, 2, 2), ord(name)) for name in own}
     detailed = {name: {"boundary": np.full((1, 3, 2), ord(name))} for name in own}
-    merged = _of_all_processes(_Part(counted, detailed, [], ()), NAMES)
+    merged = _joined(collected(_Part(counted, detailed, [], ())), NAMES)
     return list(merged.counted), merged.detailed
 
 

@@ -43,6 +43,13 @@ OPTIONS = {"rgbt.evaluate": OfEvaluate, "rgbt.consistency": OfConsistency}
             "rgb, ring5, own head, rgb_removed",
         ),
         (
+            ExtraEvaluation(batch_norm="adabn", batch_norm_splits=("train_day", "train_night")),
+            "rgbt.evaluate modality=default regions=as\xa0trained batch_norm=adabn "
+            "batch_norm_splits=train_day,train_night",
+            "table_default_as-trained_norm-adabn-train_day-train_night.npz",
+            "default, as trained, norm-adabn-train_day-train_night",
+        ),
+        (
             ExtraEvaluation(regions="ring5", world="N+", dataset=("dataset.rgb_noise=0.1",)),
             "rgbt.evaluate modality=default regions=ring5 dataset.rgb_noise=0.1",
             # sha256 of "dataset.rgb_noise=0.1"
@@ -85,7 +92,7 @@ OPTIONS = {"rgbt.evaluate": OfEvaluate, "rgbt.consistency": OfConsistency}
 def test_evaluation_has_command_file_and_label(
     evaluation: ExtraEvaluation, command: str, file: str, label: str
 ) -> None:
-    module, *words = command.split(" ")
+    module, *words = (word.replace("\xa0", " ") for word in command.split(" "))
     assert evaluation.command == (module, *words)
     assert (evaluation.path, evaluation.label) == (f"evaluations/{file}", label)
     options = {word.partition("=")[0] for word in words if word not in evaluation.dataset}

@@ -115,6 +115,11 @@ def test_own_table_needs_no_printed_values(tmp_path: Path) -> None:
             "only for scores of single frames; remove",
         ),
         (column(metric="TC", frames="aligned", corruption="removed:rgb"), "remove corruption: re"),
+        (column(mean=["mIoU", "b"], batch_norm="adabn"), "single frames; remove batch_norm: adabn"),
+        (
+            column(metric="Var", batch_norm_splits=["val"]),
+            "'batch_norm_splits' needs batch_norm: a",
+        ),
         (
             column(metric="distance/0-15"),
             "distance: '0-15' is not a valid choice; did you mean '0-10",

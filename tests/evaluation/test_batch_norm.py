@@ -1,0 +1,173 @@
+"""Statistics of batch normalisation: their values, their images, and the counts with them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from rgbt.build.session import Session, open_session
+from rgbt.checks import InputError
+from rgbt.config.compose import compose
+from rgbt.data.mfnet import MFNet
+from rgbt.evaluation.batch_norm import Part, normalised, parts_of_split, statistics_in_words
+from rgbt.evaluation.prediction import Predictor
+from rgbt.evaluation.request import BatchNormRequest, EvaluationRequest
+from rgbt.evaluation.segmentation import evaluate
+from rgbt.requirements import Record
+from rgbt.spec.specify import specify
+from rgbt.types import Output
+from tests.commands import SPLITS, words_of
+
+
+class AboveMean(nn.Module):
+    """Class 1 where the thermal image is above the running mean, else class 0."""
+
+    record = Record(views=("rgbt",))
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.norm = nn.BatchNorm2d(4)
+        self.unused = nn.BatchNorm2d(2)
+        self.sizes: list[int] = []
+
+    def forward(self, rgb: Tensor, thermal: Tensor, *, views: tuple[str, ...] = ()) -> Output:
+        self.sizes.append(len(rgb))
+        above = self.norm(torch.cat([rgb, thermal], 1))[:, 3] > 0
+        return Output(F.one_hot(above.long(), 9).movedim(-1, 1).float(), {})
+
+
+class Days(MFNet):
+    """Its split "days" has no image of the night."""
+
+    def names(self, split: str) -> tuple[str, ...]:
+        return ("00002D", "00004D") if split == "days" else super().names(split)
+
+
+@pytest.fixture
+def session(data: Path) -> Session:
+    words = words_of(data, data / "runs", "+experiment=mfnet", "masker.patch_size=null")
+    session = open_session(specify(compose(words)))
+    return replace(session, dataset=Days(data), model=AboveMean())
+
+
+def request(kind: str, *splits: str) -> EvaluationRequest:
+    return EvaluationRequest(split="test", batch_norm=BatchNormRequest(kind=kind, splits=splits))
+
+
+def pixels(session: Session, *names: str) -> NDArray[np.float64]:
+    """(pixels, 4): red, green, blue and thermal of all pixels of some images, in [0, 1]."""
+    samples = [session.dataset.read(name) for name in names]
+    images = [np.dstack([each.rgb, each.thermal]).reshape(-1, 4) for each in samples]
+    return np.concatenate(images) / 255
+
+
+@pytest.mark.parametrize("size", [1, 3])
+def test_statistics_are_those_of_all_pixels_in_any_order(session: Session, size: int) -> None:
+    session = replace(session, loading=replace(session.loading, eval_batch_size=size))
+    model = session.model
+    predictor = Predictor(session, model, request("recomputed"))
+    before = {name: each.clone() for name, each in model.state_dict().items()}
+    names = tuple(SPLITS["train"])
+    expected = pixels(session, *names)
+    for sources in (names, names[::-1]):
+        part = Part("", (), sources)
+        with normalised(session, predictor, request("recomputed"), part):
+            assert model.norm.running_mean.numpy() == pytest.approx(expected.mean(0), abs=1e-6)
+            assert model.norm.running_var.numpy() == pytest.approx(expected.var(0), abs=1e-6)
+            assert torch.equal(model.unused.running_var, torch.ones(2))
+            assert not model.training
+            assert not model.norm.training
+        for name, each in model.state_dict().items():
+            assert torch.equal(each, before[name])
+
+
+TRAIN_DAYS, TRAIN_NIGHTS = ([n for n in SPLITS["train"] if n[-1] == t] for t in "DN")
+
+
+@pytest.mark.parametrize(
+    ("kind", "splits", "of_day", "of_night"),
+    [
+        ("recomputed", (), SPLITS["test"], SPLITS["test"]),
+        ("recomputed", ("days",), ["00002D", "00004D"], ["00002D", "00004D"]),
+        ("adabn", (), ["00201D", "00203D"], ["00202N"]),
+        ("adabn", ("train", "days"), TRAIN_DAYS, TRAIN_NIGHTS),
+        ("batch", (), ["00201D", "00203D"], ["00202N"]),  # batches of two
+    ],
+)
+def test_counts_are_of_the_statistics_of_each_domain(
+    session: Session, kind: str, splits: tuple[str, ...], of_day: list[str], of_night: list[str]
+) -> None:
+    result = evaluate(session, session.model, request(kind, *splits))
+    assert result.counts.names == tuple(SPLITS["test"])
+    for name, counts in zip(result.counts.names, result.counts.counts, strict=True):
+        mean = pixels(session, *(of_night if name[-1] == "N" else of_day))[:, 3].mean()
+        counted = session.dataset.label(name).ravel() != 255
+        above = (pixels(session, name)[:, 3] > mean)[counted]
+        assert counts.sum((0, 1))[:2].tolist() == [(~above).sum(), above.sum()]
+    assert torch.equal(session.model.norm.running_mean, torch.zeros(4))
+    # Without the option, the network keeps its own mean of 0, and every batch is whole.
+    session.model.sizes.clear()
+    plain = evaluate(session, session.model, EvaluationRequest(split="test")).counts.counts
+    assert plain.sum((0, 1, 2))[0] == sum(
+        (pixels(session, name)[:, 3] == 0).sum() for name in SPLITS["test"]
+    )
+    assert session.model.sizes == [2, 1]
+
+
+def test_images_are_stated(session: Session) -> None:
+    def stated(*of: str) -> str:
+        return statistics_in_words(session, request(*of))
+
+    assert statistics_in_words(session, EvaluationRequest(split="test")) == ""
+    assert stated("batch") == "statistics of the batch, in batches of 2"
+    assert stated("recomputed") == "recomputed statistics, of 3 images (test), in batches of 2"
+    assert stated("adabn", "train", "days") == (
+        "AdaBN, of 4 images by day and 4 images at night (train, days), in batches of 2"
+    )
+
+
+def test_data_without_time_of_day_is_one_domain(
+    session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Days, "nights", lambda self, names: None)
+    names, train = (tuple(SPLITS[split]) for split in ("test", "train"))
+    assert parts_of_split(session.dataset, request("adabn", "train")) == [Part("", names, train)]
+
+
+def test_statistics_that_cannot_be_computed_are_refused(session: Session) -> None:
+    wanted = request("adabn", "days")
+    with pytest.raises(InputError, match="splits=days has no images at night of mfnet, but 'test'"):
+        evaluate(session, session.model, wanted)
+    assert not session.model.sizes
+    exported = nn.Sequential(nn.BatchNorm2d(3, track_running_stats=False))
+    exported.record = AboveMean.record
+    with pytest.raises(InputError, match="adabn requires a network with batch normalisation"):
+        evaluate(session, exported, request("adabn"))
+    skipping = replace(session.loading, on_error="skip")
+    part = Part("", (), ("missing",))
+    predictor = Predictor(session, session.model, wanted)
+    with (
+        pytest.raises(InputError, match="batch_norm=adabn: no image could be read"),
+        normalised(replace(session, loading=skipping), predictor, wanted, part),
+    ):
+        raise AssertionError
+    assert torch.equal(session.model.norm.running_var, torch.ones(4))
+
+
+def test_options_make_the_request() -> None:
+    made = BatchNormRequest.from_options
+    assert made("as trained", "") is None
+    assert made("batch", "") == BatchNormRequest(kind="batch")
+    found = made("adabn", "train_day,train_night")
+    assert found == BatchNormRequest(kind="adabn", splits=("train_day", "train_night"))
+    assert found.file_stem == "norm-adabn-train_day-train_night"
+    for kind in ("as trained", "batch"):
+        with pytest.raises(InputError, match=f"=val has no effect with batch_norm={kind}; set"):
+            made(kind, "val")
