@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    import torch
+    from collections.abc import Callable
 
-    from rgbt.types import GeneratorOf
+    import torch
 
 
 def derive(seed: int, purpose: str, *index: int) -> int:
@@ -38,7 +38,9 @@ def torch_generator(
     return torch.Generator(device=device).manual_seed(derive(seed, purpose, *index))
 
 
-def generators_of_step(seed: int, step: int, device: torch.device) -> GeneratorOf:
+def generators_of_step(
+    seed: int, step: int, device: torch.device
+) -> Callable[[str], torch.Generator]:
     """Purpose -> generator of one step (see `rgbt.types.GeneratorOf`)."""
     return lambda purpose: torch_generator(seed, purpose, step, device=device)
 

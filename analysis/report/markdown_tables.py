@@ -25,8 +25,6 @@ NOT_EVALUATED = "The run has no counts for this column."
 MOST_ON_ONE_LINE = 2
 """Most columns with all of `KINDS` on one line; more columns have a line for each kind."""
 
-PER_COLUMN = len(KINDS)
-
 
 def markdown_table(
     header: Sequence[str], rows: Iterable[Sequence[str]], texts: Collection[int] = (0,)

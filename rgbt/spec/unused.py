@@ -33,7 +33,7 @@ def unused_sentences(config: DictConfig, overrides: Sequence[str]) -> Iterator[s
                 f"{word} has no effect with {node}.{needed[0]}={found}; set "
                 f"{node}.{needed[0]}={needed[1]}, or omit it."
             )
-        elif node == "recipe" and key not in OF_CODE and f"{{{key}}}" not in written:
+        elif node == "recipe" and setting and key not in OF_CODE and f"{{{key}}}" not in written:
             yield (
                 f"{word} has no effect at scale={config.scale.name}, which does not read {key}; "
                 "set a value of the scale, such as scale.lr=..., or omit it."

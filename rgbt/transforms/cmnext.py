@@ -87,9 +87,7 @@ class CmnextTransform:
 
     def test(self, sample: Sample) -> Example:
         """Whole image, resized to `test_short_edge` where that is set; the label as it is."""
-        return evaluated(
-            sample, self.test_short_edge, None, np.uint8, track_position=self.track_position
-        )
+        return evaluated(sample, self.test_short_edge, track_position=self.track_position)
 
 
 def draw_offset(length: int, crop: int, rng: np.random.Generator) -> tuple[int, int]:

@@ -120,7 +120,7 @@ class CrmTransform:
         return evaluated(
             sample,
             self.test_short_edge,
-            self.max_size,
-            self.dtype,
             track_position=self.track_position,
+            max_size=self.max_size,
+            dtype=self.dtype,
         )

@@ -63,10 +63,10 @@ def viewed(  # noqa: PLR0913 - three of one kind
 def evaluated(
     sample: Sample,
     short_edge: int | None,
-    max_size: int | None,
-    dtype: DTypeLike,
     *,
     track_position: bool,
+    max_size: int | None = None,
+    dtype: DTypeLike = np.uint8,
     of_image: ImageResize = View.bilinear,
 ) -> Example:
     """The whole images of a sample, resized on request; the label as it is.
@@ -74,9 +74,9 @@ def evaluated(
     Args:
         sample: as it lies on disk.
         short_edge: of the images in pixels; None keeps their size.
+        track_position: see `viewed`.
         max_size: limit of their long edge in pixels (see `short_edge_hw`).
         dtype: see `viewed`.
-        track_position: see `viewed`.
         of_image: how RGB and thermal are resized.
     """
     source_hw = image_hw(sample)

@@ -79,7 +79,7 @@ class SemsegTransform:
 
     def test(self, sample: Sample) -> Example:
         """Whole image, resized to `test_short_edge` where that is set; the label as it is."""
-        return evaluated(sample, self.test_short_edge, None, np.float32, track_position=False)
+        return evaluated(sample, self.test_short_edge, track_position=False, dtype=np.float32)
 
     def _rotated(self, example: Example, rng: np.random.Generator) -> Example:
         if rng.random() >= self.rotate_probability:

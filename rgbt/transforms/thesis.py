@@ -83,12 +83,7 @@ class ThesisTransform:
     def test(self, sample: Sample) -> Example:
         """Whole image, resized to `test_short_edge` where that is set; the label as it is."""
         return evaluated(
-            sample,
-            self.test_short_edge,
-            None,
-            np.uint8,
-            track_position=self.track_position,
-            of_image=area,
+            sample, self.test_short_edge, track_position=self.track_position, of_image=area
         )
 
     def _blur(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:

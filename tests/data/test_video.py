@@ -129,6 +129,8 @@ def test_the_last_frame_without_rgb_image_is_reported(tmp_path: Path) -> None:
     assert problems[-1] == f"{root}/y/ir/10.png has no RGB image."
     with pytest.raises(InputError, match=r"10\.png has no RGB image"):
         video(root).sequences("test")
+    shutil.rmtree(root / "y" / "rgb")  # a video of which nothing else is listed
+    assert len(video(root).own_problems({})) == 4
 
 
 def test_fingerprint_covers_frames_without_a_label(mvseg: Path) -> None:

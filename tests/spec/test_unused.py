@@ -14,6 +14,7 @@ CASES = {
     "used": ((EMA, "trainer.averaging=ema"), None),
     "recipe": (("recipe.lr=0.1",), "recipe.lr=0.1"),
     "recipe of demo": (("recipe.demo_steps=3",), None),
+    "a whole recipe": (("scale=paper", "recipe=kp"), None),
     "read by code": (("recipe.dataset=kp",), None),
     "recipe of paper": (("scale=paper", "recipe.lr=0.1"), None),
 }

@@ -191,20 +191,20 @@ class VideoDataset(FileDataset):
 
     def own_problems(self, lists: SplitNames) -> list[str]:
         """Frames without an RGB image, or without a thermal image, of any split."""
-        return [f"{each}." for each in self._unpaired(self.videos, set().union(*lists.values()))]
+        return [f"{each}." for each in self._unpaired(None, set().union(*lists.values()))]
 
-    def _unpaired(self, videos: Collection[str], read: Collection[str] = ()) -> list[str]:
-        """What videos lack, as beginnings of sentences; frames that are `read` report it."""
+    def _unpaired(self, videos: Collection[str] | None, read: Collection[str] = ()) -> list[str]:
+        """What videos lack (None: all), as beginnings of sentences, but for frames in `read`."""
         files = [each.files for each in self.frames.values()]
         no_rgb = [
             f"{path} has no RGB image"
             for path, values in without_rgb(self.root, self._partners, files)
-            if values.get(VIDEO, "") in videos
+            if videos is None or values.get(VIDEO, "") in videos
         ]
         no_thermal = [
             f"the frame '{name}' has no thermal image {frame.files.thermal}"
             for name, frame in self.frames.items()
-            if frame.video in videos and name not in read
+            if (videos is None or frame.video in videos) and name not in read
             if not os.path.lexists(frame.files.thermal)
         ]
         return no_rgb + no_thermal

@@ -36,7 +36,10 @@ LISTS = {split: f"{split}.txt" for split in ("train", "val", "test", "test_day",
 FOLDERS = {"visible": "v", "infrared": "i", "label": "l"}
 """Folder of a video -> last letter of the names of its files."""
 
-PARTNERS = ("data/{video}/infrared/{name}i.{suffix}", "data/{video}/label/{name}l.png")
+PARTNERS = (
+    *("data/{video}/infrared/{name}i.jpg", "data/{video}/infrared/{name}i.png"),
+    "data/{video}/label/{name}l.png",
+)
 """Thermal images and labels."""
 
 STEM = re.compile(r"(\d*?)(\d{4})")
