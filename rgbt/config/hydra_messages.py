@@ -156,6 +156,10 @@ def _unknown_key(full_key: str, overrides: Sequence[str]) -> str:
             "folder contains: dataset=mfnet (or pst900, kp, freiburg, mvseg, video, folder) "
             "dataset.root=..."
         )
+    for word in overrides:  # an empty mapping, such as model.stubs={pandas: {}}
+        key = word.partition("=")[0]
+        if full_key.startswith(f"{key}.") and not OmegaConf.select(config, key):
+            return f"'{word}' adds keys and needs a plus: '+{word}'."
     known = _settings(OmegaConf.select(config, ".".join(parents)) if parents else config)
     hint = f"{nearest(last, known)}." if parents else _key_hint(config, last, known)
     return f"'{full_key}' is not a key of the configuration; {hint}"

@@ -129,7 +129,7 @@ def exported_network(
     """
     graph = ScoresOfImages(network, view=view, head=None)
     program = traced(graph, image_hw)
-    num_classes = program.module()(*program.example_inputs[0]).shape[1]
+    num_classes = program.graph.output_node().args[0][0].meta["val"].shape[1]
     made = Description(
         version=rgbt.__version__,
         network=type(network).__name__,

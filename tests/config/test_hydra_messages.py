@@ -30,6 +30,10 @@ from rgbt.config.hydra_messages import check_words
         (("lr=1",), "'lr' is not a key of the configuration; did you mean optimizer.lr?"),
         (("dataset.root=/x",), "Choose the data set that the folder contains: dataset=mfnet (or"),
         (("dataset.num_trian=1",), "did you mean 'num_train'?"),
+        (
+            ("model=external", "model.checkout=/code", "model.stubs={a.b: {}}"),
+            "'model.stubs={a.b: {}}' adds keys and needs a plus: '+model.stubs={a.b: {}}'.",
+        ),
     ],
 )
 def test_word_that_hydra_refuses_says_what_to_type(words: tuple[str, ...], sentence: str) -> None:

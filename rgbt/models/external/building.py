@@ -144,6 +144,11 @@ def reason(error: BaseException) -> str:
 
 def advice(error: BaseException) -> str:
     """What to do about an error of foreign code; begins with a space, or is empty."""
+    if isinstance(error, ModuleNotFoundError) and "cuda" in str(error.name):
+        return (
+            " It is an operator compiled for CUDA: choose a machine with a GPU, and compile the "
+            "operator from its sources, often in the checkout."
+        )
     if isinstance(error, ModuleNotFoundError):
         return (
             " Install the package; or, where the network does not use it, name it in model.stubs, "

@@ -146,12 +146,13 @@ class Checkout:
         """Stand-ins of the packages that are not installed, with the packages that they lie in."""
         found: dict[str, ModuleType] = {}
         for name, attributes in self.stubs:
-            if _is_installed(name.partition(".")[0]):
+            if _is_installed(name):
                 continue
             parts = name.split(".")
             for length in range(1, len(parts) + 1):
                 package = ".".join(parts[:length])
-                found.setdefault(package, _Stub(package))
+                if package not in found and not _is_installed(package):
+                    found[package] = _Stub(package)
             for attribute, target in attributes:
                 setattr(found[name], attribute, _object(target))
         return found
@@ -185,9 +186,12 @@ class _Placeholder:
         return arguments[0] if decorated else self
 
 
-def _is_installed(package: str) -> bool:
-    module = sys.modules.get(package)
-    return module is not None or importlib.util.find_spec(package) is not None
+def _is_installed(name: str) -> bool:
+    """Whether a module can be found; for one inside a package, the package is imported."""
+    try:
+        return sys.modules.get(name) is not None or importlib.util.find_spec(name) is not None
+    except Exception:  # its package is not installed, or cannot be imported
+        return False
 
 
 def _object(target: str) -> Any:

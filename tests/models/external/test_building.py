@@ -54,6 +54,7 @@ def hollow(n_class):
         ({"constructor": "model.stops:Net"}, "cannot be imported: SystemExit: 2"),
         ({"constructor": "model.net:hollow"}, r"builds parameters without values \(device meta"),
         ({"constructor": "model.wrong:Net"}, r"cannot be imported: SyntaxError: .*"),
+        ({"constructor": "model.scans:Net"}, r"'scan_cuda'.* compiled for CUDA: .* its sources"),
     ],
 )
 def test_mistakes_are_one_sentence(tmp_path: Path, changes: dict[str, object], reason: str) -> None:
@@ -64,6 +65,7 @@ def test_mistakes_are_one_sentence(tmp_path: Path, changes: dict[str, object], r
             "model/net.py": f"{STACKED}\ndef build():\n    return 3\n{HOLLOW}",
             "model/stops.py": "raise SystemExit(2)",
             "model/wrong.py": "def",
+            "model/scans.py": "import scan_cuda",
         },
     )
     with pytest.raises(InputError, match=reason) as info:

@@ -104,6 +104,12 @@ def test_a_stub_does_not_replace_an_installed_package(tmp_path: Path) -> None:
     assert network.eval()(*images()).logits.shape == (2, 3, 8, 12)
 
 
+def test_a_stub_replaces_a_module_that_an_installed_package_lacks(tmp_path: Path) -> None:
+    code = "from numpy.lib.gone.inner import delete\nimport numpy\nnumpy.ones(2)\n" + STACKED
+    external(write_checkout(tmp_path, {"model/net.py": code}), stubs={"numpy.lib.gone.inner": {}})
+    assert "numpy.lib.gone" not in sys.modules
+
+
 def test_prints_and_log_handlers_are_dropped(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
