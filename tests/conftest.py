@@ -62,7 +62,7 @@ def pytest_collection_finish() -> None:
     After a freeze Python takes the heap for a small one, and searched it for a tenth of the time.
     """
     gc.freeze()
-    gc.set_threshold(20_000, 20, 20)
+    gc.set_threshold(100_000, 20, 20)
     gc.enable()
     sys.dont_write_bytecode = WRITES_NO_BYTECODE
 

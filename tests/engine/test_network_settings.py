@@ -24,10 +24,10 @@ from tests.models.plain import generator, images, nano
 CPU = torch.device("cpu")
 ALL_VIEWS = ("rgbt", "rgb", "thermal")
 DROPS = {"drop_path_rate": 0.4}
-CASES: list[tuple[str, dict[str, Any]]] = [
+CASES: list[Any] = [
     ("mfnet", {}),
     ("rtfnet", {}),
-    ("rtfnet", {"depth": 50}),
+    pytest.param("rtfnet", {"depth": 50}, marks=pytest.mark.slow),
     ("pspnet", {}),
     ("deeplabv2", {}),
     ("cmx", {**DROPS, "decoder_dropout": 0.3}),
@@ -94,7 +94,10 @@ def test_recomputed_activations_give_the_same_bits(name: str, changes: dict[str,
     assert plain.eval()(*images(1)).logits.equal(net.eval()(*images(1)).logits)
 
 
-@pytest.mark.parametrize("name", ["rtfnet", "cmx", "mask2former"])
+@pytest.mark.parametrize(
+    "name",
+    [*(pytest.param(name, marks=pytest.mark.slow) for name in ("rtfnet", "cmx")), "mask2former"],
+)
 def test_recomputed_activations_give_the_same_bits_in_mixed_precision(name: str) -> None:
     plain, net = nano(name), nano(name)
     prepare_training(net, settings(activation_checkpointing=True), CPU)
