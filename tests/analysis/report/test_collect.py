@@ -163,7 +163,7 @@ def test_results_pages_show_claims_and_hide_folders(data: ReportData, runs_dir: 
     assert "| B is better than A. (own, TABLE I; paper scale) | ✓ holds |" in pages["index.md"]
     cell = table_of(data, "own/t").cells[0][0]
     assert f"| ours | 3 | {cell.mean:.2f} ± {cell.sd:.2f} |" in table
-    assert "(paper scale, trainer.max_steps=9)" in table
+    assert "(paper scale, `trainer.max_steps=9`)" in table
     assert str(runs_dir) not in "".join(pages.values())
 
 
