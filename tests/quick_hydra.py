@@ -57,10 +57,7 @@ def make_hydra_quick() -> None:
 
 
 def _copied(metadata: Metadata, memo: dict[int, Any]) -> Metadata:
-    """A copy of what OmegaConf knows about a node: types, flags and values of resolvers.
-
-    A node is copied with it, and a configuration has some hundred nodes.
-    """
+    """A copy of what OmegaConf knows about a node: types, flags and values of resolvers."""
     copied = copy.copy(metadata)
     copied.flags = dict(metadata.flags or {})
     copied.resolver_cache = copy.deepcopy(metadata.resolver_cache, memo)
@@ -135,13 +132,13 @@ def _loaded(
     chosen, values = [*hydras, *divided[0]], divided[1]
     searched = [(each.provider, each.path) for each in loader.get_search_path().get_path()]
     key = (config_name, *chosen, *searched, *_states(str(conf_dir())))
-    try:
-        if key not in _commands:
+    if key not in _commands:
+        try:
             _commands[key] = pickle.dumps(_load(loader, config_name, chosen, *given))
-        config: DictConfig = pickle.loads(_commands[key])
-        loader._apply_overrides_to_config(values, config)
-    except (HydraException, OmegaConfBaseException):  # it names the first of all words
-        return _load(loader, config_name, overrides, *given)
+        except (HydraException, OmegaConfBaseException):  # it names the first of all words
+            return _load(loader, config_name, overrides, *given)
+    config: DictConfig = pickle.loads(_commands[key])
+    loader._apply_overrides_to_config(values, config)
     _note_command(config, others)
     return config
 

@@ -90,7 +90,7 @@ def load_table(name: str, folder: Path = OWN) -> Table:
 
 @cache
 def _adapter() -> Any:
-    """What reads a table; made once, because that takes ten times as long as to read a table."""
+    """What reads a table; made once, because that takes longer than to read a table."""
     import pydantic
 
     return pydantic.TypeAdapter(Table)
