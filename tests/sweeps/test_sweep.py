@@ -17,6 +17,7 @@ from sweeps.point import Point
 from sweeps.search import Search
 from sweeps.settings import SweepSettings
 from sweeps.sweep import study_command, sweep
+from sweeps.worker import point_list
 from sweeps.worker.point_list import PointList
 from sweeps.worker.trial_sources import Outcome
 
@@ -152,7 +153,12 @@ def test_sweep_search_settings_of_grid_are_refused(
     assert calls.lists == []
 
 
-def test_mistake_is_reported_before_any_run(tmp_path: Path) -> None:
+def test_mistake_is_reported_before_any_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        point_list, "PLANNED_FIRST_S", 60.0
+    )  # a slow machine plans one point in 2 s
     with pytest.raises(InputError, match="masker=squre: there is no masker 'squre'"):
         call(tmp_path, "+experiment=grbm", "masker=square,squre")
     assert not any(tmp_path.iterdir())
