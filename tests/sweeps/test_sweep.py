@@ -156,9 +156,8 @@ def test_sweep_search_settings_of_grid_are_refused(
 def test_mistake_is_reported_before_any_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        point_list, "PLANNED_FIRST_S", 60.0
-    )  # a slow machine plans one point in 2 s
+    # A slow machine plans one point in the usual 2 s.
+    monkeypatch.setattr(point_list, "PLANNED_FIRST_S", 60.0)
     with pytest.raises(InputError, match="masker=squre: there is no masker 'squre'"):
         call(tmp_path, "+experiment=grbm", "masker=square,squre")
     assert not any(tmp_path.iterdir())
