@@ -160,7 +160,13 @@ def _unknown_key(full_key: str, overrides: Sequence[str]) -> str:
         key = word.partition("=")[0]
         if full_key.startswith(f"{key}.") and not OmegaConf.select(config, key):
             return f"'{word}' adds keys and needs a plus: '+{word}'."
-    known = _settings(OmegaConf.select(config, ".".join(parents)) if parents else config)
+    node = OmegaConf.select(config, ".".join(parents)) if parents else config
+    if node is None:
+        return (
+            f"'{full_key}' is not a key of the configuration, because {'.'.join(parents)} is null; "
+            f"choose a file of {parents[0]}= that sets it."
+        )
+    known = _settings(node)
     hint = f"{nearest(last, known)}." if parents else _key_hint(config, last, known)
     return f"'{full_key}' is not a key of the configuration; {hint}"
 

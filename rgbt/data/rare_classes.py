@@ -56,14 +56,15 @@ class RareClasses:
         names: their names.
         probabilities: (C,) float64, of each.
         images: for each, places in the list of the split of the images that show enough of it.
-        min_crop_pixels: a crop with as many pixels of its class or fewer is drawn again.
+        min_crop_pixels: a crop with as many pixels of its class or fewer is drawn again; None: no
+            crop is.
     """
 
     classes: tuple[int, ...]
     names: tuple[str, ...]
     probabilities: NDArray[np.float64]
     images: tuple[NDArray[np.int64], ...]
-    min_crop_pixels: float
+    min_crop_pixels: float | None
 
     def draw(self, rng: np.random.Generator) -> tuple[int, NDArray[np.int64]]:
         """A class, and places of its images, of which the first is drawn and the others follow."""
@@ -115,7 +116,7 @@ def count_rare_classes(
         names=tuple(dataset.classes[index] for index in classes),
         probabilities=class_probabilities(pixels.sum(0)[classes], settings.class_temperature),
         images=tuple(np.flatnonzero(pixels[:, index] > least) for index in classes),
-        min_crop_pixels=settings.min_crop_ratio * least,
+        min_crop_pixels=settings.min_crop_ratio * least if settings.min_crop_ratio else None,
     )
 
 
@@ -149,8 +150,9 @@ class RareClassExamples:
         sample = self.source.first_readable([self.source.names[each] for each in places], skipped)
         rng = numpy_generator(self.seed, "augment", *key)
         example = self.make(sample, rng)
-        for _ in range(MOST_REDRAWS if self.rare.min_crop_pixels else 0):
-            if np.count_nonzero(example.label == drawn) > self.rare.min_crop_pixels:
+        least = self.rare.min_crop_pixels
+        for _ in range(MOST_REDRAWS):
+            if least is None or np.count_nonzero(example.label == drawn) > least:
                 break
             example = self.make(sample, rng)
         return example

@@ -12,7 +12,7 @@ Batch Normalization for Robustness under Covariate Shift" (2020): those of each 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import Any, NamedTuple
 
@@ -55,18 +55,30 @@ class BatchMoments:
     batches are normalised in training.
 
     Args:
+        name: of the normalisation, for messages.
         norm: its running statistics are overwritten.
     """
 
-    def __init__(self, norm: _BatchNorm) -> None:
+    def __init__(self, name: str, norm: _BatchNorm) -> None:
+        self._name = name
         self._norm = norm
         self._count = 0
         self._mean = torch.zeros(norm.num_features, dtype=torch.float64)
         self._squares = torch.zeros(norm.num_features, dtype=torch.float64)
 
     def __call__(self, _: nn.Module, inputs: Sequence[Any]) -> None:
-        """Measure the input (N, C, ...) of the normalisation, before it is normalised."""
+        """Measure the input (N, C, ...) of the normalisation, before it is normalised.
+
+        Raises:
+            InputError: one value for each channel, which would all be normalised to 0.
+        """
         values: Tensor = inputs[0]
+        if values.numel() == values.shape[1]:
+            raise InputError(
+                f"batch_norm=...: {self._name} gets one value for each channel of a batch of one "
+                "image, which has no variance; set data.eval_batch_size so that every batch has "
+                "two images or more, also the last one by day and at night."
+            )
         dims = (0, *range(2, values.dim()))
         variance, mean = torch.var_mean(values.float(), dims, correction=0)
         self._set(mean, variance)
@@ -131,8 +143,10 @@ def _by_domain(dataset: LabelledDataset, names: Names) -> dict[str, Names]:
 @contextmanager
 def normalised(
     session: Session, predictor: Predictor, request: EvaluationRequest, part: Part
-) -> Iterator[None]:
+) -> Iterator[tuple[str, ...]]:
     """Within it, the network has the requested statistics of `part`; afterwards its own.
+
+    Gives the names of unreadable images, which are not in the statistics.
 
     Args:
         session: reads the images.
@@ -141,36 +155,38 @@ def normalised(
         part: one of `parts_of_split`.
 
     Raises:
-        InputError: the network has no batch normalisation, or no image can be read.
+        InputError: the network has no batch normalisation, or no image can be read; a batch whose
+            statistics cannot be computed (`BatchMoments`).
     """
     wanted = request.batch_norm
     if wanted is None:
-        yield
+        yield ()
         return
     norms = _norms(predictor.model, wanted)
-    stored = [{key: each.clone() for key, each in norm.state_dict().items()} for norm in norms]
+    stored = [{key: each.clone() for key, each in n.state_dict().items()} for n in norms.values()]
+    skipped: Names = ()
     try:
         with ExitStack() as hooks:
-            moments = [BatchMoments(norm) for norm in norms]
-            for norm, each in zip(norms, moments, strict=True):
+            moments = [BatchMoments(name, norm) for name, norm in norms.items()]
+            for norm, each in zip(norms.values(), moments, strict=True):
                 hooks.enter_context(norm.register_forward_pre_hook(each))
             if wanted.kind != "batch":
-                _pass(session, predictor, part.sources)
+                skipped = _pass(session, predictor, part.sources)
                 hooks.close()
                 _finish(moments, wanted)
-            yield
+            yield skipped
     finally:
-        for norm, before in zip(norms, stored, strict=True):
+        for norm, before in zip(norms.values(), stored, strict=True):
             norm.load_state_dict(before)
 
 
-def _norms(model: nn.Module, wanted: BatchNormRequest) -> list[_BatchNorm]:
-    """The batch normalisations of a network that have running statistics."""
-    found = [
-        module
-        for module in model.modules()
+def _norms(model: nn.Module, wanted: BatchNormRequest) -> dict[str, _BatchNorm]:
+    """The batch normalisations of a network that have running statistics, by name."""
+    found = {
+        name: module
+        for name, module in model.named_modules()
         if isinstance(module, _BatchNorm) and module.running_mean is not None
-    ]
+    }
     if not found:
         raise InputError(
             f"batch_norm={wanted.kind} requires a network with batch normalisation that can be "
@@ -180,14 +196,16 @@ def _norms(model: nn.Module, wanted: BatchNormRequest) -> list[_BatchNorm]:
     return found
 
 
-def _pass(session: Session, predictor: Predictor, names: Names) -> None:
-    """Predict images without using the predictions."""
+def _pass(session: Session, predictor: Predictor, names: Names) -> Names:
+    """Predict images without using the predictions; the names of those that cannot be read."""
     dataset = Unlabelled(Subset(session.dataset, names))
     with progress() as display:
         task = display.add_task("statistics", total=len(names), note="images")
-        for batch in eval_batches(dataset, "", session.transform, session.loading):
+        batches = eval_batches(dataset, "", session.transform, session.loading)
+        for batch in batches:
             predictor.classes(batch.to(session.fabric.device))
             display.advance(task, len(batch.name))
+    return tuple(batches.skipped)
 
 
 def _finish(moments: Sequence[BatchMoments], wanted: BatchNormRequest) -> None:
@@ -198,11 +216,13 @@ def _finish(moments: Sequence[BatchMoments], wanted: BatchNormRequest) -> None:
         )
 
 
-def statistics_in_words(session: Session, request: EvaluationRequest) -> str:
+def statistics_in_words(
+    session: Session, request: EvaluationRequest, skipped: Collection[str] = ()
+) -> str:
     """The statistics of batch normalisation for people; "" for those of the training.
 
     For example: AdaBN, of 300 images by day and 300 images at night (train_day, train_night), in
-    batches of 10.
+    batches of 10. Images that were `skipped` are not counted.
     """
     wanted = request.batch_norm
     if wanted is None:
@@ -211,6 +231,8 @@ def statistics_in_words(session: Session, request: EvaluationRequest) -> str:
     if wanted.kind == "batch":
         return f"{wanted.title}, {batches}"
     parts = parts_of_split(session.dataset, request)
-    numbers = " and ".join(f"{len(part.sources)} images{part.domain}" for part in parts)
+    numbers = " and ".join(
+        f"{sum(name not in skipped for name in part.sources)} images{part.domain}" for part in parts
+    )
     splits = ", ".join(wanted.splits or (request.split,))
     return f"{wanted.title}, of {numbers} ({splits}), {batches}"

@@ -48,7 +48,7 @@ class EvaluationResult:
 
     Attributes:
         kept: examples for pictures.
-        skipped: names of unreadable files that were skipped.
+        skipped: names of unreadable files that were skipped, of the split and of statistics.
         details: kind -> counts of the requested details (`rgbt.metrics.details`).
     """
 
@@ -77,13 +77,16 @@ def evaluate(session: Session, model: nn.Module, request: EvaluationRequest) -> 
     wanted = request.batch_norm
     decode_ahead(session, request.split, *(wanted.splits if wanted is not None else ()))
     parts = []
+    unmeasured: list[str] = []
     for part in parts_of_split(session.dataset, request):
-        with normalised(session, predictor, request, part):
+        with normalised(session, predictor, request, part) as skipped:
+            unmeasured += skipped
             parts.append(_count(session, predictor, request, part.names, detail))
     every = _joined([each for part in parts for each in collected(part)], names)
     counts = counts_of(session, request.split, every.counted, session.regions.name)
     details = details_counts(session, request.split, every.detailed, request.details)
-    return EvaluationResult(counts, predictor.view, tuple(every.kept), every.skipped, details)
+    unread = tuple(dict.fromkeys((*every.skipped, *unmeasured)))
+    return EvaluationResult(counts, predictor.view, tuple(every.kept), unread, details)
 
 
 def _count(
@@ -212,7 +215,7 @@ def overview(
     label = label_of(opened, request, result.view)
     tables = result_tables(result.counts, session.regions, label, opened.step)
     heads = session.domains.heads_in_words(head or session.domains.tested_head)
-    statistics = statistics_in_words(session, request)
+    statistics = statistics_in_words(session, request, result.skipped)
     lines = [
         *([("heads", heads)] if heads else []),
         *([("batch norm", statistics)] if statistics else []),

@@ -53,7 +53,7 @@ class NetworkCopy(nn.Module):
         modes = [(module, module.training) for module in network.modules()]
         norms = [module for module, trains in modes if isinstance(module, _BatchNorm) and trains]
         tracking = [module.track_running_stats for module in norms]
-        self._exchange()
+        self._exchange(self._own_tensors())
         try:
             network.eval()
             for norm in norms if self._normalisation == "batch" else ():
@@ -62,15 +62,16 @@ class NetworkCopy(nn.Module):
             with torch.no_grad():
                 yield
         finally:
-            self._exchange()
+            # Backwards: a tensor with two names is exchanged twice.
+            self._exchange(self._own_tensors()[::-1])
             for norm, tracks in zip(norms, tracking, strict=True):
                 norm.track_running_stats = tracks
             for module, trains in modes:
                 module.training = trains
 
-    def _exchange(self) -> None:
-        """Exchange the tensors of the network with the copies, without another copy."""
-        for name, own in self._own_tensors():
+    def _exchange(self, tensors: list[tuple[str, Tensor]]) -> None:
+        """Exchange these tensors of the network with their copies, without another copy."""
+        for name, own in tensors:
             copied = self.get_buffer(_key(name))
             self._buffers[_key(name)], own.data = own.data, copied
 

@@ -54,6 +54,28 @@ def composed(words: Callable[..., list[str]]) -> Composed:
     return make
 
 
+def test_rare_classes_are_those_of_the_source_as_it_is_labelled(
+    composed: Composed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Target images and upstream runs are shuffled; an upstream run has the batch size."""
+    words = ["data.sampling=rare_classes", "data.batch_size=2"]
+    upstream = composed("self_training_night", *words).upstream[0].data
+    assert (upstream.sampling, upstream.batch_size) == ("shuffled", 2)
+    counted: list[Any] = []
+    drawn: list[Any] = []
+    monkeypatch.setattr(
+        training_setup, "count_rare_classes", lambda *args: counted.append(args) or "rare"
+    )
+    monkeypatch.setattr(training_setup, "train_batches", lambda *args: drawn.append(args))
+    monkeypatch.setattr(training_setup, "PairedBatches", lambda *_, **__: None)
+    relabelled = SimpleNamespace(names=lambda split: ("a", "b"))
+    monkeypatch.setattr(training_setup, "_labelled", lambda *_: relabelled)
+    setup = set_up_training(composed("self_training_night", *words, "model.weights=null"))
+    setup.batches(range(1))
+    assert [each[:2] for each in counted] == [(relabelled, setup.splits()["source"])]
+    assert [each[-1] for each in drawn] == ["rare", None]
+
+
 def write_folder(spec: RunSpec, folder: Path, split: str, **changes: Any) -> Path:
     """A folder that says it is finished, with (empty) files of every image of a split."""
     dataset = spec.dataset.build()

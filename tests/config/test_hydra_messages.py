@@ -31,6 +31,10 @@ from rgbt.config.hydra_messages import check_words
         (("dataset.root=/x",), "Choose the data set that the folder contains: dataset=mfnet (or"),
         (("dataset.num_trian=1",), "did you mean 'num_train'?"),
         (
+            ("scheme=self_training", "scheme.feature_distance.weight=1"),
+            "because scheme.feature_distance is null; choose a file of scheme= that sets it.",
+        ),
+        (
             ("model=external", "model.checkout=/code", "model.stubs={a.b: {}}"),
             "'model.stubs={a.b: {}}' adds keys and needs a plus: '+model.stubs={a.b: {}}'.",
         ),

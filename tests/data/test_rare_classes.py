@@ -89,14 +89,18 @@ def test_class_without_an_image_is_refused(dataset: MFNet) -> None:
 
 
 @pytest.mark.parametrize(
-    ("pixels", "ratio", "calls"),
-    [([9, 25, 26, 99], 0.5, 3), ([0] * 20, 0.5, 11), ([0, 99], 0.0, 1), ([26], 0.5, 1)],
+    ("least", "pixels", "ratio", "calls"),
+    [
+        *[(50, [9, 25, 26, 99], 0.5, 3), (50, [0] * 20, 0.5, 11)],
+        *[(50, [0, 99], 0.0, 1), (50, [26], 0.5, 1), (0, [0, 1], 0.5, 2), (0, [0], 0.0, 1)],
+    ],
 )
 def test_crop_is_drawn_again_until_it_shows_enough(
-    dataset: MFNet, pixels: list[int], ratio: float, calls: int
+    dataset: MFNet, least: int, pixels: list[int], ratio: float, calls: int
 ) -> None:
-    """Half of 50 pixels, at most ten times again."""
-    rare = count_rare_classes(dataset, "train", settings(min_crop_ratio=ratio))
+    """Half of 50 pixels, or one pixel, at most ten times again."""
+    chosen = settings(min_class_pixels=least, min_crop_ratio=ratio)
+    rare = count_rare_classes(dataset, "train", chosen)
     left: Iterator[int] = iter(pixels)
     seen = []
 

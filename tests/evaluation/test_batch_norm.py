@@ -22,7 +22,7 @@ from rgbt.evaluation.request import BatchNormRequest, EvaluationRequest
 from rgbt.evaluation.segmentation import evaluate
 from rgbt.requirements import Record
 from rgbt.spec.specify import specify
-from rgbt.types import Output
+from rgbt.types import Output, Sample
 from tests.commands import SPLITS, words_of
 
 
@@ -159,6 +159,36 @@ def test_statistics_that_cannot_be_computed_are_refused(session: Session) -> Non
     ):
         raise AssertionError
     assert torch.equal(session.model.norm.running_var, torch.ones(4))
+
+
+@pytest.mark.parametrize("kind", ["batch", "adabn"])
+def test_one_value_for_each_channel_is_refused(session: Session, kind: str) -> None:
+    """Of a batch of one image at night it would be normalised to 0, whatever the image."""
+    model = session.model
+    model.norm.register_forward_pre_hook(lambda _, inputs: (inputs[0].mean((2, 3), keepdim=True),))
+    with pytest.raises(InputError, match=r"norm gets one value .* set data\.eval_batch_size"):
+        evaluate(session, model, request(kind))
+    assert torch.equal(model.norm.running_mean, torch.zeros(4))
+    assert len(model.norm._forward_pre_hooks) == 1
+
+
+def test_unreadable_images_are_not_in_the_stated_number(
+    session: Session, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lost, read = TRAIN_NIGHTS[0], Days.read
+
+    def damaged(self: Days, name: str) -> Sample:
+        if name == lost:
+            raise InputError("damaged")
+        return read(self, name)
+
+    monkeypatch.setattr(Days, "read", damaged)
+    session = replace(session, loading=replace(session.loading, on_error="skip"))
+    wanted = request("adabn", "train")
+    result = evaluate(session, session.model, wanted)
+    assert result.skipped == (lost,)
+    words = statistics_in_words(session, wanted, result.skipped)
+    assert words.startswith("AdaBN, of 4 images by day and 3 images at night (train)")
 
 
 def test_options_make_the_request() -> None:

@@ -37,6 +37,19 @@ def test_value_and_gradient_by_hand() -> None:
     torch.testing.assert_close(features.grad, expected)
 
 
+def test_value_is_of_single_precision_and_of_the_cells_of_all_processes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """256 - 0.25 is rounded to 256 in bfloat16; the other process has three cells."""
+    features, initial = (
+        torch.full((1, 1, 1, 1), value, dtype=torch.bfloat16) for value in (256.0, 0.25)
+    )
+    cells = torch.ones(1, 1, 1, dtype=torch.bool)
+    assert feature_distance(features, initial, cells).item() == 255.75
+    monkeypatch.setattr("rgbt.losses.feature_distance.mean_count", lambda count: 2 * count)
+    assert feature_distance(features, initial, cells).item() == 255.75 / 2
+
+
 def test_without_a_thing_it_costs_nothing() -> None:
     features = torch.ones(1, 2, 2, 2, requires_grad=True)
     found = feature_distance(features, torch.zeros(1, 2, 2, 2), torch.zeros(1, 2, 2) > 0)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from rgbt.checks import InputError
 from rgbt.models.dinov2.encoder import Encoder
-from rgbt.models.dinov2.rotary import RotaryPositions
+from rgbt.models.dinov2.rotary import RotaryPositions, rotated
 from tests.models import test_dinov2_encoder as dinov2
 from tests.models.golden import network
 from tests.models.plain import count, normal
@@ -164,6 +164,12 @@ def test_rotation_by_hand() -> None:
     angles = torch.cat([angles, torch.zeros(4, 2)], 1).tile(2)
     torch.testing.assert_close(cos, angles.cos())
     torch.testing.assert_close(sin, angles.sin())
+
+
+def test_half_precision_is_rounded_after_the_rotation() -> None:
+    x = normal(1, 1, 4, 8).bfloat16()
+    rotation = RotaryPositions(8, 100.0)((3, 1), 1)
+    assert torch.equal(rotated(x, rotation), rotated(x.float(), rotation).bfloat16())
 
 
 def test_initial_tokens_are_drawn_as_in_the_release() -> None:

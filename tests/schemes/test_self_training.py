@@ -185,6 +185,22 @@ def test_feature_distance_is_that_to_the_start_on_things_of_the_source() -> None
     assert set(record_of(scheme).networks) == {"teacher"}
 
 
+def test_initial_network_sees_the_source_with_its_own_statistics() -> None:
+    model = network(False)
+    model.norm = torch.nn.BatchNorm2d(1)
+    scheme = scheme_of(model, domains=domains(False, labels="none"), **DISTANCE)
+    model.norm.running_mean.fill_(3.0)
+    seen: list[tuple[bool, float]] = []
+    model.register_forward_hook(
+        lambda *_: seen.append((model.norm.training, model.norm.running_mean.item()))
+    )
+    phase_of(scheme, batches())
+    calls = [(views, *norm) for (views, *_), norm in zip(model.calls, seen, strict=True)]
+    # The teacher has the statistics of its batch, the initial network those of the start.
+    assert calls[:2] == [(("thermal",), True, 3.0), (("rgb",), False, 0.0)]
+    assert set(seen[2:]) == {(True, 3.0)}
+
+
 def test_ignored_rows_leave_rows_for_pseudo_labels() -> None:
     scheme_of(network(False), ignored_top=0.5, ignored_bottom=0.4)
     with pytest.raises(InputError, match="their sum must be below 1"):

@@ -117,6 +117,20 @@ def test_copy_with_buffers_is_the_network_as_it_was() -> None:
     assert all(torch.equal(before[name], after[name]) for name in before)
 
 
+def test_tensor_with_two_names_is_exchanged_as_one() -> None:
+    network = nn.ModuleDict({"first": Net()})
+    network["second"] = network["first"]
+    copied = NetworkCopy(network, normalisation="running", buffers=True)
+    network["first"].weight.data.fill_(5.0)
+    network["first"].norm.running_mean.fill_(3.0)
+    for _ in range(2):
+        with copied.in_network():
+            assert network["second"].weight.item() == 2.0
+            assert network["second"].norm.running_mean.item() == 0.0
+        assert network["first"].weight.item() == 5.0
+        assert network["first"].norm.running_mean.item() == 3.0
+
+
 def test_an_error_leaves_the_network_as_it_was() -> None:
     network = Net()
     teacher = teacher_of(network)
