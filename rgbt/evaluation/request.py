@@ -126,8 +126,8 @@ class BatchNormRequest:
             )
         if kind == AS_TRAINED:
             return None
-        named = tuple(split_list(splits, "batch_norm_splits")) if splits else ()
-        return cls(kind=cast(Statistics, kind), splits=named)
+        named = dict.fromkeys(split_list(splits, "batch_norm_splits") if splits else ())
+        return cls(kind=cast(Statistics, kind), splits=tuple(named))
 
     @property
     def file_stem(self) -> str:

@@ -165,7 +165,7 @@ def test_options_make_the_request() -> None:
     made = BatchNormRequest.from_options
     assert made("as trained", "") is None
     assert made("batch", "") == BatchNormRequest(kind="batch")
-    found = made("adabn", "train_day,train_night")
+    found = made("adabn", "train_day,train_night,train_day")
     assert found == BatchNormRequest(kind="adabn", splits=("train_day", "train_night"))
     assert found.file_stem == "norm-adabn-train_day-train_night"
     for kind in ("as trained", "batch"):
