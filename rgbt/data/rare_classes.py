@@ -146,9 +146,8 @@ class RareClassExamples:
             InputError: no image of the class can be read.
         """
         drawn, positions = self.rare.draw(numpy_generator(self.seed, "rare class", *key))
-        sample = self.source.first_readable(
-            [self.source.names[each] for each in positions], skipped
-        )
+        names = [self.source.names[position] for position in positions]
+        sample = self.source.first_readable(names, skipped)
         rng = numpy_generator(self.seed, "augment", *key)
         example = self.make(sample, rng)
         for _ in range(MOST_REDRAWS if self.rare.min_crop_pixels else 0):

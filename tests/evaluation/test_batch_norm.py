@@ -17,6 +17,7 @@ from rgbt.checks import InputError
 from rgbt.config.compose import compose
 from rgbt.data.mfnet import MFNet
 from rgbt.evaluation.batch_norm import Part, normalised, parts_of_split, statistics_in_words
+from rgbt.evaluation.corruption_request import requested_corruption
 from rgbt.evaluation.prediction import Predictor
 from rgbt.evaluation.request import BatchNormRequest, EvaluationRequest
 from rgbt.evaluation.segmentation import evaluate
@@ -159,6 +160,13 @@ def test_statistics_that_cannot_be_computed_are_refused(session: Session) -> Non
     ):
         raise AssertionError
     assert torch.equal(session.model.norm.running_var, torch.ones(4))
+
+
+def test_earlier_frames_of_another_split_are_refused() -> None:
+    delayed = requested_corruption("delayed", "1", (), ())
+    assert replace(request("adabn", "test"), corruption=delayed).corruption == delayed
+    with pytest.raises(InputError, match="splits=train cannot be used with corruption=delayed"):
+        replace(request("adabn", "train"), corruption=delayed)
 
 
 def test_options_make_the_request() -> None:
