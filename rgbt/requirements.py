@@ -50,6 +50,14 @@ class Requirement:
         """The same of a part of the component at `node`; `setting` is then relative to that."""
         return replace(self, setting=f"{node}.{self.setting}")
 
+    @classmethod
+    def of_background(cls, setting: str) -> Requirement:
+        """Class 0 of the data set is its background, because of this setting."""
+        return cls(
+            *("dataset", "first_class", "background", setting),
+            advice="name class 0 in dataset.background if it is no object",
+        )
+
 
 @dataclass(frozen=True, kw_only=True)
 class Record:

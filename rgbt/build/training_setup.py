@@ -225,7 +225,8 @@ def _where_to_augment(session: Session) -> Literal["loader", "device"]:
     """What `LoaderSettings.augment` comes to on this device with this transform."""
     requested = session.loading.augment
     if requested == "auto":
-        can = record_of(session.transform).works_on_batches
+        redraws = session.loading.sampling == "rare_classes"  # crops, by their labels
+        can = record_of(session.transform).works_on_batches and not redraws
         return "device" if can and session.fabric.device.type == "cuda" else "loader"
     return requested
 

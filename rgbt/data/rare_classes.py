@@ -55,7 +55,7 @@ class RareClasses:
         classes: indices of the C classes that are drawn.
         names: their names.
         probabilities: (C,) float64, of each.
-        images: for each, places in the list of the split of the images that show enough of it.
+        images: for each, positions in the list of the split of the images that show enough of it.
         min_crop_pixels: a crop with as many pixels of its class or fewer is drawn again; None: no
             crop is.
     """
@@ -67,7 +67,7 @@ class RareClasses:
     min_crop_pixels: float | None
 
     def draw(self, rng: np.random.Generator) -> tuple[int, NDArray[np.int64]]:
-        """A class, and places of its images, of which the first is drawn and the others follow."""
+        """A class, and positions of its images: the drawn one, then the others in their order."""
         number = int(rng.choice(len(self.classes), p=self.probabilities))
         images = self.images[number]
         return self.classes[number], np.roll(images, -int(rng.integers(len(images))))
@@ -146,8 +146,9 @@ class RareClassExamples:
         Raises:
             InputError: no image of the class can be read.
         """
-        drawn, places = self.rare.draw(numpy_generator(self.seed, "rare class", *key))
-        sample = self.source.first_readable([self.source.names[each] for each in places], skipped)
+        drawn, positions = self.rare.draw(numpy_generator(self.seed, "rare class", *key))
+        names = [self.source.names[position] for position in positions]
+        sample = self.source.first_readable(names, skipped)
         rng = numpy_generator(self.seed, "augment", *key)
         example = self.make(sample, rng)
         least = self.rare.min_crop_pixels

@@ -11,6 +11,7 @@ from rgbt.build.load_run import TrainedNetwork, open_exported, open_trained
 from rgbt.checks import InputError, check_choice, split_list
 from rgbt.config.common_options import AS_TRAINED, NetworkOptions
 from rgbt.config.stored_config import parse_trust
+from rgbt.corruptions.corruption import OfTime
 from rgbt.data.domains import TestedHead
 from rgbt.data.label_map import LabelMap
 from rgbt.dataset import LabelledDataset
@@ -126,8 +127,8 @@ class BatchNormRequest:
             )
         if kind == AS_TRAINED:
             return None
-        named = tuple(split_list(splits, "batch_norm_splits")) if splits else ()
-        return cls(kind=cast(Statistics, kind), splits=named)
+        named = dict.fromkeys(split_list(splits, "batch_norm_splits") if splits else ())
+        return cls(kind=cast(Statistics, kind), splits=tuple(named))
 
     @property
     def file_stem(self) -> str:
@@ -157,6 +158,9 @@ class EvaluationRequest:
         keep: names of the images that are returned for pictures.
         details: what else is counted, see `rgbt.metrics.details`.
         batch_norm: statistics of batch normalisation; None: those of the training.
+
+    Raises:
+        InputError: statistics of other splits under a corruption of time.
     """
 
     split: str
@@ -166,6 +170,18 @@ class EvaluationRequest:
     keep: Collection[str] = ()
     details: tuple[Details, ...] = ()
     batch_norm: BatchNormRequest | None = None
+
+    def __post_init__(self) -> None:
+        splits = () if self.batch_norm is None else self.batch_norm.splits
+        corruption = self.corruption
+        if corruption is None or not isinstance(corruption.corruption, OfTime):
+            return
+        if set(splits) - {self.split}:
+            raise InputError(
+                f"batch_norm_splits={','.join(splits)} cannot be used with "
+                f"corruption={corruption.name}, which shows earlier frames of '{self.split}'; "
+                "omit batch_norm_splits, or choose another corruption."
+            )
 
     @classmethod
     def from_options(

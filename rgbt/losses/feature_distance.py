@@ -93,7 +93,7 @@ class FeatureDistance:
             Requirement("model", "features", True, setting),
             Requirement(
                 *("model.weights", "pretrained", True, setting),
-                advice="name a file of weights with pretrained=FILE",
+                advice="name a file of weights with pretrained=FILE or model.weights=FILE",
             ),
         )
 

@@ -68,7 +68,7 @@ class TemporalLoss:
         """
         own = [Requirement("scheme", "frames", 2)]
         if self.form == "released" and (self.alpha or self.second in ("dice", "con_acc")):
-            own += [Requirement("dataset", "first_class", "background", "loss.form=released")]
+            own += [Requirement.of_background("loss.form=released")]
         compares = self.second in ("con", "con_acc")
         return Record(
             requires=(*record_of(self.segmentation).requires, *own),

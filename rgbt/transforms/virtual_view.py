@@ -90,7 +90,7 @@ class VirtualView:
     @property
     def record(self) -> Record:
         """Its camera; class 0 is painted where nothing is seen, if that is the background."""
-        painted = Requirement("dataset", "first_class", "background", "view.outside=background")
+        painted = Requirement.of_background("view.outside=background")
         return Record(
             requires=() if self.outside == "ignore" else (painted,),
             camera=self.camera,

@@ -86,8 +86,8 @@ def _check_column(column: Column, table: Table, before: Sequence[Column], where:
             )
     if column.batch_norm_splits and column.batch_norm in ("as trained", "batch"):
         raise InputError(
-            f"{where}: 'batch_norm_splits' needs batch_norm: adabn or recomputed; add it, or "
-            "remove it."
+            f"{where}: 'batch_norm_splits' needs batch_norm: adabn or recomputed; add that, or "
+            "remove batch_norm_splits."
         )
     if column.corruption is None and column.severity is not None:
         raise InputError(

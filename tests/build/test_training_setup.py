@@ -269,9 +269,9 @@ def test_all_that_is_read_is_decoded_before_the_first_step(
     assert torch.equal(other.to("cpu").rgb, one.to("cpu").rgb)
 
 
-def where(requested: str, device: str, transform: object) -> str:
+def where(requested: str, device: str, transform: object, sampling: str = "shuffled") -> str:
     session: Any = SimpleNamespace(
-        loading=SimpleNamespace(augment=requested),
+        loading=SimpleNamespace(augment=requested, sampling=sampling),
         transform=transform,
         fabric=SimpleNamespace(device=torch.device(device)),
     )
@@ -285,6 +285,7 @@ def test_where_batches_are_augmented() -> None:
         assert where("auto", device, object()) == "loader"
         assert where("device", device, able) == "device", "as requested"
         assert where("loader", device, able) == "loader"
+        assert where("auto", device, able, "rare_classes") == "loader", "which draws crops again"
 
 
 def test_network_settings_are_applied_and_keep_the_loss(composed: Composed) -> None:

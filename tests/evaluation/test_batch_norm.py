@@ -17,6 +17,7 @@ from rgbt.checks import InputError
 from rgbt.config.compose import compose
 from rgbt.data.mfnet import MFNet
 from rgbt.evaluation.batch_norm import Part, normalised, parts_of_split, statistics_in_words
+from rgbt.evaluation.corruption_request import requested_corruption
 from rgbt.evaluation.prediction import Predictor
 from rgbt.evaluation.request import BatchNormRequest, EvaluationRequest
 from rgbt.evaluation.segmentation import evaluate
@@ -191,11 +192,18 @@ def test_unreadable_images_are_not_in_the_stated_number(
     assert words.startswith("AdaBN, of 4 images by day and 3 images at night (train)")
 
 
+def test_earlier_frames_of_another_split_are_refused() -> None:
+    delayed = requested_corruption("delayed", "1", (), ())
+    assert replace(request("adabn", "test"), corruption=delayed).corruption == delayed
+    with pytest.raises(InputError, match="splits=train cannot be used with corruption=delayed"):
+        replace(request("adabn", "train"), corruption=delayed)
+
+
 def test_options_make_the_request() -> None:
     made = BatchNormRequest.from_options
     assert made("as trained", "") is None
     assert made("batch", "") == BatchNormRequest(kind="batch")
-    found = made("adabn", "train_day,train_night")
+    found = made("adabn", "train_day,train_night,train_day")
     assert found == BatchNormRequest(kind="adabn", splits=("train_day", "train_night"))
     assert found.file_stem == "norm-adabn-train_day-train_night"
     for kind in ("as trained", "batch"):

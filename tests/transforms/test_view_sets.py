@@ -151,6 +151,7 @@ def test_unknown_sets_are_named(tmp_path: Path) -> None:
 def test_views_that_paint_the_background_require_class_0_to_be_that() -> None:
     (required,) = sets("released_1").record.requires
     assert (required.node, required.setting) == ("dataset", "consistency.view.outside=background")
+    assert "dataset.background" in required.advice
     assert required.is_met_by(Record(first_class="background"))
     assert not required.is_met_by(Record(first_class="object"))
     assert not sets().record.requires

@@ -143,7 +143,10 @@ class Checkout:
         return found
 
     def _stubs(self) -> dict[str, ModuleType]:
-        """Stand-ins of the packages that are not installed, with the packages that they lie in."""
+        """Stand-ins of modules that are not installed, with the packages that they lie in.
+
+        Packages of the checkout stay its own, also where a stub lies in them.
+        """
         found: dict[str, ModuleType] = {}
         for name, attributes in self.stubs:
             if _is_installed(name):
@@ -151,7 +154,8 @@ class Checkout:
             parts = name.split(".")
             for length in range(1, len(parts) + 1):
                 package = ".".join(parts[:length])
-                if package not in found and not _is_installed(package):
+                own = package != name and self.folder.joinpath(*parts[:length]).is_dir()
+                if package not in found and not own and not _is_installed(package):
                     found[package] = _Stub(package)
             for attribute, target in attributes:
                 setattr(found[name], attribute, _object(target))

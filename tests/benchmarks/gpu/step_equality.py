@@ -32,6 +32,7 @@ FIRST = (
     *("temporal_con", "temporal_con_acc", "temporal_dice", "temporal_con_released"),
     *("rtfnet_temporal_con", "sh_source", "sh_max_squares", "sh_both", "sh_adversarial"),
     *("heatnet", "multi_head_night", "multi_head_modified_night", "multi_head_modified_thermal"),
+    *("self_training_night", "cmnext", "dinov2", "rgb_teacher_semseg"),
 )
 """Experiments that cover every scheme, loss and network; the others follow as time allows."""
 

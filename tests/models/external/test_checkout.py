@@ -110,6 +110,17 @@ def test_a_stub_replaces_a_module_that_an_installed_package_lacks(tmp_path: Path
     assert "numpy.lib.gone" not in sys.modules
 
 
+@pytest.mark.parametrize("empty", [(), ("model",)])
+def test_a_stub_inside_the_checkout_keeps_its_package(
+    tmp_path: Path, empty: tuple[str, ...]
+) -> None:
+    code = "import model.ops.compiled\nfrom model.ops.size import SIZE\nassert SIZE == 2\n"
+    files = {"model/net.py": code + STACKED, "model/ops/size.py": "SIZE = 2"}
+    stubs = {"model.ops.compiled": {}}
+    external(write_checkout(tmp_path, files), stubs=stubs, empty_packages=empty)
+    assert not any(name.partition(".")[0] == "model" for name in sys.modules)
+
+
 def test_prints_and_log_handlers_are_dropped(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
