@@ -117,7 +117,7 @@ OTHERS: dict[str, tuple[Callable[[Tensors], Tensors], int]] = {
 """Form -> how it is made, and how many entries of the encoder it does not hold."""
 
 
-def stored(folder: Path, tensors: Tensors) -> Path:
+def written(folder: Path, tensors: Tensors) -> Path:
     """A file of safetensors, as both programs publish."""
     save_file({name: value.contiguous() for name, value in tensors.items()}, folder / "file.st")
     return folder / "file.st"
@@ -130,7 +130,7 @@ def test_every_form_gives_equal_outputs(tmp_path: Path, form: str, mlp: str) -> 
     tensors, (made, absent) = small_file(mlp), OTHERS[form]
     first, second = small(mlp), small(mlp)
     report = load_weights(first, saved(tmp_path, tensors))
-    other = load_weights(second, stored(tmp_path, made(tensors)))
+    other = load_weights(second, written(tmp_path, made(tensors)))
     assert report.facts.what == "DINOv3 vision transformer"
     assert other.facts.what == f"DINOv3 vision transformer of {form}"
     assert report.num_set - other.num_set == absent
@@ -148,7 +148,7 @@ def test_every_form_gives_equal_outputs(tmp_path: Path, form: str, mlp: str) -> 
 
 def test_a_file_of_timm_without_biases_sets_them_to_0(tmp_path: Path) -> None:
     net = small()
-    load_weights(net, stored(tmp_path, as_timm(small_file(), bias=False)))
+    load_weights(net, written(tmp_path, as_timm(small_file(), bias=False)))
     assert not any(block.attn.qkv.bias.any() for block in net.backbone.encoder.blocks)
 
 
@@ -178,7 +178,7 @@ def test_files_are_read_strictly(tmp_path: Path, form: Any, lost: str) -> None:
         tensors["blocks.2.ls2.gamma"] = torch.ones(16)
     before = {name: value.clone() for name, value in net.state_dict().items()}
     with pytest.raises(InputError, match="does not fit this network"):
-        load_weights(net, stored(tmp_path, tensors))
+        load_weights(net, written(tmp_path, tensors))
     assert all(torch.equal(value, before[name]) for name, value in net.state_dict().items())
 
 
@@ -187,13 +187,13 @@ def test_an_added_bias_of_keys_is_refused(tmp_path: Path) -> None:
     tensors = as_hugging_face(small_file())
     tensors["layer.0.attention.k_proj.bias"] = torch.ones(16)
     with pytest.raises(InputError, match="1 entry of the file unknown to the network"):
-        load_weights(small(), stored(tmp_path, tensors))
+        load_weights(small(), written(tmp_path, tensors))
 
 
 @pytest.mark.parametrize("form", [dict, as_hugging_face, as_timm])
 def test_a_file_of_the_other_generation_is_one_sentence(tmp_path: Path, form: Any) -> None:
     with pytest.raises(InputError) as error:
-        load_weights(dinov2.small(), stored(tmp_path, form(small_file())))
+        load_weights(dinov2.small(), written(tmp_path, form(small_file())))
     text = sentence(error)
     assert "a file of DINOv3, while the encoder of this network is one of DINOv2" in text
 
@@ -201,7 +201,7 @@ def test_a_file_of_the_other_generation_is_one_sentence(tmp_path: Path, form: An
 @pytest.mark.parametrize("form", [dict, dinov2.as_timm])
 def test_a_file_of_dinov2_is_one_sentence(tmp_path: Path, form: Any) -> None:
     with pytest.raises(InputError) as error:
-        load_weights(small(), stored(tmp_path, form(dinov2.small_file(4))))
+        load_weights(small(), written(tmp_path, form(dinov2.small_file(4))))
     text = sentence(error)
     assert "a file of DINOv2, while the encoder of this network is one of DINOv3" in text
 

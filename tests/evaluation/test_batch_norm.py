@@ -192,7 +192,7 @@ def test_unreadable_images_are_not_in_the_stated_number(
     assert words.startswith("AdaBN, of 4 images by day and 3 images at night (train)")
 
 
-def test_earlier_frames_of_another_split_are_refused() -> None:
+def test_frames_before_those_of_another_split_are_refused() -> None:
     delayed = requested_corruption("delayed", "1", (), ())
     assert replace(request("adabn", "test"), corruption=delayed).corruption == delayed
     with pytest.raises(InputError, match="splits=train cannot be used with corruption=delayed"):

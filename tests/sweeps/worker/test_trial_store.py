@@ -255,20 +255,20 @@ def test_ask_at_once_for_a_point_requeued_twice_keeps_one(monkeypatch: pytest.Mo
     a.release(number, "gone", requeue=True)
     a.study.enqueue_trial({"x": x}, user_attrs={names.KEY: f"x={x}", names.REPLACES: number})
     by_key, drop = a.by_key, b.drop
-    seen, asked = [], []
+    seen, answers = [], []
 
-    def drop_after_a_looked(*arguments: Any) -> None:
+    def drop_after_a(*arguments: Any) -> None:
         seen.append(by_key())
         drop(*arguments)
 
-    def look_when_b_has_asked() -> Any:
-        asked.append(b.ask(1))
+    def look_after_b() -> Any:
+        answers.append(b.ask(1))
         return seen.pop()
 
-    monkeypatch.setattr(b, "drop", drop_after_a_looked)
-    monkeypatch.setattr(a, "by_key", look_when_b_has_asked)
-    asked.append(a.ask(1))
-    assert [trial is None for trial in asked].count(False) == 1, "the point was lost"
+    monkeypatch.setattr(b, "drop", drop_after_a)
+    monkeypatch.setattr(a, "by_key", look_after_b)
+    answers.append(a.ask(1))
+    assert [trial is None for trial in answers].count(False) == 1, "the point was lost"
     assert states(a) == ["RUNNING"]
 
 
@@ -278,15 +278,15 @@ def test_release_keeps_point_that_another_driver_takes_before_the_drop(
     storage = memory()
     number, x = taken(searching(storage, GONE), 1)
     slow, fast = searching(storage), searching(storage)
-    drop, asked = slow.drop, []
+    drop, answers = slow.drop, []
 
     def ask_first(*arguments: Any) -> None:
-        asked.append(fast.ask(1))
+        answers.append(fast.ask(1))
         drop(*arguments)
 
     monkeypatch.setattr(slow, "drop", ask_first)
     slow.release(number, "its driver had ended", requeue=True)
-    (again,) = asked
+    (again,) = answers
     assert again is not None, "the point was lost"
     assert again.suggest_float("x", 0, 1) == x
     assert states(slow) == ["RUNNING"]
