@@ -15,6 +15,7 @@ import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
+from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
@@ -24,7 +25,12 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode, return_and_correct_aliasing
 from torch.utils._pytree import tree_leaves, tree_map
 
+import rgbt
+
 DEVICE = torch.device("meta")
+
+PACKAGE = Path(rgbt.__file__).parent
+"""The code that is measured: not the tests, also where the repository is in a folder `rgbt`."""
 
 READS = ("_local_scalar_dense", "equal", "is_nonzero")
 """Operations that give the host a number."""
@@ -184,8 +190,9 @@ class _Operations(TorchDispatchMode):
 def line_of_ours() -> str:
     """File, line and function of the last frame in our code."""
     for frame in reversed(traceback.extract_stack()):
-        if "/rgbt/" in frame.filename and "site-packages" not in frame.filename:
-            return f"{frame.filename[frame.filename.rindex('rgbt/') :]}:{frame.lineno} {frame.name}"
+        path = Path(frame.filename)
+        if path.is_relative_to(PACKAGE):
+            return f"{path.relative_to(PACKAGE.parent)}:{frame.lineno} {frame.name}"
     return "elsewhere"
 
 

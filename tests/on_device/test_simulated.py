@@ -9,7 +9,13 @@ import pytest
 import torch
 
 from rgbt.config.compose import available
-from tests.on_device.simulated import DEVICE, DeviceMismatchError, Placed, simulation
+from tests.on_device.simulated import (
+    DEVICE,
+    DeviceMismatchError,
+    Placed,
+    line_of_ours,
+    simulation,
+)
 from tests.on_device.simulated_run import on_cpu, simulated, words_of
 
 SOME = ("crm", "temporal_con", "sh_adversarial")
@@ -60,6 +66,11 @@ def test_random_numbers_need_a_generator_of_the_device() -> None:
         drawn = torch.rand(4, generator=generator, device=generator.device)
         assert isinstance(drawn, Placed)
         assert drawn.tolist() == torch.rand(4, generator=torch.Generator().manual_seed(3)).tolist()
+
+
+def test_lines_of_tests_are_not_ours() -> None:
+    """Also in a clone whose folder is called rgbt."""
+    assert line_of_ours() == "elsewhere"
 
 
 @pytest.mark.parametrize(
