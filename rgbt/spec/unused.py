@@ -22,7 +22,6 @@ def unused_sentences(config: DictConfig, overrides: Sequence[str]) -> Iterator[s
         config: as composed, with its references to other settings.
         overrides: as typed.
     """
-    written = str(OmegaConf.to_container(config))
     for word in overrides:
         key = word.lstrip("+").partition("=")[0]
         node, _, setting = key.partition(".")
@@ -33,8 +32,13 @@ def unused_sentences(config: DictConfig, overrides: Sequence[str]) -> Iterator[s
                 f"{word} has no effect with {node}.{needed[0]}={found}; set "
                 f"{node}.{needed[0]}={needed[1]}, or omit it."
             )
-        elif node == "recipe" and setting and key not in OF_CODE and f"{{{key}}}" not in written:
+        elif node == "recipe" and setting and not _is_read(config, key):
             yield (
                 f"{word} has no effect at scale={config.scale.name}, which does not read {key}; "
                 "set a value of the scale, such as scale.lr=..., or omit it."
             )
+
+
+def _is_read(config: DictConfig, key: str) -> bool:
+    """Whether code or another setting reads a setting of the recipe."""
+    return key in OF_CODE or f"{{{key}}}" in str(OmegaConf.to_container(config))
