@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from analysis.uncertainty import Comparison, Interval, Resampling
     from rgbt.metrics.counts import Counts
     from rgbt.metrics.metric import Absent
-    from rgbt.tracking.tables import TextTable
+    from rgbt.tables import TextTable
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def main(options: Options, overrides: list[str]) -> int:
     from analysis.uncertainty.sentence import sentence
     from rgbt.files.atomic import write_atomic
     from rgbt.metrics.named import parse
-    from rgbt.tracking.terminal import path_lines, print_rich, rich_table
+    from rgbt.terminal import path_lines, print_rich, rich_table
 
     del overrides  # none takes effect
     check_out(options.out)
@@ -173,7 +173,7 @@ def metrics_of(text: str, every: Sequence[Counts], settings: Resampling) -> list
 
 def comparison_grid(comparison: Comparison, labels: Sequence[str]) -> TextTable:
     """One line per score."""
-    from rgbt.tracking.tables import TextTable, number
+    from rgbt.tables import TextTable, number
 
     with_seeds = any(difference.both is not None for difference in comparison.differences)
     level = f"{100 * comparison.level:g} %"
@@ -245,7 +245,7 @@ def _counts(
     opened: Sequence[tuple[NamedCounts, ...]], missing: str
 ) -> tuple[list[Counts], list[Counts]]:
     from analysis.uncertainty.same_images import common
-    from rgbt.tracking.terminal import info
+    from rgbt.terminal import info
 
     methods = [[named.counts for named in each] for each in opened]
     shared = {each.path for each in opened[0]} & {each.path for each in opened[1]}
@@ -283,7 +283,7 @@ def _p(value: float) -> str:
 
 def comparison_csv(comparison: Comparison) -> str:
     """One line per score with all digits; empty where there is no value."""
-    from rgbt.tracking.csv_files import csv_text
+    from rgbt.tables import csv_text
 
     ends = ("images_low", "images_high", "p_images", "both_low", "both_high", "p_both", "p_holm")
     rows: list[tuple[object, ...]] = []

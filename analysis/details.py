@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from analysis.uncertainty import Estimate, Resampling
     from rgbt.metrics.counts import Counts
     from rgbt.metrics.score_grid import ScoreGrid
-    from rgbt.tracking.tables import TextTable
+    from rgbt.tables import TextTable
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def main(options: Options, overrides: list[str]) -> int:
     from analysis.results import label_of, open_counts
     from analysis.uncertainty import Resampling
     from rgbt.files.atomic import write_atomic
-    from rgbt.tracking.terminal import path_lines, print_rich, rich_table
+    from rgbt.terminal import path_lines, print_rich, rich_table
 
     del overrides  # none takes effect
     check_out(options.out)
@@ -125,7 +125,7 @@ def table_of(key: DetailKey, counts: Sequence[Counts], settings: Resampling) -> 
 
 def text_tables(tables: Sequence[DetailTable], label: str) -> Iterator[TextTable]:
     """The tables as text; those of single frames have one row for each input and come first."""
-    from rgbt.tracking.tables import TextTable
+    from rgbt.tables import TextTable
 
     plain: dict[str, list[DetailTable]] = {}
     for table in tables:
@@ -145,7 +145,7 @@ def text_tables(tables: Sequence[DetailTable], label: str) -> Iterator[TextTable
 
 def details_csv(tables: Sequence[DetailTable]) -> str:
     """One line per score with all digits; empty where there is no value."""
-    from rgbt.tracking.csv_files import csv_text
+    from rgbt.tables import csv_text
 
     header = ("regions", "details", "input", "metric", "value", "sd", "seeds", "low", "high")
     rows: list[tuple[object, ...]] = [header]
@@ -161,7 +161,7 @@ def details_csv(tables: Sequence[DetailTable]) -> str:
 
 
 def _cells(table: DetailTable, metrics: Sequence[str]) -> list[str]:
-    from rgbt.tracking.tables import number
+    from rgbt.tables import number
 
     cells = []
     for metric in metrics:

@@ -19,7 +19,7 @@ from rgbt.config.plain_command import PlainCommand
 if TYPE_CHECKING:
     from analysis.uncertainty import Comparison, Difference, Resampling
     from rgbt.metrics.counts import Counts
-    from rgbt.tracking.tables import TextTable
+    from rgbt.tables import TextTable
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class MeasuredFlow:
         label: name of the folder.
         exact: counts along the exact flow.
         estimated: counts of the same pairs along the estimated flow.
-        records: one line for each pair (`rgbt.evaluation.flow_record`).
+        records: one line for each pair (`rgbt.evaluation.pair_frames`).
     """
 
     label: str
@@ -59,7 +59,7 @@ class MeasuredFlow:
 def main(options: Options, overrides: list[str]) -> int:
     """Compare TC, CA and warping error along an estimated and along the exact flow."""
     from analysis.uncertainty import Resampling
-    from rgbt.tracking.terminal import print_rich, rich_table
+    from rgbt.terminal import print_rich, rich_table
 
     del overrides  # none takes effect
     if not options.folder:
@@ -83,7 +83,7 @@ def read_measured(folder: Path, split: str) -> MeasuredFlow:
         InputError: the folder lacks one of the files, or has those of several flows.
     """
     from rgbt.metrics.counts import Counts
-    from rgbt.tracking.csv_files import read_csv
+    from rgbt.tables import read_csv
 
     found = sorted(folder.glob(f"consistency_flow-*_{split}.npz"))
     if len(found) != 1:
@@ -118,7 +118,7 @@ def compare_flows(measured: MeasuredFlow, settings: Resampling) -> Comparison:
 
 def difference_table(measured: MeasuredFlow, comparison: Comparison) -> TextTable:
     """One line for each score."""
-    from rgbt.tracking.tables import TextTable
+    from rgbt.tables import TextTable
 
     rows = tuple(_row(each) for each in comparison.differences)
     title = f"{measured.label}: scores along two flows, {len(measured.exact.names)} pairs (percent)"
@@ -134,7 +134,7 @@ def _row(found: Difference) -> tuple[str, ...]:
 
 def record_table(measured: MeasuredFlow) -> TextTable:
     """Means over scenes: pixels used, error of the flow, its length."""
-    from rgbt.tracking.tables import TextTable
+    from rgbt.tables import TextTable
 
     header = ("scenes", "pixels used, %", "of these hidden, %", "error, px", "displacement, px")
     return TextTable("The estimated flow", header, tuple(_means(measured)))

@@ -13,11 +13,9 @@ import numpy as np
 from rgbt.checks import InputError, nearest, split_list
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import file_name, protocol_of
-from rgbt.spec.naming import GROUP, group_of
-from rgbt.tracking.run_files import Description
-from rgbt.tracking.run_folder import find_run, runs_in
-from rgbt.tracking.run_result import RunResult
-from rgbt.tracking.terminal import info
+from rgbt.runs.folder import GROUP, Description, counts_name, find_run, runs_in
+from rgbt.runs.result import RunResult
+from rgbt.terminal import info
 
 SEED = "rgbt.seed"
 
@@ -118,7 +116,7 @@ def _check_trainings_differ(text: str, found: Sequence[NamedCounts]) -> None:
 def groups_in(runs_dir: Path | str) -> list[str]:
     """Names of all groups with finished runs in a folder."""
     runs = [run for run in _runs(Path(runs_dir)) if run.is_finished]
-    return sorted({_groups(_description(run))[0] for run in runs} - {""})
+    return sorted({_description(run).tags.get(GROUP, "") for run in runs} - {""})
 
 
 def label_of(counts: Sequence[NamedCounts]) -> str:
@@ -179,7 +177,7 @@ def _of_file(path: Path) -> NamedCounts:
 
 def _of_group(word: str, runs_dir: Path) -> list[RunResult]:
     runs = _runs(runs_dir) if word else []  # "" is no group, but that of runs without one
-    return [run for run in runs if word in _groups(_description(run)) and run.is_finished]
+    return [r for r in runs if word == _description(r).tags.get(GROUP) and r.is_finished]
 
 
 def _runs(runs_dir: Path) -> list[RunResult]:
@@ -188,7 +186,7 @@ def _runs(runs_dir: Path) -> list[RunResult]:
 
 def _of_run(run: RunResult, split: str, frames: Frames) -> NamedCounts:
     split = split or "test"
-    path = run.folder / file_name(frames, split) if frames else run.counts_path(split)
+    path = run.folder / file_name(frames, split) if frames else run.folder / counts_name(split)
     if frames and not path.is_file():
         views = {"next": "next", "flow": "video", "triples": "video"}.get(frames, "virtual")
         raise InputError(
@@ -201,18 +199,12 @@ def _of_run(run: RunResult, split: str, frames: Frames) -> NamedCounts:
     description = _description(run)
     seed = description.tags.get(SEED, "")
     return NamedCounts(
-        label=_groups(description)[0] or run.key,
+        label=description.tags.get(GROUP) or run.key,
         path=path,
-        counts=Counts.load(path) if frames else run.counts_of(split),
+        counts=Counts.load(path) if frames else run.counts(split),
         run=run,
         seed=int(seed) if seed else None,
     )
-
-
-def _groups(description: Description) -> tuple[str, str]:
-    """The run's group as it is written now, and as the run wrote it: commands may name either."""
-    tags = description.tags
-    return group_of(tags, description.params), tags.get(GROUP, "")
 
 
 def _description(run: RunResult) -> Description:

@@ -11,7 +11,7 @@ from analysis.results import RUNS, NamedCounts, open_counts
 from rgbt.checks import InputError, nearest, split_list
 from rgbt.files.budgets import read_json
 from rgbt.metrics.counts import Counts
-from rgbt.spec.corruption_names import row_name
+from rgbt.runs.naming import row_name
 
 FOLDER = Path("evaluations") / "robustness"
 FORMAT = "rgbt robustness 1"

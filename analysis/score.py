@@ -181,7 +181,7 @@ def score_tables(
 
 def write_counts(scored: FolderScores, out: Path) -> None:
     """Write ``counts_<partition>.npz`` of each partition, and ``maps.npz`` where there is one."""
-    from rgbt.tracking.terminal import info
+    from rgbt.terminal import info
 
     out.mkdir(parents=True, exist_ok=True)
     # The predictions may be other ones than at the last time: earlier counts and maps would pass
@@ -216,7 +216,7 @@ def _show(tables: Sequence[ScoreTable], remarks: list[str], out: Path | None) ->
 
     from analysis.predictions.text import convention_line, grids, markdown, tidy_csv
     from rgbt.files.atomic import write_atomic
-    from rgbt.tracking.terminal import path_lines, print_rich, rich_table
+    from rgbt.terminal import path_lines, print_rich, rich_table
 
     places = []
     if out is not None:
@@ -263,7 +263,7 @@ def _scored(options: Options, overrides: list[str]) -> FolderScores:
 
 def _score_counts(options: Options, overrides: list[str]) -> list[tuple[str, Counts]]:
     from analysis.results import open_counts
-    from rgbt.tracking.terminal import info
+    from rgbt.terminal import info
 
     default = Options()
     without_effect = [key for key in OF_A_FOLDER if getattr(options, key) != getattr(default, key)]

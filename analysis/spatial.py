@@ -24,7 +24,7 @@ if TYPE_CHECKING:  # --help answers without waiting for torch and OpenCV
     from analysis.statistics.data import SpatialStatistics
     from analysis.statistics.judging import Claim
     from rgbt.metrics.metric import Regions
-    from rgbt.tracking.tables import TextTable
+    from rgbt.tables import TextTable
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ def main(options: Options, overrides: list[str]) -> int:
     from analysis.statistics.comparison import Resampling, comparison_grids
     from analysis.statistics.data import SpatialStatistics
     from analysis.statistics.derive import no_background
-    from rgbt.tracking.terminal import info, path_lines, print_rich, rich_table
+    from rgbt.terminal import info, path_lines, print_rich, rich_table
 
     check_out(options.out)
     level, split = options.level, options.split

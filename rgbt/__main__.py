@@ -1,18 +1,18 @@
 """The command ``rgbt``, also ``python -m rgbt``: ``rgbt evaluate run=...``.
 
 ``rgbt NAME ...`` is ``python -m MODULE ...`` (`rgbt.config.plain_command`), except that the
-folders of PYTHONPATH and the working directory are searched for modules last.
+working directory is searched for modules last.
 """
 
 from __future__ import annotations
 
 import runpy
 import sys
+from pathlib import Path
 
 import rgbt
 from rgbt.checks import nearest
-from rgbt.config.plain_command import COMMANDS, exit_code, say
-from rgbt.config.shadowing import search_user_folders_last
+from rgbt.config.plain_command import COMMANDS, say
 
 HELP = """A lab for RGB-thermal semantic segmentation.
 
@@ -22,14 +22,13 @@ usage: rgbt COMMAND [key=value ...]
 
 rgbt COMMAND --help shows its options. Start with: rgbt run +experiment=grbm
 rgbt --version shows the version.
-Completion of the command line: rgbt --completion bash (zsh, fish).
 """
 
 
 def main() -> None:
     """Run the command that the first word names; leaves by ``sys.exit``."""
     name, *words = sys.argv[1:] or ["--help"]
-    search_user_folders_last()
+    sys.path.append(str(Path.cwd()))  # a user's own maskers; searched last
     code = 0
     if name in COMMANDS:
         sys.argv[1:] = words
@@ -38,11 +37,6 @@ def main() -> None:
         sys.stdout.write(help_text())
     elif name in ("-V", "--version"):
         sys.stdout.write(f"rgbt {rgbt.__version__}\n")
-    elif name in ("--completion", "--complete"):
-        from rgbt.config.completion import print_candidates, print_script
-
-        answer = print_script if name == "--completion" else print_candidates
-        code = exit_code(lambda: answer(words))
     else:
         code = say(f"'{name}' is not a command; {nearest(name, COMMANDS)}.", 2)
     sys.exit(code)

@@ -8,18 +8,12 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:  # the command line answers --help without waiting for torch
+if TYPE_CHECKING:  # --help does not wait for torch
     from torch import Tensor
 
 
-EXTENDING = "see docs/how-to/add-other-components.md"
-
-
 class InputError(ValueError):
-    """A mistake of the user: a message without a traceback, exit code 2.
-
-    The message says what is wrong, where, what was expected, and what to do.
-    """
+    """A mistake of the user: a message without a traceback, exit code 2."""
 
 
 class RunError(RuntimeError):
@@ -33,8 +27,7 @@ def without_controls(text: str) -> str:
 
 def one_line(text: object) -> str:
     """`text` in one line without control characters, at most 200 characters long."""
-    words = " ".join(str(text).split())
-    plain = without_controls(words).rstrip(".")
+    plain = without_controls(" ".join(str(text).split())).rstrip(".")
     return plain if len(plain) <= 200 else f"{plain[:197]}..."
 
 
@@ -47,23 +40,12 @@ def nearest(word: str, known: Iterable[str]) -> str:
 
 
 def split_list(text: str, what: str) -> list[str]:
-    """The entries of a list as people type it: "a,b", "[a, b]", also one entry alone.
+    """The entries of a list as people type it: "a,b", "[a, b]", "[crm, grbm sizes=[240,480]]".
 
-    Examples:
-        >>> split_list("[crm, grbm sizes=[240,480]]", "runs")
-        ['crm', 'grbm sizes=[240,480]']
-
-    Args:
-        text: entries with commas between them, in brackets or not; commas within further brackets
-            belong to an entry.
-        what: the entries are, for the message.
-
-    Raises:
-        InputError: an entry is empty.
+    InputError names `what` the entries are, where one is empty.
     """
     whole = re.fullmatch(r"\s*\[((?:[^\[\]]|\[[^\[\]]*\])*)\]\s*", text)
-    inner = whole[1] if whole else text
-    words = [word.strip() for word in re.split(r",(?![^\[]*\])", inner)]
+    words = [word.strip() for word in re.split(r",(?![^\[]*\])", whole[1] if whole else text)]
     if not all(words):
         raise InputError(f"'{text}': expected {what}, separated by commas.")
     return words
@@ -77,37 +59,19 @@ def check_range(name: str, value: float, low: float, high: float) -> None:
 
 def check_choice(name: str, value: str, known: Iterable[str]) -> None:
     """Raise InputError unless `value` is one of `known`; names the nearest one."""
-    names = list(known)
-    if value not in names:
+    if value not in (names := list(known)):
         raise InputError(f"{name}: '{value}' is not a valid choice; {nearest(value, names)}.")
 
 
 def not_finite(tensors: Mapping[str, Tensor]) -> list[str]:
     """Names of the tensors that hold NaN or infinity, in their order."""
-    # The sums first, all before any is waited for: a sum is fast, and not finite if a part is not.
+    # All sums before any is waited for: a sum is fast, and not finite if a part is not.
     sums = {name: tensor.sum().isfinite() for name, tensor in tensors.items()}
     return [name for name, each in sums.items() if not each and not tensors[name].isfinite().all()]
 
 
 def check_shape(name: str, tensor: Tensor, letters: str, **sizes: int) -> dict[str, int]:
-    """Sizes of `tensor` by letter, raising where rank or a known size differs.
-
-    Examples:
-        >>> check_shape("label", torch.zeros(2, 4, 6), "B H W", B=2)["W"]
-        6
-
-    Args:
-        name: what the tensor is called in the message.
-        tensor: any tensor.
-        letters: space-separated, one per dimension, e.g. "B H W".
-        sizes: sizes that are already fixed, by letter.
-
-    Returns:
-        letter -> size.
-
-    Raises:
-        ValueError: expected and actual shape, when they differ.
-    """
+    """Sizes by letter: ``check_shape("label", label, "B H W", B=2)["W"]``; ValueError if other."""
     names = letters.split()
     found = dict(zip(names, tensor.shape, strict=False))
     expected = {letter: sizes.get(letter, found.get(letter, -1)) for letter in names}
@@ -120,47 +84,28 @@ def check_shape(name: str, tensor: Tensor, letters: str, **sizes: int) -> dict[s
 def check_members(
     key: str, part: object, attributes: Iterable[str], calls: Mapping[str, Sequence[str]]
 ) -> None:
-    """Refuse a user's component that lacks a member that rgbt uses.
+    """Refuse a user's component, of the node `key`, that lacks a member that rgbt uses.
 
-    Args:
-        key: node of the configuration that names it, for the message.
-        part: any object.
-        attributes: names that it must have.
-        calls: method -> its arguments in order; those that end in "=" are passed by keyword.
-
-    Raises:
-        InputError: naming the class, the member and how it is used.
+    `calls` has the arguments of each method in order; those that end in "=" are passed by keyword.
     """
-    name = type(part).__name__
-    for attribute in attributes:
-        if not hasattr(part, attribute):
-            raise InputError(f"{key}: {name} has no attribute `{attribute}`; {EXTENDING}.")
+    name = f"{key}: {type(part).__name__}"
+    for member in (*attributes, *calls):
+        if not hasattr(part, member):
+            raise InputError(f"{name} has no `{member}`; see docs/how-to/add-other-components.md.")
     for method, arguments in calls.items():
-        function = getattr(part, method, None)
-        used = f"{method}({', '.join(arguments).replace('=', '=...')})"
-        if not callable(function):
-            raise InputError(f"{key}: {name} has no method {used}; {EXTENDING}.")
         by_keyword = {each[:-1]: None for each in arguments if each.endswith("=")}
+        by_place = arguments[: len(arguments) - len(by_keyword)]
         try:
-            inspect.signature(function).bind(
-                *arguments[: len(arguments) - len(by_keyword)], **by_keyword
-            )
+            inspect.signature(getattr(part, method)).bind(*by_place, **by_keyword)
         except TypeError as error:
-            raise InputError(
-                f"{key}: {name}.{method} must accept the call {used}, but it does not ({error}); "
-                f"{EXTENDING}."
-            ) from None
+            raise InputError(f"{name}.{method}({', '.join(arguments)}): {error}.") from None
 
 
 def described(value: object) -> str:
-    """A value in words, for a message: "Tensor (2, 9, 4, 6) float32", "dict with loss", "None"."""
-    if value is None:
-        return "None"
-    kind = type(value).__name__
+    """A value in a message: "Tensor (2, 9, 4, 6) float32", "dict with loss", "float 1.0"."""
+    kind = "None" if value is None else type(value).__name__
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         return f"{kind} {tuple(value.shape)} {str(value.dtype).removeprefix('torch.')}"
     if isinstance(value, Mapping):
         return f"{kind} with {', '.join(map(str, value)) or 'nothing'}"
-    if isinstance(value, str | int | float | bool):
-        return f"{kind} {value!r}"
-    return kind
+    return f"{kind} {value!r}" if isinstance(value, str | int | float) else kind

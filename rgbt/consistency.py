@@ -13,24 +13,20 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from annotated_types import Interval as Bounds
 
 from rgbt.checks import InputError
-from rgbt.config.common_options import (
-    Modality,
-    NetworkOptions,
-    PredictionFormatOptions,
-    Split,
-)
+from rgbt.config.common_options import Modality, NetworkOptions, PredictionFormatOptions, Split
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
 
 if TYPE_CHECKING:
     from rgbt.evaluation.prediction import EvaluationData
-    from rgbt.evaluation.temporal_consistency import Pairs
 
 OF_PREDICTIONS = ("pairs", "format", "palette", "prefix", "suffix")
-"""Options without effect on a network and on images of pairs."""
-
-OF_A_NETWORK = ("run", "runs_dir", "checkpoint", "modality", "trust")
-"""Options without effect on images of pairs and on predictions of another method."""
+OF_A_NETWORK = ("run", "exported", "runs_dir", "checkpoint", "modality", "trust")
+WITHOUT_EFFECT = {
+    "run": OF_PREDICTIONS,
+    "predictions": OF_A_NETWORK,
+    "export": (*OF_A_NETWORK, *OF_PREDICTIONS, "predictions", "out", "flow", "least_used"),
+}
 
 
 @dataclass(frozen=True)
@@ -40,46 +36,35 @@ class Options(NetworkOptions, PredictionFormatOptions):
     frames: Annotated[
         Literal["virtual", "next", "video"],
         Help(
-            "virtual: virtual views of every image, with three published sets of angles; reported "
-            'as "aligned" (the first prediction is warped to the second frame, as in the paper) '
-            'and "released" (it is not warped). next: real second frames with known motion '
-            "(dataset=synth dataset.ego_forward_m=0.5, or a data set with a folder next/). video: "
-            "images with consecutive numbers, along an estimated flow; also measures the warping "
-            "error and flicker"
+            "virtual: virtual views of every image, reported as 'aligned' (the first prediction "
+            "is warped to the second frame, as in the paper) and 'released' (it is not warped). "
+            "next: real second frames with known motion (a folder next/, or dataset=synth "
+            "dataset.ego_forward_m=0.5). video: images with consecutive numbers, along an "
+            "estimated flow; also measures the warping error and flicker"
         ),
     ] = "virtual"
     flow: Annotated[
         Literal["default", "exact", "rgb", "thermal", "both"],
         Help(
-            "how points are followed to the next frame: exact (stored beside frames=next, the "
-            "default there), or estimated from rgb, from thermal, or from the better of both at "
-            "each pixel (both, the default of frames=video). With frames=next the estimated flow "
-            "is counted beside the exact one"
+            "how points are followed to the next frame: exact (the default of frames=next), or "
+            "estimated from rgb, thermal, or the better of both at each pixel (both, the default "
+            "of frames=video). frames=next counts an estimated flow beside the exact one"
         ),
     ] = "default"
     least_used: Annotated[
         float,
         Bounds(ge=0, le=1),
-        Help(
-            "frames=video: pairs in which a smaller share of the pixels has a reliable flow are "
-            "left out"
-        ),
+        Help("frames=video: leave out pairs with a smaller share of pixels with reliable flow"),
     ] = 0.1
     split: Split = "test"
     modality: Modality = "default"
     export: Annotated[
         Path | None,
-        Help(
-            "instead of a run: write both frames of every pair as images to this folder, for a "
-            "method outside of rgbt; nothing is measured"
-        ),
+        Help("instead of a run: write the frames of every pair to this folder, for any method"),
     ] = None
     predictions: Annotated[
         Path | None,
-        Help(
-            "instead of a run: folder of label images that any method predicted of exported "
-            "images, NAME.png and NAME_view1.png, ..."
-        ),
+        Help("instead of a run: folder of label images that any method predicted"),
     ] = None
     pairs: Annotated[
         Path | None,
@@ -87,11 +72,7 @@ class Options(NetworkOptions, PredictionFormatOptions):
     ] = None
     out: Annotated[
         Path | None,
-        Help(
-            "folder for the counts and a picture; default: evaluations/ in the run folder, and "
-            "none for predictions. Counts of other images, other views or another motion have "
-            "names of their own there"
-        ),
+        Help("folder for the files; default: evaluations/ of the run, none for predictions"),
     ] = None
 
 
@@ -99,142 +80,77 @@ def main(options: Options, overrides: list[str]) -> int:
     """Measure TC and CA of a run, of a network with weights from a file, or of predictions.
 
     Overrides such as consistency.sets=[my.csv] consistency.view.camera.fx=700 dataset=mfnet; all
-    other settings are those of conf/consistency/views.yaml, not those of the run.
+    other settings are those of conf/consistency/views.yaml, not those of the run. The scores are
+    added to the result of the run; rgbt sync sends them to MLflow.
 
     For a method outside of rgbt: rgbt consistency export=images dataset=mfnet dataset.root=...,
     predict every image in images/rgb and images/thermal, then
     rgbt consistency predictions=predicted pairs=images dataset=mfnet dataset.root=...
     With frames=video nothing is exported: the predictions are those of the images themselves.
     """
+    kind = "export" if options.export else "predictions" if options.predictions else "run"
+    of_frames = {"video": ("pairs", "export")}.get(options.frames, ("least_used",))
+    for name in (*WITHOUT_EFFECT[kind], *of_frames):
+        if getattr(options, name) != getattr(Options(), name):
+            raise InputError(f"'{name}' has no effect on {kind}=... frames={options.frames}.")
     if not any(item.split("=")[0] == "consistency" for item in overrides):
         overrides = ["consistency=views", *overrides]
-    if options.export is None and options.predictions is None:
-        _check_without(options, OF_PREDICTIONS, "a network")
-        return _measure_network(options, overrides)
-    _check_without(options, OF_A_NETWORK, "images of pairs and on predictions")
-    if options.predictions is None:
-        _check_without(options, (*OF_PREDICTIONS, "out"), "export=...")
-        return _export(options, overrides)
-    if options.export is not None:
-        raise InputError("expected one of export=... and predictions=..., got both.")
-    return _measure_predictions(options, overrides)
+    if options.export is None:
+        _measure(options, overrides)
+        return 0
+    from rgbt.evaluation.pair_predictions import PairSource, write_images
+    from rgbt.terminal import path_lines, print_rich
 
-
-def _check_without(options: Options, names: tuple[str, ...], what: str) -> None:
-    default = Options()
-    for name in names:
-        if getattr(options, name) != getattr(default, name):
-            raise InputError(f"'{name}' has no effect on {what}; omit it.")
-
-
-def _export(options: Options, overrides: list[str]) -> int:
-    from rgbt.evaluation.pair_images import write_images
-    from rgbt.evaluation.pair_list import PairSource
-    from rgbt.tracking.terminal import path_lines, print_rich
-
-    assert options.export is not None, "the caller has checked it"
-    if options.frames == "video":
-        raise InputError(
-            "frames=video compares images of the data set itself; predict these as NAME.png, then "
-            "give predictions=FOLDER."
-        )
-    _check_without(options, ("flow", "least_used"), "export=...")
-    listed = write_images(
-        PairSource.compose(overrides), options.split, options.frames, options.export
-    )
+    source = PairSource.compose(overrides)
+    listed = write_images(source, options.split, options.frames, options.export)
     written = f"{len(listed.images)} of {len(listed.pairs)} pairs in {options.export.resolve()}"
     print_rich(path_lines([("images", written)]))
     return 0
 
 
-def _measure_predictions(options: Options, overrides: list[str]) -> int:
-    from rgbt.data.prediction_files import Affixes, opened_folder
-    from rgbt.data.prediction_format import FormatOptions
-    from rgbt.evaluation.consistency_files import write_pairs
-    from rgbt.evaluation.pair_images import FolderFrames, FolderPairs
-    from rgbt.evaluation.pair_list import PairSource, list_pairs
-    from rgbt.evaluation.pairing import Pairing
-    from rgbt.evaluation.request import EvaluationRequest
-    from rgbt.evaluation.temporal_consistency import count_predicted
-    from rgbt.metrics.pair_list import read_list
-    from rgbt.metrics.pairs import file_name
-    from rgbt.tracking.terminal import info, path_lines, print_rich
-
-    split, folder, out = options.split, options.predictions, options.out
-    assert folder is not None, "the caller has checked it"
-    given = FormatOptions(
-        form=options.format,
-        palette=options.palette,
-        affixes=Affixes(options.prefix, options.suffix),
-    )
-    pairing = Pairing.of(options.frames, options.flow, options.least_used)
-    with opened_folder(folder) as opened:
-        predictor: FolderFrames
-        if pairing.frames == "video":
-            _check_without(options, ("pairs",), "frames=video")
-            source = PairSource.compose(overrides)
-            predictor = FolderFrames(opened, source, pairing.images(source, split), given)
-        else:
-            listed, source = read_list(options.pairs or folder), PairSource.compose(overrides)
-            wanted = list_pairs(source, split, pairing.frames)
-            predictor = FolderPairs(opened, source, listed, wanted, given)
-        request = EvaluationRequest(split=split, keep=pairing.pictured(source, split))
-        pairs = count_predicted(source, predictor, request, pairing)
-    info(predictor.sentence)
-    _show(pairs, source, folder.resolve().name, options)
-    if out is not None:
-        paths = {
-            each: out / Path(file_name(each, split, pairing.file_mark(source, each))).name
-            for each in pairs.counts
-        }
-        print_rich(path_lines(write_pairs(pairs, paths, source.dataset)))
-    return 0
-
-
-def _show(pairs: Pairs, data: EvaluationData, label: str, options: Options) -> None:
-    """Print TC and CA by class, and what an estimated flow is like."""
-    from rgbt.evaluation.flow_record import flow_sentences
-    from rgbt.evaluation.temporal_consistency import changes_grid, consistency_table
-    from rgbt.tracking.tables import consistency_grid
-    from rgbt.tracking.terminal import print_rich, rich_table
-
-    table = consistency_table(pairs.counts, data.regions.absent)
-    views = next(iter(pairs.counts.values())).partition.partition("-")[2] or "published"
-    if options.frames == "video":
-        views = f"{options.split} by consecutive numbers"
-    on = f"{data.dataset.name}, {options.split}; {options.frames}: {views}"
-    print_rich(rich_table(consistency_grid(table, f"Consistency of {label} ({on})")))
-    if pairs.records:
-        print_rich(rich_table(changes_grid(pairs.counts)))
-        least_used = options.least_used if options.frames == "video" else 0.0
-        for sentence in flow_sentences(pairs.records, least_used):
-            print_rich(sentence)
-
-
-def _measure_network(options: Options, overrides: list[str]) -> int:
-    from rgbt.evaluation.consistency_files import PairFiles, add_to_result
-    from rgbt.evaluation.pairing import Pairing
-    from rgbt.evaluation.request import EvaluationRequest, NetworkRequest
-    from rgbt.evaluation.temporal_consistency import consistency_table, count_pairs
-    from rgbt.tracking.run_folder import RunFolder
-    from rgbt.tracking.terminal import path_lines, print_rich
+def _measure(options: Options, overrides: list[str]) -> None:
+    from rgbt.evaluation import consistency_files as files
+    from rgbt.evaluation import temporal_consistency as pairs_of
+    from rgbt.evaluation.pair_frames import Pairing
+    from rgbt.evaluation.pair_predictions import count_predictions
+    from rgbt.evaluation.request import EvaluationRequest, NetworkRequest, other_images
+    from rgbt.runs.folder import RunFolder, read_marker
+    from rgbt.tables import consistency_grid
+    from rgbt.terminal import path_lines, print_rich, rich_table
 
     split, out = options.split, options.out
     pairing = Pairing.of(options.frames, options.flow, options.least_used)
-    network = NetworkRequest(options, overrides)
-    network.check_comparable(out)
-    request = EvaluationRequest.from_options(split, options.modality)
-    opened = network.open()
-    session = opened.session
-    files = PairFiles(opened, network, request, pairing, out)
-    request = replace(request, keep=pairing.pictured(session, split))
-    pairs = count_pairs(session, session.model, request, pairing)
-    _show(pairs, session, opened.label, options)
-    print_rich(path_lines(files.write(pairs)))
-    if pairing.frames == "virtual" and options.run and not (out or files.suffixes):
-        table = consistency_table(pairs.counts, session.regions.absent)
-        add_to_result(RunFolder(opened.folder.parent), session, split, table)
-    return 0
+    data: EvaluationData
+    if options.predictions:
+        folder, exported = options.predictions, options.pairs or options.predictions
+        pairs, data = count_predictions(folder, exported, options, overrides, split, pairing)
+        paths = files.count_paths(out, data, split, pairing) if out else {}
+        label = folder.resolve().name
+    else:
+        network = NetworkRequest(options, overrides)
+        network.check_comparable(out)
+        request = EvaluationRequest.from_options(split, options.modality)
+        data = session = network.open()
+        label, run = session.label, session.evaluations.parent
+        suffixes = (*([request.view] if request.view else []), *network.suffixes)
+        if options.frames != "next":  # whose counts are marked by their motion
+            suffixes += other_images(session.dataset, None if out else read_marker(run))
+        paths = files.count_paths(out or session.evaluations, session, split, pairing, suffixes)
+        request = replace(request, keep=pairing.pictured(session, split))
+        pairs = pairs_of.count_pairs(session, session.model, request, pairing)
+    table = pairs_of.consistency_table(pairs.counts, data.regions.absent)
+    views = next(iter(pairs.counts.values())).partition.partition("-")[2] or "published"
+    title = f"Consistency of {label} ({data.dataset.name}, {split}; {options.frames}: {views})"
+    print_rich(rich_table(consistency_grid(table, title)))
+    if pairs.records:
+        print_rich(rich_table(pairs_of.changes_grid(pairs.counts)))
+        least_used = options.least_used if options.frames == "video" else 0.0
+        for sentence in files.flow_sentences(pairs.records, least_used):
+            print_rich(sentence)
+    if paths:
+        print_rich(path_lines(files.write_pairs(pairs, paths, data.dataset)))
+    if pairing.frames == "virtual" and options.run and not (out or suffixes):
+        files.add_to_result(RunFolder(run), session, split, table)
 
 
 entry = PlainCommand(Options, main)

@@ -1,19 +1,14 @@
-"""The members of every data set, and the base of data sets that wrap another one.
-
-Wrappers are images from a cache, other labels, corrupted images. Parts that must not import
-`rgbt.data` use these members too, which is why they are here.
-"""
+"""The members of every data set, and the base of those that wrap another one (cache, labels)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rgbt.requirements import Record, record_of
 from rgbt.types import Sample, SceneMaps
 
 
@@ -91,80 +86,46 @@ class KnownScenes(Protocol):
 class DatasetWrapper:
     """Base class of a data set that changes another one; a subclass overrides what it changes.
 
-    Args:
-        source: the wrapped data set.
-
-    Attributes:
-        source: the wrapped data set.
+    All other members are those of the wrapped data set, the attribute `source`; a subclass calls
+    ``self.source.read(name)`` for what it overrides.
     """
+
+    if TYPE_CHECKING:  # what `__getattr__` finds
+        root: Path
+        name: str
+        num_classes: int
+        classes: tuple[str, ...]
+        palette: tuple[tuple[int, int, int], ...]
+        unscored: tuple[str, ...]
+        background: tuple[str, ...]
+        splits: Mapping[str, str]
+        has: Callable[[str], bool]
+        names: Callable[[str], tuple[str, ...]]
+        read: Callable[[str], Sample]
+        label: Callable[[str], NDArray[np.uint8] | None]
+        files: Callable[[str], tuple[Path, ...]]
+        decoding: Callable[[], dict[str, Any]]
+        nights: Callable[[tuple[str, ...]], tuple[bool, ...] | None]
+        fingerprint: Callable[[], str]
 
     def __init__(self, source: LabelledDataset) -> None:
         self.source = source
-        self.root = source.root
-        self.name = source.name
-        self.num_classes = source.num_classes
-        self.classes = source.classes
-        self.palette = source.palette
-        self.unscored = source.unscored
-        self.background = source.background
 
-    @property
-    def record(self) -> Record:
-        """Record of the source."""
-        return record_of(self.source)
-
-    @property
-    def splits(self) -> Mapping[str, str]:
-        """Splits of the source."""
-        return self.source.splits
-
-    def has(self, split: str) -> bool:
-        """Whether the source has any image of `split`."""
-        return self.source.has(split)
-
-    def names(self, split: str) -> tuple[str, ...]:
-        """Names of a split of the source."""
-        return self.source.names(split)
-
-    def read(self, name: str) -> Sample:
-        """One sample of the source."""
-        return self.source.read(name)
-
-    def label(self, name: str) -> NDArray[np.uint8] | None:
-        """The label of `read` alone."""
-        return self.source.label(name)
-
-    def files(self, name: str) -> tuple[Path, ...]:
-        """Files of the source."""
-        return self.source.files(name)
-
-    def decoding(self) -> dict[str, Any]:
-        """Settings of the source that change what `read` returns."""
-        return self.source.decoding()
-
-    def nights(self, names: tuple[str, ...]) -> tuple[bool, ...] | None:
-        """Whether each image was taken at night, if the source states it."""
-        return self.source.nights(names)
-
-    def fingerprint(self) -> str:
-        """Fingerprint of the source."""
-        return self.source.fingerprint()
+    def __getattr__(self, key: str) -> Any:
+        if key == "source" or key.startswith("__"):  # of a copy that has no attributes yet
+            raise AttributeError(key)
+        return getattr(self.source, key)
 
 
 class Subset(DatasetWrapper):
-    """A data set of which only some images are read.
-
-    Args:
-        source: the wrapped data set.
-        chosen: names of the images; every split has these.
-    """
+    """A data set of which only the images `chosen` are read, whatever the split."""
 
     def __init__(self, source: LabelledDataset, chosen: tuple[str, ...]) -> None:
         super().__init__(source)
         self._chosen = chosen
 
     def names(self, split: str) -> tuple[str, ...]:
-        """The chosen names, whatever the split."""
+        """The chosen names."""
         del split
         return self._chosen
 

@@ -5,7 +5,6 @@ The command writes the counts and prints the tables derived from them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -23,14 +22,10 @@ from rgbt.config.common_options import (
 )
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
-from rgbt.metrics.details import DISTANCES, SIZES, WIDTH
+from rgbt.metrics.details import WIDTH
 
 ALL = "all"
 """Value of `modality`: each view of the network."""
-
-
-def _text(edges: Sequence[float]) -> str:
-    return ",".join(f"{edge:g}" for edge in edges)
 
 
 @dataclass(frozen=True)
@@ -40,10 +35,7 @@ class Options(NetworkOptions):
     split: Split = "test"
     modality: Annotated[
         str,
-        Help(
-            "input images of the network: rgbt, rgb or thermal; by default those that it was "
-            "designed for; all: each that it predicts from, and a table of them"
-        ),
+        Help("input images: rgbt, rgb, thermal, default (as designed), or all and a table of them"),
     ] = "default"
     regions: RegionsFile = "as trained"
     head: Head = "as trained"
@@ -65,8 +57,8 @@ class Options(NetworkOptions):
     boundary_border: Annotated[
         bool, Help("whether the border of the image is an outline of masks, as Cheng et al. coded")
     ] = False
-    distances: Annotated[str, Help("edges between bins of distance in metres")] = _text(DISTANCES)
-    sizes: Annotated[str, Help("edges between bins of size in pixels of an object")] = _text(SIZES)
+    distances: Annotated[str, Help("edges between bins of distance in metres")] = "10,20,40"
+    sizes: Annotated[str, Help("edges between bins of size in pixels of an object")] = "64,256,1024"
     out: Annotated[
         Path | None,
         Help("file for the counts, details beside it; default: evaluations/ in the run folder"),
@@ -79,65 +71,42 @@ def main(options: Options, overrides: list[str]) -> int:
     Overrides such as dataset=mfnet dataset.root=/data/MFNet data.eval_batch_size=1, and settings
     of the corruption: corruption.block=16 corruption.seed=1
     """
-    from rgbt.evaluation.corruption_request import requested_corruption, split_overrides
-    from rgbt.evaluation.details import save_details, score_table, views_table
-    from rgbt.evaluation.request import (
-        DEFAULT_VIEW,
-        BatchNormRequest,
-        EvaluationRequest,
-        NetworkRequest,
-    )
-    from rgbt.evaluation.segmentation import counts_path, evaluate, label_of, overview
+    from rgbt.evaluation import request as requests
+    from rgbt.evaluation import segmentation
     from rgbt.metrics.details import requested
     from rgbt.requirements import record_of
-    from rgbt.tracking.terminal import path_lines, print_rich, rich_table
+    from rgbt.terminal import print_rich, rich_table
     from rgbt.training.overview import announce_network
 
-    _check_out(options)
+    if options.out is not None and (options.out.is_dir() or options.modality == ALL):
+        raise InputError(f"out={options.out} must be the file of a single evaluation's counts.")
     boundary = options.boundary_width, options.boundary_border
     details = requested(options.details, boundary, options.distances, options.sizes)
-    words, overrides = split_overrides(overrides)
-    network = NetworkRequest(options, overrides, options.regions)
-    corruption = requested_corruption(options.corruption, options.severity, words, network.trust)
-    modality = DEFAULT_VIEW if options.modality == ALL else options.modality
-    request = EvaluationRequest.from_options(
+    words, overrides = requests.split_overrides(overrides)
+    network = requests.NetworkRequest(options, overrides, options.regions)
+    corruption = requests.requested_corruption(
+        options.corruption, options.severity, words, network.trust
+    )
+    modality = "default" if options.modality == ALL else options.modality
+    request = requests.EvaluationRequest.from_options(
         options.split, modality, options.head, corruption, details
     )
-    batch_norm = BatchNormRequest.from_options(options.batch_norm, options.batch_norm_splits)
+    batch_norm = requests.BatchNormRequest.from_options(
+        options.batch_norm, options.batch_norm_splits
+    )
     opened = network.open()
     announce_network(opened)
-    views = record_of(opened.session.model).views if options.modality == ALL else (request.view,)
+    views = record_of(opened.model).views if options.modality == ALL else (request.view,)
     by_view = {}
     for each in (replace(request, view=view, batch_norm=batch_norm) for view in views):
-        result = evaluate(opened.session, opened.session.model, each)
+        result = segmentation.evaluate(opened, opened.model, each)
         by_view[result.view] = result.counts
-        path = options.out or counts_path(opened, network, each, result)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        result.counts.save(path)
-        files = save_details(result.details, path)
-        print_rich(overview(opened, each, result, path))
-        for counts in result.details.values():
-            print_rich(rich_table(score_table(counts, label_of(opened, each, result.view))))
-        if files:
-            print_rich(path_lines(files))
+        path = options.out or segmentation.counts_path(opened, network, each, result)
+        result.save(path)
+        print_rich(segmentation.overview(opened, each, result, path))
     if len(by_view) > 1:
-        print_rich(rich_table(views_table(by_view, opened.label)))
+        print_rich(rich_table(segmentation.views_table(by_view, opened.label)))
     return 0
-
-
-def _check_out(options: Options) -> None:
-    if options.out is None:
-        return
-    if options.out.is_dir():
-        raise InputError(
-            f"out={options.out} is a folder; give a file name for the counts, such as "
-            "out=counts.npz."
-        )
-    if options.modality == ALL:
-        raise InputError(
-            f"out={options.out} is the file of a single evaluation, but modality=all makes "
-            "several; omit out=."
-        )
 
 
 entry = PlainCommand(Options, main)

@@ -39,13 +39,9 @@ Seed = Annotated[int, Interval(ge=0, lt=2**32)]
 """A seed of generators; 0 is valid."""
 
 NumSteps = Annotated[int, Interval(ge=1, le=10**8), doc("more steps would take years")]
-
 NumStepsOrZero = Annotated[int, Interval(ge=0, le=10**8), doc("more steps would take years")]
-
 BatchSize = Annotated[int, Interval(ge=1, le=4096), doc("images held in memory at once")]
-
 Workers = Annotated[int, Interval(ge=0, le=1024), doc("processes on one machine")]
-
 Threads = Annotated[int, Interval(ge=1, le=1024), doc("threads of one process")]
 NumDevices = Annotated[int, Interval(ge=1, le=1024), doc("devices of one machine")]
 

@@ -1,8 +1,4 @@
-"""Evaluate a run on missing or corrupted images: ``rgbt robustness run=...``.
-
-The command evaluates every severity of every corruption. It stores the counts in the run folder,
-each with a file that describes its inputs. Counts that exist are reused.
-"""
+"""Evaluate a run on missing or corrupted images: ``rgbt robustness run=...``."""
 
 from __future__ import annotations
 
@@ -22,43 +18,34 @@ class Options(NetworkOptions):
 
     run: Annotated[
         str,
-        Help(
-            "run folders, config keys or MLflow run ids, separated by commas. Without a run, name "
-            "a network and its weights: model=mfnet model.weights=final.pth "
-            "dataset.root=/data/MFNet"
-        ),
+        Help("run folders, keys or MLflow run ids, separated by commas; see rgbt evaluate"),
     ] = ""
     split: Split = "test"
     corruptions: Annotated[
         str,
         Help(
-            "files of conf/corruption separated by commas, such as frozen,noise:rgb (also "
-            ":thermal, :both), or all. Clean images are always evaluated as well, and so is each "
-            "branch alone if the network can decode it"
+            "files of conf/corruption separated by commas, such as frozen,noise:rgb, or all. Clean "
+            "images are evaluated as well, and each branch alone if the network can decode it"
         ),
     ] = "all"
     regions: RegionsFile = "as trained"
     out: Annotated[
         Path | None,
-        Help(
-            "folder for the counts of one run; default: evaluations/robustness/ in the run folder"
-        ),
+        Help("folder for the counts of one run; default: evaluations/robustness/ in it"),
     ] = None
 
 
 def main(options: Options, overrides: list[str]) -> int:
     """Evaluate runs under every severity of every corruption; one table per run.
 
-    Overrides such as dataset=mfnet dataset.root=/data/MFNet, corruption.seed=1 (random draws), and
-    any key of a single corruption: corruptions=noise corruption.severities=[4,12]. Rerun the
-    command to resume; existing counts are replaced only if the data, the weights or the corruption
-    changed. `rgbt figures figure=robustness` draws the results.
+    Overrides such as dataset=mfnet dataset.root=/data/MFNet, corruption.seed=1, and any key of a
+    single corruption: corruptions=noise corruption.severities=[4,12]. Existing counts are replaced
+    only if data, weights or corruption changed. `rgbt figures figure=robustness` draws the results.
     """
-    from rgbt.evaluation.corruption_request import choose_corruptions, split_overrides
-    from rgbt.evaluation.request import NetworkRequest
+    from rgbt.evaluation.request import NetworkRequest, choose_corruptions, split_overrides
     from rgbt.evaluation.robustness import counts_folder, measure, robustness_grid, write_tables
-    from rgbt.tracking.run_folder import find_run
-    from rgbt.tracking.terminal import path_lines, print_rich, rich_table
+    from rgbt.runs.folder import find_run
+    from rgbt.terminal import path_lines, print_rich, rich_table
 
     words, overrides = split_overrides(overrides)
     split, out = options.split, options.out
@@ -68,9 +55,7 @@ def main(options: Options, overrides: list[str]) -> int:
     ]
     corruptions = choose_corruptions(options.corruptions, words, networks[0].trust)
     if out and len(networks) > 1:
-        raise InputError(
-            f"out= is the folder for a single run, but run= names {len(networks)} runs; omit out=."
-        )
+        raise InputError(f"out={out} is the folder of a single run, but run={options.run}.")
     for network in networks:  # before the first of them is measured
         network.check_comparable(out)
         if network.options.run:
@@ -81,10 +66,9 @@ def main(options: Options, overrides: list[str]) -> int:
     for network in networks:
         opened = network.open()
         folder = out or counts_folder(opened, network, split)
-        measured = measure(opened.session, split, corruptions, folder)
-        # A file of weights has neither a step nor a seed.
-        label = f"{opened.label} seed={opened.session.spec.seed}" if opened.step else opened.label
-        on = f"{opened.session.dataset.name}, {split}"
+        measured = measure(opened, split, corruptions, folder)
+        label = f"{opened.label} seed={opened.spec.seed}" if opened.step else opened.label
+        on = f"{opened.dataset.name}, {split}"
         grid = robustness_grid(measured, f"Robustness of {label} ({on}): mIoU in percent")
         write_tables(measured, grid, folder / stem)
         print_rich(rich_table(grid))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from rgbt.checks import InputError
 from rgbt.config.command import command
 
 if TYPE_CHECKING:
@@ -14,31 +15,30 @@ if TYPE_CHECKING:
 
 
 @command(sweeper="study")
-def main(config: DictConfig) -> int:
+def main(config: DictConfig, overrides: list[str]) -> int:
     """Train the upstream runs and the run, evaluate its checkpoint on the test split."""
-    from hydra.core.hydra_config import HydraConfig
-
     from rgbt.config.command import words_of_run
-    from rgbt.spec.naming import tags_from_environment
-    from rgbt.spec.request import note_request
-    from rgbt.spec.specify import specify
-    from rgbt.spec.unused import unused_sentences
-    from rgbt.tracking.terminal import warn
-    from rgbt.training.show import is_launched, report_pretrained, show_known
+    from rgbt.runs.naming import tags_from_environment
+    from rgbt.runs.specify import requested_run
+    from rgbt.terminal import info
+    from rgbt.training.show import is_launched, show
+
+    tags = tags_from_environment()
+    run = requested_run(config, overrides)
+    if run.pretrained is not None and not run.uses_pretrained:
+        info(
+            f"pretrained={run.pretrained} is ignored: the experiment {run.name} does not use "
+            "ImageNet weights."
+        )
+    if run.out is not None:
+        raise InputError(f"out={run.out} has no effect here: runs are written to runs_dir=...")
+    if run.is_finished and not run.fresh and not is_launched():
+        show(run, tags)
+        return 0
     from rgbt.training.start import start
 
-    overrides, tags = list(HydraConfig.get().overrides.task), tags_from_environment()
-    for sentence in () if is_launched() else unused_sentences(config, overrides):
-        warn(sentence)
-    if show_known(config, overrides, tags):
-        return 0
     # torch is imported from here on, after --help and after finished runs
-    run = specify(config, overrides)
-    report_pretrained(run.pretrained, run.uses_pretrained, run.name)
-    code = start(run, tags, words_of_run())
-    if run.is_finished and not is_launched():
-        note_request(config, run)
-    return code
+    return start(run.check(), tags, words_of_run(overrides))
 
 
 if __name__ == "__main__":

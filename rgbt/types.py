@@ -3,8 +3,8 @@
 Letters, everywhere: ``B`` batch, ``C`` channels, ``H W`` pixels, ``h w`` cells or feature grid,
 ``K`` classes, ``Q`` queries, ``R`` regions, ``P`` stacked passes of one batch, ``L`` prediction
 layers.
-Conventions: RGB order, (row, column) order, labels int64 (uint8 until they are on the device) with
-255 = ignore, mask True = hidden, resize with ``align_corners=False``.
+RGB order, (row, column), labels int64 (uint8 before the device) with 255 = ignore, mask True =
+hidden, resize with ``align_corners=False``.
 """
 
 from __future__ import annotations
@@ -88,14 +88,11 @@ class Batch:
         rgb: (B, 3, H, W); uint8 or float32 in 0..255 from the loader, float32 in [0, 1] after
             ``to``.
         thermal: (B, 1, H, W), same dtype rule as ``rgb``.
-        label: (B, H', W') uint8 from the loader, int64 after ``to``; 255 = ignore. H' = H and
-            W' = W in training; in evaluation the label keeps the resolution of the file while the
-            images may have been resized.
+        label: (B, H', W') uint8 from the loader, int64 after ``to``; 255 = ignore. In training
+            H' = H and W' = W; in evaluation they are the size of the file.
         name: B names.
-        centre_yx: (B, 2) int64, the pixel of this crop that is nearest to the centre
-            (rows // 2, columns // 2) of the original image; the first in row-major order on a tie.
-        position: (B, 2, H, W) float32, (row, column) in the original image of every crop pixel;
-            None where the transform is configured not to track it.
+        centre_yx: (B, 2) int64, see `Example`.
+        position: (B, 2, H, W) float32, see `Example`; None where it is not tracked.
         original_hw: (B, 2) int64, height and width of the original image.
         confidence: (B, H', W') float32 in [0, 1], of the labels; None where they carry none.
     """
@@ -193,8 +190,7 @@ class Frame(NamedTuple):
     Attributes:
         output: what the network returned for it.
         batch: its images and labels.
-        logits: (B, K, H, W) float, dense class scores whose softmax are class probabilities; also
-            for networks that return masks and classes of queries.
+        logits: (B, K, H, W) float, dense class scores, also of networks that return masks.
     """
 
     output: Output
@@ -224,8 +220,7 @@ class AnyMasker(Protocol):
     """The interface of a masker, which draws hidden cells (see `rgbt.maskers.masker.Masker`).
 
     A crop is padded at the bottom and right to multiples of 32 pixels before cells are cut
-    (`rgbt.geometry.padding.padded_hw`: 120 x 160 becomes 128 x 160), so that h and w divide the
-    padded height and width.
+    (120 x 160 becomes 128 x 160), so that h and w divide the padded height and width.
     """
 
     def __call__(

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from rgbt.checks import InputError
 from rgbt.metrics.names import CA, TC
 from rgbt.metrics.pairs import HEADLINES, PROTOCOLS, file_name
-from rgbt.spec.run_spec import RunSpec
-from rgbt.tracking.run_files import counts_name
+from rgbt.runs.folder import counts_name
+from rgbt.runs.run_spec import RunSpec
 from sweeps import attributes as names
 from sweeps.report.study_data import read
 from sweeps.settings import Objective, SweepSettings

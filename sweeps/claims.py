@@ -18,10 +18,10 @@ from rgbt.config.options import Help, readable_paths
 from rgbt.config.plain_command import PlainCommand
 
 if TYPE_CHECKING:
-    from rgbt.tracking.run_result import RunResult
+    from rgbt.runs.result import RunResult
+    from sweeps.point import Outcome
     from sweeps.table.request import TableRequest
     from sweeps.verdicts.judge import CellRunId, JudgedClaim
-    from sweeps.verdicts.stored import StoredRun
 
 ALL = "all"
 
@@ -53,7 +53,7 @@ def main(options: Options, overrides: list[str]) -> int:
     from rich.text import Text
 
     from rgbt.files.atomic import write_atomic
-    from rgbt.tracking.terminal import path_lines, print_rich, rich_table
+    from rgbt.terminal import path_lines, print_rich, rich_table
     from sweeps.rendering.claims import claims_csv, claims_grid, claims_markdown, counted
 
     judged, times = judge_all(options, overrides)
@@ -122,7 +122,7 @@ def judge_all(options: Options, overrides: Sequence[str]) -> tuple[list[JudgedCl
     return judged, [line for line in times if line]
 
 
-def judge_stored(request: TableRequest, runs: Mapping[CellRunId, StoredRun]) -> list[JudgedClaim]:
+def judge_stored(request: TableRequest, runs: Mapping[CellRunId, Outcome]) -> list[JudgedClaim]:
     """The claims of one table, judged by its finished runs."""
     from sweeps.table.efficiency import exact_sizes
     from sweeps.verdicts.judge import TableJudge

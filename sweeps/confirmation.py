@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 from rgbt.checks import InputError
 from sweeps import attributes as names
 from sweeps.candidates import SEED, Candidate, Candidates
-from sweeps.point import Point
+from sweeps.point import Outcome, Point
 from sweeps.rendering.confirmation import Confirmed, confirmation_grid
 from sweeps.report.study_data import confirmed_study
 from sweeps.settings import Objective, SweepSettings
@@ -29,7 +29,6 @@ from sweeps.worker.point_list import PointList, run_points
 from sweeps.worker.progress import duration
 from sweeps.worker.run_store import RunStore
 from sweeps.worker.storage import find_study, open_storage, open_study
-from sweeps.worker.trial_sources import Outcome
 from sweeps.worker.trial_store import counted_trials
 
 if TYPE_CHECKING:

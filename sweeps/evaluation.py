@@ -8,8 +8,8 @@ from typing import Literal
 
 from rgbt.metrics.details import OF_SCENES, DetailKind
 from rgbt.metrics.pairs import Protocol, file_name
-from rgbt.spec.corruption_names import row_name
-from rgbt.tracking.run_result import RunResult
+from rgbt.runs.naming import row_name
+from rgbt.runs.result import RunResult
 
 Head = Literal["as trained", "own", "source", "target"]
 """The head that predicts: that of the domain of each image, or that of one domain for all."""

@@ -6,7 +6,10 @@ import colorsys
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
+from rgbt.runs.folder import read_result
+from rgbt.runs.result import RunResult
 from sweeps.evaluation import ExtraEvaluation
 
 Value = str | int | float | bool | None
@@ -61,3 +64,42 @@ class Point:
     def runs(self) -> tuple[tuple[str, ...], ...]:
         """Overrides of each run."""
         return tuple((*self.overrides, f"seed={seed}") for seed in self.seeds) or (self.overrides,)
+
+
+State = Literal["finished", "failed", "running", "waiting", "missing"]
+UNFINISHED: tuple[State, ...] = ("waiting", "failed")
+"""States of points that a command runs."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A point with its state and its finished runs.
+
+    Attributes:
+        state: "finished", "failed", "running" (by another driver), "waiting" (not started) or
+            "missing" (not in the store that is read).
+        reason: why it failed, or "".
+        results: its finished runs; of a waiting point, runs that lack further evaluations only.
+        keys: of its runs; () where its configuration is wrong.
+        missing: path of counts that a finished run has not -> why.
+    """
+
+    point: Point
+    state: State
+    reason: str = ""
+    results: tuple[RunResult, ...] = ()
+    keys: tuple[str, ...] = ()
+    missing: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def is_trained(self) -> bool:
+        """Whether it lacks further evaluations of its runs only."""
+        return self.state in UNFINISHED and bool(self.results)
+
+    @property
+    def seconds(self) -> float | None:
+        """Duration of its runs; None where one of them is unknown."""
+        found = [read_result(result.folder) or {} for result in self.results]
+        each = [result.get("seconds_of_last_process") for result in found]
+        known = [float(seconds) for seconds in each if seconds is not None]
+        return sum(known) if known and len(known) == len(each) else None

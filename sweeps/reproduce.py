@@ -24,10 +24,10 @@ from sweeps.table.new_table import NewOptions, new
 from sweeps.table.request import seeds_of
 
 if TYPE_CHECKING:
+    from sweeps.point import Outcome
     from sweeps.table_plan import TablePlan
     from sweeps.worker.planner import Planner
     from sweeps.worker.run_store import RunStore
-    from sweeps.worker.trial_sources import Outcome
 
 ALL = "all"
 UNTIL_DECIDED = "until_decided"
@@ -191,7 +191,7 @@ def _show_time(outcomes: Sequence[Outcome], planner: Planner) -> None:
     """Print how long the finished runs and those upstream of them took."""
     from rich.text import Text
 
-    from rgbt.tracking.terminal import print_rich
+    from rgbt.terminal import print_rich
     from sweeps.rendering.times import time_line, upstream_line
 
     finished = [outcome for outcome in outcomes if outcome.results]
@@ -212,7 +212,7 @@ def _show(
     """Print the preview of one table, or one line for each of all."""
     from rich.text import Text
 
-    from rgbt.tracking.terminal import print_rich, rich_table
+    from rgbt.terminal import print_rich, rich_table
     from sweeps.rendering.preview import cells_grid, most_line, summary, tables_grid
     from sweeps.rendering.times import upstream_line
 

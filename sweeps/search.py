@@ -10,8 +10,9 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from rgbt.checks import InputError, RunError
-from rgbt.tracking.provenance import command_line
-from rgbt.tracking.terminal import info
+from rgbt.runs.provenance import command_line
+from rgbt.runs.run_spec import RunSpec
+from rgbt.terminal import info
 from sweeps import attributes as names
 from sweeps.candidates import Candidates, check_confirmable
 from sweeps.confirmation import confirm, preview_line
@@ -20,7 +21,7 @@ from sweeps.space.samplers import build_pruner, build_sampler
 from sweeps.space.space import Parameter, as_overrides, signature, suggest
 from sweeps.study import dashboard_command, report, show_links, study_folder
 from sweeps.worker.driver import drive
-from sweeps.worker.planner import PlannedRun, Planner, specify_run
+from sweeps.worker.planner import Planner, specify_run
 from sweeps.worker.progress import ProgressView
 from sweeps.worker.run_store import RunStore
 from sweeps.worker.storage import find_study, open_storage, open_study
@@ -104,14 +105,18 @@ def search(request: Search, settings: SweepSettings) -> None:
     show_links([*links, ("dashboard", dashboard_command(settings.storage, runs_dir))])
 
 
-def _probe(request: Search, settings: SweepSettings) -> PlannedRun:
+def _probe(request: Search, settings: SweepSettings) -> RunSpec:
     """The run at the lowest point of the space; the highest one is checked too.
 
     Both refuse what the runs would: an end of a range that a setting does not accept, a missing
     data set, or an objective that the runs do not measure.
     """
     highest = specify_run((*request.fixed, *_end_of(request.parameters, "high")))
-    lowest = Planner().plan_run((*request.fixed, *_end_of(request.parameters, "low")))
+    planner = Planner()
+    lowest = planner.specify((*request.fixed, *_end_of(request.parameters, "low")))
+    planner.fingerprint(lowest)
+    views = lowest.consistency.values
+    measured = views["splits"] if views["sets"] else ()
     trainer = highest.trainer
     is_validated = trainer.tested == "best" or highest.dataset.build().has(trainer.selection_split)
     for objective in settings.objectives:
@@ -122,7 +127,7 @@ def _probe(request: Search, settings: SweepSettings) -> PlannedRun:
                 f"{trainer.selection_split}, so the runs are not validated; hold images out, or "
                 "choose test/..."
             )
-        if objective.is_consistency and split not in lowest.consistency_splits:
+        if objective.is_consistency and split not in measured:
             splits = ",".join(dict.fromkeys((split, "test")))
             raise InputError(
                 f"objective '{objective.metric}': the runs do not measure it; add "

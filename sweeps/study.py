@@ -19,13 +19,13 @@ from rgbt.config.command import built
 from rgbt.config.common_options import RunsDir
 from rgbt.config.options import Help, readable_paths
 from rgbt.config.plain_command import PlainCommand
-from rgbt.tracking.provenance import without_passwords
+from rgbt.runs.provenance import without_passwords
 from sweeps.worker.storage import JOURNAL, load_study, open_storage, storage_file, study_names
 
 if TYPE_CHECKING:
     import optuna
 
-    from rgbt.tracking.tables import TextTable
+    from rgbt.tables import TextTable
     from rgbt.tracking.tracker import Link, Tracking
     from sweeps.report.figures import StudyFigure
     from sweeps.report.study_data import Importances, StudyData
@@ -87,7 +87,7 @@ def report(study: optuna.Study, out: Path, tracking: Tracking) -> list[Link]:
     from rich.text import Text
 
     from rgbt.files.atomic import write_atomic
-    from rgbt.tracking.terminal import print_rich, rich_table
+    from rgbt.terminal import print_rich, rich_table
     from sweeps.report.figures import draw
     from sweeps.report.records import record
     from sweeps.report.study_data import importances, read
@@ -199,7 +199,7 @@ def _check_exists(storage: str | None, runs_dir: Path) -> None:
 
 def show_links(links: Sequence[Link]) -> None:
     """Print links, one "name  address" pair per line."""
-    from rgbt.tracking.terminal import path_lines, print_rich
+    from rgbt.terminal import path_lines, print_rich
 
     print_rich(path_lines(links))
 

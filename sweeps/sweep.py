@@ -15,11 +15,11 @@ from omegaconf import DictConfig
 
 from rgbt.checks import InputError, RunError
 from rgbt.metrics import names
+from rgbt.runs.provenance import without_passwords
+from rgbt.tables import ABSENT, TextTable, number
+from rgbt.terminal import info, print_rich, rich_table
 from rgbt.tracking.mlflow_store import MlflowTracking
-from rgbt.tracking.provenance import without_passwords
-from rgbt.tracking.tables import ABSENT, TextTable, number
-from rgbt.tracking.terminal import info, print_rich, rich_table
-from sweeps.point import Point
+from sweeps.point import UNFINISHED, Outcome, Point
 from sweeps.rendering.seed_groups import group_grid, unfinished_grid
 from sweeps.report.study_data import short_names
 from sweeps.search import Search, search
@@ -43,7 +43,6 @@ from sweeps.worker.point_list import (
 )
 from sweeps.worker.progress import duration
 from sweeps.worker.run_store import open_run_store
-from sweeps.worker.trial_sources import UNFINISHED, Outcome
 
 PATHS = ("runs_dir", "dataset.root", "dataset.cache_dir", "tracking")
 """Overrides that may differ between two calls of the same sweep."""
@@ -173,7 +172,9 @@ def grid_table(points: PointList, outcomes: Sequence[Outcome]) -> TextTable:
     metrics = (names.MIOU, names.VAR)
     rows = []
     for outcome in outcomes:
-        scores: Mapping[str, float] = outcome.results[0].scores() if outcome.results else {}
+        scores: Mapping[str, float] = (
+            outcome.results[0].recorded_scores() if outcome.results else {}
+        )
         shown = [f"test/{metric}" for metric in metrics]
         values = [number(scores[name]) if name in scores else ABSENT for name in shown]
         key = outcome.keys[0] if outcome.keys else ABSENT

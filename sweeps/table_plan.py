@@ -9,7 +9,7 @@ from pathlib import Path
 from analysis.uncertainty.contrasts import FIXED
 from analysis.uncertainty.verdicts import AnyTime, FixedSeeds
 from rgbt.checks import InputError
-from sweeps.table.cells import CellRun
+from sweeps.point import Outcome
 from sweeps.table.efficiency import exact_sizes
 from sweeps.table.external import ExternalRow
 from sweeps.table.external_runs import check_external, run_external
@@ -36,7 +36,7 @@ class TablePlan:
     points: PointList
     until_decided: SeedsUntilDecided | None
     rows: Sequence[ExternalRow] = ()
-    external: dict[CellRunId, CellRun] = field(default_factory=dict)
+    external: dict[CellRunId, Outcome] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -67,7 +67,7 @@ class TablePlan:
             )
         rule = AnyTime() if max_seeds else FixedSeeds()
         judge = TableJudge(request.name, request.table, rule, sizes=exact_sizes(request))
-        external: dict[CellRunId, CellRun] = {}
+        external: dict[CellRunId, Outcome] = {}
         more = max_seeds and SeedsUntilDecided(request, judge, max_seeds, external)
         points = PointList(
             study=f"table/{request.name}",

@@ -5,8 +5,8 @@ from __future__ import annotations
 from functools import cache
 
 from rgbt.config.compose import compose
-from rgbt.spec.run_spec import RunSpec
-from rgbt.spec.specify import specify
+from rgbt.runs.run_spec import RunSpec
+from rgbt.runs.specify import specify
 from sweeps.table.table import Row, Table
 
 

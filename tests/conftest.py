@@ -14,17 +14,14 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from hydra._internal.hydra import Hydra
 
 from rgbt.randomness import numpy_generator
 from rgbt.runtime.signals import WORDS
-from tests.commands import SPLITS, Call, Trained, only_run, without_pictures, words_of
-from tests.quick_hydra import make_hydra_quick
+from tests.commands import SPLITS, Call, Trained, without_pictures, words_of
 
 WriteMFNet = Callable[..., Path]
 
@@ -43,43 +40,10 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     return True if is_left_out else None
 
 
-WRITES_NO_BYTECODE = sys.dont_write_bytecode
-
-
-def pytest_collection() -> None:
-    """Search for no garbage: the collection makes millions of objects that stay.
-
-    Keep the compiled modules, also where images of containers forbid it: the processes that tests
-    start would compile all of them again.
-    """
-    gc.disable()
-    sys.dont_write_bytecode = False
-
-
 def pytest_collection_finish() -> None:
-    """Search for garbage again, but less often, and not in what the collection made.
-
-    After a freeze Python takes the heap for a small one, and searched it for a tenth of the time.
-    """
+    """Search less often for garbage, and never in what the collection made, which stays."""
     gc.freeze()
     gc.set_threshold(100_000, 20, 20)
-    gc.enable()
-    sys.dont_write_bytecode = WRITES_NO_BYTECODE
-
-
-@pytest.fixture(scope="session", autouse=True)
-def composed_once() -> Iterator[None]:
-    """Hydra composes what it runs twice, first to see whether it is a grid: only searches are."""
-    ask = Hydra.get_mode
-
-    def get_mode(self: Hydra, config_name: str | None, overrides: list[str]) -> Any:
-        names_one = any("search" in word or "hydra.mode" in word for word in overrides)
-        return ask(self, config_name, overrides) if names_one else None
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Hydra, "get_mode", get_mode)
-        make_hydra_quick()
-        yield
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -101,10 +65,8 @@ def same_signal_handlers() -> Iterator[None]:
 def pair(name: str, hw: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """RGB, thermal, label of a name: noise that depends on the name alone."""
     rng = numpy_generator(0, name)
-    rgb = rng.integers(0, 256, (*hw, 3), dtype=np.uint8)
-    thermal = rng.integers(0, 256, hw, dtype=np.uint8)
-    label = rng.integers(0, 9, hw, dtype=np.uint8)
-    return rgb, thermal, label
+    rgb, thermal = (rng.integers(0, 256, each, dtype=np.uint8) for each in ((*hw, 3), hw))
+    return rgb, thermal, rng.integers(0, 9, hw, dtype=np.uint8)
 
 
 def write_png(path: Path, image: np.ndarray) -> None:
@@ -124,12 +86,11 @@ def write_data(
         for name in names:
             rgb, thermal, label = pair(name, hw)
             if layout == "packed":
-                write_png(root / "images" / f"{name}.png", np.dstack([rgb, thermal]))
-                write_png(root / "labels" / f"{name}.png", label)
+                images = {"images": np.dstack([rgb, thermal]), "labels": label}
             else:
-                write_png(root / "RGB" / f"{name}.png", rgb)
-                write_png(root / "Thermal" / f"{name}.png", thermal)
-                write_png(root / "Label" / f"{name}.png", label)
+                images = {"RGB": rgb, "Thermal": thermal, "Label": label}
+            for folder, image in images.items():
+                write_png(root / folder / f"{name}.png", image)
     return root
 
 
@@ -187,22 +148,28 @@ def data(write_mfnet: Callable[..., Path]) -> Path:
 
 @pytest.fixture(scope="session")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Trained:
-    """The folder of a run with these overrides, on data equal to `data`; to be read or copied."""
+    """The folder of a run with these overrides, trained once in a session; to be read or copied.
+
+    Runs on a data set that the overrides name share a folder of runs, and their upstream runs.
+    """
     from rgbt.run import main
+    from tests.composed import specified
 
     made: dict[tuple[str, ...], Path] = {}
+    shared = tmp_path_factory.mktemp("shared")
 
     def run(*overrides: str) -> Path:
         if overrides not in made:
-            place = tmp_path_factory.mktemp("trained")
-            data = write_data(place / "mf", SPLITS, (48, 64))
-            words = ["rgbt", *words_of(data, place / "runs", *overrides)]
-            with pytest.MonkeyPatch.context() as patch:
-                patch.setattr(sys, "argv", words)
+            names_data = any(word.startswith("dataset=") for word in overrides)
+            place = shared if names_data else tmp_path_factory.mktemp("trained")
+            data = place / "mf" if names_data else write_data(place / "mf", SPLITS, (48, 64))
+            words = words_of(data, place / "runs", *overrides)
+            with pytest.MonkeyPatch.context() as patch, without_pictures():
+                patch.setattr(sys, "argv", ["rgbt", *words])
                 with pytest.raises(SystemExit) as left:
                     main()
             assert not left.value.code
-            made[overrides] = only_run(place / "runs")
+            made[overrides] = specified(tuple(words)).folder
         return made[overrides]
 
     return run

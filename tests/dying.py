@@ -19,16 +19,13 @@ from tests.commands import without_pictures
 
 def die_at(instant: str) -> None:
     """Kill this process before or after the n-th time that a file gets its name."""
-    when, name, nth = instant.rsplit(" ", 2)
     seen: Counter[str] = Counter()
-    rename, link = os.replace, os.link
 
     def reached(now: str, target: Any) -> None:
         path = Path(target)
         shown = "/".join(path.parts[-1 if path.parent.parent.name != "checkpoints" else -3 :])
-        moment = f"{now} {shown}"
-        seen[moment] += 1
-        if (moment, seen[moment]) == (f"{when} {name}", int(nth)):
+        seen[f"{now} {shown}"] += 1
+        if f"{now} {shown} {seen[f'{now} {shown}']}" == instant:
             os.kill(os.getpid(), signal.SIGKILL)
 
     def named(make: Any) -> Any:
@@ -39,7 +36,7 @@ def die_at(instant: str) -> None:
 
         return do
 
-    os.replace, os.link = named(rename), named(link)
+    os.replace, os.link = named(os.replace), named(os.link)
 
 
 if __name__ == "__main__":

@@ -1,40 +1,32 @@
-"""TC and CA of runs, during training and afterwards, on virtual and on true second frames."""
+"""TC and CA of runs and of predictions of any method, on virtual and on true second frames."""
 
 from __future__ import annotations
 
+import csv
 import json
 import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from rgbt import consistency, evaluate
-from rgbt.config.compose import compose
+from rgbt import consistency, predict
 from rgbt.files.budgets import read_json
-from rgbt.metrics import names, scores
 from rgbt.metrics.counts import Counts
+from rgbt.metrics.named import value
 from rgbt.metrics.pairs import ca, ca_released, tc
-from rgbt.spec.naming import describe
-from rgbt.spec.specify import specify
-from rgbt.tracking.run_result import RunResult
-from tests.commands import (
-    SPLITS,
-    Call,
-    Trained,
-    assert_one_sentence,
-    logged,
-    only_run,
-    short,
-    train,
-)
-from tests.conftest import pair, write_data, write_png
+from rgbt.randomness import numpy_generator
+from rgbt.runs.result import RunResult
+from rgbt.transforms.view_sets import read_angles
+from tests.commands import SPLITS, Call, Trained, logged, only_run, short, train
+from tests.conftest import pair, write_png
 
 TEMPORAL = ("+experiment=temporal_con", "masker.patch_size=null", *short(2))
-UNMEASURED = (*TEMPORAL, "consistency=none")
 ALIGNED, RELEASED = "consistency_aligned_test.npz", "consistency_released_test.npz"
 SCORES = ("TC/aligned", "CA/aligned", "TC/released", "CA/released")
 SYNTH = (
@@ -43,21 +35,18 @@ SYNTH = (
 )
 
 
-def copied(trained: Trained, tmp_path: Path, *overrides: str) -> Path:
-    done = trained(*TEMPORAL, *overrides)
-    return Path(shutil.copytree(done, tmp_path / "runs" / done.name))
-
-
 @pytest.fixture
 def folder(trained: Trained, tmp_path: Path) -> Path:
     """A copy of a run of temporal_con that measured its consistency."""
-    return copied(trained, tmp_path)
+    done = trained(*TEMPORAL)
+    return Path(shutil.copytree(done, tmp_path / "runs" / done.name))
 
 
 @pytest.fixture
 def plain(trained: Trained, tmp_path: Path) -> Path:
     """A copy of the same run without the measurement."""
-    return copied(trained, tmp_path / "plain", "consistency=none")
+    done = trained(*TEMPORAL, "consistency=none")
+    return Path(shutil.copytree(done, tmp_path / "plain" / "runs" / done.name))
 
 
 def measure(call: Call, *arguments: str) -> str:
@@ -67,15 +56,21 @@ def measure(call: Call, *arguments: str) -> str:
     return out
 
 
+def refused(call: Call, named: str, *arguments: str) -> None:
+    code, _, err = call(consistency.entry, *arguments)
+    assert (code, named in " ".join(err.split())) == (2, True), err
+
+
 def read(folder: Path, name: str) -> Any:
     return read_json(folder / name, dict[str, Any], "")
 
 
-def counts_of(path: Path) -> np.ndarray:
-    return Counts.load(path).counts
-
-
-# ---- what a run measures --------------------------------------------------------------------
+def assert_same_counts(folder: Path, other: Path) -> None:
+    for name in (ALIGNED, RELEASED):
+        mine, theirs = (Counts.load(each / name) for each in (folder, other))
+        assert np.array_equal(mine.counts, theirs.counts)
+        for key in ("names", "night", "classes", "partition", "dataset", "split", "absent"):
+            assert getattr(mine, key) == getattr(theirs, key)
 
 
 def test_run_measures_its_consistency(trained: Trained) -> None:
@@ -93,7 +88,6 @@ def test_run_measures_its_consistency(trained: Trained) -> None:
     assert (by_set.sum((2, 3, 4)) > 0.97 * 48 * 64).all()
     # The same labels and second predictions, whatever is done with the first one.
     assert (by_set.sum(3) <= whole.sum(3)).all()
-    assert (folder / "figures" / "pairs.png").stat().st_size > 1000
 
     absent = OmegaConf.load(folder / "config.yaml").metric.absent
     expected = {
@@ -104,65 +98,11 @@ def test_run_measures_its_consistency(trained: Trained) -> None:
     }
     result, table = read(folder, "result.json"), read(folder, "tables.json")["consistency"]
     assert not [name for name in result["val"] if name.startswith(("TC", "CA"))]
-    (last,) = logged(folder, "test")
     for name, by_class in expected.items():
         score, protocol = name.split("/")
         assert result["test"][name] == pytest.approx(by_class.mean(), abs=1e-12)
-        assert last["values"][name] == result["test"][name]
+        assert logged(folder, "test")[0]["values"][name] == result["test"][name]
         assert table[score.lower()][protocol] == pytest.approx(by_class, abs=1e-12)
-        assert table[f"mean_{score.lower()}"][protocol] == result["test"][name]
-    assert result["test"]["CA/aligned"] <= result["test"]["TC/aligned"]
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("pictures")
-def test_run_measures_its_best_checkpoint_and_draws_it(
-    call: Call, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    summary, validated = scores.summary, 0
-
-    def falling(*given: Any) -> dict[str, float]:
-        nonlocal validated
-        validated += 1
-        return {**summary(*given), names.MIOU: 1 / validated}
-
-    with monkeypatch.context() as patch:
-        patch.setattr(scores, "summary", falling)
-        words = (*TEMPORAL, "trainer.eval_every=1", "scale.lr=0.05")
-        code, _, err = train(call, data, tmp_path / "runs", *words)
-    assert code == 0, err
-    folder = only_run(tmp_path / "runs")
-    result = read(folder, "result.json")
-    assert (result["best_step"], result["steps"]) == (1, 2)
-    for checkpoint in ("best", "last"):
-        place = f"out={tmp_path / checkpoint}"
-        measure(call, f"run={folder}", f"checkpoint={checkpoint}", place)
-    for name in (ALIGNED, RELEASED):
-        mine = counts_of(folder / "evaluations" / name)
-        assert np.array_equal(mine, counts_of(tmp_path / "best" / name))
-        last = tmp_path / "last" / name.replace("_test", "_test_last")
-        assert not np.array_equal(mine, counts_of(last))
-    picture = (folder / "figures" / "pairs.png").read_bytes()
-    assert picture == (tmp_path / "best" / "pairs_aligned_test.png").read_bytes()
-    assert picture != (tmp_path / "last" / "pairs_aligned_test_last.png").read_bytes()
-
-
-@pytest.mark.slow
-def test_run_val_is_the_split_of_the_selection(call: Call, data: Path, tmp_path: Path) -> None:
-    words = (*TEMPORAL, "trainer.selection_split=train", "consistency.splits=[val]")
-    code, _, err = train(call, data, tmp_path / "runs", *words)
-    assert code == 0, err
-    folder = only_run(tmp_path / "runs")
-    found = Counts.load(folder / "evaluations" / "consistency_aligned_train.npz")
-    assert (found.split, found.names) == ("train", tuple(SPLITS["train"]))
-    assert not list((folder / "evaluations").glob("*_val.npz"))
-    before = read(folder, "result.json")
-    assert set(SCORES) <= set(before["val"])
-    assert not set(SCORES) & set(before["test"])
-    # Measured later, too, and the split that is merely called val is none of the result.
-    for split in ("train", "val"):
-        measure(call, f"run={folder}", f"split={split}")
-        assert read(folder, "result.json") == before
 
 
 def test_run_image_of_another_shape_does_not_cost_the_training(
@@ -176,62 +116,40 @@ def test_run_image_of_another_shape_does_not_cost_the_training(
     code, _, err = train(call, data, tmp_path / "runs", *words)
     assert code == 0, err
     folder = only_run(tmp_path / "runs")
-    assert_one_sentence(err, f"consistency.view, image '{name}': ")
-    assert "Consistency was not measured; measure it later with `rgbt consistency`" in err
+    assert f"consistency.view, image '{name}': " in " ".join(err.split())
     result = read(folder, "result.json")
-    assert result["test"]["mIoU"] is not None
     assert not set(SCORES) & set(result["test"])
     assert set(SCORES) <= set(result["val"])
-    assert read(folder, "tables.json")["consistency"] is None
-    assert not [*folder.rglob("consistency_*_test.npz"), *folder.rglob("pairs*.png")]
-
-
-# ---- what is measured of a finished run -----------------------------------------------------
+    assert not [*folder.rglob("consistency_*_test.npz")]
 
 
 def test_consistency_of_a_finished_run_equals_its_own(
-    call: Call, trained: Trained, folder: Path, plain: Path
+    call: Call, folder: Path, plain: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Measured later, also of a run from before there was any consistency, it is the same."""
+    """And contacts no address that the run folder names."""
+    called: list[object] = []
+    monkeypatch.setattr("socket.socket.connect", lambda *given: called.append(given))
+    address = json.dumps({"uri": "http://127.0.0.1:9", "run_id": "a"})
+    (plain / "mlflow.json").write_text(address)
     assert plain.name == folder.name  # the same key
-    config = OmegaConf.load(plain / "config.yaml")
-    del config["consistency"]
-    OmegaConf.save(config, plain / "config.yaml")
-    tables = read(plain, "tables.json")
-    assert tables.pop("consistency") is None
-    (plain / "tables.json").write_text(json.dumps(tables))
-    code, _, err = call(evaluate.entry, f"run={plain}")
-    assert code == 0, err
     before, expected = read(plain, "result.json"), read(folder, "result.json")
-    out = measure(call, f"run={plain.name}", f"runs_dir={plain.parent}")
-    for column in ("TC aligned", "CA aligned", "TC released", "CA released", "color_cone"):
-        assert column in out
-    for name in (ALIGNED, RELEASED):
-        mine, theirs = (Counts.load(each / "evaluations" / name) for each in (plain, folder))
-        assert np.array_equal(mine.counts, theirs.counts)
-        assert (mine.names, mine.partition, mine.dataset) == (
-            *(theirs.names, theirs.partition, theirs.dataset),
-        )
-    found, new = read(plain, "result.json"), {name: expected["test"][name] for name in SCORES}
-    assert found == {**before, "test": {**before["test"], **new}}
+    assert "CA released" in measure(call, f"run={plain.name}", f"runs_dir={plain.parent}")
+    assert_same_counts(plain / "evaluations", folder / "evaluations")
+    new = {name: expected["test"][name] for name in SCORES}
+    assert read(plain, "result.json") == {**before, "test": {**before["test"], **new}}
     own = read(folder, "tables.json")["consistency"]
-    assert read(plain, "tables.json") == {**tables, "consistency": own}
-    measure(call, f"run={plain}")  # once more is the same
-    assert read(plain, "result.json") == found
-
-    assert "val/TC/aligned" not in RunResult(plain).scores()
+    assert read(plain, "tables.json")["consistency"] == own
     measure(call, f"run={plain}", "split=val")
-    stored = read(plain, "result.json")["val"]
-    for name in SCORES:
-        assert RunResult(plain).scores()[f"val/{name}"] == pytest.approx(100 * stored[name])
+    stored, scores = read(plain, "result.json")["val"], RunResult(plain).recorded_scores()
+    assert all(scores[f"val/{name}"] == pytest.approx(100 * stored[name]) for name in SCORES)
+    assert not called
+    assert (plain / "mlflow.json").read_text() == address
 
 
 ASIDE = {
     "another place": ("out={tmp}/out",),
     "last checkpoint": ("checkpoint=last",),
-    "a named modality": ("modality=rgbt",),
     "a set": ("consistency.sets=[released_1]",),
-    "a camera": ("consistency.view.camera.fx=500",),
     "another split": ("split=train",),
     "other images": ("dataset=mfnet", "dataset.root={tmp}/other", "dataset.name=other"),
 }
@@ -249,194 +167,199 @@ def test_consistency_with_other_views_replaces_nothing(
     assert [(folder / name).read_bytes() for name in files] == before
 
 
-@pytest.mark.slow
-def test_consistency_of_user_views_has_a_separate_file(
-    call: Call, trained: Trained, tmp_path: Path
-) -> None:
-    mine = tmp_path / "mine.csv"
-    mine.write_text("yaw,pitch,roll\n3,2,1\n-4,0,2\n")
-    camera = "consistency.view.camera.fx=500"
-    run = copied(trained, tmp_path, f"consistency.sets=[{mine}]", camera)
-    (path,) = (run / "evaluations").glob("consistency_aligned*_test.npz")
-    before = Counts.load(path)
-    assert path.name != ALIGNED
-    assert before.counts.shape == (3, 10, 9, 9)
-    assert before.partition.startswith("aligned1-")
-    # The same views, measured afterwards: the same counts in the same place.
-    (run / "evaluations").rename(run / "kept")
-    measure(call, f"run={run}", f"consistency.sets=[{mine.rename(tmp_path / 'moved.csv')}]", camera)
-    after = Counts.load(path)
-    assert np.array_equal(after.counts, before.counts)
-    assert after.partition == before.partition
-
-
-@pytest.mark.slow
-def test_consistency_of_split_checkpoint_and_modality_have_files(
-    call: Call, trained: Trained, tmp_path: Path
-) -> None:
-    folder, out = trained("+experiment=crm", *short(1)), tmp_path / "out"
-    requested = (
-        "modality=default",
-        "modality=rgb",
-        "modality=thermal",
-        "checkpoint=last",
-        "split=val",
-    )
-    for word in requested:
-        measure(call, f"run={folder}", f"out={out}", word)
-    ends = ("test", "test_rgb", "test_thermal", "test_last", "val")
-    expected = {f"consistency_{p}_{end}.npz" for p in ("aligned", "released") for end in ends}
-    assert {path.name for path in out.glob("*.npz")} == expected
-    found = [counts_of(out / f"consistency_aligned_{end}.npz") for end in ends]
-    assert not np.array_equal(found[0], found[1])
-    assert not np.array_equal(found[1], found[2])
-    val = Counts.load(out / "consistency_aligned_val.npz")
-    assert (val.split, val.names) == ("val", tuple(SPLITS["val"]))
-
-
-def test_consistency_of_weights_from_a_file(call: Call, folder: Path, data: Path) -> None:
-    out = measure(
-        call,
-        *("model=cmx_tiny", f"model.weights={folder}", f"runs_dir={folder.parent}"),
-        *("dataset=mfnet", f"dataset.root={data}", "scale=demo", "scale.test_short_edge=48"),
-        *("trainer.accelerator=cpu", "transform=flip", "model/inputs=temporal"),
-    )
-    assert "TC aligned" in out
-    (path,) = (folder.parent / "evaluations").glob(f"*/{ALIGNED}")
-    assert np.array_equal(counts_of(path), counts_of(folder / "evaluations" / ALIGNED))
-
-
-def test_consistency_of_true_second_frames(call: Call, folder: Path, tmp_path: Path) -> None:
-    where = (f"run={folder}", "frames=next", *SYNTH, f"dataset.cache_dir={tmp_path / 'cache'}")
-    aside = (*where, "split=val", f"out={tmp_path / 'out'}")
-    code, _, err = call(consistency.entry, *aside)
-    assert code == 2
-    assert_one_sentence(err, "dataset=synth writes it with dataset.ego_forward_m=0.5")
-    assert not (tmp_path / "out").exists()
-    out = measure(call, *aside, "dataset.ego_forward_m=0.5")
-    assert "TC next" in out
-    assert "TC aligned" not in out
-    counts = Counts.load(tmp_path / "out" / "consistency_next_val.npz")
-    assert re.fullmatch("next1-[0-9a-f]{6}", counts.partition)
-    assert counts.counts.shape == (2, 10, 9, 9)
-    assert 0.5 * 2 * 48 * 64 < counts.counts.sum() < 2 * 48 * 64  # what both frames show
-    assert (tmp_path / "out" / "pairs_next_val.png").exists()
-
-
-@pytest.mark.slow
 def test_consistency_on_another_motion_replaces_no_counts(
     call: Call, plain: Path, tmp_path: Path
 ) -> None:
     path = plain / "evaluations" / "consistency_next_test.npz"
     where = (f"run={plain}", "frames=next", *SYNTH, f"dataset.cache_dir={tmp_path / 'cache'}")
-    measure(call, *where, "dataset.ego_forward_m=0.5")
-    before, result = path.read_bytes(), (plain / "result.json").read_bytes()
-    code, _, err = call(consistency.entry, *where, "dataset.ego_forward_m=0.7")
-    assert code == 2, err
-    assert_one_sentence(err, f"{path} holds counts for second frames of another motion")
+    refused(call, "", *where)  # without second frames
+    assert not path.exists()
+    assert "TC next" in measure(call, *where, "dataset.ego_forward_m=0.5")
+    counts, before = Counts.load(path), path.read_bytes()
+    assert re.fullmatch("next1-[0-9a-f]{6}", counts.partition)
+    assert counts.counts.shape == (3, 10, 9, 9)
+    assert 0.5 * 3 * 48 * 64 < counts.counts.sum() < 3 * 48 * 64  # what both frames show
+    refused(call, str(path), *where, "dataset.ego_forward_m=0.7")
     assert path.read_bytes() == before
-    # The same motion again, and the other one in a place of its own.
-    kept = counts_of(path)
-    measure(call, *where, "dataset.ego_forward_m=0.5")
-    assert np.array_equal(counts_of(path), kept)
     measure(call, *where, "dataset.ego_forward_m=0.7", f"out={tmp_path / 'out'}")
-    other = Counts.load(tmp_path / "out" / path.name)
-    assert other.partition != Counts.load(path).partition
-    assert (plain / "result.json").read_bytes() == result
+    assert Counts.load(tmp_path / "out" / path.name).partition != counts.partition
 
 
-def test_consistency_counts_are_kept_where_no_picture_can_be_drawn(
-    call: Call, folder: Path, tmp_path: Path
+@pytest.fixture
+def exported(call: Call, data: Path, tmp_path: Path) -> Path:
+    folder = tmp_path / "pairs"
+    measure(call, f"export={folder}", "dataset=mfnet", f"dataset.root={data}")
+    return folder
+
+
+@pytest.fixture
+def predicted(exported: Path, tmp_path: Path) -> Path:
+    """Predictions of a method that sees class 1 where red is bright."""
+    for path in (exported / "rgb").glob("*.png"):
+        red = cv2.imread(str(path))[..., 2]
+        write_png(tmp_path / "predicted" / path.name, (red > 127).astype(np.uint8))
+    shutil.copy(exported / "pairs.json", tmp_path / "predicted")
+    return tmp_path / "predicted"
+
+
+def test_export_writes_both_frames_of_every_pair_and_their_list(exported: Path, data: Path) -> None:
+    for name in (f"{name}{view}" for name in SPLITS["test"] for view in ("", "_view1", "_view3")):
+        for kind, shape in (("rgb", (48, 64, 3)), ("thermal", (48, 64))):
+            path = exported / kind / f"{name}.png"
+            assert cv2.imread(str(path), cv2.IMREAD_UNCHANGED).shape == shape
+    packed = cv2.imread(str(data / "images" / "00202N.png"), cv2.IMREAD_UNCHANGED)
+    assert np.array_equal(cv2.imread(str(exported / "rgb" / "00202N.png")), packed[..., :3])
+    listed = read(exported, "pairs.json")
+    assert (listed["split"], listed["frames"], listed["views"]) == ("test", "virtual", "published")
+    assert listed["sets"] == ["released_1", "released_2", "released_3"]
+    assert len(listed["pairs"]) == 3 * len(SPLITS["test"])
+    angles = read_angles("released_2")[2].tolist()  # of the third image
+    assert list(listed["pairs"][7].values()) == ["00203D", "00203D_view2", 2, *angles]
+
+
+def test_predictions_of_a_network_count_as_the_network_does(
+    call: Call, trained: Trained, exported: Path, data: Path, tmp_path: Path
 ) -> None:
-    listed = [f"{number:05d}D" for number in range(301, 309)]
-    data = write_data(tmp_path / "other", {**SPLITS, "test": listed}, (48, 64))
-    for name in listed[:6]:
-        (data / "images" / f"{name}.png").write_bytes(b"")
-    more = ("dataset=mfnet", f"dataset.root={data}", "data.on_error=skip")
-    measure(call, f"run={folder}", f"out={tmp_path / 'out'}", *more)
-    assert Counts.load(tmp_path / "out" / ALIGNED).names == tuple(listed[6:])
+    run, written, out = trained(*TEMPORAL), tmp_path / "written", tmp_path / "counts"
+    code, _, err = call(predict.entry, f"run={run}", f"input={exported}", f"out={written}")
+    assert code == 0, err
+    words = (f"predictions={written}", f"pairs={exported}", f"out={out}")
+    measure(call, *words, "dataset=mfnet", f"dataset.root={data}")
+    assert_same_counts(out, run / "evaluations")
 
 
-@pytest.mark.parametrize(
-    ("measured", "requested", "reported"),
-    [
-        (("consistency=none",), (), True),
-        (("consistency=none",), ("consistency=none",), False),
-        ((), (), False),
-        ((), ("consistency.splits=[val,test]",), True),
-        ((), ("consistency.sets=[released_1]",), True),
-    ],
-    ids=["nothing measured", "nothing requested", "measured", "another split", "other views"],
-)
-def test_finished_run_reports_missing_measurements(
+def small(path: Path) -> None:
+    assert cv2.imwrite(str(path), np.zeros((24, 32), np.uint8))
+
+
+def interrupt(data: Path, predicted: Path) -> None:
+    listed = {**read(predicted, "pairs.json"), "complete": False}
+    (predicted / "pairs.json").write_text(json.dumps(listed))
+
+
+def name_twice(data: Path, predicted: Path) -> None:
+    for folder in ("images", "labels"):
+        shutil.copy(data / folder / "00202N.png", data / folder / "00201D_view1.png")
+    (data / "test.txt").write_text("00201D\n00201D_view1\n")
+
+
+OF_METHOD, VIEW, LABEL = "predictions={tmp}/predicted", "00202N_view2.png", "labels/00201D.png"
+REFUSED: dict[str, tuple[tuple[str, ...], str, Callable[[Path, Path], None] | None]] = {
+    "sets": ((OF_METHOD, "consistency.sets=[released_1]"), "set of views", None),
+    "split": ((OF_METHOD, "split=val"), "split=test", None),
+    "list": ((OF_METHOD, "pairs={tmp}"), "pairs=FOLDER", None),
+    "run": ((OF_METHOD, "run=runs/1c0ffe"), "'run'", None),
+    "both": ((OF_METHOD, "export={tmp}/more"), "'predictions'", None),
+    "network": (("run=x", "pairs={tmp}"), "'pairs'", None),
+    "flow of views": ((OF_METHOD, "flow=rgb"), "flow=rgb", None),
+    "share of next": ((OF_METHOD, "frames=next", "least_used=0.5"), "'least_used'", None),
+    "other pairs": (("export={tmp}/pairs", "split=val"), "export=", None),
+    "other files": (("export={tmp}",), "export=", None),
+    "no prediction": ((OF_METHOD,), VIEW, lambda _, folder: (folder / VIEW).unlink()),
+    "small prediction": ((OF_METHOD,), VIEW, lambda _, folder: small(folder / VIEW)),
+    "other label": ((OF_METHOD,), "other images", lambda data, _: small(data / LABEL)),
+    "interrupted export": ((OF_METHOD,), "interrupted", interrupt),
+    "one name for two": ((OF_METHOD,), "00201D_view1", name_twice),
+}
+
+
+@pytest.mark.parametrize(("words", "named", "spoil"), REFUSED.values(), ids=REFUSED)
+def test_settings_and_files_that_do_not_fit_are_refused(
     call: Call,
-    trained: Trained,
     data: Path,
+    predicted: Path,
     tmp_path: Path,
-    measured: tuple[str, ...],
-    requested: tuple[str, ...],
-    reported: bool,
+    words: tuple[str, ...],
+    named: str,
+    spoil: Callable[[Path, Path], None] | None,
 ) -> None:
-    folder = copied(trained, tmp_path, *measured)
-    before, known = sorted(folder.rglob("*")), read(folder, "run.json")
-    code, _, err = train(call, data, folder.parent, *TEMPORAL, *requested)
-    assert code == 0, err
-    lines = [line for line in err.splitlines() if "has not been measured" in line]
-    assert len(lines) == reported
-    assert all(f"rgbt consistency run={folder} split=..." in line for line in lines)
-    assert sorted(folder.rglob("*")) == before
-    assert read(folder, "run.json") == known
+    if spoil is not None:
+        spoil(data, predicted)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*.*") if path.is_file()}
+    given = (word.format(tmp=tmp_path) for word in words)
+    refused(call, named, "dataset=mfnet", f"dataset.root={data}", *given)
+    after = {path: path.read_bytes() for path in tmp_path.rglob("*.*") if path.is_file()}
+    assert after == before
 
 
-@pytest.mark.slow
-def test_mlflow_gets_what_was_added_once(call: Call, data: Path, tmp_path: Path) -> None:
-    from mlflow.tracking import MlflowClient
+HW = (48, 64)
+STEP = 4
+"""Columns by which everything moves to the left from frame to frame."""
 
-    code, _, err = train(call, data, tmp_path, *UNMEASURED, "tracking=mlflow")
-    assert code == 0, err
-    folder = only_run(tmp_path)
-    run_id = read(folder, "mlflow.json")["run_id"]
-    client = MlflowClient(f"sqlite:///{tmp_path / 'mlflow.db'}")
-    before = client.get_run(run_id).data.metrics
-    assert not [key for key in before if "TC" in key or "CA" in key]
-    measure(call, f"run={folder}", "checkpoint=last")
-    assert client.get_run(run_id).data.metrics == before
-
-    for split in ("val", "test", "test", "val"):
-        measure(call, f"run={folder}", f"split={split}")
-    found, result = client.get_run(run_id), read(folder, "result.json")
-    assert found.info.status == "FINISHED"
-    for kind, prefix in (("val", "val/"), ("test", "")):
-        for name in SCORES:
-            (point,) = client.get_metric_history(run_id, f"{prefix}{name}")
-            assert point.value == pytest.approx(100 * result[kind][name], abs=0.005)
-            assert point.step == 0
-    assert found.data.metrics.items() >= before.items()
-    assert len(found.data.metrics) == len(before) + 8
-    assert "TC aligned" in found.data.tags["mlflow.note.content"]
-    sent = {item.path for item in client.list_artifacts(run_id, "evaluations")}
-    assert f"evaluations/{ALIGNED}" in sent
-
-    # A store that is away does not cost what was measured.
-    state = read(folder, "mlflow.json")
-    (folder / "mlflow.json").write_text(json.dumps({**state, "uri": "http://127.0.0.1:9"}))
-    code, _, err = call(consistency.entry, f"run={folder}")
-    assert code == 0, err
-    assert_one_sentence(err, f"rgbt sync run={folder}")
+NUMBERS = range(1, 5)
+PIXELS = numpy_generator(0, "scene").integers(0, 256, (HW[0], HW[1] + STEP * 10))
+NOISE = cv2.GaussianBlur(PIXELS.astype(np.float32), (0, 0), 2.0)
+SCENE = (255 * (NOISE - NOISE.min()) / np.ptp(NOISE)).astype(np.uint8)
+CLASSES = np.broadcast_to(np.arange(NOISE.shape[1]) // 12 % 3, NOISE.shape).astype(np.uint8)
 
 
-def test_name_of_a_run_omits_measurements() -> None:
-    def named(*words: str) -> tuple[str, str]:
-        overrides = ["+experiment=temporal_con", *words]
-        found = describe(specify(compose(overrides), overrides))
-        return found.name, found.tags["rgbt.group"]
+def shown(image: np.ndarray, number: int) -> np.ndarray:
+    return np.ascontiguousarray(image[:, STEP * number : STEP * number + HW[1]])
 
-    plain = ("seed=0 · temporal_con", "temporal_con")
-    for words in (
-        ("consistency=none",),
-        ("consistency.view.camera.fx=500",),
-        ("camera@consistency.view.camera=synth",),
-    ):
-        assert named(*words) == plain
-    assert named("scheme.view.camera.fx=500")[1] == "temporal_con fx=500"
-    assert named("camera@scheme.view.camera=synth")[1] != "temporal_con"
+
+@pytest.fixture
+def drive(tmp_path: Path) -> Path:
+    """A video of four frames, of which the third is labelled."""
+    for number in NUMBERS:
+        write_png(tmp_path / "drive" / f"{number}.png", np.dstack([shown(SCENE, number)] * 4))
+    write_png(tmp_path / "drive" / "label" / "3.png", shown(CLASSES, 3))
+    return tmp_path / "drive"
+
+
+def of_video(drive: Path) -> tuple[str, ...]:
+    return (
+        *("frames=video", "dataset=video", f"dataset.root={drive}", "dataset.num_classes=3"),
+        *("dataset.classes=[a,b,c]", "dataset.rgb='{name}.png'", "dataset.thermal='{name}.png'"),
+        *("dataset.label='label/{name}.png'", "dataset.absent=released"),
+    )
+
+
+def predict_video(folder: Path, *, wrong: tuple[int, ...] = ()) -> Path:
+    for number in NUMBERS:
+        found = shown(CLASSES, number)
+        write_png(folder / f"{number}.png", (found + (number in wrong)).astype(np.uint8) % 3)
+    return folder
+
+
+def measure_video(call: Call, drive: Path, folder: Path, *more: str) -> dict[str, Counts]:
+    out = folder.parent / f"{folder.name}_out"
+    given = (f"predictions={folder}", *of_video(drive), f"out={out}", *more)
+    assert "Flow of 3 pairs" in measure(call, *given)
+    paths = {name: out / f"consistency_{name}_test.npz" for name in ("flow", "triples")}
+    return {name: Counts.load(path) for name, path in paths.items()}
+
+
+def test_predictions_that_follow_the_motion_are_consistent(
+    call: Call, drive: Path, tmp_path: Path
+) -> None:
+    found = measure_video(call, drive, predict_video(tmp_path / "right"))
+    assert found["flow"].names == ("2", "3", "4")
+    assert found["triples"].names == ("3", "4")
+    # The flow is rounded to whole pixels, so that a column beside a border may differ.
+    assert min(value(name, found["flow"], "released") for name in ("TC", "CA")) > 97
+    assert value("warping_error", found["flow"], "released") < 1.5
+    assert value("flicker", found["triples"], "released") < 1
+    # Only the third frame has a label; all count for TC.
+    labelled = found["flow"].counts[:, :3].sum((1, 2, 3))
+    assert labelled.tolist() == [0, found["flow"].counts[1].sum(), 0]
+    assert labelled[1] > 0.6 * HW[0] * HW[1]
+    records = list(csv.DictReader((tmp_path / "right_out" / "flow_test.csv").open()))
+    assert [record["name"] for record in records] == ["2", "3", "4"]
+    for record in records:
+        assert float(record["displacement_px"]) == pytest.approx(STEP, abs=0.3)
+        assert 0.6 < float(record["used"]) < 1 - STEP / HW[1] + 0.02
+    assert (tmp_path / "right_out" / "pairs_flow_test.png").is_file()
+
+
+def test_a_frame_that_is_wrong_alone_flickers(call: Call, drive: Path, tmp_path: Path) -> None:
+    found = measure_video(call, drive, predict_video(tmp_path / "wrong", wrong=(2,)))
+    by_pair = [value("warping_error", found["flow"].select([n]), "released") for n in ("2", "3")]
+    assert min(by_pair) > 97
+    assert value("warping_error", found["flow"].select(["4"]), "released") < 1.5
+    # Frames 1, 2, 3 change and change back; frames 2, 3, 4 only change.
+    assert value("flicker", found["triples"].select(["3"]), "released") > 97
+    assert value("flicker", found["triples"].select(["4"]), "released") < 1.5
+    # Another source of the flow has files of its own.
+    measure_video(call, drive, tmp_path / "wrong", "flow=thermal")
+    (path,) = (tmp_path / "wrong_out").glob("consistency_flow-*_test.npz")
+    assert Counts.load(path).partition == path.stem[12:-5].replace("flow", "flow1")

@@ -10,12 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from rgbt.corruptions.pixels import Noise
 from rgbt.data.cache.dataset import CachedDataset, cached_layer
 from rgbt.data.mfnet import CLASSES, MFNet
 from rgbt.data.pseudo_labels import FORMAT, PseudoLabelled, Unlabelled
 from rgbt.dataset import DatasetWrapper, layers, reader_of
-from rgbt.evaluation.corrupted_dataset import CorruptedDataset
+from rgbt.evaluation.request import CorruptedDataset, choose_corruption
 
 NAMES = ("00001D", "00002N")
 
@@ -26,16 +25,13 @@ def pseudo(source: MFNet, folder: Path) -> PseudoLabelled:
     return PseudoLabelled(source, folder, with_confidence=True)
 
 
-def corrupted(source: MFNet, _: Path) -> CorruptedDataset:
-    kind = Noise(image="both", severities=(8.0,))
-    return CorruptedDataset(source, kind, 8, split="train")
-
-
 WRAPPERS: dict[str, Callable[[MFNet, Path], DatasetWrapper]] = {
     "cached": lambda source, folder: CachedDataset(source, folder / "cache", num_threads=1),
     "pseudo-labelled": pseudo,
     "unlabelled": lambda source, folder: Unlabelled(source),
-    "corrupted": corrupted,
+    "corrupted": lambda source, _: CorruptedDataset(
+        source, choose_corruption("noise").at("8"), "train"
+    ),
 }
 
 

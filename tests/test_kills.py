@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import json
 import os
 import random
 import signal
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from mlflow.tracking import MlflowClient
 
 from rgbt.engine.checkpoint import load_checkpoint
-from rgbt.metrics.counts import Counts
-from rgbt.tracking.run_files import read_result
+from rgbt.runs.folder import RunFolder
+from rgbt.runs.result import RunResult
 from sweeps.worker.executors import LocalExecutor, LocalJob
 from tests.commands import only_run
 from tests.conftest import write_data
@@ -37,7 +37,7 @@ SETTINGS = (
     *("trainer.threads=1", "masker.patch_size=null"),
 )
 ENDINGS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
-TIMES = ("images_per_s", "wait_share", "peak_memory_mib")
+TIMES = ("time", "images_per_s", "wait_share", "peak_memory_mib")
 
 
 @dataclass
@@ -45,27 +45,21 @@ class Training:
     """One command that is rerun after every kill."""
 
     place: Path
-    root: Path
     executor: LocalExecutor
     num_workers: int = 0
-    started: int = 0
 
-    @property
-    def log(self) -> Path:
-        return self.place / "log"
+    def __post_init__(self) -> None:
+        self.log = self.place / "log"
 
     def start(self, instant: str = "-") -> LocalJob:
-        self.started += 1
+        root = self.place.parent
         words = (
-            *SETTINGS,
-            *(f"dataset.root={self.root / 'mf'}", f"runs_dir={self.place}"),
-            *(f"tracking.uri=sqlite:///{self.root / 'mlflow.db'}",),
-            *(f"tracking.experiment={self.place.name}", f"data.num_workers={self.num_workers}"),
+            *(f"tracking.uri=sqlite:///{root / 'mlflow.db'}", f"dataset.root={root / 'mf'}"),
+            *(f"tracking.experiment={self.place.name}", f"runs_dir={self.place}"),
+            f"data.num_workers={self.num_workers}",
         )
-        environment = {"OMP_NUM_THREADS": "1"}
-        return self.executor.start(
-            ("tests.dying", instant, "rgbt.run", *words), environment, self.log
-        )
+        command = ("tests.dying", instant, "rgbt.run", *SETTINGS, *words)
+        return self.executor.start(command, {"OMP_NUM_THREADS": "1"}, self.log)
 
     def wait_for_training(self, job: LocalJob, pid: int) -> None:
         """Until the process holds the lock of its run folder, or has ended."""
@@ -74,30 +68,23 @@ class Training:
                 return
             time.sleep(0.005)
 
+    def end(self, job: LocalJob) -> int:
+        deadline = time.monotonic() + 300
+        while (code := job.poll()) is None:
+            assert time.monotonic() < deadline, "hangs"
+            time.sleep(0.005)
+        return code
+
     def finish(self) -> Path:
-        assert ended(self.start()) == 0, self.log.read_text()[-3000:]
+        assert self.end(self.start()) == 0, self.log.read_text()[-3000:]
         return only_run(self.place)
 
 
-def ended(job: LocalJob) -> int:
-    deadline = time.monotonic() + 300
-    while (code := job.poll()) is None:
-        assert time.monotonic() < deadline, "hangs"
-        time.sleep(0.005)
-    return code
-
-
-@dataclass
-class Bench:
+class Bench(NamedTuple):
     root: Path
     executor: LocalExecutor
     undisturbed: Path
     seconds: float
-
-    @property
-    def training_seconds(self) -> float:
-        result = json.loads((self.undisturbed / "result.json").read_text())
-        return float(result["seconds_of_last_process"])
 
 
 @pytest.fixture(scope="module")
@@ -105,19 +92,15 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
     root = tmp_path_factory.mktemp("kills")
     write_data(root / "mf", IMAGES, (64, 64))
     executor = LocalExecutor()
-    first = Training(root / "first", root, executor)
-    first.finish()  # starts the fork server and makes the store
-    straight = Training(root / "straight", root, executor)
+    Training(root / "first", executor).finish()  # starts the fork server and makes the store
     began = time.monotonic()
-    return Bench(root, executor, straight.finish(), time.monotonic() - began)
+    straight = Training(root / "straight", executor).finish()
+    return Bench(root, executor, straight, time.monotonic() - began)
 
 
-def lines(folder: Path) -> list[tuple[str, int, dict[str, Any]]]:
-    texts = (folder / "metrics.jsonl").read_text().splitlines()
-    found = [json.loads(text) for text in texts]
-    for line in found:
-        line["values"] = {k: v for k, v in line["values"].items() if k not in TIMES}
-    return [(line["kind"], line["step"], line["values"]) for line in found]
+def lines(folder: Path) -> list[Any]:
+    plain = [{**vars(line), **line.values, "values": None} for line in RunFolder(folder).lines()]
+    return [{name: line[name] for name in line if name not in TIMES} for line in plain]
 
 
 def files(folder: Path) -> set[Path]:
@@ -129,9 +112,7 @@ def files(folder: Path) -> set[Path]:
 def check(bench: Bench, place: Path) -> None:
     """The run in `place` is as the undisturbed one, and nothing else is left."""
     folder, straight = only_run(place), bench.undisturbed
-    result, expected = (read_result(each) for each in (folder, straight))
-    assert result is not None
-    assert expected is not None
+    result, expected = (RunResult(each).result for each in (folder, straight))
     for one in (result, expected):
         del one["seconds_of_last_process"], one["name"]  # the name says how many workers
     assert result == expected
@@ -140,55 +121,37 @@ def check(bench: Bench, place: Path) -> None:
         assert (folder / name).read_bytes() == (straight / name).read_bytes(), name
     assert load_checkpoint(folder / "best.pt")["step"] == result["best_step"]
     for split in ("val", "test"):
-        one, other = (Counts.load(f / f"counts_{split}.npz") for f in (folder, straight))
-        assert np.array_equal(one.counts, other.counts)
+        one, other = (RunResult(each).counts(split).counts for each in (folder, straight))
+        assert np.array_equal(one, other)
     assert files(folder) == files(straight)
-    runs = sent(bench.root, place.name)
-    assert [(run.data.tags.get("rgbt.key"), run.info.status) for run in runs] == [
-        (folder.name, "FINISHED")
-    ]
-    steps = shown_steps(bench.root, runs[0].info.run_id)
-    assert steps == sorted(set(steps)) == list(range(1, STEPS + 1))
-
-
-def store(root: Path) -> Any:
-    from mlflow.tracking import MlflowClient
-
-    return MlflowClient(tracking_uri=f"sqlite:///{root / 'mlflow.db'}")
-
-
-def sent(root: Path, experiment: str) -> list[Any]:
-    client = store(root)
-    found = client.get_experiment_by_name(experiment)
-    return list(client.search_runs([found.experiment_id]))
-
-
-def shown_steps(root: Path, run_id: str) -> list[int]:
-    return [metric.step for metric in store(root).get_metric_history(run_id, "train/loss")]
+    store = MlflowClient(tracking_uri=f"sqlite:///{bench.root / 'mlflow.db'}")
+    experiment = store.get_experiment_by_name(place.name)
+    (run,) = store.search_runs([experiment.experiment_id])
+    assert (run.data.tags.get("rgbt.key"), run.info.status) == (folder.name, "FINISHED")
+    steps = [metric.step for metric in store.get_metric_history(run.info.run_id, "train/loss")]
+    assert steps == list(range(1, STEPS + 1))
 
 
 @pytest.mark.parametrize("series", range(10))
 def test_killed_at_random_instants(bench: Bench, series: int) -> None:
     """Six kills each, sixty in all; by the process or its whole group, with workers or without."""
     draw = random.Random(series)
-    training = Training(
-        bench.root / f"random_{series}", bench.root, bench.executor, num_workers=series % 2
-    )
+    training = Training(bench.root / f"random_{series}", bench.executor, num_workers=series % 2)
+    inside = float(RunResult(bench.undisturbed).result["seconds_of_last_process"])
     for _ in range(6):
         job = training.start()
         pid = job._process.pid
         assert pid is not None
         number = draw.choice(ENDINGS)
-        if draw.random() < 0.8:  # while it trains, else at any moment
+        trains = draw.random() < 0.8  # killed while it trains, else at any moment
+        if trains:
             training.wait_for_training(job, pid)
-            time.sleep(draw.uniform(0.0, 1.0) * bench.training_seconds)
-        else:
-            time.sleep(draw.uniform(0.0, 1.0) * bench.seconds)
+        time.sleep(draw.uniform(0.0, 1.0) * (inside if trains else bench.seconds))
         if draw.random() < 0.5:
             job._signal(number)
         elif job.poll() is None:
             os.kill(pid, number)
-        code = ended(job)
+        code = training.end(job)
         # Before the command answers signals: as the system does, or Python for Ctrl-C.
         early = {-number, 1} if number == signal.SIGINT else {-number}
         assert code in {0, 128 + number} | early, training.log.read_text()[-3000:]
@@ -197,7 +160,7 @@ def test_killed_at_random_instants(bench: Bench, series: int) -> None:
 
 
 INSTANTS = (
-    *("before config.yaml 1", "after run.json 1", "after mlflow.json 1", "before mlflow.json 2"),
+    *("before config.yaml 1", "after run.json 1", "after mlflow.json 1", "before mlflow.json 1"),
     *("after dataset.json 1", "after provenance.json 1", "before metrics.jsonl 1"),
     *("after checkpoints/3/counts_val.npz 1", "before checkpoints/3/best.pt 1"),
     *("after checkpoints/3/best.pt 1", "before last.pt 2", "after last.pt 2"),
@@ -210,7 +173,8 @@ INSTANTS = (
 @pytest.mark.parametrize("instant", INSTANTS)
 def test_killed_between_two_writes(bench: Bench, instant: str) -> None:
     name = instant.replace(" ", "_").replace("/", "_")
-    training = Training(bench.root / name, bench.root, bench.executor)
-    assert ended(training.start(instant)) == -signal.SIGKILL, training.log.read_text()[-3000:]
+    training = Training(bench.root / name, bench.executor)
+    code = training.end(training.start(instant))
+    assert code == -signal.SIGKILL, training.log.read_text()[-3000:]
     training.finish()
     check(bench, training.place)

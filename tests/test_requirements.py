@@ -1,4 +1,4 @@
-"""What a component provides and requires."""
+"""What a component provides and requires, and which missing requirement is reported."""
 
 from __future__ import annotations
 
@@ -7,23 +7,10 @@ from typing import Any
 
 import pytest
 
+from rgbt.assembly.contracts import check_requirements
 from rgbt.checks import InputError
-from rgbt.requirements import PLAIN, Record, Requirement, record_of
+from rgbt.requirements import PLAIN, Record, Requirement
 from rgbt.types import VIEWS
-
-
-def test_record_of_component_without_record_has_defaults() -> None:
-    record = record_of(object())
-    assert record is PLAIN
-    assert (record.outputs, record.views, record.heads) == ("scores", VIEWS, ())
-    assert (record.frames, record.num_domains, record.shows_views) == (1, 1, False)
-    assert (record.hides_cells, record.works_on_batches, record.crop_hw) == (True, False, None)
-    assert (record.optimizers, record.networks, record.requires) == ({"main": ()}, {}, ())
-
-
-def test_record_of_other_type_is_refused() -> None:
-    with pytest.raises(InputError, match=r"SimpleNamespace.record is dict with views; expected"):
-        record_of(SimpleNamespace(record={"views": 1}))
 
 
 @pytest.mark.parametrize(
@@ -43,4 +30,23 @@ def test_record_of_other_type_is_refused() -> None:
     ],
 )
 def test_requirement_is_met(key: str, value: Any, record: Record, is_met: bool) -> None:
-    assert Requirement("model", key, value).is_met_by(record) == is_met
+    need = Requirement("model", key, value, "scheme.pairs=2", advice="name a flow")
+    assert need.is_met_by(record) == is_met
+    components = {
+        "scheme": SimpleNamespace(record=Record(requires=(need,))),
+        "model": SimpleNamespace(record=record),
+    }
+    if is_met:
+        check_requirements(components)
+    else:
+        with pytest.raises(InputError, match=f"scheme.pairs=2 requires {key}=.*; name a flow, or"):
+            check_requirements(components)
+    del components["model"]
+    check_requirements(components)
+
+
+def test_loss_without_record_requires_class_scores() -> None:
+    masks = SimpleNamespace(record=Record(outputs="masks"))
+    with pytest.raises(InputError, match="outputs=scores"):
+        check_requirements({"loss": object(), "model": masks})
+    check_requirements({"loss": object(), "model": object()})

@@ -28,7 +28,6 @@ def test_robustness_counts_are_those_of_evaluate(
     code, out, err = call(ENTRY, f"run={folder}", *NOISE)
     assert code == 0, err
     place = folder / "evaluations" / "robustness" / "test"
-    assert "noise, RGB" in out
     assert f"counts  {place}/" in out
     assert {path.name for path in place.iterdir()} == {
         *("robustness_noise_rgb.md", "robustness_noise_rgb.csv"),
@@ -48,14 +47,9 @@ def test_robustness_counts_are_those_of_evaluate(
         file = tmp_path / f"{mark}.npz"
         assert call(EVALUATE, f"run={folder}", f"out={file}", *words)[0] == 0
         np.testing.assert_array_equal(counts[mark], Counts.load(file).counts)
-    assert (
-        call(EVALUATE, f"run={folder}", "corruption=noise", "corruption.image=rgb", "severity=16")[
-            0
-        ]
-        == 0
-    )
-    (named,) = (folder / "evaluations").glob("*noise*.npz")
-    assert named.name == "mfnet_test_rgbt_ring5_noise_rgb-16.npz"
+    words = ("corruption=noise", "corruption.image=rgb", "severity=16")
+    assert call(EVALUATE, f"run={folder}", *words)[0] == 0
+    assert (folder / "evaluations" / "mfnet_test_rgbt_ring5_noise_rgb-16.npz").exists()
     # Over other regions beside them; twice the same run, of which nothing is made again.
     words = ("corruptions=removed:thermal", "regions=ring9", "runs_dir=" + str(tmp_path / "runs"))
     code, out, err = call(ENTRY, "run=key,key", *words)

@@ -4,26 +4,30 @@ from __future__ import annotations
 
 import json
 import multiprocessing
-import os
 import shutil
-import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from rgbt import evaluate, predict
-from rgbt.checks import InputError
+from rgbt.checkpoints.stored import save
+from rgbt.config.component import build
+from rgbt.config.compose import compose
 from rgbt.engine.checkpoint import load_checkpoint
 from rgbt.metrics.counts import Counts
 from rgbt.run import main
-from rgbt.tracking.run_folder import find_run
 from tests.checkpoints.test_stored import same
 from tests.commands import (
+    DAYS_AND_NIGHTS,
+    ON_CPU,
+    SMALL,
     SPLITS,
     Call,
     Trained,
@@ -35,55 +39,36 @@ from tests.commands import (
     train,
     words_of,
 )
+from tests.composed import specified
+from tests.conftest import write_png
+from tests.data.folder_files import PATTERNS, write_folder
+from tests.data.freiburg_files import write_freiburg
+from tests.data.kp_files import write_kp
+from tests.data.pst900_files import write_pst900
+from tests.data.video_files import write_mvseg
 
-ROOT = Path(__file__).resolve().parents[1]
-
-ADAPTATION = (
-    *("sh_", "self_training", "multi_head", "heatnet", "rgb_teacher", "thermal_teacher"),
-    *("start_deeplabv2", "start_pspnet", "start_semseg"),
+NO_PATCH = "masker.patch_size=null"
+OF_SYNTH = (
+    *("dataset.num_train=3", "dataset.num_val=3", "dataset.num_test=3"),
+    *("dataset.height=48", "dataset.width=64", *SMALL),
 )
-"""Beginnings of experiments on days and nights: `tests/test_adaptation_run.py`."""
-
-METHODS = ("crm", "grbm", "spatialseg")
-ELSEWHERE = [f"{method}_{dataset}" for method in METHODS for dataset in ("kp", "pst900")]
-"""Experiments that are others' on another data set: `tests/test_recipes.py`."""
-
-EXPERIMENTS = sorted(path.stem for path in (ROOT / "conf" / "experiment").glob("*.yaml"))
-
-
-LIKE_ANOTHER = (
-    *("crm", "grbm_released", "spatialseg", "cmx_released", "temporal_con"),
-    *("rtfnet_152", "rtfnet_152_temporal_con"),
-)
-"""Experiments with the network, scheme and loss of one that is trained here or in tests below, and
-other values. Common starts are their network's experiment on other scenes. Both are slow."""
+ON_DATA = {
+    **{name: (NO_PATCH,) for name in ("baseline", "cmx", "cmnext", "mfnet", "rtfnet")},
+    **{name: (NO_PATCH,) for name in ("dinov2", "dinov3", "temporal_con_released")},
+    **{"grbm": (), "spatialseg_released": ()},
+    "crm_pst900": ("dataset=synth_pst900", *OF_SYNTH),
+    "spatialseg_kp": ("dataset=synth_kp", *OF_SYNTH),
+}
+"""One experiment for each network, scheme and loss; `tests/test_behaviour.py` has all."""
 
 
-def trained_here(name: str) -> Any:
-    is_slow = name in LIKE_ANOTHER or name.startswith("start_")
-    return pytest.param(name, marks=pytest.mark.slow if is_slow else ())
-
-
-@pytest.mark.parametrize(
-    "experiment",
-    [
-        trained_here(name)
-        for name in EXPERIMENTS
-        if not name.startswith(ADAPTATION) and name not in ELSEWHERE
-    ],
-)
-def test_every_experiment_trains_evaluates_and_writes_its_folder(
-    call: Call, data: Path, tmp_path: Path, experiment: str
-) -> None:
-    unmasked = not experiment.startswith(METHODS)
-    patch = ["masker.patch_size=null"] if unmasked else []
-    code, out, err = train(call, data, tmp_path, f"+experiment={experiment}", *patch, *short(2))
-    assert code == 0, err
-    assert all(word in out for word in ("IoU1", "mIoU", "unlabeled"))
-    folder = only_run(tmp_path)
+@pytest.mark.parametrize("experiment", ON_DATA)
+def test_experiment_trains_and_counts_every_pixel(trained: Trained, experiment: str) -> None:
+    folder = trained(f"+experiment={experiment}", *ON_DATA[experiment], *short(2))
     counts = Counts.load(folder / "counts_test.npz")
-    assert counts.names == tuple(SPLITS["test"])
-    assert counts.counts.sum() == 3 * 48 * 64
+    assert len(counts.names) == 3
+    # Void of KP does not count.
+    assert (counts.counts.sum() == 3 * 48 * 64) != experiment.endswith("_kp")
     written = {path.name for path in folder.iterdir()}
     assert {"config.yaml", "metrics.jsonl", "provenance.json", "tables.json", "best.pt"} <= written
     lines = logged(folder)
@@ -93,78 +78,105 @@ def test_every_experiment_trains_evaluates_and_writes_its_folder(
     assert {"loss", "grad_norm", "images_per_s", "wait_share"} <= set(lines[0]["values"])
 
 
+OWN = (
+    *(f"dataset.{key}='{text}'" for key, text in PATTERNS.items()),
+    *("dataset.num_classes=3", "dataset.classes=[background,person,car]"),
+    *("dataset.thermal_range=[20000,24000]", "metric.regions=2"),
+)
+FREIBURG = ("dataset.crop=null", "dataset.val_sequences=[seq_04_day]")
+FILES: dict[str, tuple[Callable[[Path], Path], tuple[str, ...]]] = {
+    **{"pst900": (write_pst900, ()), "kp": (write_kp, ()), "mvseg": (write_mvseg, ())},
+    **{"freiburg": (write_freiburg, FREIBURG), "folder": (write_folder, OWN)},
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dataset", FILES)
+def test_smoke_runs_on_files_of_every_layout(call: Call, tmp_path: Path, dataset: str) -> None:
+    write, own = FILES[dataset]
+    words = (f"dataset={dataset}", f"dataset.root={write(tmp_path / 'data')}", *own, *ON_CPU)
+    smoke = ("+experiment=grbm", "+debug=smoke", f"runs_dir={tmp_path / 'runs'}")
+    code, _, err = call(main, *smoke, *words)
+    assert code == 0, err
+    assert len(logged(only_run(tmp_path / "runs"), "train")) == 2
+
+
 @pytest.mark.usefixtures("pictures")
 def test_finished_run_shows_its_tables_again(call: Call, data: Path, tmp_path: Path) -> None:
     words = (data, tmp_path, "+experiment=grbm", *short(1))
-    first = train(call, *words)
+    code, out, err = train(call, *words)
+    assert code == 0, err
     for picture in ("panel.png", "regions.png"):
         assert (only_run(tmp_path) / "figures" / picture).stat().st_size > 1000
-    again = train(call, *words)
-    assert again[:2] == (0, first[1])
-    assert "is already finished" in again[2]
-    # The default, typed: the same run, shown under the name that says more.
-    for more in (["masker.sigma_div=4"], []):
-        assert "is already finished" in train(call, *words, *more)[2]
-        assert "sigma_div=4" in json.loads((only_run(tmp_path) / "run.json").read_text())["name"]
+    # The default, typed: the same run.
+    code, again, err = train(call, *words, "masker.sigma_div=4")
+    assert code == 0, err
+    assert "is already finished" in err
+    assert next(line for line in out.splitlines() if "mIoU" in line) in again
 
 
-def test_seed_decides_losses_and_key(
-    call: Call, data: Path, trained: Trained, tmp_path: Path
-) -> None:
-    first = trained("+experiment=crm", *short(1))
-    for seed in (0, 1):
-        train(call, data, tmp_path / str(seed), "+experiment=crm", f"seed={seed}", *short(1))
-    same, other = only_run(tmp_path / "0"), only_run(tmp_path / "1")
-    assert (same.name, losses(same)) == (first.name, losses(first))
-    assert other.name != first.name
-    assert losses(other) != losses(first)
+def test_seeds_decide_losses_and_key(trained: Trained) -> None:
+    def run(*words: str) -> tuple[str, list[dict[str, float]]]:
+        folder = trained("+experiment=crm", *words, *short(1))
+        return folder.name, losses(folder)
+
+    sources = ("weights", "order", "masks")
+    zeros = [f"seeds.{each}=0" for each in sources]
+    first = run()
+    assert run("seed=0") == run("seed=1", *zeros) == first
+    for others in ("seed=1", *(f"seeds.{each}=1" for each in sources)):
+        key, steps = run(others)
+        assert key != first[0]
+        assert steps != first[1], others
 
 
-def test_seeds_of_every_source_together_are_the_seed(
-    call: Call, data: Path, trained: Trained, tmp_path: Path
-) -> None:
-    first = losses(trained("+experiment=crm", *short(1)))
-    all_three = ("seeds.weights=0", "seeds.order=0", "seeds.masks=0")
-    for name, seeds in (("same", all_three), ("masks", all_three[:2])):
-        train(call, data, tmp_path / name, "+experiment=crm", "seed=1", *seeds, *short(1))
-    assert losses(only_run(tmp_path / "same")) == first
-    assert losses(only_run(tmp_path / "masks")) != first
+KILLED = (
+    ("+experiment=temporal_con", NO_PATCH),
+    ("+experiment=sh_adversarial", "model.weights=null", *DAYS_AND_NIGHTS),
+    ("+experiment=heatnet", *DAYS_AND_NIGHTS),
+)
 
 
-@pytest.mark.parametrize("averaging", [pytest.param("none", marks=pytest.mark.slow), "ema"])
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("+experiment=grbm", "trainer.averaging=ema"),
+        *(pytest.param(each, marks=pytest.mark.slow) for each in KILLED),
+    ],
+)
 def test_killed_run_resumed_equals_uninterrupted(
-    call: Call, data: Path, tmp_path: Path, averaging: str
+    call: Call, data: Path, trained: Trained, tmp_path: Path, words: tuple[str, ...]
 ) -> None:
-    overrides = ("+experiment=grbm", f"trainer.averaging={averaging}", *short(6))
+    """Which has loader workers, that draw the same."""
+    overrides = (*words, *short(6))
+    arguments = words_of(data, tmp_path, *overrides)
+    resumed = specified(tuple(arguments)).folder
 
     def run() -> None:
-        sys.argv = ["rgbt", *words_of(data, tmp_path / "killed", *overrides)]
+        sys.argv = ["rgbt", *arguments]
         main()
 
     process = multiprocessing.get_context("fork").Process(target=run)
     process.start()
-    deadline = time.monotonic() + 120
-    while not any('"step": 3' in p.read_text() for p in tmp_path.glob("killed/*/metrics.jsonl")):
+    lines, deadline = resumed / "metrics.jsonl", time.monotonic() + 240
+    while not (lines.exists() and '"step": 3' in lines.read_text()):
         assert time.monotonic() < deadline, "step 3 was not reached"
         time.sleep(0.02)
     process.kill()
     process.join()
-    (folder,) = (path.parent for path in (tmp_path / "killed").glob("*/metrics.jsonl"))
-    assert not (folder / "result.json").exists()
-
-    code, _, err = train(call, data, tmp_path / "killed", *overrides)
+    assert not (resumed / "result.json").exists()
+    code, _, err = train(call, data, tmp_path, *overrides)
     assert code == 0, err
     assert "resumes at step" in err
-    train(call, data, tmp_path / "straight", *overrides)
-    resumed, straight = only_run(tmp_path / "killed"), only_run(tmp_path / "straight")
+    straight = trained(*overrides, "data.num_workers=2")
     assert resumed.name == straight.name
     for split in ("val", "test"):
         a, b = (Counts.load(f / f"counts_{split}.npz").counts for f in (resumed, straight))
         assert np.array_equal(a, b)
     ends = [load_checkpoint(each / "last.pt") for each in (resumed, straight)]
-    assert same(ends[0]["model"], ends[1]["model"])
-    assert same(ends[0].get("unaveraged"), ends[1].get("unaveraged"))
-    assert [line["step"] for line in logged(resumed, "train")] == list(range(1, 7))
+    for part in ("model", "unaveraged", "others", "optimizers"):
+        assert same(ends[0].get(part), ends[1].get(part)), part
+    assert losses(resumed) == losses(straight)
 
 
 def test_unreadable_files_are_skipped_on_request(call: Call, data: Path, tmp_path: Path) -> None:
@@ -173,7 +185,7 @@ def test_unreadable_files_are_skipped_on_request(call: Call, data: Path, tmp_pat
     for name in spoiled:
         path = data / "images" / f"{name}.png"
         path.write_bytes(path.read_bytes()[:100])
-    words = ("+experiment=temporal_con", "masker.patch_size=null", "data.on_error=skip", *short(4))
+    words = ("+experiment=temporal_con", NO_PATCH, "data.on_error=skip", *short(4))
     code, _, err = train(call, data, tmp_path / "runs", *words)
     assert code == 0, err
     folder = only_run(tmp_path / "runs")
@@ -194,7 +206,7 @@ def test_unfinished_run_on_other_images_is_refused(call: Call, data: Path, runs:
     (only_run(runs) / "result.json").unlink()
     # A replaced file is mentioned ...
     path = data / "images" / "00003N.png"
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    image: Any = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     image[:24] = 0
     assert cv2.imwrite(str(path), image)
     code, _, err = train(call, data, runs, "+experiment=crm", *short(1))
@@ -212,91 +224,155 @@ def test_evaluate_and_predict_a_finished_run(
     call: Call, data: Path, runs: Path, tmp_path: Path
 ) -> None:
     folder = only_run(runs)
+    payload = load_checkpoint(folder / "last.pt")
+    payload["model"] = {key: torch.zeros_like(each) for key, each in payload["model"].items()}
+    save(folder / "last.pt", payload)
     requests = {
         "rgbt_ring5": (f"run={folder}",),
         "rgb_ring9": (f"run={folder.name}", f"runs_dir={runs}", "modality=rgb", "regions=ring9"),
         "rgbt_ring5_last": (f"run={folder}", "checkpoint=last"),
     }
+    found = {}
     for name, words in requests.items():
-        code, out, err = call(evaluate.entry, *words)
+        code, _, err = call(evaluate.entry, *words)
         assert code == 0, err
-        assert ("IoU9" in out) == name.endswith("ring9")
-        assert (folder / "evaluations" / f"mfnet_test_{name}.npz").exists()
-    for name in ("rgbt_ring5", "rgbt_ring5_last"):  # one step: the last one is the best one
-        stored = Counts.load(folder / "evaluations" / f"mfnet_test_{name}.npz")
-        assert np.array_equal(stored.counts, Counts.load(folder / "counts_test.npz").counts)
+        found[name] = Counts.load(folder / "evaluations" / f"mfnet_test_{name}.npz").counts
+    stored = Counts.load(folder / "counts_test.npz").counts
+    assert np.array_equal(found["rgbt_ring5"], stored)
+    # Without weights it predicts one class.
+    assert np.count_nonzero(found["rgbt_ring5_last"].sum((0, 1, 2))) == 1
 
-    other = tmp_path / "images"
-    other.mkdir()
-    (other / "a.png").write_bytes((data / "images" / "00201D.png").read_bytes())
-    words = (f"run={folder}", f"input={other}")
+    image = tmp_path / "images" / "a.png"
+    image.parent.mkdir()
+    shutil.copy(data / "images" / "00201D.png", image)
+    before = image.read_bytes()
+    words = (f"run={folder}", f"input={image.parent}")
+    assert call(predict.entry, *words, f"out={image.parent}")[0] == 2
+    assert image.read_bytes() == before
     code, _, err = call(predict.entry, *words, f"out={tmp_path / 'out'}")
     assert code == 0, err
-    classes = cv2.imread(str(tmp_path / "out" / "a.png"), cv2.IMREAD_UNCHANGED)
-    assert classes.shape == (48, 64)
-    assert classes.max() < 9
-    assert cv2.imread(str(tmp_path / "out" / "a_overlay.png")).shape == (48, 64, 3)
-
-    before = (other / "a.png").read_bytes()
-    code, _, err = call(predict.entry, *words, f"out={other}")
-    assert code == 2
-    assert_one_sentence(err, "would be overwritten")
-    assert (other / "a.png").read_bytes() == before
+    classes: Any = cv2.imread(str(tmp_path / "out" / "a.png"), cv2.IMREAD_UNCHANGED)
+    assert (classes.shape, classes.max() < 9) == ((48, 64), True)
+    assert (tmp_path / "out" / "a_overlay.png").exists()
 
 
-@pytest.mark.slow
-def test_multirun_finishes_the_other_points_when_one_is_wrong(
-    call: Call, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from sweeps.worker import executors
-
-    monkeypatch.setattr(executors, "PRELOADED", ("torch", "hydra"))  # MLflow is not used here
-    code, _, err = train(
-        call, data, tmp_path, "-m", "+experiment=grbm", "masker.patch_size=40,32,64", *short(1)
-    )
-    assert code == 1
-    assert "1 of 3 points failed, first patch_size=40: " in err
-    assert len(list(tmp_path.glob("*/result.json"))) == 2
+def test_reported_where_test_images_select_the_best(call: Call, data: Path, tmp_path: Path) -> None:
+    words = ("+experiment=crm", "dataset.splits.val=test.txt", *short(1))
+    assert "trainer.selection_split=val" in train(call, data, tmp_path, *words)[2]
 
 
-def test_run_is_not_matched_by_part_of_a_name(tmp_path: Path) -> None:
-    folder = tmp_path / "abc"
-    folder.mkdir()
-    (folder / "config.yaml").write_text("")
-    (folder / "mlflow.json").write_text('{"run_id": "f00", "experiment": "rgbt"}')
-    assert find_run("f00", tmp_path) == find_run("abc", tmp_path) == folder
-    with pytest.raises(InputError, match="run=rgbt is neither"):
-        find_run("rgbt", tmp_path)
+NIGHT = ("+experiment=multi_head_night", *DAYS_AND_NIGHTS, *short(2))
 
 
-def test_help_needs_neither_torch_nor_mlflow() -> None:
-    script = (
-        "import sys, runpy\nsys.argv = ['rgbt', '--help']\n"
-        "try:\n    runpy.run_module('rgbt.run', run_name='__main__')\n"
-        "except SystemExit as left:\n    assert not left.code\n"
-        "heavy = {'torch', 'mlflow', 'pandas', 'matplotlib'} & set(sys.modules)\n"
-        "assert not heavy, heavy\n"
-    )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT)
-    assert done.returncode == 0, done.stderr
-    assert "+experiment=grbm" in done.stdout
-
-
-SHARED = Path(os.environ.get("RGBT_SHARED", ROOT.parent / "shared"))
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not (SHARED / "realdata" / "mfnet200").exists(), reason="reference material")
-def test_real_pairs_train_and_evaluate_like_the_embedded_data(call: Call, tmp_path: Path) -> None:
-    real = SHARED / "realdata" / "mfnet200"
-    code, out, err = call(
-        *(main, "+experiment=grbm", "dataset=mfnet", f"dataset.root={real}", "tracking=none"),
-        *("dataset.splits.test=val.txt", f"runs_dir={tmp_path}", "trainer.threads=2", *short(2)),
-    )
+def evaluated(call: Call, folder: Path, *words: str) -> Counts:
+    """Counts of `rgbt.evaluate` of a run folder."""
+    out = folder.parent / "evaluated.npz"
+    code, _, err = call(evaluate.entry, f"run={folder}", f"out={out}", *words)
     assert code == 0, err
-    counts = Counts.load(only_run(tmp_path) / "counts_test.npz")
-    assert counts.counts.shape == (100, 5, 9, 9)
-    assert counts.counts.sum() == 100 * 480 * 640
-    # Labelled pixels per class of these 100 images, counted independently of this project.
-    labelled = [29157290, 176251, 290344, 553653, 108846, 134539, 0, 223949, 75128]
-    assert counts.whole().sum(1).tolist() == labelled
+    return Counts.load(out)
+
+
+def scores_by_hand(counts: Counts) -> list[float]:
+    """mIoU of all images, of the two by day and of the two at night; 0 of an absent class."""
+    scores = []
+    for images in (slice(None), slice(2), slice(2, None)):
+        matrix = counts.counts[images].sum((0, 1))
+        union = (matrix.sum(0) + matrix.sum(1) - np.diag(matrix))[:12]
+        scores.append(float(np.mean(np.diag(matrix)[:12] / np.maximum(union, 1))))
+    return scores
+
+
+def test_run_on_days_and_nights_counts_every_image(trained: Trained) -> None:
+    folder = trained(*NIGHT)
+    counts = Counts.load(folder / "counts_test.npz")
+    cache = folder.parents[1] / "cache"
+    dataset = build(compose([*DAYS_AND_NIGHTS, f"dataset.cache_dir={cache}"]).dataset)
+    assert counts.names == dataset.names("test")
+    assert counts.night == (False, False, True, True)
+    assert counts.unscored == ("background", "ignore")
+    labels = np.stack([dataset.read(name).label for name in counts.names])
+    assert counts.counts.sum() == (labels != 255).sum()
+    values = logged(folder, "test")[0]["values"]
+    scores = [values[name] for name in ("mIoU", "day/mIoU", "night/mIoU")]
+    assert scores == pytest.approx(scores_by_hand(counts))
+
+
+def test_statistics_of_each_domain_change_the_counts_and_not_the_run(
+    trained: Trained, call: Call
+) -> None:
+    folder = trained(*NIGHT)
+    files = {path: path.read_bytes() for path in folder.glob("*") if path.is_file()}
+    code, out, err = call(evaluate.entry, f"run={folder}", "batch_norm=adabn")
+    assert code == 0, err
+    assert "AdaBN" in out
+    found = Counts.load(folder / "evaluations" / "synth_freiburg_test_rgb_ring5_norm-adabn.npz")
+    stored = Counts.load(folder / "counts_test.npz")
+    assert (found.names, found.night) == (stored.names, stored.night)
+    assert not np.array_equal(found.counts, stored.counts)
+    assert {path: path.read_bytes() for path in files} == files
+
+
+def without_target_head(folder: Path, place: Path) -> Path:
+    """A copy of a run whose head of the target predicts class 0 everywhere."""
+    shutil.copytree(folder, place)
+    payload = load_checkpoint(place / "best.pt")
+    for name, values in payload["model"].items():
+        if name.startswith("heads.target."):
+            values.zero_()
+    save(place / "best.pt", payload)
+    return place
+
+
+def only_road(counts: np.ndarray) -> bool:
+    return not counts[..., 1:].any()
+
+
+def test_night_images_are_predicted_by_the_targets_head(
+    trained: Trained, call: Call, tmp_path: Path
+) -> None:
+    folder = trained(*NIGHT)
+    broken = without_target_head(folder, tmp_path / "broken")
+    whole = Counts.load(folder / "counts_test.npz").counts
+    night, day = slice(2, 4), slice(0, 2)
+    target = evaluated(call, broken).counts
+    assert only_road(target[night])
+    assert np.array_equal(target[day], whole[day])
+    # And with the requested head.
+    assert only_road(evaluated(call, broken, "head=target").counts)
+    assert not only_road(evaluated(call, broken, "head=source").counts[night])
+    assert np.array_equal(evaluated(call, folder, "head=own").counts, whole)
+    # Images of a user need the request.
+    rng = np.random.default_rng(0)
+    write_png(tmp_path / "mine" / "street.png", rng.integers(0, 256, (48, 64, 4), dtype=np.uint8))
+    words = (f"run={broken}", f"input={tmp_path / 'mine'}", f"out={tmp_path / 'out'}")
+    assert call(predict.entry, *words)[0] == 2
+    for head, scores in (("source", True), ("target", False)):
+        assert call(predict.entry, *words, f"head={head}")[0] == 0
+        found = cv2.imread(str(tmp_path / "out" / "street.png"), cv2.IMREAD_UNCHANGED)
+        assert found.any() == scores
+
+
+def test_chain_without_validation_split_reports_its_last_checkpoints(
+    call: Call, tmp_path: Path
+) -> None:
+    root, runs = write_freiburg(tmp_path / "freiburg"), tmp_path / "runs"
+    data = ("dataset=freiburg", f"dataset.root={root}", "dataset.crop=null", f"runs_dir={runs}")
+    words = ("+debug=smoke", *data, "scale.critic_width=4", *ON_CPU)
+    for more, named in (
+        (("+experiment=sh_source", "trainer.tested=best"), "dataset.val_sequences"),
+        # At demo scale the teacher is tested with its best checkpoint, so that it needs images.
+        (("+experiment=multi_head_night",), "upstream run thermal_teacher of multi_head_night"),
+    ):
+        code, _, err = call(main, *more, *words)
+        assert code == 2
+        assert_one_sentence(err, named)
+    assert not runs.exists()
+    code, _, err = call(main, "+experiment=sh_adversarial", *words)
+    assert code == 0, err
+    results = sorted(runs.glob("*/result.json"))
+    assert len(results) == 2
+    for path in results:
+        result = json.loads(path.read_text())
+        assert (result["best_step"], result["steps"]) == (2, 2)
+        assert not {"val", "best_score"} & set(result)
+        assert {line["kind"] for line in logged(path.parent)} == {"train", "test"}

@@ -175,8 +175,8 @@ def main(options: Options, overrides: list[str]) -> int:
         idle = [*(["out"] if out else []), *given, *overrides]
         if idle:
             raise InputError(f"'{idle[0]}' needs the name of a figure: figure=...")
-        from rgbt.tracking.tables import TextTable
-        from rgbt.tracking.terminal import print_rich, rich_table
+        from rgbt.tables import TextTable
+        from rgbt.terminal import print_rich, rich_table
 
         rows = tuple((name, spec.shows, spec.needs) for name, spec in FIGURES.items())
         print_rich(rich_table(TextTable("figures", ("figure", "shows", "made from"), rows)))

@@ -19,7 +19,7 @@ from rgbt.metrics.metric import Absent
 from rgbt.metrics.named import value
 from rgbt.metrics.pairs import HEADLINES, Protocol, protocol_of
 from rgbt.metrics.scores import class_mean
-from rgbt.tracking.tables import class_labels
+from rgbt.tables import class_labels
 
 TITLES: dict[Protocol, str] = {
     "aligned": "virtual views, first frame warped into the second",

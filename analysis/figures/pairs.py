@@ -19,8 +19,8 @@ from analysis.figures.grid import Texts, draw_grid
 from analysis.figures.inputs import FigureInput
 from analysis.figures.panels import most_different
 from rgbt.checks import InputError, nearest
+from rgbt.terminal import info
 from rgbt.tracking.pictures import colours
-from rgbt.tracking.terminal import info
 
 THERMAL_COLOURS = "jet"
 """Temporal, captions of Figs. 1 and 2."""

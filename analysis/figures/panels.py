@@ -28,8 +28,8 @@ from rgbt.metrics.counts import Counts, scored_classes
 from rgbt.metrics.metric import Regions
 from rgbt.metrics.regions import ring_rectangle
 from rgbt.metrics.scores import miou
+from rgbt.terminal import info
 from rgbt.tracking.pictures import colours
-from rgbt.tracking.terminal import info
 
 if TYPE_CHECKING:
     from rgbt.dataset import LabelledDataset

@@ -18,9 +18,8 @@ from analysis.robustness import CLEAN, Level, Training, trainings
 from rgbt.checks import InputError, nearest, split_list
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.scores import miou
-from rgbt.spec.corruption_names import row_name
-from rgbt.tracking.csv_files import csv_text
-from rgbt.tracking.tables import TextTable, number
+from rgbt.runs.naming import row_name
+from rgbt.tables import TextTable, csv_text, number
 
 Floats = NDArray[np.float64]
 

@@ -12,8 +12,7 @@ from analysis.predictions.scoring import FolderScores
 from analysis.predictions.table import ALL, Metric, Score, ScoreKey, ScoreTable
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.names import MACC, MIOU
-from rgbt.tracking.csv_files import csv_text
-from rgbt.tracking.tables import ABSENT, TextTable, class_labels, number
+from rgbt.tables import ABSENT, TextTable, class_labels, csv_text, number
 
 COLUMNS = (
     *("method", "split", "partition", "images", "num_images", "region", "class", "metric"),

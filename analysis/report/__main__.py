@@ -18,7 +18,6 @@ from analysis.arguments import Resamples, check_out
 from rgbt.config.command import built
 from rgbt.config.options import Help, readable_paths
 from rgbt.config.plain_command import PlainCommand
-from rgbt.config.shadowing import check_not_shadowed
 from rgbt.config.stored_config import parse_trust
 
 MAX_REMARKS = 5
@@ -55,7 +54,6 @@ def main(options: Options, overrides: list[str]) -> int:
     Every score is computed from the counts of its run. What cannot be read is reported here and
     listed on the page.
     """
-    check_not_shadowed("sweeps")
     runs_dir, out = options.runs_dir, options.out
     check_out(out)
     trust = parse_trust(options.trust)
@@ -70,8 +68,8 @@ def main(options: Options, overrides: list[str]) -> int:
     from analysis.report.markdown import write_pages
     from analysis.report.networks import network_entries
     from analysis.report.page import write_page
-    from rgbt.tracking.provenance import command_line
-    from rgbt.tracking.terminal import info, path_lines, print_rich
+    from rgbt.runs.provenance import command_line
+    from rgbt.terminal import info, path_lines, print_rich
 
     typed = command_line(["rgbt", "report", *sys.argv[1:]])
     with Progress(console=Console(stderr=True)) as progress:

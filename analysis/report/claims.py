@@ -9,7 +9,7 @@ from dataclasses import replace
 from analysis.report.data import ClaimEntry, FormsEntry
 from analysis.report.tables_rescored import RescoredTable
 from analysis.uncertainty.verdicts import AnyTime, FixedSeeds
-from sweeps.table.cells import CellRun
+from sweeps.point import Outcome
 from sweeps.table.table import Table
 from sweeps.verdicts.contrasts import contrasts_of
 from sweeps.verdicts.forms import forms_grid
@@ -37,7 +37,7 @@ def seeds_were_added(draft: RescoredTable) -> bool:
 
 
 def claim_entries(
-    judge: TableJudge, runs: Mapping[CellRunId, CellRun] | None = None
+    judge: TableJudge, runs: Mapping[CellRunId, Outcome] | None = None
 ) -> tuple[ClaimEntry, ...]:
     """The claims of a table with their verdicts; those that are not run last.
 
@@ -50,7 +50,7 @@ def claim_entries(
     return tuple(sorted(entries, key=lambda each: each.verdict == "not run"))
 
 
-def _entry(judged: JudgedClaim, table: Table, runs: Mapping[CellRunId, CellRun]) -> ClaimEntry:
+def _entry(judged: JudgedClaim, table: Table, runs: Mapping[CellRunId, Outcome]) -> ClaimEntry:
     claim = judged.claim
     entry = ClaimEntry(
         name=claim.name,
@@ -84,7 +84,7 @@ def _entry(judged: JudgedClaim, table: Table, runs: Mapping[CellRunId, CellRun])
     )
 
 
-def forms_entry(judge: TableJudge, runs: Mapping[CellRunId, CellRun]) -> FormsEntry | None:
+def forms_entry(judge: TableJudge, runs: Mapping[CellRunId, Outcome]) -> FormsEntry | None:
     """Differences of the forms of a table; None where one form was run."""
     grid = forms_grid(judge, runs)
     return None if grid is None else FormsEntry(header=grid.header, rows=grid.rows)

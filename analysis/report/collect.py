@@ -16,9 +16,9 @@ from analysis.report.runs import ReportRun, open_run
 from analysis.report.store import MlflowRun, read_store
 from analysis.report.studies import study_entries
 from analysis.report.tables import Track, table_entries
+from rgbt.runs.folder import REPLACED_TAG
+from rgbt.runs.provenance import without_passwords
 from rgbt.tracking.mlflow_store import MlflowTracking
-from rgbt.tracking.provenance import without_passwords
-from rgbt.tracking.replaced_runs import TAG as REPLACED_TAG
 from rgbt.tracking.tracker import Tracking
 
 TITLE = "RGB-thermal segmentation: runs and tables"

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
-from rgbt.spec.run_spec import NOT_IN_KEY
+from rgbt.runs.run_spec import NOT_IN_KEY
 
 Uncertainty = Literal["images", "seeds", "images and seeds", "none"]
 VerdictWord = Literal["holds", "contradicted", "undecided", "not run"]

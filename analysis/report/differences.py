@@ -16,7 +16,7 @@ from analysis.uncertainty import Comparison, Resampling, compare
 from rgbt.checks import InputError
 from rgbt.files.yaml_files import read_yaml
 from rgbt.metrics import names
-from rgbt.spec.run_spec import NOT_IN_KEY
+from rgbt.runs.run_spec import NOT_IN_KEY
 
 FILE = Path(__file__).with_name("differences.yaml")
 METRICS = (names.MIOU, names.VAR)

@@ -30,8 +30,7 @@ from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.names import in_percent
 from rgbt.metrics.scores import iou, miou, summary
-from rgbt.spec.naming import group_of
-from rgbt.tracking.provenance import COMMIT_LENGTH, commit_of, without_passwords
+from rgbt.runs.provenance import COMMIT_LENGTH, commit_of, without_passwords
 from sweeps.table.cells import OWN_COUNTS
 from sweeps.table.request import DEFAULT_SCALE, TAG, UNTIL_DECIDED
 
@@ -107,7 +106,7 @@ def open_run(run: MlflowRun, remarks: list[str]) -> ReportRun:
     processes = read_provenance(run.files, key, remarks)
     first = processes[0] if processes else {}
     command = without_passwords(str(first.get("command") or run.tags.get("rgbt.command", "")))
-    group = group_of(run.tags, run.params)
+    group = run.tags.get("rgbt.group", "")
     counted_fields: dict[str, Any] = {}
     if counts is not None:
         matrices, classes, scored = counts.by_region(), counts.classes, counts.scored

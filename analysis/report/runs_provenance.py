@@ -10,8 +10,8 @@ from typing import Any
 
 from analysis.report.store import RunFiles
 from rgbt.checks import InputError
-from rgbt.tracking.provenance import commit_of, without_passwords
-from rgbt.tracking.run_files import read_provenance as provenance_of
+from rgbt.runs.folder import read_provenance as provenance_of
+from rgbt.runs.provenance import commit_of, without_passwords
 
 COMMIT_TAG = "mlflow.source.git.commit"
 

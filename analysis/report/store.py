@@ -10,11 +10,10 @@ from typing import Any, TypeVar
 from urllib.parse import unquote, urlparse
 
 from rgbt.checks import InputError, RunError, nearest
-from rgbt.files.budgets import TEXT, read_bytes
-from rgbt.tracking.mlflow_client import quiet_client
-from rgbt.tracking.mlflow_store import MlflowTracking
-from rgbt.tracking.provenance import without_passwords
-from rgbt.tracking.run_files import read_result
+from rgbt.files.budgets import inside, read_bytes
+from rgbt.runs.folder import read_result
+from rgbt.runs.provenance import without_passwords
+from rgbt.tracking.mlflow_store import LimitedClient, MlflowTracking
 from rgbt.tracking.tracker import Tracking
 
 T = TypeVar("T")
@@ -46,11 +45,11 @@ class RunFiles:
         """Where the file called `path` can be read; None: there is none.
 
         Raises:
-            InputError: the store has it, but it cannot be fetched.
+            InputError: it is a link out of its folder, or cannot be fetched from the store.
         """
         for folder in self.folders:
             if (folder / path).is_file():
-                return folder / path
+                return inside(folder / path, folder)
         if self.fetch is None:
             return None
         if path not in self._fetched:
@@ -71,7 +70,7 @@ class RunFiles:
         if found is None:
             return None
         try:
-            return read_bytes(found, TEXT).decode()
+            return read_bytes(found).decode()
         except (OSError, UnicodeDecodeError) as error:
             raise InputError(f"{found} cannot be read ({error}).") from error
 
@@ -142,7 +141,7 @@ def read_store(tracking: Tracking, runs_dir: Path, copies: Path) -> list[MlflowR
             "the store with tracking.uri=..."
         )
     try:
-        client = quiet_client()(tracking_uri=uri)
+        client = LimitedClient(uri)
         experiment = client.get_experiment_by_name(tracking.experiment)
         if experiment is None:
             known = [each.name for each in client.search_experiments()]

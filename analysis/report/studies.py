@@ -11,8 +11,8 @@ import numpy as np
 from analysis.report.data import StudyEntry, TrialEntry
 from analysis.report.store import MlflowRun, read_each
 from rgbt.checks import InputError
-from rgbt.tracking.csv_files import read_csv
-from rgbt.tracking.provenance import without_passwords
+from rgbt.runs.provenance import without_passwords
+from rgbt.tables import read_csv
 
 TRIALS_FILE = "trials.csv"
 MARKDOWN_FILE = "study.md"

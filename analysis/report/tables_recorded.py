@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from analysis.report.data import ShownForm
 from analysis.report.store import MlflowRun
 from rgbt.checks import InputError
-from rgbt.tracking.csv_files import read_csv
+from rgbt.tables import read_csv
 from sweeps.verdicts.forms import RELEASED
 
 CSV_FILE = "table.csv"

@@ -5,21 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from analysis.report.runs import ReportRun
 from analysis.report.tables_recorded import NO_CELL, RecordedCell, RecordedTable
 from rgbt.checks import InputError
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.named import value
-from sweeps.table.cells import (
-    CellRun,
-    TableCell,
-    counts_path,
-    derived,
-    is_counted,
-    is_of_runs,
-    metric_of,
-)
+from sweeps.point import Outcome, Point
+from sweeps.table.cells import TableCell, counts_path, derived, is_counted, is_of_runs, metric_of
 from sweeps.table.scoring import ScoredTable, score
 from sweeps.table.table import Column, Row, Table
 from sweeps.verdicts.forms import both_forms
@@ -45,15 +39,6 @@ class CountsSource:
 
 
 @dataclass(frozen=True)
-class _Outcome:
-    """The outcome of a cell's run, as `sweeps.table.scoring` reads it."""
-
-    state: str
-    reason: str = ""
-    results: tuple[ReportRun, ...] = ()
-
-
-@dataclass(frozen=True)
 class RescoredTable:
     """A recorded table with its file, scored from the counts of the runs that the record names.
 
@@ -64,7 +49,7 @@ class RescoredTable:
 
     recorded: RecordedTable
     scored: ScoredTable
-    outcomes: Mapping[CellRunId, CellRun]
+    outcomes: Mapping[CellRunId, Outcome]
     runs: Mapping[str, ReportRun]
 
     def line(self, row: Row, column: Column) -> RecordedCell:
@@ -136,7 +121,7 @@ def score_again(
     """Means from the counts of the runs that the record names."""
     table = _in_form(table, recorded)
     labels = {row.label for row in table.rows}
-    outcomes: dict[CellRunId, CellRun] = {}
+    outcomes: dict[CellRunId, Outcome] = {}
     for label in recorded.rows():
         lines = [line for (row, _), line in recorded.lines.items() if row == label]
         keys = tuple(dict.fromkeys(key for line in lines for key in line.keys))
@@ -163,16 +148,18 @@ def _in_form(table: Table, recorded: RecordedTable) -> Table:
 
 def _by_seed(
     keys: Sequence[str], seeds: Sequence[int], runs: Mapping[str, ReportRun]
-) -> dict[int, _Outcome]:
+) -> dict[int, Outcome]:
     """The outcome of every run of a row; one that is not here has an outcome without results.
 
     The seeds of a row without a run have none: the record says why, or the row needs fewer seeds
     than others of the table.
     """
     here = {seed: key for key in keys if key in runs and (seed := runs[key].entry.seed) is not None}
-    outcomes = {seed: _Outcome("finished", results=(runs[key],)) for seed, key in here.items()}
+    none = Point("", ())
+    found: dict[int, Any] = {seed: runs[key] for seed, key in here.items()}
+    outcomes = {seed: Outcome(none, "finished", results=(run,)) for seed, run in found.items()}
     rest = [seed for seed in seeds if seed not in here]
     gone = [key for key in keys if key not in runs]
     for seed, key in zip(rest, gone, strict=False):
-        outcomes[seed] = _Outcome("missing", f"run {key} is not in the store")
+        outcomes[seed] = Outcome(none, "missing", f"run {key} is not in the store")
     return outcomes

@@ -20,7 +20,7 @@ from analysis.statistics.judging import Finding
 from analysis.statistics.resampling import ConsecutiveBlocks, ValueInterval, snr_samples
 from analysis.statistics.tables import SHORT, digits, range_text
 from rgbt.checks import InputError
-from rgbt.tracking.tables import ABSENT, TextTable
+from rgbt.tables import ABSENT, TextTable
 
 Floats = NDArray[np.float64]
 

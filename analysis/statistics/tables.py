@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from analysis.statistics import derive
 from analysis.statistics.data import MODALITIES, SpatialStatistics
 from analysis.statistics.judging import FAILS, HOLDS, OPEN, Claim, Finding, Range
-from rgbt.tracking.csv_files import csv_text
-from rgbt.tracking.tables import ABSENT, TextTable, number
+from rgbt.tables import ABSENT, TextTable, csv_text, number
 
 COLUMNS = 12
 """More regions than this become rows."""

@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import yaml
+from pydantic import PydanticSchemaGenerationError, TypeAdapter
+from pydantic.errors import PydanticInvalidForJsonSchema
 
 from reference_pages.docstrings import description, parameters
 from reference_pages.guides import about, link
 from reference_pages.markdown import block, code, page, table
 from rgbt.config.component import RUN_SETTINGS, constructor, setting_types
 from rgbt.config.compose import conf_dir
-from rgbt.config.values import expected
 
 OWN_PAGES = ("experiment",)
 """Groups that have a page of another form (`reference_pages.experiments`)."""
@@ -218,7 +219,33 @@ def _keys(made: Any, values: dict[str, str]) -> str:
 
 def kind_of(annotation: Any) -> str:
     """What an annotation takes, for a cell of a table: "number from 0 to 1, or null"."""
-    return expected(annotation).removeprefix("a ")
+    try:
+        schema = TypeAdapter(annotation).json_schema()
+    except (PydanticSchemaGenerationError, PydanticInvalidForJsonSchema):
+        return "a mapping with `_target_`"
+    return _in_words(schema)
+
+
+BOUNDS = {
+    **{"minimum": "from {}", "exclusiveMinimum": "above {}"},
+    **{"maximum": "to {}", "exclusiveMaximum": "below {}", "multipleOf": "in steps of {}"},
+    **{"minItems": "of at least {}", "maxItems": "of at most {}"},
+}
+
+
+def _in_words(schema: dict[str, Any]) -> str:
+    """A JSON schema in words."""
+    if "anyOf" in schema:
+        return " or ".join(map(_in_words, schema["anyOf"]))
+    if "enum" in schema or "const" in schema:
+        return ", ".join(map(repr, schema.get("enum") or [schema["const"]]))
+    if "$ref" in schema or schema.get("type") == "object":
+        return "mapping"
+    bounds = (text.format(f"{schema[key]:g}") for key, text in BOUNDS.items() if key in schema)
+    items = schema.get("prefixItems") or [schema.get("items") or {}]
+    each = {_in_words(item) for item in items} if schema.get("type") == "array" else ()
+    kind = "list" if each else schema.get("type", "any value")
+    return " ".join([kind, *bounds, *(["each", " or ".join(sorted(each))] if any(each) else [])])
 
 
 def _shown(value: Any) -> str:

@@ -38,9 +38,6 @@ class StudySweeper(Sweeper):
             InputError: settings, space or a point that do not fit.
             RunError: points failed; the others were run.
         """
-        from rgbt.config.shadowing import check_not_shadowed
-
-        check_not_shadowed("sweeps")
         assert self.hydra_context is not None, "Hydra calls setup() before sweep()"
         assert self.config is not None, "as above"
         from sweeps.worker.executors import limit_spinning

@@ -1,34 +1,41 @@
-"""Compose the configuration with Hydra, list its files, and register its resolvers."""
+"""Compose the configuration with Hydra, list its files, and register its resolvers.
+
+Each file is parsed once while a command runs, and each choice of files is composed once. Tables and
+searches set values on copies of it, which is thirty times faster.
+"""
 
 from __future__ import annotations
 
-import gc
 import os
+import pickle
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
 import hydra
+from hydra._internal.core_plugins.file_config_source import FileConfigSource
+from hydra._internal.sources_registry import SourcesRegistry
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.object_type import ObjectType
-from omegaconf import DictConfig, OmegaConf
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override, OverrideType
+from hydra.core.plugins import Plugins
+from hydra.errors import HydraException
+from hydra.plugins.config_source import ConfigResult
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf.errors import OmegaConfBaseException
 
 from rgbt.checks import InputError, nearest
-from rgbt.config.compose_cache import compose_cached
-from rgbt.config.config_source import parse_interpolations_once, parsing_once
 
-SEARCH_PATH = "hydra.searchpath"
-"""Override that names the folders of a user's own files for one command."""
-
-OWN_FOLDERS = "RGBT_CONF"
-"""Variable that names them for every composition, with commas (read by conf/config.yaml)."""
+SEARCH_PATH = "hydra.searchpath"  # names the folders of a user's own files for one command
+OWN_FOLDERS = "RGBT_CONF"  # names them for every composition, with commas (conf/config.yaml)
 
 SAME_FILES = {"bench": "demo"}
-"""Scale -> scale whose data sets, networks and other files it has, where a choice by scale does not
-name it."""
+"""Scale -> scale whose files it has, where a choice by scale does not name it."""
 
 PIXELS = re.compile(r"\$\{px:\s*(\d+)\}")
 
@@ -42,11 +49,7 @@ def conf_dir() -> Path:
 
 @contextmanager
 def searching(words: Sequence[str]) -> Iterator[None]:
-    """Use the search path in the `words` of a command line for all compositions of the command.
-
-    Upstream runs, defaults and groups of a run that is opened again are composed without these
-    words, and need the folders of ``hydra.searchpath=...`` too.
-    """
+    """Use the search path in the `words` of a command line for all compositions of the command."""
     before = own_folders()
     given = [word.partition("=")[2] for word in words if word.startswith(f"{SEARCH_PATH}=")]
     os.environ[OWN_FOLDERS] = given[0].strip("[]") if given else before
@@ -62,38 +65,68 @@ def own_folders() -> str:
 
 
 def compose(overrides: Sequence[str]) -> DictConfig:
-    """The configuration that `rgbt.run` would compose from these overrides, unchecked."""
-    folders = [str(conf_dir()), *filter(None, own_folders().split(","))]
-    words = [word for word in overrides if not _is_without_effect(word)]
-    return compose_cached(words, top_level()[1], folders, _composed_by_hydra)
+    """The unchecked configuration of `rgbt.run`; HydraException or OmegaConfBaseException."""
+    return composed(overrides)[0]
 
 
-def _is_without_effect(word: str) -> bool:
-    """Whether an override of Hydra's own node does not change a configuration composed here.
-
-    The node is left out of the result. The folders of ``searching`` are searched in any case.
-    """
-    key, _, value = word.partition("=")
-    return word == "hydra.mode=RUN" or (
-        key == SEARCH_PATH and value.strip("[]") == own_folders() != ""
-    )
-
-
-def _composed_by_hydra(words: list[str]) -> DictConfig:
-    with own_hydra(), _without_collection():
-        return hydra.compose("config", words)
-
-
-@contextmanager
-def _without_collection() -> Iterator[None]:
-    """No search for cycles of garbage, which takes a fifth of a composition that leaves few."""
-    was_enabled = gc.isenabled()
-    gc.disable()
+def composed(overrides: Sequence[str]) -> tuple[DictConfig, bool]:
+    """The same, and whether its files make it a search (``hydra.mode=MULTIRUN``)."""
+    files, values = _divided(tuple(overrides))
     try:
-        yield
-    finally:
-        if was_enabled:
-            gc.enable()
+        config, is_search = pickle.loads(_by_hydra(files, own_folders()))  # noqa: S301 - made below
+        for each in values:  # as Hydra does after it has merged the files
+            OmegaConf.update(config, each.key_or_group, each.value())
+    except (HydraException, OmegaConfBaseException):  # Hydra names the first wrong word of all
+        config, is_search = pickle.loads(_by_hydra(tuple(overrides), own_folders()))  # noqa: S301
+    return config, is_search
+
+
+@lru_cache(maxsize=4096)
+def _divided(words: tuple[str, ...]) -> tuple[tuple[str, ...], tuple[Override, ...]]:
+    """The words that choose files, and the overrides that set values afterwards.
+
+    The order of other words matters (keys that are added or removed, whole nodes): Hydra takes all.
+    """
+    try:
+        parsed = OverridesParser.create().parse_overrides(list(words))
+    except HydraException:
+        return words, ()
+    files, values = [], []
+    for word, each in zip(words, parsed, strict=True):
+        key = each.key_or_group
+        is_value = each.package is None and ("." in key or key in top_level()[1])
+        if each.is_sweep_override() or isinstance(each.value(), dict):
+            return words, ()
+        if not is_value or key.startswith("hydra."):
+            files.append(word)
+        elif each.type == OverrideType.CHANGE:
+            values.append(each)
+        else:
+            return words, ()
+    return tuple(files), tuple(values)
+
+
+@lru_cache(maxsize=256)
+def _by_hydra(words: tuple[str, ...], _own: str) -> bytes:
+    with own_hydra():
+        config = hydra.compose("config", list(words), return_hydra_config=True)
+    is_search = config.hydra.mode == RunMode.MULTIRUN
+    with open_dict(config):
+        del config["hydra"]
+    return pickle.dumps((config, is_search))
+
+
+class _ParsedOnce(FileConfigSource):
+    """Copies of parsed files, which Hydra changes: parsing takes half of its time."""
+
+    def load_config(self, config_path: str) -> ConfigResult:
+        result: ConfigResult = pickle.loads(_parsed(self.path, self.provider, config_path))  # noqa: S301
+        return result
+
+
+@lru_cache(maxsize=4096)
+def _parsed(folder: str, provider: str, name: str) -> bytes:
+    return pickle.dumps(FileConfigSource(provider, folder).load_config(name))
 
 
 def available(group: str) -> list[str]:
@@ -108,27 +141,11 @@ def groups() -> list[str]:
 
 @cache
 def _listed(group: str, kind: ObjectType, _own: str) -> tuple[str, ...]:
-    """Names in a group; cached, because Hydra needs 20 ms. `_own` is read by conf/config.yaml."""
+    """Cached, because Hydra needs 20 ms. `_own` is read by conf/config.yaml."""
     with own_hydra():
-        loader = GlobalHydra.instance().config_loader()
-        return tuple(loader.get_group_options(group, kind, "config"))
-
-
-def choices(plain: Mapping[str, Any], group: str) -> Iterator[tuple[str, DictConfig]]:
-    """The files of a group: name, and the node that each would be in the configuration `plain`."""
-    names = available(group)
-    composed = _composed_choices(group, plain["scale"]["name"], tuple(names))
-    changed = OmegaConf.create(dict(plain))
-    for number, name in enumerate(names):
-        changed[group] = composed[f"choice_{number}"]
-        yield name, changed[group]
-
-
-@cache
-def _composed_choices(group: str, scale: str, names: tuple[str, ...]) -> DictConfig:
-    """The files of a group, composed all at once in packages of their own: as fast as one."""
-    words = [f"scale={scale}"] if scale in available("scale") else []
-    return compose([*words, *(f"+{group}@choice_{n}={name}" for n, name in enumerate(names))])
+        return tuple(
+            GlobalHydra.instance().config_loader().get_group_options(group, kind, "config")
+        )
 
 
 @cache
@@ -145,10 +162,8 @@ def top_level() -> tuple[tuple[str, ...], tuple[str, ...]]:
 def check_keys(keys: Iterable[Any]) -> None:
     """Refuse a key that ``conf/config.yaml`` does not declare, naming the nearest that it does."""
     known = [key for each in top_level() for key in each]
-    for key in keys:
-        if key not in known:
-            hint = nearest(str(key), known)
-            raise InputError(f"'{key!s}' is not a key of the configuration; {hint}.")
+    for key in (str(each) for each in keys if each not in known):
+        raise InputError(f"'{key}' is not a key of the configuration; {nearest(key, known)}.")
 
 
 @contextmanager
@@ -158,8 +173,7 @@ def own_hydra() -> Iterator[None]:
     outer = GlobalHydra.instance().hydra
     GlobalHydra.instance().clear()
     try:
-        config_dir = str(conf_dir())
-        with parsing_once(), hydra.initialize_config_dir(config_dir, version_base="1.3"):
+        with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
             yield
     finally:
         GlobalHydra.instance().clear()
@@ -168,32 +182,33 @@ def own_hydra() -> Iterator[None]:
 
 
 def register_resolvers() -> None:
-    """Register the resolvers that configuration files may use.
+    """Register what configuration files may use, and the source that parses them once.
 
     ``${by_scale:{demo:cmx_tiny,paper:cmx_b2}}``: the entry of the scale, also in a defaults list.
-    ``${by_network:{CMX:start_cmx}}``: the entry of the class of the network; with several heads it
-    ends with ``_heads``, with rotary positions with ``_rotary``.
+    ``${by_network:{CMX:start_cmx}}``: of the class of the network, with ``_heads`` and ``_rotary``.
     ``${px:64}``: 64 pixels of the paper's images, scaled to the images of the scale.
     ``${scenes:600,6}``: 600 scenes of an embedded data set, or 6 where the scale takes a few.
     """
-    parse_interpolations_once()
-    for name, resolve in (
-        *(("by_scale", _by_scale), ("px", _scaled_pixels), ("scenes", _num_scenes)),
-        ("by_network", _by_network),
-    ):
-        if not OmegaConf.has_resolver(name):
-            OmegaConf.register_new_resolver(name, resolve)
-
-
-def _by_scale(choices: dict[str, Any], *, _root_: DictConfig) -> Any:
-    scale = _root_.scale  # in a defaults list the name of the file, elsewhere the node
-    name = scale if isinstance(scale, str) else scale.name
-    return choices[chosen_scale(name, choices)]
+    Plugins.instance()  # registers Hydra's own sources, once
+    SourcesRegistry.instance().types["file"] = _ParsedOnce
+    resolvers: dict[str, Callable[..., Any]] = {
+        "by_scale": _by_scale,
+        "by_network": _by_network,
+        "px": lambda pixels, *, _root_: round(pixels * float(_root_.scale.pixel_factor)),
+        "scenes": lambda many, few, *, _root_: few if _root_.scale.get("few_scenes") else many,
+    }
+    for name, resolve in resolvers.items():
+        OmegaConf.register_new_resolver(name, resolve, replace=True)
 
 
 def chosen_scale(scale: str, choices: Iterable[str]) -> str:
     """The entry of `choices` for a scale: its own, or that of the scale whose files it shares."""
     return scale if scale in choices else SAME_FILES.get(scale, scale)
+
+
+def _by_scale(choices: dict[str, Any], *, _root_: DictConfig) -> Any:
+    scale = _root_.scale  # in a defaults list the name of the file, elsewhere the node
+    return choices[chosen_scale(scale if isinstance(scale, str) else scale.name, choices)]
 
 
 def _by_network(choices: dict[str, Any], *, _root_: DictConfig) -> Any:
@@ -202,16 +217,8 @@ def _by_network(choices: dict[str, Any], *, _root_: DictConfig) -> Any:
     rotary = "_rotary" if model.get("rope_base") else ""
     name = str(model._target_).rpartition(".")[2] + heads + rotary
     if name not in choices:
-        raise InputError(
-            f"pretrained has no file and no common start for the network {name}; expected one of "
-            f"{', '.join(choices)}. Set pretrained=FILE, or pretrained=null to start from random "
-            "weights."
-        )
+        raise InputError(f"pretrained: nothing is known for {name}; set a file, or null.")
     return choices[name]
-
-
-def _scaled_pixels(pixels: int, *, _root_: DictConfig) -> int:
-    return round(pixels * float(_root_.scale.pixel_factor))
 
 
 def with_pixels(text: str, factor: float) -> str:
@@ -219,18 +226,10 @@ def with_pixels(text: str, factor: float) -> str:
     return PIXELS.sub(lambda found: str(round(int(found[1]) * factor)), text)
 
 
-def _num_scenes(usually: int, few: int, *, _root_: DictConfig) -> int:
-    return few if _root_.scale.get("few_scenes", False) else usually
-
-
 def flatten(plain: Mapping[str, Any]) -> dict[str, Any]:
     """Leaves of plain values by dotted key, lists as they are."""
-
-    def leaves(value: Any, path: str) -> Iterator[tuple[str, Any]]:
-        if not isinstance(value, Mapping):
-            yield path, value
-            return
-        for key, child in value.items():
-            yield from leaves(child, f"{path}.{key}" if path else str(key))
-
-    return dict(leaves(plain, ""))
+    leaves: dict[str, Any] = {}
+    for key, value in plain.items():
+        inner = flatten(value) if isinstance(value, Mapping) else {"": value}
+        leaves |= {f"{key}.{path}" if path else str(key): leaf for path, leaf in inner.items()}
+    return leaves

@@ -1,9 +1,7 @@
 """The list of commands, and the code that parses their options and sets their exit codes.
 
-``rgbt NAME`` is ``python -m MODULE``. Words ``key=value`` that are no options
-(`rgbt.config.options`) are overrides of the configuration. A command that fails prints one message
-on stderr. Exit codes: 0 done, 1 the run failed or a check found problems, 2 the input was wrong,
-129, 130 and 143 stopped by SIGHUP, Ctrl-C and SIGTERM.
+Exit codes: 0 done, 1 the run failed or a check found problems, 2 the input was wrong, 129, 130 and
+143 stopped by SIGHUP, Ctrl-C and SIGTERM. A failure prints one message on stderr.
 """
 
 from __future__ import annotations
@@ -26,7 +24,7 @@ HELP = ("-h", "--help")
 
 
 class Entry(NamedTuple):
-    """What ``python -m`` runs, and one line about it."""
+    """A command: what ``python -m`` runs, and one line about it."""
 
     module: str
     about: str
@@ -39,45 +37,31 @@ COMMANDS = {
     "consistency": Entry("rgbt.consistency", "measure the temporal consistency (TC, CA) of a run"),
     "robustness": Entry("rgbt.robustness", "score a run under missing, noisy or occluded images"),
     "profile": Entry("rgbt.profile", "measure speed, memory, parameters and FLOPs of networks"),
-    "reproduce": Entry(
-        "sweeps.reproduce", "run a published table or your own; new: write your own"
-    ),
+    "reproduce": Entry("sweeps.reproduce", "run a published table; new: write your own"),
     "claims": Entry("sweeps.claims", "print the claims of the papers with their verdicts"),
     "study": Entry("sweeps.study", "report a grid or a search, also while it runs"),
-    "report": Entry(
-        "analysis.report.__main__", "write one page with everything in the MLflow store"
-    ),
+    "report": Entry("analysis.report.__main__", "write one page with the whole MLflow store"),
     "compare": Entry("analysis.compare", "compare two methods: differences, intervals, p-values"),
-    "details": Entry(
-        "analysis.details", "show boundary IoU, calibration, distance and size with intervals"
-    ),
+    "details": Entry("analysis.details", "show boundary, calibration, distance and size scores"),
     "flow": Entry("analysis.flow_error", "compare scores along an estimated and the exact flow"),
     "score": Entry("analysis.score", "score predictions of any method by region"),
     "spatial": Entry("analysis.spatial", "measure the statistics of a data set by region"),
     "figures": Entry("analysis.figures.__main__", "draw a figure of the papers"),
     "check": Entry("rgbt.data.check", "validate a whole data set and report its problems"),
-    "prepare": Entry(
-        "rgbt.data.prepare.__main__", "convert an official download into a data set folder"
-    ),
-    "cache": Entry(
-        "rgbt.data.cache.__main__", "decode a data set once into a cache, or remove the cache"
-    ),
+    "prepare": Entry("rgbt.data.prepare.__main__", "convert a download into a data set folder"),
+    "cache": Entry("rgbt.data.cache.__main__", "decode a data set into a cache, or remove it"),
     "export": Entry("rgbt.export", "write a network as ONNX, compared with the network"),
     "weights": Entry("rgbt.weights", "inspect a file of weights, or export the weights of a run"),
     "sync": Entry("rgbt.tracking.sync", "send run folders to MLflow"),
-    "corruptions": Entry("rgbt.corruptions.__main__", "draw the corruptions of one pair of images"),
+    "ui": Entry("rgbt.tracking.ui", "open MLflow at the runs of a folder"),
+    "corruptions": Entry("rgbt.corruptions.__main__", "draw the corruptions of a pair of images"),
     "masks": Entry("rgbt.maskers.sketch", "draw examples of a masker"),
     "scenes": Entry("rgbt.data.synth.sheet", "draw scenes of the embedded data set"),
 }
 
 
 def exit_code(work: Callable[[], int | None], *, catch_interrupt: bool = True) -> int:
-    """Run `work` and return its exit code; an InputError is printed on stderr.
-
-    Args:
-        work: what to do.
-        catch_interrupt: False inside a grid, where Ctrl-C ends all points and not only this one.
-    """
+    """Run `work` and return its exit code. In a grid, Ctrl-C is not caught: it ends all points."""
     try:
         with ending_command(), reporting_exhaustion():
             return work() or 0
@@ -89,17 +73,13 @@ def exit_code(work: Callable[[], int | None], *, catch_interrupt: bool = True) -
         handled()
         if isinstance(stop, Stopped):
             return say(str(stop), stop.code)
-        # A second Ctrl-C.
-        return say("interrupted; rerun the command to resume from its last checkpoint.", 130)
+        return say("interrupted; rerun the command to resume.", 130)  # a second Ctrl-C
     except Exception as error:
         if type(error).__module__.partition(".")[0] in ("hydra", "omegaconf"):
-            from rgbt.config.hydra_messages import hydra_sentence  # --help does not wait for Hydra
+            from rgbt.config.command import hydra_sentence  # --help does not wait for Hydra
 
             words = [word for word in sys.argv[1:] if not word.startswith("-")]
             return say(hydra_sentence(error, words), 2)
-        if isinstance(error, FileExistsError | NotADirectoryError):
-            place = f"{error.filename} is a file, but a folder is needed"
-            return say(f"{place}; name another path.", 2)
         if isinstance(error, OSError):
             return say(f"{error.filename or 'a file'}: {error.strerror or error}.", 2)
         raise
@@ -120,8 +100,7 @@ class PlainCommand(Generic[T]):
 
     Attributes:
         options: frozen dataclass that declares the options.
-        main: gets the options, and all other words as overrides of the configuration; its docstring
-            is the help text.
+        main: gets the options and all other words, overrides; its docstring is the help text.
         heeds: keys of the configuration that take effect, each with all below it; None: all.
         name: as it is typed; "": as `COMMANDS` names its module.
         first: option that the first word sets if it has no ``=``.
@@ -137,7 +116,10 @@ class PlainCommand(Generic[T]):
         """Run with the words of ``sys.argv``; a mistake is one sentence on stderr."""
         words = sys.argv[1:]
         if set(words) & set(HELP):
-            usage = f"{self.name or self._typed()} {self.first.upper()}".strip()
+            modules = {entry.module: f"rgbt {name}" for name, entry in COMMANDS.items()}
+            spec, module = getattr(sys.modules["__main__"], "__spec__", None), self.main.__module__
+            module = spec.name if module == "__main__" and spec else module
+            usage = f"{self.name or modules.get(module, module)} {self.first.upper()}".strip()
             about = inspect.getdoc(self.main) or ""
             sys.stdout.write(f"{help_text(usage, self.options, about, self.first)}\n")
             sys.exit(0)
@@ -147,20 +129,8 @@ class PlainCommand(Generic[T]):
             code = exit_code(lambda: self.run(words))
         sys.exit(code)
 
-    def _typed(self) -> str:
-        """How the command may be typed: "rgbt evaluate"."""
-        spec = getattr(sys.modules["__main__"], "__spec__", None)
-        module = self.main.__module__
-        module = spec.name if module == "__main__" and spec else module
-        names = [name for name, entry in COMMANDS.items() if entry.module == module]
-        return f"rgbt {names[0]}" if names else f"python -m {module}"
-
     def run(self, words: Sequence[str]) -> int | None:
-        """Parse `words` and do it.
-
-        Raises:
-            InputError: see `rgbt.config.options.parse`.
-        """
+        """Parse `words` (see `rgbt.config.options.parse`) and do it."""
         if self.first and words and "=" not in words[0] and not words[0].startswith("-"):
             words = [f"{self.first}={words[0]}", *words[1:]]
         options, overrides = parse(self.options, words, self.heeds)
@@ -169,13 +139,7 @@ class PlainCommand(Generic[T]):
 
 @dataclass(frozen=True)
 class CommandGroup:
-    """A command with subcommands: ``rgbt weights inspect FILE``.
-
-    Attributes:
-        about: what ``--help`` shows, unless there is a default.
-        commands: by name.
-        default: runs if the first word is not a subcommand; None: a subcommand is required.
-    """
+    """A command with subcommands by name; `default` runs if the first word is none of them."""
 
     about: str
     commands: Mapping[str, PlainCommand[Any]]
@@ -184,15 +148,12 @@ class CommandGroup:
     def __call__(self) -> None:
         """Run the command that ``sys.argv`` names; leaves by ``sys.exit``."""
         name = "".join(sys.argv[1:2])
-        command = self.commands.get(name)
-        if command is not None:
+        if name in self.commands:
             del sys.argv[1]
-        command = command or self.default
+        command = self.commands.get(name, self.default)
         if command is not None:
             command()
-        elif name in HELP:
-            sys.stdout.write(f"{self.about.strip()}\n")
-            sys.exit(0)
-        else:
-            known = nearest(name, self.commands)
-            sys.exit(say(f"expected a command, got '{name}'; {known}.", 2))
+        elif name not in HELP:
+            sys.exit(say(f"'{name}' is not a command; {nearest(name, self.commands)}.", 2))
+        sys.stdout.write(f"{self.about.strip()}\n")
+        sys.exit(0)

@@ -18,8 +18,8 @@ from rgbt.config.plain_command import PlainCommand
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from rgbt.corruptions.corruption import Corruption
     from rgbt.dataset import LabelledDataset
+    from rgbt.evaluation.request import CorruptionRequest
     from rgbt.types import Sample
 
 SUFFIXES = (".png", ".jpg")
@@ -54,7 +54,7 @@ def main(options: Options, overrides: list[str]) -> int:
     Overrides choose the data set, dataset=mfnet dataset.root=/data/MFNet (default: the embedded
     data set), and the random draws, corruption.seed=1
     """
-    from rgbt.evaluation.corruption_request import (
+    from rgbt.evaluation.request import (
         choose_corruptions,
         split_overrides,
         standard_corruptions,
@@ -77,8 +77,7 @@ def main(options: Options, overrides: list[str]) -> int:
         raise InputError(
             f"name={name}: split '{options.split}' has no sample of this name; {near}."
         )
-    kinds = [each.corruption for each in chosen]
-    lines = sheet(dataset, kinds, name, options.split, chosen[0].seed)
+    lines = sheet(dataset, chosen, name, options.split)
     path.parent.mkdir(parents=True, exist_ok=True)
     draw(lines).savefig(path, dpi=95)
     print(path)
@@ -86,18 +85,18 @@ def main(options: Options, overrides: list[str]) -> int:
 
 
 def sheet(
-    source: LabelledDataset, kinds: Sequence[Corruption], name: str, split: str, seed: int = 0
+    source: LabelledDataset, chosen: Sequence[CorruptionRequest], name: str, split: str
 ) -> list[list[tuple[str, Sample]]]:
     """The sample `name` with captions for every corruption: clean, then under every severity."""
-    from rgbt.evaluation.corrupted_dataset import CorruptedDataset
+    from rgbt.evaluation.request import CorruptedDataset
 
     lines = []
-    for kind in kinds:
-        pairs = [(kind.title, source.read(name))]
-        for severity in kind.severities:
-            caption = f"{severity:g} {kind.unit}" if kind.unit else ""
-            seen = CorruptedDataset(source, kind, severity, split=split, seed=seed)
-            pairs.append((caption, seen.read(name)))
+    for each in chosen:
+        unit = each.corruption.unit
+        pairs = [(each.corruption.title, source.read(name))]
+        for level in each.ladder():
+            caption = f"{level.severity:g} {unit}" if unit else ""
+            pairs.append((caption, CorruptedDataset(source, level, split).read(name)))
         lines.append(pairs)
     return lines
 

@@ -1,6 +1,6 @@
 """The interface of corruptions, which change the pixels of a pair or show another frame.
 
-Severity 0 is the clean image and never reaches a corruption: `rgbt.evaluation.corrupted_dataset`
+Severity 0 is the clean image and never reaches a corruption: `rgbt.evaluation.request`
 returns such samples as they are. Lengths are given in pixels of an image of `REFERENCE_HEIGHT` rows
 and scaled to the height of the file, so that one ladder serves MFNet (480), PST900 (720) and the
 embedded data (120).

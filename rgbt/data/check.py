@@ -25,7 +25,7 @@ WIDTH_WITHOUT_TERMINAL = 120
 
 
 @command()
-def main(config: DictConfig) -> int:
+def main(config: DictConfig, _overrides: list[str]) -> int:
     """Check ``config.dataset``; returns 1 if there are problems."""
     dataset = build(config.dataset)
     if not isinstance(dataset, FileDataset):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 from rgbt.checks import InputError
@@ -146,7 +147,7 @@ class Domains:
             target_confidence=self.target is not None and self.target.confidence,
         )
 
-    @property
+    @cached_property
     def named(self) -> dict[str, Domain]:
         """The domains by name: "source" and, where there is one, "target"."""
         both = {"source": self.source, "target": self.target}

@@ -7,6 +7,7 @@ image is in the alpha channel, so the four channels must not be processed as one
 from __future__ import annotations
 
 import io
+import tokenize
 import zlib
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,6 @@ from PIL import Image
 
 from rgbt.checks import InputError, one_line
 from rgbt.data.integrity import JPEG, LEFT_OUT, PNG, UNREADABLE, read_image, read_whole
-from rgbt.files.budgets import check_array
 
 Array = NDArray[np.uint8]
 
@@ -107,9 +107,8 @@ def read_array(path: Path, what: str) -> NDArray[Any]:
     if data.startswith(b"PK"):
         raise InputError(f"{path}: expected {what}, got several arrays; use the original file.")
     try:
-        check_array(io.BytesIO(data), len(data))
         array: NDArray[Any] = np.load(io.BytesIO(data), allow_pickle=False)
-    except (ValueError, EOFError) as error:
+    except (ValueError, EOFError, MemoryError, tokenize.TokenError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(

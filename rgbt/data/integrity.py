@@ -19,7 +19,7 @@ from pathlib import Path
 from PIL import Image
 
 from rgbt.checks import InputError
-from rgbt.files.budgets import CONTENT, PIXELS, read_bytes
+from rgbt.files.budgets import check_size, read_bytes
 
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 """First bytes of these formats, independent of the suffix of the name."""
@@ -29,7 +29,7 @@ PNG_END = b"IEND\xaeB`\x82"
 
 JPEG_SCAN, JPEG_END = 0xDA, b"\xff\xd9"
 
-Image.MAX_IMAGE_PIXELS = None  # `PIXELS` is checked instead, which the user can set
+Image.MAX_IMAGE_PIXELS = None  # `check_size` is called instead, whose limit the user can set
 warnings.filterwarnings("ignore", module=r"PIL\.")  # on damaged files, which are refused
 
 LEFT_OUT = "replace it, or skip unreadable files with data.on_error=skip"
@@ -43,10 +43,10 @@ def read_whole(path: Path, advice: str = LEFT_OUT) -> bytes:
 
     Raises:
         InputError: a missing file, a broken link, not a regular file, no permission, larger than
-            `CONTENT` allows, or an error of the disk.
+            `rgbt.files.budgets` allows, or an error of the disk.
     """
     try:
-        return read_bytes(path, CONTENT, advice)
+        return read_bytes(path, advice)
     except (FileNotFoundError, NotADirectoryError):
         why = ""
         if os.path.islink(path):  # noqa: PTH114
@@ -78,7 +78,7 @@ def read_image(path: Path, advice: str = LEFT_OUT) -> bytes:
 
     Raises:
         InputError: as `read_whole`, an empty or truncated file, a damaged PNG, or more pixels than
-            `PIXELS` allows.
+            `rgbt.files.budgets` allows.
     """
     data = read_whole(path, advice)
     if not data:
@@ -96,7 +96,7 @@ def read_image(path: Path, advice: str = LEFT_OUT) -> bytes:
             f"not match); {advice}."
         )
     try:
-        PIXELS.check(path, math.prod(_size(data)))
+        check_size(path, math.prod(_size(data)), "pixels")
     except UNREADABLE as error:
         if isinstance(error, InputError):
             raise

@@ -13,7 +13,7 @@ import multiprocessing
 import re
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
-from typing import Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numpy as np
 import torch
@@ -22,7 +22,6 @@ from torch.utils.data import DataLoader
 from rgbt.checks import InputError, RunError
 from rgbt.data.batches import BatchTransform, Transform, collate
 from rgbt.data.loader_settings import LoaderSettings as LoaderSettings  # as conf/ names it
-from rgbt.data.rare_classes import RareClasses, RareClassExamples
 from rgbt.data.reader import (
     BatchReader,
     EvalExamples,
@@ -39,6 +38,9 @@ from rgbt.dataset import LabelledDataset
 from rgbt.processes import num_processes, rank
 from rgbt.randomness import numpy_generator
 from rgbt.types import Batch, Loadable
+
+if TYPE_CHECKING:
+    from rgbt.data.rare_classes import RareClasses
 
 LOG = logging.getLogger(__name__)
 
@@ -169,6 +171,8 @@ def train_batches(  # noqa: PLR0913 - most trainings draw no classes
     make: MakeExample = TrainExamples(source, transform.train, seed)
     stack: Stack = partial(collate, advice=CROP_ADVICE)
     if rare is not None:
+        from rgbt.data.rare_classes import RareClassExamples  # few runs draw by class
+
         make = RareClassExamples(source, transform.train, seed, rare)
     elif settings.augment == "device":
         work = cast(BatchTransform, transform)

@@ -1,6 +1,6 @@
 """Read labels that a trained network predicted, instead of those of a data set.
 
-A folder of them (written by `rgbt.evaluation.pseudo_labels`) holds:
+A folder of them (written by `rgbt.evaluation.images`) holds:
 
     labels/NAME.png       8 bit, class ids of the data set, 255 below the confidence threshold
     confidence/NAME.png   16 bit, 65535 times the probability of the predicted class
@@ -40,7 +40,6 @@ class Manifest(TypedDict, total=False):
     format: Required[str]
     teacher: str
     weights: str
-    network: str
     view: str | None
     head: str | None
     label_map: dict[str, Any] | None
@@ -66,8 +65,8 @@ class PseudoLabels:
     Attributes:
         folder: its path.
         manifest: content of ``pseudo_labels.json``: "format", "teacher" (a run's key, or a file),
-            "weights" (SHA-256 of the teacher's parameters), "network" (SHA-256 of how it is
-            built and fed), "view", "head", "label_map" (num_source, targets, groups; None: none),
+            "weights" (SHA-256 of the teacher's parameters), "view", "head", "label_map"
+            (num_source, targets, groups; None: none),
             "threshold", "dataset", "fingerprint" (of the data set), "split", "classes" (their
             names), "images" (how many), "skipped" (unreadable ones), "kept" (share of pixels with
             a label), "mean_confidence" (of all pixels), "by_class" (per class: "share" of all

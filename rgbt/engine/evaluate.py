@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from lightning_fabric import Fabric
 from torch import Tensor, nn
 
 from rgbt.checks import RunError
 from rgbt.class_scores import best_of, classes_of
+from rgbt.engine.device import Autocast
 from rgbt.engine.predicted_scores import label_sized
 from rgbt.engine.prediction import WHOLE, Prediction
 from rgbt.requirements import record_of
@@ -23,7 +23,7 @@ FAINTEST = 1e-6
 def class_maps(
     model: nn.Module,
     batch: Batch,
-    fabric: Fabric,
+    precision: Autocast,
     view: View | None = None,
     heads: Sequence[str | None] = (),
     settings: Prediction = WHOLE,
@@ -36,19 +36,21 @@ def class_maps(
     Args:
         model: a network in evaluation mode.
         batch: on the device, images in [0, 1].
-        fabric: precision.
+        precision: of the forward pass, such as a session.
         view: input images of the prediction; None leaves the choice to the network.
         heads: which head predicts each image of the batch; () leaves it to the network.
         settings: mirrored images, windows and the enlargement of the scores.
     """
     with torch.inference_mode():
-        return classes_of(label_scores(model, batch, fabric, view, heads, settings)).to(torch.uint8)
+        return classes_of(label_scores(model, batch, precision, view, heads, settings)).to(
+            torch.uint8
+        )
 
 
 def probabilities(
     model: nn.Module,
     batch: Batch,
-    fabric: Fabric,
+    precision: Autocast,
     view: View | None = None,
     heads: Sequence[str | None] = (),
     settings: Prediction = WHOLE,
@@ -65,13 +67,13 @@ def probabilities(
     not tell a pixel that queries of one class hardly claim from one that they claim wholly.
     """
     with torch.inference_mode():
-        return _shares(label_scores(model, batch, fabric, view, heads, settings), model)
+        return _shares(label_scores(model, batch, precision, view, heads, settings), model)
 
 
 def confident_class_maps(
     model: nn.Module,
     batch: Batch,
-    fabric: Fabric,
+    precision: Autocast,
     view: View | None = None,
     heads: Sequence[str | None] = (),
     settings: Prediction = WHOLE,
@@ -82,7 +84,7 @@ def confident_class_maps(
     `class_maps`.
     """
     with torch.inference_mode():
-        scores = label_scores(model, batch, fabric, view, heads, settings)
+        scores = label_scores(model, batch, precision, view, heads, settings)
         classes = classes_of(scores).to(torch.uint8)
         # The class with the highest score has the highest probability.
         return classes, best_of(_shares(scores, model)).score
@@ -98,7 +100,7 @@ def _shares(scores: Tensor, model: nn.Module) -> Tensor:
 def label_scores(
     model: nn.Module,
     batch: Batch,
-    fabric: Fabric,
+    precision: Autocast,
     view: View | None = None,
     heads: Sequence[str | None] = (),
     settings: Prediction = WHOLE,
@@ -108,7 +110,7 @@ def label_scores(
     Raises:
         RunError: a score is NaN or infinite.
     """
-    with torch.inference_mode(), fabric.autocast():
+    with torch.inference_mode(), precision.autocast():
         scores = label_sized(
             lambda images: class_scores(model, images, view, heads), batch, settings
         )

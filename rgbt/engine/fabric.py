@@ -1,18 +1,25 @@
-"""Connect the processes of a run, one for each device, and choose their devices."""
+"""Open Lightning Fabric for a training, in one process or in one process for each device."""
 
 from __future__ import annotations
 
+import logging
 from datetime import timedelta
 
 import torch
 from lightning_fabric import Fabric
 from lightning_fabric.plugins.environments.cluster_environment import ClusterEnvironment
+from lightning_fabric.plugins.environments.lightning import LightningEnvironment
 from lightning_fabric.strategies.ddp import DDPStrategy
 from torch import nn
 
 from rgbt.checks import InputError
+from rgbt.engine.device import choose_device
 from rgbt.engine.settings import TrainerSettings
-from rgbt.runtime.group import Group
+from rgbt.processes import num_processes
+from rgbt.runtime.group import Group, group_from_environment
+
+# Fabric sets itself to INFO when imported, and would repeat the configuration in a line.
+logging.getLogger("lightning_fabric").setLevel(logging.WARNING)
 
 PATIENCE = timedelta(days=7)
 """Time that processes wait for each other: process 0 does some work alone, and may wait for an
@@ -20,6 +27,24 @@ upstream run that another command trains."""
 
 CPU, CUDA = "gloo", "cpu:gloo,cuda:nccl"
 """Connections of the processes; what is not on a GPU goes through gloo, which waits idly."""
+
+
+def open_fabric(trainer: TrainerSettings) -> Fabric:
+    """Device and precision of a training; within a connected group, those of this process.
+
+    Raises:
+        InputError: the machine has no such device.
+    """
+    group = group_from_environment() if num_processes() > 1 else None
+    if group is not None:
+        return group_fabric(trainer, group)
+    # Without an environment, Fabric reads the variables of SLURM, also for a single process.
+    return Fabric(
+        accelerator=choose_device(trainer).type,
+        devices=1,
+        precision=trainer.precision,
+        plugins=[LightningEnvironment()],
+    )
 
 
 def group_fabric(trainer: TrainerSettings, group: Group) -> Fabric:

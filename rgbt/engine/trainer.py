@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import torch
 from lightning_fabric import Fabric
@@ -25,7 +25,6 @@ from rgbt.engine.checkpoint import (
     training_payload,
 )
 from rgbt.engine.committed import Checkpoints
-from rgbt.engine.gradient_shares import TermGradients
 from rgbt.engine.gradients import average_gradients, check_gradients
 from rgbt.engine.optimizers import step_without_gradient
 from rgbt.engine.progress import progress
@@ -35,6 +34,9 @@ from rgbt.processes import collected, mean_count, num_processes
 from rgbt.randomness import generators_of_step
 from rgbt.runtime.signals import Stopped, at_once, deferred
 from rgbt.types import Batch, GeneratorOf, Phase, TwoDomains
+
+if TYPE_CHECKING:
+    from rgbt.engine.gradient_shares import TermGradients
 
 RecordStep = Callable[[int, dict[str, float]], None]
 Validate = Callable[[int], float]
@@ -297,7 +299,11 @@ class Trainer:
         # Once for all of them: what two optimisers share is clipped as one gradient.
         parameters = list({id(each): each for group in groups for each in group}.values())
         names = "+".join(phase.optimizers)
-        terms = None if shares is None else TermGradients(parameters, self.fabric.backward)
+        terms = None
+        if shares is not None:
+            from rgbt.engine.gradient_shares import TermGradients  # rarely logged
+
+            terms = TermGradients(parameters, self.fabric.backward)
         losses = [self._backward(phase, terms)]
         losses += [self._backward(next(phases), terms) for phases in others]
         if shares is not None and terms is not None:

@@ -1,8 +1,7 @@
-"""Export a trained network to a file, after its graph was compared with the network."""
+"""Export a trained network to an ONNX file, after its graph was compared with the network."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,8 +11,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 import rgbt
-from rgbt.build.load_run import TrainedNetwork
-from rgbt.build.session import Session
+from rgbt.assembly.session import Session
 from rgbt.checks import InputError
 from rgbt.class_scores import classes_of
 from rgbt.data.batches import collate
@@ -21,14 +19,13 @@ from rgbt.data.domains import TestedHead
 from rgbt.data.to_predict import of_split
 from rgbt.evaluation.prediction import heads_of, view_of
 from rgbt.exported.description import Description, require_packages
-from rgbt.exported.graph import OPSET, ScoresOfImages, onnx_bytes, torch_bytes, traced
+from rgbt.exported.graph import OPSET, ScoresOfImages, onnx_bytes, traced
 from rgbt.exported.onnx_network import ExportedNetwork
 from rgbt.files.atomic import write_atomic
 from rgbt.requirements import record_of
 from rgbt.types import View
 
-ONNX, TORCH = ".onnx", ".pt2"
-"""Endings of the two formats."""
+NO_TRACKING = "rgbt.tracking.mlflow_store.NoTracking"
 
 Hw = tuple[int, int]
 """Height and width, pixels."""
@@ -39,83 +36,68 @@ ScoresOf = Callable[[Tensor, Tensor], Tensor]
 
 @dataclass(frozen=True, kw_only=True)
 class ExportRequest:
-    """What is exported, and how it is compared.
+    """What is exported, and how it is compared."""
 
-    Attributes:
-        out: new file; its ending chooses the format.
-        view: input images; None: those that the network is designed for.
-        head: of a network with a head per domain; None: as the run's configuration says.
-        image_hw: height and width of the images; None: those of the data set after the transform.
-        split: whose images are compared.
-        num_images: how many of them, the first ones.
-        tolerance: largest difference of scores as a share of the largest score, and largest share
-            of pixels with another class.
-    """
-
-    out: Path
-    view: View | None
-    head: TestedHead | None
-    image_hw: Hw | None
-    split: str
-    num_images: int
-    tolerance: float
+    out: Path  # new file
+    view: View | None  # input images; None: those that the network is designed for
+    head: TestedHead | None  # None: as the configuration of the run says
+    image_hw: Hw | None  # None: the size of the images after the transform
+    split: str  # whose images are compared
+    num_images: int  # how many of them, the first ones
+    tolerance: float  # of `Comparison.check`
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """An exported graph against the network in PyTorch, on the same images.
-
-    Attributes:
-        num_images: that were compared.
-        difference: largest absolute difference of two scores.
-        largest: largest absolute score.
-        equal: share of pixels with the same class.
-    """
+    """An exported graph against the network in PyTorch, on the same images."""
 
     num_images: int
-    difference: float
-    largest: float
-    equal: float
+    difference: float  # largest absolute difference of two scores
+    largest: float  # largest absolute score
+    equal: float  # share of pixels with the same class
 
     def check(self, tolerance: float) -> None:
-        """Raise InputError where the graph differs by more than `tolerance`."""
+        """Raise InputError where scores, relative to the largest, or classes differ by more."""
         share = self.difference / self.largest if self.largest else self.difference
         if not (share <= tolerance and 1 - self.equal <= tolerance):
             raise InputError(
-                f"the exported graph differs from the network by {share:.3g} of the largest score, "
-                f"and in the class of {1 - self.equal:.3%} of the pixels, more than "
-                f"tolerance={tolerance:g}; no file was written. Choose the other format, or a "
-                "higher tolerance."
+                f"tolerance={tolerance:g}: the exported graph differs from the network by "
+                f"{share:.3g} of the largest score, and in the class of {1 - self.equal:.3%} of "
+                "the pixels; no file was written."
             )
 
 
-def export(opened: TrainedNetwork, request: ExportRequest) -> tuple[Description, Comparison]:
-    """Write the exported network of `opened`, unless its graph gives other scores.
+def export(session: Session, request: ExportRequest) -> tuple[Description, Comparison]:
+    """Write the exported network of `session` in float32, unless it gives other scores on the CPU.
 
-    The graph computes in float32; images are compared on the CPU in the same precision.
-
-    Raises:
-        InputError: an unknown format or existing file; a network with a head per image; a graph
-            that cannot be made, or that differs from the network.
+    Raises InputError for an existing file, a network with a head per image, and a graph that cannot
+    be made or that differs from the network.
     """
     check_out(request.out)
-    session = opened.session
-    names = session.dataset.names(request.split)
     view = view_of(session, request.view)
-    head = only_head(session, view, request.head, names)
+    head = only_head(session, view, request.head, session.dataset.names(request.split))
     images = list(_images(session, request))
-    network = session.model.cpu().float().eval()
-    graph = ScoresOfImages(network, view=view, head=head)
+    graph = ScoresOfImages(session.model.cpu().float().eval(), view=view, head=head)
     image_hw = (images[0][0].shape[-2], images[0][0].shape[-1])
-    description = _description(opened, request, image_hw, view=view, head=head)
-    program = traced(graph, image_hw)
-    if request.out.suffix == ONNX:
-        content = onnx_bytes(program, description)
-        scores_of: ScoresOf = _scores_of(ExportedNetwork(content, request.out))
-    else:
-        content = torch_bytes(program, description)
-        scores_of = program.module()
-    compared = compare(graph, scores_of, images)
+    description = Description(
+        version=rgbt.__version__,
+        network=type(session.model).__name__,
+        run=session.evaluations.parent.name if session.step else session.label,
+        step=session.step,
+        dataset=session.dataset.name,
+        fingerprint=session.dataset.fingerprint(),
+        classes=tuple(session.dataset.classes),
+        view=view,
+        head=head,
+        outputs=record_of(session.model).outputs,
+        image_hw=image_hw,
+        opset=OPSET,
+        # Where runs are tracked may hold a password and does not change a prediction.
+        settings={**session.spec.plain, "tracking": {"_target_": NO_TRACKING}},
+    )
+    content = onnx_bytes(traced(graph, image_hw), description)
+    network = ExportedNetwork(content, request.out)
+    compared = compare(graph, lambda rgb, thermal: network(rgb, thermal).logits, images)
     compared.check(request.tolerance)
     request.out.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(request.out, content)
@@ -123,40 +105,20 @@ def export(opened: TrainedNetwork, request: ExportRequest) -> tuple[Description,
 
 
 def check_out(out: Path) -> None:
-    """Refuse a file that cannot be written, before a network is opened.
-
-    Raises:
-        InputError: an unknown ending, an existing file, a folder that does not take files, or the
-            packages for ONNX are missing.
-    """
-    if out.suffix not in (ONNX, TORCH):
-        raise InputError(
-            f"out={out}: expected a file name that ends in {ONNX}, or in {TORCH} for the format of "
-            "torch.export."
-        )
+    """Raise InputError for another ending, an existing file or missing packages for ONNX."""
+    if out.suffix != ".onnx":
+        raise InputError(f"out={out}: expected a file name that ends in .onnx.")
     if out.exists():
-        raise InputError(
-            f"out={out} exists, and an export overwrites no file; choose another name."
-        )
-    folder = next(each for each in out.absolute().parents if each.exists())
-    if not (folder.is_dir() and os.access(folder, os.W_OK | os.X_OK)):
-        raise InputError(
-            f"out={out}: {folder} is not a folder in which files can be written; choose another "
-            "folder."
-        )
-    if out.suffix == ONNX:
-        require_packages()
+        raise InputError(f"out={out} exists, and an export overwrites no file.")
+    require_packages()
 
 
 def compare(
     reference: ScoresOf, scores_of: ScoresOf, images: list[tuple[Tensor, Tensor]]
 ) -> Comparison:
-    """Two functions on the same images: the first one alone, then two at a time.
+    """The network in PyTorch and the exported graph on the same images, at least one.
 
-    Args:
-        reference: the network in PyTorch.
-        scores_of: the exported graph.
-        images: RGB (1, 3, H, W) and thermal (1, 1, H, W) each, at least one.
+    The first image is alone, then they come two at a time: RGB (1, 3, H, W), thermal (1, 1, H, W).
     """
     difference = largest = 0.0
     same = total = 0
@@ -173,34 +135,15 @@ def compare(
     return Comparison(len(images), difference, largest, same / total)
 
 
-def _scores_of(network: ExportedNetwork) -> ScoresOf:
-    def scores_of(rgb: Tensor, thermal: Tensor) -> Tensor:
-        logits = network(rgb, thermal).logits
-        assert isinstance(logits, Tensor), "an exported network always has scores"
-        return logits
-
-    return scores_of
-
-
 def only_head(
     session: Session, view: View, head: TestedHead | None, names: tuple[str, ...]
 ) -> str | None:
-    """The name of the head that predicts the images `names`; None: the network has one for all.
-
-    Args:
-        session: its domains choose the head of an image.
-        view: input images of the network.
-        head: as in `ExportRequest`.
-        names: of images of the data set.
-
-    Raises:
-        InputError: images have different heads.
-    """
+    """The one head of the images `names`, None: the only one; InputError where they differ."""
     heads = set(heads_of(session, view, head)(names))
     if len(heads) > 1:
         raise InputError(
-            "the network predicts an image with the head of its domain, but an exported graph has "
-            "one head; choose it with head=source or head=target."
+            "head: an image is predicted with the head of its domain, but an exported graph has "
+            "one; choose it with head=source or head=target."
         )
     return heads.pop() if heads else None
 
@@ -214,53 +157,23 @@ def _images(session: Session, request: ExportRequest) -> Iterator[tuple[Tensor, 
     for name in found.names[: request.num_images]:
         batch = collate([session.transform.test(found.read(name))], "").to("cpu")
         wanted = wanted or _image_hw(session, (batch.rgb.shape[-2], batch.rgb.shape[-1]))
-        rgb, thermal = (
-            each
-            if each.shape[-2:] == wanted
-            else F.interpolate(each, size=wanted, mode="bilinear", align_corners=False)
-            for each in (batch.rgb, batch.thermal)
-        )
+        rgb, thermal = batch.rgb, batch.thermal
+        if rgb.shape[-2:] != wanted:
+            rgb, thermal = (F.interpolate(i, size=wanted, mode="bilinear") for i in (rgb, thermal))
         yield rgb, thermal
 
 
 def _image_hw(session: Session, whole: Hw) -> Hw:
-    """Size of the images of one forward pass, of images of the size `whole`.
-
-    Raises:
-        InputError: the prediction shows the network images of several sizes.
-    """
-    settings = session.prediction
-    window = settings.window_hw or (10**6, 10**6)
+    """Size of the images of one forward pass, of images of the size `whole`; InputError if many."""
+    window = session.prediction.window_hw or (10**6, 10**6)
+    scales = session.prediction.scales
     sizes = {
         (min(window[0], round(scale * whole[0])), min(window[1], round(scale * whole[1])))
-        for scale in settings.scales
+        for scale in scales
     }
     if len(sizes) > 1:
         raise InputError(
-            f"prediction.scales={list(settings.scales)} shows the network images of several sizes, "
-            "but an exported graph takes one; set prediction.scales=[1.0]."
+            f"prediction.scales={list(scales)}: an exported graph takes one size; "
+            "set prediction.scales=[1.0]."
         )
     return sizes.pop()
-
-
-def _description(
-    opened: TrainedNetwork, request: ExportRequest, image_hw: Hw, *, view: View, head: str | None
-) -> Description:
-    session = opened.session
-    # Where runs are tracked may hold a password and does not change a prediction.
-    settings = {key: value for key, value in session.spec.plain.items() if key != "tracking"}
-    return Description(
-        version=rgbt.__version__,
-        network=type(session.model).__name__,
-        run=opened.label if not opened.step else opened.folder.parent.name,
-        step=opened.step,
-        dataset=session.dataset.name,
-        fingerprint=session.dataset.fingerprint(),
-        classes=tuple(session.dataset.classes),
-        view=view,
-        head=head,
-        outputs=record_of(session.model).outputs,
-        image_hw=image_hw,
-        opset=OPSET if request.out.suffix == ONNX else 0,
-        settings=settings,
-    )

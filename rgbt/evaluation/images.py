@@ -1,42 +1,53 @@
-"""Write predictions of single images as colour overlays and PNGs of class indices."""
+"""Write predictions of images: colour overlays and class indices, or pseudo-labels of a split."""
 
 from __future__ import annotations
 
+import hashlib
+import json
+import tempfile
+from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any, cast
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rgbt.build.session import Session
-from rgbt.checks import InputError
+from rgbt.assembly.session import Session
+from rgbt.checks import InputError, check_range
+from rgbt.class_scores import best_of
+from rgbt.config.command import composing
+from rgbt.config.component import build
+from rgbt.config.compose import compose
 from rgbt.data.batches import collate
 from rgbt.data.label_map import LabelMap
+from rgbt.data.loaders import eval_batches
+from rgbt.data.pseudo_labels import (
+    FORMAT,
+    FULL,
+    MANIFEST,
+    PseudoLabels,
+    confidence_path,
+    label_path,
+)
 from rgbt.data.to_predict import ToPredict, of_files, of_path, of_split
 from rgbt.engine.progress import progress
-from rgbt.evaluation.prediction import Predictor
+from rgbt.evaluation.prediction import Predictor, decode_ahead, view_of, weights_digest
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.evaluation.segmentation import legend_of
 from rgbt.files.atomic import write_atomic
+from rgbt.files.budgets import sealed
+from rgbt.tables import TextTable, percent
+from rgbt.terminal import info
 from rgbt.tracking.pictures import overlay
-from rgbt.tracking.terminal import info
-from rgbt.types import Batch, Sample
+from rgbt.types import IGNORE, Batch, Sample
 
 
 def chosen_images(session: Session, source: str, rgb: str, thermal: str) -> ToPredict:
-    """The images of the options ``input``, or ``rgb`` and ``thermal``.
-
-    Raises:
-        InputError: neither or both are given, or there are no such images.
-    """
+    """The images of the options ``input``, or ``rgb`` and ``thermal``."""
     if bool(rgb) != bool(thermal) or bool(source) == bool(rgb):
-        given = {"input": source, "rgb": rgb, "thermal": thermal}
-        raise InputError(
-            "expected either input=FOLDER (or a split, or a file of four channels) or rgb=FILE "
-            "thermal=FILE, got "
-            + (" and ".join(key for key, value in given.items() if value) or "none")
-            + " of input, rgb and thermal."
-        )
+        raise InputError("expected either input=... or both rgb=FILE and thermal=FILE.")
     dataset = session.dataset
     if rgb:
         return of_files(dataset, Path(rgb), Path(thermal))
@@ -52,14 +63,7 @@ def write_images(
     out: Path,
     label_map: LabelMap | None,
 ) -> str:
-    """Write NAME_overlay.png and NAME.png of every image to `out`, with a progress bar.
-
-    Returns:
-        how many images were written, and where.
-
-    Raises:
-        InputError: an input image would be overwritten, or cannot be read.
-    """
+    """Write NAME_overlay.png and NAME.png of every image to `out`; how many, and where."""
     images.check_out(out)
     legend = legend_of(session.dataset)
     predictor = Predictor(session, session.model, request)
@@ -74,16 +78,15 @@ def write_images(
             write_png(out / f"{sample.name}.png", classes)
             written += 1
             display.advance(task)
-    for reason in list(images.skipped.values())[:1]:
-        info(f"{len(images.skipped)} image(s) skipped; the first: {reason}")
-    for path in images.others[:1]:
-        info(f"{len(images.others)} image(s) belong to no pair and were not read; first: {path}")
+    for what, named in (("skipped", [*images.skipped.values()]), ("of no pair", images.others)):
+        if named:
+            info(f"{len(named)} image(s) {what}; the first: {named[0]}")
     return f"{written} images in {out.resolve()}"
 
 
 def batch_of(session: Session, sample: Sample) -> Batch:
     """One image on the device; one at a time, because images of a folder may have any sizes."""
-    return collate([session.transform.test(sample)], "").to(session.fabric.device)
+    return collate([session.transform.test(sample)], "").to(session.device)
 
 
 def write_png(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
@@ -92,3 +95,128 @@ def write_png(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None
     assert encoded, "images of 8 and 16 bit can be encoded"
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(path, content.tobytes())
+
+
+def label_map_of(name: str) -> LabelMap | None:
+    """The file of ``conf/label_map/`` called `name`; None for "none"."""
+    if name == "none":
+        return None
+    with composing([]):
+        return cast(LabelMap, build(compose([f"+label_map={name}"]).label_map))
+
+
+def write_pseudo_labels(
+    session: Session,
+    teacher: str,
+    request: EvaluationRequest,
+    out: Path,
+    *,
+    threshold: float = 0.0,
+    label_map: LabelMap | None = None,
+) -> PseudoLabels:
+    """Predict a split with the network of `session` and write its confident pixels as labels.
+
+    The confidence of a pixel is the largest of its class probabilities
+    (`rgbt.engine.evaluate.probabilities`), with a label map that of the network's own class. The
+    folder (`rgbt.data.pseudo_labels`) is written under a temporary name and renamed at the end.
+
+    Source: HeatNet's release (thermal teacher, night images). It keeps every pixel: threshold 0.
+
+    Args:
+        session: its network is the teacher.
+        teacher: key of its run, or file of its weights; for people.
+        request: split, view and head.
+        out: folder, missing or empty.
+        threshold: pixels whose confidence is below it get 255 instead of a class; in [0, 1].
+        label_map: from the classes of the network to those of the data set, where they differ.
+    """
+    check_range("threshold", threshold, 0, 1)
+    settings: dict[str, Any] = {
+        "format": FORMAT,
+        "teacher": teacher,
+        "weights": weights_digest(session.model),
+        "view": view_of(session, request.view),
+        "head": request.head or session.domains.tested_head,
+        "label_map": None if label_map is None else json.loads(json.dumps(asdict(label_map))),
+        "threshold": float(threshold),
+        "dataset": session.dataset.name,
+        "fingerprint": session.dataset.fingerprint(),
+        "split": request.split,
+        "classes": list(session.dataset.classes),
+    }
+    if out.is_dir() and any(out.iterdir()):
+        raise InputError(f"out={out}: the folder is not empty.")
+    out.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as temporary:
+        made = Path(temporary) / out.name
+        manifest = settings | _predict(session, request, made, threshold, label_map)
+        write_atomic(made / MANIFEST, (json.dumps(sealed(manifest), indent=1) + "\n").encode())
+        with suppress(OSError):  # another process was faster
+            made.rename(out)
+    return PseudoLabels(out)
+
+
+def _predict(
+    session: Session,
+    request: EvaluationRequest,
+    out: Path,
+    threshold: float,
+    label_map: LabelMap | None,
+) -> dict[str, Any]:
+    """Predict and write all images of the split; the part of the manifest that counts them."""
+    decode_ahead(session, request.split)
+    names = session.dataset.names(request.split)
+    batches = eval_batches(session.dataset, request.split, session.transform, session.loading)
+    predictor = Predictor(session, session.model, request)
+    digest = hashlib.sha256()
+    counts, sums = np.zeros(IGNORE + 1, np.int64), np.zeros(IGNORE + 1)
+    with progress() as display:
+        task = display.add_task("predicting", total=len(names), note="images")
+        for batch in batches:
+            found = predictor.probabilities(batch.to(session.device))
+            confidence, classes = (each.cpu().numpy() for each in best_of(found))
+            for name, sure, ids in zip(batch.name, confidence, classes, strict=True):
+                known = ids.astype(np.uint8)
+                known = known if label_map is None else label_map(known)
+                label = np.where(sure < threshold, np.uint8(IGNORE), known)
+                scaled = np.rint(FULL * sure.astype(np.float64)).clip(0, FULL).astype(np.uint16)
+                write_png(confidence_path(out, name), scaled)
+                write_png(label_path(out, name), label)
+                digest.update(f"{name} {label.shape}\n".encode())
+                digest.update(label.tobytes())
+                digest.update(scaled.astype("<u2").tobytes())
+                counts += np.bincount(label.ravel(), minlength=IGNORE + 1)
+                sums += np.bincount(label.ravel(), scaled.ravel(), IGNORE + 1)
+            display.advance(task, len(batch.name))
+    total = int(counts.sum())
+    if not total:
+        raise InputError(f"split '{request.split}': no image could be read.")
+    means = [
+        float(added) / FULL / int(n) if n else None for n, added in zip(counts, sums, strict=True)
+    ]
+    return {
+        "images": len(names) - len(batches.skipped),
+        "skipped": sorted(batches.skipped),
+        "kept": 1 - int(counts[IGNORE]) / total,
+        "mean_confidence": float(sums.sum()) / FULL / total,
+        "by_class": {
+            name: {"share": int(counts[number]) / total, "mean_confidence": means[number]}
+            for number, name in enumerate(session.dataset.classes)
+        },
+        "digest": digest.hexdigest(),
+    }
+
+
+def labels_table(labels: PseudoLabels) -> TextTable:
+    """The share of pixels of each class, and the teacher's confidence in them."""
+    made = labels.manifest
+    rows = [
+        (name, each["share"], each["mean_confidence"]) for name, each in made["by_class"].items()
+    ]
+    kept, total = made["kept"], sum(share * (mean or 0.0) for _, share, mean in rows)
+    rows += [("kept", kept, total / kept if kept else None)]
+    rows += [("all pixels", 1.0, made["mean_confidence"])]
+    which = f"confidence of at least {made['threshold']:g}" if made["threshold"] else "every pixel"
+    title = f"{made['images']} images of {made['dataset']} {made['split']}, {which}"
+    grid = [(name, percent(a), percent(float("nan") if b is None else b)) for name, a, b in rows]
+    return TextTable(title, ("class", "pixels", "confidence"), tuple(grid))

@@ -1,24 +1,33 @@
-"""Code shared by all evaluations of a network: view, heads, batches and counts per image."""
+"""Code shared by all evaluations of a network: view, heads, batches, normalisation, counts.
+
+Statistics of batch normalisation can be computed again from images without labels: Li et al.,
+"Revisiting Batch Normalization For Practical Domain Adaptation" (2016), Algorithm 1 (AdaBN); Nado
+et al., "Evaluating Prediction-Time Batch Normalization ... under Covariate Shift" (2020).
+They are of all values of all inputs, not an average of batches: that misses their differences.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack, suppress
+import hashlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from rich.progress import Progress, TaskID
+from rich.progress import TaskID
 from torch import Tensor, nn
+from torch.nn.modules.batchnorm import _BatchNorm
 
-from rgbt.build.session import Session
+from rgbt.assembly.session import Session
 from rgbt.checks import InputError, check_choice
 from rgbt.data.cache.dataset import cached_layer
 from rgbt.data.domains import TestedHead
 from rgbt.data.loader_settings import LoaderSettings
-from rgbt.dataset import LabelledDataset
+from rgbt.data.loaders import eval_batches
+from rgbt.dataset import LabelledDataset, Subset
 from rgbt.engine.evaluate import class_maps, confident_class_maps, probabilities
 from rgbt.engine.progress import progress
 from rgbt.evaluation.request import EvaluationRequest
@@ -27,9 +36,10 @@ from rgbt.metrics.metric import Regions
 from rgbt.requirements import record_of
 from rgbt.transforms.joint import View as ImageView
 from rgbt.transforms.joint import whole_view
-from rgbt.transforms.thesis import mixed
 from rgbt.transforms.view_sets import ViewSets
 from rgbt.types import Batch, View
+
+Names = tuple[str, ...]
 
 
 class EvaluationData(Protocol):
@@ -57,20 +67,12 @@ class EvaluationData(Protocol):
 
 
 class Predictor:
-    """Predicts batches with `model`, left in evaluation mode; each image by its head.
-
-    Attributes:
-        model: the network.
-        view: input images of the prediction.
-
-    Raises:
-        InputError: the network does not support the requested view.
-    """
+    """Predicts batches from `view` with `model` in evaluation mode; each image by its head."""
 
     def __init__(self, session: Session, model: nn.Module, request: EvaluationRequest) -> None:
         self.view = view_of(session, request.view)
         self._heads = heads_of(session, self.view, request.head)
-        self._fabric = session.fabric
+        self._session = session
         self.model = model.eval()
         self._settings = session.prediction
 
@@ -78,10 +80,10 @@ class Predictor:
         """A batch from the loader, with labels of the size at which classes are counted."""
         if self._settings.counted == "label":
             return batch
-        image_hw = batch.rgb.shape[-2], batch.rgb.shape[-1]
+        from rgbt.transforms.thesis import mixed  # few recipes count at the size of the images
+
         resize = mixed if self._settings.label_resize == "bilinear" else ImageView.nearest
-        label_hw = batch.label.shape[-2], batch.label.shape[-1]
-        view = whole_view(label_hw, image_hw)
+        view = whole_view(_hw(batch.label), _hw(batch.rgb))
         labels = [resize(view, label) for label in batch.label.numpy()]
         return replace(batch, label=torch.from_numpy(np.stack(labels)))
 
@@ -89,7 +91,12 @@ class Predictor:
         """`rgbt.engine.evaluate.class_maps` of a batch on the device."""
         if self._settings.enlarged == "scores":
             return class_maps(self.model, batch, *self._how(batch))
-        return self._enlarged(class_maps(self.model, _image_sized(batch), *self._how(batch)), batch)
+        # Predicted at the size of the images; class numbers are enlarged like brightness.
+        small = replace(batch, label=batch.label.new_zeros(len(batch.label), *_hw(batch.rgb)))
+        found = class_maps(self.model, small, *self._how(batch))
+        view = whole_view(_hw(batch.rgb), _hw(batch.label))
+        maps = [view.bilinear(each, np.uint8) for each in found.cpu().numpy()]
+        return torch.from_numpy(np.stack(maps)).to(found.device)
 
     def confident_classes(self, batch: Batch) -> tuple[Tensor, Tensor]:
         """`rgbt.engine.evaluate.confident_class_maps` of a batch on the device."""
@@ -101,30 +108,15 @@ class Predictor:
         return probabilities(self.model, batch, *self._how(batch))
 
     def _how(self, batch: Batch) -> tuple[Any, ...]:
-        return self._fabric, self.view, self._heads(batch.name), self._settings
-
-    def _enlarged(self, classes: Tensor, batch: Batch) -> Tensor:
-        """Class numbers at the size of the labels, interpolated as if they were brightness."""
-        view = whole_view(
-            (classes.shape[1], classes.shape[2]), (batch.label.shape[-2], batch.label.shape[-1])
-        )
-        maps = [view.bilinear(each, np.uint8) for each in classes.cpu().numpy()]
-        return torch.from_numpy(np.stack(maps)).to(classes.device)
+        return self._session, self.view, self._heads(batch.name), self._settings
 
 
-def _image_sized(batch: Batch) -> Batch:
-    """A batch whose labels have the size of its images, for predictions of that size."""
-    return replace(batch, label=batch.label.new_zeros(len(batch.label), *batch.rgb.shape[-2:]))
+def _hw(images: Tensor) -> tuple[int, int]:
+    return images.shape[-2], images.shape[-1]
 
 
 def view_of(session: Session, view: View | None = None) -> View:
-    """The view that the network of a session predicts from.
-
-    None: the view of its source domain, or else the network's first view.
-
-    Raises:
-        InputError: the network does not predict from `view`.
-    """
+    """The view that a network predicts from; None: that of its source domain, or its first."""
     known = record_of(session.model).views
     if view is None:
         return session.domains.source.view or known[0]
@@ -135,10 +127,7 @@ def view_of(session: Session, view: View | None = None) -> View:
 def heads_of(
     session: Session, view: View, head: TestedHead | None = None
 ) -> Callable[[tuple[str, ...]], tuple[str | None, ...]]:
-    """Names of images -> the head that predicts each; None: the network's only one.
-
-    Where `head` is None the run's configuration says which (`domains.tested_head`).
-    """
+    """Names of images -> the head that predicts each; None: the network's only one."""
     requested = session.domains.tested_head if head is None else head
 
     def choose(names: tuple[str, ...]) -> tuple[str | None, ...]:
@@ -159,17 +148,10 @@ def counts_of(
     partition: str,
     dtype: type[np.integer] = np.int32,
 ) -> Counts:
-    """The counts (R, K, K) of each image as those of a split; stored as `dtype`.
-
-    Raises:
-        InputError: there is none, because no image could be read.
-    """
+    """The counts (R, K, K) of each image as those of a split; InputError if there is none."""
     dataset, names = data.dataset, tuple(by_name)
     if not names:
-        raise InputError(
-            f"split '{split}' of {dataset.name}: no image could be read. Check the files with "
-            "rgbt check."
-        )
+        raise InputError(f"split '{split}' of {dataset.name}: no image could be read.")
     return Counts(
         counts=np.stack(list(by_name.values())).astype(dtype),
         names=names,
@@ -184,23 +166,152 @@ def counts_of(
 
 
 def decode_ahead(session: Session, *splits: str) -> None:
-    """Fill the image cache with these splits, if the session has one.
-
-    In the main process, before others read from it; InputError where it cannot be written.
-    """
+    """Fill the image cache with these splits, if there is one, before other processes read it."""
     dataset = cached_layer(session.dataset)
     if dataset is None:
         return
     names = tuple(name for split in splits for name in dataset.names(split))
-    with ExitStack() as shown:
-        tasks: dict[str, TaskID] = {}
-        display: list[Progress] = []
+    tasks: dict[str, TaskID] = {}
+    with progress() as display:
 
         def advance(what: str, done: int, total: int) -> None:
-            if not display:  # where everything is there, nothing is shown
-                display.append(shown.enter_context(progress()))
             if what not in tasks:
-                tasks[what] = display[0].add_task(what, total=total, note="images")
-            display[0].update(tasks[what], completed=done, total=total)
+                tasks[what] = display.add_task(what, total=total, note="images")
+            display.update(tasks[what], completed=done, total=total)
 
         dataset.ensure(names, advance)
+
+
+def weights_digest(model: nn.Module) -> str:
+    """SHA-256 in hexadecimal over names and bytes of all parameters and buffers that are saved."""
+    digest = hashlib.sha256()
+    for name, tensor in sorted(model.state_dict().items()):
+        digest.update(f"{name} {tuple(tensor.shape)} {tensor.dtype}\n".encode())
+        digest.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy())
+    return digest.hexdigest()
+
+
+class BatchMoments:
+    """Hook of one normalisation: it uses the statistics of each batch, which are collected.
+
+    Variances have the divisor n, as batches are normalised in training.
+    """
+
+    def __init__(self, norm: _BatchNorm) -> None:
+        self.count = 0
+        self._norm = norm
+        self._mean = torch.zeros(norm.num_features, dtype=torch.float64)
+        self._squares = torch.zeros(norm.num_features, dtype=torch.float64)
+
+    def __call__(self, _: nn.Module, inputs: Sequence[Any]) -> None:
+        """Measure the input (N, C, ...) of the normalisation, before it is normalised.
+
+        Raises:
+            InputError: one value for each channel, which would all be normalised to 0.
+        """
+        values: Tensor = inputs[0]
+        count = values.numel() // values.shape[1]
+        if count == 1:
+            raise InputError(
+                "batch_norm: one value for each channel has no variance; set data.eval_batch_size "
+                "so that every batch has two images, also the last one by day and at night."
+            )
+        dims = (0, *range(2, values.dim()))
+        batch_variance, batch_mean = torch.var_mean(values.float(), dims, correction=0)
+        self._set(batch_mean, batch_variance)
+        variance, mean = batch_variance.cpu().double(), batch_mean.cpu().double()
+        # Chan et al., "Algorithms for Computing the Sample Variance" (1983), Eq. 2.1.
+        share = count / (self.count + count)
+        difference = mean - self._mean
+        self._mean += share * difference
+        self._squares += count * variance + self.count * share * difference.square()
+        self.count += count
+
+    def finish(self) -> None:
+        """Give the normalisation what was collected; without an input it keeps what it has."""
+        if self.count:
+            self._set(self._mean, self._squares / self.count)
+
+    def _set(self, mean: Tensor, variance: Tensor) -> None:
+        self._norm.get_buffer("running_mean").copy_(mean)
+        self._norm.get_buffer("running_var").copy_(variance)
+
+
+def parts_of_split(
+    dataset: LabelledDataset, request: EvaluationRequest
+) -> list[tuple[Names, Names]]:
+    """Names of images that share statistics, and of those that the statistics are computed from.
+
+    Images by day and at night are apart, except for "recomputed" and where the data set does not
+    state which images were taken at night.
+    """
+    wanted, names = request.batch_norm, dataset.names(request.split)
+    splits = () if wanted is None else wanted.splits
+    sources = tuple(dict.fromkeys(n for each in splits for n in dataset.names(each))) or names
+    dark, dark_sources = dataset.nights(names), dataset.nights(sources)
+    if wanted is None or wanted.kind == "recomputed" or dark is None or dark_sources is None:
+        return [(names, sources)]
+    parts = []
+    for night in sorted(set(dark)):
+        own = tuple(n for n, each in zip(names, dark, strict=True) if each == night)
+        measured = tuple(n for n, each in zip(sources, dark_sources, strict=True) if each == night)
+        if not measured:
+            time = "at night" if night else "by day"
+            raise InputError(f"batch_norm_splits={','.join(splits)} has no images {time}.")
+        parts.append((own, measured))
+    return parts
+
+
+@contextmanager
+def normalised(
+    session: Session, predictor: Predictor, request: EvaluationRequest, sources: Names
+) -> Iterator[Names]:
+    """Within it, the network has the requested statistics of `sources`; afterwards its own.
+
+    Gives the names of unreadable images, which are not in the statistics.
+    """
+    wanted = request.batch_norm
+    if wanted is None:
+        yield ()
+        return
+    every = (each for each in predictor.model.modules() if isinstance(each, _BatchNorm))
+    norms = [each for each in every if each.running_mean is not None]
+    if not norms:
+        raise InputError(f"batch_norm={wanted.kind}: the network has none that can be changed.")
+    stored = [{key: each.clone() for key, each in norm.state_dict().items()} for norm in norms]
+    moments = [BatchMoments(norm) for norm in norms]
+    skipped: Names = ()
+    try:
+        with ExitStack() as hooks:
+            for norm, each in zip(norms, moments, strict=True):
+                hooks.enter_context(norm.register_forward_pre_hook(each))
+            if wanted.kind != "batch":
+                skipped = _pass(session, predictor, sources)
+                hooks.close()
+                _finish(moments, wanted.kind)
+            yield skipped
+    finally:
+        for norm, before in zip(norms, stored, strict=True):
+            norm.load_state_dict(before)
+
+
+def _finish(moments: Sequence[BatchMoments], kind: str) -> None:
+    if not any(each.count for each in moments):
+        raise InputError(f"batch_norm={kind}: no image could be read.")
+    for each in moments:
+        each.finish()
+
+
+def _pass(session: Session, predictor: Predictor, names: Names) -> Names:
+    """Predict images without using the predictions; the names of those that cannot be read."""
+    from rgbt.data.pseudo_labels import Unlabelled  # the statistics are rarely computed again
+
+    batches = eval_batches(
+        Unlabelled(Subset(session.dataset, names)), "", session.transform, session.loading
+    )
+    with progress() as display:
+        task = display.add_task("statistics", total=len(names), note="images")
+        for batch in batches:
+            predictor.classes(batch.to(session.device))
+            display.advance(task, len(batch.name))
+    return tuple(batches.skipped)

@@ -7,87 +7,70 @@ more exact than the times themselves.
 
 from __future__ import annotations
 
+import json
 import math
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from statistics import median, quantiles
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
 
+import numpy as np
+import pandas as pd
 import torch
-from rich.progress import Progress, TaskID
+from torch.nn.attention import SDPBackend, sdpa_kernel
+from torch.utils.flop_counter import FlopCounterMode
 
+from rgbt.checks import InputError
 from rgbt.engine.progress import progress
-from rgbt.evaluation.flops import FlopCount, count_flops
-from rgbt.evaluation.prepared_network import PreparedNetwork, peak_on_cpu
-from rgbt.evaluation.profiled_network import ProfiledNetwork, check_networks
+from rgbt.evaluation.profiled_network import PreparedNetwork, ProfiledNetwork, check_networks
+from rgbt.files.atomic import write_atomic
 from rgbt.randomness import numpy_generator
-from rgbt.tracking.provenance import machine
+from rgbt.runs.provenance import machine
+from rgbt.tables import ABSENT, TextTable, csv_text
 
 CONFIDENCE = 0.95
 """Of the interval of a ratio."""
 
+FLOPS = (
+    "FLOPs: of convolutions and matrix products; a multiplication and its addition are two "
+    "operations (papers often print half of it)."
+)
+MEASURED = (
+    "Latency of a batch of {batch_size}: median and quartiles of {rounds} rounds, after {warmup} "
+    "unmeasured predictions. Each round measures every network once, in random order.",
+    "Ratio: median over rounds of the latency divided by that of {first} in the same round, with "
+    "the 95 % interval of the median.",
+    "A prediction is normalisation, forward pass, resizing of the class scores to the image, and "
+    "argmax. Reading of files and transfer to the device are not part of it.",
+    "Peak memory: most that PyTorch allocated on a GPU for weights, batch and one prediction.",
+)
+
 
 @dataclass(frozen=True)
 class ProfileSettings:
-    """How networks are measured.
+    """How networks are measured."""
 
-    Attributes:
-        batch_size: images of a prediction.
-        rounds: measured predictions of each network.
-        warmup: predictions before them that are not measured.
-        measure: whether memory and time are measured; False: parameters and operations only.
-    """
-
-    batch_size: int = 1
-    rounds: int = 20
-    warmup: int = 3
-    measure: bool = True
+    batch_size: int = 1  # images of a prediction
+    rounds: int = 20  # measured predictions of each network
+    warmup: int = 3  # predictions before them that are not measured
+    measure: bool = True  # False: parameters and operations only
 
 
-@dataclass(frozen=True)
-class Ratio:
-    """Median over rounds of a time divided by that of the first network in the same round.
-
-    Attributes:
-        low: end of the interval of the median, NaN with fewer than six rounds.
-        high: other end.
-    """
-
-    estimate: float
-    low: float
-    high: float
-
-
-@dataclass(frozen=True)
-class NetworkProfile:
-    """The measurements of one network.
-
-    Attributes:
-        network: what was measured.
-        parameters: number of all parameters.
-        trainable: number of those that are trained.
-        flops: operations of the prediction of one batch.
-        peak_memory: bytes; None where it was not measured.
-        milliseconds: of every round, for one batch; () where nothing was measured.
-        ratio: to the first network; None where nothing was measured.
-    """
-
-    network: ProfiledNetwork
-    parameters: int
-    trainable: int
-    flops: FlopCount
-    peak_memory: int | None = None
-    milliseconds: tuple[float, ...] = ()
-    ratio: Ratio | None = None
-
-    @property
-    def quartiles(self) -> tuple[float, float, float]:
-        """First quartile, median and third quartile of the milliseconds; NaN without any."""
-        if len(self.milliseconds) < 2:
-            only = self.milliseconds[0] if self.milliseconds else math.nan
-            return only, only, only
-        low, middle, high = quantiles(self.milliseconds, n=4, method="inclusive")
-        return low, middle, high
+COLUMNS = {
+    "parameters, M": ("parameters", 1e6, 2),
+    "trainable, M": ("trainable", 1e6, 2),
+    "GFLOPs": ("flops", 1e9, 2),
+    "peak, MiB": ("peak_memory", 2**20, 0),
+    "latency, ms": ("latency_ms", 1, 1),
+    "quartile": ("first_quartile_ms", 1, 1),
+    "to": ("third_quartile_ms", 1, 1),
+    "images/s": ("images_per_second", 1, 2),
+    "ratio": ("ratio", 1, 3),
+    "from": ("ratio_low", 1, 3),
+    "up to": ("ratio_high", 1, 3),
+}
+"""Header of the printed table -> column of `Profile.networks`, unit, decimals."""
 
 
 @dataclass(frozen=True)
@@ -95,123 +78,140 @@ class Profile:
     """Networks that were measured in one run.
 
     Attributes:
-        kind: of the device: "cpu", "cuda" or "mps".
-        device: its model.
-        threads: of the CPU.
-        torch_version: of PyTorch.
-        settings: how they were measured.
-        networks: in the order of the request; ratios refer to the first.
+        setup: kind of the device ("cpu", "cuda" or "mps"), its model, threads, version of PyTorch,
+            settings.
+        networks: a row per network, in the order of the request; None where nothing was measured.
+            FLOPs and milliseconds (of every round) are of one batch, peak_memory is in bytes; ratio
+            is that to the first network, ratio_low and ratio_high the ends of its interval.
     """
 
-    kind: str
-    device: str
-    threads: int
-    torch_version: str
-    settings: ProfileSettings
-    networks: tuple[NetworkProfile, ...]
+    setup: dict[str, Any]
+    networks: pd.DataFrame
 
-    def images_per_second(self, network: NetworkProfile) -> float:
-        """Images per second at the median time."""
-        return 1000 * self.settings.batch_size / network.quartiles[1]
+    def grid(self) -> TextTable:
+        """One line per network; memory and times only where they were measured."""
+        names, found = self.networks["name"], {"image": list(self.networks["image_hw"])}
+        for header, (key, unit, digits) in COLUMNS.items():
+            values = self.networks[key].astype(float) / unit
+            if values.notna().any():
+                found[header] = [f"{v:.{digits}f}" if v == v else ABSENT for v in values]
+        notes = [FLOPS]
+        if self.setup["measure"]:
+            notes += [each.format(first=names[0], **self.setup) for each in MEASURED]
+            notes.append(f"Precision: {', '.join(sorted(set(self.networks['precision'])))}.")
+        title = "Efficiency on {device}, {threads} threads, torch {torch}".format(**self.setup)
+        rows = tuple(zip(names, *found.values(), strict=True))
+        return TextTable(title, ("network", *found), rows, tuple(notes))
+
+    def write(self, path: Path) -> None:
+        """Write a JSON file with all numbers, or a CSV file with one line per network."""
+        if path.suffix == ".json":
+            networks = json.loads(self.networks.to_json(orient="records", double_precision=15))
+            text = json.dumps({**self.setup, "networks": networks}, indent=1) + "\n"
+        else:
+            flat = self.networks.drop(columns="milliseconds").assign(**self.setup).astype(object)
+            rows = flat.where(flat.notna(), "").itertuples(index=False, name=None)
+            text = csv_text([tuple(flat.columns), *rows])
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomic(path, text.encode())
 
 
-@dataclass
-class _Measured:
-    """A network while it is measured."""
-
-    prepared: PreparedNetwork
-    flops: FlopCount
-    peak: int | None = None
-    milliseconds: list[float] = field(default_factory=list)
+def check_out(path: Path) -> None:
+    """Refuse a file of another format, before anything is measured."""
+    if path.suffix not in (".json", ".csv"):
+        raise InputError(f"out={path}: expected a file name that ends in .json or .csv.")
 
 
 def profile(networks: Sequence[ProfiledNetwork], settings: ProfileSettings) -> Profile:
-    """Measure networks in one run, with a progress bar.
+    """Measure networks in one run, with a progress bar; all are on the device together.
 
-    All of them are kept on the device together.
-
-    Raises:
-        InputError: names or devices that do not fit, or images that a network cannot predict.
+    Raises InputError for names or devices that do not fit, or images that a network cannot predict.
     """
     check_networks(networks)
     rounds = settings.rounds if settings.measure else 0
+    rows: list[dict[str, Any]] = []
+    prepared: list[PreparedNetwork] = []
     with progress() as display:
         task = display.add_task("preparing", total=len(networks), note="")
-        found = [_prepare(network, settings, display, task) for network in networks]
+        for network in networks:
+            display.update(task, note=network.name)
+            prepared.append(PreparedNetwork(network, settings.batch_size))
+            rows.append(_prepare(prepared[-1], settings))
+            display.advance(task)
         display.update(task, description="measuring", total=rounds, completed=0, note="rounds")
         for number in range(rounds):
             # Drawn, so that no network always follows the same other one.
-            for index in numpy_generator(0, "profile", number).permutation(len(found)):
-                found[index].milliseconds.append(_milliseconds(found[index].prepared))
+            for index in numpy_generator(0, "profile", number).permutation(len(networks)):
+                start = time.perf_counter()
+                prepared[index].predict()
+                rows[index]["milliseconds"].append(1000 * (time.perf_counter() - start))
             display.advance(task)
-    first = found[0].milliseconds
-    return Profile(
-        kind=found[0].prepared.device.type,
-        device=device_name(found[0].prepared.device),
-        threads=torch.get_num_threads(),
-        torch_version=torch.__version__,
-        settings=settings,
-        networks=tuple(_profile_of(each, first) for each in found),
-    )
+    for row in rows if rounds else ():
+        times = row["milliseconds"]
+        low, middle, high = np.percentile(times, [25, 50, 75])
+        row |= {"latency_ms": middle, "first_quartile_ms": low, "third_quartile_ms": high}
+        row["images_per_second"] = 1000 * settings.batch_size / middle
+        ratio = ratio_of(times, rows[0]["milliseconds"])
+        row |= zip(("ratio", "ratio_low", "ratio_high"), ratio, strict=True)
+    device = prepared[0].device
+    on_gpu = device.type == "cuda"
+    setup = {
+        "device": torch.cuda.get_device_name(device) if on_gpu else str(machine()["cpu"]),
+        "kind": device.type,
+        "threads": torch.get_num_threads(),
+        "torch": torch.__version__,
+        **asdict(settings),
+    }
+    return Profile(setup, pd.DataFrame(rows))
 
 
-def _prepare(
-    network: ProfiledNetwork, settings: ProfileSettings, display: Progress, task: TaskID
-) -> _Measured:
-    """Build a network, count and measure what needs no rounds, and warm it up."""
-    display.update(task, note=network.name)
-    prepared = PreparedNetwork(network, settings.batch_size)
-    measured = _Measured(prepared, count_flops(prepared.predict))
+def _prepare(prepared: PreparedNetwork, settings: ProfileSettings) -> dict[str, Any]:
+    """Count and measure what needs no rounds, and warm the network up."""
+    network = prepared.network
+    flops = count_flops(prepared.predict)
     if network.is_onnx:
         prepared.use_onnx()
-    if settings.measure:
-        if prepared.device.type == "cuda":
-            measured.peak = prepared.peak_on_gpu()
-        elif prepared.device.type == "cpu" and not network.is_onnx:
-            measured.peak = peak_on_cpu(network, settings.batch_size)
-        for _ in range(settings.warmup):
-            prepared.predict()
-    display.advance(task)
-    return measured
+    peak = prepared.peak_memory() if settings.measure and not network.is_onnx else None
+    for _ in range(settings.warmup if settings.measure else 0):
+        prepared.predict()
+    return {
+        "name": network.name,
+        "overrides": " ".join(network.overrides),
+        "image_hw": "x".join(map(str, network.image_hw)),
+        "precision": network.trainer.precision,
+        **dict.fromkeys(key for key, _, _ in COLUMNS.values()),  # None: not measured
+        "parameters": prepared.parameters,
+        "trainable": prepared.trainable,
+        "flops": flops,
+        "peak_memory": peak,
+        "milliseconds": [],
+    }
 
 
-def _milliseconds(prepared: PreparedNetwork) -> float:
-    start = time.perf_counter()
-    prepared.predict()
-    return 1000 * (time.perf_counter() - start)
+def count_flops(call: Callable[[], object]) -> int:
+    """Operations of convolutions and matrix products of one call, by `torch.utils.flop_counter`.
+
+    Attention is computed as matrix products and a softmax, because the fused operation of some
+    devices has no formula. So every device gives the same count.
+    """
+    with sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:
+        call()
+    return int(counter.get_total_flops())
 
 
-def _profile_of(measured: _Measured, first: Sequence[float]) -> NetworkProfile:
-    return NetworkProfile(
-        network=measured.prepared.network,
-        parameters=measured.prepared.parameters,
-        trainable=measured.prepared.trainable,
-        flops=measured.flops,
-        peak_memory=measured.peak,
-        milliseconds=tuple(measured.milliseconds),
-        ratio=ratio_of(measured.milliseconds, first) if first else None,
-    )
-
-
-def ratio_of(times: Sequence[float], first: Sequence[float]) -> Ratio:
-    """Median of the ratios of each round with its interval.
+def ratio_of(times: Sequence[float], first: Sequence[float]) -> tuple[float, float, float]:
+    """Median of the ratios of each round, and the ends of its interval; NaN below six rounds.
 
     The interval has no assumption about the distribution: its ends are two of the sorted ratios
     (Conover, Practical Nonparametric Statistics, 3rd ed., Sec. 3.2). It holds the true median in at
     least 95 % of repetitions if rounds are independent.
     """
-    ratios = sorted(mine / other for mine, other in zip(times, first, strict=True))
-    number, rank = len(ratios), -1
-    below = 0.0  # probability that at most `rank` of the ratios are below the true median
-    while (below := below + math.comb(number, rank + 1) / 2**number) <= (1 - CONFIDENCE) / 2:
-        rank += 1
+    from scipy.stats import binom
+
+    ratios = np.sort(np.divide(times, first))
+    # Largest rank for which at most 2.5 % is the probability that more ratios are below the median.
+    rank = int(binom.ppf((1 - CONFIDENCE) / 2, len(ratios), 0.5)) - 1
+    middle = float(np.median(ratios))
     if rank < 0:
-        return Ratio(median(ratios), math.nan, math.nan)
-    return Ratio(median(ratios), ratios[rank], ratios[number - 1 - rank])
-
-
-def device_name(device: torch.device) -> str:
-    """The model of a graphics card or processor."""
-    if device.type == "cuda":
-        return torch.cuda.get_device_name(device)
-    return str(machine()["cpu"])
+        return middle, math.nan, math.nan
+    return middle, float(ratios[rank]), float(ratios[-1 - rank])

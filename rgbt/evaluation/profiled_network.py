@@ -1,26 +1,37 @@
-"""The networks that `rgbt profile` measures: chosen by overrides, by a file or by finished runs."""
+"""The networks that `rgbt profile` measures, and their predictions of random images."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
-from rgbt.build.load_run import trusted_settings
-from rgbt.checks import InputError, split_list
+import torch
+from torch import Tensor, nn
+
+from rgbt.assembly.load_run import trusted_settings
+from rgbt.checks import InputError, one_line, split_list
 from rgbt.config.command import composing
 from rgbt.config.component import Component
 from rgbt.config.compose import check_keys, compose
 from rgbt.config.values import check_value
 from rgbt.data.domains import Domains
+from rgbt.engine.allocator import keep_memory
+from rgbt.engine.device import autocast, choose_device
+from rgbt.engine.evaluate import class_maps
 from rgbt.engine.settings import TrainerSettings
+from rgbt.engine.threads import fix_threads
 from rgbt.exported.description import require_packages
+from rgbt.exported.onnx_network import exported_network
 from rgbt.files.yaml_files import read_yaml
+from rgbt.randomness import derive, torch_generator
 from rgbt.ranges import Size, Text
-from rgbt.spec.load_spec import load_spec
-from rgbt.tracking.run_folder import find_run
-from rgbt.types import View
+from rgbt.requirements import record_of
+from rgbt.runs.folder import find_run
+from rgbt.runs.specify import load_spec
+from rgbt.types import Batch, View
 
 SCALE = "scale=paper"
 """Used where no scale is given: the networks of the demo are tiny."""
@@ -31,35 +42,20 @@ Hw = tuple[int, int]
 
 @dataclass(frozen=True)
 class ProfiledNetwork:
-    """A network and the size of its images; nothing is built yet.
+    """A network and the size of its images; nothing is built yet."""
 
-    Attributes:
-        name: in the table, unique.
-        model: how it is built.
-        trainer: device, threads and precision.
-        view: input images; None: those that the network is designed for.
-        image_hw: height and width of the images and of the prediction, pixels.
-        overrides: of the configuration that describe the network; () for a finished run.
-        is_onnx: whether onnxruntime computes it from its exported graph, and not PyTorch.
-    """
-
-    name: str
+    name: str  # in the table, unique
     model: Component
-    trainer: TrainerSettings
-    view: View | None
+    trainer: TrainerSettings  # device, threads and precision
+    view: View | None  # input images; None: those that the network is designed for
     image_hw: Hw
-    overrides: tuple[str, ...] = ()
-    is_onnx: bool = False
+    overrides: tuple[str, ...] = ()  # that describe the network; () for a finished run
+    is_onnx: bool = False  # onnxruntime computes it from its exported graph, and not PyTorch
 
 
 @dataclass(frozen=True, kw_only=True)
 class NetworkEntry:
-    """One entry of a file of networks.
-
-    Attributes:
-        overrides: of the configuration, such as [+experiment=grbm, model=mask2former_swin_s].
-        image_hw: height and width of its images; None: the option image_hw.
-    """
+    """One entry of a file of networks; without a size, that of the option image_hw."""
 
     __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid"}
 
@@ -70,10 +66,7 @@ class NetworkEntry:
 def from_overrides(name: str, overrides: Sequence[str], image_hw: Hw) -> ProfiledNetwork:
     """The network of a configuration, at scale=paper if no scale is given.
 
-    Its data set need not exist: only the number of classes is read.
-
-    Raises:
-        InputError: Hydra or the network's constructor refuses an override.
+    Its data set need not exist. Raises InputError where Hydra or a constructor refuses an override.
     """
     has_scale = any(word.startswith("scale=") for word in overrides)
     words = [*([] if has_scale else [SCALE]), *overrides]
@@ -98,38 +91,18 @@ def from_models(models: str, overrides: Sequence[str], image_hw: Hw) -> list[Pro
 
 
 def from_file(path: Path, overrides: Sequence[str], image_hw: Hw) -> list[ProfiledNetwork]:
-    """The networks of a YAML file: name -> `NetworkEntry`.
-
-    Args:
-        path: of the file.
-        overrides: of every network, besides those of its entry.
-        image_hw: of an entry without a size.
-
-    Raises:
-        InputError: no such file, no mapping, an unknown key, or as `from_overrides`.
-    """
-    plain = read_yaml(path)
-    if not isinstance(plain, Mapping) or not plain:
-        raise InputError(
-            f"networks={path}: expected a mapping from names to overrides, such as "
-            "'ours: {overrides: [model=cmx_b2]}'."
-        )
-    networks = []
-    for name, value in plain.items():
-        entry: NetworkEntry = check_value(f"{path}, {name}", value, NetworkEntry)
-        words = [*entry.overrides, *overrides]
-        networks.append(from_overrides(str(name), words, entry.image_hw or image_hw))
-    return networks
+    """The networks of a YAML file: name -> `NetworkEntry`; `overrides` apply to all."""
+    entries = check_value(str(path), read_yaml(path), dict[str, NetworkEntry])
+    return [
+        from_overrides(name, [*entry.overrides, *overrides], entry.image_hw or image_hw)
+        for name, entry in entries.items()
+    ]
 
 
 def from_runs(
     runs: str, runs_dir: Path, overrides: Sequence[str], image_hw: Hw, trust: Sequence[str]
 ) -> list[ProfiledNetwork]:
-    """The networks of finished runs; their weights are not read.
-
-    Raises:
-        InputError: no such run, a target that is not trusted, overrides that do not fit.
-    """
+    """The networks of finished runs with random weights; InputError as for other commands."""
     networks = []
     for run in split_list(runs, "runs"):
         settings = trusted_settings(find_run(run, runs_dir), trust, overrides)
@@ -140,36 +113,94 @@ def from_runs(
 
 
 def with_onnx(networks: Sequence[ProfiledNetwork]) -> list[ProfiledNetwork]:
-    """Each network followed by its exported form, "NAME, ONNX".
-
-    Raises:
-        InputError: a device other than the CPU, or the packages for ONNX are missing.
-    """
+    """Each network followed by its exported form, "NAME, ONNX"; InputError without the packages."""
     require_packages()
-    for network in networks:
-        if network.trainer.accelerator != "cpu":
-            raise InputError(
-                f"onnx=true compares on the CPU, but '{network.name}' has "
-                f"trainer.accelerator={network.trainer.accelerator}; set trainer.accelerator=cpu."
-            )
     pairs = [(each, replace(each, name=f"{each.name}, ONNX", is_onnx=True)) for each in networks]
     return [network for pair in pairs for network in pair]
 
 
 def check_networks(networks: Sequence[ProfiledNetwork]) -> None:
-    """Refuse networks that cannot be compared in one run.
+    """Raise InputError where ratios would mean nothing, or two networks have one name."""
+    names = [each.name for each in networks]
+    if len(set(names)) < len(names):
+        raise InputError(f"networks: a name occurs twice in {', '.join(names)}.")
+    for key in ("accelerator", "threads"):
+        values = {str(getattr(each.trainer, key)): each.name for each in networks}
+        if len(values) > 1:
+            raise InputError(f"trainer.{key}: networks are compared with one value, got {values}.")
+    if any(each.is_onnx for each in networks) and networks[0].trainer.accelerator != "cpu":
+        raise InputError("trainer.accelerator: onnx=true compares on the CPU; set it to cpu.")
 
-    Raises:
-        InputError: two of one name, or different devices or numbers of threads.
+
+class PreparedNetwork:
+    """A network with random weights on its device; it predicts one batch again and again.
+
+    Raises InputError where the constructor refuses a setting, or the machine lacks the device.
     """
-    first = networks[0]
-    for index, network in enumerate(networks):
-        if network.name in [each.name for each in networks[:index]]:
-            raise InputError(f"'{network.name}' is named twice; name each network once.")
-        for key in ("accelerator", "threads"):
-            mine, other = getattr(network.trainer, key), getattr(first.trainer, key)
-            if mine != other:
-                raise InputError(
-                    f"'{network.name}' has trainer.{key}={mine}, but '{first.name}' has {other}; "
-                    f"networks are compared on one device. Set trainer.{key}={other} for all."
-                )
+
+    def __init__(self, network: ProfiledNetwork, batch_size: int) -> None:
+        keep_memory()
+        fix_threads(network.trainer.threads)
+        self.network = network
+        self.device = choose_device(network.trainer)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(derive(0, "weights"))
+            model: nn.Module = network.model.build()
+        on_gpu = self.device.type == "cuda"
+        self._allocated = torch.cuda.memory_allocated(self.device) if on_gpu else 0
+        self.parameters = sum(each.numel() for each in model.parameters())
+        self.trainable = sum(each.numel() for each in model.parameters() if each.requires_grad)
+        # The counter of operations follows gradients otherwise, which a prediction does not have.
+        self._model: nn.Module = model.eval().requires_grad_(False).to(self.device)
+        self._view = network.view or record_of(model).views[0]
+        self._batch = random_batch(batch_size, network.image_hw).to(self.device)
+
+    def autocast(self) -> AbstractContextManager[Any]:
+        """Context of a forward pass at the precision of the network."""
+        return autocast(self.device, self.network.trainer.precision)
+
+    def predict(self) -> Tensor:
+        """(B, H, W) uint8: the class of every pixel; waits until the device has finished.
+
+        Raises InputError where the network cannot predict images of this size.
+        """
+        try:
+            classes = class_maps(self._model, self._batch, self, self._view)
+        except (RuntimeError, ValueError) as error:
+            height, width = self.network.image_hw
+            where = f"{self.network.name} at image_hw={height},{width}"
+            raise InputError(f"{where}: {one_line(error)}.") from error
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)
+        elif self.device.type == "mps":
+            torch.mps.synchronize()
+        return classes
+
+    def use_onnx(self) -> None:
+        """Predict with onnxruntime from now on; InputError where it cannot be exported."""
+        name, image_hw = self.network.name, self.network.image_hw
+        self._model = exported_network(self._model, self._view, image_hw, name)
+
+    def peak_memory(self) -> int | None:
+        """Bytes on a CUDA device: most that weights, batch and one prediction take; else None."""
+        if self.device.type != "cuda":
+            return None
+        torch.cuda.reset_peak_memory_stats(self.device)
+        self.predict()
+        return torch.cuda.max_memory_allocated(self.device) - self._allocated
+
+
+def random_batch(batch_size: int, image_hw: Hw) -> Batch:
+    """Images of random values; the speed of a prediction does not depend on them."""
+    generator = torch_generator(0, "profile")
+    shape = (batch_size, 4, *image_hw)
+    images = torch.randint(256, shape, generator=generator, dtype=torch.uint8)
+    return Batch(
+        rgb=images[:, :3],
+        thermal=images[:, 3:],
+        label=torch.zeros((batch_size, *image_hw), dtype=torch.uint8),
+        name=tuple(f"random {index}" for index in range(batch_size)),
+        centre_yx=torch.zeros((batch_size, 2), dtype=torch.int64),
+        position=None,
+        original_hw=torch.tensor([image_hw] * batch_size),
+    )

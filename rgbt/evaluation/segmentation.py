@@ -1,55 +1,50 @@
-"""Predict a split, count by image, region, label and class, and make tables of the counts."""
+"""Predict a split, count by image, region, label and class, and make tables of the counts.
+
+Details are counted beside them: boundaries, calibration, distance and size of objects.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import RenderableType
+from rich.console import Group
 from torch import Tensor, nn
 
-from rgbt.build.load_run import TrainedNetwork
-from rgbt.build.session import Session
+from rgbt.assembly.session import Session
+from rgbt.checks import InputError
 from rgbt.data.loaders import eval_batches
-from rgbt.dataset import LabelledDataset, Subset, background_indices
+from rgbt.dataset import KnownScenes, LabelledDataset, Subset, background_indices, reader_of
 from rgbt.engine.progress import progress
-from rgbt.evaluation.batch_norm import normalised, parts_of_split, statistics_in_words
-from rgbt.evaluation.details import DetailCounter, DetailedImages, details_counts
-from rgbt.evaluation.prediction import Predictor, counts_of, decode_ahead
+from rgbt.evaluation import prediction
+from rgbt.evaluation.prediction import Predictor, counts_of
 from rgbt.evaluation.request import EvaluationRequest, NetworkRequest
 from rgbt.metrics import scores
 from rgbt.metrics.absent import absent_notes
 from rgbt.metrics.confusion import RegionCounter
 from rgbt.metrics.counts import Counts
-from rgbt.metrics.details import DetailKind
+from rgbt.metrics.details import OF_SCENES, DetailKind
 from rgbt.metrics.metric import Regions
 from rgbt.processes import collected, num_processes
+from rgbt.tables import ClassTable, RegionTable, ResultTables, TextTable, number
+from rgbt.terminal import result_view, rich_table
 from rgbt.tracking.pictures import Legend, PanelExample
-from rgbt.tracking.tables import ClassTable, RegionTable, ResultTables
-from rgbt.tracking.terminal import result_view
 from rgbt.transforms.joint import whole_view
-from rgbt.types import Batch, View
+from rgbt.types import View
 
 NUM_PANELS = 6
 """Images of the qualitative panel: the same number by day and by night if the split has both."""
 
 
-Counted = dict[str, NDArray[np.int64]]
-"""Name of an image -> its counts (R, K, K)."""
-
-
 @dataclass(frozen=True)
 class EvaluationResult:
-    """Counts of one split per image and region, predicted from `view`.
+    """Counts of one split per image and region, predicted from `view`, and kept examples.
 
-    Attributes:
-        kept: examples for pictures.
-        skipped: names of unreadable files that were skipped, of the split and of statistics.
-        details: kind -> counts of the requested details (`rgbt.metrics.details`).
+    `skipped` are unreadable images, of the split and of statistics of batch normalisation.
     """
 
     counts: Counts
@@ -58,6 +53,22 @@ class EvaluationResult:
     skipped: tuple[str, ...]
     details: Mapping[DetailKind, Counts] = field(default_factory=dict)
 
+    def save(self, path: Path) -> None:
+        """Write the counts to `path`, and those of details beside it."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self.counts.save(path)
+        for kind, counts in self.details.items():
+            counts.save(details_path(path, kind))
+
+
+class Counted(NamedTuple):
+    """What one process has counted: of each image counts (R, K, K), and by kind (R G, M, K)."""
+
+    counts: dict[str, NDArray[np.int64]]
+    details: dict[str, dict[DetailKind, NDArray[np.int64]]]
+    kept: list[PanelExample]
+    skipped: tuple[str, ...]
+
 
 def evaluate(session: Session, model: nn.Module, request: EvaluationRequest) -> EvaluationResult:
     """Predict a split with `model`, left in evaluation mode, and count, with a progress bar.
@@ -65,28 +76,37 @@ def evaluate(session: Session, model: nn.Module, request: EvaluationRequest) -> 
     Several processes of a run predict a part of the split each, and return the same result.
 
     Raises:
-        InputError: a file cannot be read (data.on_error=raise), or none could be; the network
-            has not the view or the head; a corruption that does not fit the images; details that
-            the data set does not have; statistics that cannot be computed (`normalised`).
+        InputError: a file cannot be read, or a request that does not fit the network or the data.
     """
     predictor = Predictor(session, model, request)
+    split, wanted = request.split, request.batch_norm
     if request.corruption is not None:
-        session = request.corruption.applied_to(session, request.split)
-    names = session.dataset.names(request.split)
-    detail = DetailCounter(request.details, session.dataset, session.regions)
-    wanted = request.batch_norm
-    decode_ahead(session, request.split, *(wanted.splits if wanted is not None else ()))
+        session = request.corruption.applied_to(session, split)
+    counters = _detail_counters(session, request)
+    prediction.decode_ahead(session, split, *(wanted.splits if wanted is not None else ()))
     parts = []
     unmeasured: list[str] = []
-    for part in parts_of_split(session.dataset, request):
-        with normalised(session, predictor, request, part) as skipped:
+    for names, sources in prediction.parts_of_split(session.dataset, request):
+        with prediction.normalised(session, predictor, request, sources) as skipped:
             unmeasured += skipped
-            parts.append(_count(session, predictor, request, part.names, detail))
-    every = _joined([each for part in parts for each in collected(part)], names)
-    counts = counts_of(session, request.split, every.counted, session.regions.name)
-    details = details_counts(session, request.split, every.detailed, request.details)
-    unread = tuple(dict.fromkeys((*every.skipped, *unmeasured)))
-    return EvaluationResult(counts, predictor.view, tuple(every.kept), unread, details)
+            parts.append(_count(session, predictor, request, names, counters))
+    every = joined(
+        [each for part in parts for each in collected(part)], session.dataset.names(split)
+    )
+    details = {}
+    for each in request.details:
+        by_name = {name: counts[each.kind] for name, counts in every.details.items()}
+        # The sums of calibration are large.
+        dtype = np.int64 if each.kind == "calibration" else np.int32
+        partition = each.partition(session.regions.name)
+        details[each.kind] = counts_of(session, split, by_name, partition, dtype)
+    return EvaluationResult(
+        counts=counts_of(session, split, every.counts, session.regions.name),
+        view=predictor.view,
+        kept=tuple(every.kept),
+        skipped=tuple(dict.fromkeys((*every.skipped, *unmeasured))),
+        details=details,
+    )
 
 
 def _count(
@@ -94,66 +114,89 @@ def _count(
     predictor: Predictor,
     request: EvaluationRequest,
     names: tuple[str, ...],
-    detail: DetailCounter,
-) -> _Part:
+    counters: Mapping[DetailKind, Any],
+) -> Counted:
     """Predict the images `names` of the split, or the part of this process, and count."""
     dataset = Subset(session.dataset, names)
     batches = eval_batches(dataset, request.split, session.transform, session.loading)
     counter = RegionCounter(len(dataset.classes), session.regions)
-    counted: Counted = {}
-    detailed: DetailedImages = {}
-    kept: list[PanelExample] = []
+    found = Counted({}, {}, [], ())
     with progress() as display:
         task = display.add_task(request.split, total=len(names), note="images")
         done = 0
         for loaded in batches:
             batch = predictor.counted(loaded)
-            predicted, confidence = _predicted(predictor, batch, session, detail)
-            for index, (name, label) in enumerate(zip(batch.name, batch.label, strict=True)):
-                classes = predicted[index]
-                counted[name] = counter(label, classes)
-                detailed[name] = detail(name, label, classes, confidence[index])
-                is_kept = name in request.keep
-                kept += [_example(session, name, classes.numpy())] if is_kept else []
+            on_device = batch.to(session.device)
+            confidence: Sequence[Tensor | None] = [None] * len(batch.name)
+            if "calibration" in counters:
+                classes, sure = predictor.confident_classes(on_device)
+                confidence = list(sure.cpu())
+            else:
+                classes = predictor.classes(on_device)
+            images = [*zip(batch.name, batch.label, classes.cpu(), confidence, strict=True)]
+            for name, label, predicted, each in images:
+                found.counts[name] = counter(label, predicted)
+                found.details[name] = _details_of(
+                    counters, session.dataset, name, (label, predicted, each)
+                )
+            kept = (image for image in images if image[0] in request.keep)
+            found.kept.extend(_example(session, name, shown.numpy()) for name, _, shown, _ in kept)
             done = min(len(names), done + num_processes() * len(batch.name))
             display.update(task, completed=done)
-    return _Part(counted, detailed, kept, tuple(batches.skipped))
+    return found._replace(skipped=tuple(batches.skipped))
 
 
-def _predicted(
-    predictor: Predictor, batch: Batch, session: Session, detail: DetailCounter
-) -> tuple[Tensor, Sequence[Tensor | None]]:
-    """Classes (B, H, W) of a batch on the CPU, with the probability of each where it is needed."""
-    on_device = batch.to(session.fabric.device)
-    if not detail.needs_confidence:
-        return predictor.classes(on_device).cpu(), [None] * len(batch.name)
-    classes, confidence = predictor.confident_classes(on_device)
-    return classes.cpu(), list(confidence.cpu())
+def _detail_counters(session: Session, request: EvaluationRequest) -> dict[DetailKind, Any]:
+    """A counter of each requested kind; InputError for scenes that the data set does not know."""
+    dataset, regions, num_classes = session.dataset, session.regions, len(session.dataset.classes)
+    counters: dict[DetailKind, Any] = {}
+    if not request.details:
+        return counters
+    from rgbt.metrics.boundary import BoundaryCounter
+    from rgbt.metrics.calibration import CalibrationCounter
+    from rgbt.metrics.scene_counts import SceneCounter
+
+    for each in request.details:
+        if each.kind == "boundary":
+            width, border = each.setting[0], each.with_border
+            counters[each.kind] = BoundaryCounter(num_classes, regions, width, border=border)
+        elif each.kind == "calibration":
+            counters[each.kind] = CalibrationCounter(num_classes, regions, each.groups)
+        elif isinstance(reader_of(dataset), KnownScenes):
+            counters[each.kind] = SceneCounter(num_classes, regions, each)
+        else:
+            raise InputError(f"details={each.kind}: {dataset.name} has no maps of its scenes.")
+    return counters
 
 
-class _Part(NamedTuple):
-    """What one process has counted, kept and skipped of the images of one domain, or of all."""
+def _details_of(
+    counters: Mapping[DetailKind, Any],
+    dataset: LabelledDataset,
+    name: str,
+    maps: tuple[Tensor, Tensor, Tensor | None],
+) -> dict[DetailKind, NDArray[np.int64]]:
+    """The details of one image from its label, classes and confidences (H, W)."""
+    label, classes, confidence = maps
+    further: dict[DetailKind, tuple[Any, ...]] = {"boundary": (), "calibration": (confidence,)}
+    reader = reader_of(dataset)
+    if isinstance(reader, KnownScenes) and counters.keys() & set(OF_SCENES):
+        scene = reader.scene_maps(name)
+        further |= {"distance": (scene.depth_m,), "size": (scene.objects,)}
+    return {kind: count(label, classes, *further[kind]) for kind, count in counters.items()}
 
-    counted: Counted
-    detailed: DetailedImages
-    kept: list[PanelExample]
-    skipped: tuple[str, ...]
 
-
-def _joined(parts: Sequence[_Part], names: Sequence[str]) -> _Part:
+def joined(parts: Sequence[Counted], names: Sequence[str]) -> Counted:
     """The parts of all processes and domains together, in the order of `names`."""
-    if len(parts) == 1:
-        return parts[0]
     position = {name: index for index, name in enumerate(names)}
-    order = position.__getitem__
-    counted = {name: counts for each in parts for name, counts in each.counted.items()}
-    detailed = {name: counts for each in parts for name, counts in each.detailed.items()}
-    examples = [example for each in parts for example in each.kept]
-    return _Part(
-        {name: counted[name] for name in sorted(counted, key=order)},
-        {name: detailed[name] for name in sorted(detailed, key=order)},
-        sorted(examples, key=lambda example: position[example.name]),
-        tuple(sorted((name for each in parts for name in each.skipped), key=order)),
+    counts = {name: found for each in parts for name, found in each.counts.items()}
+    details = {name: found for each in parts for name, found in each.details.items()}
+    kept = [example for each in parts for example in each.kept]
+    skipped = [name for each in parts for name in each.skipped]
+    return Counted(
+        {name: counts[name] for name in names if name in counts},
+        {name: details[name] for name in names if name in details},
+        sorted(kept, key=lambda example: position[example.name]),
+        tuple(sorted(skipped, key=position.__getitem__)),
     )
 
 
@@ -194,43 +237,43 @@ def result_tables(counts: Counts, regions: Regions, label: str, step: int) -> Re
 
 
 def counts_path(
-    opened: TrainedNetwork,
+    opened: Session,
     network: NetworkRequest,
     request: EvaluationRequest,
     result: EvaluationResult,
 ) -> Path:
     """File of the counts in the folder of the network: its name says what was evaluated."""
-    words = [opened.session.dataset.name, request.split, result.view, result.counts.partition]
+    words = [opened.dataset.name, request.split, result.view, result.counts.partition]
     words += [] if request.head is None else [f"{request.head}-head"]
     words += [] if request.corruption is None else [request.corruption.file_stem]
     words += [] if request.batch_norm is None else [request.batch_norm.file_stem]
-    return opened.folder / f"{'_'.join([*words, *network.suffixes])}.npz"
+    return opened.evaluations / f"{'_'.join([*words, *network.suffixes])}.npz"
 
 
 def overview(
-    opened: TrainedNetwork, request: EvaluationRequest, result: EvaluationResult, path: Path
-) -> RenderableType:
-    """Print the tables of an evaluation and the path of its counts."""
-    session, head = opened.session, request.head
+    opened: Session, request: EvaluationRequest, result: EvaluationResult, path: Path
+) -> Group:
+    """The tables of an evaluation and the path of its counts."""
     label = label_of(opened, request, result.view)
-    tables = result_tables(result.counts, session.regions, label, opened.step)
-    heads = session.domains.heads_in_words(head or session.domains.tested_head)
-    statistics = statistics_in_words(session, request, result.skipped)
-    lines = [
-        *([("heads", heads)] if heads else []),
-        *([("batch norm", statistics)] if statistics else []),
-        ("counts", str(path)),
-    ]
-    if result.skipped:
-        lines.append(("skipped", f"{len(result.skipped)} images that cannot be read"))
-    return result_view(tables, path.parent, lines)
+    tables = result_tables(result.counts, opened.regions, label, opened.step)
+    lines: dict[str, str] = {
+        "heads": opened.domains.heads_in_words(request.head or opened.domains.tested_head),
+        "batch norm": request.batch_norm.title if request.batch_norm else "",
+        "counts": str(path),
+        **{kind: str(details_path(path, kind)) for kind in result.details},
+        "unreadable": f"{len(result.skipped)} images" if result.skipped else "",
+    }
+    return Group(
+        result_view(tables, path.parent, [line for line in lines.items() if line[1]]),
+        *(rich_table(_details_table(counts, label)) for counts in result.details.values()),
+    )
 
 
-def label_of(opened: TrainedNetwork, request: EvaluationRequest, view: View) -> str:
+def label_of(opened: Session, request: EvaluationRequest, view: View) -> str:
     """The name of an evaluation in tables."""
     head = f" {request.head} head" if request.head else ""
     changes = [each.title for each in (request.corruption, request.batch_norm) if each is not None]
-    return ", ".join([f"{opened.label} {opened.session.dataset.name} {view}{head}", *changes])
+    return ", ".join([f"{opened.label} {opened.dataset.name} {view}{head}", *changes])
 
 
 def legend_of(dataset: LabelledDataset) -> Legend:
@@ -247,3 +290,32 @@ def panel_names(dataset: LabelledDataset, split: str) -> tuple[str, ...]:
     day = [name for name, dark in zip(names, at_night, strict=True) if not dark]
     num_day = min(len(day), max(NUM_PANELS // 2, NUM_PANELS - len(night)))
     return tuple(day[:num_day] + night[: NUM_PANELS - num_day])
+
+
+def details_path(path: Path, kind: DetailKind) -> Path:
+    """File of a kind beside the counts in `path`: "x.npz" -> "x-boundary.npz"."""
+    return path.with_name(f"{path.stem}-{kind}{path.suffix}")
+
+
+def _details_table(counts: Counts, label: str) -> TextTable:
+    """The scores of counts of details as a table; `label` names the network."""
+    from rgbt.metrics.score_grid import score_grid
+
+    grid = score_grid(counts)
+    rows = [(title, *_numbers(counts, metrics)) for title, metrics in grid.rows]
+    return TextTable(f"{label}: {grid.title}", ("", *grid.columns), tuple(rows))
+
+
+def views_table(by_view: Mapping[View, Counts], label: str) -> TextTable:
+    """The mIoU by region, one row for each input; counts of single frames."""
+    from rgbt.metrics.score_grid import score_grid
+
+    grid = score_grid(next(iter(by_view.values())))
+    rows = [(view, *_numbers(counts, grid.metrics)) for view, counts in by_view.items()]
+    return TextTable(f"{label}: {grid.title} and input", ("", *grid.columns), tuple(rows))
+
+
+def _numbers(counts: Counts, metrics: Sequence[str]) -> tuple[str, ...]:
+    from rgbt.metrics.named import value
+
+    return tuple(number(value(metric, counts, counts.absent)) for metric in metrics)

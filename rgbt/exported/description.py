@@ -41,7 +41,7 @@ class Description:
         head: of a network with one head per domain; None: it has one for all images.
         outputs: whether the scores are of classes, or sums over masks of queries.
         image_hw: height and width of the images.
-        opset: version of the ONNX operators; 0 for another format.
+        opset: version of the ONNX operators.
         rgb: what the first input is.
         thermal: what the second input is.
         settings: configuration of the run, without tracking: how images are read and predicted.

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import io
-import json
 import logging
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
 from typing import Any
 
 import torch
@@ -95,8 +92,7 @@ def onnx_bytes(program: torch.export.ExportedProgram, description: Description) 
             )
         except Exception as error:  # the exporter raises errors of many kinds
             raise InputError(
-                f"{description.network} cannot be written as ONNX ({one_line(error)}). Use "
-                "out=NAME.pt2 for the format of torch.export."
+                f"{description.network} cannot be written as ONNX ({one_line(error)})."
             ) from error
     assert made is not None, "dynamo=True returns the program"
     proto = made.model_proto
@@ -107,16 +103,6 @@ def onnx_bytes(program: torch.export.ExportedProgram, description: Description) 
     for name, value in description.to_metadata().items():
         proto.metadata_props.add(key=name, value=value)
     return sealed(proto.SerializeToString())
-
-
-def torch_bytes(program: torch.export.ExportedProgram, description: Description) -> bytes:
-    """The content of a file of `torch.export.save`; the description is its extra file rgbt.json."""
-    buffer = io.BytesIO()
-    with _quiet():
-        torch.export.save(
-            program, buffer, extra_files={"rgbt.json": json.dumps(asdict(description))}
-        )
-    return buffer.getvalue()
 
 
 @contextmanager

@@ -19,7 +19,7 @@ from rgbt.checks import InputError, one_line
 from rgbt.exported.description import Description, require_packages
 from rgbt.exported.graph import OPSET, ScoresOfImages, onnx_bytes, traced
 from rgbt.exported.seal import is_damaged
-from rgbt.files.budgets import CONTENT, read_bytes
+from rgbt.files.budgets import read_bytes
 from rgbt.requirements import Record, record_of
 from rgbt.types import Output, View
 
@@ -58,16 +58,11 @@ class ExportedNetwork(nn.Module):
         """The network of a file.
 
         Raises:
-            InputError: as the class; no such file; a larger one than the budget; another format.
+            InputError: as the class; no such file; a larger one than the budget.
         """
-        if path.suffix == ".pt2":
-            raise InputError(
-                f"{path} is a file of torch.export, which rgbt does not read: PyTorch evaluates "
-                "expressions in such a file as Python code. Export the network to NAME.onnx."
-            )
         if not path.is_file():
             raise InputError(f"exported={path}: there is no such file.")
-        return cls(read_bytes(path, CONTENT), path)
+        return cls(read_bytes(path), path)
 
     @property
     def record(self) -> Record:

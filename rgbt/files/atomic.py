@@ -14,35 +14,27 @@ from typing import BinaryIO
 POLL_S = 0.1
 """Seconds between two attempts to take a lock."""
 
-LEFT_BEHIND = re.compile(
-    r"\.(?:last|last_previous|best)\.pt\.partial|\.counts_\w+\.npz\.partial"
-    r"|\..+\.(\d+)|.+\.(\d+)\.partial"
-)
-"""Temporary names in a run folder, of earlier versions too, with the process that wrote them. Those
-without one are written by the holder of the run's lock alone."""
-
-STALE_S = 3600.0
-"""Age above which a temporary file is treated as abandoned."""
+LEFT_BEHIND, STALE_S = re.compile(r"\..+\.partial|\..+\.(\d+)"), 3600.0
+"""Temporary names with the process that wrote them (none: the holder of the run's lock), and the
+age in seconds above which such a file is abandoned."""
 
 _held: set[int] = set()
 """Descriptors of locks of this process; loader workers forked from it must not keep them."""
 
 
 def write_atomic(path: Path, content: bytes) -> None:
-    """Write a file so that a reader, or a machine that crashes, sees the old or the new content."""
+    """Write a file; a reader, or a machine that crashes, sees the old or the new content."""
     with replacing(path) as file:
         file.write(content)
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
-    """A file to write, which replaces `path` when the block ends without an exception.
-
-    Temporary name in the same folder, fsync, rename, fsync of the folder.
-    """
+    """A file to write, which replaces `path` when the block ends without an exception."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary.unlink(missing_ok=True)  # never write through a link of this name
     try:
-        with temporary.open("wb") as file:
+        with temporary.open("xb") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
@@ -57,48 +49,47 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
 
 
 def remove_left_behind(folder: Path, writer: int | None) -> None:
-    """Remove temporary files that a killed process left in a run folder.
+    """Remove temporary files that a killed process left in a run folder, whose lock is held.
 
-    Files that another process may be writing now, such as an evaluation, are left alone.
-
-    Args:
-        folder: of the run, whose lock is held.
-        writer: the process that held the lock before; None: not known.
+    Files that another process than `writer`, which held the lock before, may be writing now are
+    left alone.
     """
-    for path in folder.rglob("*"):
+    for path in folder.rglob(".*"):
         found = LEFT_BEHIND.fullmatch(path.name)
-        if found is None:
-            continue
-        number = found.group(1) or found.group(2)
-        is_ours = number is None or int(number) in (writer, os.getpid())
-        if is_ours or time.time() - path.stat().st_mtime > STALE_S:
+        is_ours = found and (found[1] is None or int(found[1]) in (writer, os.getpid()))
+        if is_ours or (found and time.time() - path.lstat().st_mtime > STALE_S):
             path.unlink()
 
 
 def holder_of(path: Path) -> int | None:
     """Number of the process that held the lock `path` last; None where it does not say."""
-    found = re.match(r"process (\d+) on ", path.read_text()) if path.exists() else None
-    return None if found is None else int(found.group(1))
+    found = re.match(r"process (\d+) on ", path.read_text()) if path.is_file() else None
+    return None if found is None else int(found[1])
 
 
 @contextmanager
 def holding(path: Path, *, wait_s: float = 0.0) -> Iterator[str | None]:
     """Hold an exclusive lock on the file `path`, which is made if needed and never removed.
 
-    The operating system frees the lock when this process ends, however it ends.
-
-    Args:
-        path: the lock's file; its text names the holder.
-        wait_s: seconds to wait for a lock that another process holds, >= 0; `math.inf` for ever.
+    The operating system frees the lock when this process ends, however it ends. Waits `wait_s`
+    seconds (`math.inf`: for ever) for a lock that another process holds.
 
     Yields:
         None while the lock is held by us; otherwise who holds it ("process 12 on host").
     """
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
     _held.add(descriptor)
+    deadline = time.monotonic() + wait_s
     try:
-        holder = _lock(descriptor, time.monotonic() + wait_s)
-        yield holder
+        # Polled: a wait inside flock has no limit, and a stopped process never lets go.
+        while not (is_ours := _take(descriptor, fcntl.LOCK_EX)) and time.monotonic() < deadline:
+            time.sleep(POLL_S)
+        if is_ours:
+            os.ftruncate(descriptor, 0)
+            os.pwrite(descriptor, f"process {os.getpid()} on {os.uname().nodename}".encode(), 0)
+            yield None
+        else:
+            yield os.pread(descriptor, 200, 0).decode(errors="replace") or "another process"
     finally:
         _held.discard(descriptor)
         os.close(descriptor)
@@ -106,32 +97,18 @@ def holding(path: Path, *, wait_s: float = 0.0) -> Iterator[str | None]:
 
 def is_held(path: Path) -> bool:
     """Whether some process, this one included, holds the lock `path`."""
-    if not path.exists():
+    if not path.is_file():
         return False
-    with path.open() as file:
-        try:
-            # Shared: two processes that ask at the same time do not take each other for a holder.
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
-    return False
+    with path.open() as file:  # shared: two that ask at once take no other for a holder
+        return not _take(file.fileno(), fcntl.LOCK_SH)
 
 
-def _lock(descriptor: int, deadline: float) -> str | None:
-    """None once the lock is ours; who holds it where it is not until `deadline`."""
-    while True:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            # Polled: a wait inside flock has no limit, and a stopped process never lets go.
-            if time.monotonic() >= deadline:
-                return os.pread(descriptor, 200, 0).decode(errors="replace") or "another process"
-            time.sleep(POLL_S)
-        else:
-            break
-    os.ftruncate(descriptor, 0)
-    os.pwrite(descriptor, f"process {os.getpid()} on {os.uname().nodename}".encode(), 0)
-    return None
+def _take(descriptor: int, kind: int) -> bool:
+    try:
+        fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
 
 
 def _close_in_child() -> None:

@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -197,6 +196,8 @@ def assign(cost: Tensor, targets: Targets) -> Matches:
         own_targets = np.flatnonzero(image % num_processes() == rank())
         image, label = image[own_targets] // num_processes(), label[own_targets]
         place = torch.from_numpy(own_targets).to(cost.device)
+    from scipy.optimize import linear_sum_assignment  # half a second, and only training matches
+
     query = np.full((len(cost_SBQK), len(image)), -1)
     for one_image in np.unique(image):
         columns = np.flatnonzero(image == one_image)

@@ -123,7 +123,7 @@ def _draw_frequency(
 
 
 @command()
-def main(config: DictConfig) -> int:
+def main(config: DictConfig, _overrides: list[str]) -> int:
     """Write the picture of the configured masker to `out`."""
     path = Path(config.out or "")
     if path.suffix != ".png":

@@ -1,7 +1,7 @@
 """Read and write compressed files of arrays that name their kind: counts, maps, statistics.
 
 A file is a zip archive of arrays in NumPy's format. Nothing is unpacked before the directory of
-the archive and the headers of the arrays are checked against the kind of file.
+the archive is checked; kinds and shapes are then checked against the kind of file.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import hashlib
 import os
 import re
 import struct
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -23,7 +24,7 @@ from numpy.typing import NDArray
 
 from rgbt.checks import InputError, one_line
 from rgbt.files.atomic import replacing
-from rgbt.files.budgets import ARRAYS, check_array
+from rgbt.files.budgets import check_size
 
 FORMAT, DIGEST = "format", "digest"
 """Members of every archive: its mark, and the SHA-256 of all others (`_digest`)."""
@@ -43,7 +44,7 @@ Header: TypeAlias = tuple[str, tuple[int, ...]]
 
 DAMAGED = (
     *(ValueError, TypeError, KeyError, OSError, EOFError, OverflowError, struct.error, zlib.error),
-    *(zipfile.BadZipFile, NotImplementedError, RuntimeError),
+    *(zipfile.BadZipFile, NotImplementedError, RuntimeError, MemoryError, tokenize.TokenError),
 )
 """What `zipfile` and NumPy raise on damaged files; RuntimeError: an encrypted member."""
 
@@ -80,8 +81,8 @@ class Archive:
         """What `save` wrote, by name; nothing in the file is executed.
 
         Raises:
-            InputError: no such file, one that may not be read, is damaged or larger than `ARRAYS`
-                allows, or another kind of file.
+            InputError: no such file, one that may not be read, is damaged or larger than
+                `rgbt.files.budgets` allows, or another kind of file.
         """
         if not path.is_file():
             raise InputError(f"the file of {self.what} '{path}' does not exist; {self.advice}.")
@@ -106,16 +107,14 @@ class Archive:
             ) from error
 
     def _read(self, archive: zipfile.ZipFile, path: Path) -> dict[str, NDArray[Any]]:
-        headers = _headers(archive, path)
-        is_text = headers.get(FORMAT, ("", ()))[0] == "U"
-        mark = one_line(_array(archive, FORMAT)) if is_text else "none"
+        values = _arrays(archive, path)
+        mark = one_line(values[FORMAT]) if FORMAT in values else "none"
         if mark != self.mark:
             raise InputError(
                 f"'{path}' is not a file of {self.what}: expected the mark '{self.mark}', got "
                 f"'{mark}'; {self.advice}."
             )
-        self._check_members(headers)
-        values = {name: _array(archive, name) for name in headers}
+        self._check_members({name: (a.dtype.kind, a.shape) for name, a in values.items()})
         stored = values.pop(DIGEST, None)
         if stored is not None and str(stored) != _digest(values):
             raise ValueError("its content does not match its digest")
@@ -154,26 +153,21 @@ def _check_directory(file: IO[bytes]) -> None:
         raise ValueError("its directory is not that of such a file")
 
 
-def _headers(archive: zipfile.ZipFile, path: Path) -> dict[str, Header]:
-    """Kind of numbers and shape by name; no array is unpacked."""
+def _arrays(archive: zipfile.ZipFile, path: Path) -> dict[str, NDArray[Any]]:
+    """The arrays by name; nothing in them is executed."""
     entries = archive.infolist()
-    ARRAYS.check(path, sum(entry.file_size for entry in entries))
-    headers: dict[str, Header] = {}
+    check_size(path, sum(entry.file_size for entry in entries), "bytes")
+    arrays: dict[str, NDArray[Any]] = {}
     for entry in entries:
         name = entry.filename.removesuffix(".npy")
         is_ours = entry.filename == f"{name}.npy" and entry.compress_type in COMPRESSIONS
-        if name in headers or not is_ours:
+        if name in arrays or not is_ours:
             raise ValueError("its directory is damaged")
         with archive.open(entry) as member:
-            headers[name] = check_array(member, entry.file_size)
-    return headers
-
-
-def _array(archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
-    with archive.open(f"{name}.npy") as member:
-        array: NDArray[Any] = np.lib.format.read_array(member, allow_pickle=False)
-        member.read(1)  # the checksum is compared at the end of a member
-    return array
+            arrays[name] = np.lib.format.read_array(member, allow_pickle=False)
+            if member.read(1):  # the checksum is compared at the end of a member
+                raise ValueError(f"'{name}' is longer than its header announces")
+    return arrays
 
 
 def _digest(arrays: Mapping[str, NDArray[Any]]) -> str:

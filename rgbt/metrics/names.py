@@ -5,6 +5,8 @@ Scores are fractions 0..1; `VAR` alone is in squared percent points.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 MIOU = "mIoU"
 """Mean IoU over scored classes, pixels of the whole image pooled (not the mean of the regions)."""
 
@@ -114,14 +116,14 @@ def in_percent(name: str, value: float) -> float:
     return 100 * value if _is_fraction(name) else value
 
 
-def shown(name: str, value: float) -> float:
-    """A value as MLflow shows it: scores in percent with two decimals, as the papers print them.
+def shown(values: Mapping[str, float]) -> dict[str, float]:
+    """Values as MLflow shows them: scores in percent with two decimals, as the papers print them.
 
     Its charts write 0.62 for a fraction, and its tables all sixteen digits. The folder keeps the
-    exact value.
+    exact values.
     """
-    is_score = _is_fraction(name) or name.split("/")[-1] == VAR
-    return round(in_percent(name, value), 2) if is_score else value
+    scores = {n for n in values if _is_fraction(n) or n.split("/")[-1] == VAR}
+    return {n: round(in_percent(n, v), 2) if n in scores else v for n, v in values.items()}
 
 
 def _is_fraction(name: str) -> bool:

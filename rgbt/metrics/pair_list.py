@@ -12,7 +12,7 @@ from rgbt.files.atomic import write_atomic
 from rgbt.files.budgets import read_json
 
 PAIR_LIST = "pairs.json"
-"""File that lists exported pairs of frames; see `rgbt.evaluation.pair_images`."""
+"""File that lists exported pairs of frames; see `rgbt.evaluation.pair_predictions`."""
 
 Frames = Literal["virtual", "next", "video"]
 """Second frames: virtual views of the first ones, true ones that were taken after them and are
@@ -42,7 +42,7 @@ class PairList:
         name: of the data set.
         split: of the data set.
         frames: what the second frames are.
-        views: mark of the second frames (`rgbt.evaluation.pairing.Pairing`); "published":
+        views: mark of the second frames (`rgbt.evaluation.pair_frames.Pairing`); "published":
             the published sets of virtual views.
         sets: names of the sets of views.
         pairs: in the order of the split.

@@ -1,39 +1,152 @@
 """The trackers of a run: MLflow, filled from the run folder, or none.
 
-The run folder is the source of truth. ``rgbt sync`` later sends data that could not be sent during
-training.
+The run folder is the source of truth; ``rgbt sync`` fills what could not be sent. The address of a
+store comes from the configuration, never from a run folder.
 """
 
 from __future__ import annotations
 
 import importlib.util
+import logging
+import os
 import shlex
+import shutil
 import sys
+import tempfile
+import threading
 import time
-from contextlib import suppress
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote, urlparse
 
 from rgbt.checks import InputError
+from rgbt.files.atomic import holding
 from rgbt.ranges import Text
-from rgbt.tracking.mlflow_client import MlflowStore, locked, open_store, started_monitor
-from rgbt.tracking.mlflow_server import pages_of, python_command
-from rgbt.tracking.mlflow_upload import (
-    UploadState,
-    is_up_to_date,
-    read_upload_state,
-    upload,
-    write_upload_state,
-)
-from rgbt.tracking.mlflow_view import GROUPS_VIEW, RUNS_VIEW, run_path, view_path
-from rgbt.tracking.provenance import without_passwords
-from rgbt.tracking.run_files import Description
-from rgbt.tracking.run_folder import RunFolder
+from rgbt.runs.folder import Description, RunFolder, read_description, shown_key
+from rgbt.runs.provenance import without_passwords
+from rgbt.tracking.mlflow_upload import UploadState, is_sent, read_upload_state, upload
+from rgbt.tracking.mlflow_view import view_tags
 from rgbt.tracking.tracker import Link, Status, Tracking
 
+ENVIRONMENT = {
+    "DO_NOT_TRACK": "true",
+    "MLFLOW_LOGGING_LEVEL": "ERROR",
+    # A lost server must delay a training by seconds, not by the minutes of the defaults (7, 120).
+    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1",
+    "MLFLOW_HTTP_REQUEST_TIMEOUT": "10",
+    "GIT_PYTHON_REFRESH": "quiet",
+    "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
+    "MLFLOW_ENABLE_ARTIFACTS_PROGRESS_BAR": "false",
+}
+"""Set before the first import of mlflow, unless the user set them."""
+
+SQLITE = "sqlite:///"
+EXPERIMENT = "rgbt"
+CALL_S, FILE_S, LOCK_WAIT_S = 30.0, 600.0, 50.0
+"""Seconds until a call ends, one with files ends, and another process must free its lock."""
+
 PAUSE_S = 300.0
-"""Seconds that a training waits before it uses a failed store again."""
+"""Seconds that a training waits before it uses a failed store again; doubled each time."""
+
+EXPERIMENT_NOTE = """\
+One run per configuration and seed. mIoU, Var, region/..., class/...: test split, percent (Var:
+squared percent points). In profile/iou_by_region the "step" is the region, 1 = innermost ring.
+Layouts under *Views*: every run, means over seeds, tables."""
+
+
+class StoreBusyError(Exception):
+    """Another process holds a lock for too long."""
+
+
+@dataclass(frozen=True)
+class MlflowStore:
+    """MLflow's client, the experiment, and the folder that artifacts must lie in, if any."""
+
+    client: Any
+    experiment_id: str
+    files: Path | None = None
+
+    def check_files(self, artifact_uri: str) -> None:
+        """InputError where a store that nobody named would take files out of its folder."""
+        address = urlparse(artifact_uri)
+        is_local = address.scheme in ("", "file")
+        path = Path(unquote(address.path)).resolve()
+        if self.files and not (is_local and path.is_relative_to(self.files)):
+            raise InputError(f"uri: the store keeps files outside its folder, at {artifact_uri}.")
+
+
+class LimitedClient:
+    """MLflow's client; a call raises TimeoutError where a server sends a byte now and then."""
+
+    def __init__(self, uri: str) -> None:
+        set_environment()
+        from mlflow import MlflowClient  # takes seconds, hence not at the top
+
+        self._client = self._within(CALL_S, MlflowClient, tracking_uri=uri)
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        call, limit_s = getattr(self._client, name), FILE_S if "artifact" in name else CALL_S
+        return lambda *values, **named: self._within(limit_s, call, *values, **named)
+
+    def _within(self, limit_s: float, call: Callable[..., Any], *values: Any, **named: Any) -> Any:
+        """What `call` returns. After `limit_s` it continues in its thread."""
+        outcome: Future[Any] = Future()
+
+        def work() -> None:
+            try:
+                outcome.set_result(call(*values, **named))
+            except Exception as error:
+                outcome.set_exception(error)
+
+        threading.Thread(target=work, daemon=True).start()
+        return outcome.result(limit_s)
+
+
+def set_environment() -> None:
+    """Keep MLflow quiet, and patient for seconds only."""
+    logging.getLogger("alembic").setLevel(logging.ERROR)
+    for name, value in ENVIRONMENT.items():
+        os.environ.setdefault(name, value)
+
+
+def _create_database(database: Path, artifact_uri: str | None) -> None:
+    """Make an SQLite file with its tables under another name, and rename it once it is whole.
+
+    Two processes that make the tables of one file together break it, as does one that is killed.
+    """
+    if database.exists():
+        if not database.is_file():
+            raise InputError(f"uri: {database} is not a regular file.")
+        return
+    database.parent.mkdir(parents=True, exist_ok=True)
+    with locked(database.with_name(f".{database.name}.lock")):
+        if database.exists():
+            return
+        for left in database.parent.glob(f".{database.name}.new-*"):
+            shutil.rmtree(left, ignore_errors=True)
+        scratch = tempfile.mkdtemp(prefix=f".{database.name}.new-", dir=database.parent)
+        try:
+            set_environment()
+            from mlflow.store.tracking.sqlalchemy_store import SqlAlchemyStore
+
+            made = Path(scratch, database.name)
+            SqlAlchemyStore(f"{SQLITE}{made}", artifact_uri or "./mlruns").engine.dispose()
+            made.rename(database)
+        finally:
+            shutil.rmtree(scratch, ignore_errors=True)
+
+
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """Hold a lock; StoreBusyError where another process does, because a stopped one never ends."""
+    with holding(path, wait_s=LOCK_WAIT_S) as holder:
+        if holder is not None:
+            raise StoreBusyError(f"{holder} has held {path} for {LOCK_WAIT_S:g} s")
+        yield
 
 
 class NoTracking(Tracking):
@@ -44,79 +157,61 @@ class MlflowTracking(Tracking):
     """Shows runs in MLflow.
 
     Args:
-        uri: the store: sqlite:///..., postgresql://..., http://...;
-            None is ``sqlite:///<runs_dir>/mlflow.db``.
-        artifact_uri: where a new experiment keeps its files; None is ``<runs_dir>/mlartifacts`` for
-            a database, and the server's own storage for http.
-        experiment: its name.
-        runs_dir: the folder of all runs.
-        log_model: whether the best checkpoint of a finished run is logged as a model.
-        system_metrics: whether MLflow measures processor, memory and GPU while a run trains.
-
-    Raises:
-        InputError: system metrics without the package that measures them.
+        uri, artifact_uri: the store, and where a new experiment keeps its files; None:
+            ``mlflow.db`` and ``mlartifacts`` in `runs_dir`, a server's own storage.
+        experiment, runs_dir: name of the experiment, and the folder of all runs.
+        system_metrics: whether MLflow measures this machine; InputError without psutil.
     """
 
     def __init__(
         self,
-        uri: Text | None,
+        uri: Text | None = None,
         *,
-        artifact_uri: Text | None,
-        experiment: Text,
+        artifact_uri: Text | None = None,
+        experiment: Text = EXPERIMENT,
         runs_dir: Text,
-        log_model: bool = False,
         system_metrics: bool = False,
     ) -> None:
         if system_metrics and importlib.util.find_spec("psutil") is None:
             raise InputError(
-                "tracking.system_metrics=true requires the package psutil; install the extra: "
-                "pip install 'rgbt[system-metrics]'."
+                "tracking.system_metrics=true requires psutil: pip install 'rgbt[system-metrics]'."
             )
         root = Path(runs_dir).resolve()
-        self.uri = f"sqlite:///{root / 'mlflow.db'}" if uri is None else uri
-        is_server = self.uri.startswith(("http://", "https://"))
-        default_uri = None if is_server else (root / "mlartifacts").as_uri()
-        self.artifact_uri = default_uri if artifact_uri is None else artifact_uri
-        self.experiment = experiment
-        self.log_model = log_model
+        self.uri = f"{SQLITE}{root / 'mlflow.db'}" if uri is None else uri
+        self._files = root if uri is None and artifact_uri is None else None
+        if artifact_uri is None and not self.uri.startswith("http"):
+            artifact_uri = (root / "mlartifacts").as_uri()
+        self.artifact_uri, self.experiment = artifact_uri, experiment
+        place = f"runs_dir={root}" if uri is None else f"uri={without_passwords(uri)}"
+        self._words = [place, *([f"experiment={experiment}"] if experiment != EXPERIMENT else [])]
         self._system_metrics = system_metrics
         self._monitor: Any = None
         self._store: MlflowStore | None = None
-        self._folder: RunFolder | None = None
-        self._is_connected = False
-        self._quiet_until = 0.0
-        self._warned = False
+        self._folder: RunFolder
+        self._is_connected = self._warned = False
+        self._quiet_until, self._pause_s = 0.0, PAUSE_S
 
     def start(self, folder: RunFolder, description: Description) -> None:
-        """Note where the run of `folder` is sent; `after_step` connects.
-
-        MLflow takes seconds to import and to open its database. The first step does not wait for
-        it, and a run that fails before contacts the store only in the end.
-        """
+        """Note the folder. MLflow takes seconds to start: the first step does not wait for it."""
         self._folder = folder
         folder.describe(description)
-        write_upload_state(folder, self._sent(folder))
 
     def after_step(self) -> None:
-        """After the first step, start the MLflow run, or continue its existing run."""
+        """After the first step, start or continue the MLflow run."""
         if not self._is_connected:
             self.update()
 
     def refresh(self, folder: RunFolder, description: Description) -> None:
-        """Send what the store lacks of a finished run; without any, MLflow is not imported.
-
-        What the store has is read from ``mlflow.json``. That it has lost runs since is detected
-        only where the file of an SQLite store is missing; `rgbt sync` asks every store.
-        """
+        """Send what the store lacks of a finished run; without any, MLflow is not imported."""
         self._folder = folder
-        folder.describe(description)
-        sent = self._sent(folder)
-        if self._has_file():
-            with suppress(InputError):  # a damaged file of the run: the upload reports it
-                if is_up_to_date(folder, sent, "FINISHED"):
-                    return
-        write_upload_state(folder, sent)
-        self.finish("FINISHED")
+        if read_description(folder.path) != description:
+            folder.describe(description)
+        database = Path(self.uri.removeprefix(SQLITE))
+        has_store = database.is_file() or not self.uri.startswith(SQLITE)
+        has_name = shown_key(folder) == folder.path.name  # a replaced run gets another one
+        is_shown = has_store and has_name and is_sent(folder, self._state(folder))
+        if not is_shown:
+            self.finish("FINISHED")
 
     def update(self) -> None:
         """Send what is new, unless the store failed a short time ago."""
@@ -132,86 +227,83 @@ class MlflowTracking(Tracking):
         self._guarded(status)
 
     def links(self) -> list[Link]:
-        """Addresses of this run and of the charts, after the command where no server runs."""
-        assert self._folder is not None, "start() comes before links()"
-        sent = self._sent(self._folder)
-        if not sent.run_id:
-            return [("MLflow later", sync_command(self._folder))]
-        shown = pages_of(self.uri, sent.run_id)
-        pages = [
-            ("this run", shown.address + run_path(sent.experiment_id, sent.run_id)),
-            ("compare runs", shown.address + view_path(sent.experiment_id, RUNS_VIEW)),
-            ("over seeds", shown.address + view_path(sent.experiment_id, GROUPS_VIEW)),
-        ]
-        return pages if shown.command is None else [("open MLflow", shown.command), *pages]
+        """The command that opens the pages, or that sends the run to its store."""
+        is_sent = bool(self._state(self._folder).run_id)
+        return [("open MLflow", self.ui_command()) if is_sent else ("MLflow later", self._later())]
+
+    def ui_command(self) -> str:
+        """The command that opens the pages of this store."""
+        return shlex.join(["rgbt", "ui", *self._words])
+
+    def _later(self) -> str:
+        named = [word for word in self._words if not word.startswith("runs_dir=")]
+        return shlex.join(["rgbt", "sync", f"run={self._folder.path}", *named])
 
     def sync(self, folder: RunFolder, status: Status) -> str:
-        """Bring this store up to date with `folder`; the id of the MLflow run.
-
-        Unlike the calls of a running training this raises what the store raises.
-        """
+        """Bring this store up to date; the id of the MLflow run. Raises what the store raises."""
         store = self.store()
         # A training and a sync by hand may meet in one folder.
         with locked(folder.path / "mlflow.lock"):
-            sent = self._sent(folder)
-            upload(store, folder, sent, status)
+            state = self._state(folder)
+            upload(store, folder, state, status)
         if status == "RUNNING" and self._system_metrics and self._monitor is None:
-            self._monitor = started_monitor(self.uri, sent.run_id)
-        return sent.run_id
+            from mlflow.system_metrics import system_metrics_monitor
+
+            # A thread that stops by itself if the store fails; a resumed run continues its steps.
+            monitor = system_metrics_monitor.SystemMetricsMonitor
+            self._monitor = monitor(state.run_id, resume_logging=True, tracking_uri=self.uri)
+            self._monitor.start()
+        return state.run_id
 
     def store(self) -> MlflowStore:
         """The open store, made where it does not exist; raises what MLflow raises."""
-        if self._store is None:
-            self._store = open_store(self.uri, self.artifact_uri, self.experiment)
-        return self._store
+        if self._store is not None:
+            return self._store
+        if self.uri.startswith(SQLITE):
+            _create_database(Path(self.uri.removeprefix(SQLITE)), self.artifact_uri)
+        client = LimitedClient(self.uri)
+        found = client.get_experiment_by_name(self.experiment)
+        if found is None:
+            with suppress(Exception):  # another process may create it at this moment
+                client.create_experiment(self.experiment, artifact_location=self.artifact_uri)
+            found = client.get_experiment_by_name(self.experiment)
+        store = MlflowStore(client, found.experiment_id, self._files)
+        store.check_files(found.artifact_location)
+        for name, value in {"mlflow.note.content": EXPERIMENT_NOTE, **view_tags()}.items():
+            if found.tags.get(name) != value:
+                client.set_experiment_tag(found.experiment_id, name, value)
+        self._store = store
+        return store
 
-    def _has_file(self) -> bool:
-        """Whether the database file exists; True for servers, which are not contacted."""
-        path = self.uri.removeprefix("sqlite:///")
-        return path == self.uri or Path(path).is_file()
-
-    def _sent(self, folder: RunFolder) -> UploadState:
+    def _state(self, folder: RunFolder) -> UploadState:
         """What this store has of the run; nothing if the folder was sent to another one."""
-        uri, artifacts = without_passwords(self.uri), self.artifact_uri
-        fresh = UploadState(
-            uri,
-            self.experiment,
-            None if artifacts is None else without_passwords(artifacts),
-            log_model=self.log_model,
-        )
+        fresh = UploadState(without_passwords(self.uri), self.experiment)
         try:
-            sent = read_upload_state(folder)
-        except InputError as error:
-            # Repaired by the next write: `upload` finds the run by its key and sends everything.
+            state = read_upload_state(folder) or fresh
+        except InputError as error:  # `upload` finds the run by its key and sends everything
             sys.stderr.write(f"rgbt: {error}\n")
             return fresh
-        # A version that hid less may have stored it: both are compared as they are hidden now.
-        same = sent is not None and without_passwords(sent.uri) == uri
-        if sent is not None and same and sent.experiment == self.experiment:
-            return replace(sent, uri=uri, log_model=self.log_model)
-        return fresh
+        return state if (state.uri, state.experiment) == (fresh.uri, fresh.experiment) else fresh
 
     def _guarded(self, status: Status) -> None:
         """Sync; what the store raises becomes a line on stderr, once."""
-        assert self._folder is not None, "start() comes first"
         try:
             self.sync(self._folder, status)
-        except InputError as error:
-            # A damaged file of the run: the store works, and the run repairs its log on resuming.
+        except InputError as error:  # a damaged file of the run, which repairs its log on resuming
             sys.stderr.write(f"rgbt: not sent to MLflow: {error}\n")
         except Exception as error:  # Catches everything: a dead tracker must never stop a training.
-            self._quiet_until = time.monotonic() + PAUSE_S
-            if self._warned:
-                return
+            self._quiet_until = time.monotonic() + self._pause_s
+            self._pause_s *= 2
+            if not self._warned:
+                sys.stderr.write(
+                    f"rgbt: MLflow at {without_passwords(self.uri)} cannot be used "
+                    f"({reason_of(error)}). The run continues; later: {self._later()}\n"
+                )
             self._warned = True
-            reason = (str(error).splitlines() or [""])[0][:120]
-            sys.stderr.write(
-                f"rgbt: MLflow at {without_passwords(self.uri)} cannot be used "
-                f"({type(error).__name__}: {without_passwords(reason)}). The run continues. To "
-                f"send it later: `{sync_command(self._folder)}`\n"
-            )
 
 
-def sync_command(folder: RunFolder) -> str:
-    """The command that sends a run folder to its store."""
-    return f"{python_command()} -m rgbt.tracking.sync {shlex.quote(f'run={folder.path}')}"
+def reason_of(error: Exception) -> str:
+    """First line of what was raised, without passwords."""
+    line = (str(error).splitlines() or [""])[0][:300]
+    name = "" if isinstance(error, InputError) else f"{type(error).__name__}: "
+    return f"{name}{without_passwords(line)}"

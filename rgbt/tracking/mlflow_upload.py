@@ -1,13 +1,13 @@
-"""Fill one MLflow run from one run folder; later calls send only new data.
+"""Fill one MLflow run from one run folder.
 
-The folder's ``mlflow.json`` notes the last step that was sent per kind of line. A run that resumes
-at an earlier step therefore does not send the same lines twice.
+MLflow drops a metric that it has with the same step, time and value, so that a batch may be sent
+again. The folder's ``mlflow.json`` notes what that does not cover: the last step of each kind of
+line, because a run that resumes at an earlier step writes lines again at another time.
 """
 
 from __future__ import annotations
 
 import getpass
-import hashlib
 import json
 import math
 import time
@@ -15,246 +15,213 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from rgbt.checks import InputError
 from rgbt.files.atomic import write_atomic
 from rgbt.files.budgets import read_json, sealed
-from rgbt.tracking.mlflow_client import MlflowStore
-from rgbt.tracking.mlflow_inputs import inputs_digest, send_inputs
-from rgbt.tracking.mlflow_metrics import later_scores, metrics_of, metrics_of_pairs, profile_of
-from rgbt.tracking.mlflow_model import checkpoint_digest, send_model
-from rgbt.tracking.replaced_runs import shown_description, shown_key
-from rgbt.tracking.run_files import Description, read_provenance, read_result, read_tables
-from rgbt.tracking.run_folder import RunFolder
-from rgbt.tracking.tables import ResultTables, result_grids, subset_mious, without_nan
+from rgbt.metrics import names
+from rgbt.runs.folder import (
+    Description,
+    MetricLine,
+    RunFolder,
+    read_marker,
+    read_provenance,
+    read_result,
+    read_tables,
+    shown_description,
+    shown_key,
+)
+from rgbt.tables import ResultTables, result_grids, subset_mious, without_nan
+from rgbt.tracking.mlflow_view import KIND_TAG
 from rgbt.tracking.tracker import Status
 
-NAME_LENGTH = 250
-"""Characters of a run's name; PostgreSQL refuses more, SQLite does not."""
+if TYPE_CHECKING:
+    from rgbt.tracking.mlflow_store import MlflowStore
 
-PARAM_LENGTH = 500
-"""Characters of a parameter's value that are sent; MLflow's pages show far fewer."""
+NAME_LENGTH, PARAM_LENGTH, TAG_LENGTH = 250, 500, 5000
+"""Characters of a run's name (PostgreSQL refuses more), of a parameter and of a tag."""
 
-TAG_LENGTH = 5000
-
-BATCH_LENGTH, BATCH_PARAMS = 1000, 100
-"""Metrics and parameters in one call, MLflow's limits."""
+BATCH_METRICS, BATCH_PARAMS = 800, 100
+"""In one call. MLflow takes 1000 of metrics, parameters and tags together."""
 
 FILES = (
-    "config.yaml",
-    "provenance.json",
-    "result.json",
-    "*.patch",
-    "counts_*.npz",
-    "evaluations/*.npz",
-    "evaluations/robustness/*/*.npz",
-    "evaluations/robustness/*/*.json",
-    "figures/*.png",
+    *("config.yaml", "provenance.json", "result.json", "*.patch", "counts_*.npz", "figures/*.png"),
+    *("evaluations/*.npz", "evaluations/robustness/*/*.npz", "evaluations/robustness/*/*.json"),
 )
+READ = ("run.json", "metrics.jsonl", "tables.json", "dataset.json")
+"""Files whose content is sent in another form."""
+
 TABLE_FILE = "tables/iou.json"
 
 
 @dataclass
 class UploadState:
-    """The record of uploaded data of a run, stored in its folder as ``mlflow.json``.
+    """What a store has of a run, ``mlflow.json`` in its folder. It is never read for an address.
 
     Attributes:
-        uri: the store, passwords hidden.
-        artifact_uri: where a new experiment keeps files, or None.
-        experiment_id: "" before the first contact.
-        run_id: "" before the first contact.
+        uri: the store, passwords hidden; `run_id` is "" before the first contact.
         steps: kind of line -> last step sent.
-        files: path in the folder -> digest of the content sent.
-        profile: whether the region profile was sent.
-        later: scores of the result that no line holds and that were sent, e.g. "test/TC/aligned".
-        shown: digest of name, tags, parameters and status that were sent; "" in older records.
-        inputs: what identifies the data set that was sent; "" before.
-        log_model: whether the best checkpoint is sent as a logged model.
-        model: digest of the checkpoint that was sent so; "" before.
+        sent: time (seconds since 1970) at which the last complete upload began.
     """
 
     uri: str
     experiment: str
-    artifact_uri: str | None = None
-    experiment_id: str = ""
     run_id: str = ""
     steps: dict[str, int] = field(default_factory=dict)
-    files: dict[str, str] = field(default_factory=dict)
-    profile: bool = False
-    later: list[str] = field(default_factory=list)
-    shown: str = ""
-    inputs: str = ""
-    log_model: bool = False
-    model: str = ""
+    sent: float = 0.0
 
 
 def read_upload_state(folder: RunFolder) -> UploadState | None:
-    """The record of this folder, or None if nothing was sent.
-
-    Raises:
-        InputError: the file is damaged.
-    """
+    """The record of this folder, or None if nothing was sent; InputError where it is damaged."""
     path = folder.path / "mlflow.json"
     advice = "remove the file; the MLflow run is then identified by its key"
     found: UploadState | None = read_json(path, UploadState, advice) if path.exists() else None
     return found
 
 
-def write_upload_state(folder: RunFolder, sent: UploadState) -> None:
+def write_upload_state(folder: RunFolder, state: UploadState) -> None:
     """Write the record."""
-    text = json.dumps(sealed(asdict(sent)), indent=1)
-    write_atomic(folder.path / "mlflow.json", text.encode())
+    write_atomic(folder.path / "mlflow.json", json.dumps(sealed(asdict(state))).encode())
 
 
-def upload(store: MlflowStore, folder: RunFolder, sent: UploadState, status: Status) -> None:
-    """Bring the MLflow run of `folder` up to date; `sent` is changed and written.
+def is_sent(folder: RunFolder, state: UploadState) -> bool:
+    """Whether no file changed since the last complete upload; MLflow is not imported."""
+    files = [*_own_files(folder), *(folder.path / name for name in READ)]
+    # The time of a change, not that of the content: a copied file keeps an old one.
+    last = max((path.lstat().st_ctime for path in files if path.exists()), default=math.inf)
+    return bool(state.run_id) and last <= state.sent
+
+
+def upload(store: MlflowStore, folder: RunFolder, state: UploadState, status: Status) -> None:
+    """Bring the MLflow run of a folder up to date; `state` is changed and written.
 
     Args:
         store: open store.
-        folder: its `describe` must have been called.
-        sent: what that store has.
+        folder: described before; the lock ``mlflow.lock`` is held.
+        state: what that store has.
         status: the state to show.
+
+    Raises:
+        InputError: a file is damaged, or a link. MLflow raises anything else.
     """
+    from mlflow.entities import Param, RunTag
+
+    linked = [name for name in READ if (folder.path / name).is_symlink()]
+    if linked:
+        raise InputError(f"{folder.path / linked[0]} is a link, which is not followed.")
+    # Taking the lock has written its file: the time by the clock of the folder's file system.
+    began = (folder.path / "mlflow.lock").lstat().st_mtime
     description = shown_description(folder)
     assert description is not None, f"{folder.path}: describe() comes before upload()"
-    run = _run_of(store, folder, sent, description)
-    tables = read_tables(folder.path)
-    every = folder.lines()
-    lines = [line for line in every if line.step > sent.steps.get(line.kind, -1)]
-    metrics = list(metrics_of(lines))
-    if tables is not None and tables.split == "test" and not sent.profile:
-        metrics += profile_of(tables, every)
-        sent.profile = True
-    later = later_scores(folder, every, sent.later)
-    metrics += metrics_of_pairs(later, every)
-    _send(store, folder, sent, (metrics, set(run.data.params), description, tables))
-    sent.steps |= {line.kind: line.step for line in lines}
-    sent.later += later
-    _send_files(store, folder, sent, tables)
-    if sent.inputs != (inputs := inputs_digest(folder.path)):
-        send_inputs(store.client, sent.run_id, folder.path)
-        sent.inputs = inputs
-    if status == "FINISHED" and tables is not None and _lacks_model(folder, sent):
-        send_model(store, sent.run_id, folder.path, len(tables.classes.names))
-        sent.model = checkpoint_digest(folder.path)
-    name = _short(description.name)
-    if name != run.info.run_name:
-        store.client.update_run(sent.run_id, name=name)
-    if status == "RUNNING" and run.info.status != status:
-        store.client.update_run(sent.run_id, status=status)
-    elif status != run.info.status:
+    client, name = store.client, description.name[:NAME_LENGTH]
+    run = _run_of(store, folder, state, name)
+    store.check_files(run.info.artifact_uri)
+    tables, every = read_tables(folder.path), folder.lines()
+
+    metrics = list(_metrics(folder, every, state, tables))
+    # MLflow refuses to change a parameter.
+    new = {key: v for key, v in description.params.items() if key not in run.data.params}
+    params = [Param(key, value[:PARAM_LENGTH]) for key, value in new.items()]
+    shown = _tags(folder, description, tables).items()
+    tags = [RunTag(key, value[:TAG_LENGTH]) for key, value in shown if value]
+    while metrics or params or tags:  # one call, except for many parameters or metrics
+        client.log_batch(state.run_id, metrics[:BATCH_METRICS], params[:BATCH_PARAMS], tags)
+        metrics, params, tags = metrics[BATCH_METRICS:], params[BATCH_PARAMS:], []
+    for line in every:  # a resumed run may be behind what was sent
+        state.steps[line.kind] = max(line.step, state.steps.get(line.kind, -1))
+    write_upload_state(folder, state)  # at once: a kill between doubles points after the resume
+    _send_files(client, folder, state, tables)
+    if not (run.inputs and run.inputs.dataset_inputs):
+        _send_inputs(client, state.run_id, folder)
+    client.update_run(state.run_id, "RUNNING" if status == "RUNNING" else None, name)
+    if status not in ("RUNNING", run.info.status):
         written = (folder.path / each for each in ("result.json", "metrics.jsonl", "run.json"))
         end = max(path.stat().st_mtime for path in written if path.exists())
-        store.client.set_terminated(sent.run_id, status=status, end_time=round(1000 * end))
-    sent.shown = _shown(folder, description, tables, status)
-    write_upload_state(folder, sent)
+        client.set_terminated(state.run_id, status=status, end_time=round(1000 * end))
+    state.sent = began
+    write_upload_state(folder, state)
 
 
-def is_up_to_date(folder: RunFolder, sent: UploadState, status: Status) -> bool:
-    """Whether `upload` would send nothing, according to the record; MLflow is not imported."""
-    description = shown_description(folder)
-    if description is None or not sent.run_id:
-        return False
-    tables = read_tables(folder.path)
-    every = folder.lines()
-    return (
-        sent.shown == _shown(folder, description, tables, status)
-        and all(line.step <= sent.steps.get(line.kind, -1) for line in every)
-        and (tables is None or tables.split != "test" or sent.profile)
-        and not later_scores(folder, every, sent.later)
-        and sent.inputs == inputs_digest(folder.path)
-        and not _lacks_model(folder, sent)
-        and not list(_changed_files(folder, sent, tables))
-    )
-
-
-def _lacks_model(folder: RunFolder, sent: UploadState) -> bool:
-    """Whether the best checkpoint is to be logged as a model and was not."""
-    return sent.log_model and sent.model != checkpoint_digest(folder.path)
-
-
-def _shown(
-    folder: RunFolder, description: Description, tables: ResultTables | None, status: Status
-) -> str:
-    """Digest of name, tags, parameters and status that the store shows."""
-    tags = _tags(folder, description, tables)
-    text = json.dumps([description.name, tags, description.params, status], sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _run_of(
-    store: MlflowStore, folder: RunFolder, sent: UploadState, description: Description
-) -> Any:
-    """The MLflow run of the folder: the one that ``mlflow.json`` names, an unnoted or a new one.
-
-    A run that was deleted in the pages takes nothing more; its folder gets a new one.
-    """
+def _run_of(store: MlflowStore, folder: RunFolder, state: UploadState, name: str) -> Any:
+    """The MLflow run that ``mlflow.json`` names; an unnoted or a new one if it was deleted."""
     from mlflow.exceptions import MlflowException
 
     try:
-        run = store.client.get_run(sent.run_id) if sent.run_id else None
+        run = store.client.get_run(state.run_id) if state.run_id else None
+        if run is not None and run.info.lifecycle_stage == "active":
+            return run
     except MlflowException as error:
         if error.error_code != "RESOURCE_DOES_NOT_EXIST":
             raise
-        run = None
-    if run is not None and run.info.lifecycle_stage == "active":
-        return run
-    # A process that was killed may have made the run without noting its id; it would stay in the
-    # pages as running for ever. The start keeps runs of one key apart that were trained again.
-    entry = (read_provenance(folder.path / "provenance.json") or [{}])[0]
-    first = entry.get("started")
+    # A process that was killed may have made the run without noting its id. The start keeps runs of
+    # one key apart that were trained again.
+    first = (read_provenance(folder.path / "provenance.json") or [{}])[0].get("started")
     seconds = time.time() if first is None else datetime.fromisoformat(first).timestamp()
-    start = round(1000 * seconds)
+    start, tags = round(1000 * seconds), _identity(folder)
     found = store.client.search_runs([store.experiment_id], f"attributes.start_time = {start}")
     # Compared here: MLflow's search cannot quote every path.
-    tags = _identity(folder)
     run = next((each for each in found if tags.items() <= each.data.tags.items()), None)
-    if run is None:
-        run = store.client.create_run(
-            store.experiment_id, start_time=start, tags=tags, run_name=_short(description.name)
-        )
-    sent.experiment_id, sent.run_id = store.experiment_id, run.info.run_id
-    sent.steps, sent.files, sent.profile, sent.later, sent.shown = {}, {}, False, [], ""
-    sent.inputs = sent.model = ""
-    write_upload_state(folder, sent)
+    run = run or store.client.create_run(store.experiment_id, start, tags, name)
+    state.run_id, state.steps, state.sent = run.info.run_id, {}, 0.0
+    write_upload_state(folder, state)
     return run
 
 
 def _identity(folder: RunFolder) -> dict[str, str]:
     """Tags that are set in the call that makes a run, and by which it is found."""
-    return {"rgbt.key": shown_key(folder), "rgbt.folder": str(folder.path)}
+    return {KIND_TAG: "run", "rgbt.key": shown_key(folder), "rgbt.folder": str(folder.path)}
 
 
-def _short(name: str) -> str:
-    """A run's name as MLflow takes it; the whole one stays in the folder."""
-    return name if len(name) <= NAME_LENGTH else f"{name[: NAME_LENGTH - 4]} ..."
+def _own_files(folder: RunFolder) -> list[Path]:
+    """Files to send: regular ones inside the folder, which no link leads to."""
+    found = sorted(path for pattern in FILES for path in folder.path.glob(pattern))
+    return [path for path in found if path.is_file() and path.resolve() == path]
 
 
-def _send(
-    store: MlflowStore,
-    folder: RunFolder,
-    sent: UploadState,
-    found: tuple[list[Any], set[str], Description, ResultTables | None],
+def _send_files(
+    client: Any, folder: RunFolder, state: UploadState, tables: ResultTables | None
 ) -> None:
-    """One call with metrics, tags and parameters; more only beyond MLflow's limits on one call."""
-    from mlflow.entities import Param, RunTag
+    """Upload the table and files that changed since the last time."""
+    for path in _own_files(folder):
+        if path.stat().st_ctime > state.sent:
+            parent = path.parent.relative_to(folder.path).as_posix()
+            client.log_artifact(state.run_id, str(path), None if parent == "." else parent)
+    if tables is not None and (folder.path / "tables.json").stat().st_ctime > state.sent:
+        client.log_text(state.run_id, json.dumps(artifact_table(tables)), TABLE_FILE)
 
-    metrics, known, description, tables = found
-    # MLflow refuses to change a parameter.
-    new = {name: value for name, value in description.params.items() if name not in known}
-    params = [Param(name, value[:PARAM_LENGTH]) for name, value in new.items()]
-    tags = _tags(folder, description, tables)
-    client, run_id = store.client, sent.run_id
-    client.log_batch(
-        run_id,
-        metrics=metrics[:BATCH_LENGTH],
-        params=params[:BATCH_PARAMS],
-        tags=[RunTag(name, value[:TAG_LENGTH]) for name, value in tags.items() if value],
-    )
-    for start in range(BATCH_LENGTH, len(metrics), BATCH_LENGTH):
-        client.log_batch(run_id, metrics=metrics[start : start + BATCH_LENGTH])
-    for start in range(BATCH_PARAMS, len(params), BATCH_PARAMS):
-        client.log_batch(run_id, params=params[start : start + BATCH_PARAMS])
+
+def _metrics(
+    folder: RunFolder, every: list[MetricLine], state: UploadState, tables: ResultTables | None
+) -> Iterator[Any]:
+    """Finite values of new lines, each with the time of its line, and what no line holds.
+
+    The latter are the IoU over the regions (the step is the region's number), and scores of pairs
+    of frames: of the selection split, and those that `rgbt.consistency` added to a finished run.
+    """
+    from mlflow.entities import Metric
+
+    new = [line for line in every if line.step > state.steps.get(line.kind, -1)]
+    # The compare page draws the metric that came first: scores before losses.
+    for line in sorted(new, key=lambda line: ("test", "val", "train").index(line.kind)):
+        # The pages draw bars over runs for a metric that has step 0 only, else a line over steps.
+        prefix, step = ("", 0) if line.kind == "test" else (f"{line.kind}/", line.step)
+        finite = {name: value for name, value in line.values.items() if math.isfinite(value)}
+        for name, value in names.shown(finite).items():
+            yield Metric(prefix + name, value, round(1000 * line.time), step)
+    now = round(1000 * every[-1].time) if every else 0
+    regions = tables.regions.region_ious if tables is not None and tables.split == "test" else ()
+    for region, iou in enumerate(regions, start=1):
+        if math.isfinite(iou):
+            yield Metric(names.REGION_PROFILE, round(100 * iou, 2), now, region)
+    result = read_result(folder.path) or {}
+    known = {name for line in every if line.kind == "test" for name in line.values}
+    for kind, prefix, sent in (("val", "val/", set()), ("test", "", known)):
+        scores = {name: v for name, v in (result.get(kind) or {}).items() if v is not None}
+        pairs = {n: v for n, v in scores.items() if n.split("/")[0] in (names.TC, names.CA)}
+        for name, value in names.shown(pairs).items():
+            if name not in sent:
+                yield Metric(f"{prefix}{name}", value, now, 0)
 
 
 def _tags(
@@ -279,56 +246,39 @@ def _tags(
 
 
 def artifact_table(tables: ResultTables) -> dict[str, list[Any]]:
-    """The result in the form that MLflow's table view requires.
+    """The result as columns and rows in percent (Var: its own unit) for MLflow's table view.
 
     That view groups by the first column, which must be unique, and compares the second between
     runs; it shows few rows on a screen, so summaries come first.
-
-    Returns:
-        ``columns`` and ``data``: row name, IoU in percent (for "Var" its own unit), accuracy.
     """
     classes, regions = tables.classes, tables.regions
-    rows: list[tuple[str, float, float]] = [
-        ("mIoU", 100 * regions.miou, math.nan),
-        ("Var", regions.variance, math.nan),
-    ]
-    rows += [(f"mIoU {name}", 100 * v, math.nan) for name, v in subset_mious(classes).items()]
+    rows = [("mIoU", regions.miou, math.nan), ("Var", regions.variance / 100, math.nan)]
+    rows += [(f"mIoU {name}", value, math.nan) for name, value in subset_mious(classes).items()]
     pairs = zip(tables.region_names, regions.region_ious, strict=True)
-    rows += [(f"mIoU {name}", 100 * iou, math.nan) for name, iou in pairs]
-    triples = zip(classes.names, classes.ious, classes.accuracies, strict=True)
-    rows += [(name, 100 * iou, 100 * accuracy) for name, iou, accuracy in triples]
+    rows += [(f"mIoU {name}", iou, math.nan) for name, iou in pairs]
+    rows += zip(classes.names, classes.ious, classes.accuracies, strict=True)
     for name, by_region in zip(classes.names, classes.region_ious, strict=True):
         pairs = zip(tables.region_names, by_region, strict=True)
-        rows += [(f"{name} / {region}", 100 * iou, math.nan) for region, iou in pairs]
-    data = [[name, *without_nan([round(v, 2) for v in values])] for name, *values in rows]
-    return {"columns": ["score", "IoU %", "accuracy %"], "data": data}
+        rows += [(f"{name} / {region}", iou, math.nan) for region, iou in pairs]
+    data = [[name, *(round(100 * v, 2) for v in values)] for name, *values in rows]
+    return {"columns": ["score", "IoU %", "accuracy %"], "data": without_nan(data)}
 
 
-def _send_files(
-    store: MlflowStore, folder: RunFolder, sent: UploadState, tables: ResultTables | None
-) -> None:
-    """Upload the table and files that are new or changed, under their path in the folder."""
-    for name, digest in _changed_files(folder, sent, tables):
-        if name == TABLE_FILE and tables is not None:
-            text = json.dumps(artifact_table(tables))
-            store.client.log_text(sent.run_id, text, TABLE_FILE)
-        else:
-            parent = None if "/" not in name else str(Path(name).parent)
-            store.client.log_artifact(sent.run_id, str(folder.path / name), parent)
-        sent.files[name] = digest
+def _send_inputs(client: Any, run_id: str, folder: RunFolder) -> None:
+    """Add the data set of a run to the column Datasets, one entry (unique name) for each split."""
+    from mlflow.entities import Dataset, DatasetInput, InputTag
 
-
-def _changed_files(
-    folder: RunFolder, sent: UploadState, tables: ResultTables | None
-) -> Iterator[tuple[str, str]]:
-    """Path in the folder and digest of the table and of files that are new or changed."""
-    if tables is not None:
-        text = json.dumps(artifact_table(tables))
-        digest = hashlib.sha256(text.encode()).hexdigest()
-        if sent.files.get(TABLE_FILE) != digest:
-            yield TABLE_FILE, digest
-    for path in sorted(found for pattern in FILES for found in folder.path.glob(pattern)):
-        name = str(path.relative_to(folder.path))
-        digest = hashlib.sha256(path.read_bytes()).hexdigest()
-        if sent.files.get(name) != digest:
-            yield name, digest
+    marker = read_marker(folder.path)
+    if marker is None or "inputs" not in marker:
+        return
+    entries = []
+    for each in marker["inputs"]:
+        dataset = Dataset(
+            name=f"{marker['name']}/{each['split']}",
+            digest=marker["files"][:8],
+            source_type="local",  # a path as text: nothing is opened
+            source=json.dumps({"uri": marker["root"]}),
+            profile=json.dumps({"images": each["images"], "fingerprint": marker["files"]}),
+        )
+        entries.append(DatasetInput(dataset, [InputTag("mlflow.data.context", each["context"])]))
+    client.log_inputs(run_id, datasets=entries)

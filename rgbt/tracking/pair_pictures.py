@@ -9,14 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rgbt.tracking.pictures import (
-    IGNORED_COLOUR,
-    Image,
-    Legend,
-    colours,
-    draw_columns,
-    overlay,
-)
+from rgbt.tracking import pictures
+from rgbt.tracking.pictures import Image, Legend, colours, overlay
 from rgbt.types import IGNORE
 
 AGREES = (235, 235, 235)
@@ -27,14 +21,9 @@ DIFFERS = (200, 30, 30)
 class PairExample:
     """Two frames of a scene and their predictions.
 
-    Attributes:
-        first_rgb: (H, W, 3) uint8, the first frame.
-        first: (H, W) uint8, its predicted classes.
-        second_rgb: (H, W, 3) uint8, the second frame.
-        second: (H, W) uint8, its predicted classes.
-        followed: (H, W) uint8, the first prediction at the points that the second frame shows.
-        seen: (H, W) bool, whether the first frame shows that point too.
-        flow: (H, W, 2) estimated motion from the second frame to the first; None: it is known.
+    Images are (H, W, 3) and class maps (H, W) uint8; `followed` is the first prediction at the
+    points of the second frame, `seen` (H, W) whether the first frame shows them too, and `flow`
+    (H, W, 2) the estimated motion from the second frame to the first; None: it is known.
     """
 
     name: str
@@ -67,7 +56,7 @@ class PairExample:
         picture = np.empty((*self.seen.shape, 3), np.uint8)
         picture[:] = AGREES
         picture[self.followed != self.second] = DIFFERS
-        picture[~self.seen] = IGNORED_COLOUR
+        picture[~self.seen] = pictures.IGNORED_COLOUR
         return picture
 
 
@@ -75,25 +64,12 @@ COLUMNS = ("frame", "its prediction", "second frame", "its prediction", "first, 
 
 
 def draw_pairs(examples: Sequence[PairExample], legend: Legend, path: Path) -> None:
-    """Write a PNG, one row per scene, as in Temporal, Figs. 1 and 6.
-
-    Raises:
-        ValueError: no examples.
-    """
-    rows = [
-        (
-            example.name,
-            (
-                example.first_rgb,
-                overlay(example.first_rgb, example.first, legend),
-                example.second_rgb,
-                overlay(example.second_rgb, example.second, legend),
-                colours(np.where(example.seen, example.followed, IGNORE), legend.palette),
-                *example.motion(),
-                example.difference(),
-            ),
-        )
-        for example in examples
-    ]
+    """Write a PNG, one row per scene (at least one), as in Temporal, Figs. 1 and 6."""
+    rows = []
+    for each in examples:
+        frames = ((each.first_rgb, each.first), (each.second_rgb, each.second))
+        shown = [image for rgb, classes in frames for image in (rgb, overlay(rgb, classes, legend))]
+        shown.append(colours(np.where(each.seen, each.followed, IGNORE), legend.palette))
+        rows.append((each.name, (*shown, *each.motion(), each.difference())))
     moving = ("motion (black: not used)",) if examples and examples[0].flow is not None else ()
-    draw_columns(rows, (*COLUMNS, *moving, "differ (grey: not seen)"), legend, path)
+    pictures.draw_columns(rows, (*COLUMNS, *moving, "differ (grey: not seen)"), legend, path)

@@ -34,35 +34,22 @@ HALF_SPAN = 15.0
 
 @dataclass(frozen=True)
 class PanelExample:
-    """One image of a qualitative panel.
-
-    Attributes:
-        rgb: (H, W, 3) uint8.
-        thermal: (H, W) uint8.
-        label: (H', W') uint8, class index or 255.
-        prediction: (H', W') uint8, class index.
-    """
+    """One image of a qualitative panel; its labels may have another size."""
 
     name: str
-    rgb: Image
-    thermal: Image
-    label: Image
-    prediction: Image
+    rgb: Image  # (H, W, 3)
+    thermal: Image  # (H, W)
+    label: Image  # (H', W'), class index or 255
+    prediction: Image  # (H', W'), class index
 
 
 @dataclass(frozen=True)
 class Legend:
-    """Class names and their colours.
-
-    Attributes:
-        names: K names.
-        palette: (K, 3) uint8, RGB.
-        background: indices of the classes that overlays do not paint.
-    """
+    """K class names and their colours."""
 
     names: tuple[str, ...]
-    palette: Image
-    background: tuple[int, ...]
+    palette: Image  # (K, 3), RGB
+    background: tuple[int, ...]  # classes that overlays do not paint
 
 
 def colours(label: Image, palette: Image) -> Image:
@@ -80,43 +67,28 @@ def colours(label: Image, palette: Image) -> Image:
 
 
 def overlay(rgb: Image, label: Image, legend: Legend, alpha: float = 0.6) -> Image:
-    """The image with classes painted over it; background classes and 255 stay unpainted.
+    """The image (H, W, 3) with classes (H, W) painted over it; background and 255 stay unpainted.
 
-        out = round((1 - alpha) * rgb + alpha * palette[label])
-
-    Args:
-        rgb: (H, W, 3) uint8, as is what is returned.
-        label: (H, W) uint8, class index or 255.
-        legend: colours and background classes.
-        alpha: opacity of the paint in [0, 1].
-
-    Raises:
-        ValueError: image and label differ in size.
+    out = round((1 - alpha) * rgb + alpha * palette[label])
     """
-    if rgb.shape[:2] != label.shape:
-        raise ValueError(f"overlay: expected one size, got image {rgb.shape}, label {label.shape}.")
     mixed = (1.0 - alpha) * rgb + alpha * colours(label, legend.palette)
     unpainted = np.isin(label, (*legend.background, IGNORE))[..., None]
     return np.where(unpainted, rgb, np.rint(mixed)).astype(np.uint8)
 
 
 def draw_panel(examples: Sequence[PanelExample], legend: Legend, path: Path) -> None:
-    """Write a PNG: one row per example; RGB, thermal, ground truth, prediction; classes below.
-
-    Raises:
-        ValueError: no examples.
-    """
+    """Write a PNG: one row per example; RGB, thermal, ground truth, prediction; classes below."""
     rows = [
         (
-            example.name,
+            each.name,
             (
-                example.rgb,
-                np.repeat(example.thermal[..., None], 3, axis=2),
-                colours(example.label, legend.palette),
-                colours(example.prediction, legend.palette),
+                each.rgb,
+                np.repeat(each.thermal[..., None], 3, axis=2),
+                colours(each.label, legend.palette),
+                colours(each.prediction, legend.palette),
             ),
         )
-        for example in examples
+        for each in examples
     ]
     draw_columns(rows, ("RGB", "thermal", "ground truth", "prediction"), legend, path)
 
@@ -127,19 +99,7 @@ def draw_columns(
     legend: Legend,
     path: Path,
 ) -> None:
-    """Write a PNG of pictures in rows and columns, with the classes below.
-
-    Args:
-        rows: name, and one (H, W, 3) picture per column.
-        titles: of the columns.
-        legend: classes and their colours.
-        path: of the PNG.
-
-    Raises:
-        ValueError: no rows.
-    """
-    if not rows:
-        raise ValueError("a qualitative panel needs at least one example, got none.")
+    """Write a PNG of `rows` (name, one (H, W, 3) picture per column), with the classes below."""
     height, width = rows[0][1][0].shape[:2]
     cell_w = 3.0
     cell_h = cell_w * height / width
@@ -177,37 +137,17 @@ def _broken(name: str, letters: int) -> str:
 
 @dataclass(frozen=True)
 class RegionHeat:
-    """The data of the region heat map.
-
-    Attributes:
-        region_map: (H, W) integers in 0..R-1, region of every pixel.
-        ious: R fractions; NaN regions stay white.
-    """
+    """The data of the region heat map."""
 
     title: str
-    region_map: NDArray[np.int64]
-    ious: tuple[float, ...]
-
-
-def region_values(heat: RegionHeat) -> NDArray[np.float64]:
-    """(H, W) IoU in percent of the region of every pixel.
-
-    Raises:
-        ValueError: the map names a region without an IoU.
-    """
-    if heat.region_map.min() < 0 or heat.region_map.max() >= len(heat.ious):
-        raise ValueError(
-            f"region map holds {heat.region_map.min()}..{heat.region_map.max()}, "
-            f"but there are {len(heat.ious)} IoUs."
-        )
-    return np.asarray(100.0 * np.asarray(heat.ious, np.float64)[heat.region_map])
+    region_map: NDArray[np.int64]  # (H, W), region of every pixel: 0..R-1
+    ious: tuple[float, ...]  # R fractions; NaN regions stay white
 
 
 def number_places(region_map: NDArray[np.int64], num_regions: int) -> list[tuple[int, int] | None]:
     """(row, column) inside each region where a number is easy to read; None for empty regions.
 
-    The pixel of the region nearest to the region's mean, taken over the part above the middle row
-    where the mean itself lies in another region (a ring's mean is the centre of the image).
+    The pixel nearest to the region's mean, above the middle row where that is in another region.
     """
     places: list[tuple[int, int] | None] = []
     for region in range(num_regions):
@@ -226,10 +166,9 @@ def number_places(region_map: NDArray[np.int64], num_regions: int) -> list[tuple
 
 
 def colour_limits(ious: Sequence[float]) -> tuple[float, float]:
-    """Ends of the colour scale in percent: the mean region, and equally far to both sides.
+    """Ends of the colour scale in percent, equally far from the mean region.
 
-    At least `HALF_SPAN` to each side, so that the same contrast is the same difference in most runs
-    and pictures of two runs can be compared.
+    At least `HALF_SPAN`, so that pictures of most runs can be compared.
     """
     percents = 100.0 * np.asarray(ious, np.float64)
     mean = float(np.nanmean(percents))
@@ -239,7 +178,7 @@ def colour_limits(ious: Sequence[float]) -> tuple[float, float]:
 
 def draw_region_heat(heat: RegionHeat, path: Path) -> None:
     """Write a PNG: the regions coloured by their IoU, the IoU in each, a colour bar."""
-    values = region_values(heat)
+    values = 100.0 * np.asarray(heat.ious, np.float64)[heat.region_map]
     height, width = values.shape
     low, high = colour_limits(heat.ious)
     size = 9 if len(heat.ious) <= 5 else 7  # nine rings are narrow

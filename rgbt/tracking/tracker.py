@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from rgbt.tracking.run_files import Description
-from rgbt.tracking.run_folder import RunFolder
+from rgbt.runs.folder import Description, RunFolder
 
 Status = Literal["RUNNING", "FINISHED", "FAILED", "KILLED"]
 
@@ -14,10 +13,7 @@ Link = tuple[str, str]
 
 
 class Tracking:
-    """Base class of trackers; this one does nothing beyond the run folder.
-
-    No call raises because a store cannot be reached.
-    """
+    """Base class, which only describes the run; no call raises for a store that is away."""
 
     def start(self, folder: RunFolder, description: Description) -> None:
         """Start or continue the run of `folder`; no step has been done yet by this process."""
@@ -38,5 +34,5 @@ class Tracking:
         self.finish("FINISHED")
 
     def links(self) -> list[Link]:
-        """Addresses of the run's pages."""
+        """The command that shows the run, one line."""
         return []

@@ -4,26 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rgbt.build.session import Session
-from rgbt.build.training_setup import TrainingSetup
+from rgbt.assembly.session import Session
+from rgbt.assembly.training_setup import TrainingSetup
 from rgbt.data.domains import TestedHead
 from rgbt.data.loaders import Batches
-from rgbt.data.pairs import PairedBatches
 from rgbt.engine.checkpoint import State, restore_weights
 from rgbt.engine.committed import Checkpoints
 from rgbt.engine.trainer import Loaded, Trainer
 from rgbt.evaluation.prediction import view_of
 from rgbt.evaluation.request import EvaluationRequest
-from rgbt.tracking.run_files import InputForm
+from rgbt.runs.folder import InputForm
+
+if TYPE_CHECKING:
+    from rgbt.data.pairs import PairedBatches
 
 
 def make_trainer(setup: TrainingSetup, folder: Path, **of_process: Any) -> Trainer:
     """The training loop of a run; `of_process` are the attributes in which processes differ."""
     session = setup.session
     return Trainer(
-        fabric=session.fabric,
+        fabric=setup.fabric,
         settings=session.trainer,
         scheme=setup.scheme,
         model=setup.model,

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from torch import nn
 
-from rgbt.build.training_setup import TrainingSetup, set_up_training
+from rgbt.assembly.training_setup import TrainingSetup, set_up_training
 from rgbt.checks import InputError, RunError
 from rgbt.engine.checkpoint import State
 from rgbt.evaluation.prediction import decode_ahead
@@ -20,8 +20,8 @@ from rgbt.evaluation.request import EvaluationRequest
 from rgbt.evaluation.segmentation import evaluate, panel_names
 from rgbt.metrics import names, scores
 from rgbt.processes import agreed, collected
+from rgbt.runs.run_spec import RunSpec
 from rgbt.runtime.member import LOST
-from rgbt.spec.run_spec import RunSpec
 from rgbt.training.common import (
     fit,
     load_best,
@@ -65,7 +65,7 @@ def _take_part(spec: RunSpec) -> None:
     # Process 0 has written what was missing in the cache of images.
     if not reason:
         try:
-            decode_ahead(setup.session, *setup.read_splits())
+            decode_ahead(setup.session, *setup.session.read_splits())
         except InputError as error:
             reason = str(error)
     if any(collected(reason)):

@@ -21,7 +21,6 @@ from types import FrameType
 from typing import IO
 
 from rgbt.config.plain_command import say
-from rgbt.config.shadowing import starting_alike
 from rgbt.runtime.group import SUPERVISOR
 from rgbt.runtime.member import LOST
 from rgbt.runtime.signals import WORDS
@@ -81,16 +80,15 @@ def _start(
     if any(name == LOOPBACK for _, name in socket.if_nameindex()):
         # Otherwise gloo looks up the name of this machine, which containers may not know.
         preferred["GLOO_SOCKET_IFNAME"] = LOOPBACK
-    with starting_alike():
-        process = subprocess.Popen(
-            [sys.executable, *COMMAND, *words],
-            env={**preferred, **os.environ, **variables},
-            stdin=subprocess.DEVNULL,
-            stdout=output,
-            stderr=output,
-            # A terminal signals all processes of a session, but the others must finish the step.
-            start_new_session=True,
-        )
+    process = subprocess.Popen(
+        [sys.executable, *COMMAND, *words],
+        env={**preferred, **os.environ, **variables},
+        stdin=subprocess.DEVNULL,
+        stdout=output,
+        stderr=output,
+        # A terminal signals all processes of a session, but the others must finish the step.
+        start_new_session=True,
+    )
     return _Member(rank, process, output)
 
 

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 
 from rgbt.checks import InputError
 from rgbt.processes import agreed, collected, num_processes
-from rgbt.spec.run_spec import RunSpec
+from rgbt.runs.run_spec import RunSpec
 
 NO_MORE = ""
 """Sent instead of a key: there is no further run to train."""

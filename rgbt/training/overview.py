@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 from torch import nn
 
-from rgbt.build.load_run import TrainedNetwork
-from rgbt.build.session import Session
-from rgbt.build.training_setup import TrainingSetup
-from rgbt.exported.onnx_network import ExportedNetwork
+from rgbt.assembly.session import Session
+from rgbt.checks import without_controls
 from rgbt.processes import num_processes
-from rgbt.tracking.terminal import path_lines
+from rgbt.terminal import path_lines
+
+if TYPE_CHECKING:  # it imports Lightning Fabric, which only a training needs
+    from rgbt.assembly.training_setup import TrainingSetup
 
 MILLION = 1e6
 
@@ -26,7 +28,7 @@ def announce_training(setup: TrainingSetup, name: str, folder: Path) -> None:
     session, trainer = setup.session, setup.session.trainer
     trained = {key: net for key, net in setup.others.items() if key in setup.optimizers}
     others = "".join(f", {key} {_millions(net)}" for key, net in trained.items())
-    counts = [f"{len(session.dataset.names(each))} {each}" for each in setup.read_splits()]
+    counts = [f"{len(session.dataset.names(each))} {each}" for each in setup.session.read_splits()]
     lines = [
         ("device", device_line(session)),
         ("network", f"{network_line(session)}{others}"),
@@ -46,16 +48,21 @@ def announce_upstream(setup: TrainingSetup, name: str, downstream: str) -> None:
     _write(f"upstream run {name} for {downstream}: {', '.join(parts)}")
 
 
-def announce_network(network: TrainedNetwork) -> None:
+def announce_network(session: Session) -> None:
     """Print device, network and checkpoint of a prediction in one line."""
-    session = network.session
-    checkpoint = f"checkpoint of step {network.step}" if network.step else network.label
-    _write(f"{device_line(session)}; {network_line(session)}; {checkpoint}")
+    from rgbt.exported.onnx_network import ExportedNetwork  # which is never trained
+
+    checkpoint = f"checkpoint of step {session.step}" if session.step else session.label
+    if isinstance(session.model, ExportedNetwork):
+        network = f"{session.model.description.network} in onnxruntime"
+    else:
+        network = network_line(session)
+    _write(f"{device_line(session)}; {network}; {checkpoint}")
 
 
 def device_line(session: Session) -> str:
     """The device with its precision: "cpu, 2 threads, 32-true"."""
-    device = session.fabric.device
+    device = session.device
     gpu = f" ({torch.cuda.get_device_name(device)})" if device.type == "cuda" else ""
     threads = torch.get_num_threads()
     plural = "" if threads == 1 else "s"
@@ -67,8 +74,6 @@ def device_line(session: Session) -> str:
 
 def network_line(session: Session) -> str:
     """Class and number of parameters: "Mask2Former, 1.23 M parameters", and of trained ones."""
-    if isinstance(session.model, ExportedNetwork):
-        return f"{session.model.description.network} in onnxruntime"
     every, trained = _millions(session.model), _millions(session.model, only_trained=True)
     of_which = f", {trained} trained" if trained != every else ""
     return f"{type(session.model).__name__}, {every} parameters{of_which}"
@@ -87,7 +92,7 @@ def _of_steps(setup: TrainingSetup) -> str:
 
 def _write(*lines: str) -> None:
     # Not as a message (`info`): drivers of sweeps take the last remark for what went wrong.
-    sys.stderr.write("".join(f"{line}\n" for line in lines))
+    sys.stderr.write("".join(f"{without_controls(line)}\n" for line in lines))
 
 
 def _millions(network: nn.Module, *, only_trained: bool = False) -> str:

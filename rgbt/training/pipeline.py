@@ -11,19 +11,18 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
-from rgbt.build.load_run import open_run
-from rgbt.build.training_setup import validate
+from rgbt.assembly.load_run import open_run
+from rgbt.assembly.training_setup import validate
 from rgbt.checks import InputError
 from rgbt.config.compose import flatten
 from rgbt.config.stored_config import checkouts, targets
-from rgbt.data.pseudo_labels import MANIFEST
-from rgbt.evaluation.pseudo_labels import Labelling, write_pseudo_labels
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.files.atomic import is_held
+from rgbt.files.budgets import check_links
 from rgbt.processes import alone
-from rgbt.spec.run_spec import WEIGHTS, Dependency, RunSpec
-from rgbt.tracking.other_code import other_code
-from rgbt.tracking.terminal import info, warn
+from rgbt.runs.provenance import other_code
+from rgbt.runs.run_spec import WEIGHTS, Dependency, RunSpec
+from rgbt.terminal import info, warn
 from rgbt.training.members import is_training_together
 from rgbt.training.train import train
 
@@ -43,6 +42,8 @@ def run_pipeline(run: RunSpec, extra_tags: Mapping[str, str]) -> None:
     Raises:
         InputError: see `validate` and `train`; the message names the upstream run that is wrong.
     """
+    for spec in run.upstream:
+        check_links(spec.folder)
     for dependency in run.dependencies if run.fresh else ():  # fresh=true does not repeat them
         spec = dependency.run
         made_by = other_code(spec.folder) if spec.is_finished else None
@@ -57,7 +58,7 @@ def run_pipeline(run: RunSpec, extra_tags: Mapping[str, str]) -> None:
         return
     specs = topological_order(run)
     labels = [run.labels_folder(name) for name in run.domains.named]
-    has_labels = all(each is None or (each / MANIFEST).is_file() for each in labels)
+    has_labels = all(each is None or each.is_dir() for each in labels)  # renamed when complete
     if not has_labels or not all(each.is_finished for each in run.upstream):
         for spec in specs:
             with _naming(spec, run), alone():
@@ -115,7 +116,7 @@ def _predict_labels(spec: RunSpec, teacher: Dependency) -> None:
     name = teacher.key.split(".")[1]
     folder, domain = spec.labels_folder(name), spec.domains.named[name]
     assert folder is not None, "the domain takes labels of an upstream run"
-    if (folder / MANIFEST).exists():
+    if folder.is_dir():
         return
     # The upstream run may be a copy from another machine, where the data have another path.
     local = ("trainer.accelerator", "trainer.threads", "dataset.root", "dataset.cache_dir")
@@ -129,11 +130,13 @@ def _predict_labels(spec: RunSpec, teacher: Dependency) -> None:
     trust = list(targets(teacher.run.plain).values())
     own = checkouts(teacher.run.plain).items()
     overrides += [f"{key}={json.dumps(checkout)}" for key, checkout in own]
-    session = open_run(teacher.run.folder, overrides, checkpoint, trust=trust).session
+    session = open_run(teacher.run.folder, overrides, checkpoint, trust=trust)
+    from rgbt.evaluation.images import write_pseudo_labels  # few runs have a teacher
+
     write_pseudo_labels(
         session,
         teacher.run.folder.name,
         EvaluationRequest(split=domain.split, view=domain.teacher_view),
-        Labelling(domain.threshold),
         folder,
+        threshold=domain.threshold,
     )

@@ -11,9 +11,9 @@ from contextlib import contextmanager
 
 from rgbt.checks import InputError, RunError
 from rgbt.engine.settings import TrainerSettings
+from rgbt.runs.run_spec import RunSpec
 from rgbt.runtime.group import Group, group_from_environment
 from rgbt.runtime.member import LOST, report_errors
-from rgbt.spec.run_spec import RunSpec
 
 OF_GLOO = "gloo/transport"
 """In the message of every error of a lost connection between CPUs."""
@@ -92,13 +92,13 @@ def _train_in(group: Group, run: RunSpec, extra_tags: Mapping[str, str]) -> None
     """Do the part of this process in the training of a run and its upstream runs."""
     from torch import distributed
 
-    from rgbt.build.session import connect
+    from rgbt.engine.fabric import group_fabric
     from rgbt.training.follow import follow
     from rgbt.training.members import dismiss
     from rgbt.training.pipeline import run_pipeline
 
     report_errors()
-    connect(run.trainer, group)
+    group_fabric(run.trainer, group)
     with _losing_connection(group):
         if group.rank > 0:
             follow(run)

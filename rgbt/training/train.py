@@ -11,34 +11,34 @@ import numpy as np
 from omegaconf import OmegaConf
 from torch import nn
 
-from rgbt.build.session import Session, names_key
-from rgbt.build.training_setup import TrainingSetup, set_up_training
+from rgbt.assembly.session import Session, names_key
+from rgbt.assembly.training_setup import TrainingSetup, set_up_training
 from rgbt.checks import InputError
 from rgbt.engine.checkpoint import State
 from rgbt.engine.committed import Checkpoints
-from rgbt.engine.gradient_shares import shares_sentence
 from rgbt.engine.trainer import WAIT_SHARE, Trainer
-from rgbt.evaluation.pairing import Pairing
 from rgbt.evaluation.prediction import decode_ahead
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.evaluation.segmentation import evaluate, legend_of, panel_names, result_tables
-from rgbt.evaluation.temporal_consistency import consistency_table, consistency_values, count_pairs
 from rgbt.metrics import names, scores
 from rgbt.metrics.counts import Counts
-from rgbt.metrics.pairs import file_name
 from rgbt.processes import agreed, alone
+from rgbt.runs.folder import (
+    Description,
+    MarkerForm,
+    RunFolder,
+    counts_name,
+    read_description,
+    read_marker,
+    set_aside,
+)
+from rgbt.runs.naming import describe
+from rgbt.runs.provenance import provenance, warn_of_steps, without_passwords
+from rgbt.runs.run_spec import RunSpec
 from rgbt.runtime.signals import deferred
-from rgbt.spec.naming import describe
-from rgbt.spec.run_spec import RunSpec
-from rgbt.tracking.other_code import warn_of_steps
-from rgbt.tracking.pair_pictures import draw_pairs
+from rgbt.tables import ConsistencyTable, without_nan
+from rgbt.terminal import info, warn
 from rgbt.tracking.pictures import RegionHeat, draw_panel, draw_region_heat
-from rgbt.tracking.provenance import provenance, without_passwords
-from rgbt.tracking.replaced_runs import replace_finished
-from rgbt.tracking.run_files import Description, MarkerForm, counts_name, read_marker
-from rgbt.tracking.run_folder import RunFolder
-from rgbt.tracking.tables import ConsistencyTable, without_nan
-from rgbt.tracking.terminal import info, warn
 from rgbt.tracking.tracker import Tracking
 from rgbt.training.common import (
     fit,
@@ -50,7 +50,7 @@ from rgbt.training.common import (
 )
 from rgbt.training.members import training_together
 from rgbt.training.overview import announce_training, announce_upstream
-from rgbt.training.show import finished_run, print_result, print_upstream_result, show
+from rgbt.training.show import print_result, print_upstream_result, show
 
 MUCH_WAITING = 0.3
 """Share of a step spent waiting for images above which a warning is printed."""
@@ -63,7 +63,7 @@ def train(
 
     Args:
         spec: the run; its upstream runs are finished.
-        extra_tags: MLflow tags of the run (see `rgbt.spec.naming.describe`).
+        extra_tags: MLflow tags of the run (see `rgbt.runs.naming.describe`).
         upstream_of: name of the run that needs this one, which is announced in one line, as is its
             result; "": the requested run, with all tables.
 
@@ -71,13 +71,8 @@ def train(
         InputError: the configuration, the data or the run folder do not fit.
         RunError: the training failed.
     """
-    if spec.out is not None:
-        raise InputError(
-            f"out={spec.out} has no effect here, because runs are written to runs_dir=...; omit "
-            "out=..."
-        )
     if spec.is_finished and not spec.fresh:
-        show(finished_run(spec, extra_tags))
+        show(spec, extra_tags)
         return
     description = describe(spec, extra_tags)
     tracking: Tracking = spec.tracking.build()
@@ -85,7 +80,7 @@ def train(
     if upstream_of:
         print_upstream_result(folder, description.name)
     else:
-        print_result(folder, tracking, spec.domains)
+        print_result(spec, folder, tracking)
 
 
 def _train_unfinished(
@@ -99,9 +94,12 @@ def _train_unfinished(
             announce_upstream(setup, description.name, upstream_of)
         else:
             announce_training(setup, description.name, spec.folder)
-        decode_ahead(setup.session, *setup.read_splits())
+        decode_ahead(setup.session, *setup.session.read_splits())
         if spec.is_finished:
-            replace_finished(RunFolder(spec.folder), tracking)
+            kept = set_aside(RunFolder(spec.folder))
+            known = None if kept is None else read_description(kept.path)
+            if kept is not None and known is not None:
+                tracking.refresh(kept, known)
         folder = RunFolder(spec.folder)
         with folder.lock():
             start_others()
@@ -164,12 +162,12 @@ class Run:
         reached = {"test": lines["test", state.step]}
         if session.selection_split is not None:
             val = lines.get(("val", state.best_step))
-            if not val:  # its line was damaged
+            if not val:  # the log was cut off, which is reported
                 path = self.folder.path / counts_name(session.selection_split)
                 val = scores.summary(Counts.load(path), session.regions.absent)
             reached = {"val": val, **reached}
         for kind, table in pairs.items():
-            reached[kind] = {**reached[kind], **consistency_values(table)}
+            reached[kind] = {**reached[kind], **_values_of(table)}
         return {kind: without_nan(values) for kind, values in reached.items()}
 
     def _claim(self, session: Session) -> None:
@@ -208,17 +206,20 @@ class Run:
         self._truncate(state)
         fit(trainer, self.setup, state)
         self._report_waiting(session)
-        lines = (line.values for line in self.folder.lines() if line.kind == "train")
-        if sentence := shares_sentence(lines):
-            info(f"{sentence}.")
+        if session.trainer.log_gradient_shares:
+            from rgbt.engine.gradient_shares import shares_sentence
+
+            lines = (line.values for line in self.folder.lines() if line.kind == "train")
+            if sentence := shares_sentence(lines):
+                info(f"{sentence}.")
         return state
 
     def _truncate(self, state: State) -> None:
         """Prepare ``metrics.jsonl`` of a run that resumes; report what is repeated or lost."""
         step = state.step
-        before = self.folder.truncate_after(step, state.evaluated_step)
-        if before.reached > step:
-            info(f"steps {step + 1} to {before.reached} were not saved and are repeated.")
+        reached = self.folder.truncate_after(step, state.evaluated_step)
+        if reached > step:
+            info(f"steps {step + 1} to {reached} were not saved and are repeated.")
         logged = [0, *(line.step for line in self.folder.lines() if line.kind == "train")]
         every = max([self.setup.session.trainer.log_every, *(np.diff(logged[-2:]).tolist())])
         if step - logged[-1] >= every:
@@ -226,12 +227,6 @@ class Run:
                 f"{self.folder.path / 'metrics.jsonl'} ends at step {logged[-1]}, but the "
                 f"checkpoint is of step {step}. The lines in between are missing; counts and "
                 "checkpoint are not affected."
-            )
-        if before.damaged:
-            more = f" and {len(before.damaged) - 1} more" if len(before.damaged) > 1 else ""
-            warn(
-                f"{self.folder.path / 'metrics.jsonl'} was damaged ({before.damaged[0]}{more}); "
-                "these lines are omitted, and metrics.jsonl.damaged holds the original file."
             )
 
     def _report_waiting(self, session: Session) -> None:
@@ -277,7 +272,14 @@ class Run:
     def _consistency(self, session: Session) -> dict[str, ConsistencyTable]:
         """TC and CA of the best checkpoint under "val" and "test", as far as requested."""
         tables: dict[str, ConsistencyTable] = {}
-        for kind in session.consistency.splits if session.consistency.sets else ():
+        if not session.consistency.sets:
+            return tables
+        from rgbt.evaluation.pair_frames import Pairing
+        from rgbt.evaluation.temporal_consistency import consistency_table, count_pairs
+        from rgbt.metrics.pairs import file_name
+        from rgbt.tracking.pair_pictures import draw_pairs
+
+        for kind in session.consistency.splits:
             split = session.selection_split if kind == "val" else kind
             if split is None:
                 info(f"consistency was not measured on val: {session.dataset.name} has none.")
@@ -311,7 +313,7 @@ class Run:
         values = scores.summary(result.counts, session.regions.absent)
         of_target = self._of_target(session, session.model, "test", self.folder.path)
         by_other = self._by_other_head(session)
-        values |= of_target | by_other | ({} if pairs is None else consistency_values(pairs))
+        values |= of_target | by_other | ({} if pairs is None else _values_of(pairs))
         self.folder.append(state.step, "test", values)
         name = self.description.name
         tables = result_tables(result.counts, session.regions, name, state.best_step)
@@ -366,3 +368,9 @@ class Run:
         values = scores.summary(counts, session.regions.absent)
         kept = (names.MIOU, *(names.subset(part, names.MIOU) for part in (names.DAY, names.NIGHT)))
         return {names.subset(request.view, name): values[name] for name in kept if name in values}
+
+
+def _values_of(table: ConsistencyTable) -> dict[str, float]:
+    from rgbt.evaluation.temporal_consistency import consistency_values
+
+    return consistency_values(table)

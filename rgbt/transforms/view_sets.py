@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from rgbt.checks import InputError, nearest, one_line
-from rgbt.files.budgets import TEXT, read_bytes
+from rgbt.files.budgets import read_bytes
 from rgbt.ranges import Names
 from rgbt.requirements import Record, record_of
 from rgbt.transforms.virtual_view import VirtualView
@@ -103,7 +103,7 @@ def read_angles(name: str) -> Tensor:
             f"{nearest(name, published)}, or give a CSV file with the columns {HEADER}."
         )
     try:
-        text = read_bytes(path, TEXT).decode("utf-8-sig")
+        text = read_bytes(path).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(
             f"consistency.sets: {path} is not UTF-8 text; save it as a CSV file with the columns "

@@ -6,8 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 
-from rgbt.tracking.csv_files import csv_text
-from rgbt.tracking.tables import ABSENT, TextTable, number
+from rgbt.tables import ABSENT, TextTable, csv_text, number
 from sweeps.verdicts.judge import JudgedClaim
 
 HEADER = (

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from statistics import fmean, stdev
 
 from analysis.uncertainty.verdicts import Verdict
-from rgbt.tracking.tables import ABSENT, TextTable, number
+from rgbt.tables import ABSENT, TextTable, number
+from sweeps.point import Outcome
 from sweeps.rendering.rendered_table import TextCell
 from sweeps.verdicts.best_point import ERROR_RATE, Race, Standing
 from sweeps.verdicts.judge import CellRunId
-from sweeps.worker.trial_sources import Outcome
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +50,7 @@ def confirmation_grid(confirmed: Confirmed, runs: Mapping[CellRunId, Outcome]) -
     race = confirmed.race if isinstance(confirmed.race, Race) else None
     scores = {
         label: [
-            run.results[0].scores()
+            run.results[0].recorded_scores()
             for (each, _), run in sorted(runs.items())
             if each == label and run.state == "finished" and run.results
         ]

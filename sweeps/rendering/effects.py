@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from rgbt.tracking.csv_files import csv_text
-from rgbt.tracking.tables import ABSENT, TextTable
+from rgbt.tables import ABSENT, TextTable, csv_text
 from sweeps.table.design import Design
 from sweeps.table.design_rows import TRAINED
 from sweeps.verdicts.effects import MEAN, DesignEffects, EffectLine

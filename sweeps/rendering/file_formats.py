@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 
-from rgbt.tracking.csv_files import csv_text
+from rgbt.tables import csv_text
 from sweeps.rendering.rendered_table import RenderedTable, TextCell
 from sweeps.table.cells import TableCell
 from sweeps.table.scoring import ScoredTable, published

@@ -7,13 +7,13 @@ from collections import Counter
 from collections.abc import Sequence
 from statistics import median
 
-from rgbt.tracking.tables import ABSENT, TextTable
+from rgbt.tables import ABSENT, TextTable
+from sweeps.point import Outcome, State
 from sweeps.table.efficiency import SCALE
 from sweeps.table.request import TableRequest
 from sweeps.table.table import MEASURED
 from sweeps.worker.point_list import estimated_seconds, other_code_line
 from sweeps.worker.progress import duration
-from sweeps.worker.trial_sources import Outcome, State
 
 STATES: tuple[State, ...] = ("finished", "running", "failed", "waiting")
 TRAINED = "trained, not evaluated for all columns"

@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rgbt.files.atomic import write_atomic
-from rgbt.tracking.tables import TextTable
-from rgbt.tracking.terminal import info, line_width, path_lines, print_rich, rich_table
+from rgbt.tables import TextTable
+from rgbt.terminal import info, path_lines, print_rich, rich_table
+from sweeps.point import Outcome
 from sweeps.rendering.claims import claims_csv, claims_grid, claims_markdown, counted
 from sweeps.rendering.effects import effects_csv, effects_grids
 from sweeps.rendering.effects_figure import draw_effects
@@ -20,7 +21,7 @@ from sweeps.rendering.rendered_table import RenderedTable, render_table
 from sweeps.rendering.terminal import terminal
 from sweeps.rendering.variance import variance_csv, variance_grids
 from sweeps.report.records import record
-from sweeps.table.cells import NO_VALUE, CellRun
+from sweeps.table.cells import NO_VALUE
 from sweeps.table.efficiency import efficiency_cells
 from sweeps.table.request import TableRequest
 from sweeps.table.scoring import ScoredTable, score, size_marks
@@ -30,7 +31,6 @@ from sweeps.verdicts.forms import forms_grid
 from sweeps.verdicts.judge import CellRunId, JudgedClaim, TableJudge
 from sweeps.verdicts.variance import VarianceBudget, variance_budget
 from sweeps.worker.point_list import other_code_line
-from sweeps.worker.trial_sources import Outcome
 
 if TYPE_CHECKING:
     from rgbt.tracking.tracker import Tracking
@@ -57,7 +57,7 @@ def publish_table(
     judge: TableJudge,
     request: TableRequest,
     outcomes: Sequence[Outcome],
-    external: Mapping[CellRunId, CellRun],
+    external: Mapping[CellRunId, Outcome],
     out: Path,
     tracking: Tracking,
 ) -> int:
@@ -74,7 +74,7 @@ def publish_table(
     Returns:
         1 where a cell failed or has no value, or the files could not be written; else 0.
     """
-    runs: dict[CellRunId, CellRun] = {**request.runs(outcomes), **external}
+    runs: dict[CellRunId, Outcome] = {**request.runs(outcomes), **external}
     sizes = efficiency_cells(request, out)
     scored = replace(
         score(request.name, request.table, runs, scale=request.scale, sizes=sizes),
@@ -90,7 +90,7 @@ def publish_table(
     rendered = render_table(scored, request.typed_overrides())
     rendered = replace(rendered, remarks=(*rendered.remarks, *_not_trained(request)))
     findings = replace(findings, variance=variance_budget(judge, runs))
-    print_rich(terminal(rendered, plain=not sys.stdout.isatty(), width=line_width()))
+    print_rich(terminal(rendered, plain=not sys.stdout.isatty()))
     if findings.forms is not None:
         print_rich(rich_table(findings.forms))
     for grid in _effects_of(findings, request.table):

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from rgbt.tracking.tables import number
+from rgbt.tables import number
 from sweeps.table.cells import NO_VALUE, is_counted, is_of_runs, metric_of
 from sweeps.table.efficiency import SCALE
 from sweeps.table.scoring import ScoredTable, published

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from rgbt.metrics import names
-from rgbt.tracking.tables import ABSENT, TextTable, number
-from sweeps.point import Point
+from rgbt.tables import ABSENT, TextTable, number
+from sweeps.point import Outcome, Point
 from sweeps.rendering.rendered_table import TextCell
 from sweeps.table.cells import TableCell, Value, over_seeds
-from sweeps.worker.trial_sources import Outcome
 
 MOST_REGIONS = 99
 
@@ -25,7 +24,9 @@ def group_grid(title: str, outcomes: Sequence[Outcome]) -> TextTable:
     groups: dict[str, list[Outcome]] = {}
     for outcome in outcomes:
         groups.setdefault(configuration(outcome.point), []).append(outcome)
-    known = {name for outcome in outcomes for run in outcome.results for name in run.scores()}
+    known = {
+        name for outcome in outcomes for run in outcome.results for name in run.recorded_scores()
+    }
     regions = map(names.region, range(1, MOST_REGIONS))
     measured = [name for name in regions if f"test/{name}" in known]
     metrics = [names.MIOU, names.VAR, *measured]
@@ -65,7 +66,9 @@ def _cell(metric: str, members: Sequence[Outcome]) -> TableCell:
     values: dict[int, Value] = {}
     for index, outcome in enumerate(members):
         scores = (
-            outcome.results[0].scores() if outcome.state == "finished" and outcome.results else {}
+            outcome.results[0].recorded_scores()
+            if outcome.state == "finished" and outcome.results
+            else {}
         )
         values[index] = scores.get(f"test/{metric}", outcome.reason or outcome.state)
     return over_seeds(values)

@@ -8,9 +8,9 @@ from pathlib import Path
 from statistics import median
 
 from rgbt.checks import InputError
-from rgbt.spec.run_spec import RunSpec
-from rgbt.tracking.run_files import read_result
-from rgbt.tracking.run_result import RunResult
+from rgbt.runs.folder import read_result
+from rgbt.runs.result import RunResult
+from rgbt.runs.run_spec import RunSpec
 from sweeps.worker.planner import Planner
 from sweeps.worker.progress import duration
 

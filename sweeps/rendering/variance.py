@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 
 from analysis.uncertainty import Interval
-from rgbt.tracking.csv_files import csv_text
-from rgbt.tracking.tables import ABSENT, TextTable, number
+from rgbt.tables import ABSENT, TextTable, csv_text, number
 from sweeps.verdicts.variance import SourceSpread, VarianceBudget
 
 SOURCES = ("source", "sd", "95 % interval", "share of all", "runs")

@@ -9,15 +9,13 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from rgbt.tracking.mlflow_server import pages_of
+from rgbt.runs.provenance import without_passwords
+from rgbt.terminal import info
 from rgbt.tracking.mlflow_store import MlflowTracking
-from rgbt.tracking.mlflow_view import run_path
-from rgbt.tracking.provenance import without_passwords
-from rgbt.tracking.terminal import info
 from rgbt.tracking.tracker import Link, Tracking
 
 if TYPE_CHECKING:
-    from rgbt.tracking.mlflow_client import MlflowStore
+    from rgbt.tracking.mlflow_store import MlflowStore
 
 Kind = Literal["table", "study"]
 
@@ -53,7 +51,7 @@ def record(  # noqa: PLR0913 - each is a part of the run in MLflow
         note: description of the run, in Markdown.
 
     Returns:
-        links to it.
+        the command that opens MLflow.
     """
     if not isinstance(tracking, MlflowTracking):
         return []
@@ -83,9 +81,7 @@ def record(  # noqa: PLR0913 - each is a part of the run in MLflow
             f"{without_passwords(reason)}); rerun the command to send it."
         )
         return []
-    shown = pages_of(tracking.uri, run_id)
-    page = (f"{kind} in MLflow", shown.address + run_path(store.experiment_id, run_id))
-    return [page] if shown.command is None else [("open MLflow", shown.command), page]
+    return [("open MLflow", tracking.ui_command())]
 
 
 def _run(store: MlflowStore, name: str) -> str:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rgbt.config.compose import PIXELS, with_pixels
-from rgbt.tracking.tables import TextTable
+from rgbt.tables import TextTable
 from sweeps import attributes
 
 if TYPE_CHECKING:

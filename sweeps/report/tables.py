@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from rgbt.metrics import names as metric_names
-from rgbt.tracking.csv_files import csv_text
-from rgbt.tracking.tables import ABSENT, TextTable, number
+from rgbt.tables import ABSENT, TextTable, csv_text, number
 from sweeps import attributes
 from sweeps.report.study_data import Importances, StudyData, pruning_savings, short_names
 

@@ -6,7 +6,6 @@ import math
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 from rgbt.checks import InputError
 from rgbt.metrics import names
@@ -14,6 +13,7 @@ from rgbt.metrics.counts import Counts
 from rgbt.metrics.details import details_of_metric
 from rgbt.metrics.named import value
 from sweeps.evaluation import ExtraEvaluation
+from sweeps.point import Outcome
 from sweeps.table.table import Column, Row, Table
 
 HEADLINES = (names.MIOU, names.VAR, names.TC, names.CA, names.CA_RELEASED)
@@ -33,37 +33,6 @@ CellId = tuple[str, str]
 
 Value = float | str
 """A score, or the reason why there is none."""
-
-
-class ScoredRun(Protocol):
-    """A finished run, such as `rgbt.tracking.run_result.RunResult`."""
-
-    @property
-    def key(self) -> str:
-        """Its config key."""
-
-    @property
-    def commit(self) -> str | None:
-        """Git commit of the code that made it."""
-
-    def counts(self, path: str = OWN_COUNTS) -> Counts:
-        """Counts of the test split; InputError where they are missing or damaged."""
-
-
-class CellRun(Protocol):
-    """A row's run with one seed, in any state."""
-
-    @property
-    def state(self) -> str:
-        """The state: "finished", or another word."""
-
-    @property
-    def reason(self) -> str:
-        """Why it is not finished, else empty."""
-
-    @property
-    def results(self) -> Sequence[ScoredRun]:
-        """The finished run, or empty."""
 
 
 @dataclass(frozen=True)
@@ -145,7 +114,7 @@ def is_of_runs(column: Column) -> bool:
     return column.efficiency is None
 
 
-def row_cells(table: Table, row: Row, outcomes: Mapping[int, CellRun]) -> dict[CellId, TableCell]:
+def row_cells(table: Table, row: Row, outcomes: Mapping[int, Outcome]) -> dict[CellId, TableCell]:
     """The cells of one row, whose runs are given by seed, in columns with values of runs."""
     by_seed = {seed: _values(table, row, outcome) for seed, outcome in outcomes.items()}
     keys = tuple(run.key for outcome in outcomes.values() for run in outcome.results)
@@ -159,7 +128,7 @@ def row_cells(table: Table, row: Row, outcomes: Mapping[int, CellRun]) -> dict[C
     return cells
 
 
-def _values(table: Table, row: Row, outcome: CellRun) -> dict[str, Value]:
+def _values(table: Table, row: Row, outcome: Outcome) -> dict[str, Value]:
     """Every column's value of one run."""
     counts: dict[str, Counts | str] = {}
     values: dict[str, Value] = {}
@@ -175,9 +144,11 @@ def _values(table: Table, row: Row, outcome: CellRun) -> dict[str, Value]:
     return values
 
 
-def _counts(outcome: CellRun, path: str) -> Counts | str:
+def _counts(outcome: Outcome, path: str) -> Counts | str:
     if outcome.state != "finished" or not outcome.results:
         return outcome.reason or outcome.state
+    if path in outcome.missing:
+        return outcome.missing[path]
     try:
         return outcome.results[0].counts(path)
     except (InputError, OSError) as error:

@@ -22,8 +22,8 @@ from rgbt.config.command import composing
 from rgbt.config.component import build
 from rgbt.config.compose import compose
 from rgbt.files.atomic import write_atomic
-from rgbt.tracking.provenance import machine
-from rgbt.tracking.terminal import info
+from rgbt.runs.provenance import machine
+from rgbt.terminal import info
 from sweeps.table.cells import NO_VALUE, CellId, TableCell
 from sweeps.table.request import TableRequest
 from sweeps.table.table import COUNTED, MEASURED, Column, Row

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rgbt.metrics.pair_list import PAIR_LIST
-from rgbt.tracking.provenance import without_passwords
+from rgbt.runs.provenance import without_passwords
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.table.cells import OWN_COUNTS, evaluation_of, is_counted
 from sweeps.table.external import ExternalRow

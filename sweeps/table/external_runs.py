@@ -10,17 +10,17 @@ import json
 import math
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Unpack
 
 from rgbt.checks import InputError
 from rgbt.files.atomic import holding, write_atomic
-from rgbt.files.budgets import read_json
 from rgbt.metrics.counts import Counts
-from rgbt.tracking.provenance import code, commit_of
-from rgbt.tracking.terminal import info
-from sweeps.table.cells import OWN_COUNTS, CellRun
+from rgbt.runs.provenance import code
+from rgbt.runs.result import RunResult
+from rgbt.terminal import info
+from sweeps.point import Outcome, Point
+from sweeps.table.cells import OWN_COUNTS
 from sweeps.table.external import ExternalRow
 from sweeps.table.external_data import Settings, TableData, data_of
 from sweeps.table.external_evaluations import ExternalSource, PlannedEvaluation, hash_of
@@ -35,47 +35,6 @@ DESCRIPTION = "external.json"
 """What the counts of a folder were made from; written before the first of them."""
 
 
-@dataclass(frozen=True)
-class ExternalResult:
-    """The counts of an external row; see `sweeps.table.cells.ScoredRun`.
-
-    Attributes:
-        folder: that holds them.
-        reasons: path of counts -> why they could not be made.
-        commit: Git commit of the code that made them.
-    """
-
-    folder: Path
-    reasons: Mapping[str, str]
-    commit: str | None = None
-
-    @property
-    def key(self) -> str:
-        """The hash of what they were made from."""
-        return self.folder.name
-
-    def counts(self, path: str = OWN_COUNTS) -> Counts:
-        """Counts of an evaluation; InputError with the reason where there are none."""
-        if path in self.reasons:
-            raise InputError(self.reasons[path])
-        return Counts.load(self.folder / path)
-
-
-@dataclass(frozen=True)
-class ExternalRun:
-    """The state of an external row; see `sweeps.table.cells.CellRun`.
-
-    Attributes:
-        state: "finished", "failed", or "waiting" where nothing may be evaluated.
-        reason: why it failed.
-        results: one if it is finished.
-    """
-
-    state: str
-    reason: str = ""
-    results: Sequence[ExternalResult] = ()
-
-
 def run_external(
     rows: Sequence[ExternalRow],
     table: Table,
@@ -83,7 +42,7 @@ def run_external(
     runs_dir: Path,
     dry_run: bool = False,
     **settings: Unpack[Settings],
-) -> Mapping[str, CellRun]:
+) -> Mapping[str, Outcome]:
     """Evaluate external rows, or read the counts of a previous call.
 
     Weights are loaded into the network of `Row.network` at scale=paper, otherwise into that of the
@@ -116,7 +75,7 @@ def run_external(
     }
 
 
-def check_external(runs: Mapping[str, CellRun]) -> None:
+def check_external(runs: Mapping[str, Outcome]) -> None:
     """Refuse external rows that could not be evaluated, before anything is trained.
 
     Raises:
@@ -127,26 +86,27 @@ def check_external(runs: Mapping[str, CellRun]) -> None:
             raise InputError(f"row '{label}': {run.reason}")
 
 
-def _run(source: ExternalSource, runs_dir: Path, *, dry_run: bool) -> ExternalRun:
+def _run(source: ExternalSource, runs_dir: Path, *, dry_run: bool) -> Outcome:
     description = source.description()
-    folder = runs_dir / FOLDER / hash_of(description)
+    folder, point = runs_dir / FOLDER / hash_of(description), Point(source.row.label, ())
     plans = list(source.evaluations())
     missing = [plan for plan in plans if plan.command and not _has(folder, plan, source.data)]
     if dry_run and missing:
-        return ExternalRun("waiting")
+        return Outcome(point, "waiting")
     reasons = {plan.path: plan.reason for plan in plans if plan.reason}
     if missing:
         folder.mkdir(parents=True, exist_ok=True)
         with holding(folder / "lock", wait_s=math.inf):
-            noted = {**description, "path": str(source.given.path), "commit": commit_of(code())}
+            noted = {**description, "path": str(source.given.path)}
             write_atomic(folder / DESCRIPTION, json.dumps(noted, indent=2).encode())
+            write_atomic(
+                folder / "provenance.json", json.dumps([{**code(), "diff": None}]).encode()
+            )
             reasons |= _evaluate(missing, source, folder)
     if len(reasons) == len(plans):  # also without any evaluation
         first = next((reasons[plan.path] for plan in (*missing, *plans)), "no column is a score")
-        return ExternalRun("failed", first)
-    noted = read_json(folder / DESCRIPTION, dict[str, object], "remove the folder")
-    result = ExternalResult(folder, reasons, str(noted.get("commit") or "") or None)
-    return ExternalRun("finished", results=(result,))
+        return Outcome(point, "failed", first)
+    return Outcome(point, "finished", results=(RunResult(folder),), missing=reasons)
 
 
 def _evaluate(

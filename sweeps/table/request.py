@@ -15,7 +15,7 @@ from sweeps.table.cells import evaluation_of, is_counted, world_evaluations
 from sweeps.table.table import Form, Row, Table
 
 if TYPE_CHECKING:
-    from sweeps.worker.trial_sources import Outcome
+    from sweeps.point import Outcome
 
 DEFAULT_SCALE = "demo"
 """The scale of a run without ``scale=...``."""

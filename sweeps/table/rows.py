@@ -8,7 +8,7 @@ from itertools import combinations
 from typing import Any
 
 from rgbt.checks import InputError, split_list
-from rgbt.spec.run_spec import NOT_IN_KEY, WEIGHTS, RunSpec
+from rgbt.runs.run_spec import NOT_IN_KEY, WEIGHTS, RunSpec
 from sweeps.table.cells import is_counted, metric_of
 from sweeps.table.claim import OTHERS, PREVIOUS
 from sweeps.table.request import TableRequest
@@ -146,9 +146,7 @@ def _specified(request: TableRequest, planner: Planner) -> Iterator[tuple[str, R
 
 def _varied(a: RunSpec, b: RunSpec) -> set[str]:
     """Dotted keys of `SUBJECTS` in which two runs differ; paths and initial weights aside."""
-    first, second = (
-        dict(_flat({name: each.components[name].plain for name in SUBJECTS})) for each in (a, b)
-    )
+    first, second = (dict(_flat({name: each.plain[name] for name in SUBJECTS})) for each in (a, b))
     nothing = object()
     keys = {*first, *second}
     return {

@@ -12,7 +12,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from rgbt.metrics.named import parse
-from sweeps.table.cells import CellId, CellRun, TableCell, is_counted, metric_of, row_cells
+from sweeps.point import Outcome
+from sweeps.table.cells import CellId, TableCell, is_counted, metric_of, row_cells
 from sweeps.table.table import COUNTED, MEASURED, Column, Form, Row, Table
 
 
@@ -69,7 +70,7 @@ def check_metrics(table: Table) -> None:
 def score(
     name: str,
     table: Table,
-    runs: Mapping[tuple[str, int], CellRun],
+    runs: Mapping[tuple[str, int], Outcome],
     *,
     scale: str,
     sizes: Mapping[CellId, TableCell] | None = None,

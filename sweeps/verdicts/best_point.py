@@ -20,7 +20,8 @@ from analysis.uncertainty import Resampling
 from analysis.uncertainty.contrasts import Resampler, Term
 from analysis.uncertainty.sequence import half_width
 from analysis.uncertainty.verdicts import AnyTime, Verdict, decide
-from sweeps.table.cells import CellRun, ScoredRun
+from rgbt.runs.result import RunResult
+from sweeps.point import Outcome
 from sweeps.table.claim import HIGHER, LOWER
 from sweeps.verdicts.judge import RESAMPLES, CellRunId
 from sweeps.verdicts.loaded_counts import LoadedCounts
@@ -44,7 +45,7 @@ def fewest_seeds(points: int) -> int:
     return next(n for n in count(2) if math.isfinite(half_width(1.0, n, alpha)))
 
 
-Finished = Mapping[str, Mapping[int, ScoredRun]]
+Finished = Mapping[str, Mapping[int, RunResult]]
 """Label -> seed -> finished run."""
 
 
@@ -138,7 +139,7 @@ class BestPointJudge:
         self._counts = LoadedCounts()
         self._rule = AnyTime(level=level_of(len(self.files)))
 
-    def race(self, runs: Mapping[CellRunId, CellRun]) -> Race:
+    def race(self, runs: Mapping[CellRunId, Outcome]) -> Race:
         """The standings by the finished ones of `runs`.
 
         Raises:
@@ -192,7 +193,7 @@ class BestPointJudge:
             return ""
         return (max if self.maximize else min)(left, key=lambda label: left[label])
 
-    def _score(self, label: str, own: Mapping[int, ScoredRun]) -> tuple[float, ...]:
+    def _score(self, label: str, own: Mapping[int, RunResult]) -> tuple[float, ...]:
         return self._resampler.evidence([self._term(1.0, label, own)]).values
 
     def _compared(self, label: str, other: str, finished: Finished) -> Verdict | None:
@@ -204,7 +205,7 @@ class BestPointJudge:
         wanted = LOWER if self.maximize else HIGHER
         return decide([self._resampler.evidence(terms)], wanted, self._rule, "all")
 
-    def _term(self, weight: float, label: str, own: Mapping[int, ScoredRun]) -> Term:
+    def _term(self, weight: float, label: str, own: Mapping[int, RunResult]) -> Term:
         file = self.files[label]
         return Term(
             weight=weight,

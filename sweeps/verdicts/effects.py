@@ -20,13 +20,8 @@ from analysis.uncertainty.factorial import (
 from rgbt.checks import InputError
 from rgbt.metrics import names
 from rgbt.metrics.counts import Counts
-from sweeps.table.cells import (
-    CellRun,
-    counts_path,
-    is_counted,
-    metric_of,
-    world_evaluations,
-)
+from sweeps.point import Outcome
+from sweeps.table.cells import counts_path, is_counted, metric_of, world_evaluations
 from sweeps.table.design import Design, DesignMethod, Part, cell_name, sign_of
 from sweeps.table.design_rows import TESTED, TRAINED, tested_label, trained_label
 from sweeps.table.table import Column, Table
@@ -98,7 +93,7 @@ class DesignJudge:
         self._scorer = CellScorer(settings)
         self._rows = {row.label: row for row in self.table.rows}
 
-    def effects(self, runs: Mapping[CellRunId, CellRun]) -> DesignEffects:
+    def effects(self, runs: Mapping[CellRunId, Outcome]) -> DesignEffects:
         """Every effect that the finished ones of `runs` allow."""
         lines: list[EffectLine] = []
         missing: dict[str, None] = {}
@@ -113,7 +108,7 @@ class DesignJudge:
         return DesignEffects(tuple(lines), tuple(missing))
 
     def _counts_of(
-        self, part: _Part, runs: Mapping[CellRunId, CellRun]
+        self, part: _Part, runs: Mapping[CellRunId, Outcome]
     ) -> tuple[dict[str, list[Cell]], list[str]]:
         """Counts of the methods that have them in every cell, and why others have not."""
         found, reasons = {}, []
@@ -160,7 +155,7 @@ class DesignJudge:
         """Path of the counts of the plain test images, relative to the run folder."""
         return counts_path(Column(name=names.MIOU, metric=names.MIOU), self.table)
 
-    def _cells(self, part: _Part, method: str, runs: Mapping[CellRunId, CellRun]) -> list[Cell]:
+    def _cells(self, part: _Part, method: str, runs: Mapping[CellRunId, Outcome]) -> list[Cell]:
         """The counts of a method in every cell.
 
         Raises:

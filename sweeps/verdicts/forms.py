@@ -7,8 +7,9 @@ from dataclasses import replace
 
 from analysis.uncertainty.verdicts import decide
 from rgbt.checks import InputError
-from rgbt.tracking.tables import ABSENT, TextTable
-from sweeps.table.cells import CellRun, headline_columns, is_counted
+from rgbt.tables import ABSENT, TextTable
+from sweeps.point import Outcome
+from sweeps.table.cells import headline_columns, is_counted
 from sweeps.table.claim import HIGHER
 from sweeps.table.table import Row, Table
 from sweeps.verdicts.contrasts import Contrast
@@ -57,7 +58,7 @@ def _forms_of(row: Row) -> Iterator[Row]:
         )
 
 
-def forms_grid(judge: TableJudge, runs: Mapping[CellRunId, CellRun]) -> TextTable | None:
+def forms_grid(judge: TableJudge, runs: Mapping[CellRunId, Outcome]) -> TextTable | None:
     """One line per row and score: released minus paper, paired by seed, with its interval.
 
     Returns:
@@ -76,7 +77,7 @@ def forms_grid(judge: TableJudge, runs: Mapping[CellRunId, CellRun]) -> TextTabl
 
 
 def _line(
-    judge: TableJudge, contrast: Contrast, runs: Mapping[CellRunId, CellRun]
+    judge: TableJudge, contrast: Contrast, runs: Mapping[CellRunId, Outcome]
 ) -> tuple[str, ...]:
     name = f"{contrast.other}, {contrast.column}"
     try:

@@ -15,7 +15,9 @@ from analysis.uncertainty import Interval, Resampling
 from analysis.uncertainty.contrasts import Evidence, Resampler, Term
 from analysis.uncertainty.verdicts import FixedSeeds, Rule, Verdict, decide
 from rgbt.checks import InputError
-from sweeps.table.cells import CellId, CellRun, ScoredRun, counts_path, is_counted, metric_of
+from rgbt.runs.result import RunResult
+from sweeps.point import Outcome
+from sweeps.table.cells import CellId, counts_path, is_counted, metric_of
 from sweeps.table.claim import HIGHER, LOWER, Claim
 from sweeps.table.table import Column, Table
 from sweeps.verdicts.contrasts import Contrast, base_scores, contrasts_of, printed_value
@@ -82,11 +84,11 @@ class TableJudge:
         self._resampler = Resampler(settings)
         self._counts = LoadedCounts()
 
-    def claims(self, runs: Mapping[CellRunId, CellRun]) -> list[JudgedClaim]:
+    def claims(self, runs: Mapping[CellRunId, Outcome]) -> list[JudgedClaim]:
         """Every claim of the table, judged by the finished ones of `runs`."""
         return [self.judge(claim, runs) for claim in self.table.claims]
 
-    def judge(self, claim: Claim, runs: Mapping[CellRunId, CellRun]) -> JudgedClaim:
+    def judge(self, claim: Claim, runs: Mapping[CellRunId, Outcome]) -> JudgedClaim:
         """One claim; a contrast without scores leaves a claim about all of them undecided."""
         contrasts = contrasts_of(claim, self.table)
         exact = [self._exact(each) for each in contrasts]
@@ -154,7 +156,7 @@ class TableJudge:
         return sum(known) if len(known) == len(cells) else None
 
     def evidence(
-        self, contrasts: Sequence[tuple[float, Contrast]], runs: Mapping[CellRunId, CellRun]
+        self, contrasts: Sequence[tuple[float, Contrast]], runs: Mapping[CellRunId, Outcome]
     ) -> Evidence:
         """What finished runs say about a weighted sum of contrasts.
 
@@ -171,7 +173,7 @@ class TableJudge:
         ]
         return self._resampler.evidence(terms)
 
-    def marks(self, runs: Mapping[CellRunId, CellRun]) -> dict[CellId, int]:
+    def marks(self, runs: Mapping[CellRunId, Outcome]) -> dict[CellId, int]:
         """Rank 1 of a row that is shown to be better than all others of a column; 2 the next.
 
         A row is shown to be better where the interval of its difference to each other row excludes
@@ -191,7 +193,7 @@ class TableJudge:
         return marks
 
     def _best(
-        self, column: str, highest: bool, labels: Sequence[str], runs: Mapping[CellRunId, CellRun]
+        self, column: str, highest: bool, labels: Sequence[str], runs: Mapping[CellRunId, Outcome]
     ) -> list[str]:
         """The row, and others of the same runs, that is shown to be better than all of `labels`."""
         means: dict[str, float] = {}
@@ -215,19 +217,19 @@ class TableJudge:
             return []
         return same if decide(shown, wanted, self.rule, "all").kind == "holds" else []
 
-    def _labels(self, column: str, runs: Mapping[CellRunId, CellRun]) -> list[str]:
+    def _labels(self, column: str, runs: Mapping[CellRunId, Outcome]) -> list[str]:
         present = dict.fromkeys(label for label, _ in runs)
         names = {label: self.table.columns_of(self._rows[label]) for label in present}
         return [label for label in present if column in {each.name for each in names[label]}]
 
-    def _check_differ(self, contrast: Contrast, runs: Mapping[CellRunId, CellRun]) -> None:
+    def _check_differ(self, contrast: Contrast, runs: Mapping[CellRunId, Outcome]) -> None:
         """Refuse two rows of the same runs: their difference is 0 and says nothing."""
         if contrast.other is not None and self._is_same(contrast, runs):
             raise InputError(
                 f"rows '{contrast.row}' and '{contrast.other}' are the same runs at this scale."
             )
 
-    def _is_same(self, contrast: Contrast, runs: Mapping[CellRunId, CellRun]) -> bool:
+    def _is_same(self, contrast: Contrast, runs: Mapping[CellRunId, Outcome]) -> bool:
         """Whether both rows of a contrast are the same scores of the same runs."""
         keys = [_keys(label, runs) for label in contrast.rows]
         metrics = [
@@ -246,7 +248,7 @@ class TableJudge:
         ]
 
     def _terms(
-        self, weight: float, label: str, name: str, runs: Mapping[CellRunId, CellRun]
+        self, weight: float, label: str, name: str, runs: Mapping[CellRunId, Outcome]
     ) -> Iterable[Term]:
         row = self._rows[label]
         if name not in {column.name for column in self.table.columns_of(row)}:
@@ -264,7 +266,7 @@ class TableJudge:
             )
 
     def _missing(
-        self, contrasts: Sequence[Contrast], runs: Mapping[CellRunId, CellRun]
+        self, contrasts: Sequence[Contrast], runs: Mapping[CellRunId, Outcome]
     ) -> tuple[str, ...]:
         """Rows of the contrasts without a finished run."""
         needed = {label for each in contrasts for label in each.rows}
@@ -272,13 +274,13 @@ class TableJudge:
         return tuple(label for label in self._rows if label in needed - finished)
 
 
-def _keys(label: str, runs: Mapping[CellRunId, CellRun]) -> frozenset[str]:
+def _keys(label: str, runs: Mapping[CellRunId, Outcome]) -> frozenset[str]:
     """Keys of the finished runs of a row."""
     found = (run for (each, _), run in runs.items() if each == label)
     return frozenset(result.key for run in found for result in run.results)
 
 
-def finished_runs_of(label: str, runs: Mapping[CellRunId, CellRun]) -> dict[int, ScoredRun]:
+def finished_runs_of(label: str, runs: Mapping[CellRunId, Outcome]) -> dict[int, RunResult]:
     """The finished runs of a row, by seed.
 
     Raises:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
-from sweeps.table.cells import ScoredRun
+from rgbt.runs.result import RunResult
 
 
 class LoadedCounts:
@@ -13,7 +13,7 @@ class LoadedCounts:
     def __init__(self) -> None:
         self._counts: dict[tuple[str, str], Counts] = {}
 
-    def of(self, run: ScoredRun, path: str) -> Counts:
+    def of(self, run: RunResult, path: str) -> Counts:
         """Counts of a run; InputError where they are missing, damaged or cannot be read."""
         if (run.key, path) not in self._counts:
             try:

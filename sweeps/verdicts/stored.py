@@ -4,27 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 from analysis.uncertainty.verdicts import AnyTime, FixedSeeds, Rule
 from rgbt.checks import InputError
-from rgbt.tracking.run_folder import runs_in
-from rgbt.tracking.run_result import RunResult
+from rgbt.runs.folder import runs_in
+from rgbt.runs.result import RunResult
+from sweeps.point import Outcome, Point
 from sweeps.table.request import UNTIL_DECIDED, TableRequest
 from sweeps.verdicts.judge import CellRunId
 from sweeps.worker.planner import Planner
 
 SEED = "rgbt.seed"
-
-
-@dataclass(frozen=True)
-class StoredRun:
-    """A finished run, as `sweeps.table.cells.CellRun`."""
-
-    results: tuple[RunResult, ...]
-    state: str = "finished"
-    reason: str = ""
 
 
 def finished_by_seed(runs_dir: Path) -> dict[int, set[str]]:
@@ -47,7 +38,7 @@ def stored_runs(
     runs_dir: Path,
     finished: Mapping[int, Collection[str]],
     planner: Planner,
-) -> dict[CellRunId, StoredRun]:
+) -> dict[CellRunId, Outcome]:
     """The finished runs of every row; rows that cannot be composed have none.
 
     Args:
@@ -59,7 +50,7 @@ def stored_runs(
     Raises:
         InputError: no row can be composed.
     """
-    runs: dict[CellRunId, StoredRun] = {}
+    runs: dict[CellRunId, Outcome] = {}
     errors = []
     for row in request.trained_rows:
         try:
@@ -70,7 +61,9 @@ def stored_runs(
             continue
         for seed, key in sorted(keys.items()):
             if key in finished[seed]:
-                runs[row.label, seed] = StoredRun((RunResult(runs_dir / key),))
+                runs[row.label, seed] = Outcome(
+                    Point(row.label, ()), "finished", results=(RunResult(runs_dir / key),)
+                )
     if errors and len(errors) == len(request.trained_rows):
         raise errors[0]  # of the command, and not of a row
     return runs

@@ -10,12 +10,10 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from sweeps.point import Point
-from sweeps.table.cells import CellRun
+from sweeps.point import Outcome, Point
 from sweeps.table.request import TableRequest
 from sweeps.verdicts.contrasts import contrasts_of
 from sweeps.verdicts.judge import CellRunId, JudgedClaim, TableJudge
-from sweeps.worker.trial_sources import Outcome
 
 START = 4
 """Seeds of every row before the claims are judged for the first time: with fewer, an interval that
@@ -38,7 +36,7 @@ class PairedSeeds:
 
     def further(
         self,
-        runs: Mapping[CellRunId, CellRun],
+        runs: Mapping[CellRunId, Outcome],
         open_groups: Callable[[], Iterable[Sequence[str]]],
     ) -> list[CellRunId]:
         """The lowest seed that some rows of a group lack, for each of them; of every open group.
@@ -60,7 +58,7 @@ class PairedSeeds:
         wanted = {each: None for labels in groups for each in self._next(labels, runs)}
         return list(wanted)
 
-    def _next(self, labels: Sequence[str], runs: Mapping[CellRunId, CellRun]) -> list[CellRunId]:
+    def _next(self, labels: Sequence[str], runs: Mapping[CellRunId, Outcome]) -> list[CellRunId]:
         own = {each: run for each, run in runs.items() if each[0] in labels}
         if len({seed for (_, seed), run in own.items() if run.state != "finished"}) > 1:
             return []
@@ -84,7 +82,7 @@ class SeedsUntilDecided:
     request: TableRequest
     judge: TableJudge
     max_seeds: int
-    external: Mapping[CellRunId, CellRun] = field(default_factory=dict)
+    external: Mapping[CellRunId, Outcome] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._seeds = PairedSeeds(range(self.max_seeds))
@@ -118,7 +116,7 @@ class SeedsUntilDecided:
             ]
         )
 
-    def _open(self, runs: Mapping[CellRunId, CellRun]) -> list[list[str]]:
+    def _open(self, runs: Mapping[CellRunId, Outcome]) -> list[list[str]]:
         """Labels of the trained rows of every claim that further seeds may decide."""
         judged = self.judge.claims({**runs, **self.external})
         return [labels for each in judged if _is_open(each) and (labels := self._trained(each))]

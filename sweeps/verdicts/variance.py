@@ -12,7 +12,7 @@ from analysis.uncertainty.contrasts import Evidence
 from analysis.uncertainty.intervals import Spread
 from analysis.uncertainty.variance import sd_interval, smallest_difference
 from rgbt.checks import InputError
-from sweeps.table.cells import CellRun
+from sweeps.point import Outcome
 from sweeps.verdicts.contrasts import Contrast
 from sweeps.verdicts.judge import CellRunId, TableJudge
 
@@ -79,7 +79,7 @@ class VarianceBudget:
     smallest: tuple[Smallest, ...]
 
 
-def variance_budget(judge: TableJudge, runs: Mapping[CellRunId, CellRun]) -> VarianceBudget | None:
+def variance_budget(judge: TableJudge, runs: Mapping[CellRunId, Outcome]) -> VarianceBudget | None:
     """The variance budget that a table declares, from the finished ones of `runs`.
 
     Returns:

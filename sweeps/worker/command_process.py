@@ -7,7 +7,6 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from rgbt.config.shadowing import starting_alike
 from sweeps.worker.executors import GRACE_S
 from sweeps.worker.run_monitor import failure_reason
 
@@ -25,13 +24,12 @@ def run_command(command: Sequence[str], log: Path) -> str:
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("ab") as output:
         begin = output.tell()
-        with starting_alike():
-            process = subprocess.Popen(
-                [sys.executable, "-m", *command],
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-            )
+        process = subprocess.Popen(
+            [sys.executable, "-m", *command],
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+        )
         try:
             code = process.wait()
         finally:

@@ -20,7 +20,7 @@ from typing import Any
 
 from rgbt.checks import RunError
 from rgbt.metrics.names import CA, TC
-from rgbt.spec.naming import TAGS
+from rgbt.runs.naming import TAGS
 from sweeps import attributes as names
 from sweeps.settings import SweepSettings
 from sweeps.worker.executors import (

@@ -23,8 +23,7 @@ from typing import Protocol, TextIO
 
 import rgbt
 from rgbt.checks import InputError
-from rgbt.config.shadowing import searches_working_directory_first, starting_alike
-from rgbt.spec.source_code import counted_modules
+from rgbt.runs.source_code import counted_modules
 from sweeps.worker.template import Template, TemplateProcess
 
 MLFLOW = ("mlflow", "mlflow.store.tracking.sqlalchemy_store")
@@ -112,12 +111,9 @@ class LocalExecutor:
             # Points that are planned have imported what the user wrote for them.
             return LocalJob(_templates[0].start(_run_module, arguments, counted_modules()))
         if not self._is_preloaded:
-            first = () if searches_working_directory_first() else ("sweeps.worker.search_last",)
-            shared = (*PRELOADED, *MLFLOW, *own_modules(), *counted_modules())
-            modules = (*first, *shared, PRELOADED_LAST)
+            modules = (*PRELOADED, *MLFLOW, *own_modules(), *counted_modules(), PRELOADED_LAST)
             self._context.set_forkserver_preload(list(modules))
-            with starting_alike():
-                forkserver.ensure_running()
+            forkserver.ensure_running()
             self._is_preloaded = True
         process = self._context.Process(target=_run_module, args=arguments)
         # Ctrl-C in the terminal is for the driver, which then stops its jobs in order.

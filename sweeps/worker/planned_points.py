@@ -8,11 +8,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from rgbt.checks import InputError
-from rgbt.spec.naming import VARIED
-from sweeps.point import COLOUR, Point, colour, varied_keys
+from rgbt.runs.naming import VARIED
+from sweeps.point import COLOUR, Outcome, Point, colour, varied_keys
 from sweeps.worker.planner import PlannedPoint, Planner
 from sweeps.worker.progress import planning_progress
-from sweeps.worker.trial_sources import Outcome
 
 SHOWN_S = 0.2
 """Seconds of planning between two updates of its progress."""

@@ -9,7 +9,7 @@ from statistics import median
 from typing import Any
 
 from sweeps import attributes as names
-from sweeps.point import Point
+from sweeps.point import UNFINISHED, Outcome, Point
 from sweeps.settings import SweepSettings
 from sweeps.worker.driver import drive
 from sweeps.worker.planned_points import PlannedPoints
@@ -18,11 +18,10 @@ from sweeps.worker.progress import ProgressView
 from sweeps.worker.run_store import RunStore
 from sweeps.worker.storage import find_study, open_storage, open_study
 from sweeps.worker.trial_sources import (
-    UNFINISHED,
     ListSource,
-    Outcome,
     finished_runs,
     is_evaluated,
+    outcome_of,
     reason_of,
 )
 from sweeps.worker.trial_store import Owner, TrialStore, counted_trials, trials_by_key
@@ -85,14 +84,14 @@ def preview_points(
     def status(plan: PlannedPoint) -> Outcome:
         results = finished_runs(plan, points.runs) or ()
         if results and is_evaluated(plan, results):
-            return Outcome.of(plan, "finished", results=results)
+            return outcome_of(plan, "finished", results=results)
         same = trials.get(plan.key, [])
         states = [trial.state.name for trial in same]
         if "RUNNING" in states:
-            return Outcome.of(plan, "running")
+            return outcome_of(plan, "running")
         if states and states[-1] == "FAIL":
-            return Outcome.of(plan, "failed", reason_of(same[-1]), results)
-        return Outcome.of(plan, "waiting", results=results)
+            return outcome_of(plan, "failed", reason_of(same[-1]), results)
+        return outcome_of(plan, "waiting", results=results)
 
     return planned.outcomes(status)
 

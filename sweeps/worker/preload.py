@@ -3,8 +3,8 @@
 The runs then have the digests of the code that they execute, even if files are edited meanwhile.
 """
 
-from rgbt.spec.source_code import loaded_modules, user_code
-from rgbt.tracking.provenance import code, packages
+from rgbt.runs.provenance import code, packages
+from rgbt.runs.source_code import loaded_modules, user_code
 
 
 def record_code() -> None:

@@ -17,17 +17,14 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from rich.progress_bar import ProgressBar
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
-from rgbt.tracking.terminal import SHORTEST, shortened
+from rgbt.checks import without_controls
+from rgbt.terminal import plain_text
 from sweeps.worker.running_trial import RunningTrial
 
 CONSOLE = Console(stderr=True)
-LABEL_WIDTH = 52
-OTHER_WIDTH = 68
-"""Characters of a line beside the label: bar, share, status and score."""
-
 SAY_S = 10.0
 """Seconds between two lines about planning where stderr is no terminal."""
 
@@ -107,15 +104,14 @@ class ProgressView:
         now = time.monotonic()
         if now - self._counted > 5:
             self._counted, self._done = now, self.count()
-        rows = Table.grid(padding=(0, 2))
-        room = max(SHORTEST, min(LABEL_WIDTH, CONSOLE.width - OTHER_WIDTH))
-        labels = shortened([trial.plan.point.label for trial in trials], [room] * len(trials))
-        for trial, label in zip(trials, labels, strict=True):
+        rows = Table.grid(Column(), Column(overflow="fold"), padding=(0, 2))
+        for trial in trials:
             score = "" if math.isnan(trial.score) else f"val mIoU {100 * trial.score:.2f}"
             bar = ProgressBar(total=1.0, completed=trial.done_share, width=24)
             share = f"{100 * trial.done_share:3.0f} %"
-            rows.add_row("  ", Text(label), bar, share, Text(trial.status), score)
-        self._live.update(Group(Text(self._headline(trials)), rows))
+            label = plain_text(trial.plan.point.label)
+            rows.add_row("  ", label, bar, share, Text(trial.status), score)
+        self._live.update(Group(plain_text(self._headline(trials)), rows))
 
     def _headline(self, trials: Sequence[RunningTrial]) -> str:
         of = "" if self.total is None else f" of {self.total}"
@@ -137,6 +133,7 @@ class ProgressView:
         return f", about {duration(points * median(known) / self.workers)} left"
 
     def _say(self, text: str) -> None:
+        text = without_controls(text)
         if self._live is not None:
             self._live.console.print(text, markup=False, highlight=False, soft_wrap=True)
         else:

@@ -9,7 +9,7 @@ import signal
 from contextlib import suppress
 from pathlib import Path
 
-from rgbt.tracking.run_folder import MetricLine, metric_line
+from rgbt.runs.folder import MetricLine
 
 FULL = 1_000_000
 """Bytes; a disk with less is full."""
@@ -47,7 +47,7 @@ class MetricsReader:
         lines = []
         for text in whole.splitlines():
             with suppress(ValueError):
-                lines.append(metric_line(text))
+                lines += MetricLine.read_all([text])
         if lines:
             self.step = lines[-1].step
         return lines

@@ -12,13 +12,11 @@ from omegaconf import DictConfig
 
 from rgbt.checks import InputError, RunError
 from rgbt.config.component import build
+from rgbt.runs.folder import RunFolder, counts_name, is_finished, read_description, set_aside
+from rgbt.runs.provenance import without_passwords
+from rgbt.runs.result import ALL_COUNTS, RunResult
+from rgbt.terminal import info
 from rgbt.tracking.mlflow_store import MlflowTracking
-from rgbt.tracking.provenance import without_passwords
-from rgbt.tracking.replaced_runs import replace_finished
-from rgbt.tracking.run_files import read_description
-from rgbt.tracking.run_folder import RunFolder
-from rgbt.tracking.run_result import ALL_COUNTS, RunResult
-from rgbt.tracking.terminal import info
 from rgbt.tracking.tracker import Status, Tracking
 from sweeps.evaluation import ExtraEvaluation
 
@@ -54,7 +52,7 @@ class RunStore:
         if result is None:
             return None
         try:
-            trained_on = result.dataset
+            trained_on = result.fingerprint
         except InputError as error:
             raise RunError(str(error)) from error
         if trained_on != dataset:
@@ -68,7 +66,10 @@ class RunStore:
         """Move a finished run that `find` ignores out of the way of a new training."""
         result = RunResult(self.runs_dir / key)
         if result.is_finished and self._is_outdated(result):
-            replace_finished(RunFolder(result.folder), self.tracking)
+            kept = set_aside(RunFolder(result.folder))
+            known = None if kept is None else read_description(kept.path)
+            if kept is not None and known is not None:
+                self.tracking.refresh(kept, known)
 
     def _is_outdated(self, result: RunResult) -> bool:
         return self.fresh and result.other_code is not None
@@ -92,7 +93,7 @@ class RunStore:
     def mark_stopped(self, key: str, reason: str) -> None:
         """Record in MLflow why a run was stopped before its end."""
         path = self.runs_dir / key
-        if not (path / "run.json").exists() or RunResult(path).is_finished:
+        if not (path / "run.json").exists() or is_finished(path):
             return  # not started, or finished while it was being stopped
         self._describe(RunFolder(path), {"rgbt.stopped": reason}, "KILLED")
 
@@ -116,7 +117,7 @@ class RunStore:
         run_id = copy / "run_id"
         if run_id.exists():
             result = RunResult(copy, run_id.read_text(errors="replace"))
-            if result.dataset == dataset:
+            if result.fingerprint == dataset:
                 return result
         return self._with_mlflow(lambda tracking: _fetch(tracking, dataset, copy))
 
@@ -151,7 +152,7 @@ def _fetch(tracking: MlflowTracking, dataset: str, copy: Path) -> RunResult | No
     result = RunResult(copy, runs[0].info.run_id)
     copy.mkdir(parents=True, exist_ok=True)
     _download(tracking, result, FETCHED_FILES)
-    if not result.is_finished or not result.counts_path().exists():
+    if not result.is_finished or not (copy / counts_name("test")).exists():
         return None
     # Written last: a copy without it is incomplete and is fetched again.
     (copy / "run_id").write_text(result.run_id)

@@ -12,11 +12,12 @@ from statistics import fmean
 
 from rgbt.checks import RunError
 from rgbt.files.atomic import is_held
-from rgbt.tracking.run_folder import MetricLine
-from rgbt.tracking.run_result import RunResult
+from rgbt.runs.folder import MetricLine, is_finished
+from rgbt.runs.result import RunResult
+from rgbt.runs.run_spec import RunSpec
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.worker.executors import GRACE_S, Job
-from sweeps.worker.planner import PlannedPoint, PlannedRun
+from sweeps.worker.planner import PlannedPoint
 from sweeps.worker.run_monitor import MetricsReader, failure_reason, signal_lock_holder
 from sweeps.worker.run_store import RunStore
 
@@ -76,7 +77,7 @@ class RunningTrial:
     def done_share(self) -> float:
         """Steps done of all steps of the trial, 0..1."""
         run = self.plan.runs[min(self._index, len(self.plan.runs) - 1)]
-        done = self._index + min(1.0, self._metrics.step / run.steps)
+        done = self._index + min(1.0, self._metrics.step / run.trainer.max_steps)
         return min(1.0, done / len(self.plan.runs))
 
     @property
@@ -129,10 +130,10 @@ class RunningTrial:
     def _execute(self) -> Iterator[None]:
         for index, run in enumerate(self.plan.runs):
             self._index = index
-            result = self.runs.find(run.key, run.dataset)
+            result = self.runs.find(run.key, self.plan.fingerprints[run.key])
             if result is None:
                 yield from self._train(run)
-                result = self.runs.find(run.key, run.dataset)
+                result = self.runs.find(run.key, self.plan.fingerprints[run.key])
             if result is None:
                 raise TrialError(
                     f"the run finished with another key than {run.key}: its configuration, its "
@@ -144,11 +145,11 @@ class RunningTrial:
             self._results = (*self._results, result)
         self._index = len(self.plan.runs)
 
-    def _train(self, run: PlannedRun) -> Iterator[None]:
+    def _train(self, run: RunSpec) -> Iterator[None]:
         folder = self.runs.runs_dir / run.key
         self._metrics = MetricsReader(folder)
         self.runs.replace_outdated(run.key)
-        while not (folder / "result.json").exists():
+        while not is_finished(folder):
             if is_held(folder / "lock"):
                 # A killed driver left it running, or it was started by hand. Its result is used
                 # when it finishes; otherwise the run resumes from its checkpoint.
@@ -161,12 +162,12 @@ class RunningTrial:
             code, reason = yield from self._run(("rgbt.run", *run.overrides), run.key)
             if code == 0:
                 return
-            finished = (folder / "result.json").exists()
+            finished = is_finished(folder)
             if not finished and not is_held(folder / "lock"):
                 raise TrialError(reason())
 
     def _evaluate(
-        self, run: PlannedRun, result: RunResult, evaluation: ExtraEvaluation
+        self, run: RunSpec, result: RunResult, evaluation: ExtraEvaluation
     ) -> Iterator[None]:
         if evaluation.is_stored(result):
             return
@@ -240,6 +241,6 @@ class RunningTrial:
 
 def mean_scores(results: Sequence[RunResult]) -> Mapping[str, float]:
     """Scores that all runs have, averaged over the runs."""
-    each = [result.scores() for result in results]
+    each = [result.recorded_scores() for result in results]
     shared = set(each[0]).intersection(*each[1:])
     return {name: fmean(scores[name] for scores in each) for name in each[0] if name in shared}

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from rgbt.checks import InputError, nearest, one_line
-from rgbt.tracking.provenance import without_passwords
+from rgbt.runs.provenance import without_passwords
 from sweeps import attributes as names
 from sweeps.settings import Objective
 

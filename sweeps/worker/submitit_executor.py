@@ -23,7 +23,6 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from rgbt.checks import InputError, check_choice, nearest
-from rgbt.config.shadowing import check_not_shadowed
 from sweeps.worker.executors import GPUS, GRACE_S
 
 if TYPE_CHECKING:
@@ -156,7 +155,6 @@ class SubmititExecutor:
                 "pip install 'rgbt[cluster]'."
             ) from error
         self._submitit = submitit
-        check_not_shadowed("sweeps", in_jobs=True)
         self._cluster = str(options.get("cluster", "slurm"))
         check_choice("submitit.cluster", self._cluster, CLUSTERS)
         values = self._checked({k: v for k, v in options.items() if k != "cluster"})

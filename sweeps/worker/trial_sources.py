@@ -6,17 +6,16 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import InitVar, dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from rgbt.checks import InputError, RunError
 from rgbt.metrics.names import in_percent
-from rgbt.spec.naming import VARIED
-from rgbt.tracking.provenance import without_passwords
-from rgbt.tracking.run_files import read_result
-from rgbt.tracking.run_folder import MetricLine
-from rgbt.tracking.run_result import RunResult
+from rgbt.runs.folder import MetricLine
+from rgbt.runs.naming import VARIED
+from rgbt.runs.provenance import without_passwords
+from rgbt.runs.result import RunResult
 from sweeps import attributes as names
-from sweeps.point import COLOUR, Point, colour
+from sweeps.point import COLOUR, Outcome, Point, State, colour
 from sweeps.settings import SweepSettings
 from sweeps.worker.planner import PlannedPoint, Planner
 from sweeps.worker.run_store import RunStore
@@ -33,10 +32,6 @@ PAUSE_S = 5.0
 
 PLAN_S = 0.2
 """Seconds of planning between two searches for a point to claim."""
-
-State = Literal["finished", "failed", "running", "waiting"]
-UNFINISHED: tuple[State, ...] = ("waiting", "failed")
-"""States of points that a command runs."""
 
 
 @dataclass(frozen=True)
@@ -74,50 +69,15 @@ def trial_attributes(plan: PlannedPoint) -> Mapping[str, Any]:
         names.LABEL: plan.point.label,
         names.OVERRIDES: [without_passwords(word) for word in plan.point.overrides],
         names.RUNS: [run.key for run in plan.runs],
-        names.PIXELS: plan.runs[0].pixel_factor,
+        names.PIXELS: plan.runs[0].scale.pixel_factor,
     }
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """A point with its state and its finished runs.
-
-    Attributes:
-        state: "finished", "failed", "running" (by another driver) or "waiting" (not started).
-        reason: why it failed, or "".
-        results: its finished runs; of a waiting point, runs that lack further evaluations only.
-        keys: of its runs; () where its configuration is wrong.
-    """
-
-    point: Point
-    state: State
-    reason: str = ""
-    results: tuple[RunResult, ...] = ()
-    keys: tuple[str, ...] = ()
-
-    @classmethod
-    def of(
-        cls,
-        plan: PlannedPoint,
-        state: State,
-        reason: str = "",
-        results: tuple[RunResult, ...] = (),
-    ) -> Outcome:
-        """Of a planned point."""
-        return cls(plan.point, state, reason, results, tuple(run.key for run in plan.runs))
-
-    @property
-    def is_trained(self) -> bool:
-        """Whether it lacks further evaluations of its runs only."""
-        return self.state in UNFINISHED and bool(self.results)
-
-    @property
-    def seconds(self) -> float | None:
-        """Duration of its runs; None where one of them is unknown."""
-        found = [read_result(result.folder) or {} for result in self.results]
-        each = [result.get("seconds_of_last_process") for result in found]
-        known = [float(seconds) for seconds in each if seconds is not None]
-        return sum(known) if known and len(known) == len(each) else None
+def outcome_of(
+    plan: PlannedPoint, state: State, reason: str = "", results: tuple[RunResult, ...] = ()
+) -> Outcome:
+    """The outcome of a planned point."""
+    return Outcome(plan.point, state, reason, results, tuple(run.key for run in plan.runs))
 
 
 def _nothing_to_plan(seconds: float) -> None:
@@ -208,20 +168,20 @@ class ListSource:
         states = {trial.state.name for trial in trials}
         is_known = plan.key in self._finished
         if "RUNNING" in states and not is_known:
-            return Outcome.of(plan, "running")
+            return outcome_of(plan, "running")
         if (is_known or "COMPLETE" in states) and self._is_finished(plan):
-            return Outcome.of(plan, "finished", results=self._finished[plan.key])
+            return outcome_of(plan, "finished", results=self._finished[plan.key])
         failed = [trial for trial in trials if trial.state.name == "FAIL"]
         counted = [trial for trial in failed if trial.number not in self._forgiven]
         if len(counted) <= self.settings.retries:
-            return Outcome.of(plan, "waiting")
+            return outcome_of(plan, "waiting")
         # Its runs may have been finished by hand since.
         last = (plan.key, counted[-1].number)
         if last not in self._rechecked:
             self._rechecked.add(last)
             if self._is_finished(plan):
-                return Outcome.of(plan, "finished", results=self._finished[plan.key])
-        return Outcome.of(plan, "failed", reason_of(counted[-1]))
+                return outcome_of(plan, "finished", results=self._finished[plan.key])
+        return outcome_of(plan, "failed", reason_of(counted[-1]))
 
     def _is_finished(self, plan: PlannedPoint) -> bool:
         if plan.key not in self._finished:
@@ -237,7 +197,7 @@ def finished_runs(plan: PlannedPoint, runs: RunStore) -> tuple[RunResult, ...] |
     results = []
     for run in plan.runs:
         try:
-            result = runs.find(run.key, run.dataset)
+            result = runs.find(run.key, plan.fingerprints[run.key])
         except RunError:  # raised again when the point is executed
             return None
         if result is None:

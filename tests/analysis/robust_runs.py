@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from rgbt.metrics.counts import Counts
-from rgbt.tracking.run_files import Description
-from rgbt.tracking.run_folder import RunFolder
+from rgbt.runs.folder import Description, RunFolder
 from tests.analysis.counts import counts_of
 
 SCORES = {

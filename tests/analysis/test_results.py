@@ -13,8 +13,7 @@ import pytest
 from analysis.results import groups_in, label_of, open_counts
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
-from rgbt.tracking.run_files import Description, counts_name, read_description
-from rgbt.tracking.run_folder import RunFolder
+from rgbt.runs.folder import Description, RunFolder, counts_name
 from tests.analysis.uncertainty.simulated import Population, counts_of
 
 CRM, COMMAS = "crm scale=demo", "grbm scale=demo sizes=[1,2]"
@@ -97,20 +96,6 @@ def test_split_and_home_folder_take_effect(runs: Path, monkeypatch: pytest.Monke
     np.testing.assert_array_equal(found.counts.counts, some(7).counts)
 
 
-def test_older_run_is_named_by_its_old_group_and_with_new_runs(runs: Path):
-    """It wrote ${px:64}; what it stands for is in its parameters."""
-    for seed, value in ((0, "${px:64}"), (1, "32")):
-        run = RunFolder(make_run(runs, f"fff{seed}", f"grbm patch_size={value}", seed))
-        description = read_description(run.path)
-        assert description is not None
-        run.describe(replace(description, params={"scale.pixel_factor": "0.5"}))
-    found = open_counts("grbm patch_size=32", runs)
-    assert [each.key for each in found] == ["fff0", "fff1"]
-    assert label_of(found) == "grbm patch_size=32"
-    assert [each.key for each in open_counts("grbm patch_size=${px:64}", runs)] == ["fff0"]
-    assert "grbm patch_size=${px:64}" not in groups_in(runs)
-
-
 def test_folder_of_scores_is_opened_by_rings(tmp_path: Path):
     """As `analysis.score` leaves it: rings and strips."""
     for seed, name in enumerate(("horizontal5", "ring5", "vertical5")):
@@ -143,7 +128,7 @@ def test_ambiguous_folder_of_scores_is_refused(tmp_path: Path, names: tuple[str,
         ("images.npz", {}, "is not a file of counts"),
         ("", {}, "expected runs, files of counts or a group"),
         ("aaa0,,aaa1", {}, "expected runs, files of counts or a group"),
-        ("aaa0", {"split": "all"}, "splits test, val, but not of 'all'.*rgbt.evaluate"),
+        ("aaa0", {"split": "all"}, "no counts of the split 'all'.*rgbt.evaluate"),
         ("other method.npz", {"split": "val"}, "is of split 'test', not of split=val"),
         ("aaa0,mlflow-aaa0", {}, "twice; one training counts once"),
         (f"{CRM},aaa1", {}, "twice; one training counts once"),

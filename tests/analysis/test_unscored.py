@@ -19,7 +19,7 @@ from analysis.uncertainty import Resampling, compare, estimate
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
-from rgbt.tracking.run_files import counts_name
+from rgbt.runs.folder import counts_name
 from tests.analysis import counts as makes
 from tests.analysis.figures.drawn import statistics, strips
 from tests.analysis.report.stores import counts_of as stored_counts

@@ -37,10 +37,10 @@ def measure(case: str, device: str, threads: int, batch_size: int) -> dict[str, 
     """Seconds per step, wall and CPU, and peak memory in MiB of one case, in this process."""
     import torch
 
-    from rgbt.build.training_setup import set_up_training
+    from rgbt.assembly.training_setup import set_up_training
     from rgbt.config.compose import compose
     from rgbt.engine.trainer import Trainer
-    from rgbt.spec.specify import specify
+    from rgbt.runs.specify import specify
 
     experiment, changes = CASES[case]
     config = compose(
@@ -53,7 +53,7 @@ def measure(case: str, device: str, threads: int, batch_size: int) -> dict[str, 
     made = set_up_training(specify(config))
     with tempfile.TemporaryDirectory() as folder:
         trainer = Trainer(
-            fabric=made.session.fabric,
+            fabric=made.fabric,
             settings=made.session.trainer,
             scheme=made.scheme,
             model=made.model,

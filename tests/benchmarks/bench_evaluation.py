@@ -19,12 +19,12 @@ from tests.benchmarks.timing import medians  # isort: skip - before torch
 
 import torch
 
-from rgbt.build.session import open_session
+from rgbt.assembly.session import open_session
 from rgbt.config.compose import compose
 from rgbt.data.loaders import eval_batches
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.evaluation.segmentation import evaluate
-from rgbt.spec.specify import specify
+from rgbt.runs.specify import specify
 from rgbt.types import Batch
 
 ROUNDS = 5
@@ -64,7 +64,7 @@ def measure(case: Case, folder: Path) -> tuple[float, float]:
     words += [f"runs_dir={folder}", f"data.cache={folder / 'decoded'}", "tracking=none"]
     session = open_session(specify(compose(words), words), load_weights=False)
     batches = eval_batches(session.dataset, "test", session.transform, session.loading)
-    in_memory = [batch.to(session.fabric.device) for batch in batches]
+    in_memory = [batch.to(session.device) for batch in batches]
 
     def forward() -> None:
         _forward(session.model.eval(), in_memory)

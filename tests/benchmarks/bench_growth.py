@@ -22,7 +22,7 @@ from tests.benchmarks.timing import seconds  # isort: skip - before torch
 import numpy as np
 
 from analysis.results import groups_in, open_counts
-from rgbt.spec.naming import GROUP
+from rgbt.runs.naming import GROUP
 from sweeps import attributes as names
 from sweeps.point import Point
 from sweeps.settings import Objective

@@ -26,7 +26,7 @@ SMOKE = ("+experiment=grbm", "+debug=smoke")
 
 UNTIL_FIRST_STEP = """
 import os, sys
-from rgbt.tracking.run_folder import RunFolder
+from rgbt.runs.folder import RunFolder
 append = RunFolder.append
 def leave(*arguments):
     append(*arguments)

@@ -17,7 +17,7 @@ import numpy as np
 from analysis.uncertainty import Resampling
 from analysis.uncertainty.contrasts import Resampler, Term
 from analysis.uncertainty.verdicts import AnyTime, FixedSeeds, Rule, decide
-from rgbt.tracking.tables import TextTable
+from rgbt.tables import TextTable
 from tests.analysis.uncertainty.simulated import Population, counts_of
 from tests.analysis.uncertainty.simulated_claims import (
     FIRST,

@@ -137,7 +137,7 @@ def test_export_and_inspect(run: Path, tmp_path: Path, call: Call) -> None:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ((), "expected a command"),
+        ((), "known: export, inspect"),
         (("inspct",), "did you mean 'inspect'?"),
         (("inspect",), "'file' has no value"),
         (("inspect", "missing.pth"), "missing.pth does not exist"),
@@ -173,4 +173,4 @@ def test_an_export_that_the_authors_code_feeds_otherwise_is_said(
         stored.replace("final_activation: true", "final_activation: false")
     )
     _, _, err = call(entry, "export", *words, f"out={tmp_path / 'b.pth'}")
-    assert "authors' code uses model.final_activation=true, but this run used other settings" in err
+    assert "authors' code, which uses model.final_activation=true" in err

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from rgbt.build.initial_weights import differences
+from rgbt.assembly.session import differences
 from rgbt.checkpoints.load import load_weights, plan_for
 from rgbt.checkpoints.read import read
 from rgbt.checkpoints.recognise import recognise

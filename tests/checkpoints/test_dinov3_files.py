@@ -13,7 +13,7 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from rgbt.build.initial_weights import differences
+from rgbt.assembly.session import differences
 from rgbt.checkpoints.dinov3 import FORMS
 from rgbt.checkpoints.load import load_weights, plan_for
 from rgbt.checkpoints.read import read

@@ -12,7 +12,6 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from rgbt.build.requirements import record_of
 from rgbt.checkpoints.layout import family_named
 from rgbt.checkpoints.load import load_weights
 from rgbt.checkpoints.read import read
@@ -21,6 +20,7 @@ from rgbt.checkpoints.starts import DIGITS, RECIPES, STARTS
 from rgbt.checks import InputError
 from rgbt.config.component import build
 from rgbt.config.compose import available, compose
+from rgbt.requirements import record_of
 from rgbt.weights import entry
 from tests.checkpoints.files import network, saved
 from tests.checkpoints.imagenet import mit_file, resnet_file, swin_file

@@ -1,19 +1,23 @@
-"""Every file composes, the schema is the constructor, and the key names what matters."""
+"""Every file passes the schema of its constructor, and every setting has a range."""
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import pytest
+from annotated_types import Gt
+from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
+from pydantic import TypeAdapter
 
 from rgbt.checks import InputError
-from rgbt.config.component import Component, build
-from rgbt.config.compose import conf_dir, flatten
-from rgbt.spec.run_spec import NODES
-from rgbt.spec.specify import specify
+from rgbt.config.component import Component, build, setting_types
+from rgbt.config.compose import conf_dir
+from rgbt.config.values import check_value
+from rgbt.ranges import Pixels, Share
+from rgbt.runs.run_spec import NODES, VALUES
 from tests.models.golden import alone, compose
 
 
@@ -21,6 +25,9 @@ from tests.models.golden import alone, compose
 class Knob:
     size: tuple[int, int]
     kind: Literal["a", "b"]
+    share: Share = 0.5
+    sides: tuple[Pixels, ...] = ()
+    scale: Annotated[float, Gt(0)] | None = None
     inner: Knob | None = None
     model: object = None
 
@@ -36,17 +43,12 @@ def default() -> DictConfig:
 
 
 @pytest.mark.parametrize(
-    ("group", "option"), [(g, o) for g in NODES if (conf_dir() / g).is_dir() for o in options(g)]
+    ("group", "option"), [(g, o) for g in NODES if g != "scale" for o in options(g)]
 )
 def test_every_option_of_every_group_passes_the_check(
     group: str, option: str, default: DictConfig
 ) -> None:
-    if group == "scale":  # sets nodes of all groups
-        spec = specify(compose(f"scale={option}", "dataset.root=unused", "dataset=mfnet"))
-        assert spec.plain["scale"]["name"] == option
-        return
-    made = option.startswith("synth")
-    needed = {} if group != "dataset" or made else {"root": "unused"}
+    needed = {} if group != "dataset" or option.startswith("synth") else {"root": "unused"}
     if option == "folder":
         needed |= {"num_classes": 2, "classes": "[a,b]", "rgb": "a", "thermal": "b", "label": "c"}
     words = [f"dataset.{key}={needed[key]}" for key in needed]
@@ -62,97 +64,6 @@ def test_every_option_of_every_group_passes_the_check(
     assert component.target == component.plain["_target_"] == chosen[group]["_target_"]
 
 
-def test_paper_scale_is_the_released_recipe() -> None:
-    config = compose("+experiment=grbm_released", "scale=paper", "dataset.root=unused")
-    assert (config.data.batch_size, config.trainer.max_steps) == (5, 70000)
-    assert list(config.transform.sizes) == [int(0.1 * k * 480) for k in range(5, 21)]
-    assert (config.optimizer.lr, config.optimizer.backbone_multiplier) == (1e-4, 0.1)
-    assert (config.trainer.clip_norm, config.optimizer.weight_decay) == (0.01, 0.05)
-    assert (config.masker.patch_size, config.loss.num_points) == (64, 112 * 112)
-    assert compose("+experiment=crm", "scale=paper").masker.patch_size == 32
-    assert compose("+experiment=grbm", "scale=demo").masker.patch_size == 32
-
-
-def test_recipes_of_the_reference_networks() -> None:
-    """Numbers of the temporal release (CMX), and of the RTFNet and MFNet releases."""
-    cmx, rtfnet, mfnet = (
-        compose(f"+experiment={name}", "scale=paper", "dataset.root=unused")
-        for name in ("cmx", "rtfnet", "mfnet")
-    )
-    adamw = cmx.optimizer
-    assert (adamw.lr, adamw.weight_decay, adamw.decay_biases) == (6e-5, 0.01, False)
-    assert (adamw.backbone_multiplier, cmx.trainer.clip_norm) == (1.0, None)
-    assert (cmx.trainer.max_steps, cmx.schedule.warmup_steps) == (200 * 1568, 10 * 1568)
-    assert (cmx.schedule.power, cmx.schedule.per) == (0.9, "iteration")
-    for config in (rtfnet, mfnet):
-        sgd = config.optimizer
-        assert (sgd.lr, sgd.momentum, sgd.weight_decay) == (0.01, 0.9, 5e-4)
-        assert (config.schedule.factor, config.trainer.clip_norm) == (0.95, None)
-    epochs = (rtfnet.schedule.epoch_steps, mfnet.trainer.max_steps)
-    assert epochs == (1568 // 3 + 1, 100 * (784 // 8))
-    assert (cmx.model.inputs.thermal_scale, cmx.model.drop_path_stage2) == (
-        *("image_max", "released"),
-    )
-    batch_sizes = [config.data.batch_size for config in (cmx, rtfnet, mfnet)]
-    assert batch_sizes == [1, 3, 8]
-    for config in (cmx, rtfnet, mfnet):
-        assert list(config.transform.crop_hw) == [480, 640]
-        assert (config.transform.flip_probability, config.transform.colour_probability) == (0.5, 0)
-    assert [config.model._target_.split(".")[2] for config in (cmx, rtfnet, mfnet)] == [
-        *("cmx", "rtfnet", "mfnet")
-    ]
-
-
-PUBLISHED: list[tuple[str, dict[str, Any]]] = [
-    ("cmx_b2", {"drop_path_rate": 0.1, "decoder_dropout": 0.1, "decoder_norm_eps": 1e-3}),
-    ("cmx_b2", {"drop_path_stage2": "ramp", "decoder_norm_eps_eval": None}),
-    ("heatnet", {"dropout": [0.3, 0.15], "align_corners": False}),
-    ("deeplabv2_two_heads_modified", {"dropout": [0.3, 0.15], "align_corners": False}),
-    *((f"mask2former_swin_{size}", {"drop_path_rate": 0.3}) for size in "tsb"),
-    *((f"rtfnet_{n}", {"final_relu": True, "thermal_stem": "rgb_mean"}) for n in (18, 50, 152)),
-    ("mfnet", {"final_activation": True}),
-    *(
-        (name, {"ceil_mode": True, "align_corners": True})
-        for name in ("deeplabv2", "deeplabv2_tiny")
-    ),
-]
-"""Values that neither parameter counts nor recorded outputs in evaluation mode would show."""
-
-
-@pytest.mark.parametrize(("name", "settings"), PUBLISHED)
-def test_published_settings_of_the_networks(name: str, settings: dict[str, Any]) -> None:
-    model = alone(f"model/{name}").model
-    assert {key: model[key] for key in settings} == settings
-    if "ceil_mode" in settings:
-        assert model.summed_rates == model.rates
-
-
-def test_the_key_leaves_out_paths_hardware_and_tracking() -> None:
-    same = [
-        *("dataset.root=/a", "runs_dir=/b", "tracking=none", "data.num_workers=3"),
-        *(
-            "trainer.accelerator=cpu",
-            "fresh=true",
-            "trainer.threads=2",
-            "name=other",
-            "data.eval_batch_size=1",
-        ),
-    ]
-    base = ["+experiment=grbm", "dataset=mfnet", "dataset.root=/elsewhere"]
-    key = specify(compose(*base)).key
-    assert specify(compose(*base, *same)).key == key
-    # The file says 4.0; a user types 4.
-    assert specify(compose(*base, "masker.sigma_div=4")).key == key
-    for change in (
-        "seed=1",
-        "masker.sigma_div=2",
-        "dataset.name=mine",
-        "trainer.max_steps=7",
-        "trainer.threads=1",
-    ):
-        assert specify(compose(*base, change)).key != key, change
-
-
 def test_a_node_is_built_with_converted_values_and_offered_objects() -> None:
     inner = {"_target_": f"{__name__}.Knob", "size": [3, 4], "kind": "b"}
     node = OmegaConf.create({"knob": {**inner, "kind": "a", "inner": inner}}).knob
@@ -160,44 +71,72 @@ def test_a_node_is_built_with_converted_values_and_offered_objects() -> None:
     knob = build(node, model=offered, unused=1)
     assert (knob.size, knob.kind, knob.model) == ((3, 4), "a", offered)
     assert (knob.inner.size, knob.inner.kind, knob.inner.model) == ((3, 4), "b", None)
-
-
-@pytest.mark.parametrize(
-    ("change", "sentence"),
-    [
-        ({"size": [1]}, r"'knob.size' must be a list of 2, each a whole number, got \[1\]"),
-        ({"size": [1, 2.5]}, r"'knob.size\[1\]' must be a whole number, got"),
-        ({"size": [1, True]}, r"'knob.size\[1\]' must be a whole number, got"),
-        ({"kind": "c"}, "'knob.kind' must be 'a' or 'b', got \"c\""),
-        ({"kin": "a"}, "'knob.kin' is not a setting of .*did you mean 'kind'"),
-        ({"kind": "???"}, "'knob.kind' has no value"),
-        ({"kind": "${nowhere}"}, "'knob.kind' cannot be resolved"),
-        ({"_target_": "no.such.Thing"}, "'knob._target_': cannot import no.such.Thing"),
-    ],
-)
-def test_wrong_values_are_named_with_their_key(change: dict, sentence: str) -> None:
-    good = {"_target_": f"{__name__}.Knob", "size": [1, 2], "kind": "a"}
-    with pytest.raises(InputError, match=sentence):
-        Component.from_node(OmegaConf.create({"knob": {**good, **change}}).knob, "knob")
-
-
-def test_a_missing_value_is_named_when_the_object_is_built() -> None:
-    node = OmegaConf.create({"knob": {"_target_": f"{__name__}.Knob", "kind": "a"}}).knob
     with pytest.raises(InputError, match="'knob.size' has no value"):
-        build(node)
+        build(OmegaConf.create({"knob": {"_target_": f"{__name__}.Knob", "kind": "a"}}).knob)
 
 
-def test_flatten_gives_dotted_keys() -> None:
-    config = OmegaConf.create({"a": {"b": 1, "c": [1, 2]}, "d": "${a.b}"})
-    assert flatten(config) == {"a.b": 1, "a.c": [1, 2], "d": 1}
+NAN, INFINITE = float("nan"), float("inf")
+WRONG: list[tuple[dict[str, Any], str]] = [
+    *(({"size": each}, "'knob.size[1]'") for each in ([1], [1, 2.5], [1, True], [1, "2"])),
+    ({"kind": "c"}, "'knob.kind'"),
+    ({"share": 1.5}, "'knob.share'"),
+    ({"share": NAN}, "'knob.share'"),
+    ({"scale": 0}, "'knob.scale'"),
+    ({"scale": INFINITE}, "'knob.scale'"),
+    ({"sides": [4, 0]}, "'knob.sides[1]'"),
+    ({"kin": "a"}, "'knob.kin' is not a setting"),
+    ({"kind": "???"}, "'knob.kind' has no value"),
+    ({"kind": "${nowhere}"}, "nowhere"),
+    ({"inner": {"_target_": "no.such.Thing"}}, "'knob.inner._target_'"),
+    ({"_target_": "no.such.Thing"}, "'knob._target_'"),
+]
 
 
-def test_paths_are_read_as_they_are_typed() -> None:
-    from rgbt.config.command import readable_paths
+@pytest.mark.parametrize(("change", "sentence"), WRONG)
+def test_wrong_values_are_named_with_their_key(change: dict[str, Any], sentence: str) -> None:
+    good = {"_target_": f"{__name__}.Knob", "size": [1, 2], "kind": "a"}
+    with pytest.raises(InputError) as raised:
+        Component.from_node(OmegaConf.create({"knob": {**good, **change}}).knob, "knob")
+    assert sentence in str(raised.value)
+    assert str(raised.value).isprintable()
 
-    typed = ["model.weights=a/epoch=299 (best).ckpt", "dataset.root=~/MF", "model.weights=a,b"]
-    first, root, grid = readable_paths([*typed, "masker.sigma_div=1,2", "-m"])[:3]
-    assert compose(first).model.weights == "a/epoch=299 (best).ckpt"
-    assert root == f"dataset.root={Path.home()}/MF"
-    assert grid == "model.weights=a,b"
-    assert readable_paths(["-m", "masker.sigma_div=1,2"]) == ["-m", "masker.sigma_div=1,2"]
+
+TEXTS = "".join(path.read_text() for path in conf_dir().rglob("*.yaml"))
+TARGETS = sorted(set(re.findall(r"_target_: (rgbt[\w.]+)", TEXTS)))
+"""Constructors that the configuration names."""
+
+LOW, HIGH = ("minimum", "exclusiveMinimum"), ("maximum", "exclusiveMaximum")
+
+
+def unbounded(schema: Any) -> list[Any]:
+    """Numbers without both ends, and texts of any length, in a JSON schema."""
+    if not isinstance(schema, dict):
+        return [each for part in schema for each in unbounded(part)] if type(schema) is list else []
+    if {"enum", "const"} & set(schema):
+        return []
+    kind = schema.get("type")
+    has_ends = all(any(end in schema for end in ends) for ends in (LOW, HIGH))
+    is_open = kind in ("integer", "number") and not has_ends
+    is_long = kind == "string" and not {"maxLength", "format"} & set(schema)
+    inner = [
+        unbounded(part) for key, part in schema.items() if key not in ("enum", "propertyNames")
+    ]
+    return [*([schema] if is_open or is_long else []), *(each for part in inner for each in part)]
+
+
+@pytest.mark.parametrize("target", [*TARGETS, "sweeps.settings.SweepSettings"])
+def test_every_number_and_text_has_a_range(target: str) -> None:
+    for key, annotation in setting_types(get_object(target)).items():
+        try:
+            schema = TypeAdapter(annotation).json_schema()
+        except Exception:  # an object that the run provides
+            continue
+        assert not unbounded(schema), f"{target}.{key}: declare a range (rgbt.ranges)"
+
+
+def test_top_level_keys_have_a_range() -> None:
+    assert not [kind for kind in VALUES.values() if unbounded(TypeAdapter(kind).json_schema())]
+    assert check_value("seed", 0, VALUES["seed"]) == 0
+    for wrong in (-1, 2**32, True, 0.5, None):
+        with pytest.raises(InputError, match="^'seed'"):
+            check_value("seed", wrong, VALUES["seed"])

@@ -1,39 +1,31 @@
-"""Where configuration files are found, and what they choose by the scale."""
+"""Compositions are those of Hydra, also from the cache; files of the user are found."""
 
 from __future__ import annotations
 
+import random
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import hydra
 import pytest
+from omegaconf import OmegaConf
 
 from rgbt.checks import InputError
+from rgbt.config import compose as composing_module
 from rgbt.config.command import composing
-from rgbt.config.compose import available, chosen_scale, compose, groups, searching
-from rgbt.spec.specify import parse_reference, upstream_config
+from rgbt.config.compose import available, compose, own_hydra, searching
 
-OWN = """# @package _global_
-defaults:
-  - sh_source
-  - override /model: ${by_scale:{demo:mfnet_tiny,paper:mfnet}}
-  - _self_
-name: own_stage
-"""
+OWN = "# @package _global_\ndefaults:\n  - sh_source\n  - _self_\nname: own_stage\n"
 
 
 @pytest.fixture
 def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """A folder of configurations with one experiment and one scale."""
+    """A folder of configurations with one experiment."""
     monkeypatch.delenv("RGBT_CONF", raising=False)
-    for name in ("experiment", "scale"):
-        (tmp_path / name).mkdir()
+    (tmp_path / "experiment").mkdir()
     (tmp_path / "experiment" / "own_stage.yaml").write_text(OWN)
-    (tmp_path / "scale" / "middle.yaml").write_text("defaults: [demo]\n")
     return tmp_path
-
-
-def word(folder: Path) -> str:
-    return f"hydra.searchpath=[file://{folder}]"
 
 
 @pytest.mark.parametrize(
@@ -43,46 +35,71 @@ def test_by_scale_chooses_the_file_of_the_scale(words: list[str], width: int) ->
     assert compose(["+experiment=mfnet", *words]).model.decoder_width == width
 
 
-def test_by_scale_bench_has_the_files_of_the_demo_unless_it_is_named() -> None:
-    bench, demo = (compose(["+experiment=rtfnet", f"scale={name}"]) for name in ("bench", "demo"))
-    assert bench.model.base_width == demo.model.base_width == 16
-    assert bench.optimizer == demo.optimizer
-    assert chosen_scale("bench", {"demo": 1, "paper": 2}) == "demo"
-    assert chosen_scale("bench", {"demo": 1, "bench": 2}) == "bench"
-    assert chosen_scale("paper", {"demo": 1}) == "paper"
-
-
-def test_by_scale_unknown_scale_says_to_choose(own: Path) -> None:
-    words = ["+experiment=mfnet", "scale=middle", word(own)]
-    with pytest.raises(InputError) as caught, composing(words):
-        compose(words)
-    assert "supports only these scales: {demo:mfnet_tiny,paper:mfnet}" in str(caught.value)
-
-
-def test_available_lists_the_search_path_of_the_command(own: Path) -> None:
-    assert "own_stage" not in available("experiment")
-    with searching([word(own), "+experiment=own_stage"]):
-        assert {"own_stage", "grbm"} <= set(available("experiment"))
-        assert "model" in groups()
-        assert compose(["+experiment=own_stage"]).name == "own_stage"
-    assert "own_stage" not in available("experiment")
-
-
-def test_compose_reads_folders_of_the_environment(
+def test_available_lists_the_search_path_of_the_command(
     own: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    assert "own_stage" not in available("experiment")
+    with searching([f"hydra.searchpath=[file://{own}]", "+experiment=own_stage"]):
+        assert {"own_stage", "grbm"} <= set(available("experiment"))
+        assert compose(["+experiment=own_stage"]).name == "own_stage"
+    assert "own_stage" not in available("experiment")
     monkeypatch.setenv("RGBT_CONF", f"{own},{own / 'scale'}")
     assert "own_stage" in available("experiment")
     assert compose(["+experiment=own_stage"]).name == "own_stage"
 
 
-def test_upstream_experiment_on_the_search_path_is_used(own: Path) -> None:
-    with searching([word(own)]):
-        config = compose(["+experiment=sh_adversarial"])
-        value = "experiment:own_stage/last.pt"
-        reference = parse_reference("model.weights", value)
-        assert reference == ("own_stage", "last.pt", False)
-        upstream = upstream_config(config, "domains.target.labels", reference)
-    assert (upstream.name, upstream.model.decoder_width) == ("own_stage", 16)
-    with pytest.raises(InputError, match=r"no experiment 'own_stage'.*hydra\.searchpath="):
-        parse_reference("model.weights", value)
+CHOICES = (
+    *("masker=square", "masker=none", "+experiment=crm", "+experiment=grbm", "scale=paper"),
+    *("model=mfnet", "optimizer=adamw", "+debug=smoke", "hydra.mode=RUN", "+nothing=1"),
+)
+VALUES = (
+    *("optimizer.lr=0.003", "seed=7", "model.fresh=[a,b]", "model.weights=null"),
+    *("name='a, b'", 'name="it\'s"', "scale.crop_hw=[48,64]", "scale.pixel_factor=0.25"),
+    *("+model.extra={a:1,b:[x,null]}", "trainer.max_steps=${scale.eval_every}", "out=null"),
+    *("~trainer.threads", "++trainer.threads=2", "trainer.threads=1", "model={weights:x}"),
+    *("masker.blokc=1", "masker=squre", "seed=1,2", "seed=[1", "+seed=1", "sead=1"),
+)
+
+
+@pytest.mark.parametrize("seed", range(16))
+def test_random_words_are_composed_or_refused_as_hydra_does(seed: int) -> None:
+    draw = random.Random(seed)
+    words = [*draw.sample(CHOICES, 2), *draw.sample(VALUES, 4)]
+    draw.shuffle(words)
+
+    def result(make: Any, *arguments: object) -> str:
+        try:
+            return OmegaConf.to_yaml(make(*arguments))
+        except Exception as error:
+            return f"{type(error).__name__}: {error}"
+
+    for _ in range(2):  # composed, and from the cache
+        found = result(compose, words)
+        with own_hydra():
+            assert found == result(hydra.compose, "config", words), words
+
+
+def test_values_are_set_on_a_copy_of_what_hydra_composed_once() -> None:
+    composing_module._by_hydra.cache_clear()
+    first = compose(("masker=square", "seed=1"))
+    first.masker.patch_size = 99
+    second = compose(("masker=square", "seed=2", "trainer.threads=1"))
+    assert composing_module._by_hydra.cache_info().misses == 1
+    assert (first.seed, second.seed, second.masker.patch_size == 99) == (1, 2, False)
+    assert OmegaConf.is_struct(second)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        *(("experiment=grbm", "+experiment="), ("+experiment=grbm +experiment=crm", "experiment")),
+        *(("nothing", "'nothing'"), ("seed=0,1", "'seed=0,1'"), ("masker=grm", "'grm'")),
+        *(("optimiser=adamw", "'optimizer'"), ("lr=1", "optimizer.lr")),
+        *(("dataset.num_trian=1", "'num_train'"), ("+experiment=mfnet scale=middle", "'middle'")),
+    ],
+)
+def test_word_that_hydra_refuses_is_one_line(words: str, said: str) -> None:
+    with pytest.raises(InputError) as caught, composing(words.split()):
+        compose(words.split())
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)

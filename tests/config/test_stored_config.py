@@ -12,17 +12,14 @@ from omegaconf import OmegaConf
 
 from rgbt.checks import InputError
 from rgbt.config.component import Component, build
-from rgbt.config.compose import compose, conf_dir
+from rgbt.config.compose import compose
 from rgbt.config.stored_config import (
     check_targets,
-    load_config,
     parse_trust,
-    read_settings,
     settings_of,
     shipped_targets,
     targets,
 )
-from rgbt.spec.run_spec import NODES
 from tests.commands import Call, assert_one_sentence
 
 LAB = "import os\nfrom pathlib import Path\nPath(__file__).with_suffix('.imported').touch()\n" + (
@@ -49,17 +46,13 @@ def node(target: Any) -> dict[str, Any]:
 
 OTHERS = [
     *("os.system", "posix.system", "builtins.eval", "subprocess.Popen", "hydra.utils.get_object"),
-    *(
-        "rgbt.files.atomic.os.system",
-        "rgbt.config.component.get_object",
-        "rgbt.config.component.instantiate",
-    ),
-    *("rgbt.files.atomic.write_atomic", "rgbt.tracking.run_folder.RunFolder", "rgbt"),
-    *("rgbt_evil.X", "rgbt_evil", "rgbt..os", ".rgbt.maskers.masker.Masker", "rgbt.", ""),
-    *("rgbt.maskers.masker.Masker.", "rgbt.maskers.masker.Masker.__init__", "Rgbt.maskers.masker"),
-    *("rgbt.maskers.masker.Masker ", "rgbt.maskers.masker.Maske\u0433", "rgbt.maskers.masker"),
-    *("hydra_plugins.rgbt_study.StudySweeper", "\x1b[2Jos.system", "x" * 5000),
-    *(3, None, True, 1.5, ["os.system"], {"a": "os.system"}, 10**30),
+    *("rgbt.files.atomic.os.system", "rgbt.config.component.instantiate", "rgbt"),
+    *("rgbt.files.atomic.write_atomic", "rgbt.runs.folder.RunFolder", "rgbt_evil.X", "rgbt_evil"),
+    *("rgbt..os", ".rgbt.maskers.masker.Masker", "rgbt.", "", "rgbt.maskers.masker.Masker."),
+    *("rgbt.maskers.masker.Masker.__init__", "Rgbt.maskers.masker", "rgbt.maskers.masker"),
+    *("rgbt.maskers.masker.Masker ", "rgbt.maskers.masker.Maske\u0433", "x" * 5000),
+    *("hydra_plugins.rgbt_study.StudySweeper", "\x1b[2Jos.system", ["os.system"]),
+    *(3, None, True, {"a": "os.system"}, 10**30),
 ]
 
 
@@ -74,31 +67,16 @@ def test_others_targets_are_refused_before_they_are_imported(lab: Path, target: 
     ):
         with pytest.raises(InputError, match=r"^store: '.*_target_' names ") as refused:
             check_targets(settings, (), "store")
-        assert_printable(str(refused.value))
-
-
-def assert_printable(text: str) -> None:
-    assert text.isprintable()
-    assert len(text) < 450
+        assert (str(refused.value).isprintable(), len(str(refused.value)) < 450) == (True, True)
 
 
 def test_what_shipped_configurations_name_is_allowed() -> None:
     config = OmegaConf.to_container(compose(["+experiment=grbm"]), resolve=True)
     check_targets(config, (), "store")
     assert len(list(targets(config))) > 15
-    assert "rgbt.data.synth.dataset.synth" in shipped_targets()
     assert shipped_targets("masker") == {"rgbt.maskers.masker.Masker"}
     with pytest.raises(InputError, match="which no file of conf/masker names"):
         check_targets({"masker": node("rgbt.data.kp.KP")}, (), "store", "masker")
-    assert all(name.startswith("rgbt.") for name in shipped_targets())
-    assert shipped_targets() >= {
-        str(target) for path in conf_dir().rglob("l*/*.yaml") for target in loaded_targets(path)
-    }
-
-
-def loaded_targets(path: Path) -> Any:
-    plain = OmegaConf.to_container(OmegaConf.load(path))
-    return [each for each in targets(plain).values() if str(each).startswith("rgbt.")]
 
 
 def test_own_code_needs_trust_and_only_its_own_is_run(lab: Path) -> None:
@@ -109,20 +87,21 @@ def test_own_code_needs_trust_and_only_its_own_is_run(lab: Path) -> None:
     check_targets({"model": node("my_lab.Plain")}, ("other", "my_lab"), "store")
     assert marker.exists()
     check_targets({"model": node("my_lab.Plain")}, ("my_lab.Plain",), "store")
-    with pytest.raises(InputError, match=r"blocklisted"):
-        check_targets({"model": node("my_lab.os.system")}, ("my_lab",), "store")
-    with pytest.raises(InputError, match=r"defined in posix, a module that is not trusted"):
-        check_targets({"model": node("my_lab.os.getpid")}, ("my_lab",), "store")
-    with pytest.raises(InputError, match=r"defined in lab_base.* add lab_base to trust"):
-        check_targets({"model": node("my_lab.Base")}, ("my_lab",), "store")
+    for name, reason in (
+        *(("os.system", "blocklisted"), ("os.getpid", "defined in posix")),
+        ("Base", "defined in lab_base"),
+    ):
+        with pytest.raises(InputError, match=reason):
+            check_targets({"model": node(f"my_lab.{name}")}, ("my_lab",), "store")
     check_targets({"model": node("my_lab.Base")}, ("my_lab", "lab_base"), "store")
 
 
 def test_trust_is_a_list_of_dotted_names() -> None:
-    assert parse_trust("") == ()
     assert parse_trust("[my_lab, other.models]") == ("my_lab", "other.models")
+    folders = ("my_lab", "/code/GMNet", "~/x", "./y", "../z")
+    assert parse_trust(",".join(folders)) == folders
     for text in ("my lab", "a/b.py", "a..b", "a;b", "*"):
-        with pytest.raises(InputError, match="expected names of your own modules"):
+        with pytest.raises(InputError, match="^trust: expected names"):
             parse_trust(text)
 
 
@@ -130,12 +109,10 @@ def test_trust_is_a_list_of_dotted_names() -> None:
     ("plain", "reason"),
     [
         ([1], "expected a mapping"),
-        ("text", "expected a mapping"),
-        ({"a": "${oc.env:HOME}"}, r"'a' is \$\{oc.env:HOME\}; .* must not contain interpolations"),
+        ({"a": "${oc.env:HOME}"}, "'a' is an interpolation"),
         ({"a": [{"b": "x ${px:64}"}]}, "'a.0.b'"),
         ({"a": {1: 2}}, "is not text"),
         ({"model": "os.system"}, "'model' must be a mapping"),
-        ({"data": None}, "'data' must be a mapping"),
     ],
 )
 def test_a_stored_configuration_holds_resolved_values(plain: Any, reason: str) -> None:
@@ -143,34 +120,16 @@ def test_a_stored_configuration_holds_resolved_values(plain: Any, reason: str) -
         settings_of(plain, "store")
 
 
-@pytest.mark.parametrize("experiment", ["grbm", "heatnet"])
-def test_what_a_run_stores_is_read_back(experiment: str, tmp_path: Path) -> None:
-    config = compose([f"+experiment={experiment}", "scale=paper"])
-    (tmp_path / "config.yaml").write_text(OmegaConf.to_yaml(config, resolve=True))
-    expected = OmegaConf.to_container(config, resolve=True)
-    assert read_settings(tmp_path / "config.yaml") == expected
-    assert load_config(tmp_path / "config.yaml") == expected
-
-
 @pytest.mark.parametrize("target", ["os.system", "posix.system", "builtins.eval", "yaml.load"])
 def test_composed_configurations_follow_hydras_policy(target: str, tmp_path: Path) -> None:
     loud = OmegaConf.create({"x": {"_target_": target, "command": f"touch {tmp_path / 'marker'}"}})
     for use in (build, lambda each: Component.from_node(each, "x")):
-        with pytest.raises(InputError, match=r"'x\._target_': Target .* is blocklisted") as caught:
+        with pytest.raises(InputError, match=r"'x\._target_': Target .* is blocklisted"):
             use(loud.x)
-        assert_printable(str(caught.value))
     hidden = {"_target_": "hydra.utils.get_object", "path": target}
     with pytest.raises(InputError, match="is blocklisted"):
         build(OmegaConf.create({"x": hidden}).x)
     assert not (tmp_path / "marker").exists()
-
-
-def test_a_module_that_is_imported_anew_is_built_anew(lab: Path) -> None:
-    own = OmegaConf.create({"x": node("my_lab.Plain")}).x
-    first = type(build(own))
-    del sys.modules["my_lab"]
-    second = build(own)
-    assert type(second) is sys.modules["my_lab"].Plain is not first
 
 
 def test_a_hostile_run_folder_runs_nothing(call: Call, tmp_path: Path, lab: Path) -> None:
@@ -181,33 +140,31 @@ def test_a_hostile_run_folder_runs_nothing(call: Call, tmp_path: Path, lab: Path
     settings: Any = OmegaConf.to_container(compose(["+experiment=crm"]), resolve=True)
     evil = {"_target_": "os.system", "command": f"touch {marker}"}
     commands: list[tuple[Any, tuple[str, ...]]] = [
-        (evaluate.entry, (f"run={run}",)),
-        (
-            predict.entry,
-            (f"run={run}", "input=test", f"out={tmp_path / 'out'}"),
+        *(
+            (evaluate.entry, ()),
+            (consistency.entry, ()),
+            (robustness.entry, ("corruptions=noise",)),
         ),
-        (robustness.entry, (f"run={run}", "corruptions=noise")),
-        (consistency.entry, (f"run={run}",)),
+        (predict.entry, ("input=test", f"out={tmp_path / 'out'}")),
     ]
     for name in ("transform", "model", "scheme"):
-        assert name in NODES
         (run / "config.yaml").write_text(json.dumps({**settings, name: evil}))
         for entry, words in commands:
-            code, _, err = call(entry, *words)
+            code, _, err = call(entry, f"run={run}", *words)
             assert code == 2
             assert_one_sentence(err, f"'{name}._target_' names os.system")
     (run / "config.yaml").write_text(json.dumps({**settings, "loss": node("my_lab.Plain")}))
-    code, _, err = call(commands[0][0], f"run={run}")
+    err = call(evaluate.entry, f"run={run}")[2]
     assert_one_sentence(err, "add trust=my_lab.")
     assert not (lab / "my_lab.imported").exists()
-    code, _, err = call(commands[0][0], f"run={run}", "trust=my_lab")
+    err = call(evaluate.entry, f"run={run}", "trust=my_lab")[2]
     assert_one_sentence(err, "best.pt")  # the next thing that this folder lacks
     assert (lab / "my_lab.imported").exists()
     assert not marker.exists()
 
 
 def test_a_corruption_file_of_others_runs_nothing(tmp_path: Path, lab: Path) -> None:
-    from rgbt.evaluation.corruption_request import choose_corruption
+    from rgbt.evaluation.request import choose_corruption
 
     path = tmp_path / "fog.yaml"
     path.write_text(f"_target_: os.system\ncommand: touch {tmp_path / 'marker'}\n")
@@ -216,8 +173,9 @@ def test_a_corruption_file_of_others_runs_nothing(tmp_path: Path, lab: Path) -> 
     path.write_text("_target_: my_lab.Plain\nwidth: 2\n")
     with pytest.raises(InputError, match="add trust=my_lab"):
         choose_corruption(str(path))
-    with pytest.raises(InputError, match="Plain has no attribute"):  # it was built
-        choose_corruption(str(path), trust=("my_lab",))
+    assert not (lab / "my_lab.imported").exists()
+    choose_corruption(str(path), trust=("my_lab",))
+    assert (lab / "my_lab.imported").exists()
     assert not (tmp_path / "marker").exists()
 
 
@@ -237,9 +195,3 @@ def test_code_of_a_checkout_needs_a_trusted_folder(trust: tuple[str, ...]) -> No
             check_targets({"model": EXTERNAL_NODE}, other, "store")
     with pytest.raises(InputError, match=r"'scheme\.critics\.0\.checkout' is"):
         check_targets({"scheme": {"critics": [EXTERNAL_NODE]}}, ("my_lab",), "store")
-
-
-def test_trust_is_also_a_list_of_folders() -> None:
-    assert parse_trust("my_lab,/code/GMNet,~/x,./y,../z") == (
-        *("my_lab", "/code/GMNet", "~/x", "./y", "../z"),
-    )

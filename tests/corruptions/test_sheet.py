@@ -11,15 +11,19 @@ import pytest
 from rgbt.corruptions.__main__ import draw, entry, sheet, side_by_side
 from rgbt.corruptions.late import Delayed
 from rgbt.corruptions.pixels import Noise, Removed
+from rgbt.evaluation.request import CorruptionRequest
 from tests.commands import Call
 from tests.conftest import WriteMFNet
 from tests.corruptions.recorded import Recorded, sample
 
-KINDS = (
-    Noise(image="rgb", severities=(8.0, 16.0)),
-    Delayed(severities=(1.0,)),
-    Removed(image="thermal"),
-)
+KINDS = [
+    CorruptionRequest("any", each)
+    for each in (
+        Noise(image="rgb", severities=(8.0, 16.0)),
+        Delayed(severities=(1.0,)),
+        Removed(image="thermal"),
+    )
+]
 
 
 def test_a_line_per_corruption_with_the_clean_pair_first() -> None:

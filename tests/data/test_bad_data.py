@@ -126,8 +126,8 @@ DAMAGES: dict[str, tuple[Callable[[Path, Path], None], str]] = {
     "empty": (partial(fill, content=b""), "the file is empty|cannot be read as an array"),
     "cut short": (cut, "the file is (truncated|damaged or not)|cannot be read as an array"),
     "no image": (partial(fill, content=b"<html>404</html>"), "the file is damaged or not"),
-    "a folder": (make_folder, "is a folder, expected a file"),
-    "a pipe": (make_pipe, "is not a regular file, expected a file"),
+    "a folder": (make_folder, "is not a regular file"),
+    "a pipe": (make_pipe, "is not a regular file"),
     "a link that leads out": (partial(move, link="kept"), "leads out of dataset.root, to .*kept."),
     "a link to nowhere": (
         partial(move, link="gone"),

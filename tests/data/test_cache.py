@@ -616,7 +616,7 @@ def test_command_fills_and_removes_cache(
     assert entry.run([cache, "remove=true"]) == 0
     assert capsys.readouterr().out.endswith(" MB removed\n")
     assert list(case.cache.iterdir()) == []
-    with pytest.raises(InputError, match="'remove' must be true or false"):
+    with pytest.raises(InputError, match="'remove'"):
         entry.run([cache, "remove=maybe"])
     with pytest.raises(InputError, match=r"^cache: 'null' is not a folder; expected auto or a"):
         entry.run(["cache=null"])

@@ -101,7 +101,7 @@ def test_other_formats_that_are_cut_short(tmp_path: Path) -> None:
 def test_what_is_no_file(path: Path) -> None:
     assert refused(path) == f"{path} is missing."
     path.mkdir()
-    assert refused(path) == f"{path} is a folder, expected a file; replace it, or {SKIP}."
+    assert refused(path) == f"{path} is not a regular file; replace it, or {SKIP}."
     path.rmdir()
     os.mkfifo(path)  # opening it would wait for ever
     assert "is not a regular file" in refused(path)
@@ -267,7 +267,7 @@ def test_lists(tmp_path: Path) -> None:
         read_names(path, "dataset.splits.train")
     path.unlink()
     path.mkdir()
-    with pytest.raises(InputError, match=r"^dataset.splits.train: .*train.txt is a folder"):
+    with pytest.raises(InputError, match=r"^dataset.splits.train: .*train.txt is not a regular"):
         read_names(path, "dataset.splits.train")
     with pytest.raises(InputError, match="is missing"):
         read_whole(tmp_path / "none")

@@ -8,7 +8,7 @@ import pytest
 from rgbt.checks import InputError
 from rgbt.config.compose import compose
 from rgbt.data.label_map import LabelMap
-from rgbt.evaluation.pseudo_labels import label_map_of
+from rgbt.evaluation.images import label_map_of
 
 TARGETS = ("road", "car")
 

@@ -27,7 +27,7 @@ def run(root: Path, **splits: str) -> int | None:
     node = OmegaConf.load(ROOT / "conf" / "dataset" / "mfnet.yaml")
     node.root = str(root)
     OmegaConf.update(node, "splits", splits)
-    return main.__wrapped__(OmegaConf.create({"dataset": node}))
+    return main.__wrapped__(OmegaConf.create({"dataset": node}), [])
 
 
 @pytest.mark.parametrize("layout", ["packed", "folders"])
@@ -214,7 +214,7 @@ def test_check_of_another_class_is_refused() -> None:
     node = {"_target_": "rgbt.data.label_map.LabelMap", "num_source": 1, "targets": ["a"]}
     config = OmegaConf.create({"dataset": {**node, "groups": {"a": [0]}}})
     with pytest.raises(InputError, match="LabelMap cannot be checked"):
-        main.__wrapped__(config)
+        main.__wrapped__(config, [])
 
 
 @pytest.mark.slow

@@ -14,10 +14,8 @@ from typing import Any
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from rgbt.checks import InputError, nearest
-from rgbt.config.command import composing
-from rgbt.config.completion import OF_HYDRA, SCRIPTS
+from rgbt.config.command import check_words, composing
 from rgbt.config.compose import check_keys, compose
-from rgbt.config.hydra_messages import check_words
 from rgbt.config.options import parse, readable_paths
 from rgbt.config.plain_command import COMMANDS, CommandGroup, PlainCommand
 from tests.docs.blocks import ROOT, PageError
@@ -137,6 +135,10 @@ def _check_targets(line: Line) -> None:
             raise PageError(line.place, f"make has no target '{word}'; {nearest(word, targets)}")
 
 
+OF_HYDRA = ("run", "check", "masks")
+"""Commands whose arguments are all overrides."""
+
+
 def check_command(words: Sequence[str]) -> None:
     """Refuse words behind ``rgbt`` that the program would refuse.
 
@@ -144,8 +146,6 @@ def check_command(words: Sequence[str]) -> None:
         InputError: an unknown command, option or key, or a value of a wrong type.
     """
     name, *rest = [without_runs(word) for word in words] or ["--help"]
-    if name == "--completion" and rest and rest[0] in SCRIPTS:
-        return
     if name in HELP:
         return
     if name not in COMMANDS:
@@ -210,7 +210,7 @@ def _check_overrides(words: Sequence[str], *, is_run: bool = False) -> None:
         config = compose(overrides)
         check_keys(config)
         if is_run and not PLACEHOLDER.search(" ".join(words)):
-            from rgbt.spec.specify import specify
+            from rgbt.runs.specify import specify
 
             specify(config, overrides)
     composed.add(key)

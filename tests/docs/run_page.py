@@ -17,10 +17,9 @@ from typing import Any
 
 import pytest
 
-from rgbt.config.completion import OF_HYDRA
 from rgbt.config.plain_command import COMMANDS
 from tests.docs.blocks import Block, Page, PageError
-from tests.docs.command_lines import FILES, HELP, SETUP
+from tests.docs.command_lines import FILES, HELP, OF_HYDRA, SETUP
 from tests.docs.printed import difference
 from tests.docs.reader_folder import expanded, export, forget_modules, write_titled
 from tests.docs.shell import Line, is_compound, lines_of, without_runs
@@ -133,7 +132,7 @@ class Reader:
 
     def _command(self, line: Line, shown: str) -> None:
         words = [expanded(self._with_run(word, line.place), self.folder) for word in line.words[1:]]
-        if not words or set(words) & {*HELP, "--completion", "--cfg"}:
+        if not words or set(words) & {*HELP, "--cfg"}:
             return
         name, *rest = words
         if self.quick and (name == "compare" or _starts_others(name, rest)):

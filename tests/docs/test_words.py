@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 import yaml
 
-from rgbt.config.completion import OF_HYDRA
 from rgbt.config.options import help_text
 from rgbt.config.plain_command import COMMANDS, CommandGroup, PlainCommand
 from tests.docs.blocks import INLINE_CODE, ROOT, Page, pages
+from tests.docs.command_lines import OF_HYDRA
 
 pytestmark = pytest.mark.docs
 

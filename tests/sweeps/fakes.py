@@ -10,6 +10,7 @@ from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NoReturn
 
 import numpy as np
@@ -17,9 +18,8 @@ import pytest
 
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
+from rgbt.runs.folder import Description, RunFolder, counts_name
 from rgbt.tracking.mlflow_store import NoTracking
-from rgbt.tracking.run_files import Description, counts_name
-from rgbt.tracking.run_folder import RunFolder
 from sweeps import attributes as names
 from sweeps.point import Point
 from sweeps.settings import Confirm, Objective, SweepSettings
@@ -28,7 +28,7 @@ from sweeps.space.space import parse_space
 from sweeps.worker import driver as drivers
 from sweeps.worker import trial_sources
 from sweeps.worker.driver import Driver
-from sweeps.worker.planner import PlannedPoint, PlannedRun
+from sweeps.worker.planner import PlannedPoint
 from sweeps.worker.run_store import RunStore
 from sweeps.worker.running_trial import RunningTrial
 from sweeps.worker.storage import open_study
@@ -68,10 +68,19 @@ def key_of(overrides: Sequence[str]) -> str:
 
 def plan_of(point: Point, steps: int = 4) -> PlannedPoint:
     """What `Planner.plan` makes, without a configuration."""
-    runs = tuple(PlannedRun(key_of(words), DATASET, words, steps) for words in point.runs())
+    runs: Any = tuple(
+        SimpleNamespace(
+            key=key_of(words),
+            overrides=words,
+            trainer=SimpleNamespace(max_steps=steps),
+            scale=SimpleNamespace(pixel_factor=1.0),
+        )
+        for words in point.runs()
+    )
     whole = [word for words in point.runs() for word in words] + [str(point.evaluations)]
     is_one = len(runs) == 1 and not point.evaluations
-    return PlannedPoint(point, runs[0].key if is_one else key_of(whole), runs)
+    fingerprints = {run.key: DATASET for run in runs}
+    return PlannedPoint(point, runs[0].key if is_one else key_of(whole), runs, fingerprints)
 
 
 def plans(count: int, **point: Any) -> list[PlannedPoint]:

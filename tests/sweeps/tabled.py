@@ -12,11 +12,10 @@ import numpy as np
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import Protocol, partition_name
 from sweeps.evaluation import ExtraEvaluation
-from sweeps.point import Point
+from sweeps.point import Outcome, Point
 from sweeps.table.cells import OWN_COUNTS, CellId
 from sweeps.table.scoring import ScoredTable, score
 from sweeps.table.table import Column, Row, Table
-from sweeps.worker.trial_sources import Outcome
 
 DAY = [[[2, 0], [0, 2]], [[1, 1], [0, 2]]]
 NIGHT = [[[2, 0], [2, 0]], [[2, 0], [0, 2]]]
@@ -53,7 +52,7 @@ def pairs_of(same: int, other: int, protocol: Protocol = "aligned") -> Counts:
 
 @dataclass(frozen=True)
 class FakeResult:
-    """Stands for `rgbt.tracking.run_result.RunResult`."""
+    """Stands for `rgbt.runs.result.RunResult`."""
 
     key: str
     by_path: Mapping[str, Counts]

@@ -49,13 +49,14 @@ def plant(runs_dir: Path, tags: dict[str, str] | None = None) -> None:
         row = () if masker == "masker=none" else (masker,)
         for seed, share in enumerate(shares):
             words = ("+experiment=baseline", *row, SMOKE, f"seed={seed}")
-            run = planner.plan_run((f"runs_dir={runs_dir}", *words))
+            run = planner.specify((f"runs_dir={runs_dir}", *words))
+            dataset = planner.fingerprint(run)
             folder = runs_dir / run.key
             folder.mkdir(parents=True)
             described = {"name": run.key, "tags": {"rgbt.seed": str(seed), **(tags or {})}}
             (folder / "run.json").write_text(json.dumps({**described, "params": {}}))
-            replace(accuracy(share, seed), dataset=run.dataset).save(folder / "counts_test.npz")
-            (folder / "result.json").write_text(json.dumps({"dataset": run.dataset}))
+            replace(accuracy(share, seed), dataset=dataset).save(folder / "counts_test.npz")
+            (folder / "result.json").write_text(json.dumps({"dataset": dataset}))
 
 
 @pytest.fixture
@@ -168,4 +169,4 @@ def test_words_that_do_not_fit(call: Call, place: Path) -> None:
         assert_one_sentence(err, told)
     code, _, err = call(claims, "table=my/planted", "runs_dir=nowhere")
     assert code == 2
-    assert_one_sentence(err, "nowhere does not exist")
+    assert_one_sentence(err, "runs_dir=nowhere: the folder does not exist")

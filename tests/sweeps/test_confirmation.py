@@ -15,8 +15,8 @@ import pytest
 
 import sweeps.candidates as choosing
 from rgbt.checks import InputError
+from rgbt.tables import TextTable
 from rgbt.tracking.mlflow_store import NoTracking
-from rgbt.tracking.tables import TextTable
 from sweeps import attributes as names
 from sweeps.candidates import Candidates, check_confirmable, chosen_overrides, score_file
 from sweeps.confirmation import confirm, preview_line

@@ -9,7 +9,7 @@ import pytest
 from rgbt.config.options import types_of
 from rgbt.consistency import Options as OfConsistency
 from rgbt.evaluate import Options as OfEvaluate
-from rgbt.evaluation.details import details_path as written_beside
+from rgbt.evaluation.segmentation import details_path as written_beside
 from sweeps.evaluation import ExtraEvaluation
 
 OPTIONS = {"rgbt.evaluate": OfEvaluate, "rgbt.consistency": OfConsistency}

@@ -216,7 +216,7 @@ def test_killed_command_is_resumed_by_the_same_command(
     # Only what was killed was begun twice; it went on from its checkpoint.
     assert sorted(starts) == [1, 1, 2]
     text = table_of(runs)
-    assert "'masker.sigma_div' must be a number from 0.001" in text
+    assert "'masker.sigma_div'" in text
 
     monkeypatch.syspath_prepend(tmp_path)
     assert call(entry, *words[3:])[0] == 1

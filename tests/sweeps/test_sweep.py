@@ -13,13 +13,12 @@ from omegaconf import open_dict
 import sweeps.sweep as sweeping
 from rgbt.checks import InputError, RunError
 from rgbt.config.compose import conf_dir, register_resolvers
-from sweeps.point import Point
+from sweeps.point import Outcome, Point
 from sweeps.search import Search
 from sweeps.settings import SweepSettings
 from sweeps.sweep import study_command, sweep
 from sweeps.worker import point_list
 from sweeps.worker.point_list import PointList
-from sweeps.worker.trial_sources import Outcome
 
 
 class RecordedCalls:

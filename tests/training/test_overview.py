@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import copy
 import re
+from dataclasses import replace as changed
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
 
-from rgbt.build.load_run import TrainedNetwork
-from rgbt.build.training_setup import TrainingSetup, set_up_training
+from rgbt.assembly.training_setup import TrainingSetup, set_up_training
 from rgbt.training.overview import announce_network, announce_training, network_line
 from tests.composed import specified
 
@@ -58,7 +58,7 @@ def test_an_evaluation_says_in_one_line_what_predicts(
     setup: TrainingSetup, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for step in (240, 0):
-        announce_network(TrainedNetwork(setup.session, step, Path("x"), "final.pth"))
+        announce_network(changed(setup.session, step=step, label="final.pth"))
     first, second = capsys.readouterr().err.splitlines()
     assert re.fullmatch(r"cpu, \d+ threads?, 32-true; .*; checkpoint of step 240", first)
     assert second.endswith("; final.pth")

@@ -2,25 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from rgbt.checks import InputError
-from rgbt.config.compose import compose
 from rgbt.run import main
-from rgbt.spec import request
-from rgbt.tracking.mlflow_store import NoTracking
-from rgbt.tracking.run_files import Description, read_description
-from rgbt.tracking.run_folder import RunFolder
-from rgbt.training import show
-from rgbt.training.show import describe_again
-from tests.commands import Call, Trained, assert_one_sentence, only_run, short, train, words_of
+from rgbt.runs.folder import Description, RunFolder, read_description
+from tests.commands import Call, Trained, only_run, short, train, words_of
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -44,160 +35,54 @@ def words(trained: Trained, data: Path, tmp_path: Path) -> list[str]:
     return words_of(data, tmp_path / "runs", *overrides)
 
 
+@pytest.mark.parametrize("more", [[], ["data.num_workers=1", "name=other"]])
 def test_a_finished_run_is_shown_without_torch_and_mlflow(
-    call: Call, words: list[str], tmp_path: Path
+    words: list[str], more: list[str]
 ) -> None:
-    code, first, err = call(main, *words)
-    assert code == 0, err
-    # A store that nobody serves: without its record, the run would be sent and MLflow imported.
-    tracked = [*words, "tracking=mlflow", "tracking.uri=http://127.0.0.1:9"]
-    assert call(main, *tracked)[0] == 0
-    record_as_sent(only_run(tmp_path / "runs"))
-    for each in (words, tracked):
-        done = subprocess.run(
-            [sys.executable, "-c", SCRIPT, *each], capture_output=True, text=True, cwd=ROOT
-        )
-        assert done.returncode == 0, done.stderr
-        assert "is already finished" in done.stderr
-        assert "cannot be used" not in done.stderr
-        assert done.stdout.splitlines()[:4] == first.splitlines()[:4]
+    command = [sys.executable, "-c", SCRIPT, *words, *more]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    assert "is already finished" in done.stderr
+    assert "mIoU" in done.stdout
 
 
-def record_as_sent(folder: Path) -> None:
-    """Let ``mlflow.json`` say that the store on port 9 has everything of the run."""
-    from rgbt.tracking.mlflow_inputs import inputs_digest
-    from rgbt.tracking.mlflow_upload import UploadState, _changed_files, _shown, write_upload_state
-    from rgbt.tracking.run_files import read_tables
-
-    run = RunFolder(folder)
-    known, tables = read_description(folder), read_tables(folder)
-    assert known is not None
-    sent = UploadState("http://127.0.0.1:9", "rgbt", None, "1", "f00", profile=True)
-    sent.steps = {line.kind: line.step for line in run.lines()}
-    sent.files = dict(_changed_files(run, sent, tables))
-    sent.shown = _shown(run, known, tables, "FINISHED")
-    sent.inputs = inputs_digest(folder)
-    write_upload_state(run, sent)
-
-
-def test_processes_that_were_started_together_do_not_show_a_run_each(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(show, "known_run", lambda *_: pytest.fail("looked for"))
-    monkeypatch.setenv("RANK", "1")
-    nothing: Any = None
-    assert not show.show_known(nothing, [], {})
-
-
-def test_a_request_is_noted_once_and_belongs_to_the_code(
-    call: Call, words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    specified: list[str] = []
-    from rgbt.spec import specify as module
-
-    real = module.specify
-
-    def specify(*given: Any, **more: Any) -> Any:
-        specified.append("")
-        return real(*given, **more)
-
-    monkeypatch.setattr(module, "specify", specify)
-
-    def shown(*more: str) -> bool:
-        """Whether the run is shown without its specification."""
-        specified.clear()
-        code, out, err = call(main, *words, *more)
-        assert code == 0, err
-        assert "mIoU" in out
-        assert "is already finished" in err
-        return not specified
-
-    assert [shown(), shown()] == [False, True]
-    (noted,) = (tmp_path / "runs" / request.FOLDER).glob("*.json")
-    assert json.loads(noted.read_text())["key"] == only_run(tmp_path / "runs").name
-    # A value outside the key, and a default that is typed, are other requests of the same run.
-    assert [shown("data.num_workers=1"), shown("data.num_workers=1")] == [False, True]
-    monkeypatch.setattr(request, "code", lambda: {"code": "another version of rgbt"})
-    assert [shown(), shown()] == [False, True]
-    noted.write_text("{")
-    code, _, err = call(main, *words)
-    assert code == 2
-    assert_one_sentence(err, f"{noted} is damaged")
-
-
-def test_a_request_of_a_removed_run_trains_it(
-    call: Call, words: list[str], data: Path, tmp_path: Path
-) -> None:
-    call(main, *words)
+def test_a_removed_run_is_trained(call: Call, words: list[str], data: Path, tmp_path: Path) -> None:
     shutil.rmtree(only_run(tmp_path / "runs"))
     code, _, err = train(call, data, tmp_path / "runs", "+experiment=crm", *short(1))
-    assert code == 0, err
-    assert "is already finished" not in err
+    assert (code, "is already finished" in err) == (0, False), err
     assert only_run(tmp_path / "runs")
 
 
-def test_a_known_run_is_compared_with_the_present_files(
+def test_a_finished_run_is_compared_with_the_present_files(
     call: Call, words: list[str], data: Path
 ) -> None:
-    call(main, *words)
     shutil.copy(data / "labels" / "00101D.png", data / "labels" / "00201D.png")
-    _, _, err = call(main, *words)
-    assert "this run was trained on other files of the data set" in err
+    assert "trained on other files of the data set" in call(main, *words)[2]
     shutil.rmtree(data)
     code, out, err = call(main, *words)
     assert (code, "mIoU" in out) == (0, True)
     assert "other files" not in err, "a result can be shown without its data"
 
 
-def test_a_run_with_an_upstream_run_is_requested_by_the_content_of_its_weights(
-    tmp_path: Path,
-) -> None:
-    weights = tmp_path / "weights.pt"
-    weights.write_bytes(b"one")
-    words = ["+experiment=mfnet", f"runs_dir={tmp_path}"]
-    plain = request.request_digest(compose(words))
-    assert plain == request.request_digest(compose(words))
-    digests = {plain, request.request_digest(compose([*words, "seed=1"]))}
-    digests.add(request.request_digest(compose([*words, f"model.weights={weights}"])))
-    weights.write_bytes(b"other")
-    digests.add(request.request_digest(compose([*words, f"model.weights={weights}"])))
-    upstream = [*words, "model.weights=experiment:rtfnet/best.pt"]
-    digests.add(request.request_digest(compose(upstream)))
-    digests.add(request.request_digest(compose([*upstream, "scale=paper", "dataset.root=/data"])))
-    assert len(digests) == 6
-    circle = compose([*words, "model.weights=experiment:mfnet/best.pt"])
-    with pytest.raises(InputError, match="cycle"):
-        request.request_digest(circle)
-    assert request.known_run(circle, ()) is None, "specify reports it"
-    assert request.known_run(compose([*words, "fresh=true"]), ()) is None
+def test_ignored_weights_are_reported(call: Call, words: list[str]) -> None:
+    _, _, err = call(main, *words, "model.weights=null", "pretrained=swin.pth")
+    assert "pretrained=swin.pth is ignored: the experiment crm does not use" in err
 
 
-def test_ignored_weights_are_reported(capsys: pytest.CaptureFixture[str]) -> None:
-    show.report_pretrained(None, False, "mfnet")
-    show.report_pretrained("swin.pth", True, "crm")
-    assert capsys.readouterr().err == ""
-    show.report_pretrained("swin.pth", False, "mfnet")
-    said = capsys.readouterr().err
-    assert "pretrained=swin.pth is ignored: the experiment mfnet does not use" in said
-
-
-@pytest.mark.parametrize(
-    ("group", "name"),
-    [("grbm", "grbm sigma_div=2 seed=0"), ("grbm sigma_div=2", "grbm sigma_div=2 seed=0")],
-)
 def test_a_finished_run_keeps_its_name_unless_the_new_one_says_more(
-    tmp_path: Path, group: str, name: str
+    call: Call, words: list[str], tmp_path: Path
 ) -> None:
-    folder = RunFolder(tmp_path)
-    folder.describe(Description(name, {"rgbt.group": "grbm sigma_div=2", "row": "a"}, {}))
-    typed = Description("seed=0 · a longer name than before", {"rgbt.group": group}, {})
-    describe_again(folder, NoTracking(), typed)
+    folder = RunFolder(only_run(tmp_path / "runs"))
+    known = read_description(folder.path)
+    assert known is not None
+    longer = {**known.tags, "rgbt.group": f"{known.tags['rgbt.group']} masker=none", "row": "a"}
+    folder.describe(Description("of a grid", longer, known.params))
+    call(main, *words)
     kept = read_description(folder.path)
     assert kept is not None
-    assert (kept.name, kept.tags["row"]) == (name, "a")
-
-    more = Description("lr=1 · grbm", {"rgbt.group": "grbm sigma_div=2 lr=1"}, {})
-    describe_again(folder, NoTracking(), more)
+    assert (kept.name, kept.tags["row"]) == ("of a grid", "a")
+    folder.describe(Description("short", {**longer, "rgbt.group": "crm"}, known.params))
+    call(main, *words)
     kept = read_description(folder.path)
     assert kept is not None
-    assert (kept.name, kept.tags["row"]) == ("lr=1 · grbm", "a")
+    assert (kept.name, kept.tags["row"]) == (known.name, "a")

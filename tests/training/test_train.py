@@ -9,9 +9,8 @@ from typing import Any, cast
 import pytest
 
 from rgbt.engine.checkpoint import State
+from rgbt.runs.folder import Description, RunFolder
 from rgbt.tracking.mlflow_store import NoTracking
-from rgbt.tracking.run_files import Description
-from rgbt.tracking.run_folder import RunFolder
 from rgbt.training.train import Run
 
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rgbt.build.training_setup import TrainingSetup
+from rgbt.assembly.training_setup import TrainingSetup
 from rgbt.checks import InputError
 from rgbt.config.component import build
 from rgbt.requirements import record_of
@@ -192,14 +192,15 @@ def test_images_of_the_target_keep_blocks_and_thermal() -> None:
 def test_training_takes_the_transform_of_each_domain(monkeypatch: pytest.MonkeyPatch) -> None:
     from types import SimpleNamespace
 
-    from rgbt.build import training_setup
+    from rgbt.assembly import training_setup
+    from rgbt.data import pairs
 
     taken: list[Any] = []
     monkeypatch.setattr(
         training_setup, "train_batches", lambda *given: taken.append(given[2]) or SimpleNamespace()
     )
     monkeypatch.setattr(training_setup, "_where_to_augment", lambda _: "loader")
-    monkeypatch.setattr(training_setup, "PairedBatches", lambda *_, **__: None)
+    monkeypatch.setattr(pairs, "PairedBatches", lambda *_, **__: None)
     transform = heatnet(drop_probability=1.0)
     spec = specified(("+experiment=heatnet_original",))
     session: Any = SimpleNamespace(
@@ -211,7 +212,7 @@ def test_training_takes_the_transform_of_each_domain(monkeypatch: pytest.MonkeyP
     )
     datasets: Any = {"source": None, "target": None}
     none: Any = None
-    setup = TrainingSetup(session, datasets, none, {}, {}, None, none, none)
+    setup = TrainingSetup(session, none, datasets, none, {}, {}, None, none, none)
     setup.batches(range(1))
     assert [each.drop_probability for each in taken] == [1.0, 0.0]
 

@@ -7,8 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from rgbt.evaluation.pair_images import write_images
-from rgbt.evaluation.pair_list import PairSource
+from rgbt.evaluation.pair_predictions import PairSource, write_images
 
 NAMES = ("00001N", "00000D")
 METHODS = ("a", "b")

@@ -15,9 +15,8 @@ from analysis.report.store import RunFiles
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.scores import summary
 from rgbt.randomness import numpy_generator
+from rgbt.runs.folder import Description, RunFolder, counts_name
 from rgbt.tracking.mlflow_store import MlflowTracking
-from rgbt.tracking.run_files import Description, counts_name
-from rgbt.tracking.run_folder import RunFolder
 from sweeps import attributes
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.rendering.claims import claims_markdown

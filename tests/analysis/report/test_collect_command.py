@@ -69,8 +69,8 @@ def test_command_prints_path_and_content_of_the_page(
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["resamples=many"], "'resamples' must be a whole number from 100 to 1000000, got"),
-        (["resamples=10"], "'resamples' must be a whole number from 100 to 1000000, got 10."),
+        (["resamples=many"], "'resamples'"),
+        (["resamples=10"], "'resamples'"),
         (["tracking.url=x"], "'tracking.url'"),
         (["tracking=none"], "made from an MLflow store"),
         ([], "there is no MLflow store"),

@@ -23,7 +23,7 @@ from analysis.report.store import RunFiles
 from analysis.report.views import table_views
 from analysis.uncertainty import Resampling, compare
 from rgbt.config.compose import available
-from rgbt.spec.corruption_names import row_name
+from rgbt.runs.naming import row_name
 from sweeps.table.load_table import PUBLISHED, load_table
 from tests.analysis.report.pages import report, run_entry, table_entry
 from tests.analysis.report.stores import counts_of

@@ -11,7 +11,7 @@ from analysis.statistics.collect import MeasurementSettings, collect
 from analysis.statistics.comparison import Resampling, comparison_grids
 from rgbt.checks import InputError
 from rgbt.metrics.metric import Regions
-from rgbt.tracking.tables import ABSENT
+from rgbt.tables import ABSENT
 from rgbt.types import Sample
 from tests.analysis.statistics.scenes import InMemory, made
 from tests.commands import Call

@@ -13,13 +13,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rgbt.build.training_setup import TrainingSetup, set_up_training
+from rgbt.assembly.training_setup import TrainingSetup, set_up_training
 from rgbt.config.compose import compose
 from rgbt.engine.checkpoint import State
 from rgbt.engine.trainer import Trainer
 from rgbt.randomness import generators_of_step
-from rgbt.spec.run_spec import RunSpec
-from rgbt.spec.specify import specify
+from rgbt.runs.run_spec import RunSpec
+from rgbt.runs.specify import specify
 from rgbt.types import Batch
 from tests.benchmarks.gpu.device import wait
 
@@ -136,7 +136,7 @@ class Training:
         """Train for some steps, in the project's own loop."""
         setup, session = self.setup, self.setup.session
         trainer = Trainer(
-            fabric=session.fabric,
+            fabric=setup.fabric,
             settings=session.trainer,
             scheme=setup.scheme,
             model=setup.model,
@@ -148,7 +148,7 @@ class Training:
             record=lambda step, values: self.recorded.append(dict(values)),
             validate=lambda step: 0.0,
         )
-        watched = Watched(batches, session.fabric.device, steps, synchronise)
+        watched = Watched(batches, session.device, steps, synchronise)
         try:
             trainer.fit(watched, self.state)
         except EnoughStepsError:
@@ -158,12 +158,12 @@ class Training:
 
 def loss_of(setup: TrainingSetup, batch: Any, index: int = 0) -> Tensor:
     """The sum of all parts of one step, after its backward passes; no optimizer steps."""
-    device = setup.session.fabric.device
+    device = setup.session.device
     generator_of = generators_of_step(0, index, device)
     total = torch.zeros((), device=device)
     for phase in setup.scheme.phases(batch, generator_of):
         loss = torch.stack(list(phase.parts.values())).sum()
-        setup.session.fabric.backward(loss)
+        setup.fabric.backward(loss)
         total = total + loss.detach()
     return total
 

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rgbt.build.training_setup import TrainingSetup
+from rgbt.assembly.training_setup import TrainingSetup
 from rgbt.config.compose import available
 from rgbt.data.loaders import eval_batches
 from rgbt.evaluation.prediction import Predictor
@@ -74,7 +74,7 @@ def compare(name: str, device: torch.device) -> dict[str, Any]:
     loaded = next(setups[0].batches(range(1, 2)))
     losses, norms, maps = [], [], []
     for setup in setups:
-        draw_on_cpu(setup.scheme, setup.session.fabric.device)
+        draw_on_cpu(setup.scheme, setup.session.device)
         loss, norm = one_step(setup, loaded)
         losses.append(loss)
         norms.append(norm)
@@ -94,7 +94,7 @@ def compare(name: str, device: torch.device) -> dict[str, Any]:
 
 def one_step(setup: TrainingSetup, loaded: Any) -> tuple[float, float]:
     """Loss and norm of the gradient of the network, of one training step without its update."""
-    device = setup.session.fabric.device
+    device = setup.session.device
     model = setup.model.train()
 
     def generator_of(purpose: str) -> torch.Generator:
@@ -103,7 +103,7 @@ def one_step(setup: TrainingSetup, loaded: Any) -> tuple[float, float]:
     total = torch.zeros((), device=device)
     for phase in setup.scheme.phases(loaded.to(device), generator_of):
         loss = torch.stack(list(phase.parts.values())).sum()
-        setup.session.fabric.backward(loss)
+        setup.fabric.backward(loss)
         total += loss.detach()
     gradients = [each.grad for each in model.parameters() if each.grad is not None]
     return float(total), float(torch.stack([each.norm() for each in gradients]).norm())
@@ -114,7 +114,7 @@ def classes(setup: TrainingSetup) -> list[Tensor]:
     session = setup.session
     predictor = Predictor(session, setup.model, EvaluationRequest(split="test"))
     batches = eval_batches(session.dataset, "test", session.transform, session.loading)
-    return [predictor.classes(batch.to(session.fabric.device)).cpu() for batch in batches]
+    return [predictor.classes(batch.to(session.device)).cpu() for batch in batches]
 
 
 def draw_on_cpu(scheme: Any, device: torch.device) -> None:

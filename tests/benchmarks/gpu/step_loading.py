@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from statistics import median
 
-from rgbt.build.training_setup import TrainingSetup
+from rgbt.assembly.training_setup import TrainingSetup
 from rgbt.engine.trainer import WAIT_SHARE
 from rgbt.evaluation.prediction import decode_ahead
 from rgbt.runtime.resources import is_out_of_memory
@@ -58,7 +58,7 @@ def _words(task: Task, root: Path, size: int, workers: str) -> list[str]:
 
 def _loader_alone(setup: TrainingSetup, size: int, steps: int) -> float:
     """Images per second that are read, moved and augmented."""
-    device = setup.session.fabric.device
+    device = setup.session.device
     batches = setup.batches(range(steps + 2))
     for _ in range(2):  # processes start, memory is allocated
         next(batches).to(device)

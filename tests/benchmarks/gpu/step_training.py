@@ -18,8 +18,8 @@ from typing import Any
 
 import torch
 
-from rgbt.build.training_setup import TrainingSetup
-from rgbt.evaluation.flops import count_flops
+from rgbt.assembly.training_setup import TrainingSetup
+from rgbt.evaluation.profile import count_flops
 from rgbt.runtime.resources import is_out_of_memory
 from tests.benchmarks.gpu.device import (
     arithmetic,
@@ -193,7 +193,7 @@ def flops_of(setup: TrainingSetup, image: Any) -> float:
     """Operations of forward and backward pass of one image, as `rgbt profile` counts them."""
     setup.model.train()
     setup.model.zero_grad(set_to_none=True)
-    total = float(count_flops(lambda: loss_of(setup, image)).total)
+    total = float(count_flops(lambda: loss_of(setup, image)))
     setup.model.zero_grad(set_to_none=True)
     return total
 

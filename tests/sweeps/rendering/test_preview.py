@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+from sweeps.point import Outcome
 from sweeps.rendering.preview import cells_grid, summary
 from sweeps.table.request import TableRequest
 from sweeps.table.table import Column, Row
-from sweeps.worker.trial_sources import Outcome
 from tests.sweeps.tabled import table
 
 FRAMES = (

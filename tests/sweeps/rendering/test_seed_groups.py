@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from rgbt.tracking.run_result import RunResult
-from sweeps.point import Point
+from rgbt.runs.result import RunResult
+from sweeps.point import Outcome, Point
 from sweeps.rendering.seed_groups import configuration, group_grid, unfinished_grid
-from sweeps.worker.trial_sources import Outcome
 from tests.sweeps.fakes import finish
 
 

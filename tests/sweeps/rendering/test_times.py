@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from rgbt.checks import InputError
-from rgbt.tracking.run_folder import RunFolder
-from rgbt.tracking.run_result import RunResult
+from rgbt.runs.folder import RunFolder
+from rgbt.runs.result import RunResult
 from sweeps.rendering.times import time_line, upstream_line
 
 
@@ -30,7 +30,7 @@ def test_time_line_without_finished_runs_is_empty(tmp_path: Path) -> None:
 
 @dataclass(frozen=True)
 class Spec:
-    """Stands for `rgbt.spec.run_spec.RunSpec`."""
+    """Stands for `rgbt.runs.run_spec.RunSpec`."""
 
     name: str
     folder: Path

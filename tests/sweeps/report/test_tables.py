@@ -15,7 +15,7 @@ from optuna.distributions import BaseDistribution, CategoricalDistribution, Floa
 from optuna.trial import TrialState, create_trial
 from rich.console import Console
 
-from rgbt.tracking.terminal import rich_table
+from rgbt.terminal import rich_table
 from sweeps import attributes
 from sweeps.report.study_data import importances, pruning_savings, read, short_names
 from sweeps.report.tables import (

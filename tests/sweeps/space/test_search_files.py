@@ -9,7 +9,7 @@ import pytest
 from omegaconf import DictConfig
 
 from rgbt.config.compose import conf_dir, flatten, register_resolvers
-from rgbt.spec.specify import specify
+from rgbt.runs.specify import specify
 from sweeps.settings import read_settings
 from sweeps.space.samplers import build_pruner, build_sampler
 from sweeps.space.space import Choice, Parameter, as_overrides, parse_space, plain_space

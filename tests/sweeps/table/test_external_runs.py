@@ -19,11 +19,11 @@ from rgbt import consistency, evaluate, predict
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import tc
-from rgbt.tracking.run_result import RunResult
+from rgbt.runs.result import RunResult
+from sweeps.point import Outcome, Point
 from sweeps.table import external_runs
-from sweeps.table.cells import CellRun
 from sweeps.table.external import external_rows
-from sweeps.table.external_runs import ExternalRun, check_external, run_external
+from sweeps.table.external_runs import check_external, run_external
 from sweeps.table.load_table import load_table
 from sweeps.table.scoring import score
 from sweeps.table.table import Column, Row, Table
@@ -88,12 +88,12 @@ def predictions(data: Path, tmp_path: Path) -> Path:
     return folder
 
 
-Runs = Callable[..., dict[str, CellRun]]
+Runs = Callable[..., dict[str, Outcome]]
 
 
 @pytest.fixture
 def runs_of(data: Path, tmp_path: Path) -> Runs:
-    def run(*words: str, table: Table = TABLE, **options: Any) -> dict[str, CellRun]:
+    def run(*words: str, table: Table = TABLE, **options: Any) -> dict[str, Outcome]:
         place = ("dataset=mfnet", f"dataset.root={data}", "data.num_workers=0")
         rows, extra = external_rows([*place, *SMALL, *words], table)
         settings: dict[str, Any] = {"scale": "demo", "form": "paper", "extra": extra}
@@ -126,10 +126,10 @@ def test_predictions_have_the_counts_of_rgbt_score(
         found = result.counts(path)
         assert np.array_equal(found.counts, expected.counts)
         assert (found.dataset, found.partition) == (expected.dataset, file)
-        with pytest.raises(InputError, match="needs the network: predictions of a folder are of"):
-            result.counts(f"evaluations/table_default_{regions.replace(' ', '-')}_rgb_removed.npz")
-        with pytest.raises(InputError, match="needs predictions of both frames and pairs.json"):
-            result.counts("evaluations/consistency_aligned_test.npz")
+        other = f"evaluations/table_default_{regions.replace(' ', '-')}_rgb_removed.npz"
+        assert "needs the network: predictions of a folder are of" in run.missing[other]
+        pairs = "evaluations/consistency_aligned_test.npz"
+        assert "needs predictions of both frames and pairs.json" in run.missing[pairs]
     assert [command[0] for command in commands] == ["analysis.score"] * 3
 
 
@@ -146,7 +146,10 @@ def test_weights_have_the_counts_of_the_run_that_trained_them(
     assert without.partition == expected.partition == "ring5"
     pairs = found.counts("evaluations/consistency_aligned_test.npz")
     scored = score(
-        "my/1", TABLE, {("MFNet", 0): ExternalRun("finished", "", [found])}, scale="demo"
+        "my/1",
+        TABLE,
+        {("MFNet", 0): Outcome(Point("MFNet", ()), "finished", results=(found,))},
+        scale="demo",
     )
     mean = 100 * tc(pairs.by_region(), "released").mean()
     assert scored.cells["MFNet", "TC"].mean == pytest.approx(mean)
@@ -359,7 +362,7 @@ def test_published_methods_stand_beside_ours_with_their_known_counts(
     assert code == 0, err
     ours = RunResult(only_run(tmp_path / "own"))
     assert ours.counts().dataset == network.dataset
-    cells: dict[tuple[str, int], CellRun] = {(label, 0): run for label, run in runs.items()}
+    cells: dict[tuple[str, int], Outcome] = {(label, 0): run for label, run in runs.items()}
     scored = score("my/1", table, {**cells, ("Ours", 0): OurRun([ours])}, scale="demo")
     for row in table.rows:
         for column in table.columns:

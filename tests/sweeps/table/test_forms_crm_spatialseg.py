@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from rgbt.spec.run_spec import RunSpec
+from rgbt.runs.run_spec import RunSpec
 from sweeps.table.load_table import load_table
 from sweeps.table.table import Form, Row, Table
 from sweeps.worker.planner import specify_run

@@ -10,7 +10,7 @@ from typing import Any, get_args
 import pytest
 
 from rgbt.config.compose import flatten
-from rgbt.spec.run_spec import RunSpec
+from rgbt.runs.run_spec import RunSpec
 from sweeps.table.efficiency import million_parameters
 from sweeps.table.load_table import load_table, table_names
 from sweeps.table.request import TableRequest

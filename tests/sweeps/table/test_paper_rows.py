@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from rgbt.config.component import build
-from rgbt.spec.specify import specify
+from rgbt.runs.specify import specify
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.table.load_table import load_table, table_names
 from sweeps.table.request import TableRequest

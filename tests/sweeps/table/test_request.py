@@ -6,10 +6,10 @@ import pytest
 
 from rgbt.checks import InputError
 from sweeps.evaluation import ExtraEvaluation
+from sweeps.point import Outcome
 from sweeps.table.make_request import TableWords, make_request, read_named
 from sweeps.table.request import TableRequest, seeds_of
 from sweeps.table.table import Column, Row
-from sweeps.worker.trial_sources import Outcome
 from tests.sweeps.tabled import table
 
 COLUMNS = (

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from rgbt.metrics.counts import Counts
-from sweeps.worker.trial_sources import Outcome
+from sweeps.point import Outcome
 from tests.sweeps.tabled import counts_of, outcome
 
 IMAGES, PIXELS = 40, 400

@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from rgbt.metrics.counts import Counts
-from rgbt.tracking.run_files import counts_name
-from sweeps.point import Point
-from sweeps.worker.trial_sources import Outcome, State
+from rgbt.runs.folder import counts_name
+from sweeps.point import Outcome, Point, State
 from tests.sweeps.fakes import DATASET, finish
 from tests.sweeps.tabled import outcome
 

@@ -13,7 +13,7 @@ from analysis.uncertainty import Resampling
 from analysis.uncertainty.contrasts import Evidence
 from analysis.uncertainty.verdicts import AnyTime, decide
 from rgbt.checks import InputError
-from sweeps.point import Point
+from sweeps.point import Outcome, Point
 from sweeps.table.cells import OWN_COUNTS
 from sweeps.verdicts.best_point import (
     ERROR_RATE,
@@ -24,7 +24,6 @@ from sweeps.verdicts.best_point import (
     level_of,
 )
 from sweeps.verdicts.judge import CellRunId
-from sweeps.worker.trial_sources import Outcome
 from tests.sweeps.verdicts.planted import planted_outcome
 
 POINT = Point("p", ())

@@ -9,10 +9,10 @@ import pytest
 
 from analysis.uncertainty.contrasts import FIXED
 from analysis.uncertainty.verdicts import AnyTime, FixedSeeds
+from sweeps.point import Outcome
 from sweeps.table.claim import Claim
 from sweeps.table.table import Column, Row, Table
 from sweeps.verdicts.judge import CellRunId, JudgedClaim, TableJudge
-from sweeps.worker.trial_sources import Outcome
 from tests.sweeps.tabled import failed, outcome, table
 from tests.sweeps.verdicts.accuracies import accuracy, planted
 

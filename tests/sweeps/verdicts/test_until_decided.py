@@ -9,13 +9,12 @@ from typing import Any
 import pytest
 
 from analysis.uncertainty.verdicts import AnyTime
-from sweeps.point import Point
+from sweeps.point import Outcome, Point
 from sweeps.table.claim import Claim
 from sweeps.table.request import TableRequest, seed_of
 from sweeps.table.table import Row
 from sweeps.verdicts.judge import TableJudge
 from sweeps.verdicts.until_decided import START, PairedSeeds, SeedsUntilDecided
-from sweeps.worker.trial_sources import Outcome
 from tests.sweeps.tabled import table
 from tests.sweeps.verdicts.planted import in_state, planted_outcome
 

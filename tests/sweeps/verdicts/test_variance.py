@@ -9,7 +9,7 @@ import pytest
 
 from rgbt.checks import InputError
 from rgbt.config.compose import compose
-from rgbt.spec.specify import specify
+from rgbt.runs.specify import specify
 from sweeps.rendering.variance import variance_csv, variance_grids
 from sweeps.table.check_table import check_table
 from sweeps.table.load_table import STUDIES, load_table, study_names

@@ -11,10 +11,9 @@ from typing import Any
 import optuna
 import pytest
 
-from rgbt.spec.naming import TAGS
+from rgbt.runs.folder import Description, RunFolder, read_description
+from rgbt.runs.naming import TAGS
 from rgbt.tracking.mlflow_store import NoTracking
-from rgbt.tracking.run_files import Description, read_description
-from rgbt.tracking.run_folder import RunFolder
 from sweeps import attributes as names
 from sweeps.settings import Objective
 from sweeps.worker import driver as drivers

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from rgbt.checks import InputError
-from rgbt.spec.naming import VARIED
-from rgbt.tracking.provenance import code
-from rgbt.tracking.run_result import RunResult
-from sweeps.point import COLOUR, Point, colour
+from rgbt.runs.naming import VARIED
+from rgbt.runs.provenance import code
+from rgbt.runs.result import RunResult
+from sweeps.point import COLOUR, Outcome, Point, colour
 from sweeps.worker import driver as drivers
 from sweeps.worker import point_list
 from sweeps.worker.planner import PlannedPoint
@@ -26,7 +26,6 @@ from sweeps.worker.point_list import (
     run_points,
 )
 from sweeps.worker.run_store import RunStore
-from sweeps.worker.trial_sources import Outcome
 from tests.sweeps.fakes import (
     FakeExecutor,
     FakePlanner,

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from rgbt.tracking.run_folder import RunFolder
+from rgbt.runs.folder import RunFolder
 from sweeps.worker.run_monitor import (
     MetricsReader,
     failure_reason,

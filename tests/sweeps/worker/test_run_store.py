@@ -10,11 +10,10 @@ from typing import Any
 import pytest
 
 from rgbt.checks import RunError
+from rgbt.runs.folder import RunFolder, read_result
+from rgbt.runs.result import RunResult
 from rgbt.tracking.mlflow_store import MlflowTracking, NoTracking
 from rgbt.tracking.mlflow_upload import read_upload_state
-from rgbt.tracking.run_files import read_result
-from rgbt.tracking.run_folder import RunFolder
-from rgbt.tracking.run_result import RunResult
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.worker.run_store import FETCHED, RunStore
 from tests.sweeps.fakes import DATASET, counts, finish

@@ -8,10 +8,9 @@ from typing import Any
 
 import pytest
 
+from rgbt.runs.folder import RunFolder, read_description
+from rgbt.runs.result import RunResult
 from rgbt.tracking.mlflow_store import NoTracking
-from rgbt.tracking.run_files import read_description
-from rgbt.tracking.run_folder import RunFolder
-from rgbt.tracking.run_result import RunResult
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Point
 from sweeps.worker import running_trial as works

@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 from optuna.distributions import CategoricalDistribution
 
-from rgbt.spec.naming import VARIED
-from rgbt.tracking.run_folder import MetricLine
-from rgbt.tracking.run_result import RunResult
+from rgbt.runs.folder import MetricLine
+from rgbt.runs.naming import VARIED
+from rgbt.runs.result import RunResult
 from sweeps import attributes as names
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import COLOUR, Point, colour
@@ -118,7 +118,7 @@ def test_finished_runs_require_all_runs_and_evaluations(tmp_path: Path) -> None:
     assert known(plan, runs) is None
     for run in plan.runs:
         (tmp_path / run.key / "evaluations").mkdir()
-        found = runs.find(run.key, run.dataset)
+        found = runs.find(run.key, plan.fingerprints[run.key])
         assert found is not None
         shutil.copyfile(found.folder / "counts_test.npz", found.folder / ring.path)
     both = known(plan, runs)

@@ -1,0 +1,169 @@
+"""Load a trained network from a run folder, a file of weights or an exported file."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rgbt.assembly.session import Session, names_key, open_session
+from rgbt.checks import InputError, check_choice
+from rgbt.config.compose import compose
+from rgbt.config.stored_config import check_targets, checkouts, read_settings, settings_of
+from rgbt.engine.checkpoint import load_checkpoint, restore_weights, step_of
+from rgbt.files.budgets import check_links
+from rgbt.files.yaml_files import parse_yaml
+from rgbt.metrics.counts import Counts
+from rgbt.runs.folder import find_run, read_marker, read_provenance
+from rgbt.runs.source_code import code_of
+from rgbt.runs.specify import CHECKOUT, load_spec, specify
+from rgbt.terminal import warn
+
+if TYPE_CHECKING:  # few commands map classes
+    from rgbt.data.label_map import LabelMap
+
+CHECKPOINTS = ("best", "last")
+
+
+def trusted_settings(
+    folder: Path, trust: Collection[str] = (), overrides: Sequence[str] = ()
+) -> dict[str, Any]:
+    """The configuration of a run, whose objects may be built; InputError if not trusted.
+
+    A checkout that `overrides` name instead of the stored one is trusted.
+    """
+    check_links(folder)
+    settings = read_settings(folder / "config.yaml")
+    typed = [word.partition("=")[2] for word in overrides if word.startswith(f"{CHECKOUT}=")]
+    if typed and CHECKOUT in checkouts(settings):
+        named = str(parse_yaml(typed[-1], CHECKOUT))
+        settings["model"]["checkout"] = named
+        trust = (*trust, str(Path(named).expanduser().resolve()))
+    check_targets(settings, trust, str(folder / "config.yaml"))
+    return settings
+
+
+def open_network(
+    source: str | Path,
+    runs_dir: Path,
+    overrides: Sequence[str],
+    checkpoint: str = "best",
+    label_map: LabelMap | None = None,
+    trust: Collection[str] = (),
+) -> Session:
+    """A trained network: of a run, of a file of `rgbt export`, or of a file of weights.
+
+    `source` is a folder, config key or MLflow run id; or, as a path, an ONNX file, which names its
+    data set and settings. "": the weights are those of `model.weights` in the configuration of
+    `overrides` at scale=paper. Evaluations of files are written below `runs_dir` by default.
+
+    Raises:
+        InputError: as `open_run`; no weights, or a file that does not hold all of them.
+    """
+    if source and isinstance(source, str):
+        return open_run(find_run(source, runs_dir), overrides, checkpoint, label_map, trust)
+    if checkpoint != "best":
+        raise InputError(f"checkpoint={checkpoint} requires run=...")
+    if isinstance(source, Path):
+        from rgbt.exported.onnx_network import ExportedNetwork  # few networks are exported
+
+        network = ExportedNetwork.read(source)
+        made = network.description
+        settings = settings_of(made.settings, str(source))
+        check_targets(settings, trust, str(source))
+        session = open_session(load_spec(settings, overrides), label_map, network=network)
+        if label_map is None:
+            _check_classes(session, made.classes, source)
+        path, name, step = source, source.stem, made.step
+    else:
+        config = compose(["scale=paper", f"runs_dir={runs_dir}", *overrides])
+        if config.model.get("weights") is None:
+            raise InputError("run: missing; name a run=..., or a network and model.weights=...")
+        spec = specify(config)
+        session = open_session(spec, label_map)
+        assert spec.weights_path is not None, "model.weights has a value"
+        if session.weights is not None and session.weights.fresh:
+            raise InputError(
+                f"model.weights: {session.weights.sentence()}; the other parameters of the network "
+                "would be random."
+            )
+        path, name, step = spec.weights_path, spec.key, 0
+    # Copies of a data set in other folders may hold other images.
+    folder = runs_dir / "evaluations" / f"{name}-{session.dataset.fingerprint()[:8]}"
+    return replace(session, step=step, evaluations=folder, label=path.name)
+
+
+def open_run(
+    folder: Path,
+    overrides: Sequence[str],
+    checkpoint: str = "best",
+    label_map: LabelMap | None = None,
+    trust: Collection[str] = (),
+) -> Session:
+    """The network of a run with its weights.
+
+    Args:
+        folder: the run folder.
+        overrides: of its configuration, see `rgbt.runs.specify.load_spec`.
+        checkpoint: "best" by the selection split, or "last".
+        label_map: from the classes it was trained with to those of the data set, where they differ.
+        trust: modules that its configuration may name (`rgbt.config.stored_config`).
+
+    Raises:
+        InputError: a target not trusted, overrides that do not fit, no checkpoint, other classes.
+    """
+    trained_with = trusted_settings(folder, trust, overrides)
+    spec = load_spec(trained_with, overrides)
+    _warn_of_other_code(folder, trained_with)
+    check_choice("checkpoint", checkpoint, CHECKPOINTS)
+    weights = folder / f"{checkpoint}.pt"
+    if not weights.is_file():
+        raise InputError(f"{folder} has no {weights.name}; rerun its command to resume it.")
+    payload = load_checkpoint(weights)
+    session = open_session(spec, label_map)
+    counts = sorted(folder.glob("counts_*.npz"))
+    if counts and label_map is None:
+        _check_classes(session, Counts.load(counts[0]).classes, folder)
+    restore_weights(session.model, payload["model"], weights)
+    if trained_with["dataset"].get("name") == spec.dataset.plain.get("name"):
+        _warn_of_other_splits(folder, session)
+    step = step_of(payload, weights)
+    return replace(session, step=step, evaluations=folder / "evaluations", label=spec.name)
+
+
+def _check_classes(session: Session, trained: tuple[str, ...], source: Path) -> None:
+    if trained != tuple(session.dataset.classes):
+        raise InputError(
+            f"{source} was trained with the classes {', '.join(trained)}, but "
+            f"{session.dataset.name} has {', '.join(session.dataset.classes)}. `rgbt predict` can "
+            "map classes with label_map=..."
+        )
+
+
+def _warn_of_other_code(folder: Path, trained_with: Mapping[str, Any]) -> None:
+    """Warn where the user's own code is not the code that the run was trained with."""
+    now = code_of(trained_with)
+    entries = read_provenance(folder / "provenance.json") if now else []
+    before = entries[-1].get("own_code") if entries else None
+    if before is not None and before != now:
+        modules = sorted(name for name in {*before, *now} if before.get(name) != now.get(name))
+        warn(
+            f"{', '.join(modules)} changed after {folder.name} was trained, so the results will "
+            "differ from those of the run. Restore the code, or train again."
+        )
+
+
+def _warn_of_other_splits(folder: Path, session: Session) -> None:
+    """Warn where the data set that a run was trained on has other splits now."""
+    if session.spec.dataset.plain.get("name") is None:
+        return
+    try:
+        now, before = names_key(session), read_marker(folder)
+    except (InputError, OSError):
+        return  # nothing to compare with
+    if before is not None and now != before["names"]:
+        warn(
+            f"the splits of {session.dataset.name} ({session.dataset.root}) are not those of "
+            f"{folder.name}, so training images may be among the evaluated images."
+        )

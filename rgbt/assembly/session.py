@@ -1,0 +1,210 @@
+"""Build the objects that every command needs from the specification of a run."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from omegaconf import OmegaConf
+from torch import nn
+
+from rgbt.assembly.contracts import check_dataset, check_requirements, watch_model
+from rgbt.checks import InputError
+from rgbt.config.compose import compose
+from rgbt.config.stored_config import read_settings
+from rgbt.data.cache.dataset import cached_dataset
+from rgbt.data.domains import Domains
+from rgbt.data.loader_settings import LoaderSettings
+from rgbt.dataset import LabelledDataset
+from rgbt.engine.allocator import keep_memory
+from rgbt.engine.device import autocast, choose_device
+from rgbt.engine.network_settings import place
+from rgbt.engine.prediction import Prediction
+from rgbt.engine.settings import TrainerSettings
+from rgbt.engine.threads import fix_threads
+from rgbt.metrics.metric import Regions
+from rgbt.randomness import derive
+from rgbt.runs.run_spec import WEIGHTS, RunSpec
+from rgbt.terminal import info
+from rgbt.transforms.view_sets import ViewSets
+
+if TYPE_CHECKING:  # most runs start at random, and few map classes
+    from rgbt.checkpoints.report import Report
+    from rgbt.data.label_map import LabelMap
+
+
+@dataclass(frozen=True)
+class Session:
+    """What every command needs, built once.
+
+    Attributes:
+        regions: partition of the image and the rule for absent classes.
+        consistency: virtual views that TC and CA are measured on, if any.
+        model: the network, on the device, not wrapped.
+        weights: what it took from a file, None where it is random.
+        step: the optimiser step of trained weights; 0 where none is known.
+        evaluations: folder where evaluations of trained weights are written by default.
+        label: name of the trained network in tables.
+    """
+
+    spec: RunSpec
+    dataset: LabelledDataset
+    domains: Domains
+    transform: Any
+    loading: LoaderSettings
+    regions: Regions
+    prediction: Prediction
+    consistency: ViewSets
+    trainer: TrainerSettings
+    device: torch.device
+    model: nn.Module
+    weights: Report | None
+    step: int = 0
+    evaluations: Path = Path()
+    label: str = ""
+
+    def autocast(self) -> AbstractContextManager[Any]:
+        """Context of a forward pass at the precision of the run."""
+        return autocast(self.device, self.trainer.precision)
+
+    @property
+    def selection_split(self) -> str | None:
+        """The split that is evaluated during training.
+
+        None where the data set has no image of it and the last checkpoint is tested.
+        """
+        split = self.trainer.selection_split
+        is_needed = self.trainer.tested == "best" or self.dataset.has(split)
+        return split if is_needed else None
+
+    def read_splits(self) -> tuple[str, ...]:
+        """Every split that the run reads: of the training, of the selection if any, of the test."""
+        trained = (domain.split for domain in self.domains.named.values())
+        return tuple(dict.fromkeys(filter(None, (*trained, self.selection_split, "test"))))
+
+
+def open_session(
+    spec: RunSpec,
+    label_map: LabelMap | None = None,
+    *,
+    load_weights: bool = True,
+    network: nn.Module | None = None,
+    device: torch.device | None = None,
+) -> Session:
+    """Build data set, transform and network; nothing is trained or evaluated yet.
+
+    Weights are drawn from (seed, "weights") without touching the global generator; those that
+    `model.weights` names replace them.
+
+    Args:
+        spec: the run.
+        label_map: from the classes of the network to those of the data set, where they differ.
+        load_weights: False: `model.weights` is left out, because an upstream run is not finished.
+        network: used as it is; None: it is built from the settings.
+        device: where the network is placed; None: `choose_device` of the settings.
+
+    Raises:
+        InputError: settings that do not fit each other, the machine or the file of weights.
+    """
+    keep_memory()
+    fix_threads(spec.trainer.threads)
+    trainer = spec.trainer
+    device = device or choose_device(trainer)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(derive(spec.drawn.weights, "weights"))
+        model: nn.Module = spec.model.build() if network is None else network
+    files: LabelledDataset = spec.dataset.build()
+    check_dataset(files)
+    dataset = cached_dataset(files, spec.data.cache, num_threads=len(os.sched_getaffinity(0)))
+    num_classes = spec.model.values.get("num_classes", dataset.num_classes)
+    if label_map is not None:
+        label_map.check(num_classes, tuple(dataset.classes), dataset.name)
+    elif num_classes != dataset.num_classes:
+        raise InputError(
+            f"model.num_classes is {num_classes} but {dataset.name} has {dataset.num_classes} "
+            "classes; `rgbt predict` can map classes with label_map=..."
+        )
+    watch_model(model, num_classes)
+    check_requirements({"prediction": spec.prediction, "model": model})
+    weights = start_from_weights(model, spec) if load_weights and network is None else None
+    return Session(
+        spec=spec,
+        dataset=dataset,
+        domains=spec.domains,
+        transform=spec.transform.build(),
+        loading=spec.data,
+        regions=spec.metric.build(),
+        prediction=spec.prediction,
+        consistency=spec.consistency.build(),
+        trainer=trainer,
+        device=device,
+        model=place(model, device, trainer),
+        weights=weights,
+    )
+
+
+def start_from_weights(model: nn.Module, spec: RunSpec) -> Report | None:
+    """Load the weights that `model.weights` names and report this on stderr; None without weights.
+
+    A second line warns if the network has other inputs or settings than the weights were trained
+    with, as far as the file or its layout tells.
+
+    Raises:
+        InputError: the file does not fit, or `model.fresh` without a file.
+    """
+    source, fresh = spec.weights_path, spec.fresh_parts
+    if source is None:
+        if fresh:
+            raise InputError("model.fresh has no effect without model.weights.")
+        return None
+    from rgbt.checkpoints.load import load_weights  # most runs start at random
+
+    dependency = spec.dependency(WEIGHTS)
+    is_common = dependency is not None and dependency.is_common
+    report = load_weights(model, source, fresh, other_classes=is_common)
+    info(report.sentence())
+    node, facts = spec.model.plain, report.facts
+    others = differences(node, facts.convention)
+    noted, own = facts.inputs, node.get("inputs")
+    beside = source.parent / "config.yaml"  # of a checkpoint of a run
+    if noted is None and facts.layout == "own" and beside.is_file():
+        noted = read_settings(beside).get("model", {}).get("inputs")
+    if not others and None not in (noted, own) and noted != own:
+        others.append("other inputs")
+    if others:
+        info(
+            f"{source} was trained with {' '.join(others)}, but this network has other settings: "
+            "its scores will differ from those of the trained network."
+        )
+    return report
+
+
+def differences(node: Mapping[str, Any], convention: Iterable[str]) -> list[str]:
+    """Which overrides, such as "model/inputs=unit", would change the network of a `node`."""
+    return [override for override in convention if not _holds(node, override)]
+
+
+def _holds(node: Mapping[str, Any], override: str) -> bool:
+    key, _, text = override.partition("=")
+    if key == "model/inputs":
+        inputs = OmegaConf.to_container(compose([override]).model.inputs, resolve=True)
+        return bool(node["inputs"] == inputs)
+    try:
+        value = json.loads(text)
+    except json.JSONDecodeError:
+        value = text
+    return bool(node.get(key.removeprefix("model."), value) == value)
+
+
+def names_key(session: Session) -> str:
+    """SHA-256 over the names of the training splits and of the test split."""
+    domains = (domain.split for domain in session.domains.named.values())
+    lists = {split: session.dataset.names(split) for split in (*domains, "test")}
+    return hashlib.sha256(json.dumps(lists).encode()).hexdigest()

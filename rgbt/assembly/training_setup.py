@@ -1,0 +1,324 @@
+"""Build and check the objects of a training before anything is written."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, Literal
+
+import torch
+from lightning_fabric import Fabric
+from torch import nn
+
+from rgbt.assembly.contracts import (
+    CheckedLoss,
+    check_dataset,
+    check_part,
+    check_regions,
+    check_requirements,
+    is_own,
+)
+from rgbt.assembly.session import Session, open_session
+from rgbt.checks import InputError
+from rgbt.config.stored_config import EXTERNAL
+from rgbt.data.domains import GIVEN, NONE, Domain
+from rgbt.data.loaders import Batches, steps_per_epoch, train_batches
+from rgbt.dataset import LabelledDataset, reader_of
+from rgbt.engine.fabric import open_fabric
+from rgbt.engine.network_settings import prepare_training
+from rgbt.engine.schedules import Schedule
+from rgbt.engine.settings import TrainerSettings
+from rgbt.engine.trainer import Scheme
+from rgbt.maskers.contract import check_masker
+from rgbt.processes import num_processes
+from rgbt.randomness import derive, numpy_generator, torch_generator
+from rgbt.requirements import Record, record_of
+from rgbt.runs.run_spec import WEIGHTS, RunSpec, labels_key
+from rgbt.terminal import info
+from rgbt.types import AnyMasker, Loadable, Sample
+
+if TYPE_CHECKING:  # most runs have one domain, draw no classes, and train a network of this package
+    from rgbt.data.pairs import PairedBatches
+    from rgbt.data.rare_classes import RareClasses
+
+
+@dataclass(frozen=True)
+class TrainingSetup:
+    """The objects of a training, before anything is written.
+
+    Attributes:
+        fabric: device, precision and connection of the processes.
+        datasets: of each domain, with the labels that it is trained with.
+        model: the network as Fabric wrapped it.
+        others: further networks that are trained, wrapped, by name.
+        optimizers: by the names that the scheme's phases use.
+        rare: how images of the source are drawn by class; None: each once per epoch.
+        scheme: yields the phases of a step.
+        schedule: learning rate factor per step.
+    """
+
+    session: Session
+    fabric: Fabric
+    datasets: dict[str, LabelledDataset]
+    model: nn.Module
+    others: dict[str, nn.Module]
+    optimizers: dict[str, torch.optim.Optimizer]
+    rare: RareClasses | None
+    scheme: Scheme
+    schedule: Schedule
+
+    def steps_per_epoch(self) -> int:
+        """Batches of one epoch of the source."""
+        split = self.session.domains.source.split
+        return steps_per_epoch(self.datasets["source"], self.session.loading, split)
+
+    def batches(self, steps: range) -> Batches[Loadable] | PairedBatches:
+        """Training batches of these steps: of one domain, or a pair of batches of both."""
+        session, seed = self.session, self.session.spec.drawn.order
+        loading = replace(session.loading, augment=_where_to_augment(session))
+        data, split = self.datasets["source"], session.domains.source.split
+        source = train_batches(data, split, session.transform, loading, seed, steps, self.rare)
+        target = session.domains.named.get("target")
+        if target is None:
+            return source
+        from rgbt.data.pairs import PairedBatches  # most runs have one domain
+
+        transform = record_of(session.transform).for_target or session.transform
+        seed = derive(seed, "target domain")  # shuffled and augmented by draws of its own
+        data = self.datasets["target"]
+        second = train_batches(data, target.split, transform, loading, seed, steps, None)
+        every = session.trainer.accumulate
+        return PairedBatches(source, second, first=steps.start, per_step=every)
+
+
+def validate(spec: RunSpec) -> None:
+    """Build everything once, so that errors are reported before the upstream runs are trained.
+
+    Raises:
+        InputError: as `set_up_training`; what unfinished upstream runs will write is left out.
+    """
+    for name in spec.domains.named:
+        teacher = spec.dependency(labels_key(name))
+        if teacher is not None:
+            with torch.device("meta"):
+                network = teacher.run.model.build()
+            check_requirements({"domains": spec.domains, f"network of {teacher.key}": network})
+    set_up_training(spec, upstream_finished=False)
+
+
+def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> TrainingSetup:
+    """Build everything and read all lists of images of the run, so that errors come first.
+
+    Where not `upstream_finished`, weights and pseudo-labels of upstream runs are left out.
+
+    Raises:
+        InputError: settings that do not fit each other, the machine or the data.
+    """
+    missing = () if upstream_finished else [each.key for each in spec.dependencies]
+    fabric = open_fabric(spec.trainer)
+    session = open_session(spec, load_weights=WEIGHTS not in missing, device=fabric.device)
+    domains, loading = session.domains, session.loading
+    masker: AnyMasker = spec.masker.build()
+    loss = spec.loss.build()
+    checked = CheckedLoss(loss) if is_own(loss) else loss
+    _share_batch_norm(session.model, session.trainer)
+    prepare_training(session.model, session.trainer, fabric.device)
+    model = fabric.setup_module(session.model)
+    collaborators = {"model": model, "loss": checked, "masker": masker, "domains": domains}
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(derive(spec.drawn.weights, "scheme weights"))  # of networks of its own
+        scheme: Any = spec.scheme.build(**collaborators, dataset=session.dataset)
+    check_part("scheme", scheme)
+    components = {
+        **{"scheme": scheme, "loss": loss, "domains": domains, "model": session.model},
+        **{"masker": masker, "transform": session.transform, "data": loading},
+        **{"dataset": session.dataset, "consistency": session.consistency},
+        WEIGHTS: SimpleNamespace(record=Record(pretrained=spec.weights is not None)),
+    }
+    check_requirements(components)
+    for split in session.read_splits():
+        session.dataset.names(split)
+    datasets = {}
+    for name, domain in domains.named.items():
+        steps_per_epoch(session.dataset, loading, domain.split)
+        is_missing = labels_key(name) in missing
+        datasets[name] = session.dataset if is_missing else _labelled(session, name, domain)
+    _probe(session, masker, scheme)
+    if upstream_finished:
+        _report_unpublished_settings(session)
+    rare = None
+    if loading.sampling == "rare_classes" and labels_key("source") not in missing:
+        from rgbt.data.rare_classes import count_rare_classes  # most runs draw no classes
+
+        rare = count_rare_classes(datasets["source"], domains.source.split, loading)
+    others, optimizers = _networks_and_optimizers(session, fabric, scheme)
+    return TrainingSetup(
+        session, fabric, datasets, model, others, optimizers, rare, scheme, spec.schedule.build()
+    )
+
+
+def _probe(session: Session, masker: AnyMasker, scheme: object) -> None:
+    """Use a user's own parts, another author's network, the masker and the cameras once."""
+    transform, seed = session.transform, session.spec.seed
+    check_dataset(reader_of(session.dataset), session.read_splits())
+    check_part("transform", transform)
+    first = _first_readable(session, session.domains.source.split)
+    shown = _first_readable(session, "test")
+    check_regions(session.regions, shown.thermal.shape)
+    example_hw = transform.train(first, numpy_generator(seed, "probe")).thermal.shape
+    tested = transform.test(shown)
+    if session.spec.model.target == EXTERNAL:
+        _probe_external(session, example_hw, tested.thermal.shape)
+    crop_hw = example_hw if is_own(masker) else record_of(transform).crop_hw
+    if crop_hw is not None and record_of(masker).hides_cells:
+        check_masker(masker, crop_hw, torch_generator(seed, "probe"))
+    cameras = [("scheme", record_of(scheme).camera, example_hw)]
+    if session.consistency.sets:
+        camera = session.consistency.view.camera
+        cameras += [("consistency", camera, each.shape[:2]) for each in (tested.rgb, tested.label)]
+    for node, camera, image_hw in cameras:
+        try:
+            if camera is not None:
+                camera.matrix(image_hw)
+        except InputError as error:
+            raise InputError(f"{node}.view.{error}") from error
+
+
+def _first_readable(session: Session, split: str) -> Sample:
+    """The first sample of a split; unreadable ones are passed over where the run does so too."""
+    names = session.dataset.names(split)
+    for name in names if session.loading.on_error != "raise" else ():
+        with suppress(InputError):
+            return session.dataset.read(name)
+    return session.dataset.read(names[0])
+
+
+def _probe_external(session: Session, train_hw: tuple[int, int], test_hw: tuple[int, int]) -> None:
+    """Call another author's network once per size of image, so that it is refused before a run.
+
+    In training too, as its output may have another form there; its statistics do not change.
+    """
+    model = session.model
+    before = {name: value.clone() for name, value in model.named_buffers()}
+    for image_hw, is_training in ((train_hw, False), (test_hw, False), (train_hw, True)):
+        model.train(is_training)
+        count = min(2, session.loading.batch_size) if is_training else 1
+        images = [torch.zeros(count, each, *image_hw, device=session.device) for each in (3, 1)]
+        with torch.set_grad_enabled(is_training), session.autocast():
+            output = model(*images, generator=torch_generator(session.spec.seed, "probe"))
+    for name, value in model.named_buffers():
+        value.copy_(before[name])
+    if not output.logits.requires_grad:
+        raise InputError(
+            f"model.constructor={session.spec.model.values['constructor']}: the class scores have "
+            "no gradient in training; choose others with model.train_scores."
+        )
+
+
+def _shared_with_test(session: Session, split: str) -> int:
+    """Number of test images in a split."""
+    return len(set(session.dataset.names(split)) & set(session.dataset.names("test")))
+
+
+def _report_unpublished_settings(session: Session) -> None:
+    """Report settings that are valid, but not those of the published numbers."""
+    spec, name = session.spec, session.dataset.name
+    expected = spec.scale.pretrained and record_of(session.model).pretrained_parts
+    if expected and session.weights is None:
+        info(
+            "the published recipe starts from ImageNet weights, but this run starts from random "
+            "weights. Name a file with pretrained=..., or expect lower scores than published."
+        )
+    meant = spec.recipe.dataset
+    if spec.scale.name == "paper" and meant != name:
+        info(
+            f"the image sizes, batch size and steps of this recipe were published for {meant}, not "
+            f"for {name}; choose another recipe=..., or set them and recipe.dataset={name}."
+        )
+    picked = session.trainer.selection_split
+    is_selected = session.trainer.tested == "best" and picked != "test"
+    if is_selected and (shared := _shared_with_test(session, picked)):
+        info(
+            f"trainer.selection_split={picked}: the best checkpoint is selected on {shared} test "
+            "images."
+        )
+
+
+def _where_to_augment(session: Session) -> Literal["loader", "device"]:
+    """What `LoaderSettings.augment` comes to on this device with this transform."""
+    requested = session.loading.augment
+    if requested == "auto":
+        redraws = session.loading.sampling == "rare_classes"  # crops, by their labels
+        can = record_of(session.transform).works_on_batches and not redraws
+        return "device" if can and session.device.type == "cuda" else "loader"
+    return requested
+
+
+def _labelled(session: Session, name: str, domain: Domain) -> LabelledDataset:
+    """The data set with the labels that a domain is trained with; InputError without them.
+
+    Reports training images of the test split.
+    """
+    dataset, key, split = session.dataset, f"domains.{name}", domain.split
+    if domain.labels == GIVEN:
+        if _first_readable(session, split).label is None:
+            raise InputError(f"{key}.labels=given, but {dataset.name} has no labels for {split}.")
+        if shared := _shared_with_test(session, split):
+            info(
+                f"{key}.split={split}: {shared} of its images are test images, so test scores will "
+                "not measure performance on unseen images."
+            )
+        return dataset
+    from rgbt.data.pseudo_labels import PseudoLabelled, Unlabelled  # a source has its own labels
+
+    folder = session.spec.labels_folder(name)
+    if domain.labels == NONE or folder is None:
+        return Unlabelled(dataset)
+    found = PseudoLabelled(dataset, folder, with_confidence=domain.confidence)
+    listed = dataset.names(split)
+    missing, manifest = found.labels.missing(listed), found.labels.manifest
+    if missing and (session.loading.on_error == "raise" or len(missing) == len(listed)):
+        raise InputError(
+            f"{key}.labels: {folder} has no pseudo-labels for {len(missing)} of the {len(listed)} "
+            f"images of {split}, such as '{missing[0]}'."
+        )
+    if manifest["kept"] == 0:
+        raise InputError(
+            f"{key}.labels: {folder} does not label any pixel, because its threshold of "
+            f"{manifest['threshold']:g} was above every confidence."
+        )
+    is_ours = domain.labels.startswith("experiment:")
+    if is_ours and manifest["fingerprint"] != dataset.fingerprint():
+        raise InputError(
+            f"{key}.labels: {folder} was predicted on other files of {dataset.name} than those in "
+            f"{dataset.root}."
+        )
+    return found
+
+
+def _share_batch_norm(network: nn.Module, trainer: TrainerSettings) -> None:
+    """Let the processes of a run normalise their batch together, unless each has its own part."""
+    if num_processes() == 1:
+        return
+    from rgbt.engine.batch_norm import check_batch_norm_parts, synchronise_batch_norm
+
+    check_batch_norm_parts(trainer.batch_norm_parts, num_processes())
+    if trainer.batch_norm_parts == 1:
+        synchronise_batch_norm(network)
+
+
+def _networks_and_optimizers(
+    session: Session, fabric: Fabric, scheme: Any
+) -> tuple[dict[str, nn.Module], dict[str, torch.optim.Optimizer]]:
+    """Further networks of a scheme, wrapped in place, and all optimisers."""
+    builder = session.spec.optimizer.build()
+    record = record_of(scheme)
+    parts, others = record.optimizers, record.networks
+    built = {name: builder(session.model, without=without) for name, without in parts.items()}
+    for name in record.builders:
+        _share_batch_norm(others[name], session.trainer)
+        built[name] = record.builders[name](others[name])
+        others[name] = fabric.setup_module(others[name])
+    wrapped: Any = {name: fabric.setup_optimizers(each) for name, each in built.items()}
+    return others, wrapped

@@ -1,0 +1,188 @@
+"""Both frames of every pair as images for any method, and its predictions of them read back.
+
+`write_images` writes, at the size of the files of the data set,
+
+    rgb/NAME.png  thermal/NAME.png                first frames, 8 bit, as the data set reads them
+    rgb/NAME_view1.png  thermal/NAME_view1.png    second frames of the first set of views, ...
+    pairs.json                                    the pairs, their angles, what they are made of
+
+The method predicts NAME.png and NAME_view1.png, ..., of the same size; of real second frames
+NAME_next.png.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rgbt.checks import InputError
+from rgbt.config.command import composing
+from rgbt.config.common_options import PredictionFormatOptions
+from rgbt.config.component import build
+from rgbt.config.compose import compose
+from rgbt.data.loader_settings import LoaderSettings
+from rgbt.data.prediction_files import Affixes, find_affixes, opened_folder
+from rgbt.data.prediction_format import FormatOptions, recognise_format
+from rgbt.data.sequences import FramesInOrder
+from rgbt.dataset import LabelledDataset
+from rgbt.engine.progress import progress
+from rgbt.evaluation.images import write_png
+from rgbt.evaluation.pair_frames import Pairing, frame_pairs
+from rgbt.evaluation.request import EvaluationRequest
+from rgbt.evaluation.temporal_consistency import Pairs, count_predicted, to_bytes
+from rgbt.metrics import pair_list
+from rgbt.metrics.metric import Regions
+from rgbt.metrics.pair_list import PAIR_LIST, Frames, ListedPair, PairList, second_name
+from rgbt.terminal import info
+from rgbt.transforms.view_sets import ViewSets
+from rgbt.types import Batch
+
+CPU = torch.device("cpu")
+
+
+@dataclass(frozen=True)
+class PairSource:
+    """The images of pairs, without a network; see `rgbt.evaluation.prediction.EvaluationData`."""
+
+    dataset: LabelledDataset
+    transform: Any
+    loading: LoaderSettings
+    regions: Regions
+    consistency: ViewSets
+
+    @classmethod
+    def compose(cls, overrides: Sequence[str]) -> PairSource:
+        """From overrides of the configuration; images have the size of their files."""
+        words = [*overrides, "transform=none"]
+        with composing(words):
+            config = compose(words)
+            return cls(
+                dataset=build(config.dataset),
+                transform=build(config.transform),
+                # One at a time, because the images may have any sizes.
+                loading=LoaderSettings(batch_size=1, eval_batch_size=1, num_workers=0),
+                regions=build(config.metric),
+                consistency=build(config.consistency),
+            )
+
+
+def list_pairs(source: PairSource, split: str, frames: Frames) -> PairList:
+    """The pairs of a split; InputError without second frames, or with two images of one name."""
+    pairing = Pairing(frames)
+    pairing.check(source)
+    listed, sets = source.dataset.names(split), tuple(source.consistency.sets)
+    names = tuple(dict.fromkeys(listed))
+    pairs = []
+    for name in names:
+        if frames == "next":
+            pairs.append(ListedPair(name, second_name(name, frames, 0), 1))
+            continue
+        for number in range(len(sets)):
+            (angles,) = source.consistency.angles(number, [listed.index(name)]).tolist()
+            pairs.append(ListedPair(name, second_name(name, frames, number), number + 1, *angles))
+    if taken := {pair.second for pair in pairs} & set(names):
+        raise InputError(f"image '{min(taken)}' has the name of a second frame; rename it.")
+    return PairList(
+        format="rgbt pairs 1",
+        complete=True,
+        dataset=source.dataset.fingerprint(),
+        name=source.dataset.name,
+        split=split,
+        frames=frames,
+        views=pairing.mark(source, pairing.protocols[0]) or "published",
+        sets=sets if frames == "virtual" else (),
+        pairs=tuple(pairs),
+    )
+
+
+def write_images(source: PairSource, split: str, frames: Frames, out: Path) -> PairList:
+    """Write both frames of every pair of a split; InputError where `out` holds other files."""
+    listed = list_pairs(source, split, frames)
+    same = (out / PAIR_LIST).is_file() and replace(
+        pair_list.read_list(out), complete=True
+    ) == listed
+    if not same and out.exists() and (out.is_file() or any(out.iterdir())):
+        raise InputError(f"export={out} holds other files or other pairs; choose an empty folder.")
+    out.mkdir(parents=True, exist_ok=True)
+    replace(listed, complete=False).write(out)
+    with progress() as display:
+        task = display.add_task(f"{split} pairs", total=len(listed.images), note="images")
+        for pairs in frame_pairs(source, split, frames, CPU):
+            if pairs.number == 0:
+                _write(pairs.first, pairs.first.name, out)
+                display.advance(task, len(pairs.names))
+            _write(pairs.second, pairs.names, out)
+            display.advance(task, len(pairs.names))
+    listed.write(out)
+    return listed
+
+
+def _write(batch: Batch, names: Sequence[str], out: Path) -> None:
+    for name, rgb, thermal in zip(names, batch.rgb, batch.thermal, strict=True):
+        write_png(out / "rgb" / f"{name}.png", to_bytes(rgb)[..., ::-1])
+        write_png(out / "thermal" / f"{name}.png", to_bytes(thermal)[..., 0])
+
+
+class FolderPredictions:
+    """Frames `names` predicted by any method, read from its label images in `folder`.
+
+    `sentence` is what the files were read as. InputError: files are missing or of several kinds.
+    """
+
+    def __init__(
+        self, folder: Path, dataset: LabelledDataset, names: Sequence[str], given: FormatOptions
+    ) -> None:
+        there = {
+            each.relative_to(folder).with_suffix("").as_posix() for each in folder.rglob("*.png")
+        }
+        affixes = find_affixes(there, names, given.affixes)
+        self._paths = {name: folder / f"{affixes.file_stem(name)}.png" for name in names}
+        missing = [name for name in names if affixes.file_stem(name) not in there]
+        if missing:
+            path = self._paths[missing[0]]
+            raise InputError(f"predictions={path} and {len(missing) - 1} more do not exist.")
+        paths = self._paths.values()
+        self._reader, said = recognise_format(paths, dataset.classes, dataset.palette, given)
+        self.sentence = " ".join(filter(None, (said, affixes.sentence)))
+
+    def __call__(self, batch: Batch, names: Sequence[str]) -> Tensor:
+        """See `rgbt.evaluation.pair_frames.Predict`; InputError: a file of another size."""
+        wanted, maps = tuple(batch.label.shape[1:]), []
+        for path in (self._paths[name] for name in names):
+            classes = self._reader.read(path)
+            if classes.shape != wanted:
+                raise InputError(f"{path}: size {classes.shape}, but its image has {wanted}.")
+            maps.append(torch.from_numpy(np.ascontiguousarray(classes)))
+        return torch.stack(maps)
+
+
+def count_predictions(
+    folder: Path,
+    exported: Path,
+    options: PredictionFormatOptions,
+    overrides: Sequence[str],
+    split: str,
+    pairing: Pairing,
+) -> tuple[Pairs, PairSource]:
+    """Count the label images in `folder` of the images that were written to `exported`."""
+    source = PairSource.compose(overrides)
+    if pairing.frames == "video":
+        names = FramesInOrder(source.dataset, split).names(split)
+    else:
+        wanted = list_pairs(source, split, pairing.frames)
+        pair_list.check_same(pair_list.read_list(exported), wanted)
+        names = wanted.images
+    affixes = Affixes(options.prefix, options.suffix)
+    given = FormatOptions(form=options.format, palette=options.palette, affixes=affixes)
+    with opened_folder(folder) as opened:
+        predict = FolderPredictions(opened, source.dataset, names, given)
+        request = EvaluationRequest(split=split, keep=pairing.pictured(source, split))
+        pairs = count_predicted(source, predict, request, pairing, CPU)
+    info(predict.sentence)
+    return pairs, source

@@ -1,0 +1,325 @@
+"""The run folder, which holds everything that tables, figures and MLflow need later.
+
+`docs/reference/run-folder.md` lists its files. ``result.json`` is written last, by rename: a run is
+finished exactly if it exists. A folder may come from a stranger: one with a link out of it is
+refused wherever it is opened.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, NotRequired, cast
+
+from typing_extensions import TypedDict  # pydantic takes no other before Python 3.12
+
+from rgbt.checks import InputError, one_line
+from rgbt.files.atomic import holder_of, holding, is_held, remove_left_behind, write_atomic
+from rgbt.files.budgets import check_links, inside, parse_json, read_bytes, read_json, sealed
+from rgbt.tables import ResultTables
+from rgbt.terminal import info, warn
+
+Kind = Literal["train", "val", "test"]
+
+ADVICE = "restore it from a copy, or remove the run's folder to train it again"
+
+REPLACED, REPLACED_TAG, GROUP = "replaced", "rgbt.replaced", "rgbt.group"
+"""Folder and tag of finished runs that another training of the same key replaced (``fresh=true``),
+and the tag that the seeds of one configuration share."""
+
+
+@dataclass(frozen=True)
+class MetricLine:
+    """One line of ``metrics.jsonl``.
+
+    Attributes:
+        step: optimiser steps done; increases strictly within a kind.
+        kind: "train" (a logged step), "val" (an evaluation on the way), "test" (the last one).
+        time: seconds since 1970.
+        values: by name of the metric; NaN is written as null.
+    """
+
+    step: int
+    kind: Kind
+    time: float
+    values: dict[str, float]
+
+    @classmethod
+    def read_all(cls, lines: Sequence[bytes]) -> list[MetricLine]:
+        """The lines as objects; ValueError where one is damaged."""
+        text = b"[" + b",".join(lines).replace(b": null", b": NaN") + b"]"
+        found = cast("list[MetricLine]", parse_json(text, list[cls]))  # type: ignore[valid-type]
+        if len(found) != len(lines):
+            raise ValueError("expected one object in each line")
+        return found
+
+    def text(self) -> str:
+        """The line as it is written."""
+        finite = {key: v if math.isfinite(v) else None for key, v in self.values.items()}
+        return json.dumps({**vars(self), "values": finite}) + "\n"
+
+
+@dataclass(frozen=True)
+class Description:
+    """``run.json``: how a tracker shows the run."""
+
+    name: str
+    tags: dict[str, str]
+    params: dict[str, str]
+
+
+class InputForm(TypedDict):
+    """A split that a run uses: its name, what for ("train", "val", "test"), number of images."""
+
+    split: str
+    context: str
+    images: int
+
+
+class MarkerForm(TypedDict):
+    """``dataset.json``: digests of names and files of the images; the rest is for trackers."""
+
+    names: str
+    files: str
+    name: NotRequired[str]
+    root: NotRequired[str]
+    inputs: NotRequired[list[InputForm]]
+
+
+class ResultForm(TypedDict, total=False):
+    """``result.json`` (`rgbt.training.train`)."""
+
+    name: str
+    key: str
+    dataset: str
+    steps: int
+    best_step: int
+    best_score: float
+    seconds_of_last_process: float
+    skipped: list[str]
+    val: dict[str, float | None]
+    test: dict[str, float | None]
+
+
+def is_finished(folder: Path) -> bool:
+    """Whether the run in `folder` is finished."""
+    return (folder / "result.json").is_file()
+
+
+def counts_name(split: str) -> str:
+    """Name of the file of the counts that a run ended with."""
+    return f"counts_{split}.npz"
+
+
+def read_result(folder: Path) -> dict[str, Any] | None:
+    """``result.json``; None: not finished. This and the others: InputError if damaged."""
+    return cast("dict[str, Any] | None", _read(folder / "result.json", ResultForm))
+
+
+def read_description(folder: Path) -> Description | None:
+    """``run.json``; None: there is none."""
+    return cast("Description | None", _read(folder / "run.json", Description))
+
+
+def read_marker(folder: Path) -> MarkerForm | None:
+    """``dataset.json``; None: there is none."""
+    return cast("MarkerForm | None", _read(folder / "dataset.json", MarkerForm))
+
+
+def read_tables(folder: Path) -> ResultTables | None:
+    """``tables.json``; None: there is none."""
+    path = folder / "tables.json"
+    plain = _read(path, dict[str, Any])
+    try:
+        return None if plain is None else ResultTables.from_json(plain)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path} is damaged ({one_line(error)}); {ADVICE}.") from error
+
+
+def read_provenance(file: Path) -> list[dict[str, Any]]:
+    """Entries of a ``provenance.json``, one per process, the first one first; [] without a file."""
+    return _read(file, list[dict[str, Any]]) or []
+
+
+def _read(path: Path, form: Any) -> Any:
+    return read_json(inside(path, path.parent), form, ADVICE) if path.exists() else None
+
+
+class RunFolder:
+    """Writes one run's folder, made where it does not exist; InputError for a link out of it."""
+
+    def __init__(self, path: Path | str) -> None:
+        self.path = Path(path).resolve()
+        self.path.mkdir(parents=True, exist_ok=True)
+        check_links(self.path)
+
+    @contextmanager
+    def lock(self) -> Iterator[None]:
+        """Lock this folder for training, and remove incomplete files of a killed process.
+
+        InputError where another process trains here; the message names it and its machine.
+        """
+        before = holder_of(self.path / "lock")
+        with holding(self.path / "lock") as holder:
+            if holder is not None:
+                advice = "Wait for it, or stop it and rerun the command to resume."
+                raise InputError(f"{self.path} is being trained by {holder}. {advice}")
+            remove_left_behind(self.path, before)
+            yield
+
+    def clean(self) -> None:
+        """Remove incomplete files of a killed process, unless another process trains here."""
+        with suppress(InputError), self.lock():
+            pass
+
+    def is_locked(self) -> bool:
+        """Whether a process is training here now."""
+        return is_held(self.path / "lock")
+
+    def write_config(self, text: str) -> None:
+        """Write the resolved configuration (YAML text)."""
+        write_atomic(self.path / "config.yaml", text.encode())
+
+    def add_provenance(self, entry: Mapping[str, Any]) -> None:
+        """Append one process's `provenance()`; its diff becomes a file that can be applied."""
+        before = read_provenance(self.path / "provenance.json")
+        diff = entry.get("diff") or ""
+        name = f"diff_{len(before) + 1}.patch" if before else "diff.patch"
+        if diff:
+            write_atomic(self.path / name, diff.encode())
+        self._write("provenance.json", [*before, {**entry, "diff": name if diff else None}])
+
+    def begin_at(self, step: int) -> None:
+        """Note the step at which the last process of ``provenance.json`` began."""
+        *before, last = read_provenance(self.path / "provenance.json")
+        self._write("provenance.json", [*before, {**last, "from_step": step}])
+
+    def describe(self, description: Description) -> None:
+        """Write name, tags and parameters of this run for trackers."""
+        self._write("run.json", sealed(vars(description)))
+
+    def append(self, step: int, kind: Kind, values: Mapping[str, float]) -> None:
+        """Add one line to ``metrics.jsonl`` and hand it to the operating system at once."""
+        plain = {name: float(value) for name, value in values.items()}
+        with (self.path / "metrics.jsonl").open("a") as file:
+            file.write(MetricLine(step, kind, round(time.time(), 3), plain).text())
+
+    def lines(self) -> list[MetricLine]:
+        """Lines of ``metrics.jsonl``; InputError for a damaged one, but not for a cut last one."""
+        path = self.path / "metrics.jsonl"
+        whole = read_bytes(path).split(b"\n")[:-1] if path.exists() else []
+        try:
+            return MetricLine.read_all(whole)
+        except ValueError:
+            return [self._line(number, text) for number, text in enumerate(whole, 1)]
+
+    def _line(self, number: int, text: bytes) -> MetricLine:
+        try:
+            return MetricLine.read_all([text])[0]
+        except ValueError as error:
+            what = f"{self.path / 'metrics.jsonl'} is damaged (line {number}: {one_line(error)})"
+            raise InputError(f"{what}; delete the line.") from error
+
+    def truncate_after(self, step: int, evaluated_step: int | None = None) -> int:
+        """Remove the lines that a run resuming at `step` will write again.
+
+        These are the lines beyond `step`, "val" lines beyond `evaluated_step` (None: `step`), every
+        "test" line (the last evaluation is repeated), and a line cut short by a crash.
+
+        Returns:
+            the last step of any line before, 0 without lines.
+        """
+        found = self.lines()
+        ends = {"train": step, "val": step if evaluated_step is None else evaluated_step}
+        kept = (line.text() for line in found if line.step <= ends.get(line.kind, -1))
+        write_atomic(self.path / "metrics.jsonl", "".join(kept).encode())
+        return max((line.step for line in found), default=0)
+
+    def figure_path(self, name: str) -> Path:
+        """Path of the picture `name`; its folder is made."""
+        folder = self.path / "figures"
+        folder.mkdir(exist_ok=True)
+        return folder / f"{name}.png"
+
+    def write_tables(self, tables: ResultTables) -> None:
+        """Write the tables."""
+        self._write("tables.json", sealed(tables.to_json()))
+
+    def finish(self, result: Mapping[str, Any]) -> None:
+        """Mark the run as finished; everything else must be written before."""
+        self._write("result.json", sealed(result))
+
+    def mark(self, marker: MarkerForm) -> None:
+        """Write ``dataset.json``, which identifies the images."""
+        self._write("dataset.json", sealed(marker))
+
+    def _write(self, name: str, value: Any) -> None:
+        write_atomic(self.path / name, (json.dumps(value, indent=1) + "\n").encode())
+
+
+def runs_in(runs_dir: Path | str) -> list[RunFolder]:
+    """Every run folder in `runs_dir`, by name, with a warning for one that is refused."""
+    root, found = Path(runs_dir), []
+    if not root.is_dir():
+        raise InputError(f"runs_dir={root}: the folder does not exist.")
+    for path in sorted(root.glob("*/run.json")):
+        try:
+            found.append(RunFolder(path.parent))
+        except InputError as error:
+            warn(f"{path.parent} is left out: {error}")
+    return found
+
+
+def find_run(run: str, runs_dir: Path) -> Path:
+    """The folder of a run given as a folder, key or MLflow run id; InputError if there is none."""
+    for folder in (Path(run), runs_dir / run):
+        if (folder / "config.yaml").is_file():
+            return RunFolder(folder).path
+    for sent in sorted((*runs_dir.glob("*/mlflow.json"), *runs_dir.glob("replaced/*/mlflow.json"))):
+        with suppress(InputError):  # a damaged file does not identify a run
+            if (_read(sent, dict[str, Any]) or {}).get("run_id") == run:
+                return RunFolder(sent.parent).path
+    where = f"a key or an MLflow run id in runs_dir={runs_dir.resolve()}"
+    raise InputError(f"run={run} is neither a run folder (with a config.yaml), nor {where}.")
+
+
+def set_aside(folder: RunFolder) -> RunFolder | None:
+    """Move a finished run to ``<runs_dir>/replaced/<key>-<n>``, where run=FOLDER opens it.
+
+    Returns its new folder, for the tracker; None where the run is not finished (any more).
+    """
+    with folder.lock():
+        if not is_finished(folder.path):
+            return None
+        home, number = folder.path.parent / REPLACED, 1
+        while (kept := home / f"{folder.path.name}-{number}").exists():
+            number += 1
+        home.mkdir(exist_ok=True)
+        folder.path.rename(kept)
+    info(f"the finished run was moved to {kept}; open it with run={kept}.")
+    return RunFolder(kept)
+
+
+def runs_dir_of(folder: RunFolder) -> Path:
+    """The folder of runs that a run belongs to, replaced or not."""
+    return folder.path.parents[folder.path.parent.name == REPLACED]
+
+
+def shown_key(folder: RunFolder) -> str:
+    """The key of a run as a tracker shows it: `<key>`, or `replaced/<key>-<n>`."""
+    return str(folder.path.relative_to(runs_dir_of(folder)))
+
+
+def shown_description(folder: RunFolder) -> Description | None:
+    """How a tracker shows a run; a replaced one is in no group, and its key is its folder."""
+    known = read_description(folder.path)
+    if known is None or folder.path.parent.name != REPLACED:
+        return known
+    group = f"{known.tags.get(GROUP, known.name)} (replaced)"
+    tags = {**known.tags, REPLACED_TAG: "true", GROUP: group, "rgbt.key": shown_key(folder)}
+    return replace(known, name=f"{known.name} (replaced)", tags=tags)

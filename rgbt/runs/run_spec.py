@@ -1,0 +1,433 @@
+"""The complete description of one run: its settings, its key and the runs that it depends on.
+
+It is made of the composed configuration alone. Key and folder import no class that the settings
+name, so that a finished run is found without torch. A node is checked against its constructor when
+it is first used, or all of them by `RunSpec.check`. Other code reads settings and objects from here
+and never the configuration itself.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Generic, Literal, NamedTuple, TypeVar, cast, overload
+
+from rgbt.checks import InputError
+from rgbt.config.component import Component, checked_nodes
+from rgbt.config.stored_config import EXTERNAL, targets
+from rgbt.config.values import check_value
+from rgbt.data.domains import GIVEN, NONE, Domains
+from rgbt.data.loader_settings import LOADING, LoaderSettings
+from rgbt.engine.prediction import Prediction
+from rgbt.engine.settings import OF_MACHINE, Recipe, Scale, TrainerSettings
+from rgbt.files.budgets import read_json
+from rgbt.ranges import Seed, Text
+from rgbt.runs.folder import is_finished
+from rgbt.runs.source_code import checkout_code, code_of, user_code
+
+WEIGHTS = "model.weights"
+"""The setting that names the weights that a network starts from."""
+
+CheckpointFile = Literal["best.pt", "last.pt"]
+
+T = TypeVar("T")
+
+
+def labels_key(domain: str) -> str:
+    """The setting that names the labels of a domain."""
+    return f"domains.{domain}.labels"
+
+
+class Node(Generic[T]):
+    """A node of the configuration as an attribute of `RunSpec`, checked at its first use.
+
+    Args:
+        kind: of the attribute: `Component`, which is built later, or the class of the settings.
+        in_key: whether the node is part of the run key.
+        outside_key: settings of it that are not: paths, hardware and labels.
+        shared: whether upstream runs take it over from the run that needs them; or which of its
+            settings.
+    """
+
+    def __init__(
+        self,
+        kind: type[T],
+        *,
+        in_key: bool = True,
+        outside_key: tuple[str, ...] = (),
+        shared: bool | tuple[str, ...] = False,
+    ) -> None:
+        self.kind = kind
+        self.in_key = in_key
+        self.outside_key = outside_key
+        self.shared = shared
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    @overload
+    def __get__(self, spec: None, owner: type) -> Node[T]: ...
+
+    @overload
+    def __get__(self, spec: RunSpec, owner: type) -> T: ...
+
+    def __get__(self, spec: RunSpec | None, owner: type) -> Node[T] | T:
+        if spec is None:
+            return self
+        spec.use([self._name])  # an attribute of the object from now on
+        return cast(T, vars(spec)[self._name])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Seeds:
+    """Seeds of single sources of random draws; None: that source uses the seed of the run.
+
+    Attributes:
+        weights: initial weights of the network and of a discriminator.
+        order: order of the training images, and their augmentation.
+        masks: all draws of the training steps: masks, dropped layers (stochastic depth), points
+            at which masks are compared, and virtual views.
+        start: seed of the common start (``common:NAME/last.pt``). "common": that of its experiment,
+            so that all seeds begin with the same weights; "run": the same plus the seed of the run,
+            so that every seed begins with other weights, and all methods with those of their seed.
+    """
+
+    weights: Seed | None = None
+    order: Seed | None = None
+    masks: Seed | None = None
+    start: Literal["common", "run"] = "common"
+
+
+class SourceSeeds(NamedTuple):
+    """The seed of every source of random draws; attributes as in `Seeds`."""
+
+    weights: int
+    order: int
+    masks: int
+
+
+@dataclass(frozen=True)
+class Dependency:
+    """An upstream run, and what is taken from it.
+
+    Attributes:
+        key: the setting that names it: "model.weights" or "domains.target.labels".
+        run: the upstream run.
+        checkpoint: the file that is taken: "best.pt" or "last.pt".
+        is_common: whether the upstream run keeps its own seed and data set.
+    """
+
+    key: str
+    run: RunSpec
+    checkpoint: CheckpointFile
+    is_common: bool = False
+
+    @property
+    def path(self) -> Path:
+        """The checkpoint file."""
+        return self.run.folder / self.checkpoint
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RunSpec:
+    """The typed, frozen description of one run.
+
+    Attributes:
+        plain: the whole configuration as resolved YAML values, for ``config.yaml``.
+        overrides: as typed on the command line, for the name of the run.
+        dependencies: the upstream runs, in the order in which they are needed.
+        fresh: whether a finished run is trained again.
+    """
+
+    plain: Mapping[str, Any] = field(repr=False)
+    overrides: tuple[str, ...] = ()
+    dependencies: tuple[Dependency, ...] = ()
+    fresh: bool = False
+
+    scale = Node(Scale, in_key=False)
+    recipe = Node(Recipe, in_key=False)
+    dataset = Node(
+        Component,
+        outside_key=("root", "cache_dir", "palette", "background", "layout", "absent"),
+        shared=True,
+    )
+    domains = Node(Domains)
+    seeds = Node(Seeds, shared=True)
+    data = Node(LoaderSettings, outside_key=LOADING, shared=("batch_size", *LOADING))
+    transform = Node(Component)
+    masker = Node(Component)
+    model = Node(Component)
+    loss = Node(Component)
+    scheme = Node(Component)
+    optimizer = Node(Component)
+    schedule = Node(Component)
+    trainer = Node(
+        TrainerSettings,
+        outside_key=OF_MACHINE,
+        shared=("max_steps", "eval_every", "precision", "threads", "batch_norm_parts", *OF_MACHINE),
+    )
+    metric = Node(Component, shared=True)
+    prediction = Node(Prediction)
+    consistency = Node(Component, in_key=False)
+    tracking = Node(Component, in_key=False, shared=True)
+
+    @property
+    def name(self) -> str:
+        """Of the experiment."""
+        return str(self.plain["name"])
+
+    @property
+    def seed(self) -> int:
+        """Of every generator, but for those that `seeds` names."""
+        return int(self.plain["seed"])
+
+    @property
+    def runs_dir(self) -> str:
+        """The folder of run folders."""
+        return str(self.plain["runs_dir"])
+
+    @property
+    def pretrained(self) -> str | None:
+        """File of ImageNet weights that the network, or that of its first upstream run, takes."""
+        return cast("str | None", self.plain["pretrained"])
+
+    @property
+    def out(self) -> str | None:
+        """Where a command that draws or predicts writes."""
+        return cast("str | None", self.plain["out"])
+
+    def check(self) -> RunSpec:
+        """This specification, after all settings of it and of its upstream runs were checked.
+
+        Raises:
+            InputError: a missing value, an unknown key, a value of a wrong type or range.
+        """
+        for key, annotation in VALUES.items():
+            check_value(key, self.plain[key], annotation)
+        self.use([name for name in NODES if name not in vars(self)])
+        for each in self.dependencies:
+            each.run.check()
+        return self
+
+    def use(self, names: Iterable[str]) -> None:
+        """Check nodes and make them attributes: settings are built, other components later."""
+        found = checked_nodes(self.plain, names, [n for n in NODES if NODES[n].kind != Component])
+        vars(self).update(found)
+
+    @cached_property
+    def key(self) -> str:
+        """12 hexadecimal digits that identify the run: a hash of what decides its result.
+
+        SHA-256 of the nodes in the key as resolved YAML values, of the seeds, and of the user's
+        own code. Paths, hardware, labels and tracking (`NOT_IN_KEY`) are left out, so that the same
+        method with the same seed is the same run on every machine. A file of weights, a folder of
+        pseudo-labels and the checkout of another author count by their content, an upstream run by
+        its key; it need not exist yet.
+
+        Raises:
+            InputError: the file of weights, the folder of pseudo-labels or the checkout is missing.
+        """
+        settings = {
+            name: {k: v for k, v in self.plain[name].items() if k not in node.outside_key}
+            for name, node in NODES.items()
+            if node.in_key
+        }
+        model, domains = settings["model"], settings["domains"]
+        if self.weights is not None:
+            model["weights"] = self._content(WEIGHTS, self.weights)
+        for name in ("source", "target"):
+            if domains[name] is not None:
+                labels = self._content(labels_key(name), domains[name]["labels"])
+                domains[name] = {**domains[name], "labels": labels}
+        code = user_code(targets(settings).values())
+        if model.get("_target_") == EXTERNAL:
+            if not (found := checkout_code(self.plain["model"])):
+                raise InputError(
+                    f"model.checkout={model['checkout']}: expected a folder that has the module of "
+                    f"model.constructor={model['constructor']} in model.root={model['root']}."
+                )
+            model["checkout"] = dict(found)
+        text = json.dumps(
+            _plain_numbers({**settings, "seeds": self.drawn, "code": code}), sort_keys=True
+        )
+        return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+    @property
+    def drawn(self) -> SourceSeeds:
+        """The seed of every source of random draws."""
+        own = (self.seeds.weights, self.seeds.order, self.seeds.masks)
+        return SourceSeeds(*(self.seed if each is None else each for each in own))
+
+    @property
+    def folder(self) -> Path:
+        """The run folder."""
+        return Path(self.runs_dir) / self.key
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether the run has its result."""
+        return is_finished(self.folder)
+
+    @property
+    def upstream(self) -> tuple[RunSpec, ...]:
+        """The runs that this one depends on."""
+        return tuple(each.run for each in self.dependencies)
+
+    def dependency(self, key: str) -> Dependency | None:
+        """The upstream run that the setting `key` names; None where it names none."""
+        return next((each for each in self.dependencies if each.key == key), None)
+
+    @property
+    def weights(self) -> str | None:
+        """`model.weights`: a file, a run folder, or "experiment:NAME/best.pt"."""
+        return cast("str | None", self.plain["model"].get("weights"))
+
+    @property
+    def fresh_parts(self) -> tuple[str, ...]:
+        """`model.fresh`: beginnings of parameter names that keep their random start."""
+        return tuple(self.plain["model"].get("fresh") or ())
+
+    @property
+    def weights_path(self) -> Path | None:
+        """The file that `model.weights` names; of a run folder its best checkpoint.
+
+        Raises:
+            InputError: there is no such file, or the upstream run is not finished.
+        """
+        if self.weights is None:
+            return None
+        dependency = self.dependency(WEIGHTS)
+        path = Path(self.weights).expanduser() if dependency is None else dependency.path
+        path = path / "best.pt" if path.is_dir() else path
+        if not path.is_file():
+            raise InputError(
+                f"model.weights={self.weights}: {path} does not exist; give a file or a run folder."
+            )
+        return path
+
+    def labels_folder(self, domain: str) -> Path | None:
+        """The folder of pseudo-labels of "source" or "target"; None where it takes none."""
+        settings = self.domains.named[domain]
+        dependency = self.dependency(labels_key(domain))
+        if dependency is not None:
+            words = [settings.split, settings.teacher_view or "default"]
+            words += [dependency.checkpoint.removesuffix(".pt")]
+            words += [f"{settings.threshold:g}"] if settings.threshold else []
+            return dependency.run.folder / "pseudo_labels" / "_".join(words)
+        is_folder = settings.labels not in (GIVEN, NONE)
+        return Path(settings.labels).expanduser() if is_folder else None
+
+    @property
+    def uses_pretrained(self) -> bool:
+        """Whether this run, or one upstream of it, starts from the file `pretrained`."""
+        return self.weights == self.pretrained or any(
+            each.run.uses_pretrained for each in self.dependencies
+        )
+
+    def with_seed(self, seed: int) -> RunSpec:
+        """The same run with another seed; its upstream runs have it too.
+
+        Common ones keep theirs, unless `seeds.start` is "run".
+        """
+        words = [word for word in self.overrides if not word.startswith("seed=")]
+        further = seed - self.seed if self.seeds.start == "run" else 0
+
+        def seed_of(each: Dependency) -> int:
+            return each.run.seed + further if each.is_common else seed
+
+        upstream = (
+            replace(each, run=each.run.with_seed(seed_of(each))) for each in self.dependencies
+        )
+        return replace(
+            self,
+            overrides=(*words, f"seed={seed}"),
+            plain={**self.plain, "seed": seed},
+            dependencies=tuple(upstream),
+        )
+
+    def own_code(self) -> dict[str, str]:
+        """Digest or version of all code in the run that is not ours, by module (see `code_of`)."""
+        return code_of(self.plain)
+
+    def _content(self, key: str, value: str) -> str:
+        """The digest or key that represents a file, a folder or an upstream run in the key."""
+        dependency = self.dependency(key)
+        if dependency is not None:
+            return f"{dependency.run.key}/{dependency.checkpoint}"
+        if key == WEIGHTS:
+            path = self.weights_path
+            assert path is not None, "model.weights has a value"
+            return file_digest(path)
+        if value in (GIVEN, NONE):
+            return value
+        manifest = Path(value).expanduser() / "pseudo_labels.json"
+        found = read_json(manifest, dict[str, Any], "predict again") if manifest.is_file() else {}
+        if "digest" not in found:
+            raise InputError(
+                f"{key}={value}: expected given, none, experiment:NAME/best.pt, or a folder that "
+                "rgbt predict ... pseudo_labels=true has written."
+            )
+        return str(found["digest"])
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file, in hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _plain_numbers(value: Any) -> Any:
+    """`value` with 4 for 4.0, which are one setting."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain_numbers(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain_numbers(each) for each in value]
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
+NODES: dict[str, Node[Any]] = {
+    name: node for name, node in vars(RunSpec).items() if isinstance(node, Node)
+}
+"""Every node of the configuration with its policy."""
+
+VALUES: dict[str, Any] = {
+    **{"name": Text, "seed": Seed, "runs_dir": Text, "fresh": bool},
+    **{"pretrained": Text | None, "out": Text | None},
+}
+"""Every plain value at the top of the configuration with its type."""
+
+NOT_IN_KEY = (
+    *("name", "runs_dir", "out"),
+    *(key for key, node in NODES.items() if not node.in_key),
+    *(f"{key}.{each}" for key, node in NODES.items() for each in node.outside_key),
+)
+"""Dotted keys in which two configurations of one run may differ."""
+
+SHARED = (
+    *("seed", "runs_dir", "pretrained"),
+    *(key for key, node in NODES.items() if node.shared is True),
+    *(
+        f"{key}.{each}"
+        for key, node in NODES.items()
+        if not isinstance(node.shared, bool)
+        for each in node.shared
+    ),
+)
+"""Dotted keys that an upstream run has in common with the run that needs it, beside the sizes of
+the scale. A duration is that of the scale unless it was typed."""
+
+SHARED_BY_COMMON = (
+    *(key for key in SHARED if key in NOT_IN_KEY),
+    *(
+        f"{key}.{each}"
+        for key, node in NODES.items()
+        if node.shared is True and key != "dataset"
+        for each in node.outside_key
+    ),
+)
+"""Dotted keys that a common upstream run takes over from the run that needs it first. None of them
+enters the run key, so that it is one run for all seeds and data sets."""

@@ -1,0 +1,259 @@
+"""Make the specification of a run: of a composed configuration, or of a stored run.
+
+A run names an upstream run by its experiment: ``model.weights=experiment:NAME/last.pt`` starts
+from the last checkpoint of that run; ``domains.target.labels=experiment:NAME/best.pt`` trains on
+the predictions of its network. Both runs share seed, scale and data set
+(`rgbt.runs.run_spec.SHARED`): a run of seed 2 depends on runs of seed 2.
+
+``model.weights=common:NAME/last.pt`` names an upstream run that keeps its own data set: all methods
+with the same network start from the same run. It also keeps its own seed, unless `seeds.start` says
+that every seed has a start of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, cast, get_args
+
+from omegaconf import DictConfig, OmegaConf
+
+from rgbt.checks import InputError, nearest
+from rgbt.config.component import RUN_SETTINGS
+from rgbt.config.compose import (
+    SEARCH_PATH,
+    available,
+    check_keys,
+    compose,
+    flatten,
+    register_resolvers,
+)
+from rgbt.config.values import check_value
+from rgbt.files.yaml_files import parse_yaml
+from rgbt.runs.run_spec import (
+    NODES,
+    SHARED,
+    SHARED_BY_COMMON,
+    VALUES,
+    WEIGHTS,
+    CheckpointFile,
+    Dependency,
+    RunSpec,
+    labels_key,
+)
+
+PREFIX, COMMON_PREFIX = "experiment:", "common:"
+"""Before the name of an upstream run; a common one keeps its own seed and data set."""
+
+CACHE = "cache_dir"
+"""Setting of an embedded data set: where the generated images are."""
+
+CHECKOUT = "model.checkout"
+"""Setting that names the folder of another author's code."""
+
+GROUPS = ("dataset", "metric", "prediction", "consistency")
+CHANGEABLE = (
+    *(*GROUPS, "data", "transform.test_short_edge"),
+    *("trainer.accelerator", "trainer.threads", "trainer.precision", CHECKOUT),
+)
+"""Settings of a finished run that may be changed: the source of the images and the counting, and
+where code lies."""
+
+
+def specify(config: DictConfig, overrides: Sequence[str] = ()) -> RunSpec:
+    """The checked specification of a run.
+
+    Args:
+        config: as composed by Hydra.
+        overrides: as typed, for the name of the run.
+
+    Raises:
+        InputError: an unknown key, a missing value, a value of a wrong type, an upstream
+            experiment that does not exist, or a cycle of them.
+    """
+    return requested_run(config, overrides).check()
+
+
+def requested_run(
+    config: DictConfig, overrides: Sequence[str] = (), downstream: tuple[str, ...] = ()
+) -> RunSpec:
+    """The same without checking the settings, so that no class of a component is imported.
+
+    Args:
+        config: as composed by Hydra.
+        overrides: as typed.
+        downstream: names of the experiments whose upstream run this is.
+
+    Raises:
+        InputError: an unknown key, or upstream runs that do not exist or make a cycle.
+    """
+    upstream = tuple(_dependencies(config, overrides, (*downstream, config.name)))
+    return _spec_of(config, overrides, upstream)
+
+
+def _spec_of(
+    config: DictConfig, overrides: Sequence[str], upstream: tuple[Dependency, ...]
+) -> RunSpec:
+    check_keys(config)
+    plain = cast("dict[str, Any]", OmegaConf.to_container(config, resolve=True))
+    for name in NODES:
+        if not isinstance(plain.get(name), dict) or "_target_" not in plain[name]:
+            raise InputError(f"'{name}' must be a mapping with `_target_`.")
+    check_value("seed", plain["seed"], VALUES["seed"])
+    # Training again is a request to the command, and no property of the run.
+    fresh = plain["fresh"] is True
+    plain = plain if not fresh else {**plain, "fresh": False}
+    return RunSpec(plain=plain, overrides=tuple(overrides), dependencies=upstream, fresh=fresh)
+
+
+def _dependencies(
+    config: DictConfig, overrides: Sequence[str], downstream: tuple[str, ...]
+) -> Iterator[Dependency]:
+    """The upstream runs that a configuration names, each with those upstream of it."""
+    for key in (WEIGHTS, labels_key("source"), labels_key("target")):
+        reference = parse_reference(key, OmegaConf.select(config, key))
+        if reference is None:
+            continue
+        experiment = reference.experiment
+        if experiment in downstream:
+            circle = " -> ".join((*downstream, experiment))
+            raise InputError(f"{key} makes a cycle of upstream runs: {circle}.")
+        typed = [f"+experiment={experiment}", *_shared_overrides(overrides, key, reference)]
+        run = requested_run(upstream_config(config, key, reference), typed, downstream)
+        if reference.is_common and OmegaConf.select(config, "seeds.start") == "run":
+            run = run.with_seed(run.seed + config.seed)
+        yield Dependency(key, run, reference.checkpoint, reference.is_common)
+
+
+class Reference(NamedTuple):
+    """An upstream run as a setting names it.
+
+    Attributes:
+        experiment: its name.
+        checkpoint: the file that is taken: "best.pt" or "last.pt".
+        is_common: whether it keeps its own seed and data set.
+    """
+
+    experiment: str
+    checkpoint: CheckpointFile
+    is_common: bool = False
+
+
+def parse_reference(key: str, value: str | None) -> Reference | None:
+    """What "experiment:NAME/last.pt" or "common:NAME/last.pt" names; None for any other value.
+
+    Raises:
+        InputError: the reference is not of this form, there is no such experiment, or the labels
+            of a domain are those of a common run, which has other images.
+    """
+    if value is None or not str(value).startswith((PREFIX, COMMON_PREFIX)):
+        return None
+    prefix, _, rest = value.partition(":")
+    is_common = value.startswith(COMMON_PREFIX)
+    name, _, checkpoint = rest.rpartition("/")
+    if checkpoint not in get_args(CheckpointFile) or (is_common and key != WEIGHTS):
+        raise InputError(
+            f"{key}={value}: expected experiment:NAME/best.pt or experiment:NAME/last.pt"
+            + (", or the same with common:." if key == WEIGHTS else ".")
+        )
+    known = available("experiment")
+    if name not in known:
+        raise InputError(f"{key}={value}: there is no experiment '{name}'; {nearest(name, known)}.")
+    return Reference(name, cast(CheckpointFile, checkpoint), is_common)
+
+
+def upstream_config(config: DictConfig, key: str, reference: Reference) -> DictConfig:
+    """The configuration of an upstream run: its experiment, with what both runs share.
+
+    Shared are `SHARED`, the sizes of the scale and durations that were typed; for weights also the
+    network. A common run shares `SHARED_BY_COMMON` instead of `SHARED`. Everything else is the
+    experiment's own.
+    """
+    scale = config.scale.name
+    upstream = compose([f"+experiment={reference.experiment}"])
+    if upstream.scale.name != scale:
+        upstream = compose([f"+experiment={reference.experiment}", f"scale={scale}"])
+    own = RUN_SETTINGS["model"]
+    # Its experiment says whether a network has pretrained weights, the scale says all else.
+    always = SHARED_BY_COMMON if reference.is_common else SHARED
+    shared = [*always, *(f"scale.{each}" for each in config.scale if each != "pretrained")]
+    if key == WEIGHTS:
+        upstream.model = {each: upstream.model._get_node(each) for each in own}
+        shared += [f"model.{each}" for each in config.model if each not in own]
+    if reference.is_common and CACHE in config.dataset and CACHE in upstream.dataset:
+        upstream.dataset[CACHE] = config.dataset[CACHE]
+    for each in shared:
+        *parents, last = each.split(".")
+        mine: Any = OmegaConf.select(config, ".".join(parents)) if parents else config
+        node = mine._get_node(last)  # not resolved: a reference is one to the upstream run's own
+        value = OmegaConf.to_container(node) if OmegaConf.is_config(node) else node._value()
+        OmegaConf.update(upstream, each, value, merge=False, force_add=True)
+    return upstream
+
+
+def _shared_overrides(overrides: Sequence[str], key: str, reference: Reference) -> list[str]:
+    """The typed overrides that the upstream run of the setting `key` shares."""
+    always = SHARED_BY_COMMON if reference.is_common else SHARED
+    # A file of conf/debug sets sizes of the scale.
+    groups = {"scale", "debug", *(each for each in always if each in NODES)}
+    groups |= {"model"} if key == WEIGHTS else set()
+    own = (WEIGHTS, "model.fresh", "seed", "runs_dir")
+    found = []
+    for word in overrides:
+        path = word.partition("=")[0].lstrip("+").rpartition("@")[2]
+        in_group = path.replace("/", ".").split(".")[0] in groups
+        if path not in own and (path in always or in_group):
+            found.append(word)
+    return found
+
+
+def load_spec(settings: Mapping[str, Any], overrides: Sequence[str] = ()) -> RunSpec:
+    """The specification of a stored run; its weights and upstream runs are left out.
+
+    Args:
+        settings: plain values of its configuration, whose targets may be built
+            (`rgbt.config.stored_config`).
+        overrides: of `CHANGEABLE` settings. ``dataset=mfnet`` replaces the whole node by that file
+            of ``conf/dataset/``; ``data.eval_batch_size=1`` changes one value.
+
+    Raises:
+        InputError: overrides that do not fit.
+    """
+    register_resolvers()
+    config = OmegaConf.create(dict(settings))
+    _override(config, overrides)
+    config.model.weights = None  # the checkpoint holds them all
+    return _spec_of(config, (), ()).check()
+
+
+def _override(config: DictConfig, overrides: Sequence[str]) -> None:
+    """Apply overrides in place: groups first, then single values.
+
+    Absent classes count by the convention of the data set that is measured, unless the run or
+    `overrides` set ``metric.absent`` by hand. A partition of a user's own class may lack it.
+    """
+    absent = config.metric.get("absent")
+    by_hand = absent not in (None, config.dataset.get("absent", "exclude"))
+    pairs = [word.lstrip("+").partition("=")[::2] for word in overrides]
+    # camera@consistency.view.camera works there. The search path holds for the whole command.
+    changes = [(k, v, k.rpartition("@")[2]) for k, v in pairs if k != SEARCH_PATH]
+    for key, _, path in changes:
+        if not any(path == each or path.startswith(f"{each}.") for each in CHANGEABLE):
+            raise InputError(
+                f"'{key}' of a finished run cannot be changed; {nearest(key, CHANGEABLE)}."
+            )
+    groups = [key for key, _, _ in changes if key in GROUPS]
+    for group in groups:
+        own = [f"{key}={value}" for key, value, path in changes if path.split(".")[0] == group]
+        config[group] = OmegaConf.to_container(compose(own)[group], resolve=True)
+    known = flatten(cast("dict[str, Any]", OmegaConf.to_container(config)))
+    for key, value, path in changes:
+        if path.split(".")[0] in groups:
+            continue
+        # A mapping such as dataset.shares is one value, and may be replaced as one.
+        if key not in known and not any(each.startswith(f"{key}.") for each in known):
+            near = [each for each in known if each.startswith(f"{key.partition('.')[0]}.")]
+            raise InputError(f"'{key}' is not a key of this run; {nearest(key, near)}.")
+        OmegaConf.update(config, key, parse_yaml(value, key))
+    is_typed = "metric.absent" in [path for _, _, path in changes]
+    if "absent" in config.metric and not is_typed:
+        config.metric.absent = absent if by_hand else config.dataset.get("absent", "exclude")

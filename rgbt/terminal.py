@@ -1,0 +1,76 @@
+"""Print messages on stderr, and tables and paths on stdout, without control characters of names."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich import box
+from rich.cells import cell_len
+from rich.console import Console, Group, JustifyMethod, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from rgbt.checks import without_controls
+from rgbt.tables import ResultTables, TextTable, result_grids
+
+WIDTH = 10_000
+"""Columns where stdout is no terminal: a file takes lines of any length."""
+
+SHORTEST = 16
+"""Least columns of a broken label; a key takes 12 and stays whole."""
+
+LABEL = re.compile(r"[^\W\d_]{3}.* |.{32}")
+"""Cells that may be broken into several lines: words, and names longer than a key or a number."""
+
+
+def info(sentence: str) -> None:
+    """Print a message to stderr."""
+    sys.stderr.write(f"rgbt: {without_controls(sentence)}\n")
+
+
+def warn(sentence: str) -> None:
+    """Print a warning to stderr."""
+    info(f"warning: {sentence}")
+
+
+def print_rich(renderable: RenderableType) -> None:
+    """Print results to stdout; no line of text and no number is cut."""
+    Console(width=None if sys.stdout.isatty() else WIDTH).print(renderable, soft_wrap=True)
+
+
+def plain_text(text: str, style: str = "") -> Text:
+    """Text as it is: no markup, no control characters."""
+    return Text(without_controls(text), style)
+
+
+def path_lines(paths: Sequence[tuple[str, str]]) -> Text:
+    """Paths, commands and addresses, one "name  path" pair per line."""
+    width = max(len(name) for name, _ in paths)
+    return plain_text("\n".join(f"{name:<{width}}  {path}" for name, path in paths))
+
+
+def result_view(
+    tables: ResultTables, folder: Path, links: Sequence[tuple[str, str]]
+) -> RenderableType:
+    """Tables and paths of a finished run; `links` as its tracker answered."""
+    paths = path_lines([("run folder", str(folder)), *links])
+    return Group(*map(rich_table, result_grids(tables)), paths)
+
+
+def rich_table(grid: TextTable) -> RenderableType:
+    """A grid as a table: labels left and broken where they do not fit, numbers right and whole."""
+    table = Table(box=box.SIMPLE_HEAD)
+    for index, (name, *cells) in enumerate(zip(grid.header, *grid.rows, strict=True)):
+        is_label = index == 0 or any(map(LABEL.match, cells))
+        longest = max(map(cell_len, (*cells, *name.split())), default=0)
+        least = min(longest, SHORTEST) if is_label else longest
+        side: JustifyMethod = "left" if is_label else "right"
+        table.add_column(plain_text(name), justify=side, overflow="fold", min_width=least)
+    for row in grid.rows:
+        table.add_row(*map(plain_text, row))
+    # Not the table's own title, which it would break at its own width.
+    title = [plain_text(grid.title, "bold")] if grid.title else []
+    return Group(*title, table, *(plain_text(f" {note}", "dim") for note in grid.notes))

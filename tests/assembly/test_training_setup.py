@@ -1,0 +1,232 @@
+"""Before anything is trained or written: the labels of the domains, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+from rgbt.assembly import training_setup
+from rgbt.assembly.training_setup import set_up_training, validate
+from rgbt.checks import InputError
+from rgbt.config.compose import compose
+from rgbt.data import pairs, rare_classes
+from rgbt.data.pseudo_labels import FORMAT
+from rgbt.engine.recomputation import Recomputed
+from rgbt.evaluation.prediction import decode_ahead
+from rgbt.run import main
+from rgbt.runs.run_spec import RunSpec
+from rgbt.runs.specify import specify
+from rgbt.types import Batch
+from tests.commands import SPLITS, Call, assert_one_sentence, words_of
+
+SIZES = (
+    *("dataset=synth_freiburg", "dataset.num_train_day=3", "dataset.num_train_night=2"),
+    *("dataset.num_val=1", "dataset.num_test=2", "scale.batch_size=1", "scale.critic_width=4"),
+    *("trainer.accelerator=cpu", "trainer.threads=1", "data.num_workers=0", "tracking=none"),
+)
+Composed = Callable[..., RunSpec]
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture
+def words(cache: Path, tmp_path: Path) -> Callable[..., list[str]]:
+    place = (f"dataset.cache_dir={cache}", f"runs_dir={tmp_path / 'runs'}")
+    return lambda name, *more: [f"+experiment={name}", *SIZES, *place, *more]
+
+
+@pytest.fixture
+def composed(words: Callable[..., list[str]]) -> Composed:
+    def make(name: str, *more: str) -> RunSpec:
+        return specify(compose(words(name, *more)))
+
+    return make
+
+
+def test_rare_classes_are_those_of_the_source_as_it_is_labelled(
+    composed: Composed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Target images and upstream runs are shuffled; an upstream run has the batch size."""
+    words = ["data.sampling=rare_classes", "data.batch_size=2"]
+    upstream = composed("self_training_night", *words).upstream[0].data
+    assert (upstream.sampling, upstream.batch_size) == ("shuffled", 2)
+    counted: list[Any] = []
+    drawn: list[Any] = []
+    relabelled = SimpleNamespace(names=lambda split: ("a", "b"))
+    for module, name, instead in (
+        (rare_classes, "count_rare_classes", lambda *args: counted.append(args) or "rare"),
+        (training_setup, "train_batches", lambda *args: drawn.append(args)),
+        (pairs, "PairedBatches", lambda *_, **__: None),
+        (training_setup, "_labelled", lambda *_: relabelled),
+    ):
+        monkeypatch.setattr(module, name, instead)
+    setup = set_up_training(composed("self_training_night", *words, "model.weights=null"))
+    setup.batches(range(1))
+    assert [each[:2] for each in counted] == [(relabelled, setup.session.domains.source.split)]
+    assert [each[-1] for each in drawn] == ["rare", None]
+
+
+def write_folder(spec: RunSpec, folder: Path, split: str, **changes: Any) -> Path:
+    """A folder that says it is finished, with (empty) files of every image of a split."""
+    dataset = spec.dataset.build()
+    for name in dataset.names(split):
+        (folder / "labels").mkdir(parents=True, exist_ok=True)
+        (folder / "labels" / f"{name}.png").touch()
+    said = {
+        **{"format": FORMAT, "digest": "abc", "classes": list(dataset.classes)},
+        **{"kept": 0.5, "threshold": 0.9, "fingerprint": dataset.fingerprint(), **changes},
+    }
+    (folder / "pseudo_labels.json").write_text(json.dumps(said))
+    return folder
+
+
+@pytest.mark.parametrize("name", ["source", "target"])
+def test_given_labels_that_the_data_set_does_not_have(composed: Composed, name: str) -> None:
+    spec = composed("sh_both", f"domains.{name}.split=train_night")
+    with pytest.raises(InputError, match=f"domains.{name}.labels=given"):
+        set_up_training(spec)
+
+
+def test_test_images_in_training_give_a_warning(
+    composed: Composed, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def warnings_of(*words: str) -> list[str]:
+        capfd.readouterr()
+        set_up_training(composed(*words))
+        return [line for line in capfd.readouterr().err.splitlines() if "test images" in line]
+
+    assert warnings_of("sh_both") == []
+    # One of the two test images is of the day.
+    for word, count in (("domains.target.split=test_day", 1), ("domains.source.split=test", 2)):
+        (line,) = warnings_of("sh_both", word)
+        assert f"{word}: {count} of its images" in line
+    # Without their labels they are the images of a target that is adapted to, and may be seen.
+    unseen = ("sh_adversarial", "model.weights=null", "domains.target.split=test_night")
+    assert warnings_of(*unseen) == []
+
+
+def refused(call: Call, words: list[str], key: str, runs: Path) -> None:
+    before = {*runs.glob("*/*")}
+    code, _, err = call(main, *words)
+    assert code == 2, err
+    assert_one_sentence(err, key)
+    assert {*runs.glob("*/*")} == before, "nothing is left behind"
+
+
+def test_pseudo_labels_of_another_split(
+    call: Call, composed: Composed, words: Callable[..., list[str]], tmp_path: Path
+) -> None:
+    folder = write_folder(composed("sh_both"), tmp_path / "night", "train_night")
+    typed = ("sh_both", f"domains.target.labels={folder}")
+    refused(call, words(*typed), "domains.target.labels", tmp_path / "runs")
+    # A file that is left out among others is none that the run goes without unasked ...
+    folder = write_folder(composed("sh_both"), tmp_path / "day", "train_day")
+    next(iter((folder / "labels").iterdir())).unlink()
+    typed = ("sh_both", f"domains.target.labels={folder}")
+    with pytest.raises(InputError, match="no pseudo-labels for 1 of the 3 images of train_day"):
+        set_up_training(composed(*typed))
+    found = set_up_training(composed(*typed, "data.on_error=skip")).datasets["target"]
+    assert len(found.labels.missing(found.names("train_day"))) == 1
+    # ... and without any there is nothing to learn from; nor where the threshold kept none.
+    write_folder(composed("sh_both"), folder, "train_day", kept=0)
+    refused(call, words(*typed), "threshold", tmp_path / "runs")
+    shutil.rmtree(folder / "labels")
+    with pytest.raises(InputError, match="3 of the 3 images"):
+        set_up_training(composed(*typed, "data.on_error=skip"))
+
+
+def test_predicted_labels_of_other_files(
+    call: Call, composed: Composed, words: Callable[..., list[str]], tmp_path: Path
+) -> None:
+    """Named by their experiment they follow the data; a folder is taken as it is."""
+    spec = composed("multi_head_night_stage1")
+    labels = spec.upstream[0].folder / "pseudo_labels" / "train_night_thermal_best"
+    write_folder(spec, labels, "train_night")
+    (spec.upstream[0].folder / "result.json").write_text("{}")
+    assert set_up_training(spec).datasets["target"].labels.folder == labels
+    write_folder(spec, labels, "train_night", fingerprint="of other files")
+    refused(call, words("multi_head_night_stage1"), "other files", tmp_path / "runs")
+    typed = (f"domains.target.labels={labels}", "domains.target.teacher_view=null")
+    again = set_up_training(composed("multi_head_night_stage1", *typed))
+    assert again.datasets["target"].labels.manifest["fingerprint"] == "of other files"
+
+
+def test_validate_view_of_the_teacher_passes(composed: Composed) -> None:
+    for word in ("teacher_view=thermal", "teacher_view=null", "confidence=true"):
+        spec = composed("multi_head_night_stage1", f"domains.target.{word}")
+        validate(spec)
+        assert not spec.folder.exists()
+
+
+@pytest.fixture
+def cached(data: Path, tmp_path: Path) -> RunSpec:
+    """A small network on MFNet, with a cache."""
+    model = ("model=mfnet_tiny", "loss=cross_entropy", "masker=none")
+    place = (f"data.cache={tmp_path / 'cache'}", "data.num_workers=0")
+    words = [word for word in words_of(data, tmp_path / "runs", *model) if "masker." not in word]
+    return specify(compose((*words, *place)))
+
+
+def test_all_that_is_read_is_decoded_before_the_first_step(
+    cached: RunSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A full or read-only disk is reported before anything is trained."""
+    validate(cached)
+    assert not (tmp_path / "cache").exists(), "a validation writes nothing"
+    setup = set_up_training(cached)
+    decode_ahead(setup.session, *setup.session.read_splits())
+    dataset: Any = setup.session.dataset
+
+    monkeypatch.setattr(dataset.source, "read", None)  # nothing is decoded again
+    for split, names in SPLITS.items():
+        assert [dataset.read(name).name for name in names] == names, split
+    one = next(setup.batches(range(1)))
+    assert isinstance(one, Batch), "no GPU to augment on"
+    monkeypatch.setattr(training_setup, "_where_to_augment", lambda session: "device")
+    other = next(setup.batches(range(1)))
+    assert not isinstance(other, Batch)
+    assert torch.equal(other.to("cpu").rgb, one.to("cpu").rgb)
+
+
+def test_network_settings_are_applied_and_keep_the_loss(composed: Composed) -> None:
+    def first_loss(*words: str) -> tuple[torch.nn.Module, torch.Tensor]:
+        setup = set_up_training(composed("mfnet", "masker=none", *words))
+        loaded = next(setup.batches(range(1))).to("cpu")
+        phases = setup.scheme.phases(loaded, lambda _: torch.Generator().manual_seed(0))
+        return setup.session.model, torch.stack(list(next(iter(phases)).parts.values())).sum()
+
+    plain, expected = first_loss()
+    network, loss = first_loss("trainer.activation_checkpointing=true")
+    assert torch.equal(loss, expected)
+    assert isinstance(network.get_submodule("conv1_rgb").forward, Recomputed)
+    network, loss = first_loss("trainer.memory_format=channels_last")
+    torch.testing.assert_close(loss, expected, rtol=1e-4, atol=0)
+    assert not network.get_parameter("conv2_1_rgb.conv.weight").is_contiguous()
+    assert list(network.state_dict()) == list(plain.state_dict())
+
+
+@pytest.mark.parametrize(("source", "changed"), [("weights", 0), ("order", 1), ("masks", None)])
+def test_seed_of_a_source_changes_what_is_drawn_from_it_alone(
+    composed: Composed, source: str, changed: int | None
+) -> None:
+    def drawn(*more: str) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
+        setup = set_up_training(composed("sh_adversarial", "model.weights=null", *more))
+        weights = [*setup.model.parameters(), *setup.others["critic"].parameters()]
+        pair: Any = next(setup.batches(range(1)))
+        return weights, [pair.source.rgb, pair.target.rgb]
+
+    before, after = drawn(), drawn(f"seeds.{source}=1")
+    for index, (one, other) in enumerate(zip(before, after, strict=True)):
+        drawings = [both for both in zip(one, other, strict=True) if both[0].unique().numel() > 1]
+        is_same = [torch.equal(*both) for both in drawings]
+        assert not any(is_same) if index == changed else all(is_same)

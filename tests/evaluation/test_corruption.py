@@ -1,0 +1,150 @@
+"""Corruptions requested on the command line, their file names, and a data set under them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from rgbt.checks import InputError
+from rgbt.evaluation.request import (
+    CorruptedDataset,
+    choose_corruption,
+    choose_corruptions,
+    requested_corruption,
+    standard_corruptions,
+)
+from tests.corruptions.recorded import NAMES, Recorded, sample
+
+
+def corrupted(source: Recorded, name: str, severity: float, *words: str) -> CorruptedDataset:
+    return CorruptedDataset(source, choose_corruption(name, words).at(str(severity)), "test")
+
+
+def shown(data: CorruptedDataset, names: Sequence[str]) -> list[str]:
+    """Whose thermal image each name shows, known by the pixels."""
+    known = {sample(name).thermal.tobytes(): name for name in names}
+    return [known[data.read(name).thermal.tobytes()] for name in names]
+
+
+@pytest.mark.parametrize(
+    ("name", "severity", "expected"),
+    [
+        ("frozen", 3, [0, 0, 0, 3, 3, 3, 6]),
+        ("frozen", 20, [0] * 7),
+        ("delayed", 1, [0, 0, 1, 2, 3, 4, 5]),
+        ("delayed", 4, [0, 0, 0, 0, 0, 1, 2]),
+    ],
+)
+def test_late_thermal_is_that_of_a_previous_frame(
+    name: str, severity: int, expected: list[int]
+) -> None:
+    names = tuple(f"{number:02d}" for number in range(7))
+    data = corrupted(Recorded(names, by_night=False), name, severity)
+    assert shown(data, names) == [names[number] for number in expected]
+    last = data.read(names[6])
+    np.testing.assert_array_equal(last.rgb, sample(names[6]).rgb)
+    np.testing.assert_array_equal(last.label, sample(names[6]).label)
+
+
+def test_frames_of_day_and_night_are_separate() -> None:
+    assert dict(zip(NAMES, shown(corrupted(Recorded(), "delayed", 1), NAMES), strict=True)) == {
+        **{"00001D": "00001D", "00003D": "00001D", "00004D": "00003D", "00006D": "00004D"},
+        **{"00002N": "00002N", "00005N": "00002N"},
+    }
+
+
+def test_draws_differ_by_name_and_seed() -> None:
+    words = ("corruption.block=32",)
+    data = corrupted(Recorded(), "occluded:thermal", 0.5, *words)
+    other = corrupted(Recorded(), "occluded:thermal", 0.5, *words, "corruption.seed=1")
+    hidden = [data.read(NAMES[0]), data.read(NAMES[1]), other.read(NAMES[0])]
+    first, *others = [each.thermal == 0 for each in hidden]
+    assert first.mean() == 0.5
+    assert not any(np.array_equal(first, each) for each in others)
+
+
+@pytest.mark.parametrize("name", ["noise", "frozen", "delayed", "removed:rgb"])
+def test_severity_0_is_the_sample_of_the_source(name: str) -> None:
+    source = Recorded()
+    found = corrupted(source, name, 0).read("00003D")
+    np.testing.assert_array_equal(found.rgb, sample("00003D").rgb)
+    np.testing.assert_array_equal(found.thermal, sample("00003D").thermal)
+    assert source.reads == ["00003D"]
+
+
+def test_frames_of_two_sizes_are_refused() -> None:
+    data = corrupted(Recorded(sizes={"00003D": (60, 80)}), "delayed", 1)
+    for name in ("00004D", "00009D"):
+        with pytest.raises(InputError, match=name):
+            data.read(name)
+    # Corruptions of pixels need no order.
+    assert corrupted(Recorded(), "noise", 8).read("00009D").name == "00009D"
+
+
+@pytest.mark.parametrize("name", standard_corruptions())
+def test_lowest_severity_changes_the_named_image(name: str) -> None:
+    data = CorruptedDataset(Recorded(), choose_corruption(name).ladder()[0], "test")
+    clean, found = ([source.read(each) for each in NAMES] for source in (Recorded(), data))
+    same_rgb, same_thermal = (
+        all(np.array_equal(getattr(a, i), getattr(b, i)) for a, b in zip(clean, found, strict=True))
+        for i in ("rgb", "thermal")
+    )
+    of_thermal = ("delayed", "frozen", "misregistered")
+    assert same_rgb == (name.startswith(of_thermal) or name.endswith(":thermal"))
+    assert same_thermal == name.endswith(":rgb")
+
+
+SMALL = ("corruption.block=16", "corruption.seed=3", "corruption.severities=[0.2]")
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "severity", "file_stem"),
+    [
+        ("occluded", (), "0.5", "occluded-0.5"),
+        ("occluded:rgb", SMALL, "0.25", "occluded_rgb-0.25_block-16_seed-3"),
+        ("removed:rgb", (), "", "rgb_removed-1"),
+        ("removed", ("corruption.image=rgb",), "", "rgb_removed-1"),
+        ("noise:thermal", ("corruption.image=rgb",), "8", "noise_rgb-8"),
+        ("noise", ("corruption.seed=0",), "8", "noise-8"),
+    ],
+)
+def test_file_stem_names_what_is_changed(
+    name: str, words: tuple[str, ...], severity: str, file_stem: str
+) -> None:
+    assert choose_corruption(name, words).at(severity).file_stem == file_stem
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "severity", "key"),
+    [
+        ("occludd", [], "0.5", "did you mean 'occluded'"),
+        ("no.yaml", [], "1", "no.yaml"),
+        ("occluded", [], "", "severity"),
+        ("occluded", [], ".nan", "severity"),
+        ("occluded", [], "2", "severity"),
+        ("noise", [], "-1", "severity"),
+        ("frozen", [], "2.5", "severity"),
+        ("delayed", [], ".inf", "severity"),
+        ("removed:rgb", [], "0.5", "severity"),
+        ("removed", [], "1", "corruption.image"),
+        ("frozen:rgb", [], "2", "corruption.image"),
+        ("occluded", ["corruption.blok=1"], "0.5", "corruption.blok.*block"),
+        ("occluded", ["corruption.block=big"], "0.5", "corruption.block"),
+        ("noise", ["corruption.severities=[4,2]"], "3", "corruption.severities"),
+        ("none", ["corruption.block=8"], "", "corruption.block=8 has no effect"),
+        ("none", [], "3", "severity has no effect"),
+    ],
+)
+def test_bad_request_is_refused(name: str, words: list[str], severity: str, key: str) -> None:
+    with pytest.raises(InputError, match=key):
+        requested_corruption(name, severity, words, ())
+
+
+def test_choose_corruptions() -> None:
+    assert len(choose_corruptions("all", [])) == 14
+    both = choose_corruptions("blur:rgb, frozen", ["corruption.seed=2"])
+    assert [(each.name, each.seed) for each in both] == [("blur_rgb", 2), ("frozen", 2)]
+    with pytest.raises(InputError, match=r"corruption\.block=8"):
+        choose_corruptions("all", ["corruption.block=8"])
