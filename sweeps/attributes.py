@@ -50,9 +50,3 @@ METRICS = "rgbt.metrics"
 
 COMMAND = "rgbt.command"
 """Of a study: the command that created it."""
-
-CONFIRMATION = "rgbt.confirmation"
-"""Of a search: the table of its confirmation (`sweeps.confirmation`), as JSON."""
-
-CONFIRMS = "rgbt.confirms"
-"""Of a study that confirms the best points of a search: the name of the search."""

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import sys
-import time
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
 from rgbt.checks import InputError, RunError
@@ -14,8 +13,6 @@ from rgbt.runs.provenance import command_line
 from rgbt.runs.run_spec import RunSpec
 from rgbt.terminal import info
 from sweeps import attributes as names
-from sweeps.candidates import Candidates, check_confirmable
-from sweeps.confirmation import confirm, preview_line
 from sweeps.settings import SweepSettings
 from sweeps.space.samplers import build_pruner, build_sampler
 from sweeps.space.space import Parameter, as_overrides, signature, suggest
@@ -47,7 +44,7 @@ class Search:
 
 
 def search(request: Search, settings: SweepSettings) -> None:
-    """Run trials until the budget is spent, confirm the best ones, then report the study.
+    """Run trials until the budget is spent, then report the study.
 
     Raises:
         InputError: settings that do not fit, or a study of that name with another space.
@@ -62,7 +59,6 @@ def search(request: Search, settings: SweepSettings) -> None:
             "retry=failed is for grids and tables. A search continues with other points: set more "
             "trials, or retries=1 to retry each failed point immediately."
         )
-    check_confirmable(settings, request.parameters)
     sampler = build_sampler(settings.sampler, len(settings.objectives))
     first = settings.objectives[0]
     if settings.pruner is not None and not first.is_reported:
@@ -74,7 +70,6 @@ def search(request: Search, settings: SweepSettings) -> None:
     if settings.dry_run:
         _preview(request, settings)
         return
-    began = time.monotonic()
     probe = _probe(request, settings)
     storage = open_storage(settings.storage, request.runs.runs_dir)
     request.runs.create_tables()
@@ -99,7 +94,6 @@ def search(request: Search, settings: SweepSettings) -> None:
         info(f"trial {trial.number} failed: {trial.user_attrs.get(names.REASON)}")
     if trials and not states["COMPLETE"] and not states["RUNNING"]:
         raise RunError(f"no trial of {request.study} has finished; see the reasons above.")
-    _confirm(request, settings, store, time.monotonic() - began)
     runs_dir = request.runs.runs_dir
     links = report(study, study_folder(runs_dir, request.study), request.runs.tracking)
     show_links([*links, ("dashboard", dashboard_command(settings.storage, runs_dir))])
@@ -150,40 +144,11 @@ def _drive(request: Search, settings: SweepSettings, store: TrialStore) -> None:
     def num_done() -> int:
         return sum(trial.state.is_finished() for trial in store.trials())
 
-    if settings.confirm.best:
-        # The best points are known when the trials of all drivers have finished.
-        settings = replace(settings, wait=True)
     view = ProgressView(request.study, settings.trials, settings.workers, num_done)
     source = SamplerSource(
         request.fixed, request.parameters, store, Planner(), settings, view.rejected
     )
     drive(view, source, store, request.runs, settings)
-
-
-def _confirm(request: Search, settings: SweepSettings, store: TrialStore, seconds: float) -> None:
-    """Confirm the best points of a complete search.
-
-    Args:
-        request: the search.
-        settings: `confirm` and those of execution count here.
-        store: its trials.
-        seconds: since the call began.
-    """
-    if not settings.confirm.best:
-        return
-    done = sum(trial.state.is_finished() for trial in store.trials())
-    left = None if settings.hours is None else settings.hours - seconds / 3600
-    if done < (settings.trials or 0) or (left is not None and left <= 0):
-        info(
-            f"the best points are not confirmed yet: {done} of {settings.trials} trials are "
-            "finished. Rerun the command to resume."
-        )
-        return
-    candidates = Candidates.of(store.study, request.fixed, request.parameters, settings)
-    if len(candidates.points) < 2:
-        info("the best point is not confirmed: the search has no other complete point.")
-        return
-    confirm(store.study, candidates, request.runs, replace(settings, hours=left))
 
 
 def _preview(request: Search, settings: SweepSettings) -> None:
@@ -200,5 +165,3 @@ def _preview(request: Search, settings: SweepSettings) -> None:
     if settings.trials is not None:
         left = max(0, settings.trials - len(trials))
         sys.stdout.write(f"{left} of {settings.trials} trials would be run.\n")
-    if settings.confirm.best:
-        sys.stdout.write(f"{preview_line(study, settings, request.runs)}\n")

@@ -74,28 +74,6 @@ GpuSlot = Gpu | Annotated[tuple[Gpu, ...], Len(1, 64)]
 NumRuns = Annotated[int, Interval(ge=1, le=10**6)]
 
 
-@dataclass(frozen=True)
-class Confirm:
-    """How a search confirms its best points with further seeds, see `sweeps.confirmation`.
-
-    Attributes:
-        best: number of points; 0: none are confirmed.
-        max_seeds: most further seeds of a point.
-    """
-
-    __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
-
-    best: Annotated[int, Interval(ge=0, le=100)]
-    max_seeds: Annotated[int, Interval(ge=4, le=1000)]
-
-    def __post_init__(self) -> None:
-        if self.best == 1:
-            raise InputError(
-                "best=1: expected 2 or more points, which are compared with "
-                "each other, or 0 for none."
-            )
-
-
 @dataclass(frozen=True, kw_only=True)
 class SweepSettings:
     """See ``conf/hydra/sweeper/study.yaml``, which explains every key and holds the defaults."""
@@ -121,7 +99,6 @@ class SweepSettings:
     trials: NumRuns | None
     hours: Positive | None
     replicates: Annotated[int, Interval(ge=1, le=1000)]
-    confirm: Confirm
 
     def __post_init__(self) -> None:
         if self.submitit and self.executor != "submitit":

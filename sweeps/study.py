@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import re
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -98,7 +97,7 @@ def report(study: optuna.Study, out: Path, tracking: Tracking) -> list[Link]:
     grids = tables(data, shares)
     out.mkdir(parents=True, exist_ok=True)
     pictures = draw(data, shares, out)
-    lines = [*confirmation_lines(data), *remarks(shares, pictures)]
+    lines = remarks(shares, pictures)
     text = markdown(data, grids, lines)
     write_atomic(out / "study.md", (text + gallery(pictures)).encode())
     write_atomic(out / "trials.csv", trials_csv(data).encode())
@@ -133,18 +132,6 @@ def gallery(pictures: Sequence[StudyFigure]) -> str:
     """The figures in Markdown, by the names of their files."""
     drawn = [picture for picture in pictures if picture.path is not None]
     return "".join(f"\n## {p.title}\n\n![{p.title}]({p.name}.png)\n" for p in drawn)
-
-
-def confirmation_lines(data: StudyData) -> list[str]:
-    """The study with the runs of a confirmation; or the search that a study confirms."""
-    from sweeps.report.study_data import confirmed_study
-
-    about, other = "", ""
-    if data.confirms:
-        about, other = "The search that these runs confirm", data.confirms
-    elif data.confirmation is not None:
-        about, other = "Runs of the confirmation", confirmed_study(data.name)
-    return [f"{about}: {shlex.join(['rgbt', 'study', f'name={other}'])}"] if about else []
 
 
 def remarks(shares: Importances, pictures: Sequence[StudyFigure]) -> list[str]:

@@ -117,7 +117,6 @@ def _refuse_search_settings(settings: SweepSettings) -> None:
         "hours": settings.hours is not None,
         "pruner": settings.pruner is not None,
         "replicates": settings.replicates > 1,
-        "confirm": settings.confirm.best > 0,
     }
     for key in (key for key, is_given in given.items() if is_given):
         raise InputError(

@@ -19,7 +19,6 @@ from sweeps.rendering.figure import draw_table
 from sweeps.rendering.file_formats import latex, markdown, tidy_csv
 from sweeps.rendering.rendered_table import RenderedTable, render_table
 from sweeps.rendering.terminal import terminal
-from sweeps.rendering.variance import variance_csv, variance_grids
 from sweeps.report.records import record
 from sweeps.table.cells import NO_VALUE
 from sweeps.table.efficiency import efficiency_cells
@@ -29,7 +28,6 @@ from sweeps.table.table import Table
 from sweeps.verdicts.effects import DesignEffects, DesignJudge
 from sweeps.verdicts.forms import forms_grid
 from sweeps.verdicts.judge import CellRunId, JudgedClaim, TableJudge
-from sweeps.verdicts.variance import VarianceBudget, variance_budget
 from sweeps.worker.point_list import other_code_line
 
 if TYPE_CHECKING:
@@ -42,13 +40,11 @@ class Findings:
 
     Attributes:
         claims: judged.
-        variance: by source; None where the table declares none.
         forms: differences of the forms as text; None where one form was run.
         effects: of the factors of its design; None where it has none.
     """
 
     claims: Sequence[JudgedClaim] = ()
-    variance: VarianceBudget | None = None
     forms: TextTable | None = None
     effects: DesignEffects | None = None
 
@@ -89,7 +85,6 @@ def publish_table(
     )
     rendered = render_table(scored, request.typed_overrides())
     rendered = replace(rendered, remarks=(*rendered.remarks, *_not_trained(request)))
-    findings = replace(findings, variance=variance_budget(judge, runs))
     print_rich(terminal(rendered, plain=not sys.stdout.isatty()))
     if findings.forms is not None:
         print_rich(rich_table(findings.forms))
@@ -97,8 +92,6 @@ def publish_table(
         print_rich(rich_table(grid))
     if findings.claims:
         print_rich(rich_table(claims_grid(findings.claims, counted(findings.claims))))
-    for grid in _variance_grids(findings):
-        print_rich(rich_table(grid))
     failed = _report_missing(scored, outcomes)
     try:
         files = write_files(scored, rendered, findings, out)
@@ -144,8 +137,6 @@ def write_files(
         "table.csv": tidy_csv(scored),
         "table.tex": latex(rendered),
     }
-    if findings.variance is not None:
-        texts["variance.csv"] = variance_csv(findings.variance)
     if findings.claims:
         texts["claims.csv"] = claims_csv(findings.claims)
     if findings.effects is not None:
@@ -171,12 +162,7 @@ def _whole_markdown(table: Table, rendered: RenderedTable, findings: Findings) -
     parts += [] if findings.forms is None else [findings.forms.to_markdown()]
     parts += [grid.to_markdown() for grid in _effects_of(findings, table)]
     parts += [claims_markdown(findings.claims)] if findings.claims else []
-    parts += [grid.to_markdown() for grid in _variance_grids(findings)]
     return "\n".join(parts)
-
-
-def _variance_grids(findings: Findings) -> tuple[TextTable, ...]:
-    return () if findings.variance is None else variance_grids(findings.variance)
 
 
 def metrics(claims: Sequence[JudgedClaim], outcomes: Sequence[Outcome]) -> dict[str, float]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import warnings
 from collections import Counter
@@ -14,7 +13,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rgbt.config.compose import PIXELS, with_pixels
-from rgbt.tables import TextTable
 from sweeps import attributes
 
 if TYPE_CHECKING:
@@ -31,11 +29,6 @@ ADVISED = 50
 """Complete trials from which the best tenth has the five that PED-ANOVA's authors ask for."""
 
 
-def confirmed_study(search: str) -> str:
-    """Name of the study that confirms the best points of a search."""
-    return f"{search} confirmed"
-
-
 @dataclass(frozen=True)
 class StudyData:
     """A study at one moment.
@@ -47,8 +40,6 @@ class StudyData:
         maximize: whether more is better, by objective.
         trials: by number, without dropped duplicates.
         command: that created the study, or "".
-        confirmation: of a search: its best points with further seeds; None without one.
-        confirms: name of the search whose best points it confirms, or "".
     """
 
     name: str
@@ -57,8 +48,6 @@ class StudyData:
     maximize: tuple[bool, ...]
     trials: tuple[FrozenTrial, ...]
     command: str = ""
-    confirmation: TextTable | None = None
-    confirms: str = ""
 
     def of_state(self, *states: str) -> list[FrozenTrial]:
         """Trials in one of these states (names as in `STATES`), by number."""
@@ -166,18 +155,7 @@ def read(study: optuna.Study) -> StudyData:
         maximize=tuple(direction.name == "MAXIMIZE" for direction in study.directions),
         trials=tuple(t for t in trials if not t.user_attrs.get(attributes.DROPPED)),
         command=str(notes.get(attributes.COMMAND, "")),
-        confirmation=_table(notes.get(attributes.CONFIRMATION)),
-        confirms=str(notes.get(attributes.CONFIRMS, "")),
     )
-
-
-def _table(text: str | None) -> TextTable | None:
-    """A table that was written as JSON."""
-    if text is None:
-        return None
-    found = json.loads(text)
-    rows = tuple(tuple(row) for row in found["rows"])
-    return TextTable(found["title"], tuple(found["header"]), rows, tuple(found["notes"]))
 
 
 def used_parameters(data: StudyData) -> list[str]:

@@ -37,9 +37,8 @@ WORDS = {
 
 def tables(data: StudyData, shares: Importances) -> list[TextTable]:
     """What the terminal and the Markdown file show, in order; empty tables are left out."""
-    confirmed = [] if data.confirmation is None else [data.confirmation]
     grids = [
-        *(counts_grid(data), trials_grid(data), *confirmed),
+        *(counts_grid(data), trials_grid(data)),
         *(failed_grid(data), importance_grid(data, shares)),
     ]
     return [grid for grid in grids if grid.rows]

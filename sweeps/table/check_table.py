@@ -15,7 +15,6 @@ from rgbt.metrics.details import default, details_of_metric
 from rgbt.metrics.named import OF_PAIRS
 from sweeps.table.claim import OTHERS, PREVIOUS, Claim
 from sweeps.table.table import Column, ReleasedForm, Row, Table
-from sweeps.table.variance import Variance
 
 KINDS = ("metric", "minus", "mean", "efficiency")
 """Keys of a column that define its values; a column has one of them."""
@@ -48,19 +47,8 @@ def check_table(table: Table, where: str) -> None:
         _check_column(column, table, table.columns[:index], f"{where}, column '{column.name}'")
     for row in table.rows:
         _check_row(row, table, f"{where}, row '{row.label}'")
-    if table.variance is not None:
-        _check_variance(table.variance, table, f"{where}, variance")
     for claim in table.claims:
         _check_claim(claim, table, f"{where}, claim '{claim.name}'")
-
-
-def _check_variance(variance: Variance, table: Table, where: str) -> None:
-    check_choice(f"{where}, column", variance.column, [each.name for each in table.columns])
-    labels = [row.label for row in table.rows]
-    for label in variance.labels:
-        check_choice(f"{where}, row", label, labels)
-    if not variance.sources:
-        raise InputError(f"{where}, sources: expected one source or more, got none.")
 
 
 def _check_scales(at: Iterable[str], where: str) -> None:

@@ -19,7 +19,6 @@ from sweeps.table.claim import Claim
 from sweeps.table.design import Combined, Design, DesignFactor, DesignMethod, Part
 from sweeps.table.design_rows import with_design_rows
 from sweeps.table.table import Column, Factor, Row, Table
-from sweeps.table.variance import Variance
 
 PUBLISHED = Path(__file__).resolve().parents[1] / "tables"
 """The papers' tables, part of the package."""
@@ -31,7 +30,6 @@ OWN = Path("tables")
 """Tables of the user, in the current folder."""
 
 SHAPES: dict[str, type[Any]] = {
-    "variance": Variance,
     "rows": Row,
     "columns": Column,
     "factor": Factor,

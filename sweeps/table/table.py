@@ -12,7 +12,6 @@ from rgbt.metrics.pairs import Protocol
 from sweeps.evaluation import BatchNorm, Head
 from sweeps.table.claim import Claim
 from sweeps.table.design import Design
-from sweeps.table.variance import Variance
 
 Origin = Literal[
     "own_method",
@@ -188,7 +187,6 @@ class Table:
             convention of the data set (`rgbt.metrics.counts.Counts.absent`).
         columns: in order.
         factor: x axis of the figure; None: no figure over a factor.
-        variance: rows that measure the variance of a score by source; None: there are none.
         forms: one sentence per form that says what the rows are run as.
         claims: what the paper says about the table.
         remarks: footnotes of the whole table, one sentence each.
@@ -208,7 +206,6 @@ class Table:
     absent: Literal["released", "exclude"] | None = None
     columns: tuple[Column, ...]
     factor: Factor | None = None
-    variance: Variance | None = None
     forms: Mapping[Form, str] = field(default_factory=dict)
     claims: tuple[Claim, ...] = ()
     remarks: tuple[str, ...] = ()

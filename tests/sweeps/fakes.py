@@ -22,7 +22,7 @@ from rgbt.runs.folder import Description, RunFolder, counts_name
 from rgbt.tracking.mlflow_store import NoTracking
 from sweeps import attributes as names
 from sweeps.point import Point
-from sweeps.settings import Confirm, Objective, SweepSettings
+from sweeps.settings import Objective, SweepSettings
 from sweeps.space.samplers import build_sampler
 from sweeps.space.space import parse_space
 from sweeps.worker import driver as drivers
@@ -56,7 +56,6 @@ def settings(**changes: Any) -> SweepSettings:
         "objectives": (Objective("test/mIoU", "maximize"),),
         "sampler": {"kind": "random", "seed": 0},
         "replicates": 1,
-        "confirm": Confirm(best=0, max_seeds=10),
     }
     return SweepSettings(**{**plain, **changes})
 

@@ -97,26 +97,6 @@ def test_a_whole_table(call: Call, place: Path, driven: Driven) -> None:
     assert [row["mean"] for row in rows] == ["41.0", "42.0", ""]
 
 
-def test_reproduce_variance_prints_and_writes_the_budget(
-    call: Call, place: Path, driven: Driven
-) -> None:
-    declared = "variance: {column: acc, sources: {weights: one}, all: two}\nrows:"
-    file = place / "tables" / "my" / "small.yaml"
-    file.write_text(OWN_TABLE.replace("rows:", declared, 1).replace("rows of a", "of a"))
-    driven("finished")
-    code, out, err = call(entry, "table=my/small", "seeds=3", "tracking=none")
-    assert (code, err) == (0, "")
-    assert "Standard deviation of acc by source" in out
-    assert "Smallest difference of acc that paired seeds show" in out
-    folder = place / "runs" / "tables" / "my" / "small_demo"
-    lines = list(csv.DictReader((folder / "variance.csv").open()))
-    # Row "one" has the accuracies 40, 42, 44, and "two" 41, 43, 45.
-    assert [(line["name"], line["value"]) for line in lines[:3]] == [
-        *(("weights", "2"), ("sum of these", "2"), ("all", "2")),
-    ]
-    assert "Standard deviation of acc by source" in (folder / "table.md").read_text()
-
-
 def test_reproduce_table_file_is_named_by_paper(call: Call, place: Path, driven: Driven) -> None:
     asked = driven("finished")
     path = place / "elsewhere" / "mine.yaml"

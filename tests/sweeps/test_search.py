@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,7 +13,7 @@ from rgbt.checks import InputError, RunError
 from rgbt.config.compose import compose
 from sweeps import attributes as names
 from sweeps.search import Search, _probe, search
-from sweeps.settings import Confirm, Objective, SweepSettings
+from sweeps.settings import Objective, SweepSettings
 from sweeps.space.space import parse_space
 from sweeps.worker.run_store import open_run_store
 from sweeps.worker.storage import load_study, open_storage
@@ -146,89 +145,3 @@ def test_preview_shows_missing_points_and_writes_nothing(
     capsys.readouterr()
     search(wanted, settings(dry_run=True))
     assert "2 of 3 trials would be run" in capsys.readouterr().out
-
-
-CONFIRM = Confirm(best=2, max_seeds=6)
-
-
-@pytest.fixture
-def confirmations(monkeypatch: pytest.MonkeyPatch) -> list[tuple[list[str], SweepSettings]]:
-    """Labels of the points that would be confirmed, and the settings."""
-    calls: list[tuple[list[str], SweepSettings]] = []
-
-    def of(study: Any, *given: Any) -> SimpleNamespace:
-        del given
-        return SimpleNamespace(points=[f"#{trial.number}" for trial in study.trials])
-
-    def confirm(study: Any, candidates: Any, runs: Any, settings: SweepSettings) -> None:
-        del study, runs
-        calls.append((candidates.points, settings))
-
-    monkeypatch.setattr(searching, "Candidates", SimpleNamespace(of=of))
-    monkeypatch.setattr(searching, "confirm", confirm)
-    return calls
-
-
-def test_search_confirms_after_its_last_trial_only(
-    wanted: Search,
-    ends: list[str],
-    confirmations: list[tuple[list[str], SweepSettings]],
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    search(wanted, settings(trials=2, confirm=CONFIRM))
-    assert confirmations == []
-    assert "not confirmed yet: 1 of 2 trials are" in capsys.readouterr().err
-    search(wanted, settings(trials=2, confirm=CONFIRM, hours=1.0))
-    ((points, used),) = confirmations
-    assert points == ["#0", "#1"]
-    assert used.hours is not None
-    assert 0.9 < used.hours < 1, "what is left of the hours"
-    search(wanted, settings(trials=3))
-    assert len(confirmations) == 1, "only where it is set"
-
-
-def test_search_with_one_point_confirms_nothing(
-    wanted: Search,
-    ends: list[str],
-    confirmations: list[tuple[list[str], SweepSettings]],
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    search(wanted, settings(trials=1, confirm=CONFIRM))
-    assert confirmations == []
-    assert "the search has no other complete point" in capsys.readouterr().err
-
-
-def test_search_confirmation_without_trials_is_refused(wanted: Search, ends: list[str]) -> None:
-    with pytest.raises(InputError, match=r"set the number of trials with hydra.sweeper.trials"):
-        search(wanted, settings(trials=None, hours=1.0, confirm=CONFIRM))
-
-
-def test_preview_shows_what_confirming_may_cost(
-    wanted: Search, ends: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    search(wanted, settings(dry_run=True, confirm=CONFIRM))
-    assert list(tmp_path.iterdir()) == []
-    assert (
-        "The 2 best points would then be compared with 4 to 6 further seeds each: at most 12 "
-        "further runs." in capsys.readouterr().out
-    )
-
-
-@pytest.mark.slow
-def test_search_confirms_its_best_points_with_real_runs(
-    wanted: Search, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    request = replace(wanted, fixed=(*wanted.fixed, "trainer.max_steps=2", "trainer.eval_every=2"))
-    given = settings(trials=2, confirm=CONFIRM, workers=2)
-    search(request, given)
-    first = capsys.readouterr()
-    assert "Confirmation of the best 2 of 2 trials" in first.out
-    assert "Not confirmed: there are too few images for an interval." in first.out
-    runs = len(list(tmp_path.glob("*/result.json")))
-    # Seeds 1 to 4 of both points; seed 5 may start while a run of seed 4 is unfinished.
-    assert runs in (2 + 2 * 4, 2 + 2 * 5)
-    study = load_study("s confirmed", open_storage(None, tmp_path))
-    assert study.user_attrs[names.CONFIRMS] == "s"
-    search(request, given)
-    assert "started" not in capsys.readouterr().err, "a rerun has nothing to do"
-    assert len(list(tmp_path.glob("*/result.json"))) == runs

@@ -140,7 +140,6 @@ def test_sweep_search_file_runs_are_single(calls: RecordedCalls, tmp_path: Path)
     "settings",
     [
         *({"trials": 3}, {"hours": 3}, {"replicates": 2}, {"pruner": {"kind": "median"}}),
-        {"confirm": {"best": 3, "max_seeds": 10}},
     ],
 )
 def test_sweep_search_settings_of_grid_are_refused(
