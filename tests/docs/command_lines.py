@@ -175,7 +175,8 @@ def _check_options(command: PlainCommand[Any], words: list[str]) -> None:
         words = [f"{command.first}={words[0]}", *words[1:]]
     words = [PLACEHOLDER.sub("1", word) for word in words]
     options, overrides = parse(command.options, words, command.heeds)
-    experiment = getattr(options, "experiment", "")
+    # `sync` and `ui` compose nothing: their experiment is one of MLflow.
+    experiment = getattr(options, "experiment", "") if command.heeds != () else ""
     overrides = [f"+experiment={experiment}", *overrides] if experiment else overrides
     table = next((word[6:] for word in words if word.startswith("table=")), "")
     if table and (ROOT / "sweeps/tables" / table).parent.is_dir() and "/" in table:

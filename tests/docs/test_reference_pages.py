@@ -41,7 +41,7 @@ def test_every_group_says_what_it_sets(pages: dict[str, str]) -> None:
 def test_the_page_of_a_group_has_keys_types_defaults_and_meanings(pages: dict[str, str]) -> None:
     text = pages["reference/configuration/masker.md"]
     (row,) = (line for line in text.splitlines() if line.startswith("| `ratio` |"))
-    assert "number from 0 to 1, or null" in row
+    assert "number from 0 to 1 or null" in row
     assert "share of the cells" in row
     (row,) = (
         line
@@ -65,7 +65,7 @@ def test_a_command_shows_its_options(pages: dict[str, str]) -> None:
     for name in COMMANDS:
         assert f"\n## {name}\n" in text
     evaluate = text.partition("\n## evaluate\n")[2].partition("\n## ")[0]
-    assert "| `checkpoint` | 'best' or 'last' | `best` |" in evaluate
+    assert "| `checkpoint` | 'best', 'last' | `best` |" in evaluate
     assert "\n### weights inspect\n" in text
 
 
