@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from urllib.parse import unquote, urlparse
 
 from rgbt.checks import InputError, RunError, nearest
-from rgbt.files.budgets import inside, read_bytes
+from rgbt.files.plain_files import inside, read_bytes
 from rgbt.runs.folder import read_result
 from rgbt.runs.provenance import without_passwords
 from rgbt.tracking.mlflow_store import LimitedClient, MlflowTracking

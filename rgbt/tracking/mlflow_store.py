@@ -182,7 +182,8 @@ class MlflowTracking(Tracking):
         if artifact_uri is None and not self.uri.startswith("http"):
             artifact_uri = (root / "mlartifacts").as_uri()
         self.artifact_uri, self.experiment = artifact_uri, experiment
-        place = f"runs_dir={root}" if uri is None else f"uri={without_passwords(uri)}"
+        self._shown_uri = without_passwords(self.uri)
+        place = f"runs_dir={root}" if uri is None else f"uri={self._shown_uri}"
         self._words = [place, *([f"experiment={experiment}"] if experiment != EXPERIMENT else [])]
         self._system_metrics = system_metrics
         self._monitor: Any = None
@@ -277,7 +278,7 @@ class MlflowTracking(Tracking):
 
     def _state(self, folder: RunFolder) -> UploadState:
         """What this store has of the run; nothing if the folder was sent to another one."""
-        fresh = UploadState(without_passwords(self.uri), self.experiment)
+        fresh = UploadState(self._shown_uri, self.experiment)
         try:
             state = read_upload_state(folder) or fresh
         except InputError as error:  # `upload` finds the run by its key and sends everything
@@ -296,7 +297,7 @@ class MlflowTracking(Tracking):
             self._pause_s *= 2
             if not self._warned:
                 sys.stderr.write(
-                    f"rgbt: MLflow at {without_passwords(self.uri)} cannot be used "
+                    f"rgbt: MLflow at {self._shown_uri} cannot be used "
                     f"({reason_of(error)}). The run continues; later: {self._later()}\n"
                 )
             self._warned = True

@@ -18,7 +18,7 @@ from rgbt.config.compose import flatten
 from rgbt.config.stored_config import checkouts, targets
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.files.atomic import is_held
-from rgbt.files.budgets import check_links
+from rgbt.files.plain_files import check_links
 from rgbt.processes import alone
 from rgbt.runs.provenance import other_code
 from rgbt.runs.run_spec import WEIGHTS, Dependency, RunSpec
