@@ -246,10 +246,12 @@ def parts_of_split(
     state which images were taken at night.
     """
     wanted, names = request.batch_norm, dataset.names(request.split)
-    splits = () if wanted is None else wanted.splits
+    if wanted is None:
+        return [(names, ())]
+    splits = wanted.splits
     sources = tuple(dict.fromkeys(n for each in splits for n in dataset.names(each))) or names
     dark, dark_sources = dataset.nights(names), dataset.nights(sources)
-    if wanted is None or wanted.kind == "recomputed" or dark is None or dark_sources is None:
+    if wanted.kind == "recomputed" or dark is None or dark_sources is None:
         return [(names, sources)]
     parts = []
     for night in sorted(set(dark)):
