@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, NotRequired, cast
+from typing import Any, Literal, cast
 
 from typing_extensions import TypedDict  # pydantic takes no other before Python 3.12
 
@@ -73,22 +73,11 @@ class Description:
     params: dict[str, str]
 
 
-class InputForm(TypedDict):
-    """A split that a run uses: its name, what for ("train", "val", "test"), number of images."""
-
-    split: str
-    context: str
-    images: int
-
-
 class MarkerForm(TypedDict):
-    """``dataset.json``: digests of names and files of the images; the rest is for trackers."""
+    """``dataset.json``: digests of names and files of the images."""
 
     names: str
     files: str
-    name: NotRequired[str]
-    root: NotRequired[str]
-    inputs: NotRequired[list[InputForm]]
 
 
 class ResultForm(TypedDict, total=False):

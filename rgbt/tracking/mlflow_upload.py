@@ -23,7 +23,6 @@ from rgbt.runs.folder import (
     Description,
     MetricLine,
     RunFolder,
-    read_marker,
     read_provenance,
     read_result,
     read_tables,
@@ -47,7 +46,7 @@ FILES = (
     *("config.yaml", "provenance.json", "result.json", "*.patch", "counts_*.npz", "figures/*.png"),
     *("evaluations/*.npz", "evaluations/robustness/*/*.npz", "evaluations/robustness/*/*.json"),
 )
-READ = ("run.json", "metrics.jsonl", "tables.json", "dataset.json")
+READ = ("run.json", "metrics.jsonl", "tables.json")
 """Files whose content is sent in another form."""
 
 TABLE_FILE = "tables/iou.json"
@@ -156,9 +155,11 @@ def upload(store: MlflowStore, folder: RunFolder, state: UploadState, status: St
     for line in content.lines:  # a resumed run may be behind what was sent
         state.steps[line.kind] = max(line.step, state.steps.get(line.kind, -1))
     write_upload_state(folder, state)  # at once: a kill between doubles points after the resume
-    _send_files(client, folder, state, content.tables)
-    if not (run.inputs and run.inputs.dataset_inputs):
-        _send_inputs(client, state.run_id, folder)
+    for path in (each for each in _own_files(folder) if each.stat().st_ctime > state.sent):
+        parent = path.parent.relative_to(folder.path).as_posix()
+        client.log_artifact(state.run_id, str(path), None if parent == "." else parent)
+    if content.tables is not None and (folder.path / "tables.json").stat().st_ctime > state.sent:
+        client.log_text(state.run_id, json.dumps(artifact_table(content.tables)), TABLE_FILE)
     client.update_run(state.run_id, "RUNNING" if status == "RUNNING" else None, name)
     if status not in ("RUNNING", run.info.status):
         written = (folder.path / each for each in ("result.json", "metrics.jsonl", "run.json"))
@@ -197,18 +198,6 @@ def _own_files(folder: RunFolder) -> list[Path]:
     """Files to send: regular ones inside the folder, which no link leads to."""
     found = sorted(path for pattern in FILES for path in folder.path.glob(pattern))
     return [path for path in found if path.is_file() and path.resolve() == path]
-
-
-def _send_files(
-    client: Any, folder: RunFolder, state: UploadState, tables: ResultTables | None
-) -> None:
-    """Upload the table and files that changed since the last time."""
-    for path in _own_files(folder):
-        if path.stat().st_ctime > state.sent:
-            parent = path.parent.relative_to(folder.path).as_posix()
-            client.log_artifact(state.run_id, str(path), None if parent == "." else parent)
-    if tables is not None and (folder.path / "tables.json").stat().st_ctime > state.sent:
-        client.log_text(state.run_id, json.dumps(artifact_table(tables)), TABLE_FILE)
 
 
 def _metrics(content: Content, state: UploadState) -> Iterator[Any]:
@@ -278,23 +267,3 @@ def artifact_table(tables: ResultTables) -> dict[str, list[Any]]:
         rows += [(f"{name} / {region}", iou, math.nan) for region, iou in pairs]
     data = [[name, *(round(100 * v, 2) for v in values)] for name, *values in rows]
     return {"columns": ["score", "IoU %", "accuracy %"], "data": without_nan(data)}
-
-
-def _send_inputs(client: Any, run_id: str, folder: RunFolder) -> None:
-    """Add the data set of a run to the column Datasets, one entry (unique name) for each split."""
-    from mlflow.entities import Dataset, DatasetInput, InputTag
-
-    marker = read_marker(folder.path)
-    if marker is None or "inputs" not in marker:
-        return
-    entries = []
-    for each in marker["inputs"]:
-        dataset = Dataset(
-            name=f"{marker['name']}/{each['split']}",
-            digest=marker["files"][:8],
-            source_type="local",  # a path as text: nothing is opened
-            source=json.dumps({"uri": marker["root"]}),
-            profile=json.dumps({"images": each["images"], "fingerprint": marker["files"]}),
-        )
-        entries.append(DatasetInput(dataset, [InputTag("mlflow.data.context", each["context"])]))
-    client.log_inputs(run_id, datasets=entries)

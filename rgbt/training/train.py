@@ -47,7 +47,6 @@ from rgbt.training.common import (
     make_trainer,
     other_head_request,
     target_request,
-    used_splits,
 )
 from rgbt.training.members import training_together
 from rgbt.training.overview import announce_training, announce_upstream
@@ -95,7 +94,7 @@ def _train_unfinished(
             announce_upstream(setup, description.name, upstream_of)
         else:
             announce_training(setup, description.name, spec.folder)
-        decode_ahead(setup.session, *setup.session.read_splits())
+        decode_ahead(setup.session, *setup.names)
         if spec.is_finished:
             kept = set_aside(RunFolder(spec.folder))
             known = None if kept is None else read_description(kept.path)
@@ -180,13 +179,7 @@ class Run:
     def _claim(self, session: Session) -> None:
         """Write what identifies the run; refuse a folder that was started on other images."""
         dataset = session.dataset
-        now: MarkerForm = {
-            "names": names_key(session),
-            "files": dataset.fingerprint(),
-            "name": dataset.name,
-            "root": str(dataset.root),
-            "inputs": used_splits(session),
-        }
+        now: MarkerForm = {"names": names_key(session), "files": dataset.fingerprint()}
         before = read_marker(self.folder.path) or now
         if before["names"] != now["names"]:
             raise InputError(
