@@ -64,7 +64,7 @@ class RunFiles:
         """The file as text; None: there is none.
 
         Raises:
-            InputError: it cannot be fetched, is too large, or is no text.
+            InputError: it cannot be fetched or is no text.
         """
         found = self.find(path)
         if found is None:

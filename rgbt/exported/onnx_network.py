@@ -58,7 +58,7 @@ class ExportedNetwork(nn.Module):
         """The network of a file.
 
         Raises:
-            InputError: as the class; no such file; a larger one than the budget.
+            InputError: as the class; no such file.
         """
         if not path.is_file():
             raise InputError(f"exported={path}: there is no such file.")
