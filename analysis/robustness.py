@@ -9,7 +9,7 @@ from typing import Any
 
 from analysis.results import RUNS, NamedCounts, open_counts
 from rgbt.checks import InputError, nearest, split_list
-from rgbt.files.budgets import read_json
+from rgbt.files.plain_files import read_json
 from rgbt.metrics.counts import Counts
 from rgbt.runs.naming import row_name
 

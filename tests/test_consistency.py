@@ -16,7 +16,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from rgbt import consistency, predict
-from rgbt.files.budgets import read_json
+from rgbt.files.plain_files import read_json
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
 from rgbt.metrics.pairs import ca, ca_released, tc

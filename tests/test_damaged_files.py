@@ -23,7 +23,7 @@ from rgbt.data.files import decode
 from rgbt.data.integrity import read_names
 from rgbt.data.labels import read_label
 from rgbt.data.pseudo_labels import FORMAT, PseudoLabels
-from rgbt.files.budgets import sealed
+from rgbt.files.plain_files import sealed
 from rgbt.metrics.counts import Counts
 from rgbt.runs.folder import (
     Description,

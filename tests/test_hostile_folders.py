@@ -14,7 +14,7 @@ from analysis.results import open_counts
 from rgbt import consistency, evaluate, predict, robustness
 from rgbt.checks import InputError
 from rgbt.files.atomic import holding, is_held, write_atomic
-from rgbt.files.budgets import check_links
+from rgbt.files.plain_files import check_links
 from rgbt.files.yaml_files import read_yaml
 from rgbt.runs.folder import RunFolder, find_run, read_result, runs_in
 from rgbt.runs.result import RunResult

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from urllib.parse import unquote, urlparse
 
 from rgbt.checks import InputError, RunError, nearest
-from rgbt.files.budgets import inside, read_bytes
+from rgbt.files.plain_files import inside, read_bytes
 from rgbt.runs.folder import read_result
 from rgbt.runs.provenance import without_passwords
 from rgbt.tracking.mlflow_store import LimitedClient, MlflowTracking
@@ -64,7 +64,7 @@ class RunFiles:
         """The file as text; None: there is none.
 
         Raises:
-            InputError: it cannot be fetched, is too large, or is no text.
+            InputError: it cannot be fetched or is no text.
         """
         found = self.find(path)
         if found is None:

@@ -12,7 +12,7 @@ from rgbt.checks import InputError, check_choice
 from rgbt.config.compose import compose
 from rgbt.config.stored_config import check_targets, checkouts, read_settings, settings_of
 from rgbt.engine.checkpoint import load_checkpoint, restore_weights, step_of
-from rgbt.files.budgets import check_links
+from rgbt.files.plain_files import check_links
 from rgbt.files.yaml_files import parse_yaml
 from rgbt.metrics.counts import Counts
 from rgbt.runs.folder import find_run, read_marker, read_provenance

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import torch
 from lightning_fabric import Fabric
@@ -43,12 +44,17 @@ if TYPE_CHECKING:  # most runs have one domain, draw no classes, and train a net
     from rgbt.data.rare_classes import RareClasses
 
 
+Lists: TypeAlias = Mapping[str, tuple[str, ...]]
+"""Split -> names of its images."""
+
+
 @dataclass(frozen=True)
 class TrainingSetup:
     """The objects of a training, before anything is written.
 
     Attributes:
         fabric: device, precision and connection of the processes.
+        names: of the images of every split that the run reads.
         datasets: of each domain, with the labels that it is trained with.
         model: the network as Fabric wrapped it.
         others: further networks that are trained, wrapped, by name.
@@ -60,6 +66,7 @@ class TrainingSetup:
 
     session: Session
     fabric: Fabric
+    names: Lists
     datasets: dict[str, LabelledDataset]
     model: nn.Module
     others: dict[str, nn.Module]
@@ -137,34 +144,34 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
         WEIGHTS: SimpleNamespace(record=Record(pretrained=spec.weights is not None)),
     }
     check_requirements(components)
-    for split in session.read_splits():
-        session.dataset.names(split)
+    names = {split: session.dataset.names(split) for split in session.read_splits()}
     datasets = {}
     for name, domain in domains.named.items():
         steps_per_epoch(session.dataset, loading, domain.split)
         is_missing = labels_key(name) in missing
-        datasets[name] = session.dataset if is_missing else _labelled(session, name, domain)
-    _probe(session, masker, scheme)
+        datasets[name] = session.dataset if is_missing else _labelled(session, name, domain, names)
+    _probe(session, names, masker, scheme)
     if upstream_finished:
-        _report_unpublished_settings(session)
+        _report_unpublished_settings(session, names)
     rare = None
     if loading.sampling == "rare_classes" and labels_key("source") not in missing:
         from rgbt.data.rare_classes import count_rare_classes  # most runs draw no classes
 
         rare = count_rare_classes(datasets["source"], domains.source.split, loading)
     others, optimizers = _networks_and_optimizers(session, fabric, scheme)
+    schedule: Schedule = spec.schedule.build()
     return TrainingSetup(
-        session, fabric, datasets, model, others, optimizers, rare, scheme, spec.schedule.build()
+        session, fabric, names, datasets, model, others, optimizers, rare, scheme, schedule
     )
 
 
-def _probe(session: Session, masker: AnyMasker, scheme: object) -> None:
+def _probe(session: Session, names: Lists, masker: AnyMasker, scheme: object) -> None:
     """Use a user's own parts, another author's network, the masker and the cameras once."""
     transform, seed = session.transform, session.spec.seed
-    check_dataset(reader_of(session.dataset), session.read_splits())
+    check_dataset(reader_of(session.dataset), names)
     check_part("transform", transform)
-    first = _first_readable(session, session.domains.source.split)
-    shown = _first_readable(session, "test")
+    first = _first_readable(session, names[session.domains.source.split])
+    shown = _first_readable(session, names["test"])
     check_regions(session.regions, shown.thermal.shape)
     example_hw = transform.train(first, numpy_generator(seed, "probe")).thermal.shape
     tested = transform.test(shown)
@@ -185,9 +192,8 @@ def _probe(session: Session, masker: AnyMasker, scheme: object) -> None:
             raise InputError(f"{node}.view.{error}") from error
 
 
-def _first_readable(session: Session, split: str) -> Sample:
-    """The first sample of a split; unreadable ones are passed over where the run does so too."""
-    names = session.dataset.names(split)
+def _first_readable(session: Session, names: tuple[str, ...]) -> Sample:
+    """The first of these samples; unreadable ones are passed over where the run does so too."""
     for name in names if session.loading.on_error != "raise" else ():
         with suppress(InputError):
             return session.dataset.read(name)
@@ -216,12 +222,12 @@ def _probe_external(session: Session, train_hw: tuple[int, int], test_hw: tuple[
         )
 
 
-def _shared_with_test(session: Session, split: str) -> int:
+def _shared_with_test(names: Lists, split: str) -> int:
     """Number of test images in a split."""
-    return len(set(session.dataset.names(split)) & set(session.dataset.names("test")))
+    return len(set(names[split]) & set(names["test"]))
 
 
-def _report_unpublished_settings(session: Session) -> None:
+def _report_unpublished_settings(session: Session, names: Lists) -> None:
     """Report settings that are valid, but not those of the published numbers."""
     spec, name = session.spec, session.dataset.name
     expected = spec.scale.pretrained and record_of(session.model).pretrained_parts
@@ -238,7 +244,7 @@ def _report_unpublished_settings(session: Session) -> None:
         )
     picked = session.trainer.selection_split
     is_selected = session.trainer.tested == "best" and picked != "test"
-    if is_selected and (shared := _shared_with_test(session, picked)):
+    if is_selected and (shared := _shared_with_test(names, picked)):
         info(
             f"trainer.selection_split={picked}: the best checkpoint is selected on {shared} test "
             "images."
@@ -255,16 +261,16 @@ def _where_to_augment(session: Session) -> Literal["loader", "device"]:
     return requested
 
 
-def _labelled(session: Session, name: str, domain: Domain) -> LabelledDataset:
+def _labelled(session: Session, name: str, domain: Domain, names: Lists) -> LabelledDataset:
     """The data set with the labels that a domain is trained with; InputError without them.
 
     Reports training images of the test split.
     """
     dataset, key, split = session.dataset, f"domains.{name}", domain.split
     if domain.labels == GIVEN:
-        if _first_readable(session, split).label is None:
+        if _first_readable(session, names[split]).label is None:
             raise InputError(f"{key}.labels=given, but {dataset.name} has no labels for {split}.")
-        if shared := _shared_with_test(session, split):
+        if shared := _shared_with_test(names, split):
             info(
                 f"{key}.split={split}: {shared} of its images are test images, so test scores will "
                 "not measure performance on unseen images."
@@ -276,7 +282,7 @@ def _labelled(session: Session, name: str, domain: Domain) -> LabelledDataset:
     if domain.labels == NONE or folder is None:
         return Unlabelled(dataset)
     found = PseudoLabelled(dataset, folder, with_confidence=domain.confidence)
-    listed = dataset.names(split)
+    listed = names[split]
     missing, manifest = found.labels.missing(listed), found.labels.manifest
     if missing and (session.loading.on_error == "raise" or len(missing) == len(listed)):
         raise InputError(

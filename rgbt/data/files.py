@@ -7,6 +7,7 @@ image is in the alpha channel, so the four channels must not be processed as one
 from __future__ import annotations
 
 import io
+import struct
 import tokenize
 import zlib
 from pathlib import Path
@@ -18,9 +19,15 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from rgbt.checks import InputError, one_line
-from rgbt.data.integrity import JPEG, LEFT_OUT, PNG, UNREADABLE, read_image, read_whole
+from rgbt.data.integrity import JPEG, LEFT_OUT, PNG, read_image, read_whole
 
 Array = NDArray[np.uint8]
+
+UNREADABLE = (
+    *(OSError, ValueError, SyntaxError, EOFError, OverflowError, struct.error, zlib.error),
+    Image.DecompressionBombError,
+)
+"""Exceptions of Pillow for damaged files."""
 
 
 def read_packed(path: Path, advice: str) -> tuple[Array, Array]:
@@ -158,7 +165,7 @@ def _palette_indices(data: bytes, path: Path) -> Array:
     try:
         with Image.open(io.BytesIO(data)) as image:
             return np.array(image, np.uint8)
-    except (*UNREADABLE, zlib.error) as error:
+    except UNREADABLE as error:
         raise InputError(
             f"{path} cannot be decoded, because the file is damaged or not an image; {LEFT_OUT}."
         ) from error

@@ -1,25 +1,17 @@
 """Read the bytes of a file, and refuse damaged files.
 
 Some decoders accept damaged files without an error. Refused here are a truncated image, a wrong
-checksum, a broken link, a folder or a pipe instead of a file, and an image too large for the
-memory. Decoding is in `rgbt.data.files`.
+checksum, a broken link, and a folder or a pipe instead of a file. Decoding is in `rgbt.data.files`.
 """
 
 from __future__ import annotations
 
-import io
-import math
 import os
-import struct
-import warnings
 import zlib
 from functools import lru_cache
 from pathlib import Path
 
-from PIL import Image
-
 from rgbt.checks import InputError
-from rgbt.files.budgets import check_size, read_bytes
 
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 """First bytes of these formats, independent of the suffix of the name."""
@@ -29,24 +21,20 @@ PNG_END = b"IEND\xaeB`\x82"
 
 JPEG_SCAN, JPEG_END = 0xDA, b"\xff\xd9"
 
-Image.MAX_IMAGE_PIXELS = None  # `check_size` is called instead, whose limit the user can set
-warnings.filterwarnings("ignore", module=r"PIL\.")  # on damaged files, which are refused
-
 LEFT_OUT = "replace it, or skip unreadable files with data.on_error=skip"
-
-UNREADABLE = (OSError, ValueError, SyntaxError, EOFError, OverflowError, struct.error)
-"""Exceptions of Pillow for damaged headers, and for files that are not images."""
 
 
 def read_whole(path: Path, advice: str = LEFT_OUT) -> bytes:
     """Every byte of `path`; `advice` is the end of the message.
 
     Raises:
-        InputError: a missing file, a broken link, not a regular file, no permission, larger than
-            `rgbt.files.budgets` allows, or an error of the disk.
+        InputError: a missing file, a broken link, not a regular file, no permission, or an error of
+            the disk.
     """
     try:
-        return read_bytes(path, advice)
+        if path.exists() and not path.is_file():  # a pipe would be waited for
+            raise InputError(f"{path} is not a regular file; {advice}.")
+        return path.read_bytes()
     except (FileNotFoundError, NotADirectoryError):
         why = ""
         if os.path.islink(path):  # noqa: PTH114
@@ -65,7 +53,7 @@ def read_whole(path: Path, advice: str = LEFT_OUT) -> bytes:
 
 
 def read_image(path: Path, advice: str = LEFT_OUT) -> bytes:
-    """Every byte of an image that is not truncated and not too large.
+    """Every byte of an image that is not truncated.
 
     The checksums of a PNG are compared, so damage cannot change pixels. In a JPEG the end marker
     is searched after the start of the main image, as a thumbnail has an end of its own. JPEG, TIFF
@@ -77,8 +65,7 @@ def read_image(path: Path, advice: str = LEFT_OUT) -> bytes:
         advice: end of the message for a refused file.
 
     Raises:
-        InputError: as `read_whole`, an empty or truncated file, a damaged PNG, or more pixels than
-            `rgbt.files.budgets` allows.
+        InputError: as `read_whole`, an empty or truncated file, or a damaged PNG.
     """
     data = read_whole(path, advice)
     if not data:
@@ -95,14 +82,6 @@ def read_image(path: Path, advice: str = LEFT_OUT) -> bytes:
             f"{path} cannot be decoded, because the file is damaged (a checksum of the PNG does "
             f"not match); {advice}."
         )
-    try:
-        check_size(path, math.prod(_size(data)), "pixels")
-    except UNREADABLE as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(
-            f"{path} cannot be decoded, because the file is damaged or not an image; {advice}."
-        ) from error
     return data
 
 
@@ -186,15 +165,6 @@ def _is_whole_png(data: bytes) -> bool:
             return True
         at = end
     return False
-
-
-def _size(data: bytes) -> tuple[int, int]:
-    """Width and height in the header; nothing is decoded. They begin the first chunk of a PNG."""
-    if data.startswith(PNG):
-        width, height = struct.unpack_from(">II", data, 16)
-        return width, height
-    with Image.open(io.BytesIO(data)) as image:
-        return image.size
 
 
 def _scan(data: bytes) -> int:

@@ -16,13 +16,9 @@ from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 from rgbt.checks import InputError, one_line
-from rgbt.files.budgets import check_size
 
 OVERLAY = "_overlay"
 """Ending of the pictures that `rgbt.predict` writes beside its predictions."""
-
-MOST_FILES = 200_000
-"""Files in a ZIP file."""
 
 
 class Affixes(NamedTuple):
@@ -101,8 +97,8 @@ def opened_folder(path: Path) -> Iterator[Path]:
         path: a folder, or a file with the ending ".zip".
 
     Raises:
-        InputError: a damaged or encrypted archive, more than `rgbt.files.budgets` allows, two
-            files of one name, or PNG files of several folders.
+        InputError: a damaged or encrypted archive, two files of one name, or PNG files of several
+            folders.
     """
     if path.suffix.lower() != ".zip" or path.is_dir():
         yield path
@@ -133,9 +129,6 @@ def _extract(path: Path, folder: Path) -> None:
             for each in archive.infolist()
             if each.filename.lower().endswith(".png") and not _is_hidden(each.filename)
         ]
-        check_size(path, sum(each.file_size for each in entries), "bytes")
-        if len(entries) > MOST_FILES:
-            raise InputError(f"{path} holds more than {MOST_FILES:,} PNG files.")
         if locked := next((each for each in entries if each.flag_bits & 1), None):
             raise InputError(
                 f"{path}: {locked.filename} is encrypted; unpack it with its password and give the "
@@ -154,7 +147,6 @@ def _extract(path: Path, folder: Path) -> None:
                 f"{path} holds several files called {twice}; pack it again with one of each."
             )
         for each in entries:
-            # `read` ends at the size that the archive announces, which was checked above.
             (folder / PurePosixPath(each.filename).name).write_bytes(archive.read(each))
 
 

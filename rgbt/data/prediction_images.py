@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import io
 import struct
-import zlib
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -18,7 +17,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from rgbt.checks import InputError, one_line
-from rgbt.data.integrity import PNG, UNREADABLE, read_image
+from rgbt.data.files import UNREADABLE
+from rgbt.data.integrity import PNG, read_image
 from rgbt.data.palettes import Palette
 from rgbt.types import IGNORE
 
@@ -159,7 +159,7 @@ def decode(path: Path, mode: Literal["stored", "RGB"] = "stored") -> Array:
             if mode == "stored":
                 return np.array(image, np.uint8)
             shown = image.convert("RGBA")
-    except (*UNREADABLE, zlib.error) as error:
+    except UNREADABLE as error:
         raise InputError(
             f"{path} cannot be decoded ({one_line(error)}); write the prediction again."
         ) from error

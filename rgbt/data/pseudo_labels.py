@@ -25,7 +25,7 @@ from rgbt.checks import InputError
 from rgbt.data.files import decode
 from rgbt.data.labels import read_label
 from rgbt.dataset import DatasetWrapper, LabelledDataset
-from rgbt.files.budgets import read_json
+from rgbt.files.plain_files import read_json
 from rgbt.types import Sample
 
 FORMAT = "rgbt pseudo-labels 1"

@@ -11,14 +11,10 @@ from rich.progress import (
     MofNCompleteColumn,
     Progress,
     SpinnerColumn,
-    Task,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
-from rich.text import Text
-
-from rgbt.checks import without_controls
 
 CONSOLE = Console(stderr=True)
 """Progress goes to stderr; stdout is for results."""
@@ -27,26 +23,18 @@ REFRESHES = 4
 """Drawings per second on a terminal."""
 
 
-class PlainColumn(TextColumn):
-    """Text as it is: no markup and no control characters of the names of files."""
-
-    def render(self, task: Task) -> Text:
-        """The text of a task."""
-        return Text(without_controls(self.text_format.format(task=task)))
-
-
 @contextmanager
 def progress() -> Iterator[Progress]:
     """A progress display with columns for count, time left and a note (task field `note`)."""
     columns = (
         SpinnerColumn(),
-        PlainColumn("{task.description:<10}"),
+        TextColumn("{task.description:<10}", markup=False),
         BarColumn(bar_width=30),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(),
-        PlainColumn("{task.fields[note]}"),
+        TextColumn("{task.fields[note]}", markup=False),
     )
     # Drawing ten times a second takes 2 % of a core. In a file only the last state is written.
     with Progress(

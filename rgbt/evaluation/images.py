@@ -37,7 +37,7 @@ from rgbt.evaluation.prediction import Predictor, decode_ahead, view_of, weights
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.evaluation.segmentation import legend_of
 from rgbt.files.atomic import write_atomic
-from rgbt.files.budgets import sealed
+from rgbt.files.plain_files import write_json
 from rgbt.tables import TextTable, percent
 from rgbt.terminal import info
 from rgbt.tracking.pictures import overlay
@@ -150,7 +150,7 @@ def write_pseudo_labels(
     with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as temporary:
         made = Path(temporary) / out.name
         manifest = settings | _predict(session, request, made, threshold, label_map)
-        write_atomic(made / MANIFEST, (json.dumps(sealed(manifest), indent=1) + "\n").encode())
+        write_json(made / MANIFEST, manifest)
         with suppress(OSError):  # another process was faster
             made.rename(out)
     return PseudoLabels(out)

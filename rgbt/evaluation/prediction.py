@@ -12,7 +12,7 @@ import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import torch
@@ -25,45 +25,25 @@ from rgbt.assembly.session import Session
 from rgbt.checks import InputError, check_choice
 from rgbt.data.cache.dataset import cached_layer
 from rgbt.data.domains import TestedHead
-from rgbt.data.loader_settings import LoaderSettings
 from rgbt.data.loaders import eval_batches
 from rgbt.dataset import LabelledDataset, Subset
 from rgbt.engine.evaluate import class_maps, confident_class_maps, probabilities
 from rgbt.engine.progress import progress
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.metrics.counts import Counts
-from rgbt.metrics.metric import Regions
 from rgbt.requirements import record_of
 from rgbt.transforms.joint import View as ImageView
 from rgbt.transforms.joint import whole_view
-from rgbt.transforms.view_sets import ViewSets
 from rgbt.types import Batch, View
+
+if TYPE_CHECKING:  # it imports this module
+    from rgbt.evaluation.pair_predictions import PairSource
 
 Names = tuple[str, ...]
 
 
-class EvaluationData(Protocol):
-    """Images and how they are counted; a `Session` has all of it and a network too."""
-
-    @property
-    def dataset(self) -> LabelledDataset:
-        """Names, images and labels."""
-
-    @property
-    def transform(self) -> Any:
-        """Makes examples of samples, see `rgbt.data.batches.Transform`."""
-
-    @property
-    def loading(self) -> LoaderSettings:
-        """Batch sizes and workers."""
-
-    @property
-    def regions(self) -> Regions:
-        """Partition of the image and the rule for absent classes."""
-
-    @property
-    def consistency(self) -> ViewSets:
-        """Virtual views for TC and CA."""
+EvaluationData: TypeAlias = "Session | PairSource"
+"""Images and how they are counted: with a network, or for predictions of any method."""
 
 
 class Predictor:
@@ -246,10 +226,12 @@ def parts_of_split(
     state which images were taken at night.
     """
     wanted, names = request.batch_norm, dataset.names(request.split)
-    splits = () if wanted is None else wanted.splits
+    if wanted is None:
+        return [(names, ())]
+    splits = wanted.splits
     sources = tuple(dict.fromkeys(n for each in splits for n in dataset.names(each))) or names
     dark, dark_sources = dataset.nights(names), dataset.nights(sources)
-    if wanted is None or wanted.kind == "recomputed" or dark is None or dark_sources is None:
+    if wanted.kind == "recomputed" or dark is None or dark_sources is None:
         return [(names, sources)]
     parts = []
     for night in sorted(set(dark)):

@@ -136,9 +136,8 @@ def _count(
             images = [*zip(batch.name, batch.label, classes.cpu(), confidence, strict=True)]
             for name, label, predicted, each in images:
                 found.counts[name] = counter(label, predicted)
-                found.details[name] = _details_of(
-                    counters, session.dataset, name, (label, predicted, each)
-                )
+                maps = (label, predicted, each)
+                found.details[name] = _details_of(counters, session.dataset, name, maps)
             kept = (image for image in images if image[0] in request.keep)
             found.kept.extend(_example(session, name, shown.numpy()) for name, _, shown, _ in kept)
             done = min(len(names), done + num_processes() * len(batch.name))
@@ -178,8 +177,9 @@ def _details_of(
     """The details of one image from its label, classes and confidences (H, W)."""
     label, classes, confidence = maps
     further: dict[DetailKind, tuple[Any, ...]] = {"boundary": (), "calibration": (confidence,)}
-    reader = reader_of(dataset)
-    if isinstance(reader, KnownScenes) and counters.keys() & set(OF_SCENES):
+    if counters.keys() & set(OF_SCENES):
+        reader = reader_of(dataset)
+        assert isinstance(reader, KnownScenes), "otherwise there is no such counter"
         scene = reader.scene_maps(name)
         further |= {"distance": (scene.depth_m,), "size": (scene.objects,)}
     return {kind: count(label, classes, *further[kind]) for kind, count in counters.items()}

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from rgbt.checks import InputError, one_line
-from rgbt.files.budgets import parse_json
+from rgbt.files.plain_files import parse_json
 from rgbt.requirements import Outputs
 from rgbt.types import View
 

@@ -19,7 +19,7 @@ from rgbt.checks import InputError, one_line
 from rgbt.exported.description import Description, require_packages
 from rgbt.exported.graph import OPSET, ScoresOfImages, onnx_bytes, traced
 from rgbt.exported.seal import is_damaged
-from rgbt.files.budgets import read_bytes
+from rgbt.files.plain_files import read_bytes
 from rgbt.requirements import Record, record_of
 from rgbt.types import Output, View
 
@@ -58,7 +58,7 @@ class ExportedNetwork(nn.Module):
         """The network of a file.
 
         Raises:
-            InputError: as the class; no such file; a larger one than the budget.
+            InputError: as the class; no such file.
         """
         if not path.is_file():
             raise InputError(f"exported={path}: there is no such file.")

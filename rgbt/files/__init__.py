@@ -1,1 +1,1 @@
-"""Read files within budgets, write them atomically, and lock them."""
+"""Read files as plain data, write them atomically, and lock them."""

@@ -37,6 +37,7 @@ class Points:
     def __init__(self, generator: torch.Generator, *, device: torch.device) -> None:
         self.generator = generator
         self.device = device
+        self._num_processes, self._rank = num_processes(), rank()
 
     def loss(
         self, num_sets: int, num_masks: int, num_points: int, kept: Tensor | slice = EVERY
@@ -56,8 +57,8 @@ class Points:
 
     def matcher(self, num_sets: int, num_images: int, num_points: int) -> Tensor:
         """(num_sets, num_images, num_points, 2): the next sets for the matching costs."""
-        own_images = slice(rank(), None, num_processes())
-        return self.loss(num_sets, num_images * num_processes(), num_points, own_images)
+        own_images = slice(self._rank, None, self._num_processes)
+        return self.loss(num_sets, num_images * self._num_processes, num_points, own_images)
 
 
 def sample(maps: Tensor, points: Tensor, outside: Literal["zeros", "border"] = "zeros") -> Tensor:

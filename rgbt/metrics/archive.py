@@ -1,7 +1,7 @@
 """Read and write compressed files of arrays that name their kind: counts, maps, statistics.
 
-A file is a zip archive of arrays in NumPy's format. Nothing is unpacked before the directory of
-the archive is checked; kinds and shapes are then checked against the kind of file.
+A file is a zip archive of arrays in NumPy's format; their kinds and shapes are checked against the
+kind of file.
 """
 
 from __future__ import annotations
@@ -17,26 +17,16 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError, one_line
 from rgbt.files.atomic import replacing
-from rgbt.files.budgets import check_size
 
 FORMAT, DIGEST = "format", "digest"
 """Members of every archive: its mark, and the SHA-256 of all others (`_digest`)."""
-
-END = struct.Struct("<4s4H2LH")
-"""The last bytes of a zip archive without a comment: directory of how many entries and bytes."""
-
-ZIP64, ZIP64_MARK = struct.Struct("<4sLQL"), b"PK\6\7"
-"""What lies before `END` in archives of more than 4 GB, which are not read."""
-
-MOST_ENTRIES, MOST_DIRECTORY = 32, 2**14
-"""Entries and bytes of the directory; the largest kind of file has 17 entries in 1.2 kB."""
 
 COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 Header: TypeAlias = tuple[str, tuple[int, ...]]
@@ -81,17 +71,15 @@ class Archive:
         """What `save` wrote, by name; nothing in the file is executed.
 
         Raises:
-            InputError: no such file, one that may not be read, is damaged or larger than
-                `rgbt.files.budgets` allows, or another kind of file.
+            InputError: no such file, one that may not be read or is damaged, or another kind of
+                file.
         """
         if not path.is_file():
             raise InputError(f"the file of {self.what} '{path}' does not exist; {self.advice}.")
         if not os.access(path, os.R_OK):
             raise InputError(f"'{path}' cannot be read: permission denied; change its permissions.")
-        with self.refusing(path), path.open("rb") as file:
-            _check_directory(file)
-            with zipfile.ZipFile(file) as archive:
-                return self._read(archive, path)
+        with self.refusing(path), zipfile.ZipFile(path) as archive:
+            return self._read(archive, path)
 
     @contextmanager
     def refusing(self, path: Path) -> Iterator[None]:
@@ -107,7 +95,7 @@ class Archive:
             ) from error
 
     def _read(self, archive: zipfile.ZipFile, path: Path) -> dict[str, NDArray[Any]]:
-        values = _arrays(archive, path)
+        values = _arrays(archive)
         mark = one_line(values[FORMAT]) if FORMAT in values else "none"
         if mark != self.mark:
             raise InputError(
@@ -141,24 +129,10 @@ class Archive:
                 raise ValueError(f"'{name}' has the unexpected shape {shape}")
 
 
-def _check_directory(file: IO[bytes]) -> None:
-    """Refuse directories that `zipfile` would read completely before counting their entries."""
-    end = file.seek(0, os.SEEK_END)
-    file.seek(max(0, end - END.size - ZIP64.size))
-    tail = file.read()
-    if len(tail) < END.size or not tail[-END.size :].startswith(b"PK\5\6"):
-        raise ValueError("it is not a zip archive, or its end is missing")
-    _, _, _, _, entries, size, _, comment = END.unpack(tail[-END.size :])
-    if tail.startswith(ZIP64_MARK) or comment or entries > MOST_ENTRIES or size > MOST_DIRECTORY:
-        raise ValueError("its directory is not that of such a file")
-
-
-def _arrays(archive: zipfile.ZipFile, path: Path) -> dict[str, NDArray[Any]]:
+def _arrays(archive: zipfile.ZipFile) -> dict[str, NDArray[Any]]:
     """The arrays by name; nothing in them is executed."""
-    entries = archive.infolist()
-    check_size(path, sum(entry.file_size for entry in entries), "bytes")
     arrays: dict[str, NDArray[Any]] = {}
-    for entry in entries:
+    for entry in archive.infolist():
         name = entry.filename.removesuffix(".npy")
         is_ours = entry.filename == f"{name}.npy" and entry.compress_type in COMPRESSIONS
         if name in arrays or not is_ours:

@@ -9,7 +9,7 @@ from typing import Literal
 
 from rgbt.checks import InputError
 from rgbt.files.atomic import write_atomic
-from rgbt.files.budgets import read_json
+from rgbt.files.plain_files import read_json
 
 PAIR_LIST = "pairs.json"
 """File that lists exported pairs of frames; see `rgbt.evaluation.pair_predictions`."""

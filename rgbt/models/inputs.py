@@ -110,7 +110,8 @@ class Inputs(nn.Module):
                 image.masked_fill(hidden[:, None, : hw[0], : hw[1]], 0.0)
                 for image, hidden in zip(images, cells, strict=True)
             ]
-        return Images(*(pad_to(image, padded_hw(hw, multiple)) for image in images))
+        whole_hw = padded_hw(hw, multiple)
+        return Images(*(pad_to(image, whole_hw) for image in images))
 
 
 def expand_cells(masks: MaskPair, count: int, image_hw: tuple[int, int], unit: int = 1) -> MaskPair:

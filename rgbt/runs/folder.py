@@ -14,13 +14,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, NotRequired, cast
+from typing import Any, Literal, cast
 
 from typing_extensions import TypedDict  # pydantic takes no other before Python 3.12
 
 from rgbt.checks import InputError, one_line
 from rgbt.files.atomic import holder_of, holding, is_held, remove_left_behind, write_atomic
-from rgbt.files.budgets import check_links, inside, parse_json, read_bytes, read_json, sealed
+from rgbt.files.plain_files import check_links, parse_json, read_json, write_json
 from rgbt.tables import ResultTables
 from rgbt.terminal import info, warn
 
@@ -73,22 +73,11 @@ class Description:
     params: dict[str, str]
 
 
-class InputForm(TypedDict):
-    """A split that a run uses: its name, what for ("train", "val", "test"), number of images."""
-
-    split: str
-    context: str
-    images: int
-
-
 class MarkerForm(TypedDict):
-    """``dataset.json``: digests of names and files of the images; the rest is for trackers."""
+    """``dataset.json``: digests of names and files of the images."""
 
     names: str
     files: str
-    name: NotRequired[str]
-    root: NotRequired[str]
-    inputs: NotRequired[list[InputForm]]
 
 
 class ResultForm(TypedDict, total=False):
@@ -147,7 +136,7 @@ def read_provenance(file: Path) -> list[dict[str, Any]]:
 
 
 def _read(path: Path, form: Any) -> Any:
-    return read_json(inside(path, path.parent), form, ADVICE) if path.exists() else None
+    return read_json(path, form, ADVICE) if path.exists() else None
 
 
 class RunFolder:
@@ -192,16 +181,12 @@ class RunFolder:
         name = f"diff_{len(before) + 1}.patch" if before else "diff.patch"
         if diff:
             write_atomic(self.path / name, diff.encode())
-        self._write("provenance.json", [*before, {**entry, "diff": name if diff else None}])
-
-    def begin_at(self, step: int) -> None:
-        """Note the step at which the last process of ``provenance.json`` began."""
-        *before, last = read_provenance(self.path / "provenance.json")
-        self._write("provenance.json", [*before, {**last, "from_step": step}])
+        entries = [*before, {**entry, "diff": name if diff else None}]
+        write_json(self.path / "provenance.json", entries)
 
     def describe(self, description: Description) -> None:
         """Write name, tags and parameters of this run for trackers."""
-        self._write("run.json", sealed(vars(description)))
+        write_json(self.path / "run.json", vars(description))
 
     def append(self, step: int, kind: Kind, values: Mapping[str, float]) -> None:
         """Add one line to ``metrics.jsonl`` and hand it to the operating system at once."""
@@ -212,9 +197,9 @@ class RunFolder:
     def lines(self) -> list[MetricLine]:
         """Lines of ``metrics.jsonl``; InputError for a damaged one, but not for a cut last one."""
         path = self.path / "metrics.jsonl"
-        whole = read_bytes(path).split(b"\n")[:-1] if path.exists() else []
+        whole = path.read_bytes().split(b"\n")[:-1] if path.exists() else []
         try:
-            return MetricLine.read_all(whole)
+            return MetricLine.read_all(whole) if whole else []
         except ValueError:
             return [self._line(number, text) for number, text in enumerate(whole, 1)]
 
@@ -225,20 +210,20 @@ class RunFolder:
             what = f"{self.path / 'metrics.jsonl'} is damaged (line {number}: {one_line(error)})"
             raise InputError(f"{what}; delete the line.") from error
 
-    def truncate_after(self, step: int, evaluated_step: int | None = None) -> int:
+    def truncate_after(self, step: int, evaluated_step: int | None = None) -> list[MetricLine]:
         """Remove the lines that a run resuming at `step` will write again.
 
         These are the lines beyond `step`, "val" lines beyond `evaluated_step` (None: `step`), every
         "test" line (the last evaluation is repeated), and a line cut short by a crash.
 
         Returns:
-            the last step of any line before, 0 without lines.
+            the lines before.
         """
         found = self.lines()
         ends = {"train": step, "val": step if evaluated_step is None else evaluated_step}
         kept = (line.text() for line in found if line.step <= ends.get(line.kind, -1))
         write_atomic(self.path / "metrics.jsonl", "".join(kept).encode())
-        return max((line.step for line in found), default=0)
+        return found
 
     def figure_path(self, name: str) -> Path:
         """Path of the picture `name`; its folder is made."""
@@ -248,18 +233,15 @@ class RunFolder:
 
     def write_tables(self, tables: ResultTables) -> None:
         """Write the tables."""
-        self._write("tables.json", sealed(tables.to_json()))
+        write_json(self.path / "tables.json", tables.to_json())
 
     def finish(self, result: Mapping[str, Any]) -> None:
         """Mark the run as finished; everything else must be written before."""
-        self._write("result.json", sealed(result))
+        write_json(self.path / "result.json", result)
 
     def mark(self, marker: MarkerForm) -> None:
         """Write ``dataset.json``, which identifies the images."""
-        self._write("dataset.json", sealed(marker))
-
-    def _write(self, name: str, value: Any) -> None:
-        write_atomic(self.path / name, (json.dumps(value, indent=1) + "\n").encode())
+        write_json(self.path / "dataset.json", marker)
 
 
 def runs_in(runs_dir: Path | str) -> list[RunFolder]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from rgbt.checks import InputError
-from rgbt.files.budgets import check_links
+from rgbt.files.plain_files import check_links
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.names import in_percent
 from rgbt.runs.folder import (

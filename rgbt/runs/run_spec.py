@@ -24,7 +24,7 @@ from rgbt.data.domains import GIVEN, NONE, Domains
 from rgbt.data.loader_settings import LOADING, LoaderSettings
 from rgbt.engine.prediction import Prediction
 from rgbt.engine.settings import OF_MACHINE, Recipe, Scale, TrainerSettings
-from rgbt.files.budgets import read_json
+from rgbt.files.plain_files import read_json
 from rgbt.ranges import Seed, Text
 from rgbt.runs.folder import is_finished
 from rgbt.runs.source_code import checkout_code, code_of, user_code

@@ -6,7 +6,6 @@ store comes from the configuration, never from a run folder.
 
 from __future__ import annotations
 
-import importlib.util
 import logging
 import os
 import shlex
@@ -160,7 +159,6 @@ class MlflowTracking(Tracking):
         uri, artifact_uri: the store, and where a new experiment keeps its files; None:
             ``mlflow.db`` and ``mlartifacts`` in `runs_dir`, a server's own storage.
         experiment, runs_dir: name of the experiment, and the folder of all runs.
-        system_metrics: whether MLflow measures this machine; InputError without psutil.
     """
 
     def __init__(
@@ -170,22 +168,16 @@ class MlflowTracking(Tracking):
         artifact_uri: Text | None = None,
         experiment: Text = EXPERIMENT,
         runs_dir: Text,
-        system_metrics: bool = False,
     ) -> None:
-        if system_metrics and importlib.util.find_spec("psutil") is None:
-            raise InputError(
-                "tracking.system_metrics=true requires psutil: pip install 'rgbt[system-metrics]'."
-            )
         root = Path(runs_dir).resolve()
         self.uri = f"{SQLITE}{root / 'mlflow.db'}" if uri is None else uri
         self._files = root if uri is None and artifact_uri is None else None
         if artifact_uri is None and not self.uri.startswith("http"):
             artifact_uri = (root / "mlartifacts").as_uri()
         self.artifact_uri, self.experiment = artifact_uri, experiment
-        place = f"runs_dir={root}" if uri is None else f"uri={without_passwords(uri)}"
+        self._shown_uri = without_passwords(self.uri)
+        place = f"runs_dir={root}" if uri is None else f"uri={self._shown_uri}"
         self._words = [place, *([f"experiment={experiment}"] if experiment != EXPERIMENT else [])]
-        self._system_metrics = system_metrics
-        self._monitor: Any = None
         self._store: MlflowStore | None = None
         self._folder: RunFolder
         self._is_connected = self._warned = False
@@ -221,9 +213,6 @@ class MlflowTracking(Tracking):
 
     def finish(self, status: Status) -> None:
         """Send what is new and close the run."""
-        if self._monitor is not None:
-            self._monitor.finish()  # reports its errors itself
-            self._monitor = None
         self._guarded(status)
 
     def links(self) -> list[Link]:
@@ -246,13 +235,6 @@ class MlflowTracking(Tracking):
         with locked(folder.path / "mlflow.lock"):
             state = self._state(folder)
             upload(store, folder, state, status)
-        if status == "RUNNING" and self._system_metrics and self._monitor is None:
-            from mlflow.system_metrics import system_metrics_monitor
-
-            # A thread that stops by itself if the store fails; a resumed run continues its steps.
-            monitor = system_metrics_monitor.SystemMetricsMonitor
-            self._monitor = monitor(state.run_id, resume_logging=True, tracking_uri=self.uri)
-            self._monitor.start()
         return state.run_id
 
     def store(self) -> MlflowStore:
@@ -277,7 +259,7 @@ class MlflowTracking(Tracking):
 
     def _state(self, folder: RunFolder) -> UploadState:
         """What this store has of the run; nothing if the folder was sent to another one."""
-        fresh = UploadState(without_passwords(self.uri), self.experiment)
+        fresh = UploadState(self._shown_uri, self.experiment)
         try:
             state = read_upload_state(folder) or fresh
         except InputError as error:  # `upload` finds the run by its key and sends everything
@@ -296,7 +278,7 @@ class MlflowTracking(Tracking):
             self._pause_s *= 2
             if not self._warned:
                 sys.stderr.write(
-                    f"rgbt: MLflow at {without_passwords(self.uri)} cannot be used "
+                    f"rgbt: MLflow at {self._shown_uri} cannot be used "
                     f"({reason_of(error)}). The run continues; later: {self._later()}\n"
                 )
             self._warned = True

@@ -11,21 +11,18 @@ import getpass
 import json
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rgbt.checks import InputError
-from rgbt.files.atomic import write_atomic
-from rgbt.files.budgets import read_json, sealed
+from rgbt.files.plain_files import read_json, write_json
 from rgbt.metrics import names
 from rgbt.runs.folder import (
     Description,
     MetricLine,
     RunFolder,
-    read_marker,
     read_provenance,
     read_result,
     read_tables,
@@ -49,7 +46,7 @@ FILES = (
     *("config.yaml", "provenance.json", "result.json", "*.patch", "counts_*.npz", "figures/*.png"),
     *("evaluations/*.npz", "evaluations/robustness/*/*.npz", "evaluations/robustness/*/*.json"),
 )
-READ = ("run.json", "metrics.jsonl", "tables.json", "dataset.json")
+READ = ("run.json", "metrics.jsonl", "tables.json")
 """Files whose content is sent in another form."""
 
 TABLE_FILE = "tables/iou.json"
@@ -72,6 +69,39 @@ class UploadState:
     sent: float = 0.0
 
 
+@dataclass(frozen=True)
+class Content:
+    """What is sent of a folder beside its files.
+
+    Attributes:
+        description: name, tags and parameters.
+        identity: tags that are set in the call that makes a run, and by which it is found.
+        process: that began the run, of ``provenance.json``.
+        result: of a finished run.
+    """
+
+    description: Description
+    identity: dict[str, str]
+    process: Mapping[str, Any]
+    lines: list[MetricLine]
+    tables: ResultTables | None
+    result: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, folder: RunFolder) -> Content:
+        """Read from the folder of a run that was described before."""
+        path, description = folder.path, shown_description(folder)
+        assert description is not None, f"{path}: describe() comes before upload()"
+        return cls(
+            description=description,
+            identity={KIND_TAG: "run", "rgbt.key": shown_key(folder), "rgbt.folder": str(path)},
+            process=next(iter(read_provenance(path / "provenance.json")), {}),
+            lines=folder.lines(),
+            tables=read_tables(path),
+            result=read_result(path) or {},
+        )
+
+
 def read_upload_state(folder: RunFolder) -> UploadState | None:
     """The record of this folder, or None if nothing was sent; InputError where it is damaged."""
     path = folder.path / "mlflow.json"
@@ -82,7 +112,7 @@ def read_upload_state(folder: RunFolder) -> UploadState | None:
 
 def write_upload_state(folder: RunFolder, state: UploadState) -> None:
     """Write the record."""
-    write_atomic(folder.path / "mlflow.json", json.dumps(sealed(asdict(state))).encode())
+    write_json(folder.path / "mlflow.json", asdict(state))
 
 
 def is_sent(folder: RunFolder, state: UploadState) -> bool:
@@ -103,37 +133,33 @@ def upload(store: MlflowStore, folder: RunFolder, state: UploadState, status: St
         status: the state to show.
 
     Raises:
-        InputError: a file is damaged, or a link. MLflow raises anything else.
+        InputError: a file is damaged. MLflow raises anything else.
     """
     from mlflow.entities import Param, RunTag
 
-    linked = [name for name in READ if (folder.path / name).is_symlink()]
-    if linked:
-        raise InputError(f"{folder.path / linked[0]} is a link, which is not followed.")
     # Taking the lock has written its file: the time by the clock of the folder's file system.
     began = (folder.path / "mlflow.lock").lstat().st_mtime
-    description = shown_description(folder)
-    assert description is not None, f"{folder.path}: describe() comes before upload()"
-    client, name = store.client, description.name[:NAME_LENGTH]
-    run = _run_of(store, folder, state, name)
+    content = Content.of(folder)
+    client, name = store.client, content.description.name[:NAME_LENGTH]
+    run = _run_of(store, folder, state, content)
     store.check_files(run.info.artifact_uri)
-    tables, every = read_tables(folder.path), folder.lines()
 
-    metrics = list(_metrics(folder, every, state, tables))
+    metrics = list(_metrics(content, state))
     # MLflow refuses to change a parameter.
-    new = {key: v for key, v in description.params.items() if key not in run.data.params}
+    new = {key: v for key, v in content.description.params.items() if key not in run.data.params}
     params = [Param(key, value[:PARAM_LENGTH]) for key, value in new.items()]
-    shown = _tags(folder, description, tables).items()
-    tags = [RunTag(key, value[:TAG_LENGTH]) for key, value in shown if value]
+    tags = [RunTag(key, value[:TAG_LENGTH]) for key, value in _tags(content).items() if value]
     while metrics or params or tags:  # one call, except for many parameters or metrics
         client.log_batch(state.run_id, metrics[:BATCH_METRICS], params[:BATCH_PARAMS], tags)
         metrics, params, tags = metrics[BATCH_METRICS:], params[BATCH_PARAMS:], []
-    for line in every:  # a resumed run may be behind what was sent
+    for line in content.lines:  # a resumed run may be behind what was sent
         state.steps[line.kind] = max(line.step, state.steps.get(line.kind, -1))
     write_upload_state(folder, state)  # at once: a kill between doubles points after the resume
-    _send_files(client, folder, state, tables)
-    if not (run.inputs and run.inputs.dataset_inputs):
-        _send_inputs(client, state.run_id, folder)
+    for path in (each for each in _own_files(folder) if each.stat().st_ctime > state.sent):
+        parent = path.parent.relative_to(folder.path).as_posix()
+        client.log_artifact(state.run_id, str(path), None if parent == "." else parent)
+    if content.tables is not None and (folder.path / "tables.json").stat().st_ctime > state.sent:
+        client.log_text(state.run_id, json.dumps(artifact_table(content.tables)), TABLE_FILE)
     client.update_run(state.run_id, "RUNNING" if status == "RUNNING" else None, name)
     if status not in ("RUNNING", run.info.status):
         written = (folder.path / each for each in ("result.json", "metrics.jsonl", "run.json"))
@@ -143,7 +169,7 @@ def upload(store: MlflowStore, folder: RunFolder, state: UploadState, status: St
     write_upload_state(folder, state)
 
 
-def _run_of(store: MlflowStore, folder: RunFolder, state: UploadState, name: str) -> Any:
+def _run_of(store: MlflowStore, folder: RunFolder, state: UploadState, content: Content) -> Any:
     """The MLflow run that ``mlflow.json`` names; an unnoted or a new one if it was deleted."""
     from mlflow.exceptions import MlflowException
 
@@ -156,21 +182,16 @@ def _run_of(store: MlflowStore, folder: RunFolder, state: UploadState, name: str
             raise
     # A process that was killed may have made the run without noting its id. The start keeps runs of
     # one key apart that were trained again.
-    first = (read_provenance(folder.path / "provenance.json") or [{}])[0].get("started")
+    first = content.process.get("started")
     seconds = time.time() if first is None else datetime.fromisoformat(first).timestamp()
-    start, tags = round(1000 * seconds), _identity(folder)
+    start, tags, name = round(1000 * seconds), content.identity, content.description.name
     found = store.client.search_runs([store.experiment_id], f"attributes.start_time = {start}")
     # Compared here: MLflow's search cannot quote every path.
     run = next((each for each in found if tags.items() <= each.data.tags.items()), None)
-    run = run or store.client.create_run(store.experiment_id, start, tags, name)
+    run = run or store.client.create_run(store.experiment_id, start, tags, name[:NAME_LENGTH])
     state.run_id, state.steps, state.sent = run.info.run_id, {}, 0.0
     write_upload_state(folder, state)
     return run
-
-
-def _identity(folder: RunFolder) -> dict[str, str]:
-    """Tags that are set in the call that makes a run, and by which it is found."""
-    return {KIND_TAG: "run", "rgbt.key": shown_key(folder), "rgbt.folder": str(folder.path)}
 
 
 def _own_files(folder: RunFolder) -> list[Path]:
@@ -179,21 +200,7 @@ def _own_files(folder: RunFolder) -> list[Path]:
     return [path for path in found if path.is_file() and path.resolve() == path]
 
 
-def _send_files(
-    client: Any, folder: RunFolder, state: UploadState, tables: ResultTables | None
-) -> None:
-    """Upload the table and files that changed since the last time."""
-    for path in _own_files(folder):
-        if path.stat().st_ctime > state.sent:
-            parent = path.parent.relative_to(folder.path).as_posix()
-            client.log_artifact(state.run_id, str(path), None if parent == "." else parent)
-    if tables is not None and (folder.path / "tables.json").stat().st_ctime > state.sent:
-        client.log_text(state.run_id, json.dumps(artifact_table(tables)), TABLE_FILE)
-
-
-def _metrics(
-    folder: RunFolder, every: list[MetricLine], state: UploadState, tables: ResultTables | None
-) -> Iterator[Any]:
+def _metrics(content: Content, state: UploadState) -> Iterator[Any]:
     """Finite values of new lines, each with the time of its line, and what no line holds.
 
     The latter are the IoU over the regions (the step is the region's number), and scores of pairs
@@ -201,6 +208,7 @@ def _metrics(
     """
     from mlflow.entities import Metric
 
+    every, tables = content.lines, content.tables
     new = [line for line in every if line.step > state.steps.get(line.kind, -1)]
     # The compare page draws the metric that came first: scores before losses.
     for line in sorted(new, key=lambda line: ("test", "val", "train").index(line.kind)):
@@ -214,30 +222,27 @@ def _metrics(
     for region, iou in enumerate(regions, start=1):
         if math.isfinite(iou):
             yield Metric(names.REGION_PROFILE, round(100 * iou, 2), now, region)
-    result = read_result(folder.path) or {}
     known = {name for line in every if line.kind == "test" for name in line.values}
     for kind, prefix, sent in (("val", "val/", set()), ("test", "", known)):
-        scores = {name: v for name, v in (result.get(kind) or {}).items() if v is not None}
+        scores = {name: v for name, v in (content.result.get(kind) or {}).items() if v is not None}
         pairs = {n: v for n, v in scores.items() if n.split("/")[0] in (names.TC, names.CA)}
-        for name, value in names.shown(pairs).items():
+        for name, value in names.shown(pairs).items() if pairs else ():
             if name not in sent:
                 yield Metric(f"{prefix}{name}", value, now, 0)
 
 
-def _tags(
-    folder: RunFolder, description: Description, tables: ResultTables | None
-) -> dict[str, str]:
+def _tags(content: Content) -> dict[str, str]:
     """Tags of a run by name; those without a value are not sent."""
-    first = (read_provenance(folder.path / "provenance.json") or [{}])[0]
+    tables = content.tables
     tags = {
         "mlflow.user": getpass.getuser(),
         "mlflow.source.type": "LOCAL",
         "mlflow.source.name": "rgbt",  # its pages show no more than the end of a path
-        "rgbt.command": first.get("command", ""),
-        "mlflow.source.git.commit": first.get("git_commit") or "",
-        "rgbt.dataset": (read_result(folder.path) or {}).get("dataset", ""),
-        **_identity(folder),
-        **description.tags,
+        "rgbt.command": content.process.get("command", ""),
+        "mlflow.source.git.commit": content.process.get("git_commit") or "",
+        "rgbt.dataset": content.result.get("dataset", ""),
+        **content.identity,
+        **content.description.tags,
     }
     if tables is not None:
         tags["mlflow.note.content"] = "\n".join(g.to_markdown() for g in result_grids(tables))
@@ -262,23 +267,3 @@ def artifact_table(tables: ResultTables) -> dict[str, list[Any]]:
         rows += [(f"{name} / {region}", iou, math.nan) for region, iou in pairs]
     data = [[name, *(round(100 * v, 2) for v in values)] for name, *values in rows]
     return {"columns": ["score", "IoU %", "accuracy %"], "data": without_nan(data)}
-
-
-def _send_inputs(client: Any, run_id: str, folder: RunFolder) -> None:
-    """Add the data set of a run to the column Datasets, one entry (unique name) for each split."""
-    from mlflow.entities import Dataset, DatasetInput, InputTag
-
-    marker = read_marker(folder.path)
-    if marker is None or "inputs" not in marker:
-        return
-    entries = []
-    for each in marker["inputs"]:
-        dataset = Dataset(
-            name=f"{marker['name']}/{each['split']}",
-            digest=marker["files"][:8],
-            source_type="local",  # a path as text: nothing is opened
-            source=json.dumps({"uri": marker["root"]}),
-            profile=json.dumps({"images": each["images"], "fingerprint": marker["files"]}),
-        )
-        entries.append(DatasetInput(dataset, [InputTag("mlflow.data.context", each["context"])]))
-    client.log_inputs(run_id, datasets=entries)

@@ -15,7 +15,6 @@ from rgbt.engine.committed import Checkpoints
 from rgbt.engine.trainer import Loaded, Trainer
 from rgbt.evaluation.prediction import view_of
 from rgbt.evaluation.request import EvaluationRequest
-from rgbt.runs.folder import InputForm
 
 if TYPE_CHECKING:
     from rgbt.data.pairs import PairedBatches
@@ -75,19 +74,3 @@ def _noting_skipped(batches: Batches[Any] | PairedBatches, state: State) -> Iter
     for batch in batches:
         state.skip(batches.skipped)
         yield batch
-
-
-def used_splits(session: Session) -> list[InputForm]:
-    """The splits that a run reads: for training, for the choice of a checkpoint and for the test.
-
-    A split that is used twice is named for its first use.
-    """
-    used = {domain.split: "train" for domain in session.domains.named.values()}
-    if session.selection_split is not None:
-        used.setdefault(session.selection_split, "val")
-    used.setdefault("test", "test")
-    names = session.dataset.names
-    return [
-        {"split": split, "context": context, "images": len(names(split))}
-        for split, context in used.items()
-    ]

@@ -65,7 +65,7 @@ def _take_part(spec: RunSpec) -> None:
     # Process 0 has written what was missing in the cache of images.
     if not reason:
         try:
-            decode_ahead(setup.session, *setup.session.read_splits())
+            decode_ahead(setup.session, *setup.names)
         except InputError as error:
             reason = str(error)
     if any(collected(reason)):

@@ -28,7 +28,7 @@ def announce_training(setup: TrainingSetup, name: str, folder: Path) -> None:
     session, trainer = setup.session, setup.session.trainer
     trained = {key: net for key, net in setup.others.items() if key in setup.optimizers}
     others = "".join(f", {key} {_millions(net)}" for key, net in trained.items())
-    counts = [f"{len(session.dataset.names(each))} {each}" for each in setup.session.read_splits()]
+    counts = [f"{len(names)} {split}" for split, names in setup.names.items()]
     lines = [
         ("device", device_line(session)),
         ("network", f"{network_line(session)}{others}"),
@@ -92,7 +92,7 @@ def _of_steps(setup: TrainingSetup) -> str:
 
 def _write(*lines: str) -> None:
     # Not as a message (`info`): drivers of sweeps take the last remark for what went wrong.
-    sys.stderr.write("".join(f"{without_controls(line)}\n" for line in lines))
+    sys.stderr.write(without_controls("".join(f"{line}\n" for line in lines)))
 
 
 def _millions(network: nn.Module, *, only_trained: bool = False) -> str:

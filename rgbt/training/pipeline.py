@@ -18,7 +18,7 @@ from rgbt.config.compose import flatten
 from rgbt.config.stored_config import checkouts, targets
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.files.atomic import is_held
-from rgbt.files.budgets import check_links
+from rgbt.files.plain_files import check_links
 from rgbt.processes import alone
 from rgbt.runs.provenance import other_code
 from rgbt.runs.run_spec import WEIGHTS, Dependency, RunSpec
@@ -42,7 +42,8 @@ def run_pipeline(run: RunSpec, extra_tags: Mapping[str, str]) -> None:
     Raises:
         InputError: see `validate` and `train`; the message names the upstream run that is wrong.
     """
-    for spec in run.upstream:
+    upstream = run.upstream
+    for spec in upstream:
         check_links(spec.folder)
     for dependency in run.dependencies if run.fresh else ():  # fresh=true does not repeat them
         spec = dependency.run
@@ -59,7 +60,7 @@ def run_pipeline(run: RunSpec, extra_tags: Mapping[str, str]) -> None:
     specs = topological_order(run)
     labels = [run.labels_folder(name) for name in run.domains.named]
     has_labels = all(each is None or each.is_dir() for each in labels)  # renamed when complete
-    if not has_labels or not all(each.is_finished for each in run.upstream):
+    if not has_labels or not all(each.is_finished for each in upstream):
         for spec in specs:
             with _naming(spec, run), alone():
                 validate(spec)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -26,6 +26,7 @@ from rgbt.processes import agreed, alone
 from rgbt.runs.folder import (
     Description,
     MarkerForm,
+    MetricLine,
     RunFolder,
     counts_name,
     read_description,
@@ -46,7 +47,6 @@ from rgbt.training.common import (
     make_trainer,
     other_head_request,
     target_request,
-    used_splits,
 )
 from rgbt.training.members import training_together
 from rgbt.training.overview import announce_training, announce_upstream
@@ -94,7 +94,7 @@ def _train_unfinished(
             announce_upstream(setup, description.name, upstream_of)
         else:
             announce_training(setup, description.name, spec.folder)
-        decode_ahead(setup.session, *setup.session.read_splits())
+        decode_ahead(setup.session, *setup.names)
         if spec.is_finished:
             kept = set_aside(RunFolder(spec.folder))
             known = None if kept is None else read_description(kept.path)
@@ -125,11 +125,13 @@ class Run:
         try:
             self.tracking.start(self.folder, replace(self.description, tags=tags))
             state = self._train(session)
+            lines = self.folder.lines()
+            self._report(session, lines)
             agreed(None)  # the other processes may read the best checkpoint
             load_best(session, self.folder.path, state.best_step)
             with alone():
                 pairs = self._consistency(session)
-            self._test(session, state, pairs.get("test"))
+            tested = self._test(session, state, pairs.get("test"))
             Checkpoints(self.folder.path).tidy()
             self.folder.finish(
                 {
@@ -141,7 +143,7 @@ class Run:
                     **({"best_score": state.best_score} if session.selection_split else {}),
                     "seconds_of_last_process": round(time.time() - started, 1),
                     "skipped": state.skipped,
-                    **self._scores(session, state, pairs),
+                    **self._scores(session, state, lines, {"test": tested}, pairs),
                 }
             )
         except KeyboardInterrupt:
@@ -155,13 +157,17 @@ class Run:
             self.tracking.finish("FINISHED")
 
     def _scores(
-        self, session: Session, state: State, pairs: Mapping[str, ConsistencyTable]
+        self,
+        session: Session,
+        state: State,
+        lines: Sequence[MetricLine],
+        reached: dict[str, dict[str, float]],
+        pairs: Mapping[str, ConsistencyTable],
     ) -> dict[str, dict[str, float | None]]:
         """Scores of the best checkpoint on the selection split, if any, and on the test split."""
-        lines = {(line.kind, line.step): line.values for line in self.folder.lines()}
-        reached = {"test": lines["test", state.step]}
         if session.selection_split is not None:
-            val = lines.get(("val", state.best_step))
+            of_val = {line.step: line.values for line in lines if line.kind == "val"}
+            val = of_val.get(state.best_step)
             if not val:  # the log was cut off, which is reported
                 path = self.folder.path / counts_name(session.selection_split)
                 val = scores.summary(Counts.load(path), session.regions.absent)
@@ -173,13 +179,7 @@ class Run:
     def _claim(self, session: Session) -> None:
         """Write what identifies the run; refuse a folder that was started on other images."""
         dataset = session.dataset
-        now: MarkerForm = {
-            "names": names_key(session),
-            "files": dataset.fingerprint(),
-            "name": dataset.name,
-            "root": str(dataset.root),
-            "inputs": used_splits(session),
-        }
+        now: MarkerForm = {"names": names_key(session), "files": dataset.fingerprint()}
         before = read_marker(self.folder.path) or now
         if before["names"] != now["names"]:
             raise InputError(
@@ -192,7 +192,6 @@ class Run:
         self.folder.mark(now)
         config = OmegaConf.to_yaml(OmegaConf.create(dict(session.spec.plain)))
         self.folder.write_config(without_passwords(config))
-        self.folder.add_provenance({**provenance(), "own_code": session.spec.own_code()})
 
     def _train(self, session: Session) -> State:
         state = State(seed=session.spec.drawn.masks)
@@ -201,26 +200,21 @@ class Run:
             if trainer.checkpoints.warning:
                 info(trainer.checkpoints.warning)
             info(f"{self.description.name} resumes at step {state.step} ({self.folder.path}).")
-        self.folder.begin_at(state.step)
+        own_code = {"own_code": session.spec.own_code(), "from_step": state.step}
+        self.folder.add_provenance({**provenance(), **own_code})
         warn_of_steps(self.folder.path, state.step)
         self._truncate(state)
         fit(trainer, self.setup, state)
-        self._report_waiting(session)
-        if session.trainer.log_gradient_shares:
-            from rgbt.engine.gradient_shares import shares_sentence
-
-            lines = (line.values for line in self.folder.lines() if line.kind == "train")
-            if sentence := shares_sentence(lines):
-                info(f"{sentence}.")
         return state
 
     def _truncate(self, state: State) -> None:
         """Prepare ``metrics.jsonl`` of a run that resumes; report what is repeated or lost."""
         step = state.step
-        reached = self.folder.truncate_after(step, state.evaluated_step)
+        lines = self.folder.truncate_after(step, state.evaluated_step)
+        reached = max((line.step for line in lines), default=0)
         if reached > step:
             info(f"steps {step + 1} to {reached} were not saved and are repeated.")
-        logged = [0, *(line.step for line in self.folder.lines() if line.kind == "train")]
+        logged = [0, *(line.step for line in lines if line.kind == "train" and line.step <= step)]
         every = max([self.setup.session.trainer.log_every, *(np.diff(logged[-2:]).tolist())])
         if step - logged[-1] >= every:
             warn(
@@ -229,13 +223,10 @@ class Run:
                 "checkpoint are not affected."
             )
 
-    def _report_waiting(self, session: Session) -> None:
-        """Report a training that mostly waited for images, and what helps."""
-        shares = [
-            line.values[WAIT_SHARE]
-            for line in self.folder.lines()
-            if line.kind == "train" and WAIT_SHARE in line.values
-        ]
+    def _report(self, session: Session, lines: Sequence[MetricLine]) -> None:
+        """Report a training that mostly waited for images, what helps, and shares of gradients."""
+        logged = [line.values for line in lines if line.kind == "train"]
+        shares = [values[WAIT_SHARE] for values in logged if WAIT_SHARE in values]
         if shares and np.median(shares) > MUCH_WAITING:
             cache = (
                 "" if session.loading.cache else "data.cache=auto decodes every image once, and "
@@ -244,6 +235,11 @@ class Run:
                 f"{np.median(shares):.0%} of the time of a step was spent waiting for images; "
                 f"{cache}data.num_workers=... reads them with more processes."
             )
+        if session.trainer.log_gradient_shares:
+            from rgbt.engine.gradient_shares import shares_sentence
+
+            if sentence := shares_sentence(logged):
+                info(f"{sentence}.")
 
     def _trainer(self, session: Session, state: State) -> Trainer:
         split = session.selection_split
@@ -304,8 +300,10 @@ class Run:
                 draw_pairs(pairs.kept, legend_of(session.dataset), self.folder.figure_path("pairs"))
         return tables
 
-    def _test(self, session: Session, state: State, pairs: ConsistencyTable | None) -> None:
-        """Counts, tables and figures of the best checkpoint on the test split."""
+    def _test(
+        self, session: Session, state: State, pairs: ConsistencyTable | None
+    ) -> dict[str, float]:
+        """Counts, tables and figures of the best checkpoint on the test split; its scores."""
         keep = panel_names(session.dataset, "test")
         result = evaluate(session, session.model, EvaluationRequest(split="test", keep=keep))
         state.skip(result.skipped)
@@ -328,7 +326,7 @@ class Run:
         self.folder.write_tables(tables)
         if not result.kept:
             info("no image of the panel could be read, so no pictures were drawn.")
-            return
+            return values
         draw_panel(result.kept, legend_of(session.dataset), self.folder.figure_path("panel"))
         heat = RegionHeat(
             title=f"{name}: IoU by region, {session.dataset.name} {tables.split}",
@@ -336,6 +334,7 @@ class Run:
             ious=tables.regions.region_ious,
         )
         draw_region_heat(heat, self.folder.figure_path("regions"))
+        return values
 
     def _by_other_head(self, session: Session) -> dict[str, float]:
         """The mIoU at night of the head that is not selected for the night, named after the head.

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from rgbt.checks import InputError, nearest, one_line
-from rgbt.files.budgets import read_bytes
+from rgbt.files.plain_files import read_bytes
 from rgbt.ranges import Names
 from rgbt.requirements import Record, record_of
 from rgbt.transforms.virtual_view import VirtualView

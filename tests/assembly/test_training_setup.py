@@ -184,7 +184,7 @@ def test_all_that_is_read_is_decoded_before_the_first_step(
     validate(cached)
     assert not (tmp_path / "cache").exists(), "a validation writes nothing"
     setup = set_up_training(cached)
-    decode_ahead(setup.session, *setup.session.read_splits())
+    decode_ahead(setup.session, *setup.names)
     dataset: Any = setup.session.dataset
 
     monkeypatch.setattr(dataset.source, "read", None)  # nothing is decoded again

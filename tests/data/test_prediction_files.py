@@ -65,16 +65,6 @@ def test_an_encrypted_zip_file_is_refused_by_name(tmp_path: Path) -> None:
         pass
 
 
-def test_a_zip_file_larger_than_the_budget_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("RGBT_MAX_FILE_MB", "1")
-    path = archive(tmp_path / "p.zip", "a.png", "b.png", content=bytes(600_000))
-    assert path.stat().st_size < 10_000
-    with pytest.raises(InputError, match="more than the limit of 1 million"), opened_folder(path):
-        pass
-
-
 def test_a_damaged_zip_file_is_refused(tmp_path: Path) -> None:
     path = archive(tmp_path / "p.zip", "a.png", content=bytes(range(256)))
     content = bytearray(path.read_bytes())

@@ -132,7 +132,7 @@ def test_a_file_that_claims_too_many_pixels_is_not_decoded(tmp_path: Path) -> No
     content[29:33] = struct.pack(">I", zlib.crc32(content[12:29]))
     path.write_bytes(content)
     for form in ("index", "colour"):
-        with pytest.raises(InputError, match="bomb.png holds 200 million pixels"):
+        with pytest.raises(InputError, match="bomb.png cannot be decoded"):
             read(path, form)
 
 

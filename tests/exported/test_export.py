@@ -201,16 +201,6 @@ def test_bytes_changed_by_another_program_raise_one_sentence_or_none(
     assert all(str(path) in each for each in messages)
 
 
-def test_a_file_above_the_budget_is_refused(
-    exported: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("RGBT_MAX_FILE_MB", "1")
-    big = exported.with_name("big.onnx")
-    big.write_bytes(bytes(1_000_001))
-    with pytest.raises(ValueError, match="more than the limit of 1 million"):
-        ExportedNetwork.read(big)
-
-
 def test_constants_in_other_files_are_refused(changed: Callable[[Change], Path]) -> None:
     def outside(proto: onnx.ModelProto) -> None:
         tensor = proto.graph.initializer[0]

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import io
 import os
-import tracemalloc
 import zipfile
 
 import numpy as np
@@ -66,18 +65,6 @@ def counts_of(path, images: int, classes: int = 3):
     return path
 
 
-def test_a_file_above_the_limit_is_refused_before_it_is_unpacked(tmp_path, monkeypatch) -> None:
-    path = counts_of(tmp_path / "c.npz", images=300, classes=30)  # 19 MB
-    monkeypatch.setenv("RGBT_MAX_FILE_MB", "15")
-    tracemalloc.start()
-    with pytest.raises(InputError, match="holds 19 million bytes.* set RGBT_MAX_FILE_MB=20"):
-        Counts.load(path)
-    assert tracemalloc.get_traced_memory()[1] < 2e6
-    tracemalloc.stop()
-    monkeypatch.setenv("RGBT_MAX_FILE_MB", "20")
-    assert Counts.load(path).counts.shape == (300, 9, 30, 30)
-
-
 def rewritten(path, change) -> None:
     """The archive with its arrays changed, as a stranger would write it."""
     with np.load(path) as stored:
@@ -98,7 +85,7 @@ def rewritten(path, change) -> None:
 )),
         (lambda a: {**{k: v for k, v in a.items() if k != "digest"}, "unscored": np.array(["x"])},
          "unscored: expected some, but not all, of the classes"),
-        (lambda a: a | {f"n{i}": np.zeros(1) for i in range(40)}, "its directory is not that of"),
+        (lambda a: a | {"n": np.zeros(1)}, "'n' has the unexpected shape"),
     ],
 )  # fmt: skip
 def test_another_content_than_the_kind_has_is_refused(tmp_path, change, reason) -> None:

@@ -128,8 +128,7 @@ def test_other_code_counts_for_processes_that_left_something(
 ) -> None:
     monkeypatch.setattr(module, "code", lambda: NOW)
     for number, step in enumerate(steps):
-        made_by(tmp_path, NOW if number else OTHER)
-        RunFolder(tmp_path).begin_at(step)
+        made_by(tmp_path, {**(NOW if number else OTHER), "from_step": step})
     assert (other_code(tmp_path) is not None) == is_other
 
 

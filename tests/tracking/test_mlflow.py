@@ -12,7 +12,6 @@ import pytest
 
 from rgbt.runs.folder import (
     Description,
-    MarkerForm,
     RunFolder,
     counts_name,
     read_description,
@@ -27,7 +26,7 @@ from rgbt.tracking.mlflow_upload import (
     write_upload_state,
 )
 from rgbt.tracking.mlflow_view import view_tags
-from tests.commands import Trained, code_of, short
+from tests.commands import code_of
 
 DEAD = "http://127.0.0.1:9"
 TAGS = {"rgbt.group": "grbm", "rgbt.seed": "0"}
@@ -332,44 +331,3 @@ def test_sync_hides_the_password_of_a_store_that_refuses(
     error = capsys.readouterr().err
     assert "API request to http://me:***@127.0.0.1:9/api failed" in error
     assert "Secret" not in error
-
-
-# ---- data sets and system metrics -----------------------------------------------------------
-
-MARKER: MarkerForm = {
-    "names": "aa",
-    "files": "0123456789abcdef",
-    "name": "mfnet",
-    "root": "/data/MFNet; $(touch /tmp/executed)",
-    "inputs": [
-        {"split": "train", "context": "train", "images": 784},
-        {"split": "test", "context": "test", "images": 393},
-    ],
-}
-
-
-def test_each_split_is_an_entry_of_the_datasets_column(runs_dir: Path) -> None:
-    folder = RunFolder(runs_dir / "inputs")
-    begin(folder, NoTracking())
-    folder.finish({"steps": 5})
-    folder.mark(MARKER)
-    for _ in range(2):  # a second time sends nothing twice
-        tracking(runs_dir).sync(folder, "FINISHED")
-    found = run_of(runs_dir, folder).inputs.dataset_inputs
-    sets = {(each.dataset.name, each.dataset.digest, each.tags[0].value): each for each in found}
-    assert set(sets) == {("mfnet/test", "01234567", "test"), ("mfnet/train", "01234567", "train")}
-    train = sets["mfnet/train", "01234567", "train"].dataset
-    assert train.source_type == "local"
-    assert json.loads(train.source) == {"uri": MARKER["root"]}, "a path as text"
-    assert json.loads(train.profile) == {"images": 784, "fingerprint": "0123456789abcdef"}
-
-
-def test_a_run_writes_the_splits_that_it_uses(trained: Trained) -> None:
-    folder = trained("+experiment=mfnet", "masker.patch_size=null", *short(1))
-    marker = json.loads((folder / "dataset.json").read_text())
-    assert (marker["name"], Path(marker["root"]).name) == ("mfnet", "mf")
-    assert marker["inputs"] == [
-        {"split": "train", "context": "train", "images": 8},
-        {"split": "val", "context": "val", "images": 2},
-        {"split": "test", "context": "test", "images": 3},
-    ]

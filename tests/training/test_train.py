@@ -18,12 +18,12 @@ def stderr_of(
     capsys: pytest.CaptureFixture[str], lines: list[tuple[str, dict[str, float]]], cache: str | None
 ) -> str:
     """What a run with these lines in its log says of waiting."""
-    kept = [SimpleNamespace(kind=kind, values=values) for kind, values in lines]
-    folder: Any = SimpleNamespace(lines=lambda: kept)
+    kept: Any = [SimpleNamespace(kind=kind, values=values) for kind, values in lines]
     nothing: Any = None
-    session: Any = SimpleNamespace(loading=SimpleNamespace(cache=cache))
+    trainer = SimpleNamespace(log_gradient_shares=False)
+    session: Any = SimpleNamespace(loading=SimpleNamespace(cache=cache), trainer=trainer)
     capsys.readouterr()
-    Run(nothing, folder, nothing, nothing)._report_waiting(session)
+    Run(nothing, nothing, nothing, nothing)._report(session, kept)
     return capsys.readouterr().err
 
 

@@ -212,7 +212,7 @@ def test_training_takes_the_transform_of_each_domain(monkeypatch: pytest.MonkeyP
     )
     datasets: Any = {"source": None, "target": None}
     none: Any = None
-    setup = TrainingSetup(session, none, datasets, none, {}, {}, None, none, none)
+    setup = TrainingSetup(session, none, {}, datasets, none, {}, {}, None, none, none)
     setup.batches(range(1))
     assert [each.drop_probability for each in taken] == [1.0, 0.0]
 

@@ -43,8 +43,8 @@ from rgbt.data.cache.sample_map import (
 )
 from rgbt.data.synth.cache import default_cache
 from rgbt.dataset import DatasetWrapper, LabelledDataset, layers
-from rgbt.files.atomic import holder_of, holding, remove_left_behind, write_atomic
-from rgbt.files.budgets import read_json, sealed
+from rgbt.files.atomic import holder_of, holding, remove_left_behind
+from rgbt.files.plain_files import read_json, write_json
 from rgbt.types import Sample
 
 LOG = logging.getLogger(__name__)
@@ -144,7 +144,7 @@ class CachedDataset(DatasetWrapper):
                 for path, (stale, size) in self._stale(cache, names, on_progress).items():
                     _check_space(cache, size * len(stale))
                     self._warn_of_others(cache, about)
-                    write_atomic(cache / ABOUT, json.dumps(sealed(about)).encode())
+                    write_json(cache / ABOUT, about)
                     write_map(path, self._decoded(stale, on_progress))
                     held = SampleMap(path)
                     self._cached |= {name: held for name in names if name in held.records}

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.files.atomic import replacing
-from rgbt.files.budgets import parse_json, sealed
+from rgbt.files.plain_files import parse_json, sealed
 from rgbt.types import Sample
 
 MAGIC = b"rgbtdec3"

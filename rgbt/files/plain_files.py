@@ -1,10 +1,9 @@
-"""Read files of others: regular, of a limited size, inside their folder, of the expected types."""
+"""Read files of others: regular, inside their folder, as JSON of the expected type."""
 
 from __future__ import annotations
 
 import json
 import os
-import stat
 import zlib
 from collections.abc import Mapping
 from functools import cache
@@ -12,25 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from rgbt.checks import InputError, one_line
+from rgbt.files.atomic import write_atomic
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter
-
-
-LIMITS = {"pixels": ("RGBT_MAX_MEGAPIXELS", 100), "bytes": ("RGBT_MAX_FILE_MB", 1000)}
-"""Environment variables that limit what is read of one file, in millions, and their values. Images
-of the supported data sets have 1.3 million pixels; counts of 10,000 images take 487 MB."""
-
-
-def check_size(path: Path, amount: int, unit: Literal["pixels", "bytes"]) -> None:
-    """Raise InputError where the file `path` holds more than `LIMITS` allow."""
-    variable, millions = LIMITS[unit]
-    limit = os.environ.get(variable, str(millions))
-    if not limit.isdecimal() or amount > 1_000_000 * int(limit):
-        raise InputError(
-            f"{path} holds {amount / 1e6:,.0f} million {unit}, more than the limit of {limit} "
-            f"million. If it is the right file, set {variable}={-(-amount // 1_000_000)}."
-        )
 
 
 def check_links(folder: Path) -> None:
@@ -55,12 +39,10 @@ def inside(path: Path, folder: Path) -> Path:
     return path
 
 
-def read_bytes(path: Path, advice: str = "") -> bytes:
-    """Every byte of a regular file within `LIMITS`; `advice` ends the InputError for others."""
-    status = path.stat()  # a pipe must not be opened: reading it would wait for ever
-    if not stat.S_ISREG(status.st_mode):
-        raise InputError(f"{path} is not a regular file{advice and f'; {advice}'}.")
-    check_size(path, status.st_size, "bytes")
+def read_bytes(path: Path) -> bytes:
+    """Every byte of a regular file; InputError for a pipe, which would be waited for."""
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path} is not a regular file.")
     return path.read_bytes()
 
 
@@ -70,8 +52,14 @@ def sealed(value: Mapping[str, Any]) -> dict[str, Any]:
     return {**plain, "crc32": f"{zlib.crc32(json.dumps(plain, sort_keys=True).encode()):08x}"}
 
 
+def write_json(path: Path, value: Mapping[str, Any] | list[Any]) -> None:
+    """Write a JSON file; a mapping is `sealed`."""
+    content = sealed(value) if isinstance(value, Mapping) else value
+    write_atomic(path, (json.dumps(content, indent=1) + "\n").encode())
+
+
 def read_json(path: Path, form: Any, advice: str) -> Any:
-    """The content of a JSON file (`parse_json`).
+    """The content of a JSON file (`parse_json`); a link out of its folder is refused.
 
     Args:
         path: of the file, which exists.
@@ -79,7 +67,7 @@ def read_json(path: Path, form: Any, advice: str) -> Any:
         advice: what to do with a damaged file, at the end of the InputError.
     """
     try:
-        return parse_json(read_bytes(path), form)
+        return parse_json(read_bytes(inside(path, path.parent)), form)
     except InputError:
         raise
     except (ValueError, OSError) as error:
