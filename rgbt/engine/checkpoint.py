@@ -8,6 +8,7 @@ When a run starts, the first of these that exists is used:
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from rgbt.checkpoints.stored import ZIP, explained, plain, read_torch_file
+from rgbt.checkpoints.torch_files import read_torch_file
 from rgbt.checks import InputError, RunError, not_finite
 
 UNAVERAGED = "unaveraged"
@@ -75,8 +76,13 @@ class State:
             raise TypeError("steps and seed are whole numbers")
         if not isinstance(state.best_score, float):
             raise TypeError("a score is a number")
-        if not isinstance(state.skipped, list) or not isinstance(state.unlogged, dict):
-            raise TypeError("no names, no values")
+        values = [*state.unlogged.items()] if isinstance(state.unlogged, dict) else [("", "")]
+        if not isinstance(state.skipped, list) or any(
+            type(name) is not str for name in (*state.skipped, *(name for name, _ in values))
+        ):
+            raise TypeError("names are text")
+        if any(type(value) is not float for _, value in values):
+            raise TypeError("logged values are numbers")
         return state
 
 
@@ -111,12 +117,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     Raises:
         InputError: missing, damaged, or not a checkpoint of rgbt; nothing in it is executed.
     """
-    if not path.is_file():
-        raise InputError(f"the checkpoint {path} does not exist.")
-    advice = "copy it again from an intact copy, or train the run again in another runs_dir=..."
-    with explained(path, "a checkpoint", advice):
-        value, container = read_torch_file(path)
-        payload = plain(value, path.stat().st_size) if container == ZIP else None
+    payload = _shared(read_torch_file(path), {})
     loaded: dict[str, Any] = payload if isinstance(payload, dict) else {}
     weights = loaded.get("model")
     if not isinstance(weights, dict) or not all(
@@ -126,6 +127,17 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
             f"{path} holds no weights under 'model'; give a checkpoint written by `rgbt run`."
         )
     return loaded
+
+
+def _shared(value: Any, known: dict[int, Any]) -> Any:
+    """`value` with one object for equal texts: what is saved again has the same bytes."""
+    if isinstance(value, str):
+        return sys.intern(value)
+    if id(value) not in known and isinstance(value, dict):
+        known[id(value)] = {_shared(k, known): _shared(each, known) for k, each in value.items()}
+    elif id(value) not in known and isinstance(value, list | tuple):
+        known[id(value)] = type(value)(_shared(each, known) for each in value)
+    return known.get(id(value), value)
 
 
 def step_of(payload: Mapping[str, Any], source: Path) -> int:
@@ -153,6 +165,7 @@ def restore_optimizer(optimizer: torch.optim.Optimizer, stored: Any, source: Pat
         InputError: it is the state of another optimizer.
     """
     try:
+        _check_places(optimizer, stored)
         optimizer.load_state_dict(stored)
     except (ValueError, TypeError, LookupError, AttributeError, RuntimeError) as error:
         raise InputError(
@@ -165,6 +178,26 @@ def restore_optimizer(optimizer: torch.optim.Optimizer, stored: Any, source: Pat
                 continue
             if value.stride() != parameter.stride():
                 state[name] = torch.empty_like(parameter, dtype=value.dtype).copy_(value)
+
+
+def _check_places(optimizer: torch.optim.Optimizer, stored: Any) -> None:
+    """Raise ValueError unless every value has the shape and type of its place.
+
+    torch compares neither: a moment of another shape ends the next step by SIGSEGV.
+    """
+    for own, group in zip(optimizer.param_groups, stored["param_groups"], strict=True):
+        for key in own.keys() & group.keys() - {"params"}:
+            kinds = [float if type(each[key]) is int else type(each[key]) for each in (own, group)]
+            if type(None) not in kinds and kinds[0] is not kinds[1]:
+                raise ValueError(f"{key} is a {kinds[1].__name__}")
+    parameters = [each for group in optimizer.param_groups for each in group["params"]]
+    for index, state in stored["state"].items():
+        for name, value in state.items():
+            is_moment = isinstance(value, Tensor) and value.ndim > 0
+            if is_moment and (
+                value.shape != parameters[index].shape or not value.is_floating_point()
+            ):
+                raise ValueError(f"{name} of parameter {index} has another shape or type")
 
 
 def restore_weights(model: nn.Module, weights: dict[str, Tensor], source: Path) -> None:

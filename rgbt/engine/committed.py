@@ -20,7 +20,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-from rgbt.checkpoints.stored import save
+from rgbt.checkpoints.torch_files import save
 from rgbt.checks import InputError, RunError
 from rgbt.engine.checkpoint import State, load_checkpoint, step_of
 

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 
-from rgbt.checkpoints.stored import save
+from rgbt.checkpoints.torch_files import save
 from rgbt.checks import RunError
 from rgbt.engine import committed
 from rgbt.engine.checkpoint import State, load_checkpoint

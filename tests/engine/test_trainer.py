@@ -10,7 +10,7 @@ import torch
 from lightning_fabric import Fabric
 from torch import Tensor, nn
 
-from rgbt.checkpoints.stored import save
+from rgbt.checkpoints.torch_files import save
 from rgbt.checks import InputError, RunError
 from rgbt.engine.checkpoint import State, load_checkpoint, restore_weights
 from rgbt.engine.optimizers import SGD, Adam, AdamW
@@ -19,7 +19,7 @@ from rgbt.engine.settings import TrainerSettings
 from rgbt.engine.trainer import Trainer
 from rgbt.randomness import torch_generator
 from rgbt.types import Batch, GeneratorOf, Phase
-from tests.checkpoints.test_stored import same
+from tests.checkpoints.test_torch_files import same
 
 SETTINGS = {
     "max_steps": 6,
