@@ -1,13 +1,18 @@
-"""Read and write the content of checkpoints: the state to resume from, and the best weights.
+"""Checkpoints of a run: the state to resume from, and the best weights.
 
 When a run starts, the first of these that exists is used:
-1. ``last.pt`` of the run folder (the run resumes; `rgbt.engine.committed`);
+1. ``last.pt`` of the run folder (the run resumes);
 2. `model.weights` (read by `rgbt.weights`);
 3. random weights.
+
+``last.pt`` commits a state: model, optimisers, step, and which step is the best. ``best.pt`` and
+the files of its evaluation (``counts_val.npz``, ...) follow at once. A process that is killed in
+between left the best weights in ``last.pt``, and `Checkpoints.load` writes ``best.pt`` from it.
 """
 
 from __future__ import annotations
 
+import shutil
 import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
@@ -17,7 +22,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from rgbt.checkpoints.torch_files import read_torch_file
+from rgbt.checkpoints.torch_files import read_torch_file, save
 from rgbt.checks import InputError, RunError, not_finite
 
 UNAVERAGED = "unaveraged"
@@ -222,6 +227,99 @@ def restore_weights(model: nn.Module, weights: dict[str, Tensor], source: Path) 
 def _some(what: str, keys: list[str]) -> str:
     shown = ", ".join(keys[:2] + ["..."] * (len(keys) > 2))
     return f"{len(keys)} keys {what}" + (f" ({shown})" if keys else "")
+
+
+class Checkpoints:
+    """Read and commit the checkpoints of one run folder (see the module).
+
+    Args:
+        folder: of the run.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.last = folder / "last.pt"
+        self.best = folder / "best.pt"
+        self._evaluations = folder / "checkpoints"
+        self._committed: tuple[int, int] | None = None
+
+    def begin_evaluation(self, step: int) -> Path:
+        """The empty folder for the files of the evaluation at `step`."""
+        folder = self._evaluations / str(step)
+        shutil.rmtree(self._evaluations, ignore_errors=True)
+        folder.mkdir(parents=True)
+        return folder
+
+    def commit(self, payload: dict[str, Any], state: State) -> None:
+        """Write the state of a run, unless it is already committed; then its best weights."""
+        if self._committed == (state.step, state.evaluated_step):
+            return
+        self.folder.mkdir(parents=True, exist_ok=True)
+        save(self.last, payload)
+        self._committed = state.step, state.evaluated_step
+        self._publish(payload, state)
+
+    def load(self) -> tuple[dict[str, Any], State] | None:
+        """The committed payload and its state; None before there is any.
+
+        Raises:
+            RunError: last.pt or best.pt is missing or damaged.
+        """
+        if not self.last.exists():
+            return None
+        try:
+            payload, state = self.committed()
+            self._publish(payload, state)
+            if state.best_step:
+                self.load_best(state.best_step)
+        except (InputError, TypeError) as error:
+            raise RunError(f"{str(error).rstrip('.')}; {self._begin_again()}") from error
+        self._committed = state.step, state.evaluated_step
+        return payload, state
+
+    def committed(self) -> tuple[dict[str, Any], State]:
+        """What `load` returned in another process of this run.
+
+        Raises:
+            InputError: this machine does not see the files.
+            TypeError: it is no state.
+        """
+        payload = load_checkpoint(self.last)
+        return payload, State.of(payload)
+
+    def load_best(self, step: int) -> dict[str, Any]:
+        """The weights of the best step, by name.
+
+        Raises:
+            InputError: the file is missing or damaged.
+            RunError: it holds the weights of another step.
+        """
+        payload = load_checkpoint(self.best)
+        found = step_of(payload, self.best)
+        if found != step:
+            raise RunError(
+                f"{self.best} is of step {found}, but the best evaluation of this run is of step "
+                f"{step}; {self._begin_again()}"
+            )
+        weights: dict[str, Any] = payload["model"]
+        return weights
+
+    def tidy(self) -> None:
+        """Remove the files that are only needed to resume, after training has ended."""
+        shutil.rmtree(self._evaluations, ignore_errors=True)
+
+    def _begin_again(self) -> str:
+        return f"remove {self.folder} and rerun the command to train the run from the start."
+
+    def _publish(self, payload: dict[str, Any], state: State) -> None:
+        """Write the weights and files of an evaluation that is the best, if they are not there."""
+        step = state.best_step
+        if step != state.step or step == 0:
+            return
+        for file in (self._evaluations / str(step)).glob("*"):
+            file.replace(self.folder / file.name)
+        if not self.best.exists() or step_of(load_checkpoint(self.best), self.best) != step:
+            save(self.best, {"model": payload["model"], "step": step})
 
 
 def check_weights(modules: Mapping[str, nn.Module], step: int) -> None:

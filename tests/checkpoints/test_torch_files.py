@@ -17,8 +17,13 @@ import torch
 from rgbt.checkpoints.read import read
 from rgbt.checkpoints.torch_files import save
 from rgbt.checks import InputError, RunError
-from rgbt.engine.checkpoint import State, load_checkpoint, restore_optimizer, training_payload
-from rgbt.engine.committed import Checkpoints
+from rgbt.engine.checkpoint import (
+    Checkpoints,
+    State,
+    load_checkpoint,
+    restore_optimizer,
+    training_payload,
+)
 from tests.checkpoints.test_read import Calls
 from tests.damage import damaged
 
