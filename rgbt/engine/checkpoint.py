@@ -319,7 +319,8 @@ class Checkpoints:
         for file in (self._evaluations / str(step)).glob("*"):
             file.replace(self.folder / file.name)
         if not self.best.exists() or step_of(load_checkpoint(self.best), self.best) != step:
-            save(self.best, {"model": payload["model"], "step": step})
+            # The same bytes from a network and from last.pt: without the versions of its modules.
+            save(self.best, {"model": dict(payload["model"]), "step": step})
 
 
 def check_weights(modules: Mapping[str, nn.Module], step: int) -> None:
