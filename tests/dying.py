@@ -1,6 +1,6 @@
 """A command that ends itself between two writes: ``python -m tests.dying "after last.pt 2" ...``.
 
-Names are those of files as they get their final one, by rename or by link; "before" is the moment
+Names are those of files as they get their final one, by rename; "before" is the moment
 with the temporary file written and flushed. "-" ends nothing. Pictures are left out.
 """
 
@@ -36,7 +36,7 @@ def die_at(instant: str) -> None:
 
         return do
 
-    os.replace, os.link = named(os.replace), named(os.link)
+    os.replace = named(os.replace)
 
 
 if __name__ == "__main__":

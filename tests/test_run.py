@@ -17,13 +17,13 @@ import pytest
 import torch
 
 from rgbt import evaluate, predict
-from rgbt.checkpoints.stored import save
+from rgbt.checkpoints.torch_files import save
 from rgbt.config.component import build
 from rgbt.config.compose import compose
 from rgbt.engine.checkpoint import load_checkpoint
 from rgbt.metrics.counts import Counts
 from rgbt.run import main
-from tests.checkpoints.test_stored import same
+from tests.checkpoints.test_torch_files import same
 from tests.commands import (
     DAYS_AND_NIGHTS,
     ON_CPU,

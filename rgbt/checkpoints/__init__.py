@@ -1,4 +1,1 @@
-"""Read and write files of tensors within a memory budget, without executing their content.
-
-`stored.read_torch_file` reads any supported file; `stored.save` writes one of rgbt with a digest.
-"""
+"""Read weights of any known network from files, and write them, without executing their content."""

@@ -1,8 +1,7 @@
 """Recognise files of ImageNet backbones, and map them to the networks.
 
-Swin Transformers (the original files, those of timm, and the pickles that detectron2 reads), MiT
-(``mit_b0.pth`` to ``mit_b5.pth``), ResNets of torchvision, and the DeepLab v2 start of AdaptSegNet
-and ADVENT.
+Swin Transformers (the original files and those of timm), MiT (``mit_b0.pth`` to ``mit_b5.pth``),
+ResNets of torchvision, and the DeepLab v2 start of AdaptSegNet and ADVENT.
 """
 
 from __future__ import annotations

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -9,8 +10,8 @@ from typing import Any
 
 from torch import Tensor
 
-from rgbt.checkpoints.pickles import DamagedError, RefusedError, printable
-from rgbt.checkpoints.stored import beginning_of, explained, read_torch_file
+from rgbt.checkpoints.torch_files import read_torch_file
+from rgbt.checks import InputError, one_line
 
 WRAPPERS = ("state_dict", "model", "module", "model_state_dict")
 """Keys under which releases put their weights."""
@@ -63,18 +64,14 @@ def read(path: Path) -> Contents:
     """Names and tensors of a file, without executing anything in it.
 
     Args:
-        path: torch.save (zip, or before 1.6), a pickle of arrays or tensors, or safetensors.
+        path: of torch.save or of safetensors.
 
     Raises:
-        InputError: missing, empty, cut short, of another kind, or asking for code.
+        InputError: missing, damaged, of another kind, or it would execute code.
     """
-    with explained(path, "a file of weights", "copy or download it again"):
-        beginning = beginning_of(path)
-        # A header of at most 100 MB, the limit of safetensors; a pickle that begins so says more.
-        if beginning[8:9] == b"{" and int.from_bytes(beginning[:8], "little") <= 100_000_000:
-            return _read_safetensors(path)
-        value, container = read_torch_file(path)
-        return _unwrapped(path, value, container)
+    if path.is_file() and path.open("rb").read(9)[8:] == b"{":  # behind the length of its header
+        return _read_safetensors(path)
+    return _unwrapped(path, read_torch_file(path, mapped=True), "torch.save")
 
 
 def _read_safetensors(path: Path) -> Contents:
@@ -85,7 +82,7 @@ def _read_safetensors(path: Path) -> Contents:
             note = dict(file.metadata() or {})
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
-        raise DamagedError from error
+        raise InputError(f"{path} cannot be read: {one_line(error)}.") from error
     own = {key.removeprefix(f"{NOTE}."): note[key] for key in note if key.startswith(f"{NOTE}.")}
     return _without_prefixes(
         Contents(path, "safetensors", tensors, ours=bool(own), note=own), tensors
@@ -94,21 +91,21 @@ def _read_safetensors(path: Path) -> Contents:
 
 def _unwrapped(path: Path, value: Any, container: str) -> Contents:
     """The tensors of a file, which are at the top level or under one known key."""
-    if type(value) is not dict:
+    if not isinstance(value, dict):
         kind = "one tensor" if isinstance(value, Tensor) else f"a {type(value).__name__}"
-        raise RefusedError(
-            f"holds {kind}, not tensors by name; give a file that holds a state_dict()."
+        raise InputError(
+            f"{path} holds {kind}, not tensors by name; give a file that holds a state_dict()."
         )
     inner = [key for key in WRAPPERS if _is_state(value.get(key))]
     if not inner and not _is_state(value):  # a key of the author's own
         inner = [key for key in value if type(key) is str and _is_state(value[key])]
     if len(inner) > 1:
-        raise RefusedError(
-            f"holds weights under {' and '.join(inner)}; keep one of them in the file."
+        raise InputError(
+            f"{path} holds weights under {' and '.join(inner)}; keep one of them in the file."
         )
     if not inner and not _is_state(value):
-        keys = ", ".join(printable(str(key), 30) for key in list(value)[:6])
-        raise RefusedError(f"holds no tensors by name; its keys are: {keys or 'none'}.")
+        keys = ", ".join(one_line(key) for key in list(value)[:6])
+        raise InputError(f"{path} holds no tensors by name; its keys are: {keys or 'none'}.")
     where = inner[0] if inner else ""
     state = value[where] if inner else value
     tensors = {name: found for name, found in state.items() if isinstance(found, Tensor)}
@@ -122,7 +119,7 @@ def _unwrapped(path: Path, value: Any, container: str) -> Contents:
         container,
         tensors,
         where=where,
-        others=tuple(printable(str(key), 40) for key in [*outside, *inside]),
+        others=tuple(one_line(key) for key in [*outside, *inside]),
         settings=_settings(value) if inner else {},
         ours=value.keys() in OURS,
         note={key: text for key, text in items if type(key) is str and type(text) is str},
@@ -133,7 +130,7 @@ def _unwrapped(path: Path, value: Any, container: str) -> Contents:
 def _is_state(value: object) -> bool:
     """Whether a dictionary is tensors by name."""
     return (
-        type(value) is dict
+        isinstance(value, dict)
         and any(isinstance(each, Tensor) for each in value.values())
         and all(type(key) is str for key in value)
     )
@@ -145,7 +142,7 @@ def _without_prefixes(contents: Contents, tensors: dict[str, Tensor]) -> Content
         tensors = {name.removeprefix(found): tensor for name, tensor in tensors.items()}
         prefix += found
         if not all(tensors):
-            raise RefusedError("has empty names of tensors.")
+            raise InputError(f"{contents.path} has empty names of tensors.")
     return replace(contents, tensors=tensors, prefix=prefix)
 
 
@@ -159,7 +156,8 @@ def _settings(value: dict[Any, Any]) -> dict[str, Any]:
         for path, node in level:
             if isinstance(node, dict) and id(node) not in seen:
                 seen.add(id(node))
-                children += [(f"{path}.{key}".lstrip("."), node[key]) for key in node]
+                items = {**node, **vars(node)} if isinstance(node, OrderedDict) else node
+                children += [(f"{path}.{key}".lstrip("."), items[key]) for key in items]
         found |= {where: child for where, child in children if isinstance(child, PLAIN)}
         level = children
     return found

@@ -12,8 +12,8 @@ from rgbt.checkpoints.dinov2 import DINOV2
 from rgbt.checkpoints.dinov3 import DINOV3
 from rgbt.checkpoints.layout import Facts, Layout
 from rgbt.checkpoints.networks import NETWORKS
-from rgbt.checkpoints.pickles import printable
 from rgbt.checkpoints.read import Contents
+from rgbt.checks import one_line
 
 LAYOUTS: Mapping[str, Layout] = MappingProxyType(NETWORKS | BACKBONES | DINOV2 | DINOV3)
 """By name, in the order they are tried: whole networks before backbones."""
@@ -28,7 +28,7 @@ def recognise(contents: Contents) -> Facts:
     if contents.note:
         # The inputs are in the note and do not follow from the layout.
         origin = " ".join(filter(None, map(contents.note.get, ("run", "checkpoint"))))
-        noted = f"exported from {printable(origin or 'rgbt')}, with the inputs of its note"
+        noted = f"exported from {one_line(origin or 'rgbt')}, with the inputs of its note"
         return replace(
             facts,
             fits=tuple(each[:1] for each in facts.fits),

@@ -11,9 +11,9 @@ from rich.text import Text
 from torch import Tensor
 
 from rgbt.checkpoints.layout import CLASS_PARTS, Facts
-from rgbt.checkpoints.pickles import printable
 from rgbt.checkpoints.plan import Plan
 from rgbt.checkpoints.read import Contents
+from rgbt.checks import one_line
 
 ANOTHER_SIZE = 0.05
 """Share of entries that do not fit above which the network is assumed to have another size."""
@@ -162,7 +162,7 @@ def facts_view(
         *more,
         *((("windows", f"{facts.window} x {facts.window} tokens"),) if facts.window else ()),
         *(("remark", remark) for remark in facts.remarks),
-        *((f"note {printable(key, 20)}", printable(contents.note[key], 600)) for key in notes),
+        *((f"note {one_line(key)}", one_line(contents.note[key])) for key in notes),
     ]
     if not facts.family and not facts.fits:
         lines.append(("names", _first(contents.tensors, 8)))
@@ -203,4 +203,4 @@ def _by_reason(reasons: Mapping[str, str]) -> list[tuple[str, list[str]]]:
 def _first(names: Iterable[str], count: int) -> str:
     listed = list(names)
     more = ", ..." if len(listed) > count else ""
-    return ", ".join(printable(name) for name in listed[:count]) + more
+    return ", ".join(one_line(name) for name in listed[:count]) + more

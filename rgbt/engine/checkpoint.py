@@ -1,13 +1,19 @@
-"""Read and write the content of checkpoints: the state to resume from, and the best weights.
+"""Checkpoints of a run: the state to resume from, and the best weights.
 
 When a run starts, the first of these that exists is used:
-1. ``last.pt`` of the run folder (the run resumes; `rgbt.engine.committed`);
+1. ``last.pt`` of the run folder (the run resumes);
 2. `model.weights` (read by `rgbt.weights`);
 3. random weights.
+
+``last.pt`` commits a state: model, optimisers, step, and which step is the best. ``best.pt`` and
+the files of its evaluation (``counts_val.npz``, ...) follow at once. A process that is killed in
+between left the best weights in ``last.pt``, and `Checkpoints.load` writes ``best.pt`` from it.
 """
 
 from __future__ import annotations
 
+import shutil
+import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -16,7 +22,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from rgbt.checkpoints.stored import ZIP, explained, plain, read_torch_file
+from rgbt.checkpoints.torch_files import read_torch_file, save
 from rgbt.checks import InputError, RunError, not_finite
 
 UNAVERAGED = "unaveraged"
@@ -75,8 +81,13 @@ class State:
             raise TypeError("steps and seed are whole numbers")
         if not isinstance(state.best_score, float):
             raise TypeError("a score is a number")
-        if not isinstance(state.skipped, list) or not isinstance(state.unlogged, dict):
-            raise TypeError("no names, no values")
+        values = [*state.unlogged.items()] if isinstance(state.unlogged, dict) else [("", "")]
+        if not isinstance(state.skipped, list) or any(
+            type(name) is not str for name in (*state.skipped, *(name for name, _ in values))
+        ):
+            raise TypeError("names are text")
+        if any(type(value) is not float for _, value in values):
+            raise TypeError("logged values are numbers")
         return state
 
 
@@ -111,12 +122,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     Raises:
         InputError: missing, damaged, or not a checkpoint of rgbt; nothing in it is executed.
     """
-    if not path.is_file():
-        raise InputError(f"the checkpoint {path} does not exist.")
-    advice = "copy it again from an intact copy, or train the run again in another runs_dir=..."
-    with explained(path, "a checkpoint", advice):
-        value, container = read_torch_file(path)
-        payload = plain(value, path.stat().st_size) if container == ZIP else None
+    payload = _shared(read_torch_file(path), {})
     loaded: dict[str, Any] = payload if isinstance(payload, dict) else {}
     weights = loaded.get("model")
     if not isinstance(weights, dict) or not all(
@@ -126,6 +132,17 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
             f"{path} holds no weights under 'model'; give a checkpoint written by `rgbt run`."
         )
     return loaded
+
+
+def _shared(value: Any, known: dict[int, Any]) -> Any:
+    """`value` with one object for equal texts: what is saved again has the same bytes."""
+    if isinstance(value, str):
+        return sys.intern(value)
+    if id(value) not in known and isinstance(value, dict):
+        known[id(value)] = {_shared(k, known): _shared(each, known) for k, each in value.items()}
+    elif id(value) not in known and isinstance(value, list | tuple):
+        known[id(value)] = type(value)(_shared(each, known) for each in value)
+    return known.get(id(value), value)
 
 
 def step_of(payload: Mapping[str, Any], source: Path) -> int:
@@ -153,6 +170,7 @@ def restore_optimizer(optimizer: torch.optim.Optimizer, stored: Any, source: Pat
         InputError: it is the state of another optimizer.
     """
     try:
+        _check_places(optimizer, stored)
         optimizer.load_state_dict(stored)
     except (ValueError, TypeError, LookupError, AttributeError, RuntimeError) as error:
         raise InputError(
@@ -165,6 +183,26 @@ def restore_optimizer(optimizer: torch.optim.Optimizer, stored: Any, source: Pat
                 continue
             if value.stride() != parameter.stride():
                 state[name] = torch.empty_like(parameter, dtype=value.dtype).copy_(value)
+
+
+def _check_places(optimizer: torch.optim.Optimizer, stored: Any) -> None:
+    """Raise ValueError unless every value has the shape and type of its place.
+
+    torch compares neither: a moment of another shape ends the next step by SIGSEGV.
+    """
+    for own, group in zip(optimizer.param_groups, stored["param_groups"], strict=True):
+        for key in own.keys() & group.keys() - {"params"}:
+            kinds = [float if type(each[key]) is int else type(each[key]) for each in (own, group)]
+            if type(None) not in kinds and kinds[0] is not kinds[1]:
+                raise ValueError(f"{key} is a {kinds[1].__name__}")
+    parameters = [each for group in optimizer.param_groups for each in group["params"]]
+    for index, state in stored["state"].items():
+        for name, value in state.items():
+            is_moment = isinstance(value, Tensor) and value.ndim > 0
+            if is_moment and (
+                value.shape != parameters[index].shape or not value.is_floating_point()
+            ):
+                raise ValueError(f"{name} of parameter {index} has another shape or type")
 
 
 def restore_weights(model: nn.Module, weights: dict[str, Tensor], source: Path) -> None:
@@ -189,6 +227,100 @@ def restore_weights(model: nn.Module, weights: dict[str, Tensor], source: Path) 
 def _some(what: str, keys: list[str]) -> str:
     shown = ", ".join(keys[:2] + ["..."] * (len(keys) > 2))
     return f"{len(keys)} keys {what}" + (f" ({shown})" if keys else "")
+
+
+class Checkpoints:
+    """Read and commit the checkpoints of one run folder (see the module).
+
+    Args:
+        folder: of the run.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.last = folder / "last.pt"
+        self.best = folder / "best.pt"
+        self._evaluations = folder / "checkpoints"
+        self._committed: tuple[int, int] | None = None
+
+    def begin_evaluation(self, step: int) -> Path:
+        """The empty folder for the files of the evaluation at `step`."""
+        folder = self._evaluations / str(step)
+        shutil.rmtree(self._evaluations, ignore_errors=True)
+        folder.mkdir(parents=True)
+        return folder
+
+    def commit(self, payload: dict[str, Any], state: State) -> None:
+        """Write the state of a run, unless it is already committed; then its best weights."""
+        if self._committed == (state.step, state.evaluated_step):
+            return
+        self.folder.mkdir(parents=True, exist_ok=True)
+        save(self.last, payload)
+        self._committed = state.step, state.evaluated_step
+        self._publish(payload, state)
+
+    def load(self) -> tuple[dict[str, Any], State] | None:
+        """The committed payload and its state; None before there is any.
+
+        Raises:
+            RunError: last.pt or best.pt is missing or damaged.
+        """
+        if not self.last.exists():
+            return None
+        try:
+            payload, state = self.committed()
+            self._publish(payload, state)
+            if state.best_step:
+                self.load_best(state.best_step)
+        except (InputError, TypeError) as error:
+            raise RunError(f"{str(error).rstrip('.')}; {self._begin_again()}") from error
+        self._committed = state.step, state.evaluated_step
+        return payload, state
+
+    def committed(self) -> tuple[dict[str, Any], State]:
+        """What `load` returned in another process of this run.
+
+        Raises:
+            InputError: this machine does not see the files.
+            TypeError: it is no state.
+        """
+        payload = load_checkpoint(self.last)
+        return payload, State.of(payload)
+
+    def load_best(self, step: int) -> dict[str, Any]:
+        """The weights of the best step, by name.
+
+        Raises:
+            InputError: the file is missing or damaged.
+            RunError: it holds the weights of another step.
+        """
+        payload = load_checkpoint(self.best)
+        found = step_of(payload, self.best)
+        if found != step:
+            raise RunError(
+                f"{self.best} is of step {found}, but the best evaluation of this run is of step "
+                f"{step}; {self._begin_again()}"
+            )
+        weights: dict[str, Any] = payload["model"]
+        return weights
+
+    def tidy(self) -> None:
+        """Remove the files that are only needed to resume, after training has ended."""
+        shutil.rmtree(self._evaluations, ignore_errors=True)
+
+    def _begin_again(self) -> str:
+        return f"remove {self.folder} and rerun the command to train the run from the start."
+
+    def _publish(self, payload: dict[str, Any], state: State) -> None:
+        """Write the weights and files of an evaluation that is the best, if they are not there."""
+        step = state.best_step
+        if step != state.step or step == 0:
+            return
+        for file in (self._evaluations / str(step)).glob("*"):
+            file.replace(self.folder / file.name)
+        if not self.best.exists() or step_of(load_checkpoint(self.best), self.best) != step:
+            # The same bytes from a network and from last.pt: without the versions of its modules.
+            save(self.best, {"model": dict(payload["model"]), "step": step})
 
 
 def check_weights(modules: Mapping[str, nn.Module], step: int) -> None:

@@ -18,13 +18,13 @@ from rgbt.checks import InputError, RunError
 from rgbt.engine.averaging import AveragedWeights
 from rgbt.engine.checkpoint import (
     ADVICE,
+    Checkpoints,
     State,
     check_weights,
     restore_optimizer,
     restore_weights,
     training_payload,
 )
-from rgbt.engine.committed import Checkpoints
 from rgbt.engine.gradients import average_gradients, check_gradients
 from rgbt.engine.optimizers import step_without_gradient
 from rgbt.engine.progress import progress
@@ -204,7 +204,6 @@ class Trainer:
             keeps = score > state.best_score or self.settings.tested == "last"
             state.best_score = score if keeps else state.best_score
         if keeps:
-            self._save_best(state.step)
             state.best_step = state.step
         state.evaluated_step = state.step
 
@@ -218,10 +217,6 @@ class Trainer:
             for module in (self.model, *self.others.values()):
                 share_running_statistics(module)
             self.average.share_buffers()
-
-    def _save_best(self, step: int) -> None:
-        if self.writes:
-            self.checkpoints.save_best(step, self.average.weights())
 
     def _save(self, state: State) -> None:
         if not self.writes:

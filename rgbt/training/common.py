@@ -10,8 +10,7 @@ from rgbt.assembly.session import Session
 from rgbt.assembly.training_setup import TrainingSetup
 from rgbt.data.domains import TestedHead
 from rgbt.data.loaders import Batches
-from rgbt.engine.checkpoint import State, restore_weights
-from rgbt.engine.committed import Checkpoints
+from rgbt.engine.checkpoint import Checkpoints, State, restore_weights
 from rgbt.engine.trainer import Loaded, Trainer
 from rgbt.evaluation.prediction import view_of
 from rgbt.evaluation.request import EvaluationRequest

@@ -14,8 +14,7 @@ from torch import nn
 from rgbt.assembly.session import Session, names_key
 from rgbt.assembly.training_setup import TrainingSetup, set_up_training
 from rgbt.checks import InputError
-from rgbt.engine.checkpoint import State
-from rgbt.engine.committed import Checkpoints
+from rgbt.engine.checkpoint import Checkpoints, State
 from rgbt.engine.trainer import WAIT_SHARE, Trainer
 from rgbt.evaluation.prediction import decode_ahead
 from rgbt.evaluation.request import EvaluationRequest
@@ -197,8 +196,6 @@ class Run:
         state = State(seed=session.spec.drawn.masks)
         trainer = self._trainer(session, state)
         if agreed(trainer.resume(state)):
-            if trainer.checkpoints.warning:
-                info(trainer.checkpoints.warning)
             info(f"{self.description.name} resumes at step {state.step} ({self.folder.path}).")
         own_code = {"own_code": session.spec.own_code(), "from_step": state.step}
         self.folder.add_provenance({**provenance(), **own_code})

@@ -134,25 +134,12 @@ SWINS = {
 
 
 @pytest.mark.parametrize(
-    ("size", "container"),
-    [
-        ("Swin-T", "original"),
-        ("Swin-T", "detectron2"),
-        pytest.param("Swin-S", "original", marks=SLOW),
-        pytest.param("Swin-B", "detectron2", marks=SLOW),
-    ],
+    "size", ["Swin-T", *(pytest.param(f"Swin-{size}", marks=SLOW) for size in "SB")]
 )
-def test_imagenet_swin_fills_both_branches(tmp_path: Path, size: str, container: str) -> None:
-    import pickle
-
+def test_imagenet_swin_fills_both_branches(tmp_path: Path, size: str) -> None:
     width, depths, heads, yaml = SWINS[size]
     tensors = swin_file(width, depths, heads, 7)
-    if container == "original":
-        path = saved(tmp_path, {"model": tensors})
-    else:
-        path = tmp_path / "swin.pkl"
-        content = {"model": tensors, "__author__": "third_party", "matching_heuristics": True}
-        path.write_bytes(pickle.dumps(content))
+    path = saved(tmp_path, {"model": tensors})
     model = on_paper(yaml)
     facts, plan = planned(model, path)
     assert facts.title == f"ImageNet Swin Transformer ({size})"

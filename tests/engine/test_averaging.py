@@ -15,7 +15,7 @@ from rgbt.engine.averaging import AveragedWeights
 from rgbt.engine.checkpoint import State, load_checkpoint
 from rgbt.engine.settings import TrainerSettings
 from rgbt.processes import rank
-from tests.checkpoints.test_stored import same
+from tests.checkpoints.test_torch_files import same
 from tests.engine.test_trainer import SETTINGS, batches, make, make_two
 from tests.processes import run_in_processes
 

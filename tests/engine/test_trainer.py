@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from lightning_fabric import Fabric
 from torch import Tensor, nn
 
-from rgbt.checkpoints.stored import save
+from rgbt.checkpoints.torch_files import save
 from rgbt.checks import InputError, RunError
 from rgbt.engine.checkpoint import State, load_checkpoint, restore_weights
 from rgbt.engine.optimizers import SGD, Adam, AdamW
@@ -19,7 +20,7 @@ from rgbt.engine.settings import TrainerSettings
 from rgbt.engine.trainer import Trainer
 from rgbt.randomness import torch_generator
 from rgbt.types import Batch, GeneratorOf, Phase
-from tests.checkpoints.test_stored import same
+from tests.checkpoints.test_torch_files import same
 
 SETTINGS = {
     "max_steps": 6,
@@ -281,14 +282,20 @@ def test_which_checkpoint_is_tested(tmp_path: Path, tested: str, kept: int) -> N
 def test_without_validation_the_best_weights_are_the_last(tmp_path: Path) -> None:
     trainer, _ = make(tmp_path, tested="last")
     trainer.validate = None
-    saved = []
-    trainer.checkpoints.save_best = lambda step, weights: saved.append((step, weights))
+    commit, best_steps = trainer.checkpoints.commit, []
+
+    def noting(payload: dict[str, Any], state: State) -> None:
+        best_steps.append(state.best_step)
+        commit(payload, state)
+
+    trainer.checkpoints.commit = noting
     state = State(seed=0)
     trainer.fit(batches(0), state)
-    ((step, weights),) = saved  # not at step 3, which is due for an evaluation
-    assert (step, state.best_step, state.evaluated_step, state.best_score) == (6, 6, 6, -1.0)
-    last = load_checkpoint(tmp_path / "last.pt")
-    assert all(torch.equal(value, last["model"][name]) for name, value in weights.items())
+    assert best_steps[-1] == 6
+    assert set(best_steps[:-1]) == {0}, "not at step 3, which is due for an evaluation"
+    assert (state.evaluated_step, state.best_score) == (6, -1.0)
+    last, best = (load_checkpoint(tmp_path / name)["model"] for name in ("last.pt", "best.pt"))
+    assert all(torch.equal(value, last[name]) for name, value in best.items())
 
 
 class Shared:

@@ -7,7 +7,6 @@ import random
 import shutil
 import struct
 import zipfile
-from copy import copy
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -15,11 +14,16 @@ from typing import Any
 import pytest
 import torch
 
-from rgbt.checkpoints import stored
 from rgbt.checkpoints.read import read
+from rgbt.checkpoints.torch_files import save
 from rgbt.checks import InputError, RunError
-from rgbt.engine.checkpoint import State, load_checkpoint, training_payload
-from rgbt.engine.committed import Checkpoints
+from rgbt.engine.checkpoint import (
+    Checkpoints,
+    State,
+    load_checkpoint,
+    restore_optimizer,
+    training_payload,
+)
 from tests.checkpoints.test_read import Calls
 from tests.damage import damaged
 
@@ -49,16 +53,9 @@ def same(one: object, other: object) -> bool:
     return type(one) is type(other) and one == other
 
 
-def sentence(refused: pytest.ExceptionInfo[Exception]) -> str:
-    text = str(refused.value)
-    assert text.isprintable(), "one line without control characters"
-    assert "weights_only" not in text
-    return text
-
-
 def test_what_is_saved_is_loaded_by_us_and_by_torch(tmp_path: Path) -> None:
     path, content = tmp_path / "last.pt", payload()
-    stored.save(path, content)
+    save(path, content)
     assert same(load_checkpoint(path), content)
     assert same(torch.load(path, weights_only=True), content)
     shutil.copy(path, tmp_path / "copy.pt")
@@ -119,9 +116,9 @@ def commented(draw: random.Random, content: bytes) -> bytes:
 
 
 @pytest.mark.parametrize("count", [8, pytest.param(80, marks=pytest.mark.slow)])
-def test_a_damaged_file_is_refused_in_one_sentence(tmp_path: Path, count: int) -> None:
+def test_a_damaged_file_is_refused_or_whole(tmp_path: Path, count: int) -> None:
     path, draw = tmp_path / "last.pt", random.Random(17)
-    stored.save(path, payload())
+    save(path, payload())
     whole = path.read_bytes()
     kinds = (headers, swapped, repacked, commented)
     variants = [(kind.__name__, kind(draw, whole)) for kind in kinds for _ in range(count)]
@@ -129,9 +126,11 @@ def test_a_damaged_file_is_refused_in_one_sentence(tmp_path: Path, count: int) -
         if content == whole:
             continue
         path.write_bytes(content)
-        with pytest.raises(InputError) as refused:
-            pytest.fail(f"{kind}: {load_checkpoint(path)}")
-        sentence(refused)
+        try:
+            found = load_checkpoint(path)
+        except InputError:
+            continue
+        assert same(found, payload()), f"{kind}: a byte of a header that nobody reads"
 
 
 def test_an_old_file_is_held_against_its_checksums(tmp_path: Path) -> None:
@@ -145,9 +144,9 @@ def test_an_old_file_is_held_against_its_checksums(tmp_path: Path) -> None:
         flipped = bytearray(whole)
         flipped[place + offset] ^= 4
         path.write_bytes(flipped)
-        with pytest.raises(InputError, match="truncated, damaged"):
+        with pytest.raises(InputError, match="does not match its checksum"):
             load_checkpoint(path)
-        with pytest.raises(InputError, match="truncated, damaged"):
+        with pytest.raises(InputError, match="does not match its checksum"):
             read(path)
 
 
@@ -155,63 +154,20 @@ def test_an_old_file_is_held_against_its_checksums(tmp_path: Path) -> None:
 def test_nothing_in_a_checkpoint_runs(tmp_path: Path, name: str) -> None:
     marker = tmp_path / "marker"
     content = payload() | {"step": Calls(os.system, f"touch {marker}")}
-    stored.save(tmp_path / name, content)  # a digest says that a file is whole, not that it is ours
-    with pytest.raises(
-        InputError, match=r"refers to posix\.system, which would execute"
-    ) as refused:
+    save(tmp_path / name, content)  # a digest says that a file is whole, not that it is ours
+    with pytest.raises(InputError, match=r"refers to posix\.system, which would execute"):
         load_checkpoint(tmp_path / name)
-    sentence(refused)
     if name == "last.pt":
         with pytest.raises(RunError, match=r"refers to posix\.system.*remove .* and rerun"):
             Checkpoints(tmp_path).load()
     assert not marker.exists()
 
 
-def test_what_would_grow_is_refused_before_it_does(tmp_path: Path) -> None:
-    packed, repeated = tmp_path / "packed.pt", tmp_path / "repeated.pt"
-    made = BytesIO()
-    torch.save({"model": {"a": torch.zeros(10_000_000)}}, made)
-    with zipfile.ZipFile(made) as source, zipfile.ZipFile(packed, "w") as target:
-        for entry in source.infolist():
-            target.writestr(entry.filename, source.read(entry), zipfile.ZIP_DEFLATED)
-    assert packed.stat().st_size < 100_000
-    with pytest.raises(InputError, match="compression"):
-        load_checkpoint(packed)
-    torch.save({"model": {"a": torch.zeros(1).expand(2**20, 2**14)}}, repeated)
-    with pytest.raises(InputError, match="far more memory than its size"):
-        load_checkpoint(repeated)
-
-
-def test_entries_that_share_their_bytes_are_refused(tmp_path: Path) -> None:
-    """A table of contents may name one place a thousand times; summing each up takes for ever."""
-    path = tmp_path / "shared.pt"
-    torch.save({"model": {"a": torch.zeros(1000)}}, path)
-    with zipfile.ZipFile(path, "a") as archive:
-        (numbers,) = (each for each in archive.infolist() if each.filename.endswith("data/0"))
-        for number in range(100):
-            again = copy(numbers)
-            again.filename = f"{number}"
-            archive.filelist.append(again)
-        archive.writestr("last", b"")  # writes the table anew
-    with pytest.raises(InputError, match="far more memory than its size"):
-        load_checkpoint(path)
-
-
-def test_a_name_in_a_file_cannot_write_to_the_terminal(tmp_path: Path) -> None:
-    path = tmp_path / "last.pt"
-    pickled = b"\x80\x02c\x1b[2Jposix\nsystem\n)R."
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("archive/data.pkl", pickled)
-    with pytest.raises(InputError, match=r"refers to \\x1b\[2Jposix\.system") as refused:
-        load_checkpoint(path)
-    sentence(refused)
-
-
 def test_a_file_that_cannot_be_written_leaves_the_old_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "last.pt"
-    stored.save(path, {"model": {}})
+    save(path, {"model": {}})
     before = path.read_bytes()
 
     def full(_: int) -> None:
@@ -219,6 +175,60 @@ def test_a_file_that_cannot_be_written_leaves_the_old_one(
 
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OSError, match="No space"):
-        stored.save(path, payload())
+        save(path, payload())
     assert path.read_bytes() == before
     assert [each.name for each in tmp_path.iterdir()] == ["last.pt"]
+
+
+def moment(stored: dict[str, Any]) -> None:
+    stored["state"][0]["exp_avg"] = torch.zeros(7)
+
+
+def whole_numbers(stored: dict[str, Any]) -> None:
+    stored["state"][0]["exp_avg"] = torch.zeros_like(
+        stored["state"][0]["exp_avg"], dtype=torch.int64
+    )
+
+
+def betas(stored: dict[str, Any]) -> None:
+    stored["param_groups"][0]["betas"] = "0.9"
+
+
+def groups(stored: dict[str, Any]) -> None:
+    stored["param_groups"] *= 2
+
+
+def another_parameter(stored: dict[str, Any]) -> None:
+    stored["state"][99] = stored["state"][0]
+
+
+@pytest.mark.parametrize("change", [moment, whole_numbers, betas, groups, another_parameter])
+def test_optimizer_state_of_other_shape_or_type_is_refused(change: Any) -> None:
+    parameter = torch.nn.Parameter(torch.zeros(2, 3))
+    optimizer = torch.optim.AdamW([parameter], lr=0.1)
+    parameter.grad = torch.ones(2, 3)
+    optimizer.step()
+    stored = optimizer.state_dict()
+    restore_optimizer(optimizer, stored, Path("last.pt"))
+    change(stored)
+    with pytest.raises(InputError, match=r"last\.pt holds the state of a different optimizer"):
+        restore_optimizer(optimizer, stored, Path("last.pt"))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        *({"step": -1}, {"step": 1.5}, {"seed": "3"}, {"best_score": None}, {"skipped": "a"}),
+        *(
+            {"skipped": [3]},
+            {"unlogged": [1.0]},
+            {"unlogged": {"loss": "1"}},
+            {"unlogged": {1: 1.0}},
+        ),
+    ],
+)
+def test_state_of_other_types_is_refused(wrong: dict[str, Any]) -> None:
+    stored = payload()
+    assert State.of(stored).unlogged == {}
+    with pytest.raises(TypeError):
+        State.of({"state": stored["state"] | wrong})
