@@ -271,7 +271,7 @@ class MlflowTracking(Tracking):
         """Sync; what the store raises becomes a line on stderr, once."""
         try:
             self.sync(self._folder, status)
-        except InputError as error:  # a damaged file of the run, which repairs its log on resuming
+        except InputError as error:  # a damaged file of the run
             sys.stderr.write(f"rgbt: not sent to MLflow: {error}\n")
         except Exception as error:  # Catches everything: a dead tracker must never stop a training.
             self._quiet_until = time.monotonic() + self._pause_s

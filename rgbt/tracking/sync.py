@@ -13,7 +13,7 @@ from typing import Annotated
 from rgbt.checks import InputError
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
-from rgbt.runs.folder import REPLACED, RunFolder, read_result, runs_dir_of, runs_in
+from rgbt.runs.folder import REPLACED, RunFolder, is_finished, runs_dir_of, runs_in
 from rgbt.tracking.mlflow_store import EXPERIMENT, MlflowTracking, StoreBusyError, reason_of
 from rgbt.tracking.tracker import Status
 
@@ -57,9 +57,8 @@ def main(options: Options, overrides: list[str]) -> int:
     failed = 0
     for folder in folders:
         try:
-            is_finished = read_result(folder.path) is not None
             status: Status = "RUNNING" if folder.is_locked() else "KILLED"
-            run_id = tracking.sync(folder, "FINISHED" if is_finished else status)
+            run_id = tracking.sync(folder, "FINISHED" if is_finished(folder.path) else status)
             sys.stdout.write(f"{folder.path}  ->  MLflow run {run_id}\n")
         except Exception as error:  # A store may fail in any way; the next folder may be sent.
             if options.run and isinstance(error, InputError):
