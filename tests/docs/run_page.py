@@ -37,7 +37,7 @@ RESAMPLING = ("compare", "score", "spatial")
 
 COMPARING = ("rgbt compare", "rgbt figures", "compare(")
 
-NAMED = {word.lstrip("+").rpartition(".")[2] for word in (*SMOKE, ENOUGH)}
+NAMED = {word.lstrip("+") for word in (*SMOKE, ENOUGH)}
 """What the groups of runs are called after them."""
 
 SIZES = ("trainer.max_steps", "trainer.eval_every", "trainer.checkpoint_every", "scale.max_steps")

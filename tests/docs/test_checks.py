@@ -211,7 +211,7 @@ def test_newest_run_stands_for_the_key(follow: Callable[..., int]) -> None:
         "rgbt evaluate run=runs/<key>",
         "rgbt run +experiment=grbm masker.sigma_div=3 trainer.max_steps=40000",
         "grep -q 'sigma_div: 3' runs/<key>/config.yaml",
-        "rgbt compare a=grbm b='grbm sigma_div=3'",
+        "rgbt compare a=grbm b='grbm masker.sigma_div=3'",
     )
     assert follow(page(text)) == 4
 
