@@ -15,7 +15,7 @@ from optuna.trial import FrozenTrial, TrialState
 from rgbt.checks import check_choice
 from sweeps.space.space import build_optuna
 
-SAMPLERS = [f"optuna.samplers.{n}Sampler" for n in ("TPE", "Random", "GP", "NSGAII", "NSGAIII")]
+SAMPLERS = [f"optuna.samplers.{n}Sampler" for n in ("TPE", "Random", "GP", "NSGAII")]
 """Samplers without state outside the storage: others (QMC, grid, brute force) keep a counter or
 stop the study, which neither several drivers nor a resumed search can share."""
 

@@ -1,7 +1,8 @@
-"""Points of ``-m`` from overrides and settings: grids, lists and searches, without running them."""
+"""Grids, lists and searches of ``-m``: what would be run, what is refused, how a search ends."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +13,20 @@ from omegaconf import open_dict
 
 import sweeps.sweep as sweeping
 from rgbt.checks import InputError, RunError
-from rgbt.config.compose import conf_dir, register_resolvers
+from rgbt.config.compose import compose, conf_dir, register_resolvers
+from sweeps import attributes as names
 from sweeps.point import Outcome, Point
-from sweeps.search import Search
-from sweeps.settings import SweepSettings
-from sweeps.sweep import study_command, sweep
+from sweeps.settings import Objective, SweepSettings
+from sweeps.space.space import parse_space
+from sweeps.sweep import Search, probe, search, study_command, sweep
 from sweeps.worker import point_list
 from sweeps.worker.point_list import PointList
+from sweeps.worker.run_store import open_run_store
+from sweeps.worker.storage import load_study, open_storage
+from tests.sweeps.fakes import settings as plain_settings
+
+GRID = ("+experiment=grbm", "masker.sigma_div=1,2", "seed=0,3")
+MEDIAN = {"_target_": "optuna.pruners.MedianPruner"}
 
 
 class RecordedCalls:
@@ -36,16 +44,14 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> RecordedCalls:
 
     def run_points(wanted: PointList, settings: SweepSettings, *, strict: bool) -> list[Outcome]:
         assert strict, "a wrong point of a grid is refused"
-        del settings
         found.lists.append(wanted)
         return found.outcomes or [Outcome(point, "finished") for point in wanted.points]
 
     def preview_points(wanted: PointList, settings: SweepSettings) -> list[Outcome]:
-        del settings
-        return found.outcomes or [Outcome(p, "waiting", keys=("k",)) for p in wanted.points]
+        return [Outcome(p, "waiting", keys=("k",)) for p in wanted.points]
 
-    monkeypatch.setattr(sweeping, "run_points", run_points)
-    monkeypatch.setattr(sweeping, "preview_points", preview_points)
+    monkeypatch.setattr(point_list, "run_points", run_points)
+    monkeypatch.setattr(point_list, "preview_points", preview_points)
     monkeypatch.setattr(sweeping, "search", lambda wanted, settings: found.searches.append(wanted))
     return found
 
@@ -64,21 +70,21 @@ def call(runs: Path, *words: str, **settings: Any) -> None:
         sweep(task, config, loader)
 
 
-def test_a_grid_is_all_combinations_each_with_its_parameters(
-    calls: RecordedCalls, tmp_path: Path
-) -> None:
-    call(tmp_path, "+experiment=grbm", "masker.sigma_div=1,2", "seed=0,3")
+def test_grid_is_all_combinations_with_parameters(calls: RecordedCalls, tmp_path: Path) -> None:
+    call(tmp_path, *GRID, "fresh=true")
     (wanted,) = calls.lists
     assert [point.label for point in wanted.points] == [
         *("sigma_div=1 seed=0", "sigma_div=1 seed=3", "sigma_div=2 seed=0", "sigma_div=2 seed=3"),
     ]
     assert wanted.points[3].params == {"masker.sigma_div": 2, "seed": 3}
-    assert "+experiment=grbm" in wanted.points[0].overrides
+    assert wanted.points[0].overrides[-3:] == ("+experiment=grbm", "masker.sigma_div=1", "seed=0")
     assert set(wanted.distributions or {}) == {"masker.sigma_div", "seed"}
     assert wanted.kind == "grid"
+    assert wanted.runs.fresh
+    assert not any(word.startswith("fresh") for point in wanted.points for word in point.overrides)
 
 
-def test_points_are_run_for_every_value_of_the_grid(calls: RecordedCalls, tmp_path: Path) -> None:
+def test_list_is_run_for_every_value_of_the_grid(calls: RecordedCalls, tmp_path: Path) -> None:
     points = [["masker.sigma_div=1", "masker.patch_size=8"], ["masker.sigma_div=4"]]
     call(tmp_path, "+experiment=grbm", "seed=0,1", points=points)
     (wanted,) = calls.lists
@@ -89,7 +95,7 @@ def test_points_are_run_for_every_value_of_the_grid(calls: RecordedCalls, tmp_pa
     ]
 
 
-def test_sweep_params_of_file_equal_typed(calls: RecordedCalls, tmp_path: Path) -> None:
+def test_params_of_file_equal_typed_ones(calls: RecordedCalls, tmp_path: Path) -> None:
     params = {"masker.sigma_div": "1,2", "model.weights": None, "seed": 5}
     call(tmp_path, "+experiment=grbm", params=params)
     (wanted,) = calls.lists
@@ -97,71 +103,57 @@ def test_sweep_params_of_file_equal_typed(calls: RecordedCalls, tmp_path: Path) 
     assert {"model.weights=null", "seed=5"} <= set(wanted.points[0].overrides)
 
 
-def test_sweep_name_is_independent_of_paths(calls: RecordedCalls, tmp_path: Path) -> None:
-    words = ("+experiment=grbm", "masker.sigma_div=1,2")
-    call(tmp_path / "a", *words)
-    call(tmp_path / "b", *words, "fresh=true", "dataset.cache_dir=/c")
-    call(tmp_path / "a", *words, "trainer.max_steps=3")
+def test_name_of_grid_is_independent_of_paths(calls: RecordedCalls, tmp_path: Path) -> None:
+    call(tmp_path / "a", *GRID)
+    call(tmp_path / "b", *GRID, "fresh=true", "dataset.cache_dir=/c")
+    call(tmp_path / "a", *GRID, "trainer.max_steps=3")
     first, moved, other = (wanted.study for wanted in calls.lists)
     assert first == moved != other
-    assert first.startswith("grbm-sigma_div-")
+    assert first.startswith("grbm-sigma_div-seed-")
 
 
-def test_sweep_fresh_is_not_passed_to_runs(calls: RecordedCalls, tmp_path: Path) -> None:
-    call(tmp_path, "+experiment=grbm", "masker.sigma_div=1,2", "fresh=true")
-    (wanted,) = calls.lists
-    assert wanted.runs.fresh
-    assert not any(word.startswith("fresh") for point in wanted.points for word in point.overrides)
-
-
-def test_sweep_search_name_ignores_order(calls: RecordedCalls, tmp_path: Path) -> None:
+def test_name_of_search_is_independent_of_order(calls: RecordedCalls, tmp_path: Path) -> None:
     words = ("+experiment=grbm", "masker.sigma_div=interval(1,4)", "seed=1", "trainer.max_steps=3")
     call(tmp_path, *words, trials=3)
-    call(tmp_path, *reversed(words), "fresh=true", trials=3)
-    call(tmp_path, *words, trials=3, replicates=2)
-    first, same, other = calls.searches
-    assert first.study == same.study != other.study
-    assert first.identity == same.identity
-    assert "trainer.max_steps=3" in first.identity
+    call(tmp_path / "b", *reversed(words), "fresh=true", trials=3)
+    for changes in ({"replicates": 2}, {"space": {"seed": {"type": "int", "low": 1, "high": 2}}}):
+        call(tmp_path, *words[:2], *words[3:], trials=3, **changes)
+    call(tmp_path, *words[:3], trials=3)
+    first, same, *others = calls.searches
+    assert (first.study, first.identity) == (same.study, same.identity)
+    assert len({each.identity for each in (first, *others)}) == 4
 
 
-def test_sweep_search_file_runs_are_single(calls: RecordedCalls, tmp_path: Path) -> None:
+def test_search_file_runs_are_single(calls: RecordedCalls, tmp_path: Path) -> None:
     call(tmp_path, "+search=grbm", "masker.sigma_div=4")
-    (wanted,) = calls.searches
-    keys = [parameter.key for parameter in wanted.parameters]
-    assert keys == ["masker.patch_size", "loss.spatial.alpha"]
-    assert "hydra.mode=RUN" in wanted.fixed
-    assert "masker.sigma_div=4" in wanted.fixed
     call(tmp_path, "+search=grbm", "masker.sigma_div=1,2")
-    assert not [word for word in calls.searches[1].fixed if "sigma_div" in word]
+    fixed, listed = calls.searches
+    assert list(fixed.space) == ["masker.patch_size", "loss.spatial.alpha"]
+    assert {"hydra.mode=RUN", "masker.sigma_div=4"} <= set(fixed.fixed)
+    assert not [word for word in listed.fixed if "sigma_div" in word]
 
 
 @pytest.mark.parametrize(
-    "settings",
-    [
-        *({"trials": 3}, {"hours": 3}, {"replicates": 2}, {"pruner": {"kind": "median"}}),
-    ],
+    "settings", [{"trials": 3}, {"hours": 3}, {"replicates": 2}, {"pruner": MEDIAN}]
 )
-def test_sweep_search_settings_of_grid_are_refused(
+def test_search_settings_of_grid_are_refused(
     calls: RecordedCalls, tmp_path: Path, settings: dict[str, Any]
 ) -> None:
-    said = f"hydra.sweeper.{next(iter(settings))} is for searches"
-    with pytest.raises(InputError, match=said):
-        call(tmp_path, "+experiment=grbm", "seed=0,1", **settings)
+    with pytest.raises(InputError, match=f"hydra.sweeper.{next(iter(settings))}"):
+        call(tmp_path, *GRID, **settings)
     assert calls.lists == []
 
 
-def test_mistake_is_reported_before_any_run(
+def test_wrong_point_is_refused_before_any_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # A slow machine plans one point in the usual 2 s.
-    monkeypatch.setattr(point_list, "PLANNED_FIRST_S", 60.0)
-    with pytest.raises(InputError, match="masker=squre: there is no masker 'squre'"):
+    monkeypatch.setattr(point_list, "PLANNED_FIRST_S", 60.0)  # a slow machine plans one in 2 s
+    with pytest.raises(InputError, match="masker=squre"):
         call(tmp_path, "+experiment=grbm", "masker=square,squre")
     assert not any(tmp_path.iterdir())
 
 
-def test_failed_points_end_in_an_error_after_the_table(
+def test_failed_points_end_in_error_after_table(
     calls: RecordedCalls, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     calls.outcomes = [
@@ -169,16 +161,16 @@ def test_failed_points_end_in_an_error_after_the_table(
         Outcome(Point("b", ()), "failed", "out of memory", keys=("k2",)),
     ]
     with pytest.raises(RunError, match="1 of 2 points failed, first b: out of memory"):
-        call(tmp_path, "+experiment=grbm", "seed=0,1")
+        call(tmp_path, *GRID)
     assert "out of memory" in capsys.readouterr().out
 
 
-def test_a_preview_runs_nothing(
+def test_preview_of_grid_runs_nothing(
     calls: RecordedCalls, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    call(tmp_path, "+experiment=grbm", "seed=0,1,2", dry_run=True)
+    call(tmp_path, *GRID, dry_run=True)
     assert calls.lists == []
-    assert "3 of 3 points would be run" in capsys.readouterr().err
+    assert "4 of 4 points" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -189,8 +181,117 @@ def test_a_preview_runs_nothing(
         ("runs", "postgresql://me:Secret@host/db", " 'storage=postgresql://me:***@host/db'"),
     ],
 )
-def test_the_command_that_draws_a_study_finds_it(
-    runs_dir: str, storage: str | None, rest: str
+def test_study_command_hides_passwords(runs_dir: str, storage: str | None, rest: str) -> None:
+    assert study_command("grbm-1", Path(runs_dir), storage) == f"rgbt study name=grbm-1{rest}"
+
+
+def sigma(low: float, high: float) -> Any:
+    return parse_space({"masker.sigma_div": {"type": "float", "low": low, "high": high}})
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> str:
+    return f"dataset.cache_dir={tmp_path_factory.mktemp('cache')}"
+
+
+@pytest.fixture
+def wanted(tmp_path: Path, cache: str) -> Search:
+    small = ("dataset.num_train=4", "dataset.num_val=2", "dataset.num_test=2")
+    place = (f"runs_dir={tmp_path}", "tracking=none", cache)
+    fixed = ("+experiment=grbm", *small, *place)
+    return Search("s", fixed, sigma(1, 4), open_run_store(compose(place)), "identity")
+
+
+@pytest.fixture
+def ends(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The states that the driver leaves trials in, instead of running them."""
+    states: list[str] = ["COMPLETE"]
+
+    def drive(view: Any, source: Any, store: Any, *rest: Any) -> None:
+        for state in states:
+            trial = store.ask(None)
+            trial.suggest_float("masker.sigma_div", 1, 4)
+            if state == "COMPLETE":
+                store.complete(trial.number, [1.0], {names.RUNS: ["k"]})
+            else:
+                store.fail(trial.number, "no memory", {})
+
+    monkeypatch.setattr(sweeping, "drive", drive)
+    monkeypatch.setattr(sweeping, "report", lambda *_: None)
+    return states
+
+
+def settings(**changes: Any) -> SweepSettings:
+    objectives = (Objective("val/mIoU", "maximize"),)
+    return plain_settings(**{"trials": 3, "objectives": objectives, **changes})
+
+
+def test_search_creates_study_and_previews_it(
+    wanted: Search,
+    ends: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    command = study_command("grbm-1", Path(runs_dir), storage)
-    assert command == f"rgbt study name=grbm-1{rest}"
+    monkeypatch.setattr("sys.orig_argv", ["python", "x=postgresql://me:secret@host/db"])
+    search(wanted, settings(dry_run=True))
+    assert list(tmp_path.iterdir()) == []
+    assert "3 of 3 trials" in capsys.readouterr().out
+    search(wanted, settings())
+    study = load_study("s", open_storage(None, tmp_path))
+    assert study.user_attrs[names.KIND] == "search"
+    assert "secret" not in study.user_attrs[names.COMMAND]
+    search(wanted, settings(dry_run=True))
+    assert "2 of 3 trials" in capsys.readouterr().out
+    search(wanted, settings(trials=9))  # a larger budget is the same study
+    assert len(study.trials) == 2
+
+
+@pytest.mark.parametrize("other", ["identity", "data", "objectives"])
+def test_search_with_other_identity_is_refused(wanted: Search, ends: list[str], other: str) -> None:
+    search(wanted, settings())
+    changed: dict[str, dict[str, Any]] = {
+        "identity": {"identity": "other"},
+        "data": {"fixed": (*wanted.fixed, "dataset.num_test=3")},
+        "objectives": {},
+    }
+    kept = {"objectives": (Objective("val/Var", "minimize"),)} if other == "objectives" else {}
+    with pytest.raises(InputError, match="a study 's' with"):
+        search(replace(wanted, **changed[other]), settings(**kept))
+
+
+TC = Objective("val/TC/aligned", "maximize")
+UP = Objective("val/mIoU", "maximize")
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"trials": None}, "hydra.sweeper.trials"),
+        ({"sampler": {"_target_": "optuna.samplers.TPE"}}, "hydra.sweeper.sampler"),
+        ({"objectives": (TC,), "pruner": MEDIAN}, "hydra.sweeper.pruner"),
+        ({"objectives": (UP, UP), "pruner": MEDIAN}, "hydra.sweeper.pruner"),
+        ({"objectives": (TC,)}, "val/TC/aligned'.*consistency.splits"),
+    ],
+)
+def test_search_invalid_settings_raise_before_study_exists(
+    wanted: Search, ends: list[str], tmp_path: Path, changes: dict[str, Any], said: str
+) -> None:
+    with pytest.raises(InputError, match=said):
+        search(wanted, settings(**changes))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("low", "high"), [(-1, 4), (1, 10**6)])
+def test_probe_range_outside_setting_raises(wanted: Search, low: float, high: float) -> None:
+    with pytest.raises(InputError, match=r"'masker.sigma_div'"):
+        probe(replace(wanted, space=sigma(low, high)), settings())
+
+
+def test_search_without_finished_trial_raises(
+    wanted: Search, ends: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    ends[:] = ["FAIL", "FAIL"]
+    with pytest.raises(RunError, match="no trial of s has finished"):
+        search(wanted, settings())
+    assert "trial 1 failed: no memory" in capsys.readouterr().err
