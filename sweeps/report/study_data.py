@@ -14,6 +14,7 @@ import numpy as np
 
 from rgbt.config.compose import PIXELS, with_pixels
 from sweeps import attributes
+from sweeps.worker.trial_store import counted_trials
 
 if TYPE_CHECKING:
     import optuna
@@ -38,7 +39,7 @@ class StudyData:
         kind: "search", "grid" or "list".
         metrics: names of the objectives.
         maximize: whether more is better, by objective.
-        trials: by number, without dropped duplicates.
+        trials: those that count, by number.
         command: that created the study, or "".
     """
 
@@ -151,13 +152,12 @@ def read(study: optuna.Study) -> StudyData:
     names = notes.get(attributes.METRICS) or study.metric_names
     count = len(study.directions)
     metrics = tuple(names or (f"objective {index + 1}" for index in range(count)))
-    trials = study.get_trials(deepcopy=False)
     return StudyData(
         name=study.study_name,
         kind=str(notes.get(attributes.KIND, "search")),
         metrics=metrics,
         maximize=tuple(direction.name == "MAXIMIZE" for direction in study.directions),
-        trials=tuple(t for t in trials if not t.user_attrs.get(attributes.DROPPED)),
+        trials=tuple(counted_trials(study)),
         command=str(notes.get(attributes.COMMAND, "")),
     )
 

@@ -7,9 +7,11 @@ import warnings
 from pathlib import Path
 
 import cv2
+import matplotlib
 import numpy as np
 import optuna
 import pytest
+from matplotlib import pyplot
 from optuna.trial import TrialState
 
 from sweeps import attributes
@@ -21,28 +23,6 @@ def new_study(*directions: str) -> optuna.Study:
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     sampler = optuna.samplers.RandomSampler(seed=0)
     return optuna.create_study(study_name="s", directions=list(directions), sampler=sampler)
-
-
-def filled(*directions: str, count: int = 24) -> optuna.Study:
-    """Float, log, int and categorical parameters that not all trials have; pruned, failed."""
-    study = new_study(*directions)
-    for index in range(count):
-        trial = study.ask()
-        rate = trial.suggest_float("optimizer.lr", 1e-5, 1e-1, log=True)
-        size = trial.suggest_int("masker.patch_size", 8, 64, step=8)
-        if trial.suggest_categorical("masker", ["grbm", "none"]) == "grbm":
-            trial.suggest_float("masker.sigma_div", 0.5, 8.0, log=True)
-        if index % 6 == 1:
-            study.tell(trial, state=TrialState.FAIL)
-            continue
-        value = -abs(math.log10(rate) + 3) - size / 100
-        if len(directions) == 1:
-            trial.report(value - 1, 10)
-        if index % 6 == 2 and len(directions) == 1:
-            study.tell(trial, state=TrialState.PRUNED)
-            continue
-        study.tell(trial, [value, float(size), 1.0, 2.0][: len(directions)])
-    return study
 
 
 def drawn(study: optuna.Study, folder: Path) -> dict[str, StudyFigure]:
@@ -61,12 +41,21 @@ def is_picture(path: Path | None) -> bool:
 ONE = ["history", "importances", "slices", "contour", "intermediate", "parallel"]
 
 
+@pytest.mark.slow
 def test_draw_one_objective_all_figures(tmp_path: Path) -> None:
-    import matplotlib
-    from matplotlib import pyplot
-
+    """Float, log, int and categorical parameters that not all trials have; pruned, failed."""
+    study = new_study("maximize")
+    for index in range(24):
+        trial = study.ask()
+        rate = trial.suggest_float("optimizer.lr", 1e-5, 1e-1, log=True)
+        size = trial.suggest_int("masker.patch_size", 8, 64, step=8)
+        if trial.suggest_categorical("masker", ["grbm", "none"]) == "grbm":
+            trial.suggest_float("masker.sigma_div", 0.5, 8.0, log=True)
+        trial.report(-1, 10)
+        state = {1: TrialState.FAIL, 2: TrialState.PRUNED}.get(index % 6)
+        study.tell(trial, None if state else math.log10(rate) - size / 100, state)
     before = {key: value for key, value in matplotlib.rcParams.items() if key != "backend"}
-    found = drawn(filled("maximize"), tmp_path)
+    found = drawn(study, tmp_path)
     assert list(found) == ONE
     for name in ONE:
         assert found[name].path == tmp_path / f"{name}.png"
@@ -74,24 +63,6 @@ def test_draw_one_objective_all_figures(tmp_path: Path) -> None:
     after = {key: value for key, value in matplotlib.rcParams.items() if key != "backend"}
     assert after == before
     assert pyplot.get_fignums() == []
-
-
-@pytest.mark.slow
-def test_draw_two_objectives_front_and_figures_each(tmp_path: Path) -> None:
-    study = filled("maximize", "minimize")
-    study.set_user_attr(attributes.METRICS, ["val/mIoU", "val/Var"])
-    found = drawn(study, tmp_path)
-    each = ("history", "importances", "slices", "contour")
-    names = [f"{name}_{end}" for end in ("val_mIoU", "val_Var") for name in each]
-    assert list(found) == [*names, "pareto", "parallel"]
-    assert all(is_picture(picture.path) for picture in found.values())
-
-
-@pytest.mark.parametrize(("kind", "names"), [("list", []), ("grid", [*ONE[1:4], "parallel"])])
-def test_draw_kind_selects_figures(tmp_path: Path, kind: str, names: list[str]) -> None:
-    study = filled("maximize", count=4)
-    study.set_user_attr(attributes.KIND, kind)
-    assert list(drawn(study, tmp_path)) == names
 
 
 def test_draw_without_complete_trials_has_reasons(tmp_path: Path) -> None:
@@ -106,34 +77,30 @@ def test_draw_without_complete_trials_has_reasons(tmp_path: Path) -> None:
     assert list(found) == ONE
     assert all(picture.path is None and picture.reason for picture in found.values())
     assert not stale.exists()
+    study.set_user_attr(attributes.KIND, "grid")
+    assert list(drawn(study, tmp_path)) == [*ONE[1:4], "parallel"]
+    study.set_user_attr(attributes.KIND, "list")
+    assert drawn(study, tmp_path) == {}
 
 
-def test_draw_constant_values_have_reasons(tmp_path: Path) -> None:
-    study = new_study("maximize", "minimize", "minimize", "maximize")
+@pytest.mark.slow
+def test_draw_two_objectives_of_which_one_is_constant(tmp_path: Path) -> None:
+    study = new_study("maximize", "minimize")
+    study.set_user_attr(attributes.METRICS, ["val/mIoU", "val/Var"])
     for index in range(12):
         trial = study.ask()
-        trial.suggest_float("same", 1.0, 1.0)
-        trial.suggest_categorical("only", ["one"])
-        value = trial.suggest_float("a" if index % 2 else "b", 0, 1)
-        study.tell(trial, [value, 3.0, value, value])
+        trial.suggest_categorical("same", ["${px:64}"])
+        study.tell(trial, [trial.suggest_float("a" if index % 2 else "b", 0, 1), 3.0])
     found = drawn(study, tmp_path)
-    without = {name for name, picture in found.items() if picture.path is None}
-    contours = {f"contour_objective_{number}" for number in (1, 2, 3, 4)}
-    assert without == {*contours, "importances_objective_2", "pareto"}
-    assert "one value" in found["importances_objective_2"].reason
-
-
-def test_of_objective_has_parameters_as_shown() -> None:
-    study = new_study("maximize", "minimize")
-    sizes = ["${px:64}", "${px:8}"]
-    for size in sizes:
-        study.enqueue_trial({"masker.patch_size": size})
-        trial = study.ask()
-        trial.suggest_categorical("masker.patch_size", sizes)
-        trial.set_user_attr(attributes.PIXELS, 0.5)
-        study.tell(trial, [1.0, len(size)])
+    each = ("history", "importances", "slices", "contour")
+    names = [f"{name}_{end}" for end in ("val_mIoU", "val_Var") for name in each]
+    assert list(found) == [*names, "pareto", "parallel"]
+    without = [name for name, picture in found.items() if picture.path is None]
+    assert without == ["contour_val_mIoU", "importances_val_Var", "contour_val_Var"]
+    assert all(is_picture(found[name].path) for name in {*found} - {*without})
     second = read(study).of_objective(1, with_others=True)
     assert second.direction.name == "MINIMIZE"
-    assert [trial.value for trial in second.trials] == [8.0, 7.0]
-    shown = [trial.params for trial in second.trials]
-    assert shown == [{"masker.patch_size": size, "objective 1": 1.0} for size in ("32", "4")]
+    first = second.trials[0]
+    assert first.value == 3.0
+    assert first.params["same"] == "64px"
+    assert "val/mIoU" in first.params

@@ -14,7 +14,7 @@ from optuna.distributions import BaseDistribution, CategoricalDistribution, Floa
 from optuna.trial import TrialState, create_trial
 
 from sweeps import attributes
-from sweeps.report.study_data import importances, pruning_savings, read, short_names
+from sweeps.report.study_data import importances, pruning_savings, read
 from sweeps.report.tables import (
     counts_grid,
     failed_grid,
@@ -63,17 +63,20 @@ def add(
 def test_trials_grid_sorts_by_objective_direction() -> None:
     study = new_study("minimize", metrics=["val/Var"])
     results = {"val/Var": 8.0, "test/Var": 9.5, "val/mIoU": 50.0, "test/mIoU": 48.25}
-    add(study, [8.0], params={"masker.alpha": 0.123456}, results=results, seconds=61.6, runs=["a1"])
+    first = {"masker.alpha": 0.123456, "optimizer.lr": 0.5, "head.lr": 1.0}
+    add(study, [8.0], params=first, results=results, seconds=61.6, runs=["a1"])
     for value in (*range(12, 22), 4.0):
         add(study, [float(value)], params={"masker.alpha": 0.25})
     grid = trials_grid(read(study))
     assert grid.title == "Best trials: lowest val/Var"
     assert grid.header == (
-        *("trial", "alpha", "val/Var", "test/Var", "val/mIoU", "test/mIoU", "seconds", "runs"),
+        *("trial", "alpha", "optimizer.lr", "head.lr", "val/Var", "test/Var", "val/mIoU"),
+        *("test/mIoU", "seconds", "runs"),
     )
     assert [row[0] for row in grid.rows] == ["11", "0", *map(str, range(1, 9))]
-    assert grid.rows[1] == ("0", "0.1235", "8.00", "9.50", "50.00", "48.25", "62", "a1")
-    assert grid.rows[0][3:] == ("-", "-", "-", "-", "-")
+    scores = ("8.00", "9.50", "50.00", "48.25", "62", "a1")
+    assert grid.rows[1] == ("0", "0.1235", "0.5", "1", *scores)
+    assert grid.rows[0][2:] == ("-", "-", "4.00", "-", "-", "-", "-", "-")
 
 
 @pytest.mark.parametrize(("notes", "shown"), [({"pixels": 0.5}, "32"), ({}, "64px")])
@@ -176,41 +179,29 @@ def test_importances_name_the_deciding_parameter() -> None:
     for index in (0, 1):
         assert sum(shares[index] for shares in found.shares.values()) == pytest.approx(1.0)
     assert "same: one value only" in found.remark
+    # In the lowest tenth x decides, in the highest tenth y.
+    for direction, first in (("minimize", "x"), ("maximize", "y")):
+        half = new_study(direction)
+        for index in range(60):
+            x, y = (index * 13 % 60) / 60, (index * 29 % 60) / 60
+            add(half, [y if x > 0.2 else -5 + x], params={"x": x, "y": y})
+        assert next(iter(importances(read(half)).shares)) == first
     grid = importance_grid(read(study), found)
     assert grid.header == ("parameter", "for up, %", "for down, %")
     assert grid.rows[0][0] == "big"
 
 
-@pytest.mark.parametrize(("direction", "first"), [("minimize", "x"), ("maximize", "y")])
-def test_importances_follow_direction_of_objective(direction: str, first: str) -> None:
-    """x decides below 0.2 alone, where values are lowest."""
-    study = new_study(direction)
-    for index in range(60):
-        x, y = (index * 13 % 60) / 60, (index * 29 % 60) / 60
-        add(study, [y if x > 0.2 else -5 + x], params={"x": x, "y": y})
-    assert next(iter(importances(read(study)).shares)) == first
-
-
-@pytest.mark.parametrize(
-    ("count", "params", "values", "reason"),
-    [
-        (9, {"x": None}, None, "they need 10 complete trials, and there are 9."),
-        (12, {"x": 0.5}, None, "no parameter took two values."),
-        (12, {"x": None}, 3.0, "objective 1: the same value in all trials. rough: 12"),
-    ],
-)
-def test_importances_missing_have_a_reason(
-    count: int, params: Mapping[str, float | None], values: float | None, reason: str
-) -> None:
-    study = new_study("maximize")
-    for index in range(count):
-        given = {name: index / 20 if value is None else value for name, value in params.items()}
-        add(study, [float(index) if values is None else values], params=given)
-    found = importances(read(study))
-    assert found.shares == {}
-    assert found.remark.startswith(reason)
-
-
-def test_short_names_stay_distinct() -> None:
-    names = short_names(["optimizer.lr", "head.lr", "masker.alpha"])
-    assert list(names.values()) == ["optimizer.lr", "head.lr", "alpha"]
+def test_importances_missing_have_a_reason() -> None:
+    few, fixed, flat = (new_study("maximize") for _ in range(3))
+    for index in range(12):
+        add(fixed, [float(index)], params={"x": 0.5})
+        add(flat, [3.0], params={"x": index / 20})
+        add(few, [float(index)] if index < 9 else [math.inf], params={"x": index / 20})
+    found = [importances(read(study)) for study in (few, fixed, flat)]
+    assert [each.shares for each in found] == [{}, {}, {}]
+    reasons = (
+        "they need 10 complete trials, and there are 9.",
+        "no parameter took two",
+        "objective",
+    )
+    assert all(each.remark.startswith(why) for each, why in zip(found, reasons, strict=True))
