@@ -10,7 +10,7 @@ from typing import Any
 
 import optuna
 import pytest
-from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution
+from optuna.distributions import CategoricalDistribution, FloatDistribution
 from optuna.trial import TrialState, create_trial
 
 from sweeps import attributes
@@ -26,14 +26,13 @@ from sweeps.report.tables import (
 )
 
 ALPHA = FloatDistribution(0, 1)
+SIZES = CategoricalDistribution(("${px:64}", "${px:8}"))
 
 
-def new_study(*directions: str, kind: str = "search", metrics: Sequence[str] = ()) -> optuna.Study:
+def new_study(*directions: str, metrics: Sequence[str] = ()) -> optuna.Study:
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     study = optuna.create_study(study_name="s", directions=list(directions))
-    study.set_user_attr(attributes.KIND, kind)
-    if metrics:
-        study.set_user_attr(attributes.METRICS, list(metrics))
+    study.set_user_attr(attributes.METRICS, list(metrics))
     return study
 
 
@@ -42,22 +41,20 @@ def add(
     values: Sequence[float] | None = None,
     *,
     state: str = "COMPLETE",
-    params: Mapping[str, Any] | None = None,
-    distributions: Mapping[str, BaseDistribution] | None = None,
-    reported: Mapping[int, float] | None = None,
+    params: Mapping[str, Any] = {},  # noqa: B006 - nobody changes it
+    reported: Mapping[int, float] = {},  # noqa: B006
     **attrs: Any,
 ) -> None:
-    params = params or {}
-    study.add_trial(
-        create_trial(
-            state=TrialState[state],
-            values=None if values is None else list(values),
-            params=dict(params),
-            distributions=dict(distributions or dict.fromkeys(params, ALPHA)),
-            intermediate_values=dict(reported or {}),
-            user_attrs={f"rgbt.{name}": value for name, value in attrs.items()},
-        )
+    """A text among `params` is one of the choices `SIZES`, a number lies in 0..1."""
+    trial = create_trial(
+        state=TrialState[state],
+        values=values,
+        params=dict(params),
+        distributions={k: SIZES if isinstance(v, str) else ALPHA for k, v in params.items()},
+        intermediate_values=dict(reported),
+        user_attrs={f"rgbt.{name}": value for name, value in attrs.items()},
     )
+    study.add_trial(trial)
 
 
 def test_trials_grid_sorts_by_objective_direction() -> None:
@@ -83,11 +80,10 @@ def test_trials_grid_sorts_by_objective_direction() -> None:
 def test_trials_grid_shows_pixels_and_absent_parameters(
     notes: dict[str, float], shown: str
 ) -> None:
-    study, key = new_study("maximize"), "masker.patch_size"
-    choices = CategoricalDistribution(("${px:64}", "${px:8}"))
-    both = {key: choices, "sigma": ALPHA}
-    add(study, [8.0], params={key: "${px:64}"}, distributions={key: choices}, **notes)
-    add(study, [7.0], params={key: "${px:64}", "sigma": 0.5}, distributions=both, **notes)
+    study = new_study("maximize")
+    size = {"masker.patch_size": "${px:64}"}
+    add(study, [8.0], params=size, **notes)
+    add(study, [7.0], params={**size, "sigma": 0.5}, **notes)
     add(study, [math.inf], **notes)
     rows = trials_grid(read(study)).rows
     assert [row[:3] for row in rows] == [("0", shown, "-"), ("1", shown, "0.5")]
@@ -108,7 +104,8 @@ def test_pareto_front_of_five_points() -> None:
 
 
 def test_tables_of_list_keep_point_order_and_last_trials() -> None:
-    study = new_study("maximize", kind="list", metrics=["val/mIoU"])
+    study = new_study("maximize", metrics=["val/mIoU"])
+    study.set_user_attr(attributes.KIND, "list")
     add(study, [51.0], label="Ny/4 seed=1", key="k1", runs=["k1"])
     add(study, state="FAIL", label="Ny/2 seed=1", key="k2", reason="exit code 1")
     add(study, [52.0], label="Ny/2 seed=1", key="k2", runs=["k2"])

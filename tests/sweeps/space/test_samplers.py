@@ -1,4 +1,4 @@
-"""Draws that drivers and resumed searches never repeat; pruners on reports of validations."""
+"""Draws that drivers and resumed searches never repeat; nodes of samplers and pruners."""
 
 from __future__ import annotations
 
@@ -149,38 +149,3 @@ def test_options_reach_optuna() -> None:
     pruner: Any = build_pruner(node("PatientPruner", patience=1, wrapped_pruner=inner))
     assert pruner._wrapped_pruner._n_startup_trials == 9
     assert isinstance(build_pruner(None), optuna.pruners.NopPruner)
-
-
-OPTIONS: dict[str, dict[str, Any]] = {
-    "Median": {"n_startup_trials": 2},
-    "Percentile": {"percentile": 40.0, "n_startup_trials": 2},
-    "SuccessiveHalving": {"min_resource": 120},
-    "Hyperband": {"min_resource": 120, "max_resource": 960},
-    "Patient": {"patience": 2},
-    "Nop": {},
-}
-
-
-def curve(quality: int, at: int, name: str) -> float:
-    """A score at a step: what is good rises, what is bad falls after its third report."""
-    falls = name == "Patient" and at > 360 and quality < 0
-    return quality - at / 100 if falls else quality + at / 100
-
-
-@pytest.mark.parametrize("name", OPTIONS)
-def test_pruners_stop_bad_trials_at_validation_steps(name: str) -> None:
-    """Reports every 120 steps: the good trials end, of the bad ones some do not."""
-    pruner = build_pruner(node(f"{name}Pruner", **OPTIONS[name]))
-    study = optuna.create_study(direction="maximize", study_name="p", pruner=pruner)
-    states: dict[bool, set[TrialState]] = {True: set(), False: set()}
-    for number in range(24):
-        trial, quality = study.ask(), 50 if number % 4 == 0 else -number
-        steps = iter(range(120, 961, 120))
-        pruned = False
-        while not pruned and (at := next(steps, None)):
-            trial.report(curve(quality, at, name), at)
-            pruned = trial.should_prune()
-        study.tell(trial, None if pruned else quality, TrialState.PRUNED if pruned else None)
-        states[quality == 50].add(study.trials[-1].state)
-    assert states[True] == {TrialState.COMPLETE}
-    assert (TrialState.PRUNED in states[False]) == (name != "Nop")

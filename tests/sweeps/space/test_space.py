@@ -28,7 +28,6 @@ from sweeps.space.space import (
     split,
     suggest,
 )
-from tests.models.golden import compose
 
 LOADER = ConfigLoaderImpl(config_search_path=create_config_search_path(str(conf_dir())))
 FLOAT = {"type": "float", "low": 0.5, "high": 32, "log": True}
@@ -46,8 +45,7 @@ def read_back(override: str) -> Any:
 
 def hydras_points(overrides: Sequence[str]) -> list[set[str]]:
     parsed = OverridesParser.create(LOADER).parse_overrides(list(overrides))
-    (batch,) = BasicSweeper.split_arguments(parsed, None)
-    return [set(point) for point in batch]
+    return [set(point) for point in BasicSweeper.split_arguments(parsed, None)[0]]
 
 
 @pytest.mark.parametrize(
@@ -122,14 +120,10 @@ def test_distributions_of_grid_take_its_trials() -> None:
     ("entry", "key"),
     [
         ({"type": "flaot"}, "k.type"),
-        ({"low": 1, "high": 2}, "k.type"),
         ({**FLOAT, "hihg": 3}, "k.hihg"),
         ({"type": "float", "low": 3, "high": 1}, "k'"),
-        ({"type": "float", "low": 3}, "k.high"),
         ({"type": "float", "low": 0, "high": float("nan")}, "k.high"),
         ({"type": "int", "low": 0.5, "high": 2}, "k.low"),
-        ({**FLOAT, "low": 0}, "k'"),
-        ({"type": "categorical"}, "k.choices"),
         ({"type": "categorical", "choices": []}, "k'"),
         ({"type": "categorical", "choices": [1, 2.5, True]}, "k.choices"),
         ({"type": "categorical", "choices": [[1], "[1]"]}, "k.choices"),
@@ -174,16 +168,12 @@ def test_suggest_gives_types_steps_and_lists() -> None:
     ("value", "text"),
     [
         ("${px:64}", "${px:64}"),
-        ("a b", "a b"),
         ("a, b", "'a, b'"),
         ("1", "'1'"),
-        ("null", "'null'"),
-        ("", "''"),
         ("it's", r"'it\'s'"),
         ("choice(1,2)", "'choice(1,2)'"),
         (None, "null"),
         (True, "true"),
-        (3, "3"),
         (3.0, "3.0"),
         (0.1 + 0.2, "0.30000000000000004"),
         (-1e22, "-1e+22"),
@@ -204,12 +194,3 @@ def test_as_overrides_any_text_is_read_back() -> None:
         single, listed = as_overrides({"x": text, "y": [text, text]})
         assert read_back(single) == text
         assert read_back(listed) == [text, text]
-
-
-def test_pixel_choices_follow_the_scale() -> None:
-    """The text of the resolver survives Optuna and the grammar, then the run resolves it."""
-    space = parse_space({"masker.patch_size": {"type": "categorical", "choices": ["${px:64}"]}})
-    overrides = as_overrides(suggest(optuna.create_study().ask(), space))
-    assert overrides == ("masker.patch_size=${px:64}",)
-    assert compose("+experiment=grbm", *overrides).masker.patch_size == 32
-    assert compose("+experiment=grbm", "scale=paper", *overrides).masker.patch_size == 64
