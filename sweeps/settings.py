@@ -106,8 +106,8 @@ class SweepSettings:
             raise InputError("timeout_minutes would include the queue; use submitit.timeout_min.")
 
 
-UNRESOLVED = ("space", "params", "points")
-"""Keys whose interpolations (``${px:64}``) are resolved by the runs, not by the sweep."""
+UNRESOLVED: dict[str, Any] = {"space": {}, "params": {}, "points": []}
+"""Keys whose interpolations (``${px:64}``) are resolved by the runs -> what null stands for."""
 
 
 def read_settings(node: DictConfig) -> SweepSettings:
@@ -116,7 +116,7 @@ def read_settings(node: DictConfig) -> SweepSettings:
     assert isinstance(raw, dict), "the node of a sweeper is a mapping"
     plain: dict[str, Any] = {}
     for key in (str(key) for key in raw if key not in ("_target_", "_recursive_")):
-        value = raw[key] if key in UNRESOLVED else node[key]
+        value = raw[key] or UNRESOLVED[key] if key in UNRESOLVED else node[key]
         is_config = OmegaConf.is_config(value)
         plain[key] = OmegaConf.to_container(value, resolve=True) if is_config else value
     return cast(SweepSettings, check_value("hydra.sweeper", plain, SweepSettings))

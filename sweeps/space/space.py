@@ -269,6 +269,8 @@ def _point(fixed: Sequence[str], own: Sequence[str]) -> GridPoint:
     params: dict[str, Value] = {}
     for override in _parsed(own):
         value = override.value()
+        if override.is_sweep_override():
+            raise InputError(f"hydra.sweeper.points: '{override.input_line}' is not one value.")
         if override.is_delete():
             continue
         if value is None or isinstance(value, str | int | float):

@@ -99,6 +99,8 @@ def test_list_points_go_in_pairs_and_replace_fixed() -> None:
     ]
     assert points[0].overrides[:2] == ("+experiment=grbm", "seed=1")
     assert points[1].overrides == ("seed=1", "experiment=crm", "~x")
+    with pytest.raises(InputError, match="hydra.sweeper.points: 'seed=0,1'"):
+        list_points([["seed=0,1"]], [])
 
 
 def test_distributions_of_grid_take_its_trials() -> None:
