@@ -267,12 +267,10 @@ def _parsed(overrides: Iterable[str]) -> list[Override]:
 
 def _point(fixed: Sequence[str], own: Sequence[str]) -> GridPoint:
     params: dict[str, Value] = {}
-    for override in _parsed(own):
+    for override in (one for one in _parsed(own) if not one.is_delete()):
         value = override.value()
         if override.is_sweep_override():
             raise InputError(f"hydra.sweeper.points: '{override.input_line}' is not one value.")
-        if override.is_delete():
-            continue
         if value is None or isinstance(value, str | int | float):
             params[override.get_key_element()] = value
         else:

@@ -51,8 +51,8 @@ def test_read_settings_keeps_interpolations_for_runs() -> None:
     assert settings.points == (("a=${px:8}",),)
 
 
-def objective(metric: str, **more: Any) -> dict[str, Any]:
-    return {"objectives": [{"metric": metric, "direction": "maximize", **more}]}
+def objective(metric: str, direction: str = "maximize") -> dict[str, Any]:
+    return {"objectives": [{"metric": metric, "direction": direction}]}
 
 
 @pytest.mark.parametrize(
@@ -60,14 +60,11 @@ def objective(metric: str, **more: Any) -> dict[str, Any]:
     [
         ({"worker": 2}, "hydra.sweeper.worker'"),
         ({"workers": 0}, "hydra.sweeper.workers'"),
-        ({"workers": "two"}, "hydra.sweeper.workers'"),
         ({"gpus": [[]]}, "hydra.sweeper.gpus"),
-        ({"retry": "all"}, "hydra.sweeper.retry'"),
         ({"submitit": {"cluster": "slurm"}}, "executor=submitit"),
         ({"executor": "submitit", "timeout_minutes": 3}, "timeout_minutes"),
         ({"objectives": []}, "hydra.sweeper.objectives'"),
         (objective("mIoU"), "objective 'mIoU'"),
-        (objective("train/mIoU"), "objective 'train/mIoU'"),
         (objective("val/TC/align"), "did you mean 'TC/aligned'"),
         (objective("val/mIoU", direction="up"), r"hydra.sweeper.objectives\[0\].direction"),
         ({"space": {"a": "0..1"}}, "hydra.sweeper.space.a'"),

@@ -95,20 +95,15 @@ def test_study_of_table_has_points_and_no_figures(
 
 
 def test_study_unknown_or_missing_name_lists_studies(call: Call, tmp_path: Path) -> None:
+    code, _, err = call(entry, "name=x", f"runs_dir={tmp_path}")
+    assert code == 2
+    assert_one_sentence(err, "there is no storage")
+    assert list(tmp_path.iterdir()) == []
     make_study(tmp_path)
     for words in (["name=search/grb"], []):
         code, _, err = call(entry, *words, f"runs_dir={tmp_path}")
         assert code == 2
         assert_one_sentence(err, "search/grbm")
-
-
-@pytest.mark.parametrize("storage", ["", "storage=sqlite:///{}/a.db"])
-def test_study_missing_storage_is_not_made(call: Call, tmp_path: Path, storage: str) -> None:
-    given = [storage.format(tmp_path)] if storage else []
-    code, _, err = call(entry, "name=x", f"runs_dir={tmp_path}", *given)
-    assert code == 2
-    assert_one_sentence(err, "there is no storage")
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_study_folders_are_safe_and_differ() -> None:
