@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -27,16 +28,10 @@ def sent(tracking: Any, path: Path, **changed: Any) -> list[tuple[str, str]]:
     return record(tracking, **(given | changed))
 
 
-@pytest.fixture
-def table_file(tmp_path: Path) -> Path:
-    path = tmp_path / "table.md"
-    path.write_text("first")
-    return path
-
-
 @pytest.mark.slow
-def test_record_is_one_run_that_a_repeat_updates(tmp_path: Path, table_file: Path) -> None:
-    tracking = tracking_in(tmp_path)
+def test_record_is_one_run_that_a_repeat_updates(tmp_path: Path) -> None:
+    tracking, table_file = tracking_in(tmp_path), tmp_path / "table.md"
+    table_file.write_text("first")
     links = sent(tracking, table_file)
     table_file.write_text("second")
     assert sent(tracking_in(tmp_path), table_file, note="x\n" * NOTE_LENGTH) == links
@@ -71,16 +66,12 @@ def test_record_is_one_run_that_a_repeat_updates(tmp_path: Path, table_file: Pat
 
 
 def test_record_without_store_costs_a_line(
-    table_file: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert sent(NoTracking(), table_file) == []
-    assert capsys.readouterr().err == ""
-    tracking = tracking_in(table_file.parent)
-
-    def away() -> None:
-        raise ConnectionError("postgresql://me:secret@host is away\nsecond line")
-
-    monkeypatch.setattr(tracking, "store", away)
-    assert sent(tracking, table_file) == []
+    assert sent(NoTracking(), tmp_path) == []
+    tracking = tracking_in(tmp_path)
+    away = ConnectionError("postgresql://me:secret@host is away\nsecond line")
+    monkeypatch.setattr(tracking, "store", Mock(side_effect=away))
+    assert sent(tracking, tmp_path) == []
     (told,) = capsys.readouterr().err.splitlines()
     assert "ConnectionError: postgresql://me:***@host" in told

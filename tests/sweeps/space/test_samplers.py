@@ -56,10 +56,6 @@ def step(study: optuna.Study) -> None:
     study.tell(trial, [values["x"], values["n"] - values["x"]][: len(study.directions)])
 
 
-def points(study: optuna.Study) -> list[dict[str, Any]]:
-    return [trial.params for trial in study.get_trials()]
-
-
 @pytest.mark.parametrize(
     ("name", "objectives"),
     [
@@ -68,7 +64,7 @@ def points(study: optuna.Study) -> list[dict[str, Any]]:
     ],
 )
 def test_sampler_resumed_search_repeats_draws(name: str, objectives: int) -> None:
-    whole = study_on(optuna.storages.InMemoryStorage(), name, objectives)
+    whole = study_on(None, name, objectives)
     for _ in range(8):
         step(whole)
     storage = optuna.storages.InMemoryStorage()
@@ -76,8 +72,9 @@ def test_sampler_resumed_search_repeats_draws(name: str, objectives: int) -> Non
         resumed = study_on(storage, name, objectives)
         for _ in range(trials):
             step(resumed)
-    assert points(resumed) == points(whole)
-    assert len({point["x"] for point in points(whole)}) > 4
+    found, repeated = ([trial.params for trial in each.trials] for each in (whole, resumed))
+    assert found == repeated
+    assert len({point["x"] for point in found}) > 4
 
 
 @pytest.mark.parametrize("name", ["TPE", "Random"])
@@ -87,12 +84,12 @@ def test_sampler_shared_seed_draws_differ(name: str, tmp_path: Path) -> None:
         running = [(study, study.ask()) for study in drivers]
         for study, trial in running:
             study.tell(trial, suggest(trial, SPACE)["x"])
-    assert len({point["x"] for point in points(drivers[0])}) == 9
+    assert len({trial.params["x"] for trial in drivers[0].trials}) == 9
 
 
 def test_sampler_concurrent_trials_keep_own_draws() -> None:
     """Asked together or one by one, told in any order: random points are those of their numbers."""
-    together, single = (study_on(optuna.storages.InMemoryStorage(), "Random") for _ in range(2))
+    together, single = (study_on(None, "Random") for _ in range(2))
     running = [together.ask() for _ in range(4)]
     for trial in reversed(running):
         suggest(trial, SPACE)
@@ -100,20 +97,17 @@ def test_sampler_concurrent_trials_keep_own_draws() -> None:
         together.tell(trial, 1.0)
     for _ in range(4):
         step(single)
-    assert points(together) == points(single)
+    assert [trial.params for trial in together.trials] == [trial.params for trial in single.trials]
 
 
 def test_sampler_ends_trial_of_other_driver() -> None:
     storage = optuna.storages.InMemoryStorage()
     number = study_on(storage, "TPE").ask().number
-    adopter = study_on(storage, "TPE")
-    adopter.tell(number, 1.0)
-    assert adopter.trials[number].state == TrialState.COMPLETE
+    assert study_on(storage, "TPE").tell(number, 1.0).state == TrialState.COMPLETE
 
 
 def test_trial_seed_differs_by_seed_and_number() -> None:
-    seeds = {trial_seed(seed, number) for seed in range(30) for number in range(30)}
-    assert len(seeds) == 900
+    assert len({trial_seed(seed, number) for seed in range(30) for number in range(30)}) == 900
     assert trial_seed(0, 0) == 0x8E2D0AA6  # printf 0:trial:0 | sha256sum
 
 

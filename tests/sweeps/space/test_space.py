@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import random
-from collections.abc import Sequence
 from typing import Any
 
 import optuna
@@ -43,11 +42,6 @@ def read_back(override: str) -> Any:
     return OverridesParser.create().parse_override(override).value()
 
 
-def hydras_points(overrides: Sequence[str]) -> list[set[str]]:
-    parsed = OverridesParser.create(LOADER).parse_overrides(list(overrides))
-    return [set(point) for point in BasicSweeper.split_arguments(parsed, None)[0]]
-
-
 @pytest.mark.parametrize(
     "overrides",
     [
@@ -63,8 +57,9 @@ def hydras_points(overrides: Sequence[str]) -> list[set[str]]:
 )
 def test_grid_points_are_hydras_in_hydras_order(overrides: list[str]) -> None:
     fixed, swept, intervals = split(overrides, LOADER)
-    points = grid_points(fixed, swept)
-    assert [set(point.overrides) for point in points] == hydras_points(overrides)
+    found = [set(point.overrides) for point in grid_points(fixed, swept)]
+    parsed = OverridesParser.create(LOADER).parse_overrides(overrides)
+    assert found == [set(point) for point in BasicSweeper.split_arguments(parsed, None)[0]]
     assert intervals == {}
 
 
