@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +17,7 @@ from omegaconf import open_dict
 import sweeps.sweep as sweeping
 from rgbt.checks import InputError, RunError
 from rgbt.config.compose import compose, conf_dir, register_resolvers
+from rgbt.metrics.counts import Counts
 from sweeps import attributes as names
 from sweeps.point import Outcome, Point
 from sweeps.settings import Objective, SweepSettings
@@ -23,6 +27,8 @@ from sweeps.worker import point_list
 from sweeps.worker.point_list import PointList
 from sweeps.worker.run_store import open_run_store
 from sweeps.worker.storage import load_study, open_storage
+from tests.commands import SPLITS, short, words_of
+from tests.conftest import write_data
 from tests.sweeps.fakes import settings as plain_settings
 
 GRID = ("+experiment=grbm", "masker.sigma_div=1,2", "seed=0,3")
@@ -244,3 +250,28 @@ def test_search_without_finished_trial_raises(wanted: Search, ends: list[str]) -
     ends[:] = ["FAIL", "FAIL"]
     with pytest.raises(RunError, match="no trial of s has finished"):
         search(wanted, settings())
+
+
+@pytest.mark.slow
+def test_workers_and_cores_do_not_change_counts(tmp_path: Path) -> None:
+    """With one thread instead of two, the counts of this experiment are others."""
+    data = write_data(tmp_path / "mf", SPLITS, (48, 64))
+    environment = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"}
+    one_core = ["taskset", "-c", str(min(os.sched_getaffinity(0)))]
+
+    def counts(name: str, *words: str, before: tuple[str, ...] = ()) -> list[bytes]:
+        chosen = ("+experiment=cmx", "masker.patch_size=null", "trainer.threads=2", *short(4))
+        typed = words_of(data, tmp_path / name, *chosen, *words)
+        command = [*before, sys.executable, "-m", "rgbt.run", *typed]
+        subprocess.run(command, check=True, capture_output=True, env=environment)
+        found = sorted((tmp_path / name).glob("*/counts_test.npz"))
+        return [Counts.load(path).counts.tobytes() for path in found]
+
+    (plain,) = counts("plain", "seed=0")
+    assert counts("core", "seed=0", before=tuple(one_core)) == [plain]
+    one = counts("one", "-m", "seed=0,1")
+    two = counts("two", "-m", "seed=0,1", "hydra.sweeper.workers=2")
+    assert len(one) == 2
+    assert plain in one
+    assert one == two
+    assert counts("threads", "seed=0", "trainer.threads=1") != [plain]

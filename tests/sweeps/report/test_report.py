@@ -1,29 +1,28 @@
-"""Results of a study as data and as tables: values by hand."""
+"""Results of a study as data, tables and figures: values by hand."""
 
 from __future__ import annotations
 
 import csv
 import io
 import math
+import warnings
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
+import cv2
+import matplotlib
+import numpy as np
 import optuna
 import pytest
+from matplotlib import pyplot
 from optuna.distributions import CategoricalDistribution, FloatDistribution
 from optuna.trial import TrialState, create_trial
 
 from sweeps import attributes
+from sweeps.report import tables
+from sweeps.report.figures import StudyFigure, draw
 from sweeps.report.study_data import importances, pruning_savings, read
-from sweeps.report.tables import (
-    counts_grid,
-    failed_grid,
-    importance_grid,
-    markdown_table,
-    tables,
-    trials_csv,
-    trials_grid,
-)
 
 ALPHA = FloatDistribution(0, 1)
 SIZES = CategoricalDistribution(("${px:64}", "${px:8}"))
@@ -31,7 +30,8 @@ SIZES = CategoricalDistribution(("${px:64}", "${px:8}"))
 
 def new_study(*directions: str, metrics: Sequence[str] = ()) -> optuna.Study:
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    study = optuna.create_study(study_name="s", directions=list(directions))
+    sampler = optuna.samplers.RandomSampler(seed=0)
+    study = optuna.create_study(study_name="s", directions=list(directions), sampler=sampler)
     study.set_user_attr(attributes.METRICS, list(metrics))
     return study
 
@@ -64,7 +64,7 @@ def test_trials_grid_sorts_by_objective_direction() -> None:
     add(study, [8.0], params=first, results=results, seconds=61.6, runs=["a1"])
     for value in (*range(12, 22), 4.0):
         add(study, [float(value)], params={"masker.alpha": 0.25})
-    grid = trials_grid(read(study))
+    grid = tables.trials_grid(read(study))
     assert grid.title == "Best trials: lowest val/Var"
     assert grid.header == (
         *("trial", "alpha", "optimizer.lr", "head.lr", "val/Var", "test/Var", "val/mIoU"),
@@ -85,7 +85,7 @@ def test_trials_grid_shows_pixels_and_absent_parameters(
     add(study, [8.0], params=size, **notes)
     add(study, [7.0], params={**size, "sigma": 0.5}, **notes)
     add(study, [math.inf], **notes)
-    rows = trials_grid(read(study)).rows
+    rows = tables.trials_grid(read(study)).rows
     assert [row[:3] for row in rows] == [("0", shown, "-"), ("1", shown, "0.5")]
 
 
@@ -97,7 +97,7 @@ def test_pareto_front_of_five_points() -> None:
         add(study, values, params={"x": 0.5})
     data = read(study)
     assert [trial.number for trial in data.front] == [3, 2, 5]
-    grid = trials_grid(data)
+    grid = tables.trials_grid(data)
     assert grid.title == "Pareto front: 3 of 5 complete trials"
     values = [("60.00", "12.00"), ("55.00", "8.00"), ("40.00", "2.00")]
     assert [row[2:4] for row in grid.rows] == values
@@ -113,19 +113,19 @@ def test_tables_of_list_keep_point_order_and_last_trials() -> None:
     add(study, state="FAIL", params={"a.x": 0.5}, reason="by\nsignal | 9", runs=["r1", "r2"])
     add(study, state="FAIL", label="l", reason="w" * 200, seconds=3.2)
     data = read(study)
-    grid = trials_grid(data)
+    grid = tables.trials_grid(data)
     assert grid.header[:4] == ("trial", "point", "state", "val/mIoU")
     assert [row[:4] for row in grid.rows[:3]] == [
         ("0", "Ny/4 seed=1", "complete", "51.00"),
         ("2", "Ny/2 seed=1", "complete", "52.00"),
         ("3", "Ny seed=1", "running", "-"),
     ]
-    failed = failed_grid(data)
+    failed = tables.failed_grid(data)
     assert failed.title == "Failed trials (1 more were retried)"
     assert failed.rows[0] == ("by signal | 9", "4", "x=0.5", "r1 r2", "-")
     assert failed.rows[1] == ("w" * 119 + "…", "5", "l", "-", "3")
-    assert "by signal \\| 9 | 4" in markdown_table(failed)
-    titles = [grid.title for grid in tables(data, importances(data))]
+    assert "by signal \\| 9 | 4" in tables.markdown_table(failed)
+    titles = [grid.title for grid in tables.tables(data, importances(data))]
     assert titles == ["Study s (list)", "Points", failed.title]
 
 
@@ -134,13 +134,11 @@ def test_trials_csv_has_all_trials_with_full_numbers() -> None:
     add(study, [100 / 3], params={"a.x": 0.1}, results={"test/mIoU": 31.0}, seconds=2.5, runs=["r"])
     reported = {10: 1.0, 20: 2.0}
     add(study, state="PRUNED", params={"a.x": 0.2}, reported=reported, reason="at 20, low")
-    first, second = csv.DictReader(io.StringIO(trials_csv(read(study))))
+    first, second = csv.DictReader(io.StringIO(tables.trials_csv(read(study))))
     assert float(first["val/mIoU"]) == 100 / 3
-    assert list(first.values())[4:] == ["0.1", first["val/mIoU"], "31.0", "2.5", "", "r", ""][1:]
-    assert list(second.values())[1:] == [
-        *("pruned", "x=0.2", "0.2", "", "", "", "20", ""),
-        "at 20, low",
-    ]
+    assert list(first.values())[5:] == ["31.0", "2.5", "", "r", ""]
+    assert list(second.values())[3:] == ["0.2", "", "", "", "20", "", "at 20, low"]
+    assert (second["state"], second["label"]) == ("pruned", "x=0.2")
 
 
 def test_pruning_savings_count_steps_and_unstarted_seeds() -> None:
@@ -155,7 +153,7 @@ def test_pruning_savings_count_steps_and_unstarted_seeds() -> None:
     saved = pruning_savings(read(study))
     assert saved is not None
     assert (saved.trials, saved.share) == (2, pytest.approx(330 / 600))
-    assert counts_grid(read(study)).rows == (("5", "2", "3", "0", "0", "0", "55%"),)
+    assert tables.counts_grid(read(study)).rows == (("5", "2", "3", "0", "0", "0", "55%"),)
 
 
 def test_importances_name_the_deciding_parameter() -> None:
@@ -179,7 +177,7 @@ def test_importances_name_the_deciding_parameter() -> None:
             x, y = (index * 13 % 60) / 60, (index * 29 % 60) / 60
             add(half, [y if x > 0.2 else -5 + x], params={"x": x, "y": y})
         assert next(iter(importances(read(half)).shares)) == first
-    grid = importance_grid(read(study), found)
+    grid = tables.importance_grid(read(study), found)
     assert grid.header == ("parameter", "for up, %", "for down, %")
     assert grid.rows[0][0] == "big"
 
@@ -198,3 +196,83 @@ def test_importances_missing_have_a_reason() -> None:
         "objective",
     )
     assert all(each.remark.startswith(why) for each, why in zip(found, reasons, strict=True))
+
+
+def drawn(study: optuna.Study, folder: Path) -> dict[str, StudyFigure]:
+    """Pictures by name; a warning is an error, as it would land in the user's terminal."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        data = read(study)
+        return {picture.name: picture for picture in draw(data, importances(data), folder)}
+
+
+def is_picture(path: Path | None) -> bool:
+    image = cv2.imread(str(path))
+    return image is not None and min(image.shape[:2]) > 150 and np.unique(image).size > 10
+
+
+ONE = ["history", "importances", "slices", "contour", "intermediate", "parallel"]
+
+
+@pytest.mark.slow
+def test_draw_one_objective_all_figures(tmp_path: Path) -> None:
+    """Float, log, int and categorical parameters that not all trials have; pruned, failed."""
+    study = new_study("maximize")
+    for index in range(24):
+        trial = study.ask()
+        rate = trial.suggest_float("optimizer.lr", 1e-5, 1e-1, log=True)
+        size = trial.suggest_int("masker.patch_size", 8, 64, step=8)
+        if trial.suggest_categorical("masker", ["grbm", "none"]) == "grbm":
+            trial.suggest_float("masker.sigma_div", 0.5, 8.0, log=True)
+        trial.report(-1, 10)
+        state = {1: TrialState.FAIL, 2: TrialState.PRUNED}.get(index % 6)
+        study.tell(trial, None if state else math.log10(rate) - size / 100, state)
+    before = {key: value for key, value in matplotlib.rcParams.items() if key != "backend"}
+    found = drawn(study, tmp_path)
+    assert list(found) == ONE
+    for name in ONE:
+        assert found[name].path == tmp_path / f"{name}.png"
+        assert is_picture(found[name].path), found[name]
+    after = {key: value for key, value in matplotlib.rcParams.items() if key != "backend"}
+    assert after == before
+    assert pyplot.get_fignums() == []
+
+
+def test_draw_without_complete_trials_has_reasons(tmp_path: Path) -> None:
+    stale = tmp_path / "history.png"
+    stale.write_bytes(b"of a study of the same name that was deleted")
+    study = new_study("maximize")
+    trial = study.ask()
+    trial.suggest_float("x", 0, 1)
+    study.tell(trial, state=TrialState.FAIL)
+    study.ask()
+    found = drawn(study, tmp_path)
+    assert list(found) == ONE
+    assert all(picture.path is None and picture.reason for picture in found.values())
+    assert not stale.exists()
+    study.set_user_attr(attributes.KIND, "grid")
+    assert list(drawn(study, tmp_path)) == [*ONE[1:4], "parallel"]
+    study.set_user_attr(attributes.KIND, "list")
+    assert drawn(study, tmp_path) == {}
+
+
+@pytest.mark.slow
+def test_draw_two_objectives_of_which_one_is_constant(tmp_path: Path) -> None:
+    study = new_study("maximize", "minimize", metrics=["val/mIoU", "val/Var"])
+    for index in range(12):
+        trial = study.ask()
+        trial.suggest_categorical("same", ["${px:64}"])
+        study.tell(trial, [trial.suggest_float("a" if index % 2 else "b", 0, 1), 3.0])
+    found = drawn(study, tmp_path)
+    each = ("history", "importances", "slices", "contour")
+    names = [f"{name}_{end}" for end in ("val_mIoU", "val_Var") for name in each]
+    assert list(found) == [*names, "pareto", "parallel"]
+    without = [name for name, picture in found.items() if picture.path is None]
+    assert without == ["contour_val_mIoU", "importances_val_Var", "contour_val_Var"]
+    assert all(is_picture(found[name].path) for name in {*found} - {*without})
+    second = read(study).of_objective(1, with_others=True)
+    assert second.direction.name == "MINIMIZE"
+    first = second.trials[0]
+    assert first.value == 3.0
+    assert first.params["same"] == "64px"
+    assert "val/mIoU" in first.params
