@@ -28,27 +28,24 @@ def test_sweeper_file_holds_all_settings() -> None:
     assert (settings.workers, settings.points, settings.pruner, settings.trust) == (1, (), None, "")
 
 
-def test_read_settings_converts_to_types() -> None:
+def test_read_settings_converts_and_resolves() -> None:
     settings = changed(
         gpus=[0, [1, 2]],
         hours=8,
         study="${storage}",
         storage="sqlite:///a.db",
         objectives=[{"metric": "test/Var", "direction": "minimize"}],
-        points=[["a=1", "b=[2,3]"], ["a=4"]],
+        points=[["a=1", "b=[2,3]"], ["a=${px:8}"]],
+        space={"a": {"choices": ["${px:8}"]}},
+        params={"a": "${px:8},2"},
     )
     assert settings.gpus == (0, (1, 2))
     assert (settings.hours, settings.study) == (8.0, "sqlite:///a.db")
     assert settings.objectives == (Objective("test/Var", "minimize"),)
-    assert settings.points == (("a=1", "b=[2,3]"), ("a=4",))
-
-
-def test_read_settings_keeps_interpolations_for_runs() -> None:
-    space = {"masker.patch_size": {"type": "categorical", "choices": ["${px:8}", "${px:64}"]}}
-    settings = changed(space=space, params={"a": "${px:8},2"}, points=[["a=${px:8}"]])
-    assert settings.space == space
+    # Those of the runs are kept.
+    assert settings.points == (("a=1", "b=[2,3]"), ("a=${px:8}",))
+    assert settings.space == {"a": {"choices": ["${px:8}"]}}
     assert settings.params == {"a": "${px:8},2"}
-    assert settings.points == (("a=${px:8}",),)
 
 
 def objective(metric: str, direction: str = "maximize") -> dict[str, Any]:
@@ -63,7 +60,6 @@ def objective(metric: str, direction: str = "maximize") -> dict[str, Any]:
         ({"gpus": [[]]}, "hydra.sweeper.gpus"),
         ({"submitit": {"cluster": "slurm"}}, "executor=submitit"),
         ({"executor": "submitit", "timeout_minutes": 3}, "timeout_minutes"),
-        ({"objectives": []}, "hydra.sweeper.objectives'"),
         (objective("mIoU"), "objective 'mIoU'"),
         (objective("val/TC/align"), "did you mean 'TC/aligned'"),
         (objective("val/mIoU", direction="up"), r"hydra.sweeper.objectives\[0\].direction"),

