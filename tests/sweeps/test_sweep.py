@@ -113,7 +113,7 @@ def test_name_of_search_is_independent_of_order(calls: RecordedCalls, tmp_path: 
     call(tmp_path / "b", *reversed(words), "fresh=true", trials=3)
     for changes in ({"replicates": 2}, {"space": {"seed": {"type": "int", "low": 1, "high": 2}}}):
         call(tmp_path, *words[:2], *words[3:], trials=3, **changes)
-    call(tmp_path, *words[:3], trials=3)
+    call(tmp_path, words[0], "masker.sigma_div=interval(1,8)", *words[2:], trials=3)
     first, same, *others = calls.searches
     assert (first.study, first.identity) == (same.study, same.identity)
     assert len({each.identity for each in calls.searches}) == 1 + len(others)
