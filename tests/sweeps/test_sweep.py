@@ -212,9 +212,9 @@ def test_search_with_other_identity_is_refused(wanted: Search, ends: list[str]) 
         replace(wanted, identity="other"),
         replace(wanted, fixed=(*wanted.fixed, "dataset.num_test=3")),
     ):
-        with pytest.raises(InputError, match="a study 's' with"):
+        with pytest.raises(InputError, match="choose another name"):
             search(other, settings())
-    with pytest.raises(InputError, match="a study 's' with"):
+    with pytest.raises(InputError, match="choose another name"):
         search(wanted, settings(objectives=(Objective("val/Var", "minimize"),)))
 
 
