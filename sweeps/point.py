@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import colorsys
 import hashlib
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
@@ -13,6 +14,9 @@ from rgbt.runs.result import RunResult
 from sweeps.evaluation import ExtraEvaluation
 
 Value = str | int | float | bool | None
+State = Literal["finished", "failed", "running", "waiting", "missing"]
+UNFINISHED: tuple[State, ...] = ("waiting", "failed")
+"""States of points that a command runs."""
 
 COLOUR = "mlflow.runColor"
 """Tag with the colour of a run in MLflow's charts. By default a hash of the run's id: two runs
@@ -21,24 +25,10 @@ of four share one of the twenty colours in every fourth grid."""
 
 def colour(study: str, index: int) -> str:
     """Colour of the point `index` of a study, "#rrggbb"; neighbours differ in hue and lightness."""
-    first = hashlib.sha256(study.encode()).digest()[0] / 256
-    hue = (first + index * GOLDEN) % 1.0
-    channels = colorsys.hls_to_rgb(hue, LIGHTNESSES[index % len(LIGHTNESSES)], SATURATION)
+    # Multiples of the golden ratio, modulo 1, never come close to each other soon.
+    hue = (hashlib.sha256(study.encode()).digest()[0] / 256 + index * 0.618034) % 1.0
+    channels = colorsys.hls_to_rgb(hue, (0.36, 0.56, 0.46)[index % 3], 0.62)
     return "#" + "".join(f"{round(255 * channel):02x}" for channel in channels)
-
-
-GOLDEN = 0.618034
-"""Golden ratio: its multiples, modulo 1, never come close to each other soon."""
-
-LIGHTNESSES = (0.36, 0.56, 0.46)
-SATURATION = 0.62
-
-
-def varied_keys(points: Sequence[Point]) -> list[str]:
-    """Keys of the overrides that not all points have, in order."""
-    common = set.intersection(*(set(point.overrides) for point in points)) if points else set()
-    words = (word for point in points for word in point.overrides if word not in common)
-    return list(dict.fromkeys(word.lstrip("+").partition("=")[0] for word in words))
 
 
 @dataclass(frozen=True)
@@ -66,9 +56,11 @@ class Point:
         return tuple((*self.overrides, f"seed={seed}") for seed in self.seeds) or (self.overrides,)
 
 
-State = Literal["finished", "failed", "running", "waiting", "missing"]
-UNFINISHED: tuple[State, ...] = ("waiting", "failed")
-"""States of points that a command runs."""
+def varied_keys(points: Sequence[Point]) -> list[str]:
+    """Keys of the overrides that not all points have, in order."""
+    common = set.intersection(*(set(point.overrides) for point in points)) if points else set()
+    words = (word for point in points for word in point.overrides if word not in common)
+    return list(dict.fromkeys(word.lstrip("+").partition("=")[0] for word in words))
 
 
 @dataclass(frozen=True)
@@ -100,6 +92,5 @@ class Outcome:
     def seconds(self) -> float | None:
         """Duration of its runs; None where one of them is unknown."""
         found = [read_result(result.folder) or {} for result in self.results]
-        each = [result.get("seconds_of_last_process") for result in found]
-        known = [float(seconds) for seconds in each if seconds is not None]
-        return sum(known) if known and len(known) == len(each) else None
+        total = sum(each.get("seconds_of_last_process", math.nan) for each in found)
+        return total if found and math.isfinite(total) else None

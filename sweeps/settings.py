@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Annotated, Any, ClassVar, Literal
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal, cast
 
 from annotated_types import Interval, Len, doc
 from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError, nearest
-from rgbt.config.component import build
+from rgbt.config.values import check_value
 from rgbt.metrics import names as scores
 from rgbt.ranges import Names, Positive, Text
 
@@ -43,17 +43,13 @@ class Objective:
     direction: Literal["maximize", "minimize"]
 
     def __post_init__(self) -> None:
-        if not self.metric.startswith(("val/", "test/")):
-            raise InputError(
-                f"objective '{self.metric}': expected val/<score> or test/<score>, such as "
-                "val/mIoU or val/Var."
-            )
-        score = self.metric.partition("/")[2]
+        split, _, score = self.metric.partition("/")
         part, _, inner = score.partition("/")
         whole = inner if part in (scores.DAY, scores.NIGHT) else score
-        if whole not in SCORES and score not in AT_THE_END and part not in ("region", "class"):
+        is_known = whole in SCORES or score in AT_THE_END or part in ("region", "class")
+        if split not in ("val", "test") or not is_known:
             known = nearest(score, (*SCORES, *AT_THE_END))
-            raise InputError(f"objective '{self.metric}': {known}.")
+            raise InputError(f"objective '{self.metric}': val/<score> or test/<score>; {known}.")
 
     @property
     def is_consistency(self) -> bool:
@@ -78,6 +74,8 @@ NumRuns = Annotated[int, Interval(ge=1, le=10**6)]
 class SweepSettings:
     """See ``conf/hydra/sweeper/study.yaml``, which explains every key and holds the defaults."""
 
+    __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
+
     storage: Text | None
     workers: Annotated[int, Interval(ge=1, le=1024), doc("processes at the same time")]
     gpus: Annotated[tuple[GpuSlot, ...], Len(1, 1024)] | None
@@ -99,56 +97,26 @@ class SweepSettings:
     trials: NumRuns | None
     hours: Positive | None
     replicates: Annotated[int, Interval(ge=1, le=1000)]
+    trust: Annotated[str, Len(0, 4096)]
 
     def __post_init__(self) -> None:
         if self.submitit and self.executor != "submitit":
-            raise InputError(
-                "submitit={...} has an effect only with executor=submitit; add executor=submitit."
-            )
+            raise InputError("submitit={...} has an effect only with executor=submitit; add it.")
         if self.executor == "submitit" and self.timeout_minutes is not None:
-            raise InputError(
-                "timeout_minutes would include the time in the queue; with executor=submitit, set "
-                "submitit={timeout_min: ...}."
-            )
+            raise InputError("timeout_minutes would include the queue; use submitit.timeout_min.")
 
 
-UNRESOLVED: dict[str, type] = {"space": dict, "params": dict, "points": list}
-"""Keys whose interpolations (``${px:64}``) are resolved by the runs, not by the sweep."""
+UNRESOLVED: dict[str, Any] = {"space": {}, "params": {}, "points": []}
+"""Keys whose interpolations (``${px:64}``) are resolved by the runs -> what null stands for."""
 
 
 def read_settings(node: DictConfig) -> SweepSettings:
-    """Settings from the node ``hydra.sweeper``.
-
-    Raises:
-        InputError: an unknown key, a missing one, a wrong type or value.
-    """
-    known = SweepSettings.__dataclass_fields__
+    """Settings from the node ``hydra.sweeper``; InputError names a wrong or missing key."""
     raw = OmegaConf.to_container(node, resolve=False)
     assert isinstance(raw, dict), "the node of a sweeper is a mapping"
-    for key in raw:
-        if key not in known and key != "_target_":
-            raise InputError(
-                f"'hydra.sweeper.{key!s}' is not a setting; {nearest(str(key), known)}."
-            )
-    for key in known:
-        if key not in raw:
-            raise InputError(
-                f"'hydra.sweeper.{key}' has no value; see conf/hydra/sweeper/study.yaml."
-            )
-    for key, kind in UNRESOLVED.items():
-        raw[key] = kind() if raw[key] is None else raw[key]
-        if not isinstance(raw[key], kind):
-            what = "mapping" if kind is dict else "list"
-            raise InputError(f"'hydra.sweeper.{key!s}' must be a {what}, got {raw[key]!r}.")
-    values = {key: node[key] for key in known if key not in UNRESOLVED}
-    empty = {key: kind() for key, kind in UNRESOLVED.items()}
-    own = {"_target_": "sweeps.settings.SweepSettings", **values, **empty}
-    settings: SweepSettings = build(OmegaConf.create({"hydra": {"sweeper": own}}).hydra.sweeper)
-    for point in raw["points"]:
-        if not isinstance(point, list):
-            raise InputError(
-                f"hydra.sweeper.points: expected a list of lists of overrides such as "
-                f"[[masker.sigma_div=1], [masker.sigma_div=4]], got {point!r} inside."
-            )
-    points = tuple(tuple(map(str, point)) for point in raw["points"])
-    return replace(settings, space=raw["space"], params=raw["params"], points=points)
+    plain: dict[str, Any] = {}
+    for key in (str(key) for key in raw if key not in ("_target_", "_recursive_")):
+        value = raw[key] or UNRESOLVED[key] if key in UNRESOLVED else node[key]
+        is_config = OmegaConf.is_config(value)
+        plain[key] = OmegaConf.to_container(value, resolve=True) if is_config else value
+    return cast(SweepSettings, check_value("hydra.sweeper", plain, SweepSettings))

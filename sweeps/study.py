@@ -19,15 +19,14 @@ from rgbt.config.common_options import RunsDir
 from rgbt.config.options import Help, readable_paths
 from rgbt.config.plain_command import PlainCommand
 from rgbt.runs.provenance import without_passwords
-from sweeps.worker.storage import JOURNAL, load_study, open_storage, storage_file, study_names
+from sweeps.worker.storage import load_study, open_storage, storage_file, study_names
 
 if TYPE_CHECKING:
     import optuna
 
     from rgbt.tables import TextTable
-    from rgbt.tracking.tracker import Link, Tracking
-    from sweeps.report.figures import StudyFigure
-    from sweeps.report.study_data import Importances, StudyData
+    from rgbt.tracking.tracker import Tracking
+    from sweeps.report.study_data import StudyData
 
 
 @dataclass(frozen=True)
@@ -35,25 +34,9 @@ class Options:
     """Options of ``rgbt study``."""
 
     name: Annotated[str, Help("name of the study; without a name, all studies are listed")] = ""
-    storage: Annotated[
-        str,
-        Help(
-            "Optuna storage: file.journal, sqlite:///FILE or postgresql://USER@HOST/NAME; default: "
-            "studies.journal in the folder of runs"
-        ),
-    ] = ""
+    storage: Annotated[str, Help("sqlite:///FILE or postgresql://...; default: studies.db")] = ""
     runs_dir: RunsDir = Path("runs")
-    out: Annotated[
-        Path | None,
-        Help(
-            "output folder of Markdown, CSV and PNG files; default: studies/<name> in the folder "
-            "of runs"
-        ),
-    ] = None
-
-
-NAME_LENGTH = 80
-"""Characters of a folder name; longer names are cut and get a hash."""
+    out: Annotated[Path | None, Help("folder of the report; default: studies/<name>")] = None
 
 
 def main(options: Options, overrides: list[str]) -> int:
@@ -62,31 +45,26 @@ def main(options: Options, overrides: list[str]) -> int:
     Overrides choose the tracker: tracking=none or tracking.uri=http://host:5000
     """
     runs_dir = options.runs_dir
-    place = options.storage or None
-    _check_exists(place, runs_dir)
-    storage = open_storage(place, runs_dir)
+    url = storage_url(options.storage, runs_dir)
+    file = storage_file(url)
+    if file is not None and not file.is_file():  # opening it would create an empty one
+        raise InputError(f"there is no storage {file}; give runs_dir=... or storage=...")
+    storage = open_storage(url, runs_dir)
     if not options.name:
-        known = ", ".join(study_names(storage)) or "none"
-        raise InputError(f"choose a study with name=...; the storage has: {known}.")
+        raise InputError(f"name has no value; the studies are: {', '.join(study_names(storage))}.")
     study = load_study(options.name, storage)
     tracking = built("tracking", [*readable_paths([f"runs_dir={runs_dir}"]), *overrides])
-    out = options.out or study_folder(runs_dir, study.study_name)
-    links = report(study, out, tracking)
-    show_links([*links, ("dashboard", dashboard_command(place, runs_dir))])
+    report(study, options.out or study_folder(runs_dir, study.study_name), tracking, url)
     return 0
 
 
-def report(study: optuna.Study, out: Path, tracking: Tracking) -> list[Link]:
-    """Print the tables of a study, write its files into `out` and send them to the tracker.
-
-    Returns:
-        links to everything, as (name, address).
-    """
+def report(study: optuna.Study, out: Path, tracking: Tracking, url: str) -> None:
+    """Print the tables of a study in the storage `url`, write its files into `out`, record them."""
     from rich.console import Group
     from rich.text import Text
 
     from rgbt.files.atomic import write_atomic
-    from rgbt.terminal import print_rich, rich_table
+    from rgbt.terminal import path_lines, print_rich, rich_table
     from sweeps.report.figures import draw
     from sweeps.report.records import record
     from sweeps.report.study_data import importances, read
@@ -97,26 +75,36 @@ def report(study: optuna.Study, out: Path, tracking: Tracking) -> list[Link]:
     grids = tables(data, shares)
     out.mkdir(parents=True, exist_ok=True)
     pictures = draw(data, shares, out)
-    lines = remarks(shares, pictures)
-    text = markdown(data, grids, lines)
-    write_atomic(out / "study.md", (text + gallery(pictures)).encode())
+    # Remarks below the tables: on the importances, and why figures are missing.
+    missing: dict[str, list[str]] = {}
+    for picture in pictures:
+        if picture.path is None:
+            missing.setdefault(picture.reason, []).append(picture.name)
+    remarks = [f"No figure {', '.join(names)}: {reason}" for reason, names in missing.items()]
+    if shares.remark and shares.remark not in missing:
+        remarks.insert(0, f"Importances: {shares.remark}")
+    text = markdown(data, grids, remarks)
+    drawn = [(picture, picture.path) for picture in pictures if picture.path is not None]
+    gallery = "".join(f"\n## {one.title}\n\n![{one.title}]({path.name})\n" for one, path in drawn)
+    write_atomic(out / "study.md", (text + gallery).encode())
     write_atomic(out / "trials.csv", trials_csv(data).encode())
-    print_rich(Group(*map(rich_table, grids), Text("\n".join(lines))))
-    drawn = [picture.path for picture in pictures if picture.path is not None]
+    print_rich(Group(*map(rich_table, grids), Text("\n".join(remarks))))
     links = record(
         tracking,
         # A table and its study may have one name, and are two records.
         name=f"study {data.name}",
         kind="study",
-        files=[out / "study.md", out / "trials.csv", *drawn],
+        files=[out / "study.md", out / "trials.csv", *(path for _, path in drawn)],
         metrics=metrics(data),
         tags={"rgbt.study": data.name, "rgbt.study.kind": data.kind},
         note=text,
     )
-    return [("report", str(out / "study.md")), ("figures", f"{len(drawn)} in {out}"), *links]
+    files = [("report", str(out / "study.md")), ("figures", f"{len(drawn)} in {out}")]
+    command = f"optuna-dashboard {without_passwords(url)}"
+    print_rich(path_lines([*files, *links, ("dashboard", command)]))
 
 
-def markdown(data: StudyData, grids: Sequence[TextTable], remark_lines: Sequence[str]) -> str:
+def markdown(data: StudyData, grids: Sequence[TextTable], remarks: Sequence[str]) -> str:
     """The report in Markdown, without figures: MLflow's descriptions cannot show them."""
     from sweeps.report.tables import markdown_table
 
@@ -124,25 +112,7 @@ def markdown(data: StudyData, grids: Sequence[TextTable], remark_lines: Sequence
     objectives = ", ".join(f"{w} {metric}" for w, metric in zip(way, data.metrics, strict=True))
     created = f"Created by `{without_passwords(data.command)}`.\n" if data.command else ""
     head = f"# Study {data.name}\n\nKind: {data.kind}. Objectives: {objectives}.\n{created}"
-    remarked = "".join(f"- {line}\n" for line in remark_lines)
-    return "\n".join([head, *map(markdown_table, grids), remarked])
-
-
-def gallery(pictures: Sequence[StudyFigure]) -> str:
-    """The figures in Markdown, by the names of their files."""
-    drawn = [picture for picture in pictures if picture.path is not None]
-    return "".join(f"\n## {p.title}\n\n![{p.title}]({p.name}.png)\n" for p in drawn)
-
-
-def remarks(shares: Importances, pictures: Sequence[StudyFigure]) -> list[str]:
-    """Remarks below the tables: on the importances, and why figures are missing."""
-    missing: dict[str, list[str]] = {}
-    for picture in pictures:
-        if picture.path is None:
-            missing.setdefault(picture.reason, []).append(picture.name)
-    lines = [f"No figure {', '.join(names)}: {reason}" for reason, names in missing.items()]
-    is_said = shares.remark in missing
-    return [*([f"Importances: {shares.remark}"] if shares.remark and not is_said else []), *lines]
+    return "\n".join([head, *map(markdown_table, grids), "".join(f"- {e}\n" for e in remarks)])
 
 
 def metrics(data: StudyData) -> dict[str, float]:
@@ -151,44 +121,24 @@ def metrics(data: StudyData) -> dict[str, float]:
     from sweeps.report.tables import WORDS
 
     numbers = {f"trials/{WORDS[state]}": float(count) for state, count in data.counts().items()}
-    for index, metric in enumerate(data.metrics):
-        values = [trial.values[index] for trial in data.complete]
-        if values:
-            numbers[f"best/{metric}"] = max(values) if data.maximize[index] else min(values)
+    for index, metric in enumerate(data.metrics if data.complete else ()):
+        best = max if data.maximize[index] else min
+        numbers[f"best/{metric}"] = best(trial.values[index] for trial in data.complete)
     saved = pruning_savings(data)
-    if saved is not None:
-        numbers["steps_saved"] = 100.0 * saved.share
-    return numbers
+    return numbers if saved is None else {**numbers, "steps_saved": 100.0 * saved.share}
 
 
 def study_folder(runs_dir: Path, name: str) -> Path:
     """Folder of the report of a study; characters such as / in its name are replaced."""
-    safe = re.sub(r"[^\w+=.-]+", "_", name).lstrip(".")[:NAME_LENGTH]
+    safe = re.sub(r"[^\w+=.-]+", "_", name).lstrip(".")[:80]
     if safe != name:
         safe += "-" + hashlib.sha256(name.encode()).hexdigest()[:6]
     return runs_dir / "studies" / safe
 
 
-def dashboard_command(storage: str | None, runs_dir: Path) -> str:
-    """The command that opens optuna-dashboard on a storage, passwords hidden."""
-    return f"optuna-dashboard {without_passwords(storage or str(runs_dir / JOURNAL))}"
-
-
-def _check_exists(storage: str | None, runs_dir: Path) -> None:
-    """Refuse a missing file: opening it would create an empty one."""
-    file = storage_file(storage or str(runs_dir / JOURNAL))
-    if file is not None and not file.is_file():
-        raise InputError(
-            f"there is no storage {file}; give the folder of runs with runs_dir=... or the "
-            "storage with storage=..."
-        )
-
-
-def show_links(links: Sequence[Link]) -> None:
-    """Print links, one "name  address" pair per line."""
-    from rgbt.terminal import path_lines, print_rich
-
-    print_rich(path_lines(links))
+def storage_url(storage: str | None, runs_dir: Path) -> str:
+    """Address of a storage; "" and None stand for the file in the folder of runs."""
+    return storage or f"sqlite:///{runs_dir / 'studies.db'}"
 
 
 entry = PlainCommand(Options, main, heeds=("tracking",))

@@ -1,51 +1,48 @@
-"""The sweep behind ``-m``: a grid of comma lists, a list of points, or a search."""
+"""The sweep behind ``-m``: a grid of comma lists, a list of points, or a search.
+
+In a search a sampler selects the points and a pruner stops bad ones.
+"""
 
 from __future__ import annotations
 
-import hashlib
-import json
 import re
 import shlex
-from collections.abc import Mapping, Sequence
+import sys
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from hydra.core.config_loader import ConfigLoader
 from omegaconf import DictConfig
 
 from rgbt.checks import InputError, RunError
-from rgbt.metrics import names
-from rgbt.runs.provenance import without_passwords
+from rgbt.metrics.names import MIOU, VAR
+from rgbt.runs.provenance import command_line, without_passwords
+from rgbt.runs.run_spec import RunSpec
 from rgbt.tables import ABSENT, TextTable, number
 from rgbt.terminal import info, print_rich, rich_table
-from rgbt.tracking.mlflow_store import MlflowTracking
+from sweeps import attributes as names
 from sweeps.point import UNFINISHED, Outcome, Point
 from sweeps.rendering.seed_groups import group_grid, unfinished_grid
 from sweeps.report.study_data import short_names
-from sweeps.search import Search, search
 from sweeps.settings import SweepSettings, read_settings
-from sweeps.space.grid import (
-    GridPoint,
-    distributions,
-    grid_points,
-    list_points,
-    merge_space,
-    split,
-)
-from sweeps.space.space import as_overrides
-from sweeps.worker.executors import fork_template
-from sweeps.worker.point_list import (
-    PointList,
-    estimated_seconds,
-    other_code_line,
-    preview_points,
-    run_points,
-)
-from sweeps.worker.progress import duration
-from sweeps.worker.run_store import open_run_store
+from sweeps.space import space as spaces
+from sweeps.space.samplers import build_pruner, build_sampler
+from sweeps.space.space import GridPoint, Space, as_overrides, key_of, signature
+from sweeps.study import report, storage_url, study_folder
+from sweeps.worker import point_list
+from sweeps.worker.driver import drive
+from sweeps.worker.planner import Planner, specify_run
+from sweeps.worker.point_list import PointList
+from sweeps.worker.progress import ProgressView, duration
+from sweeps.worker.run_store import RunStore, open_run_store
+from sweeps.worker.storage import find_study, open_storage, open_study
+from sweeps.worker.trial_sources import SamplerSource
+from sweeps.worker.trial_store import Owner, TrialStore, counted_trials
 
 PATHS = ("runs_dir", "dataset.root", "dataset.cache_dir", "tracking")
-"""Overrides that may differ between two calls of the same sweep."""
+"""Beginnings of overrides that may differ between two calls of the same sweep."""
 
 
 def sweep(arguments: Sequence[str], config: DictConfig, loader: ConfigLoader) -> None:
@@ -62,66 +59,92 @@ def sweep(arguments: Sequence[str], config: DictConfig, loader: ConfigLoader) ->
     """
     settings = read_settings(config.hydra.sweeper)
     runs = open_run_store(config)
-    if settings.executor == "local" and not settings.dry_run:
-        fork_template(with_mlflow=isinstance(runs.tracking, MlflowTracking))
-    # `fresh` is for the sweep, which decides for each point: no setting of its runs.
-    arguments = [word for word in arguments if word.partition("=")[0] != "fresh"]
     # Text of `params` stands as it would be typed, other values as Hydra reads them.
-    texts = {key: value for key, value in settings.params.items() if isinstance(value, str)}
-    others = {key: value for key, value in settings.params.items() if key not in texts}
-    typed = [f"{key}={value}" for key, value in texts.items()] + [*as_overrides(others)]
-    fixed, swept, intervals = split([*typed, *arguments], loader)
+    params = settings.params.items()
+    typed = [f"{k}={v}" if isinstance(v, str) else as_overrides({k: v})[0] for k, v in params]
+    # `fresh` is for the sweep, which decides for each point: no setting of its runs.
+    typed += [word for word in arguments if word.partition("=")[0] != "fresh"]
+    fixed, swept, intervals = spaces.split(typed, loader)
     # Overrides of Hydra itself that a run needs too; without a sweep of its own.
-    given = [word for word in config.hydra.overrides.hydra if "hydra.searchpath" in word]
-    is_search = "search" in config.hydra.runtime.choices
-    base = (*given, *(["hydra.mode=RUN"] if is_search else []))
+    base = [word for word in config.hydra.overrides.hydra if "hydra.searchpath" in word]
+    base += ["hydra.mode=RUN"] if "search" in config.hydra.runtime.choices else []
+
     if settings.space or intervals:
-        parameters = merge_space(settings.space, fixed, swept, intervals)
-        taken = {parameter.key for parameter in parameters}
-        shared = (*base, *(word for word in fixed if word.partition("=")[0] not in taken))
         if settings.points:
             raise InputError("points and a search cannot be combined; run them with two commands.")
-        identity = (sorted(shared), parameters, settings.objectives, settings.replicates)
-        name = settings.study or _name(config.name, [p.key for p in parameters], identity)
-        search(Search(name, shared, parameters, runs, _plain(sorted(shared))), settings)
+        space = spaces.merge_space(settings.space, fixed, swept, intervals)
+        constants = (sorted(space.items()), settings.objectives, settings.replicates)
+        identity = signature(_plain(sorted([*base, *fixed])), *constants)
+        name = settings.study or _name(config.name, space, identity)
+        search(Search(name, (*base, *fixed), space, runs, identity), settings)
         return
-    _refuse_search_settings(settings)
-    grid = grid_points(fixed, swept)
+
+    unused = [key for key in ("trials", "hours", "pruner") if getattr(settings, key) is not None]
+    if unused or settings.replicates > 1:
+        key = [*unused, "replicates"][0]
+        raise InputError(f"hydra.sweeper.{key} is for a search, but no key has a range.")
+    grid = spaces.grid_points(fixed, swept)
     if settings.points:
         grid = [
             GridPoint({**each.params, **own.params}, own.overrides)
             for each in grid
-            for own in list_points(settings.points, each.overrides)
+            for own in spaces.list_points(settings.points, each.overrides)
         ]
     if len(grid) == 1:
         info("no list of values was given (such as seed=0,1,2); the sweep has one point.")
-    name = settings.study or _name(config.name, list(grid[0].params), [p.overrides for p in grid])
-    tags = {f"rgbt.study/{name}": "grid"}
+    identity = signature([_plain(each.overrides) for each in grid])
+    name = settings.study or _name(config.name, list(grid[0].params), identity)
     points = tuple(
-        Point(_label(point) or name, point.overrides, params=point.params, tags=tags)
-        for point in grid
+        Point(_label(each) or name, each.overrides, each.params, {f"rgbt.study/{name}": "grid"})
+        for each in grid
     )
-    kind = "list" if settings.points else "grid"
-    _grid(PointList(name, name, kind, points, runs, base, distributions(grid)), settings)
+    kind, known = "list" if settings.points else "grid", spaces.distributions(grid)
+    _grid(PointList(name, name, kind, points, runs, tuple(base), known), settings)
 
 
 def _label(point: GridPoint) -> str:
     """The varied values of a point, as typed: "sigma_div=1 seed=0"."""
-    names = short_names([key.lstrip("+") for key in point.params])
-    return " ".join(f"{names[key.lstrip('+')]}={value}" for key, value in point.params.items())
+    values = {key.lstrip("+"): value for key, value in point.params.items()}
+    return " ".join(f"{name}={values[key]}" for key, name in short_names(values).items())
 
 
-def _refuse_search_settings(settings: SweepSettings) -> None:
-    given = {
-        "trials": settings.trials is not None,
-        "hours": settings.hours is not None,
-        "pruner": settings.pruner is not None,
-        "replicates": settings.replicates > 1,
-    }
-    for key in (key for key, is_given in given.items() if is_given):
-        raise InputError(
-            f"hydra.sweeper.{key} is for searches, but no key has a range; give a range "
-            "(optimizer.lr=interval(0.001,0.01) or +search=...), or omit it."
+def _name(experiment: str, keys: Iterable[str], identity: str) -> str:
+    """A reproducible name: the method, the varied keys, a hash of everything."""
+    varied = "-".join(re.sub(r"[^\w-]", "", key.rpartition(".")[2]) for key in keys)
+    return "-".join(word for word in (experiment, varied[:60], identity[:6]) if word)
+
+
+def _plain(words: Sequence[str]) -> list[str]:
+    """Overrides without those that are only paths."""
+    return [word for word in words if not key_of(word).startswith(PATHS)]
+
+
+def _grid(points: PointList, settings: SweepSettings) -> None:
+    if settings.dry_run:
+        outcomes = point_list.preview_points(points, settings)
+        tables = [grid_table(points, outcomes)]
+    else:
+        # A typing error should not cost hours of other runs.
+        outcomes = point_list.run_points(points, settings, strict=True)
+        tables = [group_grid(points.title, outcomes), unfinished_grid(outcomes)]
+    for table in tables:
+        if table.rows:
+            print_rich(rich_table(table))
+    if other_code := point_list.other_code_line(outcomes):
+        info(other_code)
+    if settings.dry_run:
+        seconds = point_list.estimated_seconds(outcomes, settings.workers)
+        missing = sum(outcome.state in UNFINISHED for outcome in outcomes)
+        guess = "" if seconds is None else f", about {duration(seconds)}"
+        info(f"{missing} of {len(outcomes)} points would be run{guess}.")
+        return
+    command = study_command(points.study, points.runs.runs_dir, settings.storage)
+    info(f"study {points.study}; its figures: {command}")
+    failed = [outcome for outcome in outcomes if outcome.state == "failed"]
+    if failed:
+        raise RunError(
+            f"{len(failed)} of {len(outcomes)} points failed, first {failed[0].point.label}: "
+            f"{failed[0].reason} (hydra.sweeper.retry=failed retries them)."
         )
 
 
@@ -133,68 +156,118 @@ def study_command(study: str, runs_dir: Path, storage: str | None) -> str:
     return shlex.join(words)
 
 
-def _grid(points: PointList, settings: SweepSettings) -> None:
-    if settings.dry_run:
-        outcomes = preview_points(points, settings)
-        print_rich(rich_table(grid_table(points, outcomes)))
-        seconds = estimated_seconds(outcomes, settings.workers)
-        missing = sum(outcome.state in UNFINISHED for outcome in outcomes)
-        guess = "" if seconds is None else f", about {duration(seconds)}"
-        info(f"{missing} of {len(outcomes)} points would be run{guess}.")
-        _warn_other_code(outcomes)
-        return
-    # A typing error should not cost hours of other runs.
-    outcomes = run_points(points, settings, strict=True)
-    print_rich(rich_table(group_grid(points.title, outcomes)))
-    unfinished = unfinished_grid(outcomes)
-    if unfinished.rows:
-        print_rich(rich_table(unfinished))
-    _warn_other_code(outcomes)
-    command = study_command(points.study, points.runs.runs_dir, settings.storage)
-    info(f"study {points.study}; its figures: {command}")
-    failed = [outcome for outcome in outcomes if outcome.state == "failed"]
-    if failed:
-        raise RunError(
-            f"{len(failed)} of {len(outcomes)} points failed, first {failed[0].point.label}: "
-            f"{failed[0].reason} (hydra.sweeper.retry=failed retries them)."
-        )
-
-
-def _warn_other_code(outcomes: Sequence[Outcome]) -> None:
-    line = other_code_line(outcomes)
-    if line:
-        info(line)
-
-
 def grid_table(points: PointList, outcomes: Sequence[Outcome]) -> TextTable:
     """A preview, one row per point: its label, its scores on the test split, its state."""
-    metrics = (names.MIOU, names.VAR)
+    metrics = (MIOU, VAR)
     rows = []
     for outcome in outcomes:
-        scores: Mapping[str, float] = (
-            outcome.results[0].recorded_scores() if outcome.results else {}
-        )
-        shown = [f"test/{metric}" for metric in metrics]
-        values = [number(scores[name]) if name in scores else ABSENT for name in shown]
+        scores = outcome.results[0].recorded_scores() if outcome.results else {}
+        found = [scores.get(f"test/{metric}") for metric in metrics]
+        values = [ABSENT if score is None else number(score) for score in found]
         key = outcome.keys[0] if outcome.keys else ABSENT
-        state = outcome.reason[:80] if outcome.reason else outcome.state
-        rows.append((outcome.point.label, *values, key, state))
+        rows.append((outcome.point.label, *values, key, outcome.reason[:80] or outcome.state))
     return TextTable(points.title, ("point", *metrics, "run", "state"), tuple(rows))
 
 
-def _name(experiment: str, keys: Sequence[str], identity: Any) -> str:
-    """A reproducible name: the method, the varied keys, a hash of everything."""
-    text = json.dumps(_plain(identity), sort_keys=True, default=vars)
-    digest = hashlib.sha256(text.encode()).hexdigest()[:6]
-    varied = "-".join(re.sub(r"[^\w-]", "", key.rpartition(".")[2]) for key in keys)
-    return f"{experiment}-{varied[:60]}-{digest}" if varied else f"{experiment}-{digest}"
+@dataclass(frozen=True)
+class Search:
+    """A search to run.
+
+    Attributes:
+        study: name of the study.
+        fixed: overrides that all trials share.
+        identity: signature of what must not change in a study; the data set is added to it.
+    """
+
+    study: str
+    fixed: tuple[str, ...]
+    space: Space
+    runs: RunStore
+    identity: str
 
 
-def _plain(value: Any) -> Any:
-    """`value` without the overrides that are only paths."""
-    if isinstance(value, str):
-        key = value.partition("=")[0].lstrip("+")
-        return None if key in PATHS or key.startswith("tracking.") else value
-    if isinstance(value, list | tuple):
-        return [plain for plain in map(_plain, value) if plain is not None]
-    return value
+def search(request: Search, settings: SweepSettings) -> None:
+    """Run trials until the budget is spent, then report the study.
+
+    Raises:
+        InputError: settings that do not fit, or a study of that name with another space.
+        RunError: no trial has finished.
+    """
+    if settings.trials is None and settings.hours is None:
+        raise InputError("a search needs hydra.sweeper.trials=40, hydra.sweeper.hours=8, or both.")
+    sampler, pruner = build_sampler(settings.sampler), build_pruner(settings.pruner)
+    is_reported = len(settings.objectives) == 1 and settings.objectives[0].is_reported
+    if settings.pruner is not None and not is_reported:
+        raise InputError("hydra.sweeper.pruner needs one objective that is reported, as val/mIoU.")
+    if settings.dry_run:
+        _preview(request, settings)
+        return
+    dataset = probe(request, settings).dataset
+    runs_dir = request.runs.runs_dir
+    storage = open_storage(settings.storage, runs_dir)
+    request.runs.create_tables()
+    attributes = {names.KIND: "search", names.SIGNATURE: signature(request.identity, dataset)}
+    study = open_study(request.study, storage, settings.objectives, attributes, sampler, pruner)
+    if names.COMMAND not in study.user_attrs:
+        study.set_user_attr(names.COMMAND, command_line(sys.orig_argv))
+    store = TrialStore(study, storage, Owner.this_process())
+    info(f"study {request.study}: run the same command on other machines to share it.")
+
+    def num_done() -> int:
+        return sum(trial.state.is_finished() for trial in store.trials())
+
+    view = ProgressView(request.study, settings.trials, settings.workers, num_done)
+    source = SamplerSource(request.fixed, request.space, store, Planner(), settings, view.rejected)
+    drive(view, source, store, request.runs, settings)
+
+    trials = store.trials()
+    states = Counter(trial.state.name for trial in trials)
+    for trial in [trial for trial in trials if trial.state.name == "FAIL"][:5]:
+        info(f"trial {trial.number} failed: {trial.user_attrs.get(names.REASON)}")
+    if trials and not states["COMPLETE"] and not states["RUNNING"]:
+        raise RunError(f"no trial of {request.study} has finished; see the reasons above.")
+    url = storage_url(settings.storage, runs_dir)
+    report(study, study_folder(runs_dir, request.study), request.runs.tracking, url)
+
+
+def probe(request: Search, settings: SweepSettings) -> RunSpec:
+    """The run at the lowest point of the space; the highest one is checked too.
+
+    Both refuse what the runs would: an end of a range that a setting does not accept, a missing
+    data set, or an objective that the runs do not measure.
+    """
+    planner = Planner()
+    low, high = spaces.ends(request.space)
+    lowest, highest = planner.specify((*request.fixed, *low)), specify_run((*request.fixed, *high))
+    planner.fingerprint(lowest)
+    views, trainer = lowest.consistency.values, highest.trainer
+    measured = views["splits"] if views["sets"] else ()
+    is_validated = trainer.tested == "best" or highest.dataset.build().has(trainer.selection_split)
+    for objective in settings.objectives:
+        split = objective.metric.partition("/")[0]
+        if split == "val" and not is_validated:
+            what = (
+                f"the data set has no {trainer.selection_split}; hold images out, or use test/..."
+            )
+            raise InputError(f"objective '{objective.metric}': {what}")
+        if objective.is_consistency and split not in measured:
+            what = f"not measured; add consistency=views and {split} to consistency.splits."
+            raise InputError(f"objective '{objective.metric}': {what}")
+    return lowest
+
+
+def _preview(request: Search, settings: SweepSettings) -> None:
+    """Print what would be searched and the existing trials; write nothing."""
+    study = find_study(request.study, settings.storage, request.runs.runs_dir)
+    trials = [] if study is None else counted_trials(study)
+    states = Counter(trial.state.name.lower() for trial in trials)
+    lines = [
+        f"study {request.study}: {dict(states) or 'not started'}",
+        *(f"  {key}: {one}" for key, one in request.space.items()),
+        *(f"  {objective.direction} {objective.metric}" for objective in settings.objectives),
+        f"  python -m rgbt.run {command_line(request.fixed)} ...",
+    ]
+    if settings.trials is not None:
+        left = max(0, settings.trials - len(trials))
+        lines.append(f"{left} of {settings.trials} trials would be run.")
+    sys.stdout.write("\n".join([*lines, ""]))

@@ -46,7 +46,11 @@ COMMAND = {"config", "data"}
 """What a module of a room that is a command itself may import too."""
 
 ROOMS = {
-    **{"sweeps.worker": {"sweeps.space"}, "sweeps.space": set(), "sweeps.report": set()},
+    **{
+        "sweeps.worker": {"sweeps.space"},
+        "sweeps.space": set(),
+        "sweeps.report": {"sweeps.worker"},
+    },
     **{"sweeps.table": {"sweeps.worker"}, "sweeps.verdicts": {"sweeps.table", "sweeps.worker"}},
     "sweeps.rendering": {f"sweeps.{each}" for each in ("table", "worker", "report", "verdicts")},
     **{"analysis.statistics": set(), "analysis.predictions": set(), "analysis.uncertainty": set()},

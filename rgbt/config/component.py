@@ -5,6 +5,7 @@ The schema of a node is the constructor that its ``_target_`` names, with ranges
 
 from __future__ import annotations
 
+import collections.abc
 import functools
 import inspect
 import typing
@@ -152,7 +153,17 @@ def _partial(target: str) -> functools.partial[Any]:
 
 @functools.cache
 def setting_types(target: Any) -> dict[str, Any]:
-    """Types of a constructor's settings with their ranges, by key."""
+    """Types of a constructor's settings with their ranges, by key.
+
+    A name that its module imports for a type checker only, as Optuna's do, is any type.
+    """
     function = target.__init__ if inspect.isclass(target) else target
-    hints = typing.get_type_hints(function, include_extras=True)
-    return {key: each for key, each in hints.items() if key != "return"}
+    absent: dict[str, Any] = {}
+    while True:
+        try:
+            hints = typing.get_type_hints(function, localns=absent, include_extras=True)
+        except NameError as error:
+            name = str(error.name)
+            absent[name] = getattr(collections.abc, name, Any)
+        else:
+            return {key: each for key, each in hints.items() if key != "return"}

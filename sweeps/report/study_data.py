@@ -14,6 +14,7 @@ import numpy as np
 
 from rgbt.config.compose import PIXELS, with_pixels
 from sweeps import attributes
+from sweeps.worker.trial_store import counted_trials
 
 if TYPE_CHECKING:
     import optuna
@@ -38,7 +39,7 @@ class StudyData:
         kind: "search", "grid" or "list".
         metrics: names of the objectives.
         maximize: whether more is better, by objective.
-        trials: by number, without dropped duplicates.
+        trials: those that count, by number.
         command: that created the study, or "".
     """
 
@@ -76,16 +77,20 @@ class StudyData:
     @cached_property
     def front(self) -> list[FrozenTrial]:
         """The Pareto front, best first objective first; with one objective its best trials."""
-        import optuna
-
         if not self.complete:
             return []
-        study = optuna.create_study(
-            directions=["maximize" if up else "minimize" for up in self.maximize]
-        )
-        study.add_trials(self.complete)
-        # The copy has the complete trials alone, so that its numbers are indices of our list.
-        return sorted((self.complete[best.number] for best in study.best_trials), key=self.rank)
+        # The complete trials come first in the copy: its numbers are indices of our list.
+        best = self.in_memory().best_trials
+        return sorted((self.complete[each.number] for each in best), key=self.rank)
+
+    def in_memory(self) -> optuna.Study:
+        """The complete trials, then the pruned ones, in memory and numbered anew."""
+        import optuna
+
+        ways = (optuna.study.StudyDirection.MINIMIZE, optuna.study.StudyDirection.MAXIMIZE)
+        study = optuna.create_study(directions=[ways[up] for up in self.maximize])
+        study.add_trials([*self.complete, *self.of_state("PRUNED")])
+        return study
 
     @cached_property
     def latest(self) -> list[FrozenTrial]:
@@ -147,20 +152,14 @@ def read(study: optuna.Study) -> StudyData:
     names = notes.get(attributes.METRICS) or study.metric_names
     count = len(study.directions)
     metrics = tuple(names or (f"objective {index + 1}" for index in range(count)))
-    trials = study.get_trials(deepcopy=False)
     return StudyData(
         name=study.study_name,
         kind=str(notes.get(attributes.KIND, "search")),
         metrics=metrics,
         maximize=tuple(direction.name == "MAXIMIZE" for direction in study.directions),
-        trials=tuple(t for t in trials if not t.user_attrs.get(attributes.DROPPED)),
+        trials=tuple(counted_trials(study)),
         command=str(notes.get(attributes.COMMAND, "")),
     )
-
-
-def used_parameters(data: StudyData) -> list[str]:
-    """Parameters that some complete trial has."""
-    return [n for n in data.distributions if any(n in trial.params for trial in data.complete)]
 
 
 def short_names(names: Collection[str]) -> dict[str, str]:

@@ -1,170 +1,113 @@
-"""Samplers and pruners of a search.
-
-Options are those of Optuna's constructors, as far as a YAML file can hold them.
-"""
+"""Samplers and pruners of a search: nodes such as ``{_target_: optuna.samplers.TPESampler}``."""
 
 from __future__ import annotations
 
-import importlib.util
-import inspect
-from collections.abc import Mapping
-from functools import partial
-from typing import TYPE_CHECKING, Any
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
-from rgbt.checks import InputError, check_choice, nearest
+from optuna.distributions import BaseDistribution
+from optuna.pruners import BasePruner
+from optuna.samplers import BaseSampler
+from optuna.study import Study
+from optuna.trial import FrozenTrial, TrialState
 
-if TYPE_CHECKING:
-    from optuna.pruners import BasePruner
+from rgbt.checks import check_choice
+from sweeps.space.space import build_optuna
 
-    from sweeps.space.per_trial import PerTrialSampler
+SAMPLERS = [f"optuna.samplers.{n}Sampler" for n in ("TPE", "Random", "GP", "NSGAII")]
+"""Samplers without state outside the storage: others (QMC, grid, brute force) keep a counter or
+stop the study, which neither several drivers nor a resumed search can share."""
 
-SAMPLERS = {
-    "tpe": "TPESampler",
-    "random": "RandomSampler",
-    "gp": "GPSampler",
-    "nsga2": "NSGAIISampler",
-    "cmaes": "CmaEsSampler",
-}
-"""Samplers without state outside the storage: the others (QMC, grid, brute force) keep a counter,
-which neither several drivers nor a resumed search can share. nsga2 crosses earlier points
-and may propose one of them again."""
-
-PRUNERS = {
-    "none": "NopPruner",
-    "median": "MedianPruner",
-    "percentile": "PercentilePruner",
-    "successive_halving": "SuccessiveHalvingPruner",
-    "hyperband": "HyperbandPruner",
-    "patient": "PatientPruner",
-}
-"""Pruners of a curve over steps of the optimizer. `patient` stops a trial that has not risen for
-`patience` reports, whatever the other trials do."""
-
-PLAIN: dict[str, Any] = {
-    "int": int,
-    "float": float,
-    "bool": bool,
-    "int | None": int | None,
-    "float | None": float | None,
-    "bool | None": bool | None,
-    "str | int": str | int,
-}
-"""Types of options that a YAML file can hold."""
-
-NOT_OPTIONS = (
-    "seed",
-    *("consider_prior", "prior_weight", "consider_magic_clip", "consider_endpoints"),
-    *("sigma0", "inc_popsize"),
-)
-"""The seed has its own key; Optuna 6 drops the others."""
+PRUNERS = [
+    f"optuna.pruners.{name}Pruner"
+    for name in ("Nop", "Median", "Percentile", "SuccessiveHalving", "Hyperband", "Patient")
+]
 
 
-def build_sampler(node: Mapping[str, Any], objectives: int = 1) -> PerTrialSampler:
+class PerTrialSampler(BaseSampler):
+    """Draws of a trial follow from the seed and the number of the trial, and the trials before it.
+
+    Optuna's samplers draw from one generator for all trials: two drivers with one seed, or a search
+    that is resumed, would propose the same points again. Here every trial draws by its own number
+    in the storage. No two trials share draws, and one worker repeats a search exactly, even if it
+    was stopped and resumed.
+
+    Args:
+        make: the sampler that chooses, from a seed; it keeps nothing outside the storage.
+        seed: of the search.
+    """
+
+    def __init__(self, make: Callable[[int], BaseSampler], seed: int) -> None:
+        self.make = make
+        self.seed = seed
+        self._inner: dict[int, BaseSampler] = {}
+
+    def before_trial(self, study: Study, trial: FrozenTrial) -> None:
+        """Begin a trial, also one that another process began and this one resumes."""
+        self._inner[trial.number] = self.make(trial_seed(self.seed, trial.number))
+        self._inner[trial.number].before_trial(study, trial)
+
+    def infer_relative_search_space(
+        self, study: Study, trial: FrozenTrial
+    ) -> dict[str, BaseDistribution]:
+        """See `BaseSampler`."""
+        return self._of(trial).infer_relative_search_space(study, trial)
+
+    def sample_relative(
+        self, study: Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]
+    ) -> dict[str, Any]:
+        """See `BaseSampler`."""
+        return self._of(trial).sample_relative(study, trial, search_space)
+
+    def sample_independent(
+        self, study: Study, trial: FrozenTrial, param_name: str, param_distribution: Any
+    ) -> Any:
+        """See `BaseSampler`."""
+        return self._of(trial).sample_independent(study, trial, param_name, param_distribution)
+
+    def after_trial(
+        self, study: Study, trial: FrozenTrial, state: TrialState, values: Sequence[float] | None
+    ) -> None:
+        """End a trial; one that this process never began is ended all the same."""
+        self._of(trial).after_trial(study, trial, state, values)
+        self._inner.pop(trial.number, None)
+
+    def _of(self, trial: FrozenTrial) -> BaseSampler:
+        return self._inner.get(trial.number) or self.make(trial_seed(self.seed, trial.number))
+
+
+def trial_seed(seed: int, number: int) -> int:
+    """32-bit seed that depends on both arguments (SHA-256), the same on every machine."""
+    digest = hashlib.sha256(f"{seed}:trial:{number}".encode()).digest()
+    return int.from_bytes(digest[:4], "big")
+
+
+def build_sampler(node: Mapping[str, Any]) -> PerTrialSampler:
     """The sampler of a search.
 
     Args:
-        node: its kind, one of `SAMPLERS`; its seed: one worker with the same seed proposes the same
-            points, see `PerTrialSampler`; options of Optuna's constructor.
-        objectives: how many numbers the search follows.
-
-    Raises:
-        InputError: unknown kind or option, an option of a wrong type or value, a missing package,
-            or a sampler that cannot follow so many objectives.
+        node: with `_target_`, one of `SAMPLERS`, and options of its constructor; one worker with
+            the same `seed` (0 if it has none) proposes the same points, see `PerTrialSampler`.
     """
-    import optuna
+    path = "hydra.sweeper.sampler"
+    check_choice(f"{path}._target_", str(node.get("_target_")), SAMPLERS)
+    build_optuna(node, path)
 
-    from sweeps.space.per_trial import PerTrialSampler
-
-    kind, options = _kind("sampler", node, SAMPLERS)
-    seed = options.pop("seed", 0)
-    if not isinstance(seed, int):
-        raise InputError(f"hydra.sweeper.sampler.seed: expected a whole number, got {seed}.")
-    if kind == "cmaes" and importlib.util.find_spec("cmaes") is None:
-        raise InputError("sampler.kind=cmaes needs the package cmaes; run `pip install cmaes`.")
-    if kind == "cmaes" and objectives > 1:
-        raise InputError(
-            f"sampler.kind=cmaes supports one objective, but this search has {objectives}; "
-            "choose tpe, gp or nsga2."
-        )
-    make = getattr(optuna.samplers, SAMPLERS[kind])
-    _check_options("sampler", kind, make, options)
-
-    def seeded(trial_seed: int) -> optuna.samplers.BaseSampler:
-        sampler: optuna.samplers.BaseSampler = make(**options, seed=trial_seed)
-        return sampler
-
-    _construct("sampler", kind, partial(seeded, 0))
-    return PerTrialSampler(seeded, seed)
+    return PerTrialSampler(lambda seed: build_optuna(node, path, seed=seed), node.get("seed") or 0)
 
 
-def build_pruner(node: Mapping[str, Any] | None, objectives: int = 1) -> BasePruner:
+def build_pruner(node: Mapping[str, Any] | None) -> BasePruner:
     """The pruner of a search; trials report at their validation steps.
 
     Args:
-        node: its kind, one of `PRUNERS`, and options of Optuna's constructor; None: no pruner.
+        node: with `_target_`, one of `PRUNERS`, and options of its constructor; None: no pruner.
             Those that count steps (``n_warmup_steps``, ``min_resource``) count steps of the
             optimizer, not validations.
-        objectives: how many numbers the search follows.
-
-    Raises:
-        InputError: unknown kind or option, an option of a wrong type or value or without one, or
-            more than one objective.
     """
-    import optuna
-
-    kind, options = _kind("pruner", {"kind": "none"} if node is None else node, PRUNERS)
-    if kind != "none" and objectives > 1:
-        raise InputError(
-            f"pruner.kind={kind} compares trials by one number, but this search has {objectives} "
-            "objectives; set hydra.sweeper.pruner=null or use one objective."
-        )
-    options.pop("seed", None)
-    make = getattr(optuna.pruners, PRUNERS[kind])
-    fixed = {"wrapped_pruner": None} if kind == "patient" else {}
-    _check_options("pruner", kind, make, options)
-    pruner: BasePruner = _construct("pruner", kind, partial(make, **fixed, **options))
+    path, node = "hydra.sweeper.pruner", node or {"_target_": "optuna.pruners.NopPruner"}
+    check_choice(f"{path}._target_", str(node.get("_target_")), PRUNERS)
+    # A patient pruner may wrap another one, which the node then holds.
+    alone = {} if "wrapped_pruner" in node else {"wrapped_pruner": None}
+    pruner: BasePruner = build_optuna(node, path, **alone)
     return pruner
-
-
-def _kind(
-    what: str, node: Mapping[str, Any], known: Mapping[str, str]
-) -> tuple[str, dict[str, Any]]:
-    options = dict(node)
-    if "kind" not in options:
-        raise InputError(
-            f"hydra.sweeper.{what}: 'kind' has no value; give one, such as {{kind: tpe}}."
-        )
-    kind = str(options.pop("kind"))
-    check_choice(f"{what}.kind", kind, known)
-    return kind, options
-
-
-def _check_options(what: str, kind: str, make: Any, given: Mapping[str, Any]) -> None:
-    """Refuse options that are not in the signature of `make`, or of another type."""
-    import pydantic
-
-    parameters = inspect.signature(make).parameters
-    types = {name: one.annotation for name, one in parameters.items() if name not in NOT_OPTIONS}
-    words = {n: t if isinstance(t, str) else getattr(t, "__name__", "") for n, t in types.items()}
-    known = {name: PLAIN[word] for name, word in words.items() if word in PLAIN}
-    for name in known:
-        if parameters[name].default is inspect.Parameter.empty and name not in given:
-            raise InputError(f"{what}.kind={kind} needs the option '{name}'; set {what}.{name}.")
-    for name, value in given.items():
-        if name not in known:
-            hint = nearest(name, known) if known else "it has none"
-            raise InputError(f"{what}.{name} is not an option of kind {kind}; {hint}.")
-        try:
-            pydantic.TypeAdapter(known[name]).validate_python(value, strict=True)
-        except pydantic.ValidationError as error:
-            wanted = words[name].replace("None", "null")
-            raise InputError(f"{what}.{name}: expected {wanted}, got {value!r}.") from error
-
-
-def _construct(what: str, kind: str, make: partial[Any]) -> Any:
-    """Call `make`; values that Optuna itself refuses are the user's mistake."""
-    try:
-        return make()
-    except ValueError as error:
-        reason = str(error).rstrip(".")
-        raise InputError(f"{what}.kind={kind} does not accept these options: {reason}.") from error

@@ -1,235 +1,100 @@
-"""Search spaces: read from a file, sampled by Optuna, passed to Hydra as overrides.
+"""What a sweep varies: points of a grid or a list, and ranges of a search, as overrides of Hydra.
 
-A space maps keys of the configuration to their ranges or choices, as in ``conf/search``::
+A space maps keys of the configuration to `optuna.distributions`, as in ``conf/search``::
 
     masker.sigma_div: {type: float, low: 0.5, high: 32, log: true}
     masker.patch_size: {type: categorical, choices: ["${px:8}", "${px:64}"]}
-    loss: {type: categorical, choices: [set_criterion, set_criterion_spatial]}
-    loss.spatial.alpha: {type: float, low: 0, high: 3, when: {loss: set_criterion_spatial}}
 """
 
 from __future__ import annotations
 
 import hashlib
-import json
-import math
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from decimal import Decimal
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
 
+from hydra.core.config_loader import ConfigLoader
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import OverrideType, Quote, QuotedString
+from hydra.core.override_parser.types import IntervalSweep, Override, Quote, QuotedString
 from hydra.errors import HydraException
-from omegaconf import OmegaConf
+from optuna import distributions as kinds
+from optuna.trial import BaseTrial
 
-from rgbt.checks import InputError, nearest
+from rgbt.checks import InputError, check_choice, one_line
+from rgbt.config.component import Component
+from rgbt.config.values import check_value
+from sweeps.point import Value
 
-if TYPE_CHECKING:
-    from optuna.trial import BaseTrial
+Distribution = kinds.FloatDistribution | kinds.IntDistribution | kinds.CategoricalDistribution
+Space = Mapping[str, Distribution]
+"""Key of the configuration (dotted, or a group such as ``loss``) -> what Optuna samples."""
 
-Choice = str | int | float | bool | None | tuple["Choice", ...]
-"""What a parameter can be; lists of the file are tuples here."""
-
-_RANGE = ("type", "low", "high", "step", "log", "when")
-KEYS = {"float": _RANGE, "int": _RANGE, "categorical": ("type", "choices", "when")}
-"""Keys of an entry, by its type."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Parameter:
-    """One entry of a space.
-
-    Attributes:
-        key: of the configuration: dotted, or a group such as ``loss``; as before ``=``.
-        type: "float", "int" or "categorical".
-        low: smallest value of a number.
-        high: largest value of a number, itself possible.
-        step: distance of the possible numbers; None: any float, every int.
-        log: sampled uniformly on a logarithmic scale.
-        choices: of a categorical, at least one.
-        when: (earlier key, its values): all must hold, else the parameter is not suggested.
-    """
-
-    key: str
-    type: str
-    low: float = 0.0
-    high: float = 0.0
-    step: float | None = None
-    log: bool = False
-    choices: tuple[Choice, ...] = ()
-    when: tuple[tuple[str, tuple[Choice, ...]], ...] = ()
-
-    def __str__(self) -> str:
-        """As shown: "masker.sigma_div: 0.5 to 32, logarithmic"."""
-        if self.choices:
-            words = ["one of " + " ".join(map(str, self.choices))]
-        else:
-            words = [f"{self.low:g} to {self.high:g}"]
-            words += [] if self.step is None else [f"in steps of {self.step:g}"]
-            words += ["logarithmic"] if self.log else []
-        words += [f"when {key} is {' or '.join(map(str, wanted))}" for key, wanted in self.when]
-        return f"{self.key}: {', '.join(words)}"
+TYPES = {"float": "Float", "int": "Int", "categorical": "Categorical"}
+"""Type of an entry -> beginning of the name of its distribution."""
 
 
-def parse_space(space: Mapping[str, Any]) -> tuple[Parameter, ...]:
-    """The parameters of a space, in the order of the file.
+def parse_space(entries: Mapping[str, Mapping[str, Any]]) -> Space:
+    """The distributions of a space, in the order of the file.
 
     Args:
-        space: key -> mapping with the keys of `KEYS`; ``when`` maps earlier keys to a value or a
-            list of values. Interpolations are kept as text: ``${px:64}`` is resolved by the run
-            that gets it.
+        entries: key -> type (of `TYPES`) and arguments of the distribution. Interpolations are kept
+            as text: ``${px:64}`` is resolved by the run that gets it. A list among the choices is
+            text too, because Optuna's storages hold plain values.
 
     Raises:
-        InputError: the first mistake: an unknown type or key, a range that is none, no choices, a
-            condition on a parameter that is not above it.
+        InputError: what the distribution refuses, or choices that Optuna takes for equal.
     """
-    parameters: dict[str, Parameter] = {}
-    for name, entry in plain_space(space).items():
-        key = str(name)
-        if not _is_key(key):
-            raise _wrong(key, "expected a key such as masker.sigma_div")
-        if not isinstance(entry, Mapping):
-            example = "{type: float, low: 0, high: 1}"
-            raise _wrong(key, f"expected a mapping such as {example}, got {entry!r}")
-        kind = str(entry.get("type"))
-        if kind not in KEYS:
-            raise _wrong(key, f"type '{kind}' is unknown; {nearest(kind, KEYS)}")
-        for word in map(str, entry):
-            if word not in KEYS[kind]:
-                raise _wrong(
-                    key, f"'{word}' is not a key of type {kind}; {nearest(word, KEYS[kind])}"
-                )
-        values = _choices(key, entry) if kind == "categorical" else _range(key, kind, entry)
-        when = _conditions(key, entry.get("when") or {}, parameters)
-        parameters[key] = Parameter(key=key, type=kind, when=when, **values)
-    return tuple(parameters.values())
+    space: dict[str, Distribution] = {}
+    for key, entry in entries.items():
+        path = f"hydra.sweeper.space.{key}"
+        options = dict(entry)
+        kind = str(options.pop("type", None))
+        check_choice(f"{path}.type", kind, TYPES)
+        if "choices" in options:
+            choices = check_value(f"{path}.choices", options["choices"], list[Any])
+            choices = [_text(one) if isinstance(one, list) else one for one in choices]
+            # Optuna compares by ==, for which 1, 1.0 and true are equal: it would run another one.
+            twice = [one for place, one in enumerate(choices) if one in choices[:place]]
+            if twice:
+                raise InputError(f"'{path}.choices': {twice[0]!r} equals another choice.")
+            options["choices"] = choices
+        target = f"optuna.distributions.{TYPES[kind]}Distribution"
+        space[key] = build_optuna({"_target_": target, **options}, path)
+    return space
 
 
-def plain_space(space: Mapping[str, Any]) -> dict[str, Any]:
-    """`space` without OmegaConf's containers, interpolations as text."""
-    whole = OmegaConf.to_container(space) if OmegaConf.is_config(space) else space
-    assert isinstance(whole, Mapping)
-    return dict(whole)
-
-
-def _wrong(key: str, what: str) -> InputError:
-    return InputError(f"search space, '{key}': {what}.")
-
-
-def _is_key(key: str) -> bool:
+def build_optuna(node: Mapping[str, Any], path: str, **collaborators: Any) -> Any:
+    """The object of a node of Optuna; what the constructor refuses is an InputError with `path`."""
     try:
-        override = OverridesParser.create().parse_override(f"{key}=1")
-    except HydraException:
-        return False
-    return bool(key) and override.type != OverrideType.DEL and override.get_key_element() == key
+        return Component.from_node(node, path).build(**collaborators)
+    except InputError:
+        raise
+    except ValueError as error:
+        raise InputError(f"'{path}': {one_line(error)}.") from error
 
 
-def _range(key: str, kind: str, entry: Mapping[str, Any]) -> dict[str, Any]:
-    log = entry.get("log", False)
-    if not isinstance(log, bool):
-        raise _wrong(key, f"log must be true or false, got {log!r}")
-    low, high = (_number(key, kind, end, entry.get(end)) for end in ("low", "high"))
-    if low > high:
-        raise _wrong(key, f"low={low} is greater than high={high}; exchange them")
-    if log and low <= 0:
-        raise _wrong(key, f"low={low} has no logarithm; with log: true it must be positive")
-    step = entry.get("step")
-    if step is not None:
-        step = _number(key, kind, "step", step)
-        if log:
-            raise _wrong(key, "step and log: true exclude each other; use one of them")
-        if step <= 0:
-            raise _wrong(key, f"step must be positive, got {step}")
-        first, last = Decimal(str(entry["low"])), Decimal(str(entry["high"]))
-        if (last - first) % Decimal(str(step)):
-            raise _wrong(
-                key, f"high={last} is not a whole number of steps of {step} above low={first}"
-            )
-    return {"low": low, "high": high, "log": log, "step": step}
-
-
-def _number(key: str, kind: str, name: str, value: Any) -> float:
-    is_whole = isinstance(value, int) and not isinstance(value, bool)
-    if kind == "int" and is_whole:
-        return int(value)
-    if kind == "float" and (is_whole or isinstance(value, float)) and math.isfinite(value):
-        return float(value)
-    raise _wrong(key, f"{name} must be a finite {kind}, got {value!r}")
-
-
-def _choices(key: str, entry: Mapping[str, Any]) -> dict[str, Any]:
-    given = entry.get("choices")
-    if not isinstance(given, list | tuple) or not given:
-        raise _wrong(key, f"choices must be a list of at least one value, got {given!r}")
-    choices = tuple(_choice(key, item) for item in given)
-    # Optuna compares values by ==, for which 1, 1.0 and true are equal.
-    twice = [choice for place, choice in enumerate(choices) if choice in choices[:place]]
-    if twice:
-        raise _wrong(key, f"choices contain {twice[0]!r} twice, or a value that equals it")
-    return {"choices": choices}
-
-
-def _choice(key: str, value: Any) -> Choice:
-    if isinstance(value, list | tuple):
-        return tuple(_choice(key, item) for item in value)
-    if isinstance(value, float) and not math.isfinite(value):
-        raise _wrong(key, f"a choice must be finite, got {value}")
-    if value is None or isinstance(value, str | int | float):
-        return value
-    raise _wrong(key, f"a choice is a plain value or a list of them, got {value!r}")
-
-
-def _conditions(
-    key: str, given: Any, earlier: Mapping[str, Parameter]
-) -> tuple[tuple[str, tuple[Choice, ...]], ...]:
-    """The conditions of an entry; one that can never hold is refused."""
-    if not isinstance(given, Mapping):
-        raise _wrong(key, f"when must be a mapping such as {{loss: set_criterion}}, got {given!r}")
-    conditions = []
-    for name, wanted in given.items():
-        if name not in earlier:
-            known = nearest(name, earlier)
-            raise _wrong(key, f"when: '{name}' is not a parameter above it; {known}")
-        other = earlier[name]
-        alternatives = wanted if isinstance(wanted, list | tuple) else [wanted]
-        values = tuple(_choice(key, item) for item in alternatives)
-        for value in values:
-            if other.type == "float":
-                raise _wrong(
-                    key, f"when: '{name}' is a float, which almost never equals a given value"
-                )
-            if other.type == "categorical" and value not in other.choices:
-                known = nearest(str(value), map(str, other.choices))
-                raise _wrong(key, f"when: '{name}' is never {value!r}; {known}")
-            is_inside = isinstance(value, int) and other.low <= value <= other.high
-            if other.type == "int" and not is_inside:
-                between = f"an int from {other.low} to {other.high}"
-                raise _wrong(key, f"when: '{name}' is never {value!r} but {between}")
-        conditions.append((str(name), values))
-    return tuple(conditions)
-
-
-def suggest(trial: BaseTrial, parameters: tuple[Parameter, ...]) -> dict[str, Choice]:
-    """Values of a trial, by key: of those parameters whose conditions hold.
-
-    Optuna gets lists among the choices as text, because its storages hold plain values.
-    """
-    values: dict[str, Choice] = {}
-    for each in parameters:
-        if not all(key in values and values[key] in wanted for key, wanted in each.when):
-            continue
-        key, low, high, step = each.key, each.low, each.high, each.step
-        if each.type == "float":
-            values[key] = trial.suggest_float(key, low, high, step=step, log=each.log)
-        elif each.type == "int":
-            whole = int(step or 1)
-            values[key] = trial.suggest_int(key, int(low), int(high), step=whole, log=each.log)
+def suggest(trial: BaseTrial, space: Space) -> dict[str, Any]:
+    """Values of a trial, by key."""
+    values: dict[str, Any] = {}
+    for key, one in space.items():
+        if isinstance(one, kinds.CategoricalDistribution):
+            values[key] = trial.suggest_categorical(key, one.choices)
+        elif isinstance(one, kinds.IntDistribution):
+            values[key] = trial.suggest_int(key, one.low, one.high, step=one.step, log=one.log)
         else:
-            labels = [_text(one) if isinstance(one, tuple) else one for one in each.choices]
-            chosen = trial.suggest_categorical(key, tuple(labels))
-            values[key] = dict(zip(labels, each.choices, strict=True))[chosen]
+            values[key] = trial.suggest_float(key, one.low, one.high, step=one.step, log=one.log)
     return values
+
+
+def ends(space: Space) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Overrides of the lowest and the highest point; of choices the first and the last."""
+    ranges = {
+        key: one.choices if isinstance(one, kinds.CategoricalDistribution) else (one.low, one.high)
+        for key, one in space.items()
+    }
+    first, last = ({key: each[place] for key, each in ranges.items()} for place in (0, -1))
+    return as_overrides(first), as_overrides(last)
 
 
 def as_overrides(params: Mapping[str, Any]) -> tuple[str, ...]:
@@ -237,7 +102,7 @@ def as_overrides(params: Mapping[str, Any]) -> tuple[str, ...]:
 
     Args:
         params: None, booleans, numbers, texts or lists of these, by key. Text with an
-            interpolation is passed on as it is.
+            interpolation, and text of a list ("[48,64]"), is passed on as it is.
     """
     return tuple(f"{key}={_text(value)}" for key, value in params.items())
 
@@ -249,8 +114,10 @@ def _text(value: Any) -> str:
         return str(value).lower()
     if isinstance(value, int | float):
         return repr(value)
-    if isinstance(value, list | tuple):
+    if isinstance(value, list):
         return "[" + ",".join(_text(item) for item in value) + "]"
+    if value.startswith("[") and value.endswith("]"):
+        return str(value)
     try:  # whether the grammar takes the bare text as this very text, also inside a list
         is_read_back = OverridesParser.create().parse_override(f"x=[{value}]").value() == [value]
     except HydraException:
@@ -258,13 +125,154 @@ def _text(value: Any) -> str:
     return value if is_read_back else QuotedString(text=value, quote=Quote.single).with_quotes()
 
 
-def signature(parameters: tuple[Parameter, ...], *more: Any) -> str:
-    """Hash of a space (12 hexadecimal digits), independent of the order of its parameters.
+def signature(*parts: Any) -> str:
+    """Hash of what makes a study (12 hexadecimal digits): plain values, dataclasses."""
+    return hashlib.sha256(repr(parts).encode()).hexdigest()[:12]
+
+
+SweptValues = dict[str, list[str]]
+"""Key -> values of an override, as they may stand after ``=``."""
+
+
+@dataclass(frozen=True)
+class GridPoint:
+    """One point of a grid or a list.
+
+    Attributes:
+        params: varied keys -> values as Hydra reads them, lists and mappings as they were typed.
+        overrides: all that make it, the fixed ones first.
+    """
+
+    params: Mapping[str, Value]
+    overrides: tuple[str, ...]
+
+
+def split(
+    overrides: Iterable[str], config_loader: ConfigLoader
+) -> tuple[tuple[str, ...], SweptValues, dict[str, dict[str, Any]]]:
+    """Split the overrides of ``-m`` into single values, lists of values, and ranges.
+
+    Like in Hydra's own sweeper, a repeated key keeps its first position and its last value.
 
     Args:
-        parameters: the space.
-        more: other constants of a study, such as its objectives: plain values, dataclasses.
+        overrides: as typed, e.g. ``["+experiment=grbm", "masker.sigma_div=1,2", "seed=0,1"]``.
+        config_loader: answers ``model=glob(*)``.
+
+    Returns:
+        fixed overrides as typed; swept: key (with its ``+``) -> values; intervals: key -> entry of
+        a search space, ``tag(log, interval(1, 8))`` on a logarithmic scale and
+        ``int(interval(1, 8))`` in whole numbers.
+
+    Raises:
+        InputError: a sweep without values, a tag that means nothing.
     """
-    ordered = sorted((asdict(parameter) for parameter in parameters), key=lambda one: one["key"])
-    text = json.dumps([ordered, more], sort_keys=True, default=asdict)
-    return hashlib.sha256(text.encode()).hexdigest()[:12]
+    fixed: list[str] = []
+    swept: SweptValues = {}
+    intervals: dict[str, dict[str, Any]] = {}
+    parsed = OverridesParser.create(config_loader).parse_overrides(list(overrides))
+    for key, override in {one.get_key_element(): one for one in parsed}.items():
+        value = override.value()
+        if not override.is_sweep_override():
+            fixed.append(str(override.input_line))
+        elif isinstance(value, IntervalSweep):
+            if value.tags - {"log"}:
+                raise InputError(f"'{override.input_line}': the only tag of an interval is log.")
+            # Hydra's interval leaves out its end, which an entry of a space takes in.
+            whole = isinstance(value.start, int) and isinstance(value.end, int)
+            ends = {"low": value.start, "high": value.end}
+            kind = "int" if whole else "float"
+            intervals[key] = {"type": kind, **ends, "log": "log" in value.tags}
+        else:
+            swept[key] = list(override.sweep_string_iterator())
+            if not swept[key]:
+                raise InputError(f"'{override.input_line}' has no values; widen it.")
+    return tuple(fixed), swept, intervals
+
+
+def grid_points(fixed: Sequence[str], swept: SweptValues) -> list[GridPoint]:
+    """All combinations, in Hydra's order: the last key changes fastest.
+
+    Args:
+        fixed: overrides of every point.
+        swept: as `split` returns it; empty: the one point that `fixed` makes.
+    """
+    return [
+        _point(fixed, [f"{key}={value}" for key, value in zip(swept, values, strict=True)])
+        for values in product(*swept.values())
+    ]
+
+
+def list_points(points: Sequence[Sequence[str]], fixed: Sequence[str]) -> list[GridPoint]:
+    """Points written out one by one, so that values vary together (Hydra's issue 3082).
+
+    Args:
+        points: the overrides of each.
+        fixed: overrides of every point; a point's own override of the same key has priority.
+    """
+    taken = [{key_of(word) for word in own} for own in points]
+    return [
+        _point([word for word in fixed if key_of(word) not in keys], own)
+        for own, keys in zip(points, taken, strict=True)
+    ]
+
+
+def key_of(override: str) -> str:
+    """Key of an override as typed."""
+    return override.partition("=")[0].lstrip("+~")
+
+
+def distributions(points: Sequence[GridPoint]) -> dict[str, kinds.BaseDistribution]:
+    """Distributions of the parameters of a grid or a list, for Optuna's figures.
+
+    Numbers are ranges, which may grow in a study; other choices may not.
+    """
+    found: dict[str, kinds.BaseDistribution] = {}
+    for key in dict.fromkeys(key for point in points for key in point.params):
+        seen: list[Any] = [point.params[key] for point in points if key in point.params]
+        types = {type(value) for value in seen}
+        if types <= {int, float}:
+            make = kinds.IntDistribution if types == {int} else kinds.FloatDistribution
+            found[key] = make(min(seen), max(seen))
+        else:
+            found[key] = kinds.CategoricalDistribution(tuple(dict.fromkeys(seen)))
+    return found
+
+
+def merge_space(
+    entries: Mapping[str, Mapping[str, Any]],
+    fixed: Sequence[str],
+    swept: SweptValues,
+    intervals: Mapping[str, Mapping[str, Any]],
+) -> Space:
+    """The space of a search; the command line has priority for every key.
+
+    Args:
+        entries: as in ``conf/search``.
+        fixed: overrides as typed; one for a key of `entries` takes it out of the search.
+        swept: key -> values; they are the choices of the key.
+        intervals: key -> entry of a space, in the place of the one in `entries`.
+    """
+    merged = dict(entries)
+    for key, texts in swept.items():
+        choices = [one.value() for one in _parsed(f"{key}={text}" for text in texts)]
+        merged[key] = {"type": "categorical", "choices": choices}
+    merged.update(intervals)
+    keys = {one.get_key_element() for one in _parsed(fixed)}
+    return parse_space({key: entry for key, entry in merged.items() if key not in keys})
+
+
+def _parsed(overrides: Iterable[str]) -> list[Override]:
+    return OverridesParser.create().parse_overrides(list(overrides))
+
+
+def _point(fixed: Sequence[str], own: Sequence[str]) -> GridPoint:
+    params: dict[str, Value] = {}
+    for override in (one for one in _parsed(own) if not one.is_delete()):
+        value = override.value()
+        if override.is_sweep_override():
+            raise InputError(f"hydra.sweeper.points: '{override.input_line}' is not one value.")
+        if value is None or isinstance(value, str | int | float):
+            params[override.get_key_element()] = value
+        else:
+            params[override.get_key_element()] = override.get_value_element_as_str()
+    return GridPoint(params, (*fixed, *own))

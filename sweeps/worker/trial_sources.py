@@ -25,7 +25,7 @@ from sweeps.worker.trial_store import TrialStore
 if TYPE_CHECKING:
     from optuna.trial import FrozenTrial, Trial
 
-    from sweeps.space.space import Parameter
+    from sweeps.space.space import Space
 
 PAUSE_S = 5.0
 """How long a search waits after a point that is being run already."""
@@ -228,7 +228,7 @@ class SamplerSource:
     """
 
     fixed: Sequence[str]
-    parameters: tuple[Parameter, ...]
+    space: Space
     store: TrialStore
     planner: Planner
     settings: SweepSettings
@@ -274,7 +274,7 @@ class SamplerSource:
     def _point(self, trial: Trial) -> Point:
         from sweeps.space.space import as_overrides, suggest
 
-        params = suggest(trial, self.parameters)
+        params = suggest(trial, self.space)
         chosen = as_overrides(params)
         study = self.store.study.study_name
         replicates = self.settings.replicates

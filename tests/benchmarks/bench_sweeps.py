@@ -98,7 +98,7 @@ def pruning(place: Path) -> None:
     found = {}
     for name, pruner in (
         ("none", "null"),
-        ("median", "{kind:median,n_startup_trials:4,n_warmup_steps:20}"),
+        ("median", "{_target_:optuna.pruners.MedianPruner,n_startup_trials:4,n_warmup_steps:20}"),
     ):
         runs = place / name
         wall = call(

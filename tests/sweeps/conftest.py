@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-import sweeps.sweep
 from sweeps.worker import executors
 
 
@@ -16,4 +15,3 @@ def no_template(monkeypatch: pytest.MonkeyPatch) -> None:
         del with_mlflow
 
     monkeypatch.setattr(executors, "fork_template", forks_nothing)
-    monkeypatch.setattr(sweeps.sweep, "fork_template", forks_nothing)

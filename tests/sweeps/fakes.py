@@ -54,8 +54,9 @@ def settings(**changes: Any) -> SweepSettings:
         **{"workers": 1, "executor": "local", "submitit": {}, "retries": 0, "retry": "none"},
         **{"wait": False, "dry_run": False, "params": {}, "points": (), "space": {}},
         "objectives": (Objective("test/mIoU", "maximize"),),
-        "sampler": {"kind": "random", "seed": 0},
+        "sampler": {"_target_": "optuna.samplers.RandomSampler", "seed": 0},
         "replicates": 1,
+        "trust": "",
     }
     return SweepSettings(**{**plain, **changes})
 
@@ -373,15 +374,15 @@ def search_desk(
     **changes: Any,
 ) -> Desk:
     """A driver of a search over x in 0..1, or over `space`."""
-    wanted = settings(pruner=None if pruner is None else {"kind": "given"}, **changes)
-    sampler = build_sampler({"kind": "random"}, len(wanted.objectives))
+    wanted = settings(pruner=None if pruner is None else {"_target_": "given"}, **changes)
+    sampler = build_sampler(wanted.sampler)
     storage = memory() if storage is None else storage
     store = store_on(storage, owner, wanted, sampler=sampler, pruner=pruner)
     runs = RunStore(runs_dir, NoTracking())
-    parameters = parse_space(space or {"x": {"type": "float", "low": 0, "high": 1}})
+    searched = parse_space(space or {"x": {"type": "float", "low": 0, "high": 1}})
     executor, seen = FakeExecutor(runs_dir, behaviour), view or FakeView()
     planner = planner or FakePlanner()
-    source = SamplerSource((), parameters, store, planner, wanted, seen.rejected)
+    source = SamplerSource((), searched, store, planner, wanted, seen.rejected)
     driver = Driver(store, source, runs, executor, wanted, seen)  # type: ignore[arg-type]
     return Desk(driver, store, executor, runs, seen)
 

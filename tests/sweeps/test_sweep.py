@@ -1,7 +1,11 @@
-"""Points of ``-m`` from overrides and settings: grids, lists and searches, without running them."""
+"""Grids, lists and searches of ``-m``: what would be run, what is refused, how a search ends."""
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,40 +16,43 @@ from omegaconf import open_dict
 
 import sweeps.sweep as sweeping
 from rgbt.checks import InputError, RunError
-from rgbt.config.compose import conf_dir, register_resolvers
+from rgbt.config.compose import compose, conf_dir, register_resolvers
+from rgbt.metrics.counts import Counts
+from sweeps import attributes as names
 from sweeps.point import Outcome, Point
-from sweeps.search import Search
-from sweeps.settings import SweepSettings
-from sweeps.sweep import study_command, sweep
+from sweeps.settings import Objective, SweepSettings
+from sweeps.space.space import parse_space
+from sweeps.sweep import Search, probe, search, study_command, sweep
 from sweeps.worker import point_list
 from sweeps.worker.point_list import PointList
+from sweeps.worker.run_store import open_run_store
+from sweeps.worker.storage import load_study, open_storage
+from tests.commands import SPLITS, short, words_of
+from tests.conftest import write_data
+from tests.sweeps.fakes import settings as plain_settings
+
+GRID = ("+experiment=grbm", "masker.sigma_div=1,2", "seed=0,3")
+MEDIAN = {"_target_": "optuna.pruners.MedianPruner"}
 
 
+@dataclass
 class RecordedCalls:
     """What would have been run."""
 
-    def __init__(self) -> None:
-        self.lists: list[PointList] = []
-        self.searches: list[Search] = []
-        self.outcomes: list[Outcome] = []
+    lists: list[PointList] = field(default_factory=list)
+    searches: list[Search] = field(default_factory=list)
+    outcomes: list[Outcome] = field(default_factory=list)
+
+    def run_points(self, wanted: PointList, settings: Any, *, strict: bool) -> list[Outcome]:
+        assert strict, "a wrong point of a grid is refused"
+        self.lists.append(wanted)
+        return self.outcomes or [Outcome(point, "finished") for point in wanted.points]
 
 
 @pytest.fixture
 def calls(monkeypatch: pytest.MonkeyPatch) -> RecordedCalls:
     found = RecordedCalls()
-
-    def run_points(wanted: PointList, settings: SweepSettings, *, strict: bool) -> list[Outcome]:
-        assert strict, "a wrong point of a grid is refused"
-        del settings
-        found.lists.append(wanted)
-        return found.outcomes or [Outcome(point, "finished") for point in wanted.points]
-
-    def preview_points(wanted: PointList, settings: SweepSettings) -> list[Outcome]:
-        del settings
-        return found.outcomes or [Outcome(p, "waiting", keys=("k",)) for p in wanted.points]
-
-    monkeypatch.setattr(sweeping, "run_points", run_points)
-    monkeypatch.setattr(sweeping, "preview_points", preview_points)
+    monkeypatch.setattr(point_list, "run_points", found.run_points)
     monkeypatch.setattr(sweeping, "search", lambda wanted, settings: found.searches.append(wanted))
     return found
 
@@ -64,24 +71,26 @@ def call(runs: Path, *words: str, **settings: Any) -> None:
         sweep(task, config, loader)
 
 
-def test_a_grid_is_all_combinations_each_with_its_parameters(
-    calls: RecordedCalls, tmp_path: Path
-) -> None:
-    call(tmp_path, "+experiment=grbm", "masker.sigma_div=1,2", "seed=0,3")
+def test_grid_is_all_combinations_with_parameters(calls: RecordedCalls, tmp_path: Path) -> None:
+    call(tmp_path, *GRID, "fresh=true")
     (wanted,) = calls.lists
     assert [point.label for point in wanted.points] == [
         *("sigma_div=1 seed=0", "sigma_div=1 seed=3", "sigma_div=2 seed=0", "sigma_div=2 seed=3"),
     ]
     assert wanted.points[3].params == {"masker.sigma_div": 2, "seed": 3}
-    assert "+experiment=grbm" in wanted.points[0].overrides
+    assert wanted.points[0].overrides[-3:] == ("+experiment=grbm", "masker.sigma_div=1", "seed=0")
     assert set(wanted.distributions or {}) == {"masker.sigma_div", "seed"}
     assert wanted.kind == "grid"
+    assert wanted.runs.fresh
+    assert not any(word.startswith("fresh") for point in wanted.points for word in point.overrides)
 
 
-def test_points_are_run_for_every_value_of_the_grid(calls: RecordedCalls, tmp_path: Path) -> None:
+def test_list_is_run_for_every_value_of_the_grid(calls: RecordedCalls, tmp_path: Path) -> None:
     points = [["masker.sigma_div=1", "masker.patch_size=8"], ["masker.sigma_div=4"]]
-    call(tmp_path, "+experiment=grbm", "seed=0,1", points=points)
+    params = {"seed": "0,1", "model.weights": None, "trainer.max_steps": 5}
+    call(tmp_path, "+experiment=grbm", points=points, params=params)
     (wanted,) = calls.lists
+    assert {"model.weights=null", "trainer.max_steps=5"} <= set(wanted.points[0].overrides)
     assert wanted.kind == "list"
     assert [point.label for point in wanted.points] == [
         *("seed=0 sigma_div=1 patch_size=8", "seed=0 sigma_div=4"),
@@ -89,108 +98,179 @@ def test_points_are_run_for_every_value_of_the_grid(calls: RecordedCalls, tmp_pa
     ]
 
 
-def test_sweep_params_of_file_equal_typed(calls: RecordedCalls, tmp_path: Path) -> None:
-    params = {"masker.sigma_div": "1,2", "model.weights": None, "seed": 5}
-    call(tmp_path, "+experiment=grbm", params=params)
-    (wanted,) = calls.lists
-    assert len(wanted.points) == 2
-    assert {"model.weights=null", "seed=5"} <= set(wanted.points[0].overrides)
-
-
-def test_sweep_name_is_independent_of_paths(calls: RecordedCalls, tmp_path: Path) -> None:
-    words = ("+experiment=grbm", "masker.sigma_div=1,2")
-    call(tmp_path / "a", *words)
-    call(tmp_path / "b", *words, "fresh=true", "dataset.cache_dir=/c")
-    call(tmp_path / "a", *words, "trainer.max_steps=3")
+def test_name_of_grid_is_independent_of_paths(calls: RecordedCalls, tmp_path: Path) -> None:
+    call(tmp_path / "a", *GRID)
+    call(tmp_path / "b", *GRID, "fresh=true", "dataset.cache_dir=/c")
+    call(tmp_path / "a", *GRID, "trainer.max_steps=3")
     first, moved, other = (wanted.study for wanted in calls.lists)
     assert first == moved != other
-    assert first.startswith("grbm-sigma_div-")
+    assert first.startswith("grbm-sigma_div-seed-")
 
 
-def test_sweep_fresh_is_not_passed_to_runs(calls: RecordedCalls, tmp_path: Path) -> None:
-    call(tmp_path, "+experiment=grbm", "masker.sigma_div=1,2", "fresh=true")
-    (wanted,) = calls.lists
-    assert wanted.runs.fresh
-    assert not any(word.startswith("fresh") for point in wanted.points for word in point.overrides)
-
-
-def test_sweep_search_name_ignores_order(calls: RecordedCalls, tmp_path: Path) -> None:
+def test_name_of_search_is_independent_of_order(calls: RecordedCalls, tmp_path: Path) -> None:
     words = ("+experiment=grbm", "masker.sigma_div=interval(1,4)", "seed=1", "trainer.max_steps=3")
     call(tmp_path, *words, trials=3)
-    call(tmp_path, *reversed(words), "fresh=true", trials=3)
-    call(tmp_path, *words, trials=3, replicates=2)
-    first, same, other = calls.searches
-    assert first.study == same.study != other.study
-    assert first.identity == same.identity
-    assert "trainer.max_steps=3" in first.identity
+    call(tmp_path / "b", *reversed(words), "fresh=true", trials=3)
+    for changes in ({"replicates": 2}, {"space": {"seed": {"type": "int", "low": 1, "high": 2}}}):
+        call(tmp_path, *words[:2], *words[3:], trials=3, **changes)
+    call(tmp_path, words[0], "masker.sigma_div=interval(1,8)", *words[2:], trials=3)
+    first, same, *others = calls.searches
+    assert (first.study, first.identity) == (same.study, same.identity)
+    assert len({each.identity for each in calls.searches}) == 1 + len(others)
 
 
-def test_sweep_search_file_runs_are_single(calls: RecordedCalls, tmp_path: Path) -> None:
+def test_search_file_runs_are_single(calls: RecordedCalls, tmp_path: Path) -> None:
     call(tmp_path, "+search=grbm", "masker.sigma_div=4")
     (wanted,) = calls.searches
-    keys = [parameter.key for parameter in wanted.parameters]
-    assert keys == ["masker.patch_size", "loss.spatial.alpha"]
-    assert "hydra.mode=RUN" in wanted.fixed
-    assert "masker.sigma_div=4" in wanted.fixed
-    call(tmp_path, "+search=grbm", "masker.sigma_div=1,2")
-    assert not [word for word in calls.searches[1].fixed if "sigma_div" in word]
+    assert list(wanted.space) == ["masker.patch_size", "loss.spatial.alpha"]
+    assert {"hydra.mode=RUN", "masker.sigma_div=4"} <= set(wanted.fixed)
+
+
+@pytest.mark.parametrize(("key", "value"), [("trials", 3), ("replicates", 2), ("pruner", MEDIAN)])
+def test_search_settings_of_grid_are_refused(tmp_path: Path, key: str, value: Any) -> None:
+    with pytest.raises(InputError, match=f"hydra.sweeper.{key}"):
+        call(tmp_path, *GRID, **{key: value})
+
+
+def test_failed_points_end_in_error_after_table(
+    calls: RecordedCalls, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    calls.outcomes = [Outcome(Point("a", ()), "finished"), Outcome(Point("b", ()), "failed", "oom")]
+    with pytest.raises(RunError, match="1 of 2 points failed, first b: oom"):
+        call(tmp_path, *GRID)
+    assert "oom" in capsys.readouterr().out
+
+
+def test_preview_of_grid_runs_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    call(tmp_path, *GRID, dry_run=True)
+    assert list(tmp_path.iterdir()) == []
+    assert "4 of 4 points" in capsys.readouterr().err
+
+
+def test_study_command_hides_passwords() -> None:
+    found = study_command("a", Path("/my runs"), "postgresql://me:Secret@host/db")
+    place = "'runs_dir=/my runs' 'storage=postgresql://me:***@host/db'"
+    assert found == f"rgbt study name=a {place}"
+
+
+def sigma(low: float, high: float) -> Any:
+    return parse_space({"masker.sigma_div": {"type": "float", "low": low, "high": high}})
+
+
+@pytest.fixture
+def wanted(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Search:
+    small = ("dataset.num_train=4", "dataset.num_val=2", "dataset.num_test=2")
+    cache = f"dataset.cache_dir={tmp_path_factory.mktemp('cache')}"
+    place = (f"runs_dir={tmp_path}", "tracking=none", cache)
+    fixed = ("+experiment=grbm", *small, *place)
+    return Search("s", fixed, sigma(1, 4), open_run_store(compose(place)), "identity")
+
+
+@pytest.fixture
+def ends(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The states that the driver leaves trials in, instead of running them."""
+    states: list[str] = ["COMPLETE"]
+
+    def drive(view: Any, source: Any, store: Any, *rest: Any) -> None:
+        for state in states:
+            trial = store.ask(None)
+            trial.suggest_float("masker.sigma_div", 1, 4)
+            if state == "COMPLETE":
+                store.complete(trial.number, [1.0], {names.RUNS: ["k"]})
+            else:
+                store.fail(trial.number, "no memory", {})
+
+    monkeypatch.setattr(sweeping, "drive", drive)
+    monkeypatch.setattr(sweeping, "report", lambda *_: None)
+    return states
+
+
+def settings(**changes: Any) -> SweepSettings:
+    objectives = (Objective("val/mIoU", "maximize"),)
+    return plain_settings(**{"trials": 3, "objectives": objectives, **changes})
+
+
+def test_search_creates_study_and_previews_it(
+    wanted: Search, ends: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    search(wanted, settings(dry_run=True))
+    assert list(tmp_path.iterdir()) == []
+    assert "3 of 3 trials" in capsys.readouterr().out
+    search(wanted, settings())
+    study = load_study("s", open_storage(None, tmp_path))
+    assert study.user_attrs[names.KIND] == "search"
+    assert study.user_attrs[names.COMMAND]
+    search(wanted, settings(dry_run=True))
+    assert "2 of 3 trials" in capsys.readouterr().out
+    search(wanted, settings(trials=9))  # a larger budget is the same study
+    assert len(study.trials) == 2
+
+
+def test_search_with_other_identity_is_refused(wanted: Search, ends: list[str]) -> None:
+    search(wanted, settings())
+    for other in (
+        replace(wanted, identity="other"),
+        replace(wanted, fixed=(*wanted.fixed, "dataset.num_test=3")),
+    ):
+        with pytest.raises(InputError, match="choose another name"):
+            search(other, settings())
+    with pytest.raises(InputError, match="choose another name"):
+        search(wanted, settings(objectives=(Objective("val/Var", "minimize"),)))
+
+
+TC, UP = (Objective(metric, "maximize") for metric in ("val/TC/aligned", "val/mIoU"))
 
 
 @pytest.mark.parametrize(
-    "settings",
+    ("changes", "said"),
     [
-        *({"trials": 3}, {"hours": 3}, {"replicates": 2}, {"pruner": {"kind": "median"}}),
+        ({"trials": None}, "hydra.sweeper.trials"),
+        ({"sampler": {"_target_": "optuna.samplers.TPE"}}, "hydra.sweeper.sampler"),
+        ({"objectives": (TC,), "pruner": MEDIAN}, "hydra.sweeper.pruner"),
+        ({"objectives": (UP, UP), "pruner": MEDIAN}, "hydra.sweeper.pruner"),
+        ({"objectives": (TC,)}, "val/TC/aligned'.*consistency.splits"),
     ],
 )
-def test_sweep_search_settings_of_grid_are_refused(
-    calls: RecordedCalls, tmp_path: Path, settings: dict[str, Any]
+def test_search_invalid_settings_raise_before_study_exists(
+    wanted: Search, ends: list[str], tmp_path: Path, changes: dict[str, Any], said: str
 ) -> None:
-    said = f"hydra.sweeper.{next(iter(settings))} is for searches"
     with pytest.raises(InputError, match=said):
-        call(tmp_path, "+experiment=grbm", "seed=0,1", **settings)
-    assert calls.lists == []
+        search(wanted, settings(**changes))
+    assert list(tmp_path.iterdir()) == []
 
 
-def test_mistake_is_reported_before_any_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # A slow machine plans one point in the usual 2 s.
-    monkeypatch.setattr(point_list, "PLANNED_FIRST_S", 60.0)
-    with pytest.raises(InputError, match="masker=squre: there is no masker 'squre'"):
-        call(tmp_path, "+experiment=grbm", "masker=square,squre")
-    assert not any(tmp_path.iterdir())
+@pytest.mark.parametrize(("low", "high"), [(-1, 4), (1, 10**6)])
+def test_probe_range_outside_setting_raises(wanted: Search, low: float, high: float) -> None:
+    with pytest.raises(InputError, match=r"'masker.sigma_div'"):
+        probe(replace(wanted, space=sigma(low, high)), settings())
 
 
-def test_failed_points_end_in_an_error_after_the_table(
-    calls: RecordedCalls, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    calls.outcomes = [
-        Outcome(Point("a", ()), "finished", keys=("k1",)),
-        Outcome(Point("b", ()), "failed", "out of memory", keys=("k2",)),
-    ]
-    with pytest.raises(RunError, match="1 of 2 points failed, first b: out of memory"):
-        call(tmp_path, "+experiment=grbm", "seed=0,1")
-    assert "out of memory" in capsys.readouterr().out
+def test_search_without_finished_trial_raises(wanted: Search, ends: list[str]) -> None:
+    ends[:] = ["FAIL", "FAIL"]
+    with pytest.raises(RunError, match="no trial of s has finished"):
+        search(wanted, settings())
 
 
-def test_a_preview_runs_nothing(
-    calls: RecordedCalls, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    call(tmp_path, "+experiment=grbm", "seed=0,1,2", dry_run=True)
-    assert calls.lists == []
-    assert "3 of 3 points would be run" in capsys.readouterr().err
+@pytest.mark.slow
+def test_workers_and_cores_do_not_change_counts(tmp_path: Path) -> None:
+    """With one thread instead of two, the counts of this experiment are others."""
+    data = write_data(tmp_path / "mf", SPLITS, (48, 64))
+    environment = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"}
+    one_core = ["taskset", "-c", str(min(os.sched_getaffinity(0)))]
 
+    def counts(name: str, *words: str, before: tuple[str, ...] = ()) -> list[bytes]:
+        chosen = ("+experiment=cmx", "masker.patch_size=null", "trainer.threads=2", *short(4))
+        typed = words_of(data, tmp_path / name, *chosen, *words)
+        command = [*before, sys.executable, "-m", "rgbt.run", *typed]
+        subprocess.run(command, check=True, capture_output=True, env=environment)
+        found = sorted((tmp_path / name).glob("*/counts_test.npz"))
+        return [Counts.load(path).counts.tobytes() for path in found]
 
-@pytest.mark.parametrize(
-    ("runs_dir", "storage", "rest"),
-    [
-        ("runs", None, ""),
-        ("/data/my runs", None, " 'runs_dir=/data/my runs'"),
-        ("runs", "postgresql://me:Secret@host/db", " 'storage=postgresql://me:***@host/db'"),
-    ],
-)
-def test_the_command_that_draws_a_study_finds_it(
-    runs_dir: str, storage: str | None, rest: str
-) -> None:
-    command = study_command("grbm-1", Path(runs_dir), storage)
-    assert command == f"rgbt study name=grbm-1{rest}"
+    (plain,) = counts("plain", "seed=0")
+    assert counts("core", "seed=0", before=tuple(one_core)) == [plain]
+    one = counts("one", "-m", "seed=0,1")
+    two = counts("two", "-m", "seed=0,1", "hydra.sweeper.workers=2")
+    assert len(one) == 2
+    assert plain in one
+    assert one == two
+    assert counts("threads", "seed=0", "trainer.threads=1") != [plain]

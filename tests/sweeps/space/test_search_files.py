@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import hydra
 import pytest
 from omegaconf import DictConfig
@@ -12,7 +10,7 @@ from rgbt.config.compose import conf_dir, flatten, register_resolvers
 from rgbt.runs.specify import specify
 from sweeps.settings import read_settings
 from sweeps.space.samplers import build_pruner, build_sampler
-from sweeps.space.space import Choice, Parameter, as_overrides, parse_space, plain_space
+from sweeps.space.space import Space, ends, parse_space
 from tests.models.golden import compose
 
 FILES = sorted(path.stem for path in (conf_dir() / "search").glob("*.yaml"))
@@ -25,55 +23,40 @@ def composed(*overrides: str) -> DictConfig:
         return hydra.compose("config", list(overrides), return_hydra_config=True)
 
 
-def space_of(name: str) -> dict[str, Any]:
-    return plain_space(composed(f"+search={name}").hydra.sweeper.space)
-
-
-def ends(parameter: Parameter) -> tuple[Choice, ...]:
-    return parameter.choices or (parameter.low, parameter.high)
-
-
-@pytest.mark.parametrize("name", FILES)
-def test_the_file_chooses_its_experiment_and_sets_the_sweeper(name: str) -> None:
-    config = composed(f"+search={name}")
-    sweeper = config.hydra.sweeper
-    assert config.hydra.runtime.choices["hydra/sweeper"] == "study"
-    assert config.hydra.mode.name == "MULTIRUN"
-    assert config.name == config.hydra.runtime.choices.experiment
-    settings = read_settings(sweeper)
-    assert settings.trials
-    assert settings.space
-    build_sampler(settings.sampler, len(settings.objectives))
-    build_pruner(settings.pruner, len(settings.objectives))
+def space_of(name: str) -> Space:
+    return parse_space(read_settings(composed(f"+search={name}").hydra.sweeper).space)
 
 
 @pytest.mark.parametrize(
     "name", [pytest.param(n, marks=() if n == "grbm" else pytest.mark.slow) for n in FILES]
 )
-def test_every_end_of_every_range_is_a_configuration(name: str) -> None:
-    known = flatten(compose(f"+search={name}"))
-    parameters = parse_space(space_of(name))
-    assert {parameter.key for parameter in parameters} <= set(known)
-    for place in (0, -1):
-        chosen = {one.key: ends(one)[place] for one in parameters}
-        config = compose(f"+search={name}", *as_overrides(chosen))
-        specify(config)
-        values = flatten(config)
-        for key, value in chosen.items():
-            assert str(value).startswith("${px:") or values[key] == value
+def test_search_file_is_a_search_of_its_experiment(name: str) -> None:
+    config = composed(f"+search={name}")
+    assert config.hydra.runtime.choices["hydra/sweeper"] == "study"
+    assert config.hydra.mode.name == "MULTIRUN"
+    settings = read_settings(config.hydra.sweeper)
+    assert settings.trials
+    build_sampler(settings.sampler)
+    build_pruner(settings.pruner)
+    for overrides in ends(parse_space(settings.space)):
+        single = compose(f"+search={name}", *overrides)
+        specify(single)
+        found = flatten(single)
+        for key, text in (word.split("=") for word in overrides):
+            assert text.startswith("${px:") or float(text) == found[key]
 
 
-def test_ranges_hold_the_published_values() -> None:
+def test_search_ranges_hold_the_published_values() -> None:
     """SpatialSeg, Tables III, IV, V, and the weights of both releases."""
-    sigma, patch, alpha = parse_space(space_of("grbm"))
-    assert (sigma.low, sigma.high, sigma.log) == (0.5, 32, True)
-    assert patch.choices == tuple(f"${{px:{size}}}" for size in (8, 16, 32, 64))
-    assert (alpha.low, alpha.high) == (0, 3)
-    published = {one.key: one.choices for one in parse_space(space_of("grbm_discrete"))}
-    assert published["masker.sigma_div"] == (1, 2, 4, 8, 16, 32)
-    assert published["loss.spatial.alpha"] == (0, 1, 1.5, 2, 2.5, 3)
+    grbm, discrete = space_of("grbm"), space_of("grbm_discrete")
+    low, high = ends(grbm)
+    assert low == ("masker.sigma_div=0.5", "masker.patch_size=${px:8}", "loss.spatial.alpha=0.0")
+    assert high == ("masker.sigma_div=32.0", "masker.patch_size=${px:64}", "loss.spatial.alpha=3.0")
+    assert discrete["masker.sigma_div"].choices == (1, 2, 4, 8, 16, 32)  # type: ignore[union-attr]
+    assert discrete["loss.spatial.alpha"].choices == (0, 1, 1.5, 2, 2.5, 3)  # type: ignore[union-attr]
     # Temporal, Table III: 0.5, 1 and 2 for both.
-    assert [(one.low, one.high) for one in parse_space(space_of("temporal"))] == [(0.5, 2.0)] * 2
+    assert ends(space_of("temporal"))[1] == ("loss.alpha=2.0", "loss.beta=2.0")
     released = flatten(compose("+experiment=crm"))
-    for parameter in parse_space(space_of("loss")):
-        assert parameter.low < released[parameter.key] < parameter.high
+    for low_word, high_word in zip(*ends(space_of("loss")), strict=True):
+        key, low_text = low_word.split("=")
+        assert float(low_text) < released[key] < float(high_word.split("=")[1])

@@ -42,7 +42,9 @@ def states(store: TrialStore) -> list[str]:
 
 def searching(storage: Any, owner: Owner | None = None) -> TrialStore:
     """The store of a search; every driver has a study object and a sampler of its own."""
-    return store_on(storage, owner, sampler=build_sampler({"kind": "random"}))
+    return store_on(
+        storage, owner, sampler=build_sampler({"_target_": "optuna.samplers.RandomSampler"})
+    )
 
 
 def taken(store: TrialStore, total: int | None = None) -> tuple[int, float]:
