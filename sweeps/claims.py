@@ -6,8 +6,7 @@ Nothing is run: the verdicts come from the finished runs in the folder of runs.
 from __future__ import annotations
 
 import re
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -19,9 +18,7 @@ from rgbt.config.plain_command import PlainCommand
 
 if TYPE_CHECKING:
     from rgbt.runs.result import RunResult
-    from sweeps.point import Outcome
-    from sweeps.table.request import TableRequest
-    from sweeps.verdicts.judge import CellRunId, JudgedClaim
+    from sweeps.verdicts.judge import JudgedClaim
 
 ALL = "all"
 
@@ -89,13 +86,20 @@ def judge_all(options: Options, overrides: Sequence[str]) -> tuple[list[JudgedCl
     from rich.progress import track
 
     from sweeps.rendering.times import time_line, upstream_line
-    from sweeps.table.load_table import PUBLISHED, table_names
-    from sweeps.table.make_request import TableWords, check_override, make_request, read_named
-    from sweeps.table.rows import check_rows
-    from sweeps.verdicts.stored import finished_by_seed, stored_runs
+    from sweeps.table.efficiency import exact_sizes
+    from sweeps.table.load_table import is_own, table_names
+    from sweeps.table.make_request import (
+        TableWords,
+        check_equal_runs,
+        check_override,
+        make_request,
+        read_named,
+    )
+    from sweeps.verdicts.judge import TableJudge
+    from sweeps.verdicts.stored import finished_by_seed, rule_of, stored_runs
     from sweeps.worker.planner import Planner
 
-    names = table_names(PUBLISHED / "none") if options.table == ALL else [options.table]
+    names = table_names(Path("none")) if options.table == ALL else [options.table]
     finished = finished_by_seed(options.runs_dir)
     for word in overrides:
         check_override(word)
@@ -106,47 +110,40 @@ def judge_all(options: Options, overrides: Sequence[str]) -> tuple[list[JudgedCl
     trained: list[tuple[str, ...]] = []
     for each in track(names, "judging", console=Console(stderr=True), transient=True):
         name, table = read_named(each)
-        if table.claims:
-            request, external = make_request(name, table, words)
-            if external:
-                raise InputError(
-                    f"{external[0].kind}.{external[0].label}: only finished runs are judged here; "
-                    f"use rgbt reproduce table={name} for rows that are not trained."
-                )
-            check_rows(request, planner)
+        if not table.claims:
+            continue
+        request, external = make_request(name, table, words)
+        if external:
+            raise InputError(
+                f"{external[0].kind}.{external[0].label}: only finished runs are judged here; "
+                f"use rgbt reproduce table={name} for rows that are not trained."
+            )
+        if overrides or is_own(each):  # a test checks the others
+            check_equal_runs(request, planner)
+        runs = {}
+        if overrides or finished:
             runs = stored_runs(request, options.runs_dir, finished, planner)
-            judged += judge_stored(request, runs)
-            results |= {each.key: each for run in runs.values() for each in run.results}
-            trained += [request.overrides(label, seed) for label, seed in runs]
+        found = [result for run in runs.values() for result in run.results]
+        rule = rule_of(result.tags for result in found)
+        judge = TableJudge(name, table, rule, sizes=exact_sizes(request))
+        judged += judge.claims(runs)
+        results |= {result.key: result for result in found}
+        trained += [request.overrides(label, seed) for label, seed in runs]
     times = (time_line(results.values()), upstream_line(trained, planner))
     return judged, [line for line in times if line]
 
 
-def judge_stored(request: TableRequest, runs: Mapping[CellRunId, Outcome]) -> list[JudgedClaim]:
-    """The claims of one table, judged by its finished runs."""
-    from sweeps.table.efficiency import exact_sizes
-    from sweeps.verdicts.judge import TableJudge
-    from sweeps.verdicts.stored import rule_of
-
-    rule = rule_of(result.tags for run in runs.values() for result in run.results)
-    judge = TableJudge(request.name, request.table, rule, sizes=exact_sizes(request))
-    return judge.claims(runs)
-
-
 def by_paper(judged: Sequence[JudgedClaim]) -> str:
     """How many claims each paper makes, and of how many its printed numbers agree."""
-    papers = Counter(each.table.partition("/")[0] for each in judged)
-    agree = Counter(each.table.partition("/")[0] for each in judged if each.as_printed)
-    apart = Counter(each.table.partition("/")[0] for each in judged if each.as_printed is False)
-    return "\n".join(
-        f"{paper}: {count} claims; its printed values agree with {agree[paper]}, do not agree with "
-        f"{apart[paper]}{_not_printed(count - agree[paper] - apart[paper])}."
-        for paper, count in papers.items()
-    )
-
-
-def _not_printed(count: int) -> str:
-    return f", and are not printed for {count}" if count else ""
+    lines = []
+    for paper in dict.fromkeys(each.table.partition("/")[0] for each in judged):
+        found = [each.as_printed for each in judged if each.table.partition("/")[0] == paper]
+        lines.append(
+            f"{paper}: {len(found)} claims; its printed values agree with {found.count(True)}, do "
+            f"not agree with {found.count(False)}"
+            + (f", and are not printed for {count}." if (count := found.count(None)) else ".")
+        )
+    return "\n".join(lines)
 
 
 entry = PlainCommand(Options, main)

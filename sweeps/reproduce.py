@@ -14,23 +14,20 @@ from annotated_types import Interval
 
 from rgbt.checks import InputError
 from rgbt.config.command import composing
-from rgbt.config.common_options import RunsDir
+from rgbt.config.common_options import RunsDir, Trust
 from rgbt.config.component import Component
 from rgbt.config.options import Help, readable_paths
 from rgbt.config.plain_command import CommandGroup, PlainCommand
 from rgbt.metrics.names import MIOU
 from sweeps.settings import SweepSettings
 from sweeps.table.new_table import NewOptions, new
-from sweeps.table.request import seeds_of
 
 if TYPE_CHECKING:
     from sweeps.point import Outcome
     from sweeps.table_plan import TablePlan
     from sweeps.worker.planner import Planner
-    from sweeps.worker.run_store import RunStore
 
 ALL = "all"
-UNTIL_DECIDED = "until_decided"
 NEW = PlainCommand(NewOptions, new, name="rgbt reproduce new")
 
 
@@ -69,7 +66,9 @@ class Options:
             "it is known; both: both, and the difference"
         ),
     ] = "paper"
-    rows: Annotated[str, Help("run some rows only: rows=A,H; default: all")] = ""
+    rows: Annotated[
+        str, Help("run some rows only, by label, number or group: rows=Ny,3; default: all")
+    ] = ""
     dry_run: Annotated[
         bool, Help("true: show the runs of the cells, their states and the time left; run nothing")
     ] = False
@@ -117,6 +116,7 @@ class Options:
         Literal["local", "submitit"],
         Help("local: processes on this machine; submitit: jobs of a cluster"),
     ] = "local"
+    trust: Trust = ""
     submitit: Annotated[
         dict[str, Any] | None, Help("options of the cluster jobs: submitit={timeout_min: 60}")
     ] = field(default_factory=dict)
@@ -134,27 +134,25 @@ def main(options: Options, overrides: list[str]) -> int:
     The table is a published one or your own. It ends with a verdict on each claim of its paper.
     Words with other keys are overrides of every row: dataset.root=/data/MFNet
     tracking.uri=http://host:5000. pretrained.mask2former_swin_b=FILE sets the initial weights of
-    all rows with that network. weights.CMX=FILE evaluates the network of row CMX with a file of
-    weights; predictions.CMX=FOLDER counts its predicted label images. Neither is trained.
+    all rows with that network. weights.ROW=FILE evaluates the network of a row with a file of
+    weights; predictions.ROW=FOLDER counts its predicted label images. Neither is trained. A ROW is
+    a label or a number: weights.Ours=FILE, predictions.3=FOLDER.
     conf/hydra/sweeper/study.yaml explains the options of execution.
 
     To write your own table:
     rgbt reproduce new table=my/ablation experiment=grbm masker.sigma_div=1,2,4
     """
-    from sweeps.worker.executors import fork_template, limit_spinning
-
-    settings = settings_of(options)
-    limit_spinning(settings.workers)  # before the imports that load torch
     from rgbt.config.compose import compose
-    from rgbt.tracking.mlflow_store import MlflowTracking
     from sweeps.rendering.publish import publish_table
     from sweeps.table.load_table import table_names
     from sweeps.table.make_request import check_override
+    from sweeps.table_plan import plan_table
     from sweeps.verdicts.stored import rule_of
     from sweeps.worker.planner import Planner
     from sweeps.worker.point_list import preview_points, run_points
     from sweeps.worker.run_store import open_run_store
 
+    settings = settings_of(options)
     for word in overrides:
         check_override(word)
     tracker = [word for word in overrides if word.lstrip("+~").startswith("tracking")]
@@ -167,22 +165,20 @@ def main(options: Options, overrides: list[str]) -> int:
         config = compose([*base, f"fresh={str(options.fresh).lower()}"])
         Component.from_node(config.tracking)
     runs = open_run_store(config)
-    if settings.executor == "local" and not settings.dry_run:
-        fork_template(with_mlflow=isinstance(runs.tracking, MlflowTracking))
     planner = Planner(base)
-    plans = plans_of(tables, options, extra, runs, planner)
+    plans = [plan_table(each, options, extra, runs, planner) for each in tables]
     if settings.dry_run:
         previews = [preview_points(plan.points, settings, planner) for plan in plans]
         _show(options.table, list(zip(plans, previews, strict=True)), settings.workers, planner)
         return 0
     (plan,) = plans
-    wanted = plan.request
-    plan.evaluate_external(runs.runs_dir)
+    plan.evaluate_external(runs.runs_dir, options.trust)
     outcomes = run_points(plan.points, settings, planner) if plan.points.points else []
     if plan.until_decided is None:  # an earlier command may have added seeds
         plan.judge.rule = rule_of(result.tags for each in outcomes for result in each.results)
-    out = options.out or options.runs_dir / "tables" / f"{wanted.name}_{wanted.variant}"
-    code = publish_table(plan.judge, wanted, outcomes, plan.external, out, runs.tracking)
+    request = plan.request
+    out = options.out or options.runs_dir / "tables" / f"{request.name}_{request.variant}"
+    code = publish_table(plan.judge, request, outcomes, plan.external, out, runs.tracking)
     _show_time(outcomes, planner)
     return code
 
@@ -252,48 +248,6 @@ def settings_of(options: Options) -> SweepSettings:
         return read_settings(node)
     except InputError as error:
         raise InputError(str(error).replace("hydra.sweeper.", "")) from error
-
-
-def plans_of(
-    names: Sequence[str],
-    options: Options,
-    extra: Sequence[str],
-    runs: RunStore,
-    planner: Planner,
-) -> list[TablePlan]:
-    """The tables as they are run.
-
-    Raises:
-        InputError: no such table, row, scale or metric; no seeds; overrides that mix rows up.
-    """
-    from sweeps.table.make_request import TableWords, make_request, read_named
-    from sweeps.table.rows import check_rows, select_rows
-    from sweeps.table_plan import TablePlan
-    from sweeps.verdicts.forms import both_forms
-    from sweeps.verdicts.until_decided import START
-
-    adds = options.seeds == UNTIL_DECIDED
-    seeds = tuple(range(START)) if adds else seeds_of(options.seeds)
-    plans = []
-    for each in names:
-        name, table = read_named(each)
-        is_both = options.form == "both"
-        words = TableWords(
-            seeds=seeds,
-            scale=options.scale,
-            form="paper" if options.form == "both" else options.form,
-            rows="" if is_both else options.rows,
-            overrides=extra,
-            others=("form=both", f"rows={options.rows}") if is_both else (),
-            until_decided=adds,
-        )
-        if is_both:
-            table = both_forms(select_rows(table, options.rows) if options.rows else table)
-        request, rows = make_request(name, table, words)
-        check_rows(request, planner)
-        most = options.max_seeds if adds else None
-        plans.append(TablePlan.of(request, rows, runs, planner.base, most))
-    return plans
 
 
 entry = CommandGroup(__doc__, {"new": NEW}, default=PlainCommand(Options, main))

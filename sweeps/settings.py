@@ -99,6 +99,7 @@ class SweepSettings:
     trials: NumRuns | None
     hours: Positive | None
     replicates: Annotated[int, Interval(ge=1, le=1000)]
+    trust: Annotated[str, Len(0, 4096)]
 
     def __post_init__(self) -> None:
         if self.submitit and self.executor != "submitit":

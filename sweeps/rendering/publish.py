@@ -71,7 +71,7 @@ def publish_table(
         1 where a cell failed or has no value, or the files could not be written; else 0.
     """
     runs: dict[CellRunId, Outcome] = {**request.runs(outcomes), **external}
-    sizes = efficiency_cells(request, out)
+    sizes = efficiency_cells(request)
     scored = replace(
         score(request.name, request.table, runs, scale=request.scale, sizes=sizes),
         form=request.form,

@@ -7,6 +7,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
+from pydantic import model_validator
+
 Expected = Literal["higher", "lower", "similar"]
 Combine = Literal["all", "most", "any", "mean"]
 
@@ -21,9 +23,17 @@ HIGHER: Range = (0.0, math.inf)
 LOWER: Range = (-math.inf, 0.0)
 """Of a difference whose size does not matter."""
 
+STRICT: dict[str, Any] = {"extra": "forbid", "allow_inf_nan": False}
+
+
+class Strict:
+    """A part of a table file: unknown keys, NaN and infinity are refused."""
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
+
 
 @dataclass(frozen=True, kw_only=True)
-class Claim:
+class Claim(Strict):
     """One statement of a paper about its own table.
 
     It is a set of contrasts: each row of `rows` minus each row of `against`, in each column. A
@@ -47,8 +57,6 @@ class Claim:
             them; "mean": their mean is.
         remarks: one sentence each, e.g. why the direction is a reading of ours.
     """
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid", "allow_inf_nan": False}
 
     name: str
     says: str
@@ -85,3 +93,11 @@ class Claim:
             if not against:
                 yield row, None
             yield from ((row, other) for other in against if other != row)
+
+    @model_validator(mode="after")
+    def _check(self) -> Claim:
+        if self.expected == "similar" and self.at_most is None:
+            raise ValueError("similar needs at_most, the largest difference that it means.")
+        if self.at_most is not None and self.at_most <= self.at_least:
+            raise ValueError(f"at_most must be above at_least ({self.at_least:g}).")
+        return self

@@ -11,9 +11,8 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from rgbt.metrics.named import parse
 from sweeps.point import Outcome
-from sweeps.table.cells import CellId, TableCell, is_counted, metric_of, row_cells
+from sweeps.table.cells import CellId, TableCell, row_cells
 from sweeps.table.table import COUNTED, MEASURED, Column, Form, Row, Table
 
 
@@ -23,7 +22,7 @@ class ScoredTable:
 
     Attributes:
         name: e.g. "spatialseg/table3".
-        scale: "demo" or "paper".
+        scale: a file of ``conf/scale``.
         cells: only rows that were run, and columns of efficiency.
         commits: git commit -> number of runs made by it.
         form: what the rows were run as.
@@ -55,18 +54,6 @@ def published(row: Row, column: Column) -> float | None:
     return None if printed is None else float(printed)
 
 
-def check_metrics(table: Table) -> None:
-    """Refuse a misspelt metric before anything is run.
-
-    Raises:
-        InputError: naming the metric and the nearest known one.
-    """
-    columns = list(filter(is_counted, table.columns))
-    metrics = {metric_of(column, row) for row in table.runnable_rows for column in columns}
-    for metric in sorted(metrics):
-        parse(metric)
-
-
 def score(
     name: str,
     table: Table,
@@ -75,30 +62,22 @@ def score(
     scale: str,
     sizes: Mapping[CellId, TableCell] | None = None,
 ) -> ScoredTable:
-    """Compute every cell of the rows that were run.
+    """Compute every cell of the rows with `runs`: (label of the row, seed) -> the run.
 
-    Args:
-        name: of the table.
-        table: its file.
-        runs: (label of the row, seed) -> the run.
-        scale: "demo" or "paper".
-        sizes: cells of the columns of efficiency, see `sweeps.table.efficiency`.
+    `sizes` are the cells of the columns of efficiency, see `sweeps.table.efficiency`.
     """
     seeds = sorted({seed for _, seed in runs})  # a row without seeds has a negative one
-    ran = {label for label, _ in runs}
     cells: dict[CellId, TableCell] = {}
     for row in table.rows:
-        if row.label in ran:
-            outcomes = {seed: runs[row.label, seed] for seed in seeds if (row.label, seed) in runs}
-            cells |= row_cells(table, row, outcomes)
-    cells |= sizes or {}
+        outcomes = {seed: runs[row.label, seed] for seed in seeds if (row.label, seed) in runs}
+        cells |= row_cells(table, row, outcomes)
     made_by = {run.key: run.commit for outcome in runs.values() for run in outcome.results}
     return ScoredTable(
         name=name,
         table=table,
         scale=scale,
         seeds=tuple(seed for seed in seeds if seed >= 0),
-        cells=cells,
+        cells=cells | dict(sizes or {}),
         commits=Counter(commit for commit in made_by.values() if commit is not None),
     )
 

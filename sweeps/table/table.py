@@ -1,16 +1,23 @@
-"""The parts of a table file: columns, rows, the printed values."""
+"""The parts of a table file: columns, rows, the printed values; and what they must fulfil."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any, Literal
 
-from rgbt.checks import InputError
-from rgbt.config.compose import chosen_scale
+from annotated_types import MinLen
+from pydantic import model_validator
+
+from rgbt.checks import InputError, check_choice
+from rgbt.config.compose import available, chosen_scale
+from rgbt.config.values import check_value
+from rgbt.metrics.named import OF_PAIRS, parse
 from rgbt.metrics.pairs import Protocol
+from rgbt.ranges import Size
 from sweeps.evaluation import BatchNorm, Head
-from sweeps.table.claim import Claim
+from sweeps.table.claim import OTHERS, PREVIOUS, Claim, Strict
 from sweeps.table.design import Design
 
 Origin = Literal[
@@ -35,11 +42,9 @@ COUNTED: tuple[Efficiency, ...] = ("parameters", "gflops")
 MEASURED: tuple[Efficiency, ...] = ("peak_memory", "latency", "images_per_second")
 """Of one device; shown with the ratio to the first row."""
 
-STRICT: dict[str, Any] = {"extra": "forbid", "allow_inf_nan": False}
-
 
 @dataclass(frozen=True, kw_only=True)
-class Column:
+class Column(Strict):
     """One column: a score, a difference or mean of others, or the efficiency of the network.
 
     Attributes:
@@ -66,12 +71,10 @@ class Column:
         best: which value of the column is marked.
     """
 
-    __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
-
     name: str
     metric: str | None = None
     minus: tuple[str, str] | None = None
-    mean: tuple[str, ...] | None = None
+    mean: Annotated[tuple[str, ...], MinLen(2)] | None = None
     efficiency: Efficiency | None = None
     modality: Literal["default", "rgbt", "rgb", "thermal"] = "default"
     frames: Protocol | None = None
@@ -88,9 +91,24 @@ class Column:
         """The columns that it is computed from; () for all but differences and means."""
         return self.minus or self.mean or ()
 
+    @model_validator(mode="after")
+    def _check(self) -> Column:
+        kinds = ("metric", "minus", "mean", "efficiency")
+        given = [key for key in kinds if getattr(self, key) is not None]
+        if len(given) != 1:
+            raise ValueError(f"expected one of {', '.join(kinds)}, got {given}.")
+        of_pairs = (self.metric or "").rpartition("/")[2] in OF_PAIRS
+        if of_pairs != (self.frames is not None):
+            raise ValueError(f"'frames' is needed for {', '.join(OF_PAIRS)}, and only for these.")
+        if of_pairs or self.metric is None:  # these would have no effect
+            for key in ("modality", "head", "corruption", "batch_norm"):
+                if getattr(self, key) not in (None, "as trained", "default"):
+                    raise ValueError(f"'{key}' is only for scores of single frames.")
+        return self
+
 
 @dataclass(frozen=True, kw_only=True)
-class Factor:
+class Factor(Strict):
     """The x axis of the figure.
 
     Attributes:
@@ -98,14 +116,12 @@ class Factor:
         axis: "log" for values > 0.
     """
 
-    __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
-
     name: str
     axis: Literal["linear", "log"] = "linear"
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReleasedForm:
+class ReleasedForm(Strict):
     """How the release makes a row; what is None is as in the paper's form.
 
     Attributes:
@@ -115,8 +131,6 @@ class ReleasedForm:
         remarks: what the release does differently, one sentence each.
     """
 
-    __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
-
     experiment: str | None = None
     overrides: tuple[str, ...] | None = None
     at: Mapping[str, tuple[str, ...]] | None = None
@@ -124,7 +138,7 @@ class ReleasedForm:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Row:
+class Row(Strict):
     """One row.
 
     Attributes:
@@ -150,8 +164,6 @@ class Row:
         remarks: one sentence each.
     """
 
-    __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
-
     label: str
     group: str = ""
     origin: Origin | None = None
@@ -170,9 +182,20 @@ class Row:
     doubtful: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
 
+    @model_validator(mode="after")
+    def _check(self) -> Row:
+        if self.experiment is None and (self.overrides or self.released):
+            raise ValueError("'experiment' has no value; without it overrides have no effect.")
+        for experiment in (self.experiment, self.released and self.released.experiment):
+            if experiment is not None:
+                check_choice("experiment", experiment, available("experiment"))
+        if size := self.settings.get("image_hw"):
+            check_value("settings.image_hw", size, Size)
+        return self
+
 
 @dataclass(frozen=True, kw_only=True)
-class Table:
+class Table(Strict):
     """One table.
 
     Attributes:
@@ -194,8 +217,6 @@ class Table:
         rows: in order; may be omitted beside a design.
     """
 
-    __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
-
     paper: str
     number: str
     caption: str
@@ -211,6 +232,74 @@ class Table:
     remarks: tuple[str, ...] = ()
     design: Design | None = None
     rows: tuple[Row, ...] = ()
+
+    @model_validator(mode="after")
+    def _add_rows_of_design(self) -> Table:
+        if not self.rows and self.design is None:
+            raise ValueError("'rows' has no value.")
+        of_design = () if self.design is None else self.design.rows()
+        return replace(self, rows=(*self.rows, *(Row(**each) for each in of_design)))
+
+    @model_validator(mode="after")
+    def _check_names(self) -> Table:
+        for each in (self.columns, self.rows, self.claims):
+            names = [getattr(part, "label", None) or getattr(part, "name", "") for part in each]
+            if len(set(names)) < len(names):
+                raise ValueError(f"'{max(names, key=names.count)}' is used twice.")
+        released = (row.released.at for row in self.rows if row.released)
+        for at in (self.at, *(row.at for row in self.rows), *released):
+            for scale in at or ():
+                check_choice("at", scale, available("scale"))
+        if self.regions != "as trained":
+            check_choice("regions", self.regions, available("metric"))
+        return self
+
+    @model_validator(mode="after")
+    def _check_columns(self) -> Table:
+        scores = [each.name for each in self.columns if each.metric is not None]
+        for index, column in enumerate(self.columns):
+            before = [each.name for each in self.columns[:index] if each.sources]
+            for name in column.sources:  # they are computed in order
+                check_choice(f"column '{column.name}'", name, [*scores, *before])
+        for name in self.design.outcomes if self.design else ():
+            check_choice("design.outcomes", name, [each.name for each in self.columns])
+        return self
+
+    @model_validator(mode="after")
+    def _check_rows(self) -> Table:
+        names = [each.name for each in self.columns]
+        printed = [each.name for each in self.columns if each.printed]
+        labels = [each.label for each in self.rows]
+        for index, row in enumerate(self.rows):
+            where = f"row '{row.label}'"
+            if row.same_as is not None:
+                check_choice(f"{where}, same_as (an earlier row)", row.same_as, labels[:index])
+            for name in row.without:
+                check_choice(f"{where}, without", name, names)
+            for name in (*row.values, *row.doubtful):
+                check_choice(f"{where}, printed column", name, printed)
+            is_log = self.factor is not None and self.factor.axis == "log"
+            if row.x is not None and (self.factor is None or (is_log and row.x <= 0)):
+                raise ValueError(f"{where}: 'x' needs a factor, and must be > 0 on a log axis.")
+            for metric in (each.metric for each in self.columns if each.metric is not None):
+                for key in re.findall(r"{(\w+)}", metric):
+                    check_choice(f"{where}, settings for '{metric}'", key, row.settings)
+                parse(metric.format_map(row.settings))
+        return self
+
+    @model_validator(mode="after")
+    def _check_claims(self) -> Table:
+        labels = [each.label for each in self.rows]
+        for claim in self.claims:
+            named = claim.against if claim.against not in ((OTHERS,), (PREVIOUS,)) else ()
+            for label in (*claim.rows, *named):
+                check_choice(f"claim '{claim.name}', rows", label, labels)
+            for name in (*claim.columns, *([claim.minus_column] if claim.minus_column else [])):
+                known = [each.name for each in self.columns]
+                check_choice(f"claim '{claim.name}', columns", name, known)
+            if not claim.columns or not any(True for _ in claim.pairs(labels)):
+                raise ValueError(f"claim '{claim.name}': there is nothing to compare.")
+        return self
 
     @property
     def runnable_rows(self) -> list[Row]:
