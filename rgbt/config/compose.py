@@ -192,7 +192,7 @@ def register_resolvers() -> None:
     """
     Plugins.instance()  # registers Hydra's own sources, once
     SourcesRegistry.instance().types["file"] = _ParsedOnce
-    defaults_list._create_interpolation_map = _choices_of_children
+    defaults_list._create_interpolation_map = _choices_of_children  # type: ignore[assignment]
     resolvers: dict[str, Callable[..., Any]] = {
         "by_scale": _by_scale,
         "by_network": _by_network,

@@ -185,10 +185,11 @@ class Design(Strict):
 
     @model_validator(mode="after")
     def _check_names(self) -> Design:
-        for names in (self.letters, [f.name for f in self.factors], [m.name for m in self.methods]):
-            if len(set(names)) < len(names):
-                raise ValueError(f"a name is used twice in {', '.join(names)}.")
-        for letter in (letter for each in self.combined for letter in each.levels):
+        names = ([f.name for f in self.factors], [m.name for m in self.methods])
+        for each in (self.letters, *names):
+            if len(set(each)) < len(each):
+                raise ValueError(f"a name is used twice in {', '.join(each)}.")
+        for letter in (letter for one in self.combined for letter in one.levels):
             check_choice("combined.levels", letter, self.letters)
         for index, method in enumerate(self.methods):
             check_choice("methods.experiment", method.experiment, available("experiment"))
@@ -209,15 +210,16 @@ class Design(Strict):
                 for other in others:
                     check_choice("generators (factors without a generator)", other, free)
             cells = self.cells(part)
-            for main, *others in self.effects(part).values():
-                if (len(main) == 1 and others) or len({sign_of(cell, main) for cell in cells}) == 1:
+            for main, *aliases in map(list, self.effects(part).values()):
+                is_constant = len({sign_of(cell, main) for cell in cells}) == 1
+                if (len(main) == 1 and aliases) or is_constant:
                     raise ValueError(
-                        f"generators: the effect of {main} cannot be told apart from "
-                        f"{', '.join(others) or 'the mean'}; use products of three factors or more."
+                        f"generators: {main} cannot be told apart from "
+                        f"{', '.join(aliases) or 'the mean'}; use products of three factors."
                     )
-            # The last override of a key wins.
-            words = ([word.partition("=")[::2] for word in self.cell_overrides(c)] for c in cells)
-            if len({tuple(sorted(dict(each).items())) for each in words}) < len(cells):
+            words = [[w.partition("=")[::2] for w in self.cell_overrides(cell)] for cell in cells]
+            worlds = {tuple(sorted(dict(each).items())) for each in words}  # the last value wins
+            if len(worlds) < len(cells):
                 raise ValueError("two cells have equal overrides; a factor changes nothing.")
         return self
 

@@ -150,7 +150,7 @@ class ExternalRun:
             config = compose([*base, *words])
             fingerprint = build(config.dataset).fingerprint()
             plain: Any = OmegaConf.to_container(config, resolve=True)
-        arguments = (f"dataset={NODE_FILE}",)
+        arguments: tuple[str, ...] = (f"dataset={NODE_FILE}",)
         if given.kind == "weights" and row.network:
             machine = (word for word in request.extra if word.startswith(MACHINE))
             arguments = (*row.network, *arguments, *machine)

@@ -186,7 +186,8 @@ class Row(Strict):
     def _check(self) -> Row:
         if self.experiment is None and (self.overrides or self.released):
             raise ValueError("'experiment' has no value; without it overrides have no effect.")
-        for experiment in (self.experiment, self.released and self.released.experiment):
+        released = self.released.experiment if self.released else None
+        for experiment in (self.experiment, released):
             if experiment is not None:
                 check_choice("experiment", experiment, available("experiment"))
         if size := self.settings.get("image_hw"):

@@ -1,15 +1,26 @@
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
 from rgbt.checks import InputError
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Outcome
-from sweeps.table.make_request import TableWords, make_request, read_named
+from sweeps.table.claim import Claim
+from sweeps.table.load_table import load_table
+from sweeps.table.make_request import (
+    TableWords,
+    check_equal_runs,
+    make_request,
+    read_named,
+    select_rows,
+)
 from sweeps.table.request import TableRequest, seeds_of
 from sweeps.table.table import Column, Row
+from sweeps.worker.planner import Planner
 from tests.sweeps.tabled import table
 
 COLUMNS = (
@@ -109,7 +120,7 @@ def test_seeds(text: str, seeds: tuple[int, ...]) -> None:
 
 @pytest.mark.parametrize("text", ["0", "", "a", "1,1", "-2", "1.5", "1,"])
 def test_no_seeds(text: str) -> None:
-    with pytest.raises(InputError, match="expected a number of seeds"):
+    with pytest.raises(InputError, match="^seeds="):
         seeds_of(text)
 
 
@@ -160,3 +171,63 @@ def test_evaluated_rows_are_not_trained() -> None:
     asked = replace(wanted(), evaluated=("other",))
     assert {label for label, _ in asked.row_seeds()} == {"small", "large"}
     assert len(asked.points()) == 2
+
+
+def claim(name: str, rows: tuple[str, ...], against: tuple[str, ...]) -> Claim:
+    about: Any = {"says": "", "source": "", "columns": ("acc",), "expected": "higher"}
+    return Claim(name=name, rows=rows, against=against, **about)
+
+
+def test_selected_rows_keep_their_claims() -> None:
+    rows = (
+        Row(label="a", experiment="crm"),
+        Row(label="b", experiment="crm", same_as="a"),
+        Row(label="c", experiment="grbm"),
+    )
+    claims = (claim("b_a", ("b",), ("a",)), claim("c_a", ("c",), ("a",)))
+    made = table(rows, claims=(*claims, claim("best", ("c",), ("others",))))
+    chosen = select_rows(made, "c,1")
+    assert [row.label for row in chosen.rows] == ["a", "c"]
+    assert [each.name for each in chosen.claims] == ["c_a"]
+    assert select_rows(made, "b").rows[0].same_as is None
+    assert select_rows(made, "a,b,c").claims == made.claims
+
+
+def test_twins_of_a_row_that_is_left_out_stay_declared() -> None:
+    rows = (
+        Row(label="a", experiment="crm"),
+        Row(label="b", experiment="crm", same_as="a"),
+        Row(label="c", experiment="crm", same_as="b"),
+        Row(label="d, with comma", experiment="grbm"),
+    )
+    chosen = select_rows(table(rows), "b,c,d, with comma")
+    assert [(row.label, row.same_as) for row in chosen.rows] == [
+        *(("b", None), ("c", "b"), ("d, with comma", None)),
+    ]
+    with pytest.raises(InputError, match="'e'"):
+        select_rows(table(rows), "e")
+
+
+def test_rows_that_are_one_run_are_refused_unless_the_table_says_so() -> None:
+    first, third = (Row(label=each, experiment="baseline") for each in "ac")
+    same = Row(label="b", experiment="baseline", same_as="a")
+    with pytest.raises(InputError, match=r"'a' and 'c' of own/t would be the same run .* same_as"):
+        check_equal_runs(TableRequest("own/t", table((first, third)), "demo", (0,)), Planner())
+    third = replace(third, same_as="b")
+    check_equal_runs(TableRequest("own/t", table((first, same, third)), "demo", (0,)), Planner())
+
+
+@pytest.mark.parametrize(
+    ("words", "is_refused"),
+    [
+        (("masker=grbm_released", "masker.sigma_div=4"), True),
+        (("recipe.batch_size=1", "dataset.root=/data", "model.queries=8"), False),
+    ],
+)
+def test_overrides_that_make_rows_equal_are_refused(
+    words: tuple[str, ...], is_refused: bool
+) -> None:
+    made = select_rows(load_table("spatialseg/table3"), "Ny,Ny/4")
+    request = TableRequest("t", made, "demo", (0,), words)
+    with pytest.raises(InputError, match="'Ny' and 'Ny/4'") if is_refused else nullcontext():
+        check_equal_runs(request, Planner())

@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.table.cells import TableCell
-from sweeps.table.scoring import ScoredTable, check_metrics, published, score, size_marks
+from sweeps.table.scoring import ScoredTable, published, score, size_marks
 from sweeps.table.table import Column, Row
 from tests.sweeps.tabled import Made, counts_of, failed, outcome, pairs_of, right, table
 
@@ -223,12 +222,6 @@ def test_score_counts_commits_by_run() -> None:
     }
     rows = (Row(label="a"), Row(label="b"))
     assert scored((ACC,), runs, rows).commits == {"aaa": 1, "bbb": 1}
-
-
-def test_check_metrics_refuses_misspelt_metric() -> None:
-    with pytest.raises(InputError, match="did you mean 'mIoU'"):
-        check_metrics(table(ROW, (Column(name="x", metric="mIou"),)))
-    check_metrics(table(ROW, (ACC, RGB, LESS)))
 
 
 @pytest.mark.parametrize(("absent", "wanted"), [("released", 50.0), ("exclude", 100.0)])

@@ -14,11 +14,10 @@ from sweeps.rendering.effects import CSV_HEADER, effects_csv, effects_grids
 from sweeps.rendering.effects_figure import draw_effects
 from sweeps.table.cells import world_evaluations
 from sweeps.table.design import Design, DesignFactor, DesignMethod, Part
-from sweeps.table.design_rows import with_design_rows
-from sweeps.table.rows import select_rows
-from sweeps.table.table import Column, Table
+from sweeps.table.make_request import select_rows
+from sweeps.table.table import Column, Row, Table
 from sweeps.verdicts.effects import MEAN, DesignJudge
-from tests.sweeps.tabled import counts_of, failed, outcome
+from tests.sweeps.tabled import counts_of, failed, outcome, table
 
 WHOLE = Part()
 """All combinations of the levels."""
@@ -53,8 +52,8 @@ def design_table(trained: Part | None = WHOLE, tested: Part | None = None) -> Ta
         Column(name="two", metric="region/2"),
         Column(name="contrast", minus=("one", "two")),
     )
-    table = Table(paper="my", number="1", caption="", data="", columns=columns, design=design)
-    return with_design_rows(table, "file")
+    rows = tuple(Row(**each) for each in design.rows())
+    return table(rows, columns, design=design)
 
 
 def with_rates(first: float, second: float) -> Counts:
