@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import FrozenInstanceError
 from pathlib import Path
 from typing import Any
@@ -123,7 +124,7 @@ def claim(**keys: Any) -> dict[str, Any]:
         (claim(against=["small"]), "nothing to compare"),
         (claim(expected="similar"), "at_most"),
         (claim(at_least=2, at_most=1), "at_most"),
-        ({"claims": [ONE_CLAIM, dict(ONE_CLAIM, against=[])]}, "'c' is used twice"),
+        ({"claims": [ONE_CLAIM, copy.deepcopy(ONE_CLAIM)]}, "'c' is used twice"),
     ],
 )
 def test_table_that_does_not_fit_is_refused(

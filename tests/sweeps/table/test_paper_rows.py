@@ -13,7 +13,6 @@ from sweeps.evaluation import ExtraEvaluation
 from sweeps.table.load_table import load_table, table_names
 from sweeps.table.request import TableRequest
 from sweeps.table.table import Row, Table
-from tests.composed import row_spec, specified
 from tests.sweeps.composed import checked, row_config
 
 TABLES = {name: load_table(name) for name in table_names(Path("none"))}
@@ -103,14 +102,6 @@ def test_multihead_row_has_printed_heads_and_adaptation(table: Table, row: Row) 
     assert {key: found[key] for key in shared} == {key: row.settings[key] for key in shared}
 
 
-@pytest.mark.slow  # that of its experiment is looked at in tests/test_config.py
-@pytest.mark.parametrize(("table", "row"), rows_of("multihead"))
-def test_multihead_row_at_paper_scale_trains_on_freiburg(table: Table, row: Row) -> None:
-    config = row_config(table, row, "paper")
-    assert (config.dataset.name, config.dataset.num_classes) == ("freiburg", 14)
-    assert config.model.num_classes == 14
-
-
 TWICE = (
     "spatialseg/table3 Ny/4 | spatialseg/table4 PS 64 | spatialseg/table5 alpha 0"
     " | spatialseg/table6 no weighting",
@@ -138,18 +129,6 @@ def test_rows_printed_twice_are_one_run(cells: str, scale: str) -> None:
         assert value is not None
         printed.add(round(value, 1))
     assert (len(keys), len(printed)) == (1, 1)
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["crm/table3a", "crm/table3b", "crm/table4"]
-    + [f"spatialseg/table{number}" for number in (3, 4, 5, 6)]
-    + [f"temporal/table{number}" for number in (1, 2, 3)],
-)
-def test_rows_of_an_ablation_are_different_runs(name: str) -> None:
-    table = TABLES[name]
-    keys = {specify(row_config(table, row, "demo")).key for row in table.rows}
-    assert len(keys) == len(table.rows)
 
 
 @pytest.mark.parametrize("name", ["crm/table3b", "crm/table4", "spatialseg/table4"])
@@ -225,35 +204,3 @@ def test_printed_consistency_is_of_released_protocol(number: int) -> None:
     protocols = [evaluation.frames for evaluation in wanted.evaluations()]
     assert protocols == ["released", "aligned"]
     assert any("use the released protocol" in remark for remark in wanted.table.remarks)
-
-
-def test_rtfnet_backbones_differ_at_paper_scale_only() -> None:
-    wanted = [request("temporal/table5", scale) for scale in ("demo", "paper")]
-    assert [len(each.points()) for each in wanted] == [2, 4]
-    assert wanted[1].models() == {"rtfnet_50", "rtfnet_152"}
-
-
-RTFNET = {
-    "RTFNet (ResNet-50)": ("rtfnet", 3),
-    "Ours-con (ResNet-50)": ("rtfnet_temporal_con", 3),
-    "RTFNet (ResNet-152)": ("rtfnet_152", 2),
-    "Ours-con (ResNet-152)": ("rtfnet_152_temporal_con", 2),
-}
-"""Row of Temporal, Table V -> its experiment, and images of a batch in the release of RTFNet."""
-
-
-@pytest.mark.parametrize("label", RTFNET)
-def test_rtfnet_rows_are_experiments_with_the_recipe_of_their_backbone(label: str) -> None:
-    experiment, batch = RTFNET[label]
-    table = request("temporal/table5").table
-    (row,) = (each for each in table.rows if each.label == label)
-    words = (f"+experiment={experiment}", "scale=paper", "dataset.root=/data")
-    spec = specified(words)
-    assert spec.key == row_spec(table, row, "paper").key
-    epoch = 1568 // batch  # of the training list, which holds every image twice
-    assert spec.plain["data"]["batch_size"] == batch
-    # The release keeps the last, smaller batch; the loader here drops it.
-    assert spec.plain["schedule"]["epoch_steps"] == -(-1568 // batch)
-    assert spec.trainer.max_steps == 100 * epoch
-    assert spec.trainer.eval_every == 5 * epoch
-    assert specified((words[0],)).key == row_spec(table, row, "demo").key
