@@ -60,20 +60,13 @@ def main(options: Options, overrides: list[str]) -> int:
     print_rich(Text("\n".join([by_paper(judged), *times])))
     if options.out is not None:
         options.out.mkdir(parents=True, exist_ok=True)
-        text = (
-            f"# Claims of the papers\n\n{counted(judged)} Runs: `{without_folders(run_as)}`.\n\n"
-            + "".join(f"{line}\n\n" for line in times)
-            + claims_markdown(judged, tables=True)
-        )
+        words = re.sub(r" ?dataset\.root=\S+", "", run_as)  # the folder names a machine
+        head = f"# Claims of the papers\n\n{counted(judged)} Runs: `{words}`."
+        text = "\n\n".join([head, *times, claims_markdown(judged, tables=True)])
         write_atomic(options.out / "claims.md", text.encode())
         write_atomic(options.out / "claims.csv", claims_csv(judged).encode())
         print_rich(path_lines([("claims", str(options.out / "claims.md"))]))
     return 0
-
-
-def without_folders(words: str) -> str:
-    """Words of a command without the folder of the data, which names a machine."""
-    return re.sub(r" ?dataset\.root=\S+", "", words)
 
 
 def judge_all(options: Options, overrides: Sequence[str]) -> tuple[list[JudgedClaim], list[str]]:

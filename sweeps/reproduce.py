@@ -35,86 +35,49 @@ NEW = PlainCommand(NewOptions, new, name="rgbt reproduce new")
 class Options:
     """Options of ``rgbt reproduce``; the sweeper's file explains those of execution too."""
 
-    table: Annotated[
-        str,
-        Help(
-            "table to run: spatialseg/table3, my/ablation (in ./tables) or a file; all: every "
-            "table, with dry_run=true"
-        ),
-    ]
+    table: Annotated[str, Help("spatialseg/table3, my/ablation (in ./tables), a file, or all")]
     seeds: Annotated[
-        str,
-        Help(
-            "number of seeds (3: seeds 0, 1, 2), a list (0,4,7), or until_decided: start with 4 "
-            "and add paired seeds to the rows of undecided claims, up to max_seeds"
-        ),
+        str, Help("a number (3: seeds 0, 1, 2), a list (0,4,7), or until_decided: up to max_seeds")
     ] = "1"
     max_seeds: Annotated[
         int, Interval(ge=4, le=1000), Help("most seeds of a row with seeds=until_decided")
     ] = 20
     scale: Annotated[
-        str,
-        Help(
-            "demo (minutes, embedded data), bench (calibrated data, common start) or paper "
-            "(published sizes)"
-        ),
+        str, Help("demo (minutes, embedded data), bench (common start) or paper (as published)")
     ] = "demo"
     form: Annotated[
         Literal["paper", "released", "both"],
-        Help(
-            "paper: rows as the text describes them; released: as their release made them, where "
-            "it is known; both: both, and the difference"
-        ),
+        Help("rows as the paper's text describes them, as their release made them, or both"),
     ] = "paper"
     rows: Annotated[
         str, Help("run some rows only, by label, number or group: rows=Ny,3; default: all")
     ] = ""
-    dry_run: Annotated[
-        bool, Help("true: show the runs of the cells, their states and the time left; run nothing")
-    ] = False
+    dry_run: Annotated[bool, Help("true: only show runs, their states and the time")] = False
     runs_dir: RunsDir = Path("runs")
     out: Annotated[
         Path | None,
-        Help(
-            "output folder of table.md, .csv, .tex and figure.png; default: tables/ in the folder "
-            "of runs"
-        ),
+        Help("folder of the table's files; default: tables/ in the folder of runs"),
     ] = None
     workers: Annotated[int, Help("number of runs at the same time")] = 1
     gpus: Annotated[
         tuple[int | tuple[int, ...], ...] | None,
-        Help(
-            "GPUs to use: gpus=[0,1] assigns one GPU to each worker, gpus=[[0,1],[2,3]] two, for "
-            "runs with trainer.devices=auto"
-        ),
+        Help("GPU of each worker: gpus=[0,1]; or several: gpus=[[0,1],[2,3]]"),
     ] = None
     retry: Annotated[
-        Literal["none", "failed"],
-        Help("failed: retry runs that failed in a previous call; none: do not"),
+        Literal["none", "failed"], Help("failed: retry runs that failed in a previous call")
     ] = "none"
     retries: Annotated[int, Help("how often a failed run is retried in this call")] = 0
     fresh: Annotated[
-        bool,
-        Help(
-            "true: retrain runs that another version of the code made; the old runs move to "
-            "<runs_dir>/replaced"
-        ),
+        bool, Help("true: retrain runs of other code; old ones move to <runs_dir>/replaced")
     ] = False
-    wait: Annotated[
-        bool,
-        Help("true: wait for cells that other commands run; false: do not wait"),
-    ] = True
+    wait: Annotated[bool, Help("true: wait for cells that other commands run")] = True
     storage: Annotated[
-        str | None,
-        Help("Optuna storage that all machines share: file.journal or postgresql://user@host/name"),
+        str | None, Help("Optuna storage that all machines share: postgresql://user@host/name")
     ] = None
     timeout_minutes: Annotated[float | None, Help("time limit of one run")] = None
-    max_failures: Annotated[
-        int | None, Help("start no more runs after this number of failures")
-    ] = None
+    max_failures: Annotated[int | None, Help("start no more runs after so many failures")] = None
     executor: Annotated[
-        Literal["local", "submitit"],
-        Help("local: processes on this machine; submitit: jobs of a cluster"),
+        Literal["local", "submitit"], Help("processes on this machine, or jobs of a cluster")
     ] = "local"
     trust: Trust = ""
     submitit: Annotated[

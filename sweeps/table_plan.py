@@ -54,11 +54,7 @@ class TablePlan:
     external: dict[CellRunId, Outcome] = field(default_factory=dict)
 
     def evaluate_external(self, runs_dir: Path, trust: str) -> None:
-        """Count the rows that are not trained; counts of an earlier call are read.
-
-        Raises:
-            InputError: a file or folder that does not fit its row.
-        """
+        """Count the rows that are not trained; InputError: a path that does not fit its row."""
         for row in self.rows:
             run = ExternalRun.of(row, self.request, self.points.base, runs_dir)
             outcome = run.outcome(self.request.table, trust)
@@ -70,14 +66,7 @@ class TablePlan:
 def plan_table(
     table_name: str, options: Options, extra: Sequence[str], runs: RunStore, planner: Planner
 ) -> TablePlan:
-    """The table as it is run.
-
-    Args:
-        table_name: see `sweeps.table.load_table.table_path`.
-        options: of the command.
-        extra: overrides of every row.
-        runs: finished runs.
-        planner: of its runs.
+    """The table as it is run, with `extra` as overrides of every row.
 
     Raises:
         InputError: no such table, row, scale or metric; no seeds; overrides that mix rows up; seeds

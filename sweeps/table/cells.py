@@ -147,10 +147,8 @@ def _values(table: Table, row: Row, outcome: Outcome) -> dict[str, Value]:
 def _counts(outcome: Outcome, path: str) -> Counts | str:
     if outcome.state != "finished" or not outcome.results:
         return outcome.reason or outcome.state
-    if path in outcome.missing:
-        return outcome.missing[path]
     try:
-        return outcome.results[0].counts(path)
+        return outcome.missing.get(path) or outcome.results[0].counts(path)
     except (InputError, OSError) as error:
         return str(error)
 
@@ -183,10 +181,8 @@ def over_seeds(
         if isinstance(each, str):
             reasons.setdefault(each, []).append(str(seed))
     sentences = [
-        reason
-        if seeds == [NO_SEED]
-        else f"seed{'s' * (len(seeds) > 1)} {', '.join(seeds)}: {reason}"
-        for reason, seeds in reasons.items()
+        why if seeds == [NO_SEED] else f"seed{'s' * (len(seeds) > 1)} {', '.join(seeds)}: {why}"
+        for why, seeds in reasons.items()
     ]
     return TableCell(
         mean=statistics.fmean(values) if values else math.nan,

@@ -80,11 +80,7 @@ class Claim(Strict):
         return (self.at_least, most) if self.expected == "higher" else (-most, -self.at_least)
 
     def pairs(self, labels: Sequence[str]) -> Iterator[tuple[str, str | None]]:
-        """(row, row that is subtracted or None) of every contrast of a column.
-
-        Args:
-            labels: rows that `OTHERS` stands for.
-        """
+        """(row, row that is subtracted or None) of a column; `labels` are what `OTHERS` means."""
         if self.against == (PREVIOUS,):
             yield from zip(self.rows[1:], self.rows[:-1], strict=True)
             return

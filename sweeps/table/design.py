@@ -30,14 +30,7 @@ TRAINED, TESTED = "trained", "tested"
 
 @dataclass(frozen=True, kw_only=True)
 class DesignFactor(Strict):
-    """A factor that is switched alone.
-
-    Attributes:
-        letter: one capital letter, e.g. "N".
-        name: one or two words, e.g. "noise".
-        low: overrides of the low level; `low_means` what it is, for readers.
-        high: overrides of the high level.
-    """
+    """A factor that is switched alone: overrides of both levels, and what they mean."""
 
     letter: Annotated[str, StringConstraints(pattern="^[A-Z]$")]
     name: str
@@ -72,7 +65,7 @@ class Part(Strict):
     Attributes:
         overrides: of every cell of this part, after those of the design.
         generators: letter of a factor -> letters of others whose product is its level, as
-            {S: OCN}; each halves the number of cells. Empty: all combinations.
+            {S: OCN}; each halves the number of cells.
     """
 
     overrides: tuple[str, ...] = ()
@@ -84,14 +77,10 @@ class Design(Strict):
     """A two-level factorial design.
 
     Attributes:
-        factors: in order.
-        combined: settings that depend on several factors.
         overrides: of every run and cell, e.g. the data set.
-        methods: in order.
         outcomes: names of columns whose effects are estimated.
-        trained: each method is trained and tested in each cell; None: not offered.
-        tested: each method is trained once, without any factor, and tested in each cell; None: not
-            offered.
+        trained: each method is trained and tested in each cell.
+        tested: each method is trained once, without any factor, and tested in each cell.
     """
 
     factors: Annotated[tuple[DesignFactor, ...], MinLen(2)]
@@ -108,11 +97,7 @@ class Design(Strict):
         return tuple(factor.letter for factor in self.factors)
 
     def cells(self, part: Part) -> tuple[Levels, ...]:
-        """Levels of every cell of a part; the first factor changes most slowly.
-
-        Two factors and a third with ``generators: {C: AB}`` have the cells A- B- C+, A- B+ C-,
-        A+ B- C-, A+ B+ C+.
-        """
+        """Levels of every cell of a part; the first factor changes most slowly."""
         free = [letter for letter in self.letters if letter not in part.generators]
         words: tuple[Level, ...] = ("low", "high")
         cells = []
@@ -156,14 +141,11 @@ class Design(Strict):
         return found
 
     def rows(self) -> Iterator[dict[str, Any]]:
-        """The attributes of its rows (`sweeps.table.table.Row`).
-
-        First one for each method and cell that are trained, then one for each method whose network
-        is tested in every cell.
-        """
-        for method, cell in product(self.methods, self.cells(self.trained) if self.trained else ()):
-            part = self.trained.overrides if self.trained else ()
-            words = (*self.overrides, *part, *self.cell_overrides(cell), *method.overrides)
+        """The attributes of its rows: of each method and trained cell, then of each method."""
+        part = self.trained or Part()
+        for method, cell in product(self.methods, self.cells(part) if self.trained else ()):
+            words = (*self.overrides, *part.overrides, *self.cell_overrides(cell))
+            words = (*words, *method.overrides)
             yield {
                 **{"label": trained_label(method.name, cell), "group": TRAINED},
                 **{"experiment": method.experiment, "overrides": words},

@@ -123,11 +123,7 @@ def network_of(request: TableRequest, label: str) -> Network:
 def profiled(
     networks: Mapping[Network, str], *, measure: bool
 ) -> tuple[str, dict[str, dict[str, Any]]]:
-    """The device, and what `rgbt profile` counts and measures of networks with these names.
-
-    Raises:
-        InputError: a network cannot predict images of its size.
-    """
+    """The device, and what `rgbt profile` counts and measures of networks with these names."""
     from rgbt.evaluation.profile import ProfileSettings, profile
     from rgbt.evaluation.profiled_network import from_overrides
 
@@ -143,12 +139,8 @@ def profiled(
 def million_parameters(overrides: Sequence[str]) -> float:
     """Millions of parameters of the network that overrides of `python -m rgbt.run` describe.
 
-    Only the node `model` is built, on torch's device "meta": no data set is read, its `root` may be
-    missing, and no memory is used. Discriminators belong to the scheme and are not counted; frozen
-    parameters are.
-
-    Raises:
-        InputError: overrides that Hydra or the network's constructor refuses.
+    It is built on torch's device "meta", without data or memory. Frozen parameters are counted,
+    discriminators are not. InputError: overrides that Hydra or the network refuses.
     """
     import torch
 

@@ -53,14 +53,7 @@ NEEDS_PAIRS = (
 
 @dataclass(frozen=True)
 class ExternalRow:
-    """A row whose counts are made from a path of the user.
-
-    Attributes:
-        label: of the row.
-        kind: "weights": a file that the row's network is evaluated with; "predictions": a folder of
-            predicted label images.
-        path: of the file or folder, absolute.
-    """
+    """A row whose counts are made from a file of weights, or a folder of predictions."""
 
     label: str
     kind: Literal["weights", "predictions"]
@@ -68,11 +61,7 @@ class ExternalRow:
 
 
 def row_named(word: str, table: Table) -> Row:
-    """The row with this label, or with this number from 1 on.
-
-    Raises:
-        InputError: there is none.
-    """
+    """The row with this label, or with this number from 1 on; InputError: there is none."""
     rows = {str(number): row for number, row in enumerate(table.rows, start=1)}
     rows |= {row.label: row for row in table.rows}
     if word not in rows:
@@ -84,12 +73,7 @@ def row_named(word: str, table: Table) -> Row:
 def external_rows(words: Sequence[str], table: Table) -> tuple[list[ExternalRow], list[str]]:
     """The external rows in the order of the table, and all words that are not about them.
 
-    Args:
-        words: overrides as typed.
-        table: with the rows that are named.
-
-    Raises:
-        InputError: no such row, one without a network for weights, or a path that does not exist.
+    InputError: no such row, one without a network for weights, or a path that does not exist.
     """
     found: dict[str, ExternalRow] = {}
     others = []
@@ -114,14 +98,9 @@ def external_rows(words: Sequence[str], table: Table) -> tuple[list[ExternalRow]
 
 @dataclass(frozen=True)
 class ExternalRun:
-    """The evaluations of an external row.
+    """The evaluations of an external row: `arguments` of each command, `folder` of the counts.
 
-    Attributes:
-        given: the path of the user.
-        row: of the table.
-        config: with the data set and the regions: of the row, or of the first row that can be run.
-        arguments: of every command that evaluates it.
-        folder: of its counts.
+    Data set and regions are those of the row, or of the first row that can be run (`config`).
     """
 
     given: ExternalRow
@@ -135,10 +114,7 @@ class ExternalRun:
         cls, given: ExternalRow, request: TableRequest, base: Sequence[str], runs_dir: Path
     ) -> ExternalRun:
         """Weights are loaded into the network of `Row.network` at scale=paper, otherwise into that
-        of the row's experiment at the scale of the table.
-
-        Raises:
-            InputError: the data set or the overrides of the row are wrong.
+        of the row's experiment at the scale of the table. InputError: a wrong data set or row.
         """
         row = row_named(given.label, request.table)
         trained = row if row.experiment else next(iter(request.table.runnable_rows), row)
@@ -173,13 +149,9 @@ class ExternalRun:
         return cls(given, row, config, arguments, folder)
 
     def outcome(self, table: Table, trust: str) -> Outcome:
-        """Its run, "failed" if there are no counts at all.
+        """Its run, with all counts that columns of `table` need; those that are missing are made.
 
-        An evaluation that fails beside others is the reason of its columns alone.
-
-        Args:
-            table: its columns name the evaluations; counts that are missing are made.
-            trust: see `rgbt.config.common_options.Trust`.
+        "failed" if there are none; one that fails beside others is the reason of its columns alone.
         """
         columns = filter(is_counted, table.columns_of(self.row))
         evaluations = dict.fromkeys(evaluation_of(column, table) for column in columns)
@@ -243,10 +215,7 @@ class ExternalRun:
 
 
 def content_hash(path: Path) -> str:
-    """SHA-256 in hexadecimal of a file, or of names and contents of all files in a folder.
-
-    Hidden files and folders inside it are left out.
-    """
+    """SHA-256 of a file, or of names and contents of the files in a folder that are not hidden."""
     if path.is_file():
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()

@@ -62,11 +62,7 @@ def is_own(name: str) -> bool:
 
 
 def load_table(name: str, folder: Path = OWN) -> Table:
-    """Read and check a table; for `name` and `folder` see `table_path`.
-
-    Raises:
-        InputError: no such table, or a file that is refused, with its name and the key.
-    """
+    """Read and check a table (see `table_path`); InputError names its file and the wrong key."""
     path = table_path(name, folder)
     table: Table = check_value(str(path), read_yaml(path), Table)
     return table

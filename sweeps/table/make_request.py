@@ -31,11 +31,7 @@ OF_THE_ROWS = {
 
 
 def read_named(name: str) -> tuple[str, Table]:
-    """A table with the name that its records get.
-
-    Raises:
-        InputError: no such table, a file that is refused, or a name that MLflow refuses.
-    """
+    """A table with the name that its records get; InputError: as of `load_table`, or the name."""
     table, path = load_table(name), table_path(name).resolve()
     if name.endswith((".yaml", ".yml")):
         folder = PUBLISHED if path.is_relative_to(PUBLISHED) else STUDIES
@@ -50,11 +46,7 @@ def read_named(name: str) -> tuple[str, Table]:
 
 
 def check_override(word: str) -> None:
-    """Refuse an override that belongs to the rows or columns of a table.
-
-    Raises:
-        InputError: with what to do instead.
-    """
+    """Refuse an override that belongs to the rows or columns of a table."""
     key = word.lstrip("+~").partition("=")[0].rpartition("@")[2].partition(".")[0]
     if key in OF_THE_ROWS:
         raise InputError(f"'{word}': {OF_THE_ROWS[key]}")
@@ -64,9 +56,6 @@ def select_rows(table: Table, text: str) -> Table:
     """The table with the rows of ``rows=A,H`` alone, and with the claims about them.
 
     A row is named by its label or its number, several by the name of their group (`Row.group`).
-
-    Raises:
-        InputError: a name that no row has.
     """
     labels, words = [row.label for row in table.rows], split_list(text, "rows")
     chosen: set[str] = set()
@@ -97,12 +86,7 @@ def select_rows(table: Table, text: str) -> Table:
 def check_equal_runs(request: TableRequest, planner: Planner) -> None:
     """Refuse rows that are one run with the same scores, unless the table says so (`same_as`).
 
-    Args:
-        request: the table; rows that cannot be composed are left to the planning.
-        planner: of its runs.
-
-    Raises:
-        InputError: in one sentence, with the rows.
+    Rows that cannot be composed are left to the planning.
     """
     origin = _origins(request.table)
     seen: dict[tuple[Any, ...], str] = {}
@@ -131,17 +115,10 @@ def _origins(table: Table) -> dict[str, str]:
 
 @dataclass(frozen=True, kw_only=True)
 class TableWords:
-    """What a command says about a table.
+    """What a command says about a table, see `sweeps.table.request.TableRequest`.
 
-    Attributes:
-        seeds: of every row.
-        scale: a file of ``conf/scale``.
-        form: what the rows are run as.
-        rows: the rows to keep, with commas; "": all.
-        overrides: of every row, with pretrained.NETWORK=FILE, weights.ROW=FILE and
-            predictions.ROW=FOLDER.
-        others: further words that make it another table.
-        until_decided: see `sweeps.table.request.TableRequest`.
+    `overrides` are those of every row, with pretrained.NETWORK=FILE, weights.ROW=FILE and
+    predictions.ROW=FOLDER; `others` are further words that make it another table.
     """
 
     seeds: Sequence[int]
@@ -158,13 +135,7 @@ def make_request(
 ) -> tuple[TableRequest, list[ExternalRow]]:
     """The request of a table, and its rows that are evaluated and not trained.
 
-    Args:
-        name: of the table.
-        table: its file, see `read_named`.
-        words: of the command.
-
-    Raises:
-        InputError: no such scale, row or network.
+    InputError: no such scale, row or network.
     """
     check_choice("scale", words.scale, available("scale"))
     table = select_rows(table, words.rows) if words.rows else table

@@ -24,18 +24,7 @@ HEAD = """\
 # Preview: rgbt reproduce table={name} seeds=3 dry_run=true
 # A row is the command `rgbt run +experiment=<experiment> <overrides>`. You can add, change and
 # remove rows: finished runs are reused, only missing runs are started.
-# Further columns:
-#   metric: mAcc, mPrecision, mF1, pixel_accuracy, class/person, class/person/acc,
-#     class/person/region/1, day/mIoU, night/mIoU
-#   modality: thermal            predict without RGB
-#   head: source                 predict with one head of a network with two
-#   corruption: noise, severity: 16    corrupted images (docs/how-to/measure-robustness.md)
-#   {{name: both, mean: [day, night]}}, {{name: gain, minus: [day, night]}}    from other columns
-#   {{name: TC, metric: TC, frames: aligned}}, also CA    docs/how-to/measure-consistency.md
-#   {{name: size, efficiency: parameters}}    also gflops, peak_memory, latency, images_per_second
-# Further keys of a row: values: {{mIoU: 61.79}} (published values, shown beside ours),
-# remarks: [a footnote], settings: {{key: value}}, at: {{paper: [model=mask2former_swin_s]}},
-# without: [a column that the row's network has no score for]
+# Further keys of columns and rows: docs/how-to/add-a-table.md
 """
 
 
@@ -63,16 +52,10 @@ def new(options: NewOptions, overrides: list[str]) -> int:
 
 
 def write_new(name: str, experiment: str, overrides: Sequence[str], folder: Path) -> Path:
-    """Write the file of a new table; every row is composed and checked before.
+    """Write the file of a new table into `folder`; every row is composed and checked before.
 
-    Args:
-        name: e.g. "my/ablation".
-        experiment: a file of ``conf/experiment``.
-        overrides: of `python -m rgbt.run`; comma lists are varied, all with all.
-        folder: of the user's tables.
-
-    Raises:
-        InputError: the file exists already, nothing is varied, or a row does not fit.
+    Comma lists of `overrides` are varied, all with all. InputError: the file exists already,
+    nothing is varied, or a row does not fit.
     """
     import yaml
 

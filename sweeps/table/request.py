@@ -71,10 +71,7 @@ class TableRequest:
         return (experiment, *scale, *others, *self.extra, *weights, f"seed={seed}")
 
     def row_seeds(self) -> list[tuple[str, int]]:
-        """(label, seed) of every run; all rows of a seed before the next seed.
-
-        Empty where no column is a score: columns of efficiency need no run.
-        """
+        """(label, seed) of every run, seed by seed; columns of efficiency need none."""
         if not any(map(is_counted, self.table.columns)):
             return []
         return [(row.label, seed) for seed in self.seeds for row in self.trained_rows]
@@ -85,10 +82,7 @@ class TableRequest:
         return [row for row in self.table.runnable_rows if row.label not in self.evaluated]
 
     def points(self, row_seeds: Sequence[tuple[str, int]] | None = None) -> list[Point]:
-        """The points of some rows and seeds, by default of all.
-
-        Rows with equal overrides share one point.
-        """
+        """The points of some rows and seeds, by default of all; equal runs share one point."""
         sharing: dict[tuple[str, ...], list[str]] = {}
         for label, seed in self.row_seeds() if row_seeds is None else row_seeds:
             sharing.setdefault(self.overrides(label, seed), []).append(label)

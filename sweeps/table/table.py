@@ -20,21 +20,11 @@ from sweeps.evaluation import BatchNorm, Head
 from sweeps.table.claim import OTHERS, PREVIOUS, Claim, Strict
 from sweeps.table.design import Design
 
-Origin = Literal[
-    "own_method",
-    "own_baseline",
-    "own_run_of_other_method",
-    "own_run_of_other_method_inferred",
-    "imported",
-    "imported_inferred",
-    "mixed",
-]
 Form = Literal["paper", "released"]
 """What a row is run as: as the paper's text describes it, or as its release made it."""
 
 Efficiency = Literal["parameters", "gflops", "peak_memory", "latency", "images_per_second"]
-"""What a network needs: millions of parameters, GFLOPs, MiB, milliseconds for one image, images per
-second."""
+"""Millions of parameters, GFLOPs, MiB, milliseconds for one image, images per second."""
 
 COUNTED: tuple[Efficiency, ...] = ("parameters", "gflops")
 """The same on every machine."""
@@ -53,17 +43,13 @@ class Column(Strict):
             details (`rgbt.metrics.details`) with their default bins, such as distance/10-20;
             ``{key}`` is replaced by that entry of the row's settings.
         minus: (a, b): column a minus column b.
-        mean: mean of two or more other columns of the row, e.g. of day and night.
-        efficiency: of the row's network, counted or measured without any run and always at
-            scale=paper (`sweeps.table.efficiency`); discriminators are not part of it. The images
-            have the size `settings.image_hw` of the row, or 480 x 640.
+        mean: of two or more other columns of the row, e.g. of day and night.
+        efficiency: of the row's network at scale=paper (`sweeps.table.efficiency`), without any
+            run; on images of the size `settings.image_hw` of the row, or 480 x 640.
         modality: what is predicted from; "default": what the network is made for.
-        frames: of a consistency metric: which two predictions it compares, see
-            `rgbt.metrics.pairs`.
-        head: of a network with a head per domain, the one that predicts; see
-            `sweeps.evaluation.Head`.
-        corruption: of the images, NAME or NAME:IMAGE with a file of ``conf/corruption``; None: they
-            are clean.
+        frames: of a consistency metric: its protocol, see `rgbt.metrics.pairs`.
+        head: of a network with a head per domain, the one that predicts.
+        corruption: of the images, NAME or NAME:IMAGE with a file of ``conf/corruption``.
         severity: of the corruption; may be omitted if the corruption has a single one.
         batch_norm: statistics of batch normalisation, see `sweeps.evaluation.BatchNorm`.
         batch_norm_splits: splits whose images give them; (): the test split.
@@ -109,12 +95,7 @@ class Column(Strict):
 
 @dataclass(frozen=True, kw_only=True)
 class Factor(Strict):
-    """The x axis of the figure.
-
-    Attributes:
-        name: its label.
-        axis: "log" for values > 0.
-    """
+    """The x axis of the figure: its label, and "log" for values > 0."""
 
     name: str
     axis: Literal["linear", "log"] = "linear"
@@ -124,11 +105,7 @@ class Factor(Strict):
 class ReleasedForm(Strict):
     """How the release makes a row; what is None is as in the paper's form.
 
-    Attributes:
-        experiment: instead of `Row.experiment`.
-        overrides: instead of `Row.overrides`.
-        at: instead of `Row.at`.
-        remarks: what the release does differently, one sentence each.
+    `remarks` say what the release does differently, one sentence each.
     """
 
     experiment: str | None = None
@@ -151,8 +128,7 @@ class Row(Strict):
         overrides: of `python -m rgbt.run`, at every scale.
         at: further overrides by scale; they win over all others of the row.
         released: how the release makes the row; None: the same way, as far as known.
-        same_as: label of an earlier row that may be the same run, e.g. where one small network
-            stands for two backbones at scale=demo.
+        same_as: label of an earlier row that may be the same run.
         network: overrides that describe the row's network for an evaluation with a file of weights;
             (): those of `experiment`, if there is one.
         x: where the row lies on the axis of `Table.factor`.
@@ -166,7 +142,7 @@ class Row(Strict):
 
     label: str
     group: str = ""
-    origin: Origin | None = None
+    origin: str | None = None
     proposed: bool = False
     settings: Mapping[str, Any] = field(default_factory=dict)
     experiment: str | None = None
