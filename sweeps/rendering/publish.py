@@ -20,10 +20,9 @@ from sweeps.rendering.file_formats import latex, markdown, tidy_csv
 from sweeps.rendering.rendered_table import RenderedTable, render_table
 from sweeps.rendering.terminal import terminal
 from sweeps.report.records import record
-from sweeps.table.cells import NO_VALUE
+from sweeps.table.cells import NO_VALUE, ScoredTable, score, size_marks
 from sweeps.table.efficiency import efficiency_cells
 from sweeps.table.request import TableRequest
-from sweeps.table.scoring import ScoredTable, score, size_marks
 from sweeps.table.table import Table
 from sweeps.verdicts.effects import DesignEffects, DesignJudge
 from sweeps.verdicts.forms import forms_grid

@@ -1,11 +1,12 @@
-"""Our values of a table: the value of every run, then mean and spread over seeds."""
+"""Our values of a table: of every run, then mean and spread over seeds, beside the printed ones."""
 
 from __future__ import annotations
 
 import math
 import statistics
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from rgbt.checks import InputError
 from rgbt.metrics import names
@@ -14,7 +15,7 @@ from rgbt.metrics.details import details_of_metric
 from rgbt.metrics.named import value
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Outcome
-from sweeps.table.table import Column, Row, Table
+from sweeps.table.table import COUNTED, MEASURED, Column, Form, Row, Table
 
 HEADLINES = (names.MIOU, names.VAR, names.TC, names.CA, names.CA_RELEASED)
 """The scores that a table is about, where it has them."""
@@ -43,11 +44,9 @@ class TableCell:
         mean: over seeds, percent (Var: squared percent points); NaN without any.
         sd: standard deviation over seeds with n - 1; NaN for fewer than two.
         seeds: number of seeds of the mean; 0 for the efficiency of a network, which needs no run.
-        reason: why seeds are missing, or "".
-        mark: the reason in a word, e.g. "failed".
+        reason: why seeds are missing, or ""; `mark` says it in a word, e.g. "failed".
         keys: of the runs.
-        ratio: to the first row, of memory and speed; NaN for all else.
-        device: that memory and speed were measured on; "" for all else.
+        ratio: to the first row, of memory and speed, which were measured on `device`.
     """
 
     mean: float
@@ -192,3 +191,86 @@ def over_seeds(
         mark=mark,
         keys=keys,
     )
+
+
+@dataclass(frozen=True)
+class ScoredTable:
+    """A table with our values.
+
+    Attributes:
+        cells: only of rows that were run, and of columns of efficiency.
+        commits: git commit -> number of runs made by it.
+        marks: 1 for a row that is shown to be the best of the column, 2 for the second best; see
+            `sweeps.verdicts.judge.TableJudge.marks`.
+    """
+
+    name: str
+    table: Table
+    scale: str
+    seeds: tuple[int, ...]
+    cells: Mapping[CellId, TableCell]
+    commits: Mapping[str, int]
+    form: Form = "paper"
+    marks: Mapping[CellId, int] = field(default_factory=dict)
+
+    def difference(self, row: Row, column: Column) -> float:
+        """Ours less the printed value; NaN where one is missing or of another device."""
+        if column.efficiency in MEASURED:
+            return math.nan
+        cell = self.cells.get((row.label, column.name))
+        printed = published(row, column)
+        return math.nan if cell is None or printed is None else cell.mean - printed
+
+
+def published(row: Row, column: Column) -> float | None:
+    """The printed value, or None where there is none or a dash."""
+    printed = row.values.get(column.name)
+    return None if printed is None else float(printed)
+
+
+def score(
+    name: str,
+    table: Table,
+    runs: Mapping[tuple[str, int], Outcome],
+    *,
+    scale: str,
+    sizes: Mapping[CellId, TableCell] | None = None,
+) -> ScoredTable:
+    """Compute every cell of the rows with `runs`: (label of the row, seed) -> the run.
+
+    `sizes` are the cells of the columns of efficiency, see `sweeps.table.efficiency`.
+    """
+    seeds = sorted({seed for _, seed in runs})  # a row without seeds has a negative one
+    cells: dict[CellId, TableCell] = {}
+    for row in table.rows:
+        outcomes = {seed: runs[row.label, seed] for seed in seeds if (row.label, seed) in runs}
+        cells |= row_cells(table, row, outcomes)
+    made_by = {run.key: run.commit for outcome in runs.values() for run in outcome.results}
+    return ScoredTable(
+        name=name,
+        table=table,
+        scale=scale,
+        seeds=tuple(seed for seed in seeds if seed >= 0),
+        cells=cells | dict(sizes or {}),
+        commits=Counter(commit for commit in made_by.values() if commit is not None),
+    )
+
+
+def size_marks(table: Table, sizes: Mapping[CellId, TableCell]) -> dict[CellId, int]:
+    """Marks of columns that are counted without a run and so are exact: 1 best, 2 second best.
+
+    Sizes that are equal as shown share a mark. Where all are equal none has one.
+    """
+    marks: dict[CellId, int] = {}
+    for column in table.columns:
+        if column.efficiency not in COUNTED or column.best == "none":
+            continue
+        values = {
+            cell_id: round(cell.mean, 2)
+            for cell_id, cell in sizes.items()
+            if cell_id[1] == column.name and not math.isnan(cell.mean)
+        }
+        best = sorted(set(values.values()), reverse=column.best == "highest")[:2]
+        if len(best) == 2:
+            marks |= {each: best.index(v) + 1 for each, v in values.items() if v in best}
+    return marks

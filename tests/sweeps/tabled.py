@@ -13,8 +13,7 @@ from rgbt.metrics.counts import Counts
 from rgbt.metrics.pairs import Protocol, partition_name
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Outcome, Point
-from sweeps.table.cells import OWN_COUNTS, CellId
-from sweeps.table.scoring import ScoredTable, score
+from sweeps.table.cells import OWN_COUNTS, CellId, ScoredTable, score
 from sweeps.table.table import Column, Row, Table
 
 DAY = [[[2, 0], [0, 2]], [[1, 1], [0, 2]]]

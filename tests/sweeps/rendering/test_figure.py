@@ -13,7 +13,7 @@ from sweeps.rendering.figure import (
     figure_of,
     main_columns,
 )
-from sweeps.table.scoring import score
+from sweeps.table.cells import score
 from sweeps.table.table import Column, Factor, Row
 from tests.sweeps.tabled import Made, counts_of, outcome, table
 

@@ -13,8 +13,7 @@ from rgbt.terminal import WIDTH
 from sweeps.rendering.file_formats import latex, markdown, tidy_csv
 from sweeps.rendering.rendered_table import COUNTED, FORMS, NOT_PRINTED, SMALL, render_table
 from sweeps.rendering.terminal import terminal
-from sweeps.table.cells import TableCell
-from sweeps.table.scoring import ScoredTable, score, size_marks
+from sweeps.table.cells import ScoredTable, TableCell, score, size_marks
 from sweeps.table.table import Column, Row
 from tests.sweeps.tabled import Made, failed, outcome, right, table
 

@@ -21,11 +21,10 @@ from rgbt.metrics.pairs import tc
 from rgbt.runs.result import RunResult
 from sweeps.point import Outcome
 from sweeps.table import external
-from sweeps.table.cells import evaluation_of
+from sweeps.table.cells import evaluation_of, score
 from sweeps.table.external import ExternalRow, ExternalRun, content_hash, external_rows
 from sweeps.table.load_table import load_table
 from sweeps.table.make_request import TableWords, make_request
-from sweeps.table.scoring import score
 from sweeps.table.table import Column, Row, Table
 from tests.commands import SMALL, SPLITS, Call, Trained, code_of, short
 from tests.conftest import pair, write_data

@@ -79,7 +79,6 @@ def claim(**keys: Any) -> dict[str, Any]:
         ({"rows": []}, "rows"),
         (row(overides=["a=1"]), r"rows\[0\].overides"),
         (row(overrides=["a=1"]), r"rows\[0\].*experiment"),
-        (row(origin="own_methode"), "origin"),
         (row(values={"mIuO": 1}), "'mIuO'.*did you mean 'mIoU'"),
         (row(without=["Vra"]), "without: 'Vra'"),
         (row(values={"mIoU": "61"}), "values.mIoU"),

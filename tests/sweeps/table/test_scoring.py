@@ -9,8 +9,7 @@ import pytest
 
 from rgbt.metrics.counts import Counts
 from sweeps.evaluation import ExtraEvaluation
-from sweeps.table.cells import TableCell
-from sweeps.table.scoring import ScoredTable, published, score, size_marks
+from sweeps.table.cells import ScoredTable, TableCell, published, score, size_marks
 from sweeps.table.table import Column, Row
 from tests.sweeps.tabled import Made, counts_of, failed, outcome, pairs_of, right, table
 
