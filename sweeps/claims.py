@@ -70,24 +70,14 @@ def main(options: Options, overrides: list[str]) -> int:
 
 
 def judge_all(options: Options, overrides: Sequence[str]) -> tuple[list[JudgedClaim], list[str]]:
-    """The claims of the requested tables, judged by the finished runs; and how long these took.
-
-    Raises:
-        InputError: no such table, scale or folder of runs.
-    """
+    """The claims of the requested tables, judged by the finished runs; and how long these took."""
     from rich.console import Console
     from rich.progress import track
 
     from sweeps.rendering.times import time_line, upstream_line
+    from sweeps.table import make_request as requests
     from sweeps.table.efficiency import exact_sizes
     from sweeps.table.load_table import is_own, table_names
-    from sweeps.table.make_request import (
-        TableWords,
-        check_equal_runs,
-        check_override,
-        make_request,
-        read_named,
-    )
     from sweeps.verdicts.judge import TableJudge
     from sweeps.verdicts.stored import finished_by_seed, rule_of, stored_runs
     from sweeps.worker.planner import Planner
@@ -95,24 +85,26 @@ def judge_all(options: Options, overrides: Sequence[str]) -> tuple[list[JudgedCl
     names = table_names(Path("none")) if options.table == ALL else [options.table]
     finished = finished_by_seed(options.runs_dir)
     for word in overrides:
-        check_override(word)
-    words = TableWords(seeds=(0,), scale=options.scale, form=options.form, overrides=overrides)
+        requests.check_override(word)
+    words = requests.TableWords(
+        seeds=(0,), scale=options.scale, form=options.form, overrides=overrides
+    )
     planner = Planner(readable_paths([f"runs_dir={options.runs_dir}"]))
     judged: list[JudgedClaim] = []
     results: dict[str, RunResult] = {}
     trained: list[tuple[str, ...]] = []
     for each in track(names, "judging", console=Console(stderr=True), transient=True):
-        name, table = read_named(each)
+        name, table = requests.read_named(each)
         if not table.claims:
             continue
-        request, external = make_request(name, table, words)
+        request, external = requests.make_request(name, table, words)
         if external:
             raise InputError(
                 f"{external[0].kind}.{external[0].label}: only finished runs are judged here; "
                 f"use rgbt reproduce table={name} for rows that are not trained."
             )
         if overrides or is_own(each):  # a test checks the others
-            check_equal_runs(request, planner)
+            requests.check_equal_runs(request, planner)
         runs = {}
         if overrides or finished:
             runs = stored_runs(request, options.runs_dir, finished, planner)

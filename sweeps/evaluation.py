@@ -22,16 +22,8 @@ BatchNorm = Literal["as trained", "recomputed", "adabn", "batch"]
 class ExtraEvaluation:
     """An evaluation of a finished run beside the one that every run ends with.
 
-    Attributes:
-        modality: "rgbt", "rgb" or "thermal"; "default": what the network is made for.
+    Attributes: see `sweeps.table.table.Column`, and
         regions: a file of ``conf/metric``, or "as trained".
-        frames: protocol of pairs of frames, see `rgbt.metrics.pairs`; None: single frames.
-        head: see `Head`; of single frames alone.
-        corruption: of the images, NAME or NAME:IMAGE with a file of ``conf/corruption``; None:
-            clean, as the evaluation that the run makes itself.
-        severity: of the corruption; None: the only one that it has.
-        batch_norm: see `BatchNorm`; of single frames alone.
-        batch_norm_splits: splits whose images give its statistics; (): the evaluated one.
         details: kind of counts beside the confusion matrices, see `rgbt.metrics.details`.
         world: name of the images where they are not the run's own, e.g. "O-N+"; "" where they are.
         dataset: overrides of the data set that make this world.

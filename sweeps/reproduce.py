@@ -119,47 +119,44 @@ def main(options: Options, overrides: list[str]) -> int:
     for word in overrides:
         check_override(word)
     tracker = [word for word in overrides if word.lstrip("+~").startswith("tracking")]
-    extra = tuple(word for word in overrides if word not in tracker)
     if options.table == ALL and not settings.dry_run:
         raise InputError("table=all requires dry_run=true; run one table at a time.")
-    tables = table_names() if options.table == ALL else [options.table]
     base = (*readable_paths([f"runs_dir={options.runs_dir}"]), *tracker)
     with composing(base):
         config = compose([*base, f"fresh={str(options.fresh).lower()}"])
         Component.from_node(config.tracking)
     runs = open_run_store(config)
     planner = Planner(base)
+    extra = [word for word in overrides if word not in tracker]
+    tables = table_names() if options.table == ALL else [options.table]
     plans = [plan_table(each, options, extra, runs, planner) for each in tables]
     if settings.dry_run:
         previews = [preview_points(plan.points, settings, planner) for plan in plans]
         _show(options.table, list(zip(plans, previews, strict=True)), settings.workers, planner)
         return 0
-    (plan,) = plans
+    plan = plans[0]
     plan.evaluate_external(runs.runs_dir, options.trust)
     outcomes = run_points(plan.points, settings, planner) if plan.points.points else []
     if plan.until_decided is None:  # an earlier command may have added seeds
         plan.judge.rule = rule_of(result.tags for each in outcomes for result in each.results)
-    request = plan.request
-    out = options.out or options.runs_dir / "tables" / f"{request.name}_{request.variant}"
-    code = publish_table(plan.judge, request, outcomes, plan.external, out, runs.tracking)
-    _show_time(outcomes, planner)
+    name = f"{plan.request.name}_{plan.request.variant}"
+    out = options.out or options.runs_dir / "tables" / name
+    code = publish_table(plan.judge, plan.request, outcomes, plan.external, out, runs.tracking)
+    _show_times([each for each in outcomes if each.results], planner)
     return code
 
 
-def _show_time(outcomes: Sequence[Outcome], planner: Planner) -> None:
+def _show_times(finished: Sequence[Outcome], planner: Planner) -> None:
     """Print how long the finished runs and those upstream of them took."""
     from rich.text import Text
 
     from rgbt.terminal import print_rich
     from sweeps.rendering.times import time_line, upstream_line
 
-    finished = [outcome for outcome in outcomes if outcome.results]
-    lines = (
-        time_line(result for outcome in finished for result in outcome.results),
-        upstream_line((outcome.point.overrides for outcome in finished), planner),
-    )
-    if any(lines):
-        print_rich(Text("\n".join(line for line in lines if line)))
+    took = time_line(result for outcome in finished for result in outcome.results)
+    upstream = upstream_line((outcome.point.overrides for outcome in finished), planner)
+    if took or upstream:
+        print_rich(Text("\n".join(filter(None, (took, upstream)))))
 
 
 def _show(
@@ -185,16 +182,12 @@ def _show(
     lines = summary(plan.request, outcomes, workers)
     if plan.until_decided is not None:
         lines.append(most_line(len(plan.until_decided.most_runs()), outcomes, workers))
-    upstream = upstream_line((each.point.overrides for each in outcomes), planner)
-    print_rich(Text("\n".join([*lines, *([upstream] if upstream else [])])))
+    lines.append(upstream_line((each.point.overrides for each in outcomes), planner))
+    print_rich(Text("\n".join(filter(None, lines))))
 
 
 def settings_of(options: Options) -> SweepSettings:
-    """The settings of execution; the others of a sweep as in ``conf/hydra/sweeper/study.yaml``.
-
-    Raises:
-        InputError: a value out of its range.
-    """
+    """The settings of execution; the others of a sweep as in ``conf/hydra/sweeper/study.yaml``."""
     from omegaconf import DictConfig, OmegaConf
 
     from rgbt.config.compose import conf_dir

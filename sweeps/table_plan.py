@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,16 +11,10 @@ from analysis.uncertainty.contrasts import FIXED
 from analysis.uncertainty.verdicts import AnyTime, FixedSeeds
 from rgbt.checks import InputError
 from sweeps.point import Outcome
+from sweeps.table import make_request as requests
 from sweeps.table.efficiency import exact_sizes
 from sweeps.table.external import ExternalRow, ExternalRun
 from sweeps.table.load_table import is_own
-from sweeps.table.make_request import (
-    TableWords,
-    check_equal_runs,
-    make_request,
-    read_named,
-    select_rows,
-)
 from sweeps.table.request import TableRequest, seeds_of
 from sweeps.verdicts.forms import both_forms
 from sweeps.verdicts.judge import CellRunId, TableJudge
@@ -35,15 +29,14 @@ if TYPE_CHECKING:
 UNTIL_DECIDED = "until_decided"
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class TablePlan:
     """A table that is run.
 
     Attributes:
         points: its runs that are known in advance, and how further ones are chosen.
         until_decided: adds seeds; None where their number is fixed.
-        rows: rows that are evaluated and not trained.
-        external: their runs, empty before `evaluate_external`.
+        rows: rows that are evaluated and not trained; `external` are their runs.
     """
 
     request: TableRequest
@@ -51,7 +44,7 @@ class TablePlan:
     points: PointList
     until_decided: SeedsUntilDecided | None
     rows: Sequence[ExternalRow]
-    external: dict[CellRunId, Outcome] = field(default_factory=dict)
+    external: dict[CellRunId, Outcome]
 
     def evaluate_external(self, runs_dir: Path, trust: str) -> None:
         """Count the rows that are not trained; InputError: a path that does not fit its row."""
@@ -68,15 +61,13 @@ def plan_table(
 ) -> TablePlan:
     """The table as it is run, with `extra` as overrides of every row.
 
-    Raises:
-        InputError: no such table, row, scale or metric; no seeds; overrides that mix rows up; seeds
-            are to be added, but the table has no claims.
+    InputError: no such table, row or scale; no seeds or claims; overrides that mix rows up.
     """
     adds, is_both = options.seeds == UNTIL_DECIDED, options.form == "both"
-    name, table = read_named(table_name)
+    name, table = requests.read_named(table_name)
     if is_both:
-        table = both_forms(select_rows(table, options.rows) if options.rows else table)
-    words = TableWords(
+        table = both_forms(requests.select_rows(table, options.rows) if options.rows else table)
+    words = requests.TableWords(
         seeds=range(START) if adds else seeds_of(options.seeds),
         scale=options.scale,
         form="paper" if options.form == "both" else options.form,
@@ -85,9 +76,9 @@ def plan_table(
         others=("form=both", f"rows={options.rows}") if is_both else (),
         until_decided=adds,
     )
-    request, rows = make_request(name, table, words)
+    request, rows = requests.make_request(name, table, words)
     if extra or is_own(table_name):  # a test checks the others
-        check_equal_runs(request, planner)
+        requests.check_equal_runs(request, planner)
     if adds and not request.table.claims:
         raise InputError(
             f"seeds=until_decided: {name} has no claims with these rows (and none with "
@@ -106,11 +97,4 @@ def plan_table(
         base=planner.base,
         more=more,
     )
-    return TablePlan(
-        request=request,
-        judge=judge,
-        points=points,
-        until_decided=more,
-        rows=rows,
-        external=external,
-    )
+    return TablePlan(request, judge, points, more, rows, external)

@@ -24,7 +24,7 @@ NO_VALUE = "no value"
 """Mark of a cell whose run is finished but has no value for the column."""
 
 OWN_COUNTS = "counts_test.npz"
-"""Path of the counts of the evaluation that every run makes itself, relative to the run folder."""
+"""Path, in the run folder, of the counts of the evaluation that every run makes itself."""
 
 NO_SEED = "-1"
 """The seed of a row that was not trained here, as text (`analysis.uncertainty.contrasts.FIXED`)."""
@@ -236,10 +236,7 @@ def score(
     scale: str,
     sizes: Mapping[CellId, TableCell] | None = None,
 ) -> ScoredTable:
-    """Compute every cell of the rows with `runs`: (label of the row, seed) -> the run.
-
-    `sizes` are the cells of the columns of efficiency, see `sweeps.table.efficiency`.
-    """
+    """Compute every cell of the rows with `runs`; `sizes` are those of efficiency."""
     seeds = sorted({seed for _, seed in runs})  # a row without seeds has a negative one
     cells: dict[CellId, TableCell] = {}
     for row in table.rows:

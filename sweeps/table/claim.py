@@ -38,18 +38,13 @@ class Claim(Strict):
 
     It is a set of contrasts: each row of `rows` minus each row of `against`, in each column. A
     contrast without `against` is the score itself, or with `minus_column` the difference of two
-    scores of one row. With both it is the difference of two differences: the centre gains more than
-    the edge.
+    scores of one row. With both it is the difference of two differences.
 
     Attributes:
-        name: unique in the table.
-        says: the statement in our words, one sentence.
-        source: place in the paper, e.g. "Sec. IV-C, third paragraph".
+        says: the statement in our words, one sentence; `source` is its place in the paper.
         rows: labels of the rows that the statement is about; with against: previous, in order.
         against: labels of the rows that they are compared with; "others" or "previous" alone.
-        columns: names of columns.
         minus_column: a column that is subtracted from each of `columns`.
-        expected: of each contrast. "similar" needs `at_most`.
         at_least: smallest size of the difference that the statement means; below 0 for "not worse
             by more than".
         at_most: largest size, e.g. of a "small improvement".

@@ -11,15 +11,12 @@ from typing import Any
 from rgbt.checks import InputError, check_choice, nearest, split_list
 from rgbt.config.compose import available
 from sweeps.table.cells import is_counted, metric_of
-from sweeps.table.claim import OTHERS, PREVIOUS
+from sweeps.table.claim import PREVIOUS
 from sweeps.table.external import ExternalRow, external_rows, row_named
 from sweeps.table.load_table import PUBLISHED, STUDIES, load_table, table_names, table_path
 from sweeps.table.request import PRETRAINED, TableRequest
 from sweeps.table.table import Form, Row, Table
 from sweeps.worker.planner import Planner
-
-IN_MLFLOW = re.compile(r"[\w\-. :/]+", re.ASCII)
-"""Names that MLflow takes."""
 
 OF_THE_ROWS = {
     "seed": "the rows set it; choose seeds=3.",
@@ -40,8 +37,8 @@ def read_named(name: str) -> tuple[str, Table]:
         name = str(stem)
         if not inside and name in table_names(Path("none")):
             raise InputError(f"table={path}: '{name}' is a published table; change `paper`.")
-    if not IN_MLFLOW.fullmatch(name):
-        raise InputError(f"table={name}: MLflow allows only letters, digits, spaces and _ - . : /.")
+    if not re.fullmatch(r"[\w\-. :/]+", name, re.ASCII):
+        raise InputError(f"table={name}: MLflow allows only letters, digits, spaces and _-.:/")
     return name, table
 
 
@@ -72,15 +69,12 @@ def select_rows(table: Table, text: str) -> Table:
             same = first.setdefault(origin[row.label], row.label)
             rows.append(replace(row, same_as=None if same == row.label else same))
 
-    def is_left(names: Sequence[str]) -> bool:
-        return names == (PREVIOUS,) or set(names) <= chosen
-
     # "Better than all others" is another statement where some of the others are missing.
-    claims = [each for each in table.claims if is_left(each.rows) and is_left(each.against)]
-    complete = len(rows) == len(table.rows)
-    kept = tuple(table.claims if complete else claims)
-    assert all(OTHERS not in each.against for each in kept) or complete
-    return replace(table, rows=tuple(rows), claims=kept)
+    claims = table.claims
+    if len(rows) < len(table.rows):
+        known = {*chosen, PREVIOUS}
+        claims = tuple(each for each in claims if {*each.rows, *each.against} <= known)
+    return replace(table, rows=tuple(rows), claims=claims)
 
 
 def check_equal_runs(request: TableRequest, planner: Planner) -> None:

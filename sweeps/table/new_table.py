@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import itertools
-import math
 import re
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -121,15 +121,12 @@ def _values(override: str) -> tuple[str, tuple[str, ...]]:
     with composing([override]):
         parsed = OverridesParser.create().parse_override(override)
         key, _, value = override.partition("=")
-        return key, tuple(parsed.sweep_string_iterator()) if parsed.is_sweep_override() else (
-            value,
-        )
+        is_varied = parsed.is_sweep_override()
+        return key, tuple(parsed.sweep_string_iterator()) if is_varied else (value,)
 
 
 def _numbers(texts: Sequence[str]) -> tuple[float, ...]:
-    """The values, if all are finite numbers; else ()."""
-    try:
-        numbers = tuple(map(float, texts))
-    except ValueError:
-        return ()
-    return numbers if all(map(math.isfinite, numbers)) else ()
+    """The values, if all are numbers; else ()."""
+    with suppress(ValueError):
+        return tuple(map(float, texts))
+    return ()

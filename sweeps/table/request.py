@@ -39,12 +39,8 @@ class TableRequest:
 
     Attributes:
         table: with the rows that are shown; see `sweeps.table.make_request.select_rows`.
-        scale: a file of ``conf/scale``.
-        seeds: of every row.
         extra: overrides that win over those of the rows.
-        pretrained: files of initial weights by the name of the network, for tables of several
-            backbones.
-        form: what the rows are run as.
+        pretrained: files of initial weights by the name of the network.
         evaluated: labels of rows that are evaluated and not trained (`sweeps.table.external`).
         typed: further options that make it another table, as they were typed.
         until_decided: whether seeds are added until claims are decided, which runs record.
@@ -145,11 +141,7 @@ def seed_of(overrides: Sequence[str]) -> int:
 
 
 def seeds_of(text: str) -> tuple[int, ...]:
-    """Seeds of ``seeds=3`` (these are 0, 1, 2), of ``seeds=0,4,7`` or of ``seeds=[7]``.
-
-    Raises:
-        InputError: something else.
-    """
+    """Seeds of ``seeds=3`` (these are 0, 1, 2), of ``seeds=0,4,7`` or of ``seeds=[7]``."""
     words = text.strip("[]").split(",")
     if all(word.strip().isdecimal() for word in words):
         numbers = tuple(map(int, words))

@@ -21,7 +21,7 @@ from sweeps.table.claim import OTHERS, PREVIOUS, Claim, Strict
 from sweeps.table.design import Design
 
 Form = Literal["paper", "released"]
-"""What a row is run as: as the paper's text describes it, or as its release made it."""
+"""What a row is run as."""
 
 Efficiency = Literal["parameters", "gflops", "peak_memory", "latency", "images_per_second"]
 """Millions of parameters, GFLOPs, MiB, milliseconds for one image, images per second."""
@@ -177,21 +177,15 @@ class Table(Strict):
 
     Attributes:
         paper: folder of its file; in a table of the user, any name.
-        number: as printed, e.g. "TABLE III".
-        caption: in our words.
         data: what the printed values were measured on.
-        unit: of the values, e.g. "percent".
         at: overrides of every row by scale.
         regions: a file of ``conf/metric`` the table is evaluated with, or "as trained".
         absent: how a class without a pixel scores, see `rgbt.metrics.scores`; None: by the
             convention of the data set (`rgbt.metrics.counts.Counts.absent`).
-        columns: in order.
         factor: x axis of the figure; None: no figure over a factor.
         forms: one sentence per form that says what the rows are run as.
-        claims: what the paper says about the table.
         remarks: footnotes of the whole table, one sentence each.
-        design: a factorial design whose rows follow `rows`; None: there is none.
-        rows: in order; may be omitted beside a design.
+        design: a factorial design whose rows follow `rows`.
     """
 
     paper: str
@@ -292,11 +286,7 @@ class Table(Strict):
         return tuple(column for column in self.columns if column.name not in left_out)
 
     def overrides(self, row: Row, scale: str, form: Form = "paper") -> tuple[str, ...]:
-        """Overrides of `python -m rgbt.run` that make the row, beside ``scale=...`` itself.
-
-        Raises:
-            InputError: the row has no experiment.
-        """
+        """Overrides of `python -m rgbt.run` that make the row, beside ``scale=...`` itself."""
         if row.experiment is None:
             raise InputError(f"row '{row.label}' has no experiment; it is shown as published only.")
         chosen = row.released if form == "released" and row.released else ReleasedForm()

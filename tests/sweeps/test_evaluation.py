@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from rgbt.config.options import types_of
 from rgbt.consistency import Options as OfConsistency
 from rgbt.evaluate import Options as OfEvaluate
-from rgbt.evaluation.segmentation import details_path as written_beside
 from sweeps.evaluation import ExtraEvaluation
 
 OPTIONS = {"rgbt.evaluate": OfEvaluate, "rgbt.consistency": OfConsistency}
@@ -76,12 +73,3 @@ def test_evaluation_has_command_file_and_label(
     assert (evaluation.path, evaluation.label) == (f"evaluations/{name}.npz", label)
     options = {word.partition("=")[0] for word in words if word not in evaluation.dataset}
     assert options <= set(types_of(OPTIONS[module]))
-
-
-def test_details_are_written_beside_the_file_that_the_command_writes() -> None:
-    details = ExtraEvaluation(details="boundary")
-    assert details.out == "evaluations/table_default_as-trained.npz" == ExtraEvaluation().path
-    out, path = Path(details.out), Path(details.path)
-    assert path == written_beside(out, "boundary")
-    for plain in (ExtraEvaluation("rgb"), ExtraEvaluation(frames="next")):
-        assert plain.out == plain.path

@@ -10,7 +10,6 @@ import pytest
 from rgbt.config.options import types_of
 from rgbt.tracking.mlflow_store import NoTracking
 from sweeps.point import Outcome, Point
-from sweeps.rendering import publish
 from sweeps.reproduce import OF_THE_TABLE, Options, entry
 from sweeps.settings import SweepSettings
 from sweeps.table import load_table
@@ -97,16 +96,6 @@ def test_a_whole_table(call: Call, place: Path, driven: Driven) -> None:
     assert [row["mean"] for row in rows] == ["41.0", "42.0", ""]
 
 
-def test_reproduce_table_file_is_named_by_paper(call: Call, place: Path, driven: Driven) -> None:
-    asked = driven("finished")
-    path = place / "elsewhere" / "mine.yaml"
-    path.parent.mkdir()
-    path.write_text(OWN_TABLE)
-    assert call(entry, f"table={path}", "tracking=none")[0] == 0
-    assert asked[0][0].study == "table/my/mine"
-    assert (place / "runs/tables/my/mine_demo/table.md").exists()
-
-
 def test_reproduce_failed_cell_prints_table(call: Call, place: Path, driven: Driven) -> None:
     driven("finished", "failed")
     code, out, err = call(entry, "table=my/small", "tracking=none", "out=here")
@@ -122,20 +111,6 @@ def test_cells_of_other_drivers_are_no_failure(call: Call, place: Path, driven: 
     assert code == 0
     assert "running" in out
     assert_one_sentence(err, "wait=true")
-
-
-def test_reproduce_full_disk_prints_table_without_files(
-    call: Call, place: Path, driven: Driven, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(path: Path, content: bytes) -> None:
-        raise OSError(28, "No space left on device", str(path))
-
-    driven("finished")
-    monkeypatch.setattr(publish, "write_atomic", full)
-    code, out, err = call(entry, "table=my/small", "tracking=none")
-    assert code == 1
-    assert "40.00" in out
-    assert_one_sentence(err, "No space left on device; the files were not written")
 
 
 @pytest.mark.slow

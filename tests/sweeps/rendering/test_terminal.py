@@ -58,14 +58,6 @@ def test_terminal_shows_remarks_below() -> None:
     assert SMALL.format(scale="demo") in shown
 
 
-def test_terminal_names_the_form_and_many_seeds() -> None:
-    forms = {"released": "The rows use the masks of the release."}
-    made = Made({"a": (tuple(range(5)), 1.0)}, {"forms": forms}).scored()
-    assert "Ours: scale=demo, mean ± standard deviation (n - 1) over seeds 0 to 4." in lines(made)
-    assert FORMS["paper"] in lines(made)
-    assert forms["released"] in lines(replace(made, form="released"))
-
-
 def test_unprinted_column_has_no_published_cell() -> None:
     columns = (
         Column(name="acc", metric="pixel_accuracy"),
@@ -97,30 +89,11 @@ def test_terminal_many_columns_use_separate_lines() -> None:
     assert SMALL.format(scale="paper") not in lines(wide(STACKED))  # scale=paper
 
 
-def test_terminal_wide_table_breaks_names_and_puts_sd_below() -> None:
-    shown = words(wide(WIDE))
-    assert shown[1] == ["name"] * 13
-    assert shown[2] == ["seeds", *map(str, range(13))]
-    assert shown[4] == ["a", "ours", "2", *["50.00"] * 13]
-    assert shown[5] == ["±", "sd", *["14.14"] * 13]
-
-
 @pytest.mark.parametrize("columns", [WIDE, STACKED, STACKED[:3]], ids=len)
 def test_terminal_narrow_width_keeps_numbers_whole(columns: tuple[Column, ...]) -> None:
     whole, narrow = ("\n".join(lines(wide(columns), width)) for width in (WIDTH, 60))
     for number in ("50.00", "14.14", "48.0", "49.25", "+2.00", "+0.75"):
         assert narrow.count(number) == whole.count(number)
-
-
-def test_terminal_aligns_numbers_behind_footnotes() -> None:
-    runs = {
-        **{("a", 0): outcome("k", right(40)), ("a", 1): failed("gone")},
-        ("b", 0): outcome("l", right(5)),
-    }
-    rows = (Row(label="a", experiment="crm"), Row(label="b", experiment="crm"))
-    shown = lines(score("t", table(rows), runs, scale="demo"))
-    assert shown[3].index(".00") == shown[4].index(".00")
-    assert " 40.00[1]" in shown[3], "a mean over fewer seeds is no best"
 
 
 def test_terminal_styles_best_where_shown() -> None:
@@ -210,20 +183,3 @@ def test_latex_escapes_and_omits_differences() -> None:
     for each in (text, stacked):
         body = [line for line in each.splitlines() if line.endswith(r"\\")]
         assert len({line.count(" & ") for line in body}) == 1
-
-
-def test_csv_read_back() -> None:
-    rows = (
-        Row(label="a, b", experiment="crm", values={"acc": 48.0}),
-        Row(label="theirs", values={"acc": 4.0}),
-    )
-    runs = {("a, b", 0): outcome("k0", right(40)), ("a, b", 1): outcome("k1", right(45))}
-    first, second = csv.DictReader(
-        io.StringIO(tidy_csv(score("own/t", table(rows), runs, scale="demo")))
-    )
-    assert first == {
-        **{"table": "own/t", "row": "a, b", "column": "acc", "mean": "42.5", "sd": "3.535534"},
-        **{"n": "2", "published": "48.0", "difference": "-5.5", "reason": "", "runs": "k0 k1"},
-    }
-    assert second["mean"] == second["runs"] == ""
-    assert (second["n"], second["published"], second["reason"]) == ("0", "4.0", "")

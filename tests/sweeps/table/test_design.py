@@ -13,7 +13,6 @@ from rgbt.checks import InputError
 from rgbt.config.values import check_value
 from sweeps.table.design import Design, DesignFactor, DesignMethod, Part, cell_name
 from sweeps.table.load_table import load_table
-from sweeps.table.make_request import select_rows
 from sweeps.table.request import TableRequest
 
 FACTORS: list[dict[str, Any]] = [
@@ -84,14 +83,6 @@ def test_combined_overrides_follow_those_of_the_factors(tmp_path: Path) -> None:
     assert "dataset.rgb_noise=0.5" not in words["baseline N+T+"]
 
 
-def test_groups_of_rows_are_chosen_by_name(tmp_path: Path) -> None:
-    table = load_table(write(tmp_path))
-    tested = select_rows(table, "tested")
-    assert [row.label for row in tested.rows] == ["baseline natural", "crm natural"]
-    mixed = select_rows(table, "tested,crm N-T-")
-    assert [row.label for row in mixed.rows] == ["crm N-T-", "baseline natural", "crm natural"]
-
-
 def test_rows_tested_in_worlds_request_an_evaluation_of_each(tmp_path: Path) -> None:
     table = load_table(write(tmp_path))
     request = TableRequest("my/design", table, "demo", (0,))
@@ -133,13 +124,6 @@ def test_half_fraction_mixes_pairs_of_interactions_alone() -> None:
         **{"o x c + n x s": {"OC": 1, "NS": 1}, "o x n + c x s": {"ON": 1, "CS": 1}},
         "o x s + c x n": {"OS": 1, "CN": 1},
     }
-
-
-def test_whole_factorial_has_no_aliases() -> None:
-    made, part = design({})
-    assert len(made.cells(part)) == 16
-    assert all(len(group) == 1 for group in made.effects(part).values())
-    assert len(made.effects(part)) == 4 + 6
 
 
 @pytest.mark.parametrize(

@@ -65,12 +65,6 @@ def test_parameter_cells_use_paper_scale() -> None:
     assert (cell.seeds, cell.keys, cell.reason, math.isnan(cell.sd)) == (0, (), "", True)
 
 
-def test_parameter_cells_skip_unrunnable_rows() -> None:
-    row = Row(label="a", experiment="crm")
-    assert efficiency_cells(wanted(Row(label="theirs", values={"size": 3.0}))) == {}
-    assert efficiency_cells(wanted(row, columns=(Column(name="acc", metric="mIoU"),))) == {}
-
-
 def test_parameter_cells_follow_overrides_and_report_errors() -> None:
     rows = (
         Row(label="a", experiment="crm", overrides=("model=mfnet",)),

@@ -21,9 +21,8 @@ from rgbt.metrics.pairs import tc
 from rgbt.runs.result import RunResult
 from sweeps.point import Outcome
 from sweeps.table import external
-from sweeps.table.cells import evaluation_of, score
+from sweeps.table.cells import score
 from sweeps.table.external import ExternalRow, ExternalRun, content_hash, external_rows
-from sweeps.table.load_table import load_table
 from sweeps.table.make_request import TableWords, make_request
 from sweeps.table.table import Column, Row, Table
 from tests.commands import SMALL, SPLITS, Call, Trained, code_of, short
@@ -66,12 +65,6 @@ def test_external_row_is_named_by_label_or_number(tmp_path: Path, name: str, lab
     )
 
 
-def test_external_rows_are_in_the_order_of_the_table(tmp_path: Path) -> None:
-    (tmp_path / "w.pth").touch()
-    words = [f"weights.RTFNet={tmp_path / 'w.pth'}", f"predictions.1={tmp_path}"]
-    assert [row.label for row in external_rows(words, TABLE)[0]] == ["CMNeXt", "RTFNet"]
-
-
 @pytest.mark.parametrize(
     "word",
     [
@@ -102,16 +95,6 @@ def test_content_hash_covers_names_and_contents(tmp_path: Path) -> None:
     before = content_hash(folder)
     (folder / ".DS_Store").write_bytes(b"")
     assert content_hash(folder.rename(tmp_path / "moved")) == before
-
-
-def test_table_iv_of_temporal_has_tc_and_ca_of_both_protocols() -> None:
-    """A row of predictions gets them from the folder of its mIoU."""
-    table = load_table("temporal/table4")
-    counted = {column.name: evaluation_of(column, table) for column in table.columns}
-    assert {name: each.frames for name, each in counted.items() if each is not None} == {
-        **{"TC": "released", "CA": "released"},
-        **{"TC aligned": "aligned", "CA aligned": "aligned"},
-    }
 
 
 Commands = list[tuple[str, ...]]

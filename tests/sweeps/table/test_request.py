@@ -159,20 +159,6 @@ def test_form_and_rows_make_another_table() -> None:
     assert made[2].overrides("Ny/4", 0)[0] == "+experiment=grbm_released"
 
 
-def test_seeds_of_rows_may_differ() -> None:
-    asked = wanted()
-    points = asked.points([("other", 5), ("small", 7), ("large", 7)])
-    assert [point.overrides[-1] for point in points] == ["seed=5", "seed=7"]
-    outcomes = [Outcome(point, "failed", point.label) for point in points]
-    assert sorted(asked.runs(outcomes)) == [("large", 7), ("other", 5), ("small", 7)]
-
-
-def test_evaluated_rows_are_not_trained() -> None:
-    asked = replace(wanted(), evaluated=("other",))
-    assert {label for label, _ in asked.row_seeds()} == {"small", "large"}
-    assert len(asked.points()) == 2
-
-
 def claim(name: str, rows: tuple[str, ...], against: tuple[str, ...]) -> Claim:
     about: Any = {"says": "", "source": "", "columns": ("acc",), "expected": "higher"}
     return Claim(name=name, rows=rows, against=against, **about)

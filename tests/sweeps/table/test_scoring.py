@@ -56,21 +56,6 @@ def test_score_derived_columns_are_per_seed() -> None:
     assert cells["a", "gain"].mean == -7.5  # -5 and -10
 
 
-@pytest.mark.parametrize(
-    ("column", "reason"),
-    [
-        (Column(name="x", metric="class/bus"), "no class 'bus'"),
-        (Column(name="x", metric="TC", frames="aligned"), "rgbt consistency run=..."),
-    ],
-)
-def test_score_missing_values_have_reason(column: Column, reason: str) -> None:
-    run = outcome("k", {None: right(40), ExtraEvaluation(frames="aligned"): right(40)})
-    both = Column(name="both", mean=("acc", "x"))
-    cell = scored((ACC, column, both), {("a", 0): run}).cells["a", "both"]
-    assert (cell.seeds, cell.mark, math.isnan(cell.mean)) == (0, "no value", True)
-    assert reason in cell.reason
-
-
 def test_score_omitted_rows_and_columns_have_no_cell() -> None:
     rows = (
         *(Row(label="a", without=("rgb",)), Row(label="b")),
@@ -86,24 +71,6 @@ def test_score_omitted_rows_and_columns_have_no_cell() -> None:
     }
     assert published(rows[2], RGB) is None
     assert math.isnan(found.difference(rows[2], ACC))
-
-
-@pytest.mark.parametrize(
-    ("settings", "evaluation"),
-    [
-        ({"head": "source", "modality": "rgb"}, ExtraEvaluation("rgb", head="source")),
-        (
-            {"corruption": "noise", "severity": 16},
-            ExtraEvaluation(corruption="noise", severity=16.0),
-        ),
-    ],
-)
-def test_score_heads_and_corruptions_have_own_counts(
-    settings: dict[str, Any], evaluation: ExtraEvaluation
-) -> None:
-    column = Column(name="other", metric="pixel_accuracy", **settings)
-    runs = {("a", 0): outcome("k", {None: right(50), evaluation: right(30)})}
-    assert [cell.mean for cell in scored((ACC, column), runs).cells.values()] == [50.0, 30.0]
 
 
 def details_of(partition: str, *rows: list[list[int]]) -> Counts:

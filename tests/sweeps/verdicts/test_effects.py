@@ -105,14 +105,6 @@ def test_effects_are_of_contrasts_within_runs() -> None:
     assert found["crm", "baseline", "noise"].value == pytest.approx(own - EFFECT)
 
 
-def test_effect_is_shown_and_null_effect_is_not() -> None:
-    found = estimates(design_table(), trained())
-    assert found["baseline", "", "noise"].is_shown()
-    assert found["baseline", "", "noise"].value == pytest.approx(EFFECT, abs=0.5)
-    assert not found["baseline", "", "texture"].is_shown()
-    assert found["baseline", "", "noise"].seeds == 2
-
-
 def test_method_with_a_missing_cell_is_named_and_others_are_analysed() -> None:
     runs = trained()
     for seed in (0, 1):
@@ -143,13 +135,6 @@ def test_networks_tested_in_worlds_use_the_counts_of_each_world() -> None:
     found = estimates(table, runs)
     assert found["baseline", "", "noise"].value == pytest.approx(EFFECT)
     assert ("crm", "", "noise") not in found
-
-
-def test_part_whose_rows_are_not_chosen_is_left_out() -> None:
-    table = select_rows(design_table(tested=Part()), "trained")
-    found = DesignJudge(table, resamples=100).effects(trained())
-    assert {line.part for line in found.lines} == {"trained"}
-    assert found.missing == ()
 
 
 def test_method_with_rows_that_are_not_chosen_says_which() -> None:
@@ -185,16 +170,6 @@ def test_grids_and_csv_have_a_line_for_each_effect(tmp_path: Path) -> None:
     figure = tmp_path / "figure.png"
     assert draw_effects(effects, "my/design", figure)
     assert figure.stat().st_size > 1000
-
-
-def test_one_seed_has_no_interval_and_no_figure(tmp_path: Path) -> None:
-    table = design_table()
-    assert table.design is not None
-    runs = {key: run for key, run in trained().items() if key[1] == 0}
-    effects = DesignJudge(table, resamples=100).effects(runs)
-    (grid,) = effects_grids(effects, table.design)
-    assert {row[4] for row in grid.rows if row[1] != MEAN} == {"2 seeds needed"}
-    assert not draw_effects(effects, "my/design", tmp_path / "figure.png")
 
 
 def test_scenes_are_paired_although_labels_differ() -> None:

@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 
 from analysis.uncertainty.contrasts import FIXED
-from analysis.uncertainty.verdicts import AnyTime, FixedSeeds
 from sweeps.point import Outcome
 from sweeps.table.claim import Claim
 from sweeps.table.table import Column, Row, Table
@@ -121,17 +120,6 @@ def test_mean_and_any_combine_contrasts() -> None:
     assert mean.word == "holds"
     assert mean.contrast == "mean of 2 contrasts"
     assert mean.printed == pytest.approx((49.0 + 50.0) / 2 - 50.5)
-
-
-def test_any_time_rule_needs_more_seeds() -> None:
-    one = claim(rows=("high",), against=("low",))
-    words = [
-        TableJudge("own/t", of(one), rule, resamples=200)
-        .judge(one, planted(SHARES))  # type: ignore[arg-type]
-        .word
-        for rule in (FixedSeeds(), AnyTime())
-    ]
-    assert words == ["holds", "undecided"]
 
 
 @pytest.mark.parametrize(
