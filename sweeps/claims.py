@@ -27,18 +27,11 @@ ALL = "all"
 class Options:
     """Options of ``rgbt claims``."""
 
-    table: Annotated[
-        str,
-        Help("claims of one table, such as spatialseg/table3; all: of every table of the papers"),
-    ] = ALL
+    table: Annotated[str, Help("such as spatialseg/table3; all: every table of the papers")] = ALL
     scale: Annotated[str, Help("scale of the runs: demo, bench or paper")] = "demo"
-    form: Annotated[
-        Literal["paper", "released"], Help("form of the rows, as of rgbt reproduce")
-    ] = "paper"
+    form: Annotated[Literal["paper", "released"], Help("form of the rows")] = "paper"
     runs_dir: RunsDir = Path("runs")
-    out: Annotated[
-        Path | None, Help("output folder of claims.md and claims.csv; default: only printed")
-    ] = None
+    out: Annotated[Path | None, Help("output folder of claims.md and claims.csv")] = None
 
 
 def main(options: Options, overrides: list[str]) -> int:

@@ -14,7 +14,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
@@ -25,7 +25,7 @@ from rgbt.config.compose import SEARCH_PATH, compose, own_folders, searching
 from rgbt.config.options import with_home
 from rgbt.files.atomic import write_atomic
 from rgbt.metrics.pair_list import PAIR_LIST
-from rgbt.runs.provenance import code, without_passwords
+from rgbt.runs.provenance import code
 from rgbt.runs.result import RunResult
 from rgbt.terminal import info
 from sweeps.evaluation import ExtraEvaluation
@@ -56,7 +56,7 @@ class ExternalRow:
     """A row whose counts are made from a file of weights, or a folder of predictions."""
 
     label: str
-    kind: Literal["weights", "predictions"]
+    kind: str  # "weights" or "predictions"
     path: Path
 
 
@@ -90,9 +90,7 @@ def external_rows(words: Sequence[str], table: Table) -> tuple[list[ExternalRow]
             raise InputError(f"'{word}': expected {kind}.ROW=PATH with the path of a {what}.")
         if kind == "weights" and not row.network and row.experiment is None:
             raise InputError(f"'{word}': the row has no network; give predictions.ROW=FOLDER.")
-        found[row.label] = ExternalRow(
-            row.label, cast(Literal["weights", "predictions"], kind), path
-        )
+        found[row.label] = ExternalRow(row.label, kind, path)
     return [found[row.label] for row in table.rows if row.label in found], others
 
 
@@ -136,7 +134,7 @@ class ExternalRun:
             "content": content_hash(given.path),
             "dataset": [fingerprint, {**plain["dataset"], "root": None}],
             "metric": plain["metric"],
-            "evaluated": [given.kind, *map(without_passwords, arguments)],
+            "evaluated": [given.kind, *(w for w in arguments if not w.startswith("dataset.root="))],
         }
         text = json.dumps(description, sort_keys=True, indent=1)
         folder = runs_dir.absolute() / FOLDER / hashlib.sha256(text.encode()).hexdigest()[:12]

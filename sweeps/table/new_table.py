@@ -6,7 +6,6 @@ import itertools
 import re
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,9 +14,6 @@ from rgbt.checks import InputError
 from rgbt.config.options import Help
 
 RINGS = 5
-
-LOG_FROM = 8.0
-"""Ratio of the largest to the smallest value from which the axis of the figure is logarithmic."""
 
 HEAD = """\
 # Run:     rgbt reproduce table={name} seeds=3 workers=2
@@ -80,7 +76,6 @@ def write_new(name: str, experiment: str, overrides: Sequence[str], folder: Path
         key: last if lasts.count(last) == 1 else key.lstrip("+")
         for key, last in zip(varied, lasts, strict=True)
     }
-    axis = _numbers(next(iter(varied.values()))) if len(varied) == 1 else ()
     rows: list[dict[str, Any]] = []
     for point in itertools.product(*values.values()):
         chosen = dict(zip(values, point, strict=True))
@@ -89,8 +84,7 @@ def write_new(name: str, experiment: str, overrides: Sequence[str], folder: Path
         # Hydra escapes ${px:64} inside a list; which value it has depends on the scale.
         text = re.sub(r"\\(.)", r"\1", " ".join(f"{short[key]}={chosen[key]}" for key in varied))
         label = PIXELS.sub(r"\1px", text).replace("'", "")
-        x = {"x": axis[len(rows)]} if axis else {}
-        rows.append({"label": label, "experiment": experiment, "overrides": words, **x})
+        rows.append({"label": label, "experiment": experiment, "overrides": words})
     paper, _, number = name.rpartition("/")
     table: dict[str, Any] = {
         **{"paper": paper or "own", "number": number},
@@ -102,10 +96,6 @@ def write_new(name: str, experiment: str, overrides: Sequence[str], folder: Path
             {"name": "Var", "metric": "Var", "best": "lowest"},
         ],
     }
-    if axis:
-        low, high = min(axis), max(axis)
-        is_log = low > 0 and high / low >= LOG_FROM
-        table["factor"] = {"name": min(short.values()), "axis": "log" if is_log else "linear"}
     text = yaml.safe_dump({**table, "rows": rows}, sort_keys=False, width=1000)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(path, f"{HEAD.format(name=name)}{text}".encode())
@@ -123,10 +113,3 @@ def _values(override: str) -> tuple[str, tuple[str, ...]]:
         key, _, value = override.partition("=")
         is_varied = parsed.is_sweep_override()
         return key, tuple(parsed.sweep_string_iterator()) if is_varied else (value,)
-
-
-def _numbers(texts: Sequence[str]) -> tuple[float, ...]:
-    """The values, if all are numbers; else ()."""
-    with suppress(ValueError):
-        return tuple(map(float, texts))
-    return ()

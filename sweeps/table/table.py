@@ -27,10 +27,8 @@ Efficiency = Literal["parameters", "gflops", "peak_memory", "latency", "images_p
 """Millions of parameters, GFLOPs, MiB, milliseconds for one image, images per second."""
 
 COUNTED: tuple[Efficiency, ...] = ("parameters", "gflops")
-"""The same on every machine."""
-
 MEASURED: tuple[Efficiency, ...] = ("peak_memory", "latency", "images_per_second")
-"""Of one device; shown with the ratio to the first row."""
+"""The same on every machine; of one device, shown with the ratio to the first row."""
 
 
 @dataclass(frozen=True, kw_only=True)

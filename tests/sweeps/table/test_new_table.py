@@ -18,11 +18,8 @@ def test_one_factor(tmp_path: Path) -> None:
     table = load_table("my/ablation", tmp_path)
     assert path == tmp_path / "my" / "ablation.yaml"
     assert [row.label for row in table.rows] == ["sigma_div=1", "sigma_div=4", "sigma_div=16"]
-    assert [row.x for row in table.rows] == [1.0, 4.0, 16.0]
     assert table.rows[1].overrides == ("masker.sigma_div=4", "masker.patch_size=32")
     assert table.rows[1].experiment == "grbm"
-    assert table.factor is not None
-    assert (table.factor.name, table.factor.axis) == ("sigma_div", "log")
     names = [column.name for column in table.columns]
     assert names == ["IoU1", "IoU2", "IoU3", "IoU4", "IoU5", "mIoU", "Var"]
     assert table.columns[-1].best == "lowest"
@@ -37,8 +34,6 @@ def test_a_product_has_no_axis(tmp_path: Path) -> None:
         "sigma_div=1 patch_size=32",
     ]
     assert len(table.rows) == 4
-    assert table.factor is None
-    assert table.rows[0].x is None
 
 
 @pytest.mark.parametrize(
