@@ -59,8 +59,7 @@ class ExtraEvaluation:
     def command(self) -> tuple[str, ...]:
         """Module that makes it, and its arguments except the run.
 
-        One call makes both protocols of virtual views, aligned and released, and one call makes
-        several details, because the network takes most of the time.
+        One call makes both protocols of virtual views, or several details.
         """
         if self.frames is not None:
             return ("rgbt.consistency", f"frames={'next' if self.frames == 'next' else 'virtual'}")

@@ -66,9 +66,7 @@ class Options:
     )
 
 
-OF_THE_TABLE = (
-    *("table", "seeds", "max_seeds", "scale", "form", "rows", "runs_dir", "out", "fresh"),
-)
+OF_THE_TABLE = ("table", "seeds", "max_seeds", "scale", "form", "rows", "runs_dir", "out", "fresh")
 """Options that are no settings of execution."""
 
 

@@ -59,10 +59,7 @@ class TablePlan:
 def plan_table(
     table_name: str, options: Options, extra: Sequence[str], runs: RunStore, planner: Planner
 ) -> TablePlan:
-    """The table as it is run, with `extra` as overrides of every row.
-
-    InputError: no such table, row or scale; no seeds or claims; overrides that mix rows up.
-    """
+    """The table as it is run, with `extra` as overrides of every row."""
     adds, is_both = options.seeds == UNTIL_DECIDED, options.form == "both"
     name, table = requests.read_named(table_name)
     if is_both:

@@ -7,6 +7,7 @@ import statistics
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from rgbt.checks import InputError
 from rgbt.metrics import names
@@ -17,23 +18,15 @@ from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Outcome
 from sweeps.table.table import COUNTED, MEASURED, Column, Form, Row, Table
 
-HEADLINES = (names.MIOU, names.VAR, names.TC, names.CA, names.CA_RELEASED)
-"""The scores that a table is about, where it has them."""
-
-NO_VALUE = "no value"
-"""Mark of a cell whose run is finished but has no value for the column."""
-
+HEADLINES = (names.MIOU, names.VAR, names.TC, names.CA, names.CA_RELEASED)  # of a table
+NO_VALUE = "no value"  # mark of a cell whose run is finished but has no value for the column
 OWN_COUNTS = "counts_test.npz"
 """Path, in the run folder, of the counts of the evaluation that every run makes itself."""
 
-NO_SEED = "-1"
-"""The seed of a row that was not trained here, as text (`analysis.uncertainty.contrasts.FIXED`)."""
+NO_SEED = "-1"  # of a row that was not trained here: analysis.uncertainty.contrasts.FIXED
 
-CellId = tuple[str, str]
-"""(label of the row, name of the column)."""
-
-Value = float | str
-"""A score, or the reason why there is none."""
+CellId = tuple[str, str]  # (label of the row, name of the column)
+Value = float | str  # a score, or the reason why there is none
 
 
 @dataclass(frozen=True)
@@ -69,16 +62,10 @@ def evaluation_of(column: Column, table: Table) -> ExtraEvaluation | None:
     if column.frames is not None:
         return ExtraEvaluation(frames=column.frames)
     details = details_of_metric(str(column.metric))
-    needed = ExtraEvaluation(
-        column.modality,
-        table.regions,
-        head=column.head,
-        corruption=column.corruption,
-        severity=column.severity,
-        batch_norm=column.batch_norm,
-        batch_norm_splits=column.batch_norm_splits,
-        details=None if details is None else details.kind,
-    )
+    keys = ("modality", "head", "corruption", "severity", "batch_norm", "batch_norm_splits")
+    same: dict[str, Any] = {key: getattr(column, key) for key in keys}
+    kind = None if details is None else details.kind
+    needed = ExtraEvaluation(regions=table.regions, details=kind, **same)
     return None if needed == ExtraEvaluation() else needed
 
 
@@ -99,8 +86,7 @@ def counts_path(column: Column, table: Table) -> str:
 def headline_columns(columns: Sequence[Column]) -> list[Column]:
     """Those of `HEADLINES`, over all images or those of the day or the night."""
     parts = ("", f"{names.DAY}/", f"{names.NIGHT}/")
-    headlines = {part + score for part in parts for score in HEADLINES}
-    return [column for column in columns if column.metric in headlines]
+    return [each for each in columns if each.metric in {p + h for p in parts for h in HEADLINES}]
 
 
 def is_counted(column: Column) -> bool:

@@ -12,11 +12,8 @@ from pydantic import model_validator
 Expected = Literal["higher", "lower", "similar"]
 Combine = Literal["all", "most", "any", "mean"]
 
-OTHERS = "others"
-"""In `Claim.against`: every other row of the table that has a score or a printed value."""
-
-PREVIOUS = "previous"
-"""In `Claim.against`: the row before in `Claim.rows`."""
+OTHERS = "others"  # in Claim.against: every other row that has a score or a printed value
+PREVIOUS = "previous"  # In `Claim.against`: the row before in `Claim.rows`
 
 Range = tuple[float, float]
 HIGHER: Range = (0.0, math.inf)

@@ -16,16 +16,11 @@ from rgbt.config.compose import available
 from sweeps.table.claim import Strict
 
 Level = Literal["low", "high"]
-Levels = Mapping[str, Level]
-"""Letter of each factor -> its level."""
+Levels = Mapping[str, Level]  # Letter of each factor -> its level
 
-Effect = str
-"""Letters of the factors: "N" a main effect, "ON" an interaction."""
+Effect = str  # letters of the factors: "N" a main effect, "ON" an interaction
 
-SIGNS: dict[Level, int] = {"low": -1, "high": 1}
-
-TRAINED, TESTED = "trained", "tested"
-"""Groups of rows: ``rows=trained`` chooses all rows of the group."""
+TRAINED, TESTED = "trained", "tested"  # groups of rows: rows=trained
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,10 +57,8 @@ class DesignMethod(Strict):
 class Part(Strict):
     """One of the two experiments that a design can be.
 
-    Attributes:
-        overrides: of every cell of this part, after those of the design.
-        generators: letter of a factor -> letters of others whose product is its level, as
-            {S: OCN}; each halves the number of cells.
+    In `generators`, {S: OCN} makes the level of a factor the product of those of others, which
+    halves the number of cells.
     """
 
     overrides: tuple[str, ...] = ()
@@ -151,13 +144,10 @@ class Design(Strict):
                 **{"experiment": method.experiment, "overrides": words},
                 "settings": {"method": method.name, **cell},
             }
-        if self.tested is None:
-            return
-        worlds = {
-            cell_name(cell): (*self.tested.overrides, *self.cell_overrides(cell))
-            for cell in self.cells(self.tested)
-        }
-        for method in self.methods:
+        part = self.tested or Part()
+        cells = self.cells(part) if self.tested else ()
+        worlds = {cell_name(each): (*part.overrides, *self.cell_overrides(each)) for each in cells}
+        for method in self.methods if self.tested else ():
             words = (*self.overrides, *method.overrides)
             yield {
                 **{"label": tested_label(method.name), "group": TESTED, "tested_in": worlds},
@@ -207,8 +197,8 @@ class Design(Strict):
 
 
 def sign_of(cell: Levels, effect: Effect) -> int:
-    """The sign of a cell in the contrast of an effect: the product of the signs of its factors."""
-    return prod(SIGNS[cell[letter]] for letter in effect)
+    """The sign of a cell in the contrast of an effect: the product of those of its factors."""
+    return prod(1 if cell[letter] == "high" else -1 for letter in effect)
 
 
 def cell_name(cell: Levels) -> str:

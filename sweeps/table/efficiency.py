@@ -20,33 +20,23 @@ from sweeps.table.cells import NO_VALUE, CellId, TableCell
 from sweeps.table.request import TableRequest
 from sweeps.table.table import COUNTED, MEASURED
 
-SCALE = "paper"
-"""Scale of all networks."""
+SCALE = "paper"  # Scale of all networks
 
-IMAGE_HW = (480, 640)
-"""Height and width of the images of a row without `settings.image_hw`: those of MFNet."""
+IMAGE_HW = (480, 640)  # of MFNet, for rows without settings.image_hw
 
-NOT_NETWORK = ("model.weights=", "tracking", "runs_dir=")
-"""Beginnings of overrides that say nothing about a network."""
+NOT_NETWORK = ("model.weights=", "tracking", "runs_dir=")  # overrides that begin so
 
 KEYS = {
-    "gflops": ("flops", 1e9),
-    "peak_memory": ("peak_memory", 2**20),
-    "latency": ("latency_ms", 1.0),
-    "images_per_second": ("images_per_second", 1.0),
+    **{"gflops": ("flops", 1e9), "peak_memory": ("peak_memory", 2**20)},
+    **{"latency": ("latency_ms", 1.0), "images_per_second": ("images_per_second", 1.0)},
 }
 """Column -> key of a network in a profile, and its unit there."""
 
-Network = tuple[tuple[str, ...], tuple[int, int]]
-"""Overrides and the size of the images."""
+Network = tuple[tuple[str, ...], tuple[int, int]]  # overrides and the size of the images
 
 
 def efficiency_cells(request: TableRequest) -> dict[CellId, TableCell]:
-    """The cells of all columns of efficiency, of the rows that the project can run.
-
-    Values are in the units of `Column.efficiency`; of a network that cannot be built or measured,
-    the cells have the reason.
-    """
+    """The cells of all columns of efficiency; the reason, where a network cannot be measured."""
     columns = [column for column in request.table.columns if column.efficiency is not None]
     rows = {
         row.label: {each.name: each for each in request.table.columns_of(row) if each in columns}
@@ -139,8 +129,7 @@ def profiled(
 def million_parameters(overrides: Sequence[str]) -> float:
     """Millions of parameters of the network that overrides of `python -m rgbt.run` describe.
 
-    It is built on torch's device "meta", without data or memory. Frozen parameters are counted,
-    discriminators are not. InputError: overrides that Hydra or the network refuses.
+    It is built on torch's device "meta". Discriminators are not counted. InputError: as refused.
     """
     import torch
 

@@ -35,11 +35,9 @@ from sweeps.table.request import TableRequest
 from sweeps.table.table import Row, Table
 from sweeps.worker.command_process import run_command
 
-FOLDER = "external"
-"""Folder inside the folder of runs."""
+FOLDER = "external"  # Folder inside the folder of runs
 
-NODE_FILE = "of_the_table"
-"""Files of ``conf/dataset`` and ``conf/metric`` that are written for the commands."""
+NODE_FILE = "of_the_table"  # of conf/dataset and conf/metric, written for the commands
 
 MACHINE = ("data.", "trainer.accelerator=", "trainer.precision=", "trainer.threads=")
 """Overrides of the user that reach a row with a network of its own; others are for trainings."""

@@ -9,14 +9,9 @@ from rgbt.config.values import check_value
 from rgbt.files.yaml_files import read_yaml
 from sweeps.table.table import Table
 
-PUBLISHED = Path(__file__).resolve().parents[1] / "tables"
-"""The papers' tables, part of the package."""
-
-STUDIES = Path(__file__).resolve().parents[1] / "studies"
-"""Our own studies, part of the package; no paper has printed them."""
-
-OWN = Path("tables")
-"""Tables of the user, in the current folder."""
+PUBLISHED = Path(__file__).resolve().parents[1] / "tables"  # of the papers
+STUDIES = Path(__file__).resolve().parents[1] / "studies"  # ours, which no paper has printed
+OWN = Path("tables")  # Tables of the user, in the current folder
 
 
 def table_names(folder: Path = OWN) -> list[str]:
@@ -34,15 +29,10 @@ def study_names() -> list[str]:
 
 
 def table_path(name: str, folder: Path = OWN) -> Path:
-    """The file of a table.
+    """The file of a table; InputError: no such table, or two of that name.
 
-    Args:
-        name: "spatialseg/table3" for a published table, "spatial_bias" for a study of ours,
-            "my/ablation" for one in `folder`, or a path that ends in .yaml.
-        folder: of the user's tables.
-
-    Raises:
-        InputError: no such table, or two of that name.
+    "spatialseg/table3" is a published table, "spatial_bias" a study of ours, "my/ablation" one in
+    the `folder` of the user's tables; or a path that ends in .yaml.
     """
     if name.endswith((".yaml", ".yml")):
         return Path(name).expanduser()

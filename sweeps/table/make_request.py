@@ -127,14 +127,13 @@ class TableWords:
 def make_request(
     name: str, table: Table, words: TableWords
 ) -> tuple[TableRequest, list[ExternalRow]]:
-    """The request of a table, and its rows that are evaluated and not trained.
-
-    InputError: no such scale, row or network.
-    """
+    """The request of a table, and its rows that are evaluated and not trained."""
     check_choice("scale", words.scale, available("scale"))
     table = select_rows(table, words.rows) if words.rows else table
     external, others = external_rows(words.overrides, table)
     files = [word.removeprefix(PRETRAINED) for word in others if word.startswith(PRETRAINED)]
+    rows = [f"rows={words.rows}"] if words.rows else []
+    paths = [f"{row.kind}.{row.label}={row.path}" for row in external]
     request = TableRequest(
         name,
         table,
@@ -145,11 +144,7 @@ def make_request(
         form=words.form,
         until_decided=words.until_decided,
         evaluated=tuple(row.label for row in external),
-        typed=(
-            *words.others,
-            *([f"rows={words.rows}"] if words.rows else []),
-            *(f"{row.kind}.{row.label}={row.path}" for row in external),
-        ),
+        typed=(*words.others, *rows, *paths),
     )
     for model in request.pretrained:
         if model not in request.models():

@@ -17,20 +17,15 @@ from sweeps.table.table import Form, Row, Table
 if TYPE_CHECKING:
     from sweeps.point import Outcome
 
-DEFAULT_SCALE = "demo"
-"""The scale of a run without ``scale=...``."""
+DEFAULT_SCALE = "demo"  # The scale of a run without ``scale=...``
 
-TAG = "rgbt.table/"
-"""Prefix of the tag that names a run's row: rgbt.table/spatialseg/table3 = "Ny/4"."""
-
-PRETRAINED = "pretrained."
-"""pretrained.mask2former_swin_b=FILE: initial weights of the rows that train this network."""
+TAG = "rgbt.table/"  # prefix of the tag that names the rows of a run
+PRETRAINED = "pretrained."  # pretrained.NETWORK=FILE: initial weights of its rows
+TAG_LENGTH = 5000
 
 UNTIL_DECIDED = "rgbt.until_decided/"
 """Prefix of the tag of runs whose number depends on what earlier ones have shown: intervals of
 their table must be valid at any time."""
-
-TAG_LENGTH = 5000
 
 
 @dataclass(frozen=True)

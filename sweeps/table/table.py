@@ -20,8 +20,7 @@ from sweeps.evaluation import BatchNorm, Head
 from sweeps.table.claim import OTHERS, PREVIOUS, Claim, Strict
 from sweeps.table.design import Design
 
-Form = Literal["paper", "released"]
-"""What a row is run as."""
+Form = Literal["paper", "released"]  # what a row is run as
 
 Efficiency = Literal["parameters", "gflops", "peak_memory", "latency", "images_per_second"]
 """Millions of parameters, GFLOPs, MiB, milliseconds for one image, images per second."""

@@ -105,14 +105,6 @@ def test_reproduce_failed_cell_prints_table(call: Call, place: Path, driven: Dri
     assert "failed" in (place / "here" / "table.md").read_text()
 
 
-def test_cells_of_other_drivers_are_no_failure(call: Call, place: Path, driven: Driven) -> None:
-    driven("finished", "running")
-    code, out, err = call(entry, "table=my/small", "tracking=none")
-    assert code == 0
-    assert "running" in out
-    assert_one_sentence(err, "wait=true")
-
-
 @pytest.mark.slow
 def test_table_of_sizes_runs_nothing_and_has_values(
     call: Call, place: Path, driven: Driven

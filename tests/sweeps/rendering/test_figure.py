@@ -63,16 +63,6 @@ def test_rows_below_each_other_without_a_factor() -> None:
     assert axes.get_ylim()[0] > axes.get_ylim()[1]  # the first row on top
 
 
-def test_one_panel_per_row_for_tables_of_regions() -> None:
-    columns = tuple(Column(name=f"R{n}", metric=f"region/{n}") for n in range(1, 7))
-    rows = tuple(Row(label=label, values={"R1": 3.0, "R2": 4.0}) for label in ("Car", "Bike"))
-    scored = score("t", table(rows, columns), {}, scale="demo")
-    assert main_columns(scored) == [columns[0], columns[1]]
-    many = tuple(Row(label=r.label, values={c.name: 1.0 for c in columns}) for r in rows)
-    figure = figure_of(score("t", table(many, columns), {}, scale="demo"))
-    assert [axes.get_title() for axes in figure.axes] == ["Car", "Bike"]
-
-
 def test_nothing_to_draw(tmp_path: Path) -> None:
     scored = score("t", table((Row(label="a"),)), {}, scale="demo")
     assert not draw_table(scored, tmp_path / "figure.png")

@@ -6,7 +6,6 @@ import math
 from dataclasses import replace
 from typing import Any
 
-import pytest
 from rich.console import Console
 
 from rgbt.terminal import WIDTH
@@ -87,13 +86,6 @@ def test_terminal_many_columns_use_separate_lines() -> None:
     assert shown[4] == ["published", "48.00", "49.25", "-", "-"]
     assert shown[5] == ["difference", "+2.00", "+0.75", "-", "-"]
     assert SMALL.format(scale="paper") not in lines(wide(STACKED))  # scale=paper
-
-
-@pytest.mark.parametrize("columns", [WIDE, STACKED, STACKED[:3]], ids=len)
-def test_terminal_narrow_width_keeps_numbers_whole(columns: tuple[Column, ...]) -> None:
-    whole, narrow = ("\n".join(lines(wide(columns), width)) for width in (WIDTH, 60))
-    for number in ("50.00", "14.14", "48.0", "49.25", "+2.00", "+0.75"):
-        assert narrow.count(number) == whole.count(number)
 
 
 def test_terminal_styles_best_where_shown() -> None:

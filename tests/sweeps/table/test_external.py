@@ -247,14 +247,6 @@ def test_weights_of_another_network_fail_once(
     assert "cannot be loaded into RTFNet" in run.reason
 
 
-def test_wrong_data_set_stops_before_any_command(
-    commands: Commands, runs_of: Runs, predictions: Path
-) -> None:
-    with pytest.raises(InputError, match="dataset"):
-        runs_of(f"predictions.CMNeXt={predictions}", "dataset.root=/nowhere")
-    assert not commands
-
-
 METHODS = ("LASNet", "SGFNet", "MMSMCNet")
 
 

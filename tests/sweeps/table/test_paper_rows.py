@@ -138,12 +138,6 @@ def test_rows_printed_twice_are_one_run(cells: str, scale: str) -> None:
     assert (len(keys), len(printed)) == (1, 1)
 
 
-@pytest.mark.parametrize("name", ["crm/table3b", "crm/table4", "spatialseg/table4"])
-def test_x_is_the_printed_factor(name: str) -> None:
-    key = "masking_ratio" if name == "crm/table4" else "patch_size"
-    assert [row.x for row in TABLES[name].rows] == [row.settings[key] for row in TABLES[name].rows]
-
-
 @pytest.mark.parametrize("number", [3, 4, 5, 6])
 def test_printed_variance_is_the_population_variance_of_the_rings(number: int) -> None:
     for row in TABLES[f"spatialseg/table{number}"].rows:

@@ -2,24 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
-from sweeps.table.load_table import STUDIES, load_table, study_names, table_names
-from sweeps.table.make_request import TableWords, make_request, read_named
+from sweeps.table.load_table import load_table
+from sweeps.table.make_request import TableWords, make_request
 from sweeps.worker.planner import Planner
 
 MISSING = "missing_image"
-
-
-def test_study_is_found_by_name_and_by_path() -> None:
-    assert MISSING in study_names()
-    assert MISSING not in table_names(Path("none"))
-    named, by_name = read_named(MISSING)
-    at_path, by_path = read_named(str(STUDIES / "missing_image.yaml"))
-    assert named == at_path == MISSING
-    assert by_name == by_path
 
 
 def test_missing_image_has_the_runs_of_the_ablation_of_crm() -> None:

@@ -14,7 +14,6 @@ from sweeps.rendering.effects import CSV_HEADER, effects_csv, effects_grids
 from sweeps.rendering.effects_figure import draw_effects
 from sweeps.table.cells import world_evaluations
 from sweeps.table.design import Design, DesignFactor, DesignMethod, Part
-from sweeps.table.make_request import select_rows
 from sweeps.table.table import Column, Row, Table
 from sweeps.verdicts.effects import MEAN, DesignJudge
 from tests.sweeps.tabled import counts_of, failed, outcome, table
@@ -135,13 +134,6 @@ def test_networks_tested_in_worlds_use_the_counts_of_each_world() -> None:
     found = estimates(table, runs)
     assert found["baseline", "", "noise"].value == pytest.approx(EFFECT)
     assert ("crm", "", "noise") not in found
-
-
-def test_method_with_rows_that_are_not_chosen_says_which() -> None:
-    table = select_rows(design_table(), "baseline N-T-")
-    found = DesignJudge(table, resamples=100).effects({})
-    assert found.lines == ()
-    assert found.missing == ("trained, baseline: row 'baseline N-T-' has no finished run.",)
 
 
 def test_outcome_of_corrupted_images_is_refused_by_name() -> None:

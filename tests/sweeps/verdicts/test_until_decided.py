@@ -6,10 +6,8 @@ import zlib
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-import pytest
 
 from analysis.uncertainty.verdicts import AnyTime
 from sweeps.point import Outcome, Point
@@ -17,7 +15,7 @@ from sweeps.table.claim import Claim
 from sweeps.table.request import TableRequest, seed_of
 from sweeps.table.table import Row
 from sweeps.verdicts.judge import TableJudge
-from sweeps.verdicts.until_decided import START, PairedSeeds, SeedsUntilDecided
+from sweeps.verdicts.until_decided import START, SeedsUntilDecided
 from tests.sweeps.tabled import outcome, table
 from tests.sweeps.verdicts.accuracies import accuracy
 
@@ -158,15 +156,3 @@ def test_claim_with_a_failed_row_is_not_extended() -> None:
         return failing(points) if seed_of(points[0].overrides) > START else finished(points)
 
     assert seeds(complete(adding(OPEN), finish=later))["twin"] == START + 2
-
-
-@pytest.mark.parametrize("state", ["running", "waiting"])
-def test_paired_seeds_skip_seeds_that_are_planned(state: Any) -> None:
-    runs = {("a", seed): Outcome(Point("a", ()), "finished") for seed in (4, 5)}
-    runs |= {
-        ("b", 4): Outcome(Point("b", ()), "finished"),
-        ("b", 5): Outcome(Point("b", ()), state),
-    }
-    paired = PairedSeeds(range(4, 8))
-    assert paired.further(runs, lambda: [["a", "b"]]) == [("a", 6), ("b", 6)]
-    assert PairedSeeds(range(4, 6)).further(runs, lambda: [["a", "b"]]) == []
