@@ -119,18 +119,6 @@ def test_dry_run_says_what_deciding_may_cost(call: Call, place: Path) -> None:
     assert "at most 3 runs more than these" in out
 
 
-@pytest.mark.parametrize("command", [claims, reproduce])
-def test_claim_that_does_not_fit_its_table_is_refused(
-    call: Call, place: Path, command: Callable[[], None]
-) -> None:
-    text = TABLE.replace("rows: [high]", "rows: [hihg]")
-    (place / "tables" / "my" / "planted.yaml").write_text(text)
-    (place / "runs").mkdir()
-    code, _, err = call(command, "table=my/planted")
-    assert code == 2
-    assert_one_sentence(err, "claim 'true_one', rows: 'hihg'")
-
-
 @pytest.mark.parametrize(
     ("command", "word", "key"),
     [

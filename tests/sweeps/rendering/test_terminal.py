@@ -10,7 +10,7 @@ from rich.console import Console
 
 from rgbt.terminal import WIDTH
 from sweeps.rendering.file_formats import latex, markdown, tidy_csv
-from sweeps.rendering.rendered_table import COUNTED, FORMS, NOT_PRINTED, SMALL, render_table
+from sweeps.rendering.rendered_table import COUNTED, NOT_PRINTED, SMALL, render_table
 from sweeps.rendering.terminal import terminal
 from sweeps.table.cells import ScoredTable, TableCell, score, size_marks
 from sweeps.table.table import Column, Row
@@ -46,38 +46,6 @@ def test_terminal_few_columns_are_on_one_line() -> None:
     assert shown[3] == ["a_1", "3", "_50.00", "±", "10.00", "48.0", "+2.00"]
     assert shown[4] == ["b", "3", "*70.00", "±", "10.00", "47.5", "+22.50"]
     assert shown[5] == ["theirs", "-", "50.0", "-"]
-
-
-def test_terminal_shows_remarks_below() -> None:
-    shown = lines(Made({"a": ((1,), 1.0), "b": ((2,), 3.0), "c": ((3,), 2.0)}).scored())
-    assert shown[6:9] == [
-        *("Published: somewhere; percent.", "Ours: scale=demo, of seed 0."),
-        FORMS["paper"],
-    ]
-    assert SMALL.format(scale="demo") in shown
-
-
-def test_unprinted_column_has_no_published_cell() -> None:
-    columns = (
-        Column(name="acc", metric="pixel_accuracy"),
-        Column(name="own", metric="pixel_accuracy", printed=False),
-    )
-    rows = tuple(
-        Row(label=label, experiment="crm", values={"acc": printed})
-        for label, printed in (("a", 48.5), ("b", 47.5), ("c", 46.5))
-    )
-    runs = {(label, 0): outcome(label, right(share)) for label, share in zip("abc", (3, 2, 1))}
-    scored = score("t", table(rows, columns), runs, scale="demo")
-    shown = words(scored)
-    assert shown[1] == ["seeds", "acc", "published", "difference", "own[1]"]
-    assert shown[3] == ["a", "1", "3.00", "48.5", "-45.50", "3.00"]
-    assert "[1] Not in the paper." in lines(scored)
-    body = [line for line in latex(render_table(scored)).splitlines() if line.endswith(r"\\")]
-    assert {line.count(" & ") for line in body} == {5}
-    assert "| own<sup>1</sup> |" in markdown(render_table(scored))
-    last = list(csv.DictReader(io.StringIO(tidy_csv(scored))))[-1]
-    assert (last["column"], last["mean"]) == ("own", "1.0")
-    assert last["published"] == last["difference"] == ""
 
 
 def test_terminal_many_columns_use_separate_lines() -> None:

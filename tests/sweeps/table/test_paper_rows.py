@@ -167,18 +167,3 @@ def test_columns_without_a_score_of_the_network_are_omitted() -> None:
     assert four.evaluations(["Multi-head"]) == (ExtraEvaluation(head="source"),)
     columns = three.table.columns_of(row_of("multihead/table3", "HeatNet*"))
     assert [column.name for column in columns] == ["mIoU_rgb"]
-
-
-@pytest.mark.parametrize("number", [1, 2, 3])
-def test_printed_consistency_is_of_released_protocol(number: int) -> None:
-    wanted = request(f"temporal/table{number}")
-    columns = wanted.table.columns[-4:]
-    assert [(c.name, c.metric, c.frames, c.printed) for c in columns] == [
-        ("TC", "TC", "released", True),
-        ("CA", "CA_released", "released", True),
-        ("TC aligned", "TC", "aligned", False),
-        ("CA aligned", "CA", "aligned", False),
-    ]
-    protocols = [evaluation.frames for evaluation in wanted.evaluations()]
-    assert protocols == ["released", "aligned"]
-    assert any("use the released protocol" in remark for remark in wanted.table.remarks)

@@ -57,15 +57,6 @@ def test_points_share_runs_of_equal_rows() -> None:
     assert points[0].evaluations == (ExtraEvaluation("thermal", "as trained"),)
 
 
-def test_points_at_paper_scale_use_user_overrides() -> None:
-    points = wanted("paper").points()
-    assert len(points) == 6
-    assert points[1].overrides == (
-        *("+experiment=crm", "scale=paper", "recipe.batch_size=5", "model=mask2former_swin_b"),
-        *("a.b=1", "seed=0"),
-    )
-
-
 def test_frames_are_evaluated_whatever_the_regions_of_the_table() -> None:
     columns = (
         Column(name="mIoU", metric="mIoU"),

@@ -11,7 +11,7 @@ from rgbt.metrics.counts import Counts
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.table.cells import ScoredTable, TableCell, published, score, size_marks
 from sweeps.table.table import Column, Row
-from tests.sweeps.tabled import Made, counts_of, failed, outcome, pairs_of, right, table
+from tests.sweeps.tabled import Made, counts_of, failed, outcome, right, table
 
 ACC = Column(name="acc", metric="pixel_accuracy")
 RGB = Column(name="rgb", metric="pixel_accuracy", modality="rgb")
@@ -138,56 +138,12 @@ def test_score_sizes_have_marks_without_seeds() -> None:
     assert scored((size,), {}, rows).cells == {}
 
 
-def test_score_protocols_have_separate_counts() -> None:
-    """TC of road 6/8 and 8/10, of car 0. CA of road alike; as released 6/10 and 8/12."""
-    columns = (
-        ACC,
-        Column(name="TC", metric="TC", frames="released"),
-        Column(name="CA", metric="CA_released", frames="released"),
-        Column(name="TC aligned", metric="class/road/TC", frames="aligned", printed=False),
-    )
-    rows = tuple(
-        Row(label=label, experiment="crm", values={"TC": printed})
-        for label, printed in (("a", 30.0), ("b", 31.0), ("c", 32.0))
-    )
-    made = {
-        label: {
-            None: right(share),
-            ExtraEvaluation(frames="released"): pairs_of(same, 2, "released"),
-            ExtraEvaluation(frames="aligned"): pairs_of(same + 2, 0 if label == "c" else 2),
-        }
-        for label, share, same in (("a", 40, 6), ("b", 50, 8), ("c", 60, 2))
-    }
-    found = scored(
-        columns, {(label, 0): outcome(label, each) for label, each in made.items()}, rows
-    )
-    means = {place: cell.mean for place, cell in found.cells.items()}
-    assert means["a", "TC"] == pytest.approx(100 * 6 / 8 / 2)
-    assert means["b", "TC"] == pytest.approx(100 * 8 / 10 / 2)
-    assert means["a", "CA"] == pytest.approx(100 * 6 / (6 + 8 + 8 - 2 * 6) / 2)
-    assert means["b", "CA"] == pytest.approx(100 * 8 / (8 + 10 + 10 - 2 * 8) / 2)
-    assert means["a", "TC aligned"] == pytest.approx(80.0)
-    assert means["c", "TC aligned"] == 100.0
-    assert math.isnan(found.difference(rows[0], columns[3]))
-
-
 def test_score_failed_seed_keeps_reason() -> None:
     lost = failed("out of memory")
     runs = {("a", 0): outcome("k", right(40)), ("a", 1): lost, ("a", 2): lost}
     cell = scored((ACC,), runs).cells["a", "acc"]
     assert (cell.mean, cell.seeds, cell.mark) == (40.0, 1, "failed")
     assert cell.reason == "seeds 1, 2: out of memory"
-
-
-def test_score_counts_commits_by_run() -> None:
-    runs = {
-        ("a", 0): outcome("k0", right(1), "aaa"),
-        ("a", 1): outcome("k1", right(2), "bbb"),
-        ("b", 0): outcome("k0", right(1), "aaa"),
-        ("b", 1): outcome("k2", right(1), None),
-    }
-    rows = (Row(label="a"), Row(label="b"))
-    assert scored((ACC,), runs, rows).commits == {"aaa": 1, "bbb": 1}
 
 
 @pytest.mark.parametrize(("absent", "wanted"), [("released", 50.0), ("exclude", 100.0)])

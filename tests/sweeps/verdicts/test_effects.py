@@ -136,14 +136,6 @@ def test_networks_tested_in_worlds_use_the_counts_of_each_world() -> None:
     assert ("crm", "", "noise") not in found
 
 
-def test_outcome_of_corrupted_images_is_refused_by_name() -> None:
-    table = design_table()
-    noisy = replace(table.columns[0], corruption="noise", severity=16.0)
-    table = replace(table, columns=(noisy, *table.columns[1:]))
-    found = DesignJudge(table, resamples=100).effects(trained())
-    assert "'one' is no score of the plain test images" in found.missing[0]
-
-
 def test_grids_and_csv_have_a_line_for_each_effect(tmp_path: Path) -> None:
     table = design_table()
     assert table.design is not None

@@ -152,15 +152,6 @@ def test_rows_of_the_same_runs_share_a_mark() -> None:
     assert found.reason == "rows 'high' and 'again' are the same runs at this scale."
 
 
-def test_nothing_is_marked_while_a_row_has_no_score() -> None:
-    rows = tuple(Row(label=label, experiment="crm") for label in ("low", "high", "later"))
-    runs: dict[CellRunId, Outcome] = {
-        **planted({"low": (50.0, 51.0, 49.0), "high": (60.0, 61.0, 60.0)}),
-        ("later", 0): failed("out of memory"),
-    }
-    assert TableJudge("own/t", table(rows, (ACC,)), resamples=200).marks(runs) == {}
-
-
 def test_claims_about_counted_sizes_are_exact() -> None:
     size = Column(name="size", efficiency="parameters")
     rows = tuple(Row(label=label, experiment="crm") for label in ("small", "large"))

@@ -120,15 +120,6 @@ def test_added_points_are_of_one_seed_and_name_the_rule() -> None:
     assert all("rgbt.until_decided/own/t" in each.tags for each in further)
 
 
-def test_resumed_command_adds_the_same_seeds() -> None:
-    until = adding(OPEN)
-    outcomes = complete(until)
-    half = [each for each in outcomes if seed_of(each.point.overrides) <= START]
-    assert outcomes_points(complete(adding(OPEN), half)) == outcomes_points(outcomes)
-    from_start = [each for each in outcomes if seed_of(each.point.overrides) < START]
-    assert seeds(complete(adding(OPEN), from_start)) == seeds(outcomes)
-
-
 def test_at_most_two_seeds_of_a_claim_are_unfinished() -> None:
     until = adding(OPEN)
     outcomes = finished(until.request.points())
