@@ -105,24 +105,6 @@ def test_reproduce_failed_cell_prints_table(call: Call, place: Path, driven: Dri
     assert "failed" in (place / "here" / "table.md").read_text()
 
 
-@pytest.mark.slow
-def test_table_of_sizes_runs_nothing_and_has_values(
-    call: Call, place: Path, driven: Driven
-) -> None:
-    """HeatNet 54,361,105 and the thesis' two heads 44,564,656 parameters at 14 classes."""
-    asked = driven("finished")
-    words = ("table=multihead/table5", "tracking=none", "seeds=3")
-    code, out, err = call(entry, *words)
-    assert (code, asked, err) == (0, [], "")
-    shown = {line.split()[0]: line.split() for line in out.splitlines() if "44.6" in line}
-    assert shown["Multi-head"][-3:] == ["*44.56", "44.6", "-0.04"]
-    rows = list(csv.DictReader((place / "runs/tables/multihead/table5_demo/table.csv").open()))
-    assert [row["mean"] for row in rows] == ["54.361105", "44.564656", "44.575498", "198.594658"]
-    assert [row["published"] for row in rows] == ["54.4", "44.6", "", ""]
-    code, out, _ = call(entry, *words, "dry_run=true")
-    assert (code, asked[0][0].points) == (0, ())
-
-
 def test_dry_run_lists_the_cells_and_writes_nothing(
     call: Call, place: Path, driven: Driven
 ) -> None:

@@ -2,17 +2,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
-
 from sweeps.rendering.figure import (
-    are_far_apart,
     draw_table,
     figure_of,
     main_columns,
 )
 from sweeps.table.cells import score
 from sweeps.table.table import Column, Factor, Row
-from tests.sweeps.tabled import Made, counts_of, outcome, table
+from tests.sweeps.tabled import counts_of, outcome, table
 
 MIOU = Column(name="mIoU", metric="mIoU")
 VAR = Column(name="Var", metric="Var", best="lowest")
@@ -40,27 +37,6 @@ def test_factor_against_both_metrics_in_order_of_x() -> None:
     assert list(printed.get_ydata()) == [69.0, 70.0, 72.0]
     levels = [line.get_ydata()[0] for line in upper.lines if line.get_label().startswith("base")]
     assert levels[1:] == [68.0]
-
-
-@pytest.mark.parametrize(
-    ("ours", "theirs", "expected"),
-    [
-        ([48.0, 50.0], [60.0, 61.0], True),
-        ([48.0, 60.0], [60.0, 61.0], False),
-        ([48.0, 52.0], [57.0, 61.0], False),
-        ([50.0], [50.0], False),
-        ([], [50.0], False),
-    ],
-)
-def test_far_apart(ours: list[float], theirs: list[float], expected: bool) -> None:
-    assert are_far_apart(ours, theirs) is expected
-
-
-def test_rows_below_each_other_without_a_factor() -> None:
-    scored = Made({"a long label": ((40, 60), 48.0), "b": ((), 50.0)}).scored()
-    axes = figure_of(scored).axes[0]
-    assert [label.get_text() for label in axes.get_yticklabels()] == ["a long label", "b"]
-    assert axes.get_ylim()[0] > axes.get_ylim()[1]  # the first row on top
 
 
 def test_nothing_to_draw(tmp_path: Path) -> None:

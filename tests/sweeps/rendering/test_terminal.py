@@ -56,15 +56,6 @@ def test_terminal_many_columns_use_separate_lines() -> None:
     assert SMALL.format(scale="paper") not in lines(wide(STACKED))  # scale=paper
 
 
-def test_terminal_styles_best_where_shown() -> None:
-    console = Console(width=WIDTH, record=True, file=io.StringIO(), force_terminal=True)
-    console.print(terminal(render_table(Made(ROWS).scored(MARKS)), plain=False))
-    shown = console.export_text(styles=True)
-    assert "\x1b[1m70.00\x1b[0m" in shown
-    assert "\x1b[4m50.00\x1b[0m" in shown
-    assert "Bold: shown to be the best of our rows, underlined: the second best." in shown
-
-
 def test_render_table_numbers_and_shares_footnotes() -> None:
     columns = (*STACKED[:3], Column(name="TC", metric="TC", frames="aligned", printed=False))
     rows = (
@@ -119,17 +110,6 @@ def test_render_table_of_sizes_has_no_seeds() -> None:
     assert "| b |  | **44.56** | 44.6 | -0.04 |" in markdown(render_table(scored))
     first, _ = csv.DictReader(io.StringIO(tidy_csv(scored)))
     assert (first["mean"], first["sd"], first["n"], first["runs"]) == ("54.361", "", "0", "")
-
-
-def test_markdown_read_back() -> None:
-    text = markdown(render_table(Made(ROWS).scored(MARKS)))
-    rows = [
-        [cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines()[2:7]
-    ]
-    assert rows[0] == ["", "seeds", "acc", "published", "difference"]
-    assert rows[2] == ["a_1", "3", "<u>50.00 ± 10.00</u>", "48.0", "+2.00"]
-    assert rows[3][2] == "**70.00 ± 10.00**"
-    assert "- Bold: shown to be the best of our rows, underlined: the second best." in text
 
 
 def test_latex_escapes_and_omits_differences() -> None:

@@ -53,12 +53,6 @@ def test_refused(tmp_path: Path, arguments: tuple[str, list[str]], sentence: str
     assert not (tmp_path / "my").exists()
 
 
-@pytest.mark.parametrize("name", ["spatialseg/table3", "../up", "my/x.yaml", "/abs"])
-def test_refused_names(tmp_path: Path, name: str) -> None:
-    with pytest.raises(InputError, match="another name|such as my/ablation"):
-        write_new(name, "grbm", ["masker.sigma_div=1,2"], tmp_path)
-
-
 def test_the_command_writes_once(
     call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -9,11 +9,10 @@ import pytest
 from omegaconf import DictConfig, OmegaConf
 
 from rgbt.config.component import build
-from sweeps.evaluation import ExtraEvaluation
 from sweeps.table.load_table import load_table, table_names
 from sweeps.table.request import TableRequest
 from sweeps.table.table import Row, Table
-from tests.composed import row_spec, specified
+from tests.composed import row_spec
 
 TABLES = {name: load_table(name) for name in table_names(Path("none"))}
 SECOND = {"none": [], "dice": ["dice2"], "con": ["con"], "con_acc": ["con-acc"]}
@@ -88,27 +87,6 @@ def test_temporal_row_has_printed_losses_and_views(table: Table, row: Row) -> No
         assert_printed(row, {key: mode in modes for key, modes in views.items()})
 
 
-@pytest.mark.parametrize(("table", "row"), rows_of("multihead"))
-def test_multihead_row_has_printed_heads_and_adaptation(table: Table, row: Row) -> None:
-    config = row_config(table, row)
-    source, target = config.domains.source, config.domains.target
-    before = str(config.model.weights).removeprefix("experiment:").partition("/")[0]
-    first = config
-    if before != "None":
-        first = OmegaConf.create(dict(specified((f"+experiment={before}", "scale=demo")).plain))
-    scheme = str(config.scheme["_target_"]) + str(config.scheme.get("unlabelled"))
-    adaptations = {"Adversarial": "adversarial", "MaxSquares": "maximum_squares_loss"}
-    found = {
-        "heads": len({each.head for each in (source, target) if each is not None}),
-        "modified_decoder": config.model.get("decoder", "basic") != "basic",
-        "adaptation": next((a for word, a in adaptations.items() if word in scheme), None),
-        "seg_loss_on_thermal": first.domains.target is not None,
-        "init_from_rgb_to_thermal": "thermal" in str(first.model.weights),
-    }
-    shared = set(found) & set(row.settings)
-    assert {key: found[key] for key in shared} == {key: row.settings[key] for key in shared}
-
-
 TWICE = (
     "spatialseg/table3 Ny/4 | spatialseg/table4 PS 64 | spatialseg/table5 alpha 0"
     " | spatialseg/table6 no weighting",
@@ -158,12 +136,3 @@ def test_printed_mean_is_that_of_both_columns(number: int) -> None:
         if None not in known:
             first, second, printed = (value or 0.0 for value in known)
             assert printed == pytest.approx((first + second) / 2, abs=0.0501), row.label
-
-
-def test_columns_without_a_score_of_the_network_are_omitted() -> None:
-    three, four = request("multihead/table3"), request("multihead/table4")
-    assert three.evaluations(["HeatNet*"]) == four.evaluations(["HeatNet RGB-only*"]) == ()
-    assert three.evaluations(["Multi-head"]) == (ExtraEvaluation("thermal"),)
-    assert four.evaluations(["Multi-head"]) == (ExtraEvaluation(head="source"),)
-    columns = three.table.columns_of(row_of("multihead/table3", "HeatNet*"))
-    assert [column.name for column in columns] == ["mIoU_rgb"]

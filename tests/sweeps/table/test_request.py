@@ -73,20 +73,6 @@ def test_frames_are_evaluated_whatever_the_regions_of_the_table() -> None:
         )
 
 
-def test_heads_are_evaluated_apart_and_sizes_need_no_run() -> None:
-    columns = (
-        Column(name="night", metric="night/mIoU"),
-        Column(name="by day", metric="night/mIoU", head="source"),
-        Column(name="both", mean=("night", "by day")),
-        Column(name="size", efficiency="parameters"),
-    )
-    asked = TableRequest("own/t", table(ROWS, columns), "demo", (0,))
-    assert asked.points()[0].evaluations == (ExtraEvaluation(head="source"),)
-    alone = TableRequest("own/t", table(ROWS, columns[3:]), "demo", (0, 1))
-    assert (alone.row_seeds(), alone.points(), alone.runs([])) == ([], [], {})
-    assert alone.models() == set()
-
-
 def test_outcomes_go_back_to_their_cells() -> None:
     asked = wanted()
     outcomes = [Outcome(point, "failed", point.label) for point in asked.points()]

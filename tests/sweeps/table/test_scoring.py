@@ -105,15 +105,6 @@ def test_score_details_have_own_counts() -> None:
     assert values["road", "acc"] == 50.0
 
 
-def test_score_regions_of_table_and_placeholders() -> None:
-    column = Column(name="R2", metric="class/{class}/region/2")
-    rows = tuple(Row(label=name, settings={"class": name}) for name in ("road", "car"))
-    run = outcome("k", {ExtraEvaluation("default", "ring9"): counts_of()})
-    found = scored((column,), {("road", 0): run, ("car", 0): run}, rows, regions="ring9")
-    assert found.cells["road", "R2"].mean == pytest.approx(75.0)
-    assert found.cells["car", "R2"].mean == pytest.approx(80.0)
-
-
 def test_score_sizes_have_marks_without_seeds() -> None:
     size = Column(name="size", efficiency="parameters", best="lowest")
     rows = tuple(

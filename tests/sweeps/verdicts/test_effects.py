@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from rgbt.metrics.counts import Counts
-from sweeps.rendering.effects import CSV_HEADER, effects_csv, effects_grids
-from sweeps.rendering.effects_figure import draw_effects
 from sweeps.table.cells import world_evaluations
 from sweeps.table.design import Design, DesignFactor, DesignMethod, Part
 from sweeps.table.table import Column, Row, Table
@@ -134,26 +131,6 @@ def test_networks_tested_in_worlds_use_the_counts_of_each_world() -> None:
     found = estimates(table, runs)
     assert found["baseline", "", "noise"].value == pytest.approx(EFFECT)
     assert ("crm", "", "noise") not in found
-
-
-def test_grids_and_csv_have_a_line_for_each_effect(tmp_path: Path) -> None:
-    table = design_table()
-    assert table.design is not None
-    effects = DesignJudge(table, resamples=100).effects(trained())
-    (grid,) = effects_grids(effects, table.design)
-    # Three methods and differences, each with the mean, two main effects and an interaction.
-    assert len(grid.rows) == 3 * 4
-    noise = next(row for row in grid.rows if row[:2] == ("baseline", "noise"))
-    assert noise[4] == "lower"
-    texture = next(row for row in grid.rows if row[:2] == ("crm - baseline", "texture"))
-    assert texture[4] == "no"
-    assert grid.notes[0] == "N, noise: - little; + much."
-    lines = effects_csv(effects.lines).splitlines()
-    assert lines[0] == ",".join(CSV_HEADER)
-    assert len(lines) == 1 + 12
-    figure = tmp_path / "figure.png"
-    assert draw_effects(effects, "my/design", figure)
-    assert figure.stat().st_size > 1000
 
 
 def test_scenes_are_paired_although_labels_differ() -> None:
