@@ -1,9 +1,6 @@
 from __future__ import annotations
 
-from pathlib import Path
-
 from sweeps.rendering.figure import (
-    draw_table,
     figure_of,
     main_columns,
 )
@@ -37,12 +34,6 @@ def test_factor_against_both_metrics_in_order_of_x() -> None:
     assert list(printed.get_ydata()) == [69.0, 70.0, 72.0]
     levels = [line.get_ydata()[0] for line in upper.lines if line.get_label().startswith("base")]
     assert levels[1:] == [68.0]
-
-
-def test_nothing_to_draw(tmp_path: Path) -> None:
-    scored = score("t", table((Row(label="a"),)), {}, scale="demo")
-    assert not draw_table(scored, tmp_path / "figure.png")
-    assert not (tmp_path / "figure.png").exists()
 
 
 def test_main_columns_are_headlines_of_day_and_night() -> None:
