@@ -6,8 +6,7 @@ Nothing is run: the verdicts come from the finished runs in the folder of runs.
 from __future__ import annotations
 
 import re
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -19,9 +18,7 @@ from rgbt.config.plain_command import PlainCommand
 
 if TYPE_CHECKING:
     from rgbt.runs.result import RunResult
-    from sweeps.point import Outcome
-    from sweeps.table.request import TableRequest
-    from sweeps.verdicts.judge import CellRunId, JudgedClaim
+    from sweeps.verdicts.judge import JudgedClaim
 
 ALL = "all"
 
@@ -30,18 +27,11 @@ ALL = "all"
 class Options:
     """Options of ``rgbt claims``."""
 
-    table: Annotated[
-        str,
-        Help("claims of one table, such as spatialseg/table3; all: of every table of the papers"),
-    ] = ALL
+    table: Annotated[str, Help("such as spatialseg/table3; all: every table of the papers")] = ALL
     scale: Annotated[str, Help("scale of the runs: demo, bench or paper")] = "demo"
-    form: Annotated[
-        Literal["paper", "released"], Help("form of the rows, as of rgbt reproduce")
-    ] = "paper"
+    form: Annotated[Literal["paper", "released"], Help("form of the rows")] = "paper"
     runs_dir: RunsDir = Path("runs")
-    out: Annotated[
-        Path | None, Help("output folder of claims.md and claims.csv; default: only printed")
-    ] = None
+    out: Annotated[Path | None, Help("output folder of claims.md and claims.csv")] = None
 
 
 def main(options: Options, overrides: list[str]) -> int:
@@ -63,90 +53,75 @@ def main(options: Options, overrides: list[str]) -> int:
     print_rich(Text("\n".join([by_paper(judged), *times])))
     if options.out is not None:
         options.out.mkdir(parents=True, exist_ok=True)
-        text = (
-            f"# Claims of the papers\n\n{counted(judged)} Runs: `{without_folders(run_as)}`.\n\n"
-            + "".join(f"{line}\n\n" for line in times)
-            + claims_markdown(judged, tables=True)
-        )
+        words = re.sub(r" ?dataset\.root=\S+", "", run_as)  # the folder names a machine
+        head = f"# Claims of the papers\n\n{counted(judged)} Runs: `{words}`."
+        text = "\n\n".join([head, *times, claims_markdown(judged, tables=True)])
         write_atomic(options.out / "claims.md", text.encode())
         write_atomic(options.out / "claims.csv", claims_csv(judged).encode())
         print_rich(path_lines([("claims", str(options.out / "claims.md"))]))
     return 0
 
 
-def without_folders(words: str) -> str:
-    """Words of a command without the folder of the data, which names a machine."""
-    return re.sub(r" ?dataset\.root=\S+", "", words)
-
-
 def judge_all(options: Options, overrides: Sequence[str]) -> tuple[list[JudgedClaim], list[str]]:
-    """The claims of the requested tables, judged by the finished runs; and how long these took.
-
-    Raises:
-        InputError: no such table, scale or folder of runs.
-    """
+    """The claims of the requested tables, judged by the finished runs; and how long these took."""
     from rich.console import Console
     from rich.progress import track
 
     from sweeps.rendering.times import time_line, upstream_line
-    from sweeps.table.load_table import PUBLISHED, table_names
-    from sweeps.table.make_request import TableWords, check_override, make_request, read_named
-    from sweeps.table.rows import check_rows
-    from sweeps.verdicts.stored import finished_by_seed, stored_runs
+    from sweeps.table import make_request as requests
+    from sweeps.table.efficiency import exact_sizes
+    from sweeps.table.load_table import is_own, table_names
+    from sweeps.verdicts.judge import TableJudge
+    from sweeps.verdicts.stored import finished_by_seed, rule_of, stored_runs
     from sweeps.worker.planner import Planner
 
-    names = table_names(PUBLISHED / "none") if options.table == ALL else [options.table]
+    names = table_names(Path("none")) if options.table == ALL else [options.table]
     finished = finished_by_seed(options.runs_dir)
     for word in overrides:
-        check_override(word)
-    words = TableWords(seeds=(0,), scale=options.scale, form=options.form, overrides=overrides)
+        requests.check_override(word)
+    words = requests.TableWords(
+        seeds=(0,), scale=options.scale, form=options.form, overrides=overrides
+    )
     planner = Planner(readable_paths([f"runs_dir={options.runs_dir}"]))
     judged: list[JudgedClaim] = []
     results: dict[str, RunResult] = {}
     trained: list[tuple[str, ...]] = []
     for each in track(names, "judging", console=Console(stderr=True), transient=True):
-        name, table = read_named(each)
-        if table.claims:
-            request, external = make_request(name, table, words)
-            if external:
-                raise InputError(
-                    f"{external[0].kind}.{external[0].label}: only finished runs are judged here; "
-                    f"use rgbt reproduce table={name} for rows that are not trained."
-                )
-            check_rows(request, planner)
+        name, table = requests.read_named(each)
+        if not table.claims:
+            continue
+        request, external = requests.make_request(name, table, words)
+        if external:
+            raise InputError(
+                f"{external[0].kind}.{external[0].label}: only finished runs are judged here; "
+                f"use rgbt reproduce table={name} for rows that are not trained."
+            )
+        if overrides or is_own(each):  # a test checks the others
+            requests.check_equal_runs(request, planner)
+        runs = {}
+        if overrides or finished:
             runs = stored_runs(request, options.runs_dir, finished, planner)
-            judged += judge_stored(request, runs)
-            results |= {each.key: each for run in runs.values() for each in run.results}
-            trained += [request.overrides(label, seed) for label, seed in runs]
+        found = [result for run in runs.values() for result in run.results]
+        rule = rule_of(result.tags for result in found)
+        judge = TableJudge(name, table, rule, sizes=exact_sizes(request))
+        judged += judge.claims(runs)
+        results |= {result.key: result for result in found}
+        trained += [request.overrides(label, seed) for label, seed in runs]
     times = (time_line(results.values()), upstream_line(trained, planner))
     return judged, [line for line in times if line]
 
 
-def judge_stored(request: TableRequest, runs: Mapping[CellRunId, Outcome]) -> list[JudgedClaim]:
-    """The claims of one table, judged by its finished runs."""
-    from sweeps.table.efficiency import exact_sizes
-    from sweeps.verdicts.judge import TableJudge
-    from sweeps.verdicts.stored import rule_of
-
-    rule = rule_of(result.tags for run in runs.values() for result in run.results)
-    judge = TableJudge(request.name, request.table, rule, sizes=exact_sizes(request))
-    return judge.claims(runs)
-
-
 def by_paper(judged: Sequence[JudgedClaim]) -> str:
     """How many claims each paper makes, and of how many its printed numbers agree."""
-    papers = Counter(each.table.partition("/")[0] for each in judged)
-    agree = Counter(each.table.partition("/")[0] for each in judged if each.as_printed)
-    apart = Counter(each.table.partition("/")[0] for each in judged if each.as_printed is False)
-    return "\n".join(
-        f"{paper}: {count} claims; its printed values agree with {agree[paper]}, do not agree with "
-        f"{apart[paper]}{_not_printed(count - agree[paper] - apart[paper])}."
-        for paper, count in papers.items()
-    )
-
-
-def _not_printed(count: int) -> str:
-    return f", and are not printed for {count}" if count else ""
+    lines = []
+    for paper in dict.fromkeys(each.table.partition("/")[0] for each in judged):
+        found = [each.as_printed for each in judged if each.table.partition("/")[0] == paper]
+        lines.append(
+            f"{paper}: {len(found)} claims; its printed values agree with {found.count(True)}, do "
+            f"not agree with {found.count(False)}"
+            + (f", and are not printed for {count}." if (count := found.count(None)) else ".")
+        )
+    return "\n".join(lines)
 
 
 entry = PlainCommand(Options, main)

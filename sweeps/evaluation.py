@@ -22,16 +22,8 @@ BatchNorm = Literal["as trained", "recomputed", "adabn", "batch"]
 class ExtraEvaluation:
     """An evaluation of a finished run beside the one that every run ends with.
 
-    Attributes:
-        modality: "rgbt", "rgb" or "thermal"; "default": what the network is made for.
+    Attributes: see `sweeps.table.table.Column`, and
         regions: a file of ``conf/metric``, or "as trained".
-        frames: protocol of pairs of frames, see `rgbt.metrics.pairs`; None: single frames.
-        head: see `Head`; of single frames alone.
-        corruption: of the images, NAME or NAME:IMAGE with a file of ``conf/corruption``; None:
-            clean, as the evaluation that the run makes itself.
-        severity: of the corruption; None: the only one that it has.
-        batch_norm: see `BatchNorm`; of single frames alone.
-        batch_norm_splits: splits whose images give its statistics; (): the evaluated one.
         details: kind of counts beside the confusion matrices, see `rgbt.metrics.details`.
         world: name of the images where they are not the run's own, e.g. "O-N+"; "" where they are.
         dataset: overrides of the data set that make this world.
@@ -55,47 +47,39 @@ class ExtraEvaluation:
 
     @property
     def label(self) -> str:
-        """As shown: "thermal, ring9", "rgb, ring5, source head" or "consistency, aligned".
-
-        Under a corruption: "default, ring5, occluded-0.5".
-        """
+        """As shown: "rgb, ring5, occluded-0.5, source head" or "consistency, aligned"."""
         if self.frames is not None:
             return f"consistency, {self.frames}"
-        head = [] if self.head == "as trained" else [f"{self.head} head"]
-        details = [] if self.details is None else [self.details]
-        world = [f"world {self.world}"] if self.world else []
-        changes = [*head, *self._corrupted, *self._normalised, *details, *world]
-        return ", ".join([self.modality, self.regions, *changes])
+        head = "" if self.head == "as trained" else f"{self.head} head"
+        world = f"world {self.world}" if self.world else ""
+        words = (self.modality, self.regions, head, *self._changes, self.details or "", world)
+        return ", ".join(filter(None, words))
 
     @property
     def command(self) -> tuple[str, ...]:
         """Module that makes it, and its arguments except the run.
 
-        One call makes both protocols of virtual views, aligned and released, and one call makes
-        several details, because the network takes most of the time.
+        One call makes both protocols of virtual views, or several details.
         """
         if self.frames is not None:
             return ("rgbt.consistency", f"frames={'next' if self.frames == 'next' else 'virtual'}")
-        words = [f"modality={self.modality}", f"regions={self.regions}"]
-        words += [] if self.head == "as trained" else [f"head={self.head}"]
-        words += [] if self.corruption is None else [f"corruption={self.corruption}"]
-        words += [] if self.severity is None else [f"severity={self.severity:g}"]
-        words += [] if self.batch_norm == "as trained" else [f"batch_norm={self.batch_norm}"]
-        if self.batch_norm_splits:
-            words.append(f"batch_norm_splits={','.join(self.batch_norm_splits)}")
-        if self.details is not None:
-            words.append(
-                f"details={'all' if self.details in OF_SCENES else 'boundary,calibration'}"
-            )
-        return ("rgbt.evaluate", *words, *self.dataset)
+        details = "all" if self.details in OF_SCENES else "boundary,calibration"
+        given = {
+            "head": None if self.head == "as trained" else self.head,
+            "corruption": self.corruption,
+            "severity": None if self.severity is None else f"{self.severity:g}",
+            "batch_norm": None if self.batch_norm == "as trained" else self.batch_norm,
+            "batch_norm_splits": ",".join(self.batch_norm_splits) or None,
+            "details": None if self.details is None else details,
+        }
+        words = (f"{key}={value}" for key, value in given.items() if value is not None)
+        fixed = (f"modality={self.modality}", f"regions={self.regions}")
+        return ("rgbt.evaluate", *fixed, *words, *self.dataset)
 
     @property
     def path(self) -> str:
-        """Path of its counts inside the run folder, and among the run's files in MLflow."""
-        return self.details_path(self.out)
-
-    def details_path(self, out: str) -> str:
-        """Path of its counts if the command writes `out`: details are beside the matrices."""
+        """Path of its counts inside the run folder: details are beside the matrices."""
+        out = self.out
         return out if self.details is None else f"{out.removesuffix('.npz')}-{self.details}.npz"
 
     @property
@@ -103,24 +87,17 @@ class ExtraEvaluation:
         """Path, inside the run folder, of the file that the command writes."""
         if self.frames is not None:
             return file_name(self.frames, "test")
-        head = [] if self.head == "as trained" else [f"{self.head}-head"]
-        regions = self.regions.replace(" ", "-")
+        head = "" if self.head == "as trained" else f"{self.head}-head"
         # By the overrides and not by the name, whose overrides may change.
         digest = hashlib.sha256("\n".join(self.dataset).encode()).hexdigest()[:8]
-        world = [f"world-{digest}"] if self.dataset else []
-        changes = [*head, *self._corrupted, *self._normalised, *world]
-        name = "_".join(["table", self.modality, regions, *changes])
-        return f"evaluations/{name}.npz"
+        world = f"world-{digest}" if self.dataset else ""
+        words = ("table", self.modality, self.regions.replace(" ", "-"), head, *self._changes)
+        return f"evaluations/{'_'.join(filter(None, (*words, world)))}.npz"
 
     @property
-    def _corrupted(self) -> list[str]:
-        """The corruption with its severity, as part of a name; [] without one."""
+    def _changes(self) -> tuple[str, ...]:
+        """The corruption and the statistics of batch normalisation, as parts of a name."""
         severity = "" if self.severity is None else f"-{self.severity:g}"
-        return [f"{row_name(self.corruption)}{severity}"] if self.corruption else []
-
-    @property
-    def _normalised(self) -> list[str]:
-        """The statistics of batch normalisation, as part of a name; [] as trained."""
-        if self.batch_norm == "as trained":
-            return []
-        return ["-".join(("norm", self.batch_norm, *self.batch_norm_splits))]
+        corruption = f"{row_name(self.corruption)}{severity}" if self.corruption else ""
+        norm = "-".join(("norm", self.batch_norm, *self.batch_norm_splits))
+        return corruption, "" if self.batch_norm == "as trained" else norm

@@ -14,23 +14,20 @@ from annotated_types import Interval
 
 from rgbt.checks import InputError
 from rgbt.config.command import composing
-from rgbt.config.common_options import RunsDir
+from rgbt.config.common_options import RunsDir, Trust
 from rgbt.config.component import Component
 from rgbt.config.options import Help, readable_paths
 from rgbt.config.plain_command import CommandGroup, PlainCommand
 from rgbt.metrics.names import MIOU
 from sweeps.settings import SweepSettings
 from sweeps.table.new_table import NewOptions, new
-from sweeps.table.request import seeds_of
 
 if TYPE_CHECKING:
     from sweeps.point import Outcome
     from sweeps.table_plan import TablePlan
     from sweeps.worker.planner import Planner
-    from sweeps.worker.run_store import RunStore
 
 ALL = "all"
-UNTIL_DECIDED = "until_decided"
 NEW = PlainCommand(NewOptions, new, name="rgbt reproduce new")
 
 
@@ -38,93 +35,38 @@ NEW = PlainCommand(NewOptions, new, name="rgbt reproduce new")
 class Options:
     """Options of ``rgbt reproduce``; the sweeper's file explains those of execution too."""
 
-    table: Annotated[
-        str,
-        Help(
-            "table to run: spatialseg/table3, my/ablation (in ./tables) or a file; all: every "
-            "table, with dry_run=true"
-        ),
-    ]
-    seeds: Annotated[
-        str,
-        Help(
-            "number of seeds (3: seeds 0, 1, 2), a list (0,4,7), or until_decided: start with 4 "
-            "and add paired seeds to the rows of undecided claims, up to max_seeds"
-        ),
-    ] = "1"
-    max_seeds: Annotated[
-        int, Interval(ge=4, le=1000), Help("most seeds of a row with seeds=until_decided")
-    ] = 20
-    scale: Annotated[
-        str,
-        Help(
-            "demo (minutes, embedded data), bench (calibrated data, common start) or paper "
-            "(published sizes)"
-        ),
-    ] = "demo"
+    table: Annotated[str, Help("spatialseg/table3, my/ablation (in ./tables), a file, or all")]
+    seeds: Annotated[str, Help("a number (3: 0, 1, 2), a list (0,4,7), or until_decided")] = "1"
+    max_seeds: Annotated[int, Interval(ge=4, le=1000), Help("most, with until_decided")] = 20
+    scale: Annotated[str, Help("demo (minutes, embedded data), bench or paper")] = "demo"
     form: Annotated[
         Literal["paper", "released", "both"],
-        Help(
-            "paper: rows as the text describes them; released: as their release made them, where "
-            "it is known; both: both, and the difference"
-        ),
+        Help("rows as the paper's text describes them, as their release made them, or both"),
     ] = "paper"
-    rows: Annotated[str, Help("run some rows only: rows=A,H; default: all")] = ""
-    dry_run: Annotated[
-        bool, Help("true: show the runs of the cells, their states and the time left; run nothing")
-    ] = False
+    rows: Annotated[str, Help("some rows only, by label, number or group: rows=Ny,3")] = ""
+    dry_run: Annotated[bool, Help("true: only show runs, their states and the time")] = False
     runs_dir: RunsDir = Path("runs")
-    out: Annotated[
-        Path | None,
-        Help(
-            "output folder of table.md, .csv, .tex and figure.png; default: tables/ in the folder "
-            "of runs"
-        ),
-    ] = None
+    out: Annotated[Path | None, Help("folder of the files; default: tables/ of the runs")] = None
     workers: Annotated[int, Help("number of runs at the same time")] = 1
     gpus: Annotated[
         tuple[int | tuple[int, ...], ...] | None,
-        Help(
-            "GPUs to use: gpus=[0,1] assigns one GPU to each worker, gpus=[[0,1],[2,3]] two, for "
-            "runs with trainer.devices=auto"
-        ),
+        Help("GPU of each worker: gpus=[0,1]; or several: gpus=[[0,1],[2,3]]"),
     ] = None
-    retry: Annotated[
-        Literal["none", "failed"],
-        Help("failed: retry runs that failed in a previous call; none: do not"),
-    ] = "none"
+    retry: Annotated[Literal["none", "failed"], Help("failed: those of earlier calls")] = "none"
     retries: Annotated[int, Help("how often a failed run is retried in this call")] = 0
-    fresh: Annotated[
-        bool,
-        Help(
-            "true: retrain runs that another version of the code made; the old runs move to "
-            "<runs_dir>/replaced"
-        ),
-    ] = False
-    wait: Annotated[
-        bool,
-        Help("true: wait for cells that other commands run; false: do not wait"),
-    ] = True
-    storage: Annotated[
-        str | None,
-        Help("Optuna storage that all machines share: file.journal or postgresql://user@host/name"),
-    ] = None
+    fresh: Annotated[bool, Help("true: retrain runs of other code, and keep the old ones")] = False
+    wait: Annotated[bool, Help("true: wait for cells that other commands run")] = True
+    storage: Annotated[str | None, Help("of all machines: postgresql://user@host/name")] = None
     timeout_minutes: Annotated[float | None, Help("time limit of one run")] = None
-    max_failures: Annotated[
-        int | None, Help("start no more runs after this number of failures")
-    ] = None
-    executor: Annotated[
-        Literal["local", "submitit"],
-        Help("local: processes on this machine; submitit: jobs of a cluster"),
-    ] = "local"
-    submitit: Annotated[
-        dict[str, Any] | None, Help("options of the cluster jobs: submitit={timeout_min: 60}")
-    ] = field(default_factory=dict)
+    max_failures: Annotated[int | None, Help("start no more runs after so many failures")] = None
+    executor: Annotated[Literal["local", "submitit"], Help("here, or as cluster jobs")] = "local"
+    trust: Trust = ""
+    submitit: Annotated[dict[str, Any] | None, Help("options of jobs: {timeout_min: 60}")] = field(
+        default_factory=dict
+    )
 
 
-OF_THE_TABLE = (
-    *("table", "seeds", "max_seeds", "scale", "form", "rows", "runs_dir", "out", "fresh"),
-)
+OF_THE_TABLE = ("table", "seeds", "max_seeds", "scale", "form", "rows", "runs_dir", "out", "fresh")
 """Options that are no settings of execution."""
 
 
@@ -134,73 +76,75 @@ def main(options: Options, overrides: list[str]) -> int:
     The table is a published one or your own. It ends with a verdict on each claim of its paper.
     Words with other keys are overrides of every row: dataset.root=/data/MFNet
     tracking.uri=http://host:5000. pretrained.mask2former_swin_b=FILE sets the initial weights of
-    all rows with that network. weights.CMX=FILE evaluates the network of row CMX with a file of
-    weights; predictions.CMX=FOLDER counts its predicted label images. Neither is trained.
+    all rows with that network. weights.ROW=FILE evaluates the network of a row with a file of
+    weights; predictions.ROW=FOLDER counts its predicted label images. Neither is trained. A ROW is
+    a label or a number: weights.Ours=FILE, predictions.3=FOLDER.
     conf/hydra/sweeper/study.yaml explains the options of execution.
 
     To write your own table:
     rgbt reproduce new table=my/ablation experiment=grbm masker.sigma_div=1,2,4
     """
-    from sweeps.worker.executors import fork_template, limit_spinning
-
-    settings = settings_of(options)
-    limit_spinning(settings.workers)  # before the imports that load torch
     from rgbt.config.compose import compose
-    from rgbt.tracking.mlflow_store import MlflowTracking
+    from sweeps.point import Outcome
     from sweeps.rendering.publish import publish_table
-    from sweeps.table.load_table import table_names
+    from sweeps.table.load_table import is_own, table_names
     from sweeps.table.make_request import check_override
+    from sweeps.table_plan import plan_table
     from sweeps.verdicts.stored import rule_of
     from sweeps.worker.planner import Planner
     from sweeps.worker.point_list import preview_points, run_points
     from sweeps.worker.run_store import open_run_store
 
+    settings = settings_of(options)
     for word in overrides:
         check_override(word)
     tracker = [word for word in overrides if word.lstrip("+~").startswith("tracking")]
-    extra = tuple(word for word in overrides if word not in tracker)
     if options.table == ALL and not settings.dry_run:
         raise InputError("table=all requires dry_run=true; run one table at a time.")
-    tables = table_names() if options.table == ALL else [options.table]
     base = (*readable_paths([f"runs_dir={options.runs_dir}"]), *tracker)
     with composing(base):
         config = compose([*base, f"fresh={str(options.fresh).lower()}"])
         Component.from_node(config.tracking)
     runs = open_run_store(config)
-    if settings.executor == "local" and not settings.dry_run:
-        fork_template(with_mlflow=isinstance(runs.tracking, MlflowTracking))
     planner = Planner(base)
-    plans = plans_of(tables, options, extra, runs, planner)
+    extra = [word for word in overrides if word not in tracker]
+    tables = table_names() if options.table == ALL else [options.table]
+    plans = [plan_table(each, options, extra, runs, planner) for each in tables]
     if settings.dry_run:
-        previews = [preview_points(plan.points, settings, planner) for plan in plans]
+        # Without any run and any override, the keys of tables that a test checks do not matter.
+        is_new = not (overrides or options.storage or any(runs.runs_dir.glob("*")))
+        is_new &= options.table == ALL and config.tracking.get("uri") is None
+        previews = [
+            [Outcome(point, "waiting") for point in plan.points.points]
+            if is_new and not is_own(name)
+            else preview_points(plan.points, settings, planner)
+            for name, plan in zip(tables, plans, strict=True)
+        ]
         _show(options.table, list(zip(plans, previews, strict=True)), settings.workers, planner)
         return 0
-    (plan,) = plans
-    wanted = plan.request
-    plan.evaluate_external(runs.runs_dir)
+    plan = plans[0]
+    plan.evaluate_external(runs.runs_dir, options.trust)
     outcomes = run_points(plan.points, settings, planner) if plan.points.points else []
     if plan.until_decided is None:  # an earlier command may have added seeds
         plan.judge.rule = rule_of(result.tags for each in outcomes for result in each.results)
-    out = options.out or options.runs_dir / "tables" / f"{wanted.name}_{wanted.variant}"
-    code = publish_table(plan.judge, wanted, outcomes, plan.external, out, runs.tracking)
-    _show_time(outcomes, planner)
+    name = f"{plan.request.name}_{plan.request.variant}"
+    out = options.out or options.runs_dir / "tables" / name
+    code = publish_table(plan.judge, plan.request, outcomes, plan.external, out, runs.tracking)
+    _show_times([each for each in outcomes if each.results], planner)
     return code
 
 
-def _show_time(outcomes: Sequence[Outcome], planner: Planner) -> None:
+def _show_times(finished: Sequence[Outcome], planner: Planner) -> None:
     """Print how long the finished runs and those upstream of them took."""
     from rich.text import Text
 
     from rgbt.terminal import print_rich
     from sweeps.rendering.times import time_line, upstream_line
 
-    finished = [outcome for outcome in outcomes if outcome.results]
-    lines = (
-        time_line(result for outcome in finished for result in outcome.results),
-        upstream_line((outcome.point.overrides for outcome in finished), planner),
-    )
-    if any(lines):
-        print_rich(Text("\n".join(line for line in lines if line)))
+    took = time_line(result for outcome in finished for result in outcome.results)
+    upstream = upstream_line((outcome.point.overrides for outcome in finished), planner)
+    if took or upstream:
+        print_rich(Text("\n".join(filter(None, (took, upstream)))))
 
 
 def _show(
@@ -226,16 +170,12 @@ def _show(
     lines = summary(plan.request, outcomes, workers)
     if plan.until_decided is not None:
         lines.append(most_line(len(plan.until_decided.most_runs()), outcomes, workers))
-    upstream = upstream_line((each.point.overrides for each in outcomes), planner)
-    print_rich(Text("\n".join([*lines, *([upstream] if upstream else [])])))
+    lines.append(upstream_line((each.point.overrides for each in outcomes), planner))
+    print_rich(Text("\n".join(filter(None, lines))))
 
 
 def settings_of(options: Options) -> SweepSettings:
-    """The settings of execution; the others of a sweep as in ``conf/hydra/sweeper/study.yaml``.
-
-    Raises:
-        InputError: a value out of its range.
-    """
+    """The settings of execution; the others of a sweep as in ``conf/hydra/sweeper/study.yaml``."""
     from omegaconf import DictConfig, OmegaConf
 
     from rgbt.config.compose import conf_dir
@@ -252,48 +192,6 @@ def settings_of(options: Options) -> SweepSettings:
         return read_settings(node)
     except InputError as error:
         raise InputError(str(error).replace("hydra.sweeper.", "")) from error
-
-
-def plans_of(
-    names: Sequence[str],
-    options: Options,
-    extra: Sequence[str],
-    runs: RunStore,
-    planner: Planner,
-) -> list[TablePlan]:
-    """The tables as they are run.
-
-    Raises:
-        InputError: no such table, row, scale or metric; no seeds; overrides that mix rows up.
-    """
-    from sweeps.table.make_request import TableWords, make_request, read_named
-    from sweeps.table.rows import check_rows, select_rows
-    from sweeps.table_plan import TablePlan
-    from sweeps.verdicts.forms import both_forms
-    from sweeps.verdicts.until_decided import START
-
-    adds = options.seeds == UNTIL_DECIDED
-    seeds = tuple(range(START)) if adds else seeds_of(options.seeds)
-    plans = []
-    for each in names:
-        name, table = read_named(each)
-        is_both = options.form == "both"
-        words = TableWords(
-            seeds=seeds,
-            scale=options.scale,
-            form="paper" if options.form == "both" else options.form,
-            rows="" if is_both else options.rows,
-            overrides=extra,
-            others=("form=both", f"rows={options.rows}") if is_both else (),
-            until_decided=adds,
-        )
-        if is_both:
-            table = both_forms(select_rows(table, options.rows) if options.rows else table)
-        request, rows = make_request(name, table, words)
-        check_rows(request, planner)
-        most = options.max_seeds if adds else None
-        plans.append(TablePlan.of(request, rows, runs, planner.base, most))
-    return plans
 
 
 entry = CommandGroup(__doc__, {"new": NEW}, default=PlainCommand(Options, main))

@@ -62,7 +62,12 @@ ROOMS = {
 PUBLISHED = {f"sweeps.{each}" for each in ("point", "table", "verdicts", "evaluation", "report")}
 OUTSIDE = {
     "rgbt": set(),
-    "sweeps": {"analysis.uncertainty"} | {f"rgbt.{e}" for e in READING - {"data", "geometry"}},
+    "sweeps": {
+        "analysis.uncertainty",
+        "rgbt.evaluation.profile",
+        "rgbt.evaluation.profiled_network",
+    }
+    | {f"rgbt.{each}" for each in READING - {"data", "geometry"}},
     "analysis": PUBLISHED | {f"rgbt.{each}" for each in READING - {"geometry"}},
     "analysis.uncertainty": {f"rgbt.{each}" for each in READING - {"geometry"}},
     "hydra_plugins": {"rgbt", "sweeps"},

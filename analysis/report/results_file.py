@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Literal
 
 from rgbt.files.yaml_files import read_yaml
 from sweeps.table.cells import OWN_COUNTS
-from sweeps.table.table import STRICT
+from sweeps.table.claim import STRICT
 
 FILE = Path(__file__).with_name("results.yaml")
 

@@ -23,9 +23,9 @@ from analysis.report.tables_rescored import CountsSource, RescoredTable, score_a
 from analysis.uncertainty import Interval, Resampling, compare, estimate
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
+from sweeps.table.cells import published
 from sweeps.table.load_table import load_table, study_names, table_names
 from sweeps.table.request import DEFAULT_SCALE
-from sweeps.table.scoring import published
 from sweeps.table.table import Column, Form, Row, Table
 from sweeps.verdicts.judge import TableJudge
 

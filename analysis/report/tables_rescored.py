@@ -13,8 +13,16 @@ from rgbt.checks import InputError
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.named import value
 from sweeps.point import Outcome, Point
-from sweeps.table.cells import TableCell, counts_path, derived, is_counted, is_of_runs, metric_of
-from sweeps.table.scoring import ScoredTable, score
+from sweeps.table.cells import (
+    ScoredTable,
+    TableCell,
+    counts_path,
+    derived,
+    is_counted,
+    is_of_runs,
+    metric_of,
+    score,
+)
 from sweeps.table.table import Column, Row, Table
 from sweeps.verdicts.forms import both_forms
 from sweeps.verdicts.judge import CellRunId

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import hydra
+from hydra._internal import defaults_list
 from hydra._internal.core_plugins.file_config_source import FileConfigSource
 from hydra._internal.sources_registry import SourcesRegistry
 from hydra.core.global_hydra import GlobalHydra
@@ -191,6 +192,7 @@ def register_resolvers() -> None:
     """
     Plugins.instance()  # registers Hydra's own sources, once
     SourcesRegistry.instance().types["file"] = _ParsedOnce
+    defaults_list._create_interpolation_map = _choices_of_children  # type: ignore[assignment]
     resolvers: dict[str, Callable[..., Any]] = {
         "by_scale": _by_scale,
         "by_network": _by_network,
@@ -199,6 +201,14 @@ def register_resolvers() -> None:
     }
     for name, resolve in resolvers.items():
         OmegaConf.register_new_resolver(name, resolve, replace=True)
+
+
+def _choices_of_children(overrides: Any, children: list[Any], self_added: bool) -> DictConfig:
+    """What a file's defaults are resolved with; Hydra makes it for files without defaults, too."""
+    return _create_interpolation_map(overrides, children, self_added) if children else _NO_CHOICES
+
+
+_create_interpolation_map, _NO_CHOICES = defaults_list._create_interpolation_map, DictConfig({})
 
 
 def chosen_scale(scale: str, choices: Iterable[str]) -> str:

@@ -6,8 +6,7 @@ import math
 from collections.abc import Sequence
 
 from rgbt.tables import ABSENT, TextTable, csv_text
-from sweeps.table.design import Design
-from sweeps.table.design_rows import TRAINED
+from sweeps.table.design import TRAINED, Design
 from sweeps.verdicts.effects import MEAN, DesignEffects, EffectLine
 
 HEADER = (

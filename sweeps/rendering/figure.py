@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sweeps.table.cells import headline_columns
+from sweeps.table.cells import ScoredTable, headline_columns, published
 from sweeps.table.efficiency import SCALE
-from sweeps.table.scoring import ScoredTable, published
 from sweeps.table.table import Column, Row
 
 if TYPE_CHECKING:

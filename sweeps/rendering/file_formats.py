@@ -7,8 +7,7 @@ from collections.abc import Iterable
 
 from rgbt.tables import csv_text
 from sweeps.rendering.rendered_table import RenderedTable, TextCell
-from sweeps.table.cells import TableCell
-from sweeps.table.scoring import ScoredTable, published
+from sweeps.table.cells import ScoredTable, TableCell, published
 
 LEGEND = "Bold: shown to be the best of our rows, underlined: the second best."
 

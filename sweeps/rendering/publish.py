@@ -20,10 +20,9 @@ from sweeps.rendering.file_formats import latex, markdown, tidy_csv
 from sweeps.rendering.rendered_table import RenderedTable, render_table
 from sweeps.rendering.terminal import terminal
 from sweeps.report.records import record
-from sweeps.table.cells import NO_VALUE
+from sweeps.table.cells import NO_VALUE, ScoredTable, score, size_marks
 from sweeps.table.efficiency import efficiency_cells
 from sweeps.table.request import TableRequest
-from sweeps.table.scoring import ScoredTable, score, size_marks
 from sweeps.table.table import Table
 from sweeps.verdicts.effects import DesignEffects, DesignJudge
 from sweeps.verdicts.forms import forms_grid
@@ -71,7 +70,7 @@ def publish_table(
         1 where a cell failed or has no value, or the files could not be written; else 0.
     """
     runs: dict[CellRunId, Outcome] = {**request.runs(outcomes), **external}
-    sizes = efficiency_cells(request, out)
+    sizes = efficiency_cells(request)
     scored = replace(
         score(request.name, request.table, runs, scale=request.scale, sizes=sizes),
         form=request.form,

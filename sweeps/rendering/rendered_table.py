@@ -8,9 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from rgbt.tables import number
-from sweeps.table.cells import NO_VALUE, is_counted, is_of_runs, metric_of
+from sweeps.table.cells import NO_VALUE, ScoredTable, is_counted, is_of_runs, metric_of, published
 from sweeps.table.efficiency import SCALE
-from sweeps.table.scoring import ScoredTable, published
 from sweeps.table.table import MEASURED, Column, Form, Row
 
 MAX_ON_ONE_LINE = 3

@@ -1,11 +1,13 @@
-"""Our values of a table: the value of every run, then mean and spread over seeds."""
+"""Our values of a table: of every run, then mean and spread over seeds, beside the printed ones."""
 
 from __future__ import annotations
 
 import math
 import statistics
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 from rgbt.checks import InputError
 from rgbt.metrics import names
@@ -14,25 +16,17 @@ from rgbt.metrics.details import details_of_metric
 from rgbt.metrics.named import value
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Outcome
-from sweeps.table.table import Column, Row, Table
+from sweeps.table.table import COUNTED, MEASURED, Column, Form, Row, Table
 
-HEADLINES = (names.MIOU, names.VAR, names.TC, names.CA, names.CA_RELEASED)
-"""The scores that a table is about, where it has them."""
-
-NO_VALUE = "no value"
-"""Mark of a cell whose run is finished but has no value for the column."""
-
+HEADLINES = (names.MIOU, names.VAR, names.TC, names.CA, names.CA_RELEASED)  # of a table
+NO_VALUE = "no value"  # mark of a cell whose run is finished but has no value for the column
 OWN_COUNTS = "counts_test.npz"
-"""Path of the counts of the evaluation that every run makes itself, relative to the run folder."""
+"""Path, in the run folder, of the counts of the evaluation that every run makes itself."""
 
-NO_SEED = "-1"
-"""The seed of a row that was not trained here, as text (`analysis.uncertainty.contrasts.FIXED`)."""
+NO_SEED = "-1"  # of a row that was not trained here: analysis.uncertainty.contrasts.FIXED
 
-CellId = tuple[str, str]
-"""(label of the row, name of the column)."""
-
-Value = float | str
-"""A score, or the reason why there is none."""
+CellId = tuple[str, str]  # (label of the row, name of the column)
+Value = float | str  # a score, or the reason why there is none
 
 
 @dataclass(frozen=True)
@@ -43,11 +37,9 @@ class TableCell:
         mean: over seeds, percent (Var: squared percent points); NaN without any.
         sd: standard deviation over seeds with n - 1; NaN for fewer than two.
         seeds: number of seeds of the mean; 0 for the efficiency of a network, which needs no run.
-        reason: why seeds are missing, or "".
-        mark: the reason in a word, e.g. "failed".
+        reason: why seeds are missing, or ""; `mark` says it in a word, e.g. "failed".
         keys: of the runs.
-        ratio: to the first row, of memory and speed; NaN for all else.
-        device: that memory and speed were measured on; "" for all else.
+        ratio: to the first row, of memory and speed, which were measured on `device`.
     """
 
     mean: float
@@ -70,16 +62,10 @@ def evaluation_of(column: Column, table: Table) -> ExtraEvaluation | None:
     if column.frames is not None:
         return ExtraEvaluation(frames=column.frames)
     details = details_of_metric(str(column.metric))
-    needed = ExtraEvaluation(
-        column.modality,
-        table.regions,
-        head=column.head,
-        corruption=column.corruption,
-        severity=column.severity,
-        batch_norm=column.batch_norm,
-        batch_norm_splits=column.batch_norm_splits,
-        details=None if details is None else details.kind,
-    )
+    keys = ("modality", "head", "corruption", "severity", "batch_norm", "batch_norm_splits")
+    same: dict[str, Any] = {key: getattr(column, key) for key in keys}
+    kind = None if details is None else details.kind
+    needed = ExtraEvaluation(regions=table.regions, details=kind, **same)
     return None if needed == ExtraEvaluation() else needed
 
 
@@ -100,8 +86,7 @@ def counts_path(column: Column, table: Table) -> str:
 def headline_columns(columns: Sequence[Column]) -> list[Column]:
     """Those of `HEADLINES`, over all images or those of the day or the night."""
     parts = ("", f"{names.DAY}/", f"{names.NIGHT}/")
-    headlines = {part + score for part in parts for score in HEADLINES}
-    return [column for column in columns if column.metric in headlines]
+    return [each for each in columns if each.metric in {p + h for p in parts for h in HEADLINES}]
 
 
 def is_counted(column: Column) -> bool:
@@ -147,10 +132,8 @@ def _values(table: Table, row: Row, outcome: Outcome) -> dict[str, Value]:
 def _counts(outcome: Outcome, path: str) -> Counts | str:
     if outcome.state != "finished" or not outcome.results:
         return outcome.reason or outcome.state
-    if path in outcome.missing:
-        return outcome.missing[path]
     try:
-        return outcome.results[0].counts(path)
+        return outcome.missing.get(path) or outcome.results[0].counts(path)
     except (InputError, OSError) as error:
         return str(error)
 
@@ -183,10 +166,8 @@ def over_seeds(
         if isinstance(each, str):
             reasons.setdefault(each, []).append(str(seed))
     sentences = [
-        reason
-        if seeds == [NO_SEED]
-        else f"seed{'s' * (len(seeds) > 1)} {', '.join(seeds)}: {reason}"
-        for reason, seeds in reasons.items()
+        why if seeds == [NO_SEED] else f"seed{'s' * (len(seeds) > 1)} {', '.join(seeds)}: {why}"
+        for why, seeds in reasons.items()
     ]
     return TableCell(
         mean=statistics.fmean(values) if values else math.nan,
@@ -196,3 +177,83 @@ def over_seeds(
         mark=mark,
         keys=keys,
     )
+
+
+@dataclass(frozen=True)
+class ScoredTable:
+    """A table with our values.
+
+    Attributes:
+        cells: only of rows that were run, and of columns of efficiency.
+        commits: git commit -> number of runs made by it.
+        marks: 1 for a row that is shown to be the best of the column, 2 for the second best; see
+            `sweeps.verdicts.judge.TableJudge.marks`.
+    """
+
+    name: str
+    table: Table
+    scale: str
+    seeds: tuple[int, ...]
+    cells: Mapping[CellId, TableCell]
+    commits: Mapping[str, int]
+    form: Form = "paper"
+    marks: Mapping[CellId, int] = field(default_factory=dict)
+
+    def difference(self, row: Row, column: Column) -> float:
+        """Ours less the printed value; NaN where one is missing or of another device."""
+        if column.efficiency in MEASURED:
+            return math.nan
+        cell = self.cells.get((row.label, column.name))
+        printed = published(row, column)
+        return math.nan if cell is None or printed is None else cell.mean - printed
+
+
+def published(row: Row, column: Column) -> float | None:
+    """The printed value, or None where there is none or a dash."""
+    printed = row.values.get(column.name)
+    return None if printed is None else float(printed)
+
+
+def score(
+    name: str,
+    table: Table,
+    runs: Mapping[tuple[str, int], Outcome],
+    *,
+    scale: str,
+    sizes: Mapping[CellId, TableCell] | None = None,
+) -> ScoredTable:
+    """Compute every cell of the rows with `runs`; `sizes` are those of efficiency."""
+    seeds = sorted({seed for _, seed in runs})  # a row without seeds has a negative one
+    cells: dict[CellId, TableCell] = {}
+    for row in table.rows:
+        outcomes = {seed: runs[row.label, seed] for seed in seeds if (row.label, seed) in runs}
+        cells |= row_cells(table, row, outcomes)
+    made_by = {run.key: run.commit for outcome in runs.values() for run in outcome.results}
+    return ScoredTable(
+        name=name,
+        table=table,
+        scale=scale,
+        seeds=tuple(seed for seed in seeds if seed >= 0),
+        cells=cells | dict(sizes or {}),
+        commits=Counter(commit for commit in made_by.values() if commit is not None),
+    )
+
+
+def size_marks(table: Table, sizes: Mapping[CellId, TableCell]) -> dict[CellId, int]:
+    """Marks of columns that are counted without a run and so are exact: 1 best, 2 second best.
+
+    Sizes that are equal as shown share a mark. Where all are equal none has one.
+    """
+    marks: dict[CellId, int] = {}
+    for column in table.columns:
+        if column.efficiency not in COUNTED or column.best == "none":
+            continue
+        values = {
+            cell_id: round(cell.mean, 2)
+            for cell_id, cell in sizes.items()
+            if cell_id[1] == column.name and not math.isnan(cell.mean)
+        }
+        best = sorted(set(values.values()), reverse=column.best == "highest")[:2]
+        if len(best) == 2:
+            marks |= {each: best.index(v) + 1 for each, v in values.items() if v in best}
+    return marks

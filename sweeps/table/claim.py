@@ -7,39 +7,41 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
+from pydantic import model_validator
+
 Expected = Literal["higher", "lower", "similar"]
 Combine = Literal["all", "most", "any", "mean"]
 
-OTHERS = "others"
-"""In `Claim.against`: every other row of the table that has a score or a printed value."""
-
-PREVIOUS = "previous"
-"""In `Claim.against`: the row before in `Claim.rows`."""
+OTHERS = "others"  # in Claim.against: every other row that has a score or a printed value
+PREVIOUS = "previous"  # In `Claim.against`: the row before in `Claim.rows`
 
 Range = tuple[float, float]
 HIGHER: Range = (0.0, math.inf)
 LOWER: Range = (-math.inf, 0.0)
 """Of a difference whose size does not matter."""
 
+STRICT: dict[str, Any] = {"extra": "forbid", "allow_inf_nan": False}
+
+
+class Strict:
+    """A part of a table file: unknown keys, NaN and infinity are refused."""
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
+
 
 @dataclass(frozen=True, kw_only=True)
-class Claim:
+class Claim(Strict):
     """One statement of a paper about its own table.
 
     It is a set of contrasts: each row of `rows` minus each row of `against`, in each column. A
     contrast without `against` is the score itself, or with `minus_column` the difference of two
-    scores of one row. With both it is the difference of two differences: the centre gains more than
-    the edge.
+    scores of one row. With both it is the difference of two differences.
 
     Attributes:
-        name: unique in the table.
-        says: the statement in our words, one sentence.
-        source: place in the paper, e.g. "Sec. IV-C, third paragraph".
+        says: the statement in our words, one sentence; `source` is its place in the paper.
         rows: labels of the rows that the statement is about; with against: previous, in order.
         against: labels of the rows that they are compared with; "others" or "previous" alone.
-        columns: names of columns.
         minus_column: a column that is subtracted from each of `columns`.
-        expected: of each contrast. "similar" needs `at_most`.
         at_least: smallest size of the difference that the statement means; below 0 for "not worse
             by more than".
         at_most: largest size, e.g. of a "small improvement".
@@ -47,8 +49,6 @@ class Claim:
             them; "mean": their mean is.
         remarks: one sentence each, e.g. why the direction is a reading of ours.
     """
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid", "allow_inf_nan": False}
 
     name: str
     says: str
@@ -72,11 +72,7 @@ class Claim:
         return (self.at_least, most) if self.expected == "higher" else (-most, -self.at_least)
 
     def pairs(self, labels: Sequence[str]) -> Iterator[tuple[str, str | None]]:
-        """(row, row that is subtracted or None) of every contrast of a column.
-
-        Args:
-            labels: rows that `OTHERS` stands for.
-        """
+        """(row, row that is subtracted or None) of a column; `labels` are what `OTHERS` means."""
         if self.against == (PREVIOUS,):
             yield from zip(self.rows[1:], self.rows[:-1], strict=True)
             return
@@ -85,3 +81,11 @@ class Claim:
             if not against:
                 yield row, None
             yield from ((row, other) for other in against if other != row)
+
+    @model_validator(mode="after")
+    def _check(self) -> Claim:
+        if self.expected == "similar" and self.at_most is None:
+            raise ValueError("similar needs at_most, the largest difference that it means.")
+        if self.at_most is not None and self.at_most <= self.at_least:
+            raise ValueError(f"at_most must be above at_least ({self.at_least:g}).")
+        return self

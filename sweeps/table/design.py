@@ -1,38 +1,33 @@
-"""A factorial design in a table file: factors of two levels, methods, and outcomes."""
+"""A factorial design in a table file: factors of two levels, methods, outcomes, and their rows."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import chain, combinations, product
 from math import prod
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
+
+from annotated_types import MinLen
+from pydantic import StringConstraints, model_validator
+
+from rgbt.checks import check_choice
+from rgbt.config.compose import available
+from sweeps.table.claim import Strict
 
 Level = Literal["low", "high"]
-Levels = Mapping[str, Level]
-"""Letter of each factor -> its level."""
+Levels = Mapping[str, Level]  # Letter of each factor -> its level
 
-SIGNS: dict[Level, int] = {"low": -1, "high": 1}
+Effect = str  # letters of the factors: "N" a main effect, "ON" an interaction
 
-STRICT: dict[str, Any] = {"extra": "forbid", "allow_inf_nan": False}
+TRAINED, TESTED = "trained", "tested"  # groups of rows: rows=trained
 
 
 @dataclass(frozen=True, kw_only=True)
-class DesignFactor:
-    """A factor that is switched alone.
+class DesignFactor(Strict):
+    """A factor that is switched alone: overrides of both levels, and what they mean."""
 
-    Attributes:
-        letter: one capital letter, e.g. "N".
-        name: one or two words, e.g. "noise".
-        low: overrides of the low level.
-        high: overrides of the high level.
-        low_means: what the low level is, for readers.
-        high_means: what the high level is.
-    """
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
-
-    letter: str
+    letter: Annotated[str, StringConstraints(pattern="^[A-Z]$")]
     name: str
     low: tuple[str, ...] = ()
     high: tuple[str, ...] = ()
@@ -41,32 +36,16 @@ class DesignFactor:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Combined:
-    """Overrides of the cells in which several factors have given levels.
+class Combined(Strict):
+    """Overrides of the cells in which two factors or more have given levels; they win."""
 
-    Attributes:
-        levels: level of two factors or more.
-        overrides: they win over those of the factors.
-    """
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
-
-    levels: Levels
+    levels: Annotated[Levels, MinLen(2)]
     overrides: tuple[str, ...]
 
 
 @dataclass(frozen=True, kw_only=True)
-class DesignMethod:
-    """A method that is trained.
-
-    Attributes:
-        name: first word of its rows.
-        experiment: a file of ``conf/experiment``.
-        overrides: at every scale.
-        against: name of an earlier method that its effects are compared with; None: of none.
-    """
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
+class DesignMethod(Strict):
+    """A method that is trained; its effects are compared with those of the method `against`."""
 
     name: str
     experiment: str
@@ -75,43 +54,33 @@ class DesignMethod:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Part:
+class Part(Strict):
     """One of the two experiments that a design can be.
 
-    Attributes:
-        overrides: of every cell of this part, after those of the design.
-        generators: letter of a factor -> letters of others whose product is its level, as
-            {S: OCN}; each halves the number of cells. Empty: all combinations.
+    In `generators`, {S: OCN} makes the level of a factor the product of those of others, which
+    halves the number of cells.
     """
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
 
     overrides: tuple[str, ...] = ()
     generators: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Design:
+class Design(Strict):
     """A two-level factorial design.
 
     Attributes:
-        factors: two or more, in order.
-        combined: settings that depend on several factors.
         overrides: of every run and cell, e.g. the data set.
-        methods: in order.
         outcomes: names of columns whose effects are estimated.
-        trained: each method is trained and tested in each cell; None: not offered.
-        tested: each method is trained once, without any factor, and tested in each cell; None: not
-            offered.
+        trained: each method is trained and tested in each cell.
+        tested: each method is trained once, without any factor, and tested in each cell.
     """
 
-    __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
-
-    factors: tuple[DesignFactor, ...]
+    factors: Annotated[tuple[DesignFactor, ...], MinLen(2)]
     combined: tuple[Combined, ...] = ()
     overrides: tuple[str, ...] = ()
-    methods: tuple[DesignMethod, ...]
-    outcomes: tuple[str, ...]
+    methods: Annotated[tuple[DesignMethod, ...], MinLen(1)]
+    outcomes: Annotated[tuple[str, ...], MinLen(1)]
     trained: Part | None = None
     tested: Part | None = None
 
@@ -121,12 +90,7 @@ class Design:
         return tuple(factor.letter for factor in self.factors)
 
     def cells(self, part: Part) -> tuple[Levels, ...]:
-        """Levels of every cell of a part; the first factor changes most slowly.
-
-        Examples:
-            Two factors and a third with ``generators: {C: AB}`` have the cells A- B- C+, A- B+ C-,
-            A+ B- C-, A+ B+ C+.
-        """
+        """Levels of every cell of a part; the first factor changes most slowly."""
         free = [letter for letter in self.letters if letter not in part.generators]
         words: tuple[Level, ...] = ("low", "high")
         cells = []
@@ -139,18 +103,9 @@ class Design:
 
     def cell_overrides(self, cell: Levels) -> tuple[str, ...]:
         """Overrides that make the world of a cell, without those of the whole design."""
-        words = [
-            word
-            for factor in self.factors
-            for word in (factor.high if cell[factor.letter] == "high" else factor.low)
-        ]
-        words += [
-            word
-            for each in self.combined
-            if all(cell[letter] == level for letter, level in each.levels.items())
-            for word in each.overrides
-        ]
-        return tuple(words)
+        of_factors = (getattr(factor, cell[factor.letter]) for factor in self.factors)
+        combined = (each.overrides for each in self.combined if each.levels.items() <= cell.items())
+        return tuple(chain(*of_factors, *combined))
 
     def effects(self, part: Part) -> dict[str, dict[Effect, int]]:
         """Shown name -> main effects and interactions of two factors with that contrast, and signs.
@@ -159,7 +114,6 @@ class Design:
         is what is estimated. An alias with the sign -1 is subtracted.
         """
         cells = self.cells(part)
-        names = {factor.letter: factor.name for factor in self.factors}
         groups: dict[tuple[int, ...], dict[Effect, int]] = {}
         orders = (combinations(self.letters, order) for order in (1, 2))
         for effect in map("".join, chain(*orders)):
@@ -169,32 +123,94 @@ class Design:
                 groups[opposite][effect] = -1
             else:
                 groups.setdefault(signs, {})[effect] = 1
-        return {_shown(group, names): group for group in groups.values()}
+        names = {factor.letter: factor.name for factor in self.factors}
+        found = {}
+        for group in groups.values():  # "noise", "occupancy x noise + complexity x size"
+            words = [
+                (" + " if sign > 0 else " - ") + " x ".join(names[each] for each in effect)
+                for effect, sign in group.items()
+            ]
+            found["".join(words)[3:]] = group
+        return found
 
+    def rows(self) -> Iterator[dict[str, Any]]:
+        """The attributes of its rows: of each method and trained cell, then of each method."""
+        part = self.trained or Part()
+        for method, cell in product(self.methods, self.cells(part) if self.trained else ()):
+            words = (*self.overrides, *part.overrides, *self.cell_overrides(cell))
+            words = (*words, *method.overrides)
+            yield {
+                **{"label": trained_label(method.name, cell), "group": TRAINED},
+                **{"experiment": method.experiment, "overrides": words},
+                "settings": {"method": method.name, **cell},
+            }
+        part = self.tested or Part()
+        cells = self.cells(part) if self.tested else ()
+        worlds = {cell_name(each): (*part.overrides, *self.cell_overrides(each)) for each in cells}
+        for method in self.methods if self.tested else ():
+            words = (*self.overrides, *method.overrides)
+            yield {
+                **{"label": tested_label(method.name), "group": TESTED, "tested_in": worlds},
+                **{"experiment": method.experiment, "overrides": words},
+                "settings": {"method": method.name},
+            }
 
-Effect = str
-"""Letters of the factors: "N" a main effect, "ON" an interaction."""
+    @model_validator(mode="after")
+    def _check_names(self) -> Design:
+        names = ([f.name for f in self.factors], [m.name for m in self.methods])
+        for each in (self.letters, *names):
+            if len(set(each)) < len(each):
+                raise ValueError(f"a name is used twice in {', '.join(each)}.")
+        for letter in (letter for one in self.combined for letter in one.levels):
+            check_choice("combined.levels", letter, self.letters)
+        for index, method in enumerate(self.methods):
+            check_choice("methods.experiment", method.experiment, available("experiment"))
+            if method.against is not None:
+                earlier = [each.name for each in self.methods[:index]]
+                check_choice("methods.against (an earlier method)", method.against, earlier)
+        return self
+
+    @model_validator(mode="after")
+    def _check_parts(self) -> Design:
+        parts = [part for part in (self.trained, self.tested) if part is not None]
+        if not parts:
+            raise ValueError("expected trained, tested or both, got none.")
+        for part in parts:
+            free = [letter for letter in self.letters if letter not in part.generators]
+            for letter, others in part.generators.items():
+                check_choice("generators", letter, self.letters)
+                for other in others:
+                    check_choice("generators (factors without a generator)", other, free)
+            cells = self.cells(part)
+            for main, *aliases in map(list, self.effects(part).values()):
+                is_constant = len({sign_of(cell, main) for cell in cells}) == 1
+                if (len(main) == 1 and aliases) or is_constant:
+                    raise ValueError(
+                        f"generators: {main} cannot be told apart from "
+                        f"{', '.join(aliases) or 'the mean'}; use products of three factors."
+                    )
+            words = [[w.partition("=")[::2] for w in self.cell_overrides(cell)] for cell in cells]
+            worlds = {tuple(sorted(dict(each).items())) for each in words}  # the last value wins
+            if len(worlds) < len(cells):
+                raise ValueError("two cells have equal overrides; a factor changes nothing.")
+        return self
 
 
 def sign_of(cell: Levels, effect: Effect) -> int:
-    """The sign of a cell in the contrast of an effect: the product of the signs of its factors."""
-    return prod(SIGNS[cell[letter]] for letter in effect)
+    """The sign of a cell in the contrast of an effect: the product of those of its factors."""
+    return prod(1 if cell[letter] == "high" else -1 for letter in effect)
 
 
 def cell_name(cell: Levels) -> str:
-    """The cell as it is shown.
-
-    Examples:
-        >>> cell_name({"O": "low", "N": "high"})
-        'O-N+'
-    """
+    """The cell as it is shown: "O-N+"."""
     return "".join(f"{letter}{'+' if level == 'high' else '-'}" for letter, level in cell.items())
 
 
-def _shown(group: Mapping[Effect, int], names: Mapping[str, str]) -> str:
-    """The effects of a contrast: "noise", "occupancy x noise + complexity x size"."""
-    text = ""
-    for effect, sign in group.items():
-        joint = " + " if sign > 0 else " - "
-        text += (joint if text else "") + " x ".join(names[letter] for letter in effect)
-    return text
+def trained_label(method: str, cell: Levels) -> str:
+    """Label of the row of a method that is trained in a cell."""
+    return f"{method} {cell_name(cell)}"
+
+
+def tested_label(method: str) -> str:
+    """Label of the row of a method that is trained without any factor."""
+    return f"{method} natural"

@@ -1,121 +1,221 @@
 """Rows of a table that are evaluated and not trained: files of weights, folders of predictions.
 
-The command line names them as ``weights.LABEL=FILE`` and ``predictions.LABEL=FOLDER``.
+The command line names them as ``weights.ROW=FILE`` and ``predictions.ROW=FOLDER``. Their counts are
+in ``<runs_dir>/external/<hash>/`` with the names that counts of a run have: each file is there, or
+its command is run. The hash covers the content of the weights or predictions, the data set and the
+overrides.
 """
 
 from __future__ import annotations
 
-import re
+import hashlib
+import json
+import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
 
 from rgbt.checks import InputError, nearest
-from rgbt.config.compose import available
+from rgbt.config.command import composing
+from rgbt.config.component import build
+from rgbt.config.compose import SEARCH_PATH, compose, own_folders, searching
 from rgbt.config.options import with_home
-from sweeps.table.row_names import WAYS
+from rgbt.files.atomic import write_atomic
+from rgbt.metrics.pair_list import PAIR_LIST
+from rgbt.runs.provenance import code
+from rgbt.runs.result import RunResult
+from rgbt.terminal import info
+from sweeps.evaluation import ExtraEvaluation
+from sweeps.point import Outcome, Point
+from sweeps.table.cells import OWN_COUNTS, evaluation_of, is_counted
+from sweeps.table.request import TableRequest
 from sweeps.table.table import Row, Table
+from sweeps.worker.command_process import run_command
 
-Kind = Literal["weights", "predictions"]
-KINDS: tuple[Kind, ...] = get_args(Kind)
+FOLDER = "external"  # Folder inside the folder of runs
+
+NODE_FILE = "of_the_table"  # of conf/dataset and conf/metric, written for the commands
+
+MACHINE = ("data.", "trainer.accelerator=", "trainer.precision=", "trainer.threads=")
+"""Overrides of the user that reach a row with a network of its own; others are for trainings."""
+
+NEEDS_NETWORK = "needs the network: predictions of a folder are of clean images of both cameras"
+NEEDS_PAIRS = (
+    f"needs predictions of both frames and {PAIR_LIST} in the folder; write the images with rgbt "
+    "consistency export=..."
+)
 
 
 @dataclass(frozen=True)
 class ExternalRow:
-    """A row whose counts are made from a path of the user.
-
-    Attributes:
-        label: of the row, as in the table.
-        kind: "weights": a file that the row's network is evaluated with; "predictions": a folder of
-            predicted label images.
-        path: of the file or folder, absolute.
-    """
+    """A row whose counts are made from a file of weights, or a folder of predictions."""
 
     label: str
-    kind: Kind
+    kind: str  # "weights" or "predictions"
     path: Path
 
 
+def row_named(word: str, table: Table) -> Row:
+    """The row with this label, or with this number from 1 on; InputError: there is none."""
+    rows = {str(number): row for number, row in enumerate(table.rows, start=1)}
+    rows |= {row.label: row for row in table.rows}
+    if word not in rows:
+        labels = [row.label for row in table.rows]
+        raise InputError(f"there is no row '{word}' in the table; {nearest(word, labels)}.")
+    return rows[word]
+
+
 def external_rows(words: Sequence[str], table: Table) -> tuple[list[ExternalRow], list[str]]:
-    """Separate the words about external rows from the overrides.
+    """The external rows in the order of the table, and all words that are not about them.
 
-    A LABEL is that of a row, in upper or lower case. It may omit parentheses ("A" for "(A)") and,
-    where one row remains, words after the first ("CMX" or "CMX-B2" for "CMX (MiT-B2)").
-
-    Args:
-        words: overrides as typed.
-        table: with the rows that are named.
-
-    Returns:
-        the external rows in the order of the table, and all other words.
-
-    Raises:
-        InputError: no such row or several, a row that is named twice or has no network for
-            weights, or a path that does not exist.
+    InputError: no such row, one without a network for weights, or a path that does not exist.
     """
     found: dict[str, ExternalRow] = {}
     others = []
     for word in words:
-        kind = next((each for each in KINDS if word.startswith(f"{each}.")), None)
-        if kind is None:
+        kind, _, rest = word.partition(".")
+        if kind not in ("weights", "predictions"):
             others.append(word)
             continue
-        row = _external_row(word, kind, table)
-        if row.label in found:
-            raise InputError(
-                f"'{word}': row '{row.label}' already has {found[row.label].kind} "
-                f"({found[row.label].path}); remove one of the two."
-            )
-        found[row.label] = row
+        labels = [row.label for row in table.rows if rest.startswith(f"{row.label}=")]
+        name = max(labels, key=len, default=rest.partition("=")[0])  # a label may hold "="
+        row, path = row_named(name, table), Path(with_home(rest[len(name) + 1 :])).absolute()
+        if not (path.is_file() if kind == "weights" else path.is_dir() and rest[len(name) + 1 :]):
+            what = "file of weights" if kind == "weights" else "folder of label images"
+            raise InputError(f"'{word}': expected {kind}.ROW=PATH with the path of a {what}.")
+        if kind == "weights" and not row.network and row.experiment is None:
+            raise InputError(f"'{word}': the row has no network; give predictions.ROW=FOLDER.")
+        found[row.label] = ExternalRow(row.label, kind, path)
     return [found[row.label] for row in table.rows if row.label in found], others
 
 
-def _external_row(word: str, kind: Kind, table: Table) -> ExternalRow:
-    row, text = _named_row(word, kind, table)
-    if kind == "weights" and not row.network and row.experiment is None:
-        raise InputError(
-            f"'{word}': row '{row.label}' has no network that weights can be loaded into; give its "
-            f"predictions with {KINDS[1]}.{row.label}=FOLDER."
-        )
-    path = Path(with_home(text)).absolute()
-    is_archive = path.suffix.lower() == ".zip" and path.is_file()
-    if not text or not (path.is_file() if kind == "weights" else path.is_dir() or is_archive):
-        wanted = "file of weights"
-        if kind == "predictions":
-            wanted = "folder of predicted label images or a ZIP file of one"
-        raise InputError(f"'{word}': '{text}' is not a {wanted}; give the path of one.")
-    return ExternalRow(row.label, kind, path)
+@dataclass(frozen=True)
+class ExternalRun:
+    """The evaluations of an external row: `arguments` of each command, `folder` of the counts.
 
-
-def _named_row(word: str, kind: Kind, table: Table) -> tuple[Row, str]:
-    """The row that a word names, and the text after its label; a label may hold "="."""
-    rest = word.removeprefix(f"{kind}.")
-    if "=" not in rest:
-        example = "FILE" if kind == "weights" else "FOLDER"
-        raise InputError(f"'{word}': expected {kind}.LABEL={example}.")
-    name, rows = _rows_called(rest, table)
-    labels = [row.label for row in table.rows]
-    if not rows:
-        hint = ""
-        if kind == "weights" and name in available("model"):
-            hint = f" Initial weights of trained rows are given with pretrained.{name}=FILE."
-        raise InputError(f"'{word}': the table has no row '{name}'; {nearest(name, labels)}.{hint}")
-    if len(rows) > 1:
-        several = ", ".join(f"'{row.label}'" for row in rows)
-        raise InputError(f"'{word}': '{name}' may be any of the rows {several}; name one of them.")
-    return rows[0], rest[len(name) + 1 :]
-
-
-def _rows_called(rest: str, table: Table) -> tuple[str, list[Row]]:
-    """The name in front of an equals sign of LABEL=PATH, and the rows that it may mean.
-
-    These are the rows that agree with it in the strictest of several ways; [] for none.
+    Data set and regions are those of the row, or of the first row that can be run (`config`).
     """
-    cuts = [match.start() for match in re.finditer("=", rest)]
-    for agrees in WAYS:
-        for cut in cuts:
-            rows = [row for row in table.rows if agrees(rest[:cut], row.label)]
-            if rows:
-                return rest[:cut], rows
-    return rest[: cuts[0]], []
+
+    given: ExternalRow
+    row: Row
+    config: DictConfig
+    arguments: tuple[str, ...]
+    folder: Path
+
+    @classmethod
+    def of(
+        cls, given: ExternalRow, request: TableRequest, base: Sequence[str], runs_dir: Path
+    ) -> ExternalRun:
+        """Weights are loaded into the network of `Row.network` at scale=paper, otherwise into that
+        of the row's experiment at the scale of the table. InputError: a wrong data set or row.
+        """
+        row = row_named(given.label, request.table)
+        trained = row if row.experiment else next(iter(request.table.runnable_rows), row)
+        words = (f"scale={request.scale}", *request.extra)
+        if trained.experiment:
+            experiment, *others = request.overrides(trained.label, 0)
+            words = (experiment, f"scale={request.scale}", *others)
+        with composing(words):
+            config = compose([*base, *words])
+            fingerprint = build(config.dataset).fingerprint()
+            plain: Any = OmegaConf.to_container(config, resolve=True)
+        arguments: tuple[str, ...] = (f"dataset={NODE_FILE}",)
+        if given.kind == "weights" and row.network:
+            machine = (word for word in request.extra if word.startswith(MACHINE))
+            arguments = (*row.network, *arguments, *machine)
+        elif given.kind == "weights":
+            arguments = tuple(word for word in words if not word.startswith("model.weights="))
+        description = {
+            "content": content_hash(given.path),
+            "dataset": [fingerprint, {**plain["dataset"], "root": None}],
+            "metric": plain["metric"],
+            "evaluated": [given.kind, *(w for w in arguments if not w.startswith("dataset.root="))],
+        }
+        text = json.dumps(description, sort_keys=True, indent=1)
+        folder = runs_dir.absolute() / FOLDER / hashlib.sha256(text.encode()).hexdigest()[:12]
+        for group in ("dataset", "metric"):
+            file = folder / "conf" / group / f"{NODE_FILE}.yaml"
+            file.parent.mkdir(parents=True, exist_ok=True)
+            write_atomic(file, OmegaConf.to_yaml(OmegaConf.create(plain[group])).encode())
+        write_atomic(folder / "external.json", text.encode())
+        write_atomic(folder / "provenance.json", json.dumps([{**code(), "diff": None}]).encode())
+        return cls(given, row, config, arguments, folder)
+
+    def outcome(self, table: Table, trust: str) -> Outcome:
+        """Its run, with all counts that columns of `table` need; those that are missing are made.
+
+        "failed" if there are none; one that fails beside others is the reason of its columns alone.
+        """
+        columns = filter(is_counted, table.columns_of(self.row))
+        evaluations = dict.fromkeys(evaluation_of(column, table) for column in columns)
+        reasons: dict[str, str] = {}
+        for each in sorted(evaluations, key=lambda extra: extra is not None):  # plain images first
+            extra = each or ExtraEvaluation()
+            path = OWN_COUNTS if each is None else extra.path
+            if OWN_COUNTS in reasons:  # nothing else can be made of it
+                reasons[path] = reasons[OWN_COUNTS]
+            elif not (self.folder / path).is_file():
+                info(f"row '{self.row.label}': evaluating {self.given.path} ({extra.label})")
+                reason = self._make(extra, path, trust)
+                reasons |= {path: reason} if reason else {}
+        point = Point(self.row.label, ())
+        if len(reasons) == len(evaluations):
+            return Outcome(point, "failed", next(iter(reasons.values()), "no column is a score"))
+        return Outcome(point, "finished", results=(RunResult(self.folder),), missing=reasons)
+
+    def _make(self, extra: ExtraEvaluation, path: str, trust: str) -> str:
+        """Run the command that makes the counts of `path`; why it failed, or ""."""
+        words, reason = self._command(extra)
+        if reason:
+            return reason
+        log = self.folder / "log.txt"
+        folders = ",".join(filter(None, (own_folders(), str(self.folder / "conf"))))
+        with tempfile.TemporaryDirectory(dir=self.folder) as made:
+            out = made
+            if words[0] == "rgbt.evaluate":
+                out = f"{made}/{Path(OWN_COUNTS if path == OWN_COUNTS else extra.out).name}"
+            own = [f"trust={trust}"] if trust and self.given.kind == "weights" else []
+            with searching([f"{SEARCH_PATH}=[{folders}]"]):
+                reason = run_command((*words, *own, f"out={out}"), log)
+            for file in () if reason else sorted(Path(made).glob("*_*.npz")):
+                is_own = file.name.startswith("counts_")
+                target = self.folder / (path if is_own else f"evaluations/{file.name}")
+                target.parent.mkdir(exist_ok=True)
+                file.replace(target)
+        if not reason and not (self.folder / path).is_file():
+            reason = f"the command wrote no counts; see {log}"
+        return reason
+
+    def _command(self, extra: ExtraEvaluation) -> tuple[tuple[str, ...], str]:
+        """The command of an evaluation without its output, or the reason why there is none."""
+        regions = [f"metric={NODE_FILE}"] if extra.regions == "as trained" else []
+        if self.given.kind == "weights":
+            of_network = regions if self.row.network and extra.frames is None else []
+            weights = f"model.weights={self.given.path}"
+            return (*extra.command, *self.arguments, *of_network, weights), ""
+        of_folder = (f"predictions={self.given.path}", *self.arguments)
+        if extra.frames is not None:
+            has_pairs = (self.given.path / PAIR_LIST).is_file()
+            return (*extra.command, *of_folder), "" if has_pairs else NEEDS_PAIRS
+        plain = ExtraEvaluation(regions=extra.regions)
+        if extra not in (plain, replace(plain, modality="rgbt")):
+            return (), NEEDS_NETWORK
+        metric = compose([f"metric={extra.regions}"]).metric if not regions else self.config.metric
+        if metric.get("aspect") == "released_3_4":
+            return (), f"predictions are not counted in regions {extra.regions}; choose ring5"
+        shape = (f"partition={metric.partition}", f"regions={metric.regions}")
+        return ("analysis.score", "resamples=0", *shape, *of_folder), ""
+
+
+def content_hash(path: Path) -> str:
+    """SHA-256 of a file, or of names and contents of the files in a folder that are not hidden."""
+    if path.is_file():
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    inside = ((each, each.relative_to(path)) for each in sorted(path.rglob("*")) if each.is_file())
+    shown = ((each, name) for each, name in inside if not any(p[0] == "." for p in name.parts))
+    lines = [f"{content_hash(each)} {name.as_posix()}\n" for each, name in shown]
+    return hashlib.sha256("".join(lines).encode()).hexdigest()

@@ -1,83 +1,118 @@
-"""Makes the request of a table from the words of a command."""
+"""Makes the request of a table from the words of a command, and checks its rows."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
-from rgbt.checks import InputError, check_choice, nearest
+from rgbt.checks import InputError, check_choice, nearest, split_list
 from rgbt.config.compose import available
-from sweeps.table.external import ExternalRow, external_rows
-from sweeps.table.load_table import PUBLISHED, STUDIES, load_table, table_names
+from sweeps.table.cells import is_counted, metric_of
+from sweeps.table.claim import PREVIOUS
+from sweeps.table.external import ExternalRow, external_rows, row_named
+from sweeps.table.load_table import PUBLISHED, STUDIES, load_table, table_names, table_path
 from sweeps.table.request import PRETRAINED, TableRequest
-from sweeps.table.rows import select_rows
-from sweeps.table.scoring import check_metrics
-from sweeps.table.table import Form, Table
-from sweeps.worker.storage import NAME
+from sweeps.table.table import Form, Row, Table
+from sweeps.worker.planner import Planner
+
+OF_THE_ROWS = {
+    "seed": "the rows set it; choose seeds=3.",
+    "experiment": "the rows set it; choose another table.",
+    "metric": "the columns define what is counted; set `regions` in your own table.",
+    "consistency": "the columns define what is counted; see rgbt consistency run=...",
+}
+"""Nodes of the configuration that no override may change."""
 
 
 def read_named(name: str) -> tuple[str, Table]:
-    """A table with the name that its records get.
-
-    Raises:
-        InputError: no such table, a metric that does not exist, or a name that MLflow refuses.
-    """
-    table = load_table(name)
+    """A table with the name that its records get; InputError: as of `load_table`, or the name."""
+    table, path = load_table(name), table_path(name).resolve()
     if name.endswith((".yaml", ".yml")):
-        path, name = Path(name).expanduser(), f"{table.paper}/{Path(name).stem}"
-        if path.resolve().parent == STUDIES:
-            name = path.stem
-        if name in table_names(PUBLISHED / "none") and not path.resolve().is_relative_to(PUBLISHED):
-            raise InputError(
-                f"table={path}: '{name}' is a published table, whose records it would replace; "
-                "change `paper` in the file, or its name."
-            )
-    check_metrics(table)
-    if not re.fullmatch(NAME, name):
-        raise InputError(
-            f"table={name}: MLflow allows only letters, digits, spaces and _ - . : / alone; "
-            "rename the file."
-        )
+        folder = PUBLISHED if path.is_relative_to(PUBLISHED) else STUDIES
+        inside = path.is_relative_to(folder)
+        stem = path.relative_to(folder).with_suffix("") if inside else f"{table.paper}/{path.stem}"
+        name = str(stem)
+        if not inside and name in table_names(Path("none")):
+            raise InputError(f"table={path}: '{name}' is a published table; change `paper`.")
+    if not re.fullmatch(r"[\w\-. :/]+", name, re.ASCII):
+        raise InputError(f"table={name}: MLflow allows only letters, digits, spaces and _-.:/")
     return name, table
 
 
 def check_override(word: str) -> None:
-    """Refuse an override that belongs to the rows or columns of a table.
+    """Refuse an override that belongs to the rows or columns of a table."""
+    key = word.lstrip("+~").partition("=")[0].rpartition("@")[2].partition(".")[0]
+    if key in OF_THE_ROWS:
+        raise InputError(f"'{word}': {OF_THE_ROWS[key]}")
 
-    Raises:
-        InputError: in one sentence, with what to do instead.
+
+def select_rows(table: Table, text: str) -> Table:
+    """The table with the rows of ``rows=A,H`` alone, and with the claims about them.
+
+    A row is named by its label or its number, several by the name of their group (`Row.group`).
     """
-    key = word.lstrip("+~").partition("=")[0]
-    if key in ("seed", "experiment"):
-        other = "seeds=3" if key == "seed" else "another table"
-        raise InputError(f"'{word}' is set by the rows of the table; choose {other}.")
-    if key.rpartition("@")[2].partition(".")[0] == "consistency":
-        raise InputError(
-            f"'{word}': the columns of the table define what is counted, on the published sets "
-            "of views; measure others with rgbt consistency run=..."
-        )
-    if key == "metric" or key.startswith("metric."):
-        raise InputError(
-            f"'{word}': the columns of the table define what is counted; set `regions` in your "
-            "own table."
-        )
+    labels, words = [row.label for row in table.rows], split_list(text, "rows")
+    chosen: set[str] = set()
+    while words:  # a label may contain commas
+        ends = range(len(words), 1, -1)
+        end = next((each for each in ends if ", ".join(words[:each]) in labels), 1)
+        word = ", ".join(words[:end])
+        group = {row.label for row in table.rows if row.group == word}
+        chosen |= group or {row_named(word, table).label}
+        del words[:end]
+    first, origin, rows = dict[str, str](), _origins(table), list[Row]()
+    for row in table.rows:
+        if row.label in chosen:
+            same = first.setdefault(origin[row.label], row.label)
+            rows.append(replace(row, same_as=None if same == row.label else same))
+
+    # "Better than all others" is another statement where some of the others are missing.
+    claims = table.claims
+    if len(rows) < len(table.rows):
+        known = {*chosen, PREVIOUS}
+        claims = tuple(each for each in claims if {*each.rows, *each.against} <= known)
+    return replace(table, rows=tuple(rows), claims=claims)
+
+
+def check_equal_runs(request: TableRequest, planner: Planner) -> None:
+    """Refuse rows that are one run with the same scores, unless the table says so (`same_as`).
+
+    Rows that cannot be composed are left to the planning.
+    """
+    origin = _origins(request.table)
+    seen: dict[tuple[Any, ...], str] = {}
+    for row in request.trained_rows:
+        try:
+            spec = planner.specify((*planner.base, *request.overrides(row.label, 0)))
+        except InputError:
+            continue
+        metrics = [metric_of(each, row) for each in request.table.columns if is_counted(each)]
+        same = seen.setdefault((spec.key, *metrics), row.label)
+        if origin[same] != origin[row.label]:
+            raise InputError(
+                f"the rows '{same}' and '{row.label}' of {request.name} would be the same run "
+                f"({spec.key}) at scale={request.scale}, form={request.form}; remove the override "
+                f"that makes them equal, or write same_as: {same} in the table."
+            )
+
+
+def _origins(table: Table) -> dict[str, str]:
+    """Label of every row -> the first of the rows that may be the same run."""
+    origin: dict[str, str] = {}
+    for row in table.rows:
+        origin[row.label] = origin.get(row.same_as or "", row.label)
+    return origin
 
 
 @dataclass(frozen=True, kw_only=True)
 class TableWords:
-    """What a command says about a table.
+    """What a command says about a table, see `sweeps.table.request.TableRequest`.
 
-    Attributes:
-        seeds: of every row.
-        scale: a file of ``conf/scale``.
-        form: what the rows are run as.
-        rows: the rows to keep, with commas; "": all.
-        overrides: of every row, with pretrained.NETWORK=FILE, weights.ROW=FILE and
-            predictions.ROW=FOLDER.
-        others: further words that make it another table.
-        until_decided: see `sweeps.table.request.TableRequest`.
+    `overrides` are those of every row, with pretrained.NETWORK=FILE, weights.ROW=FILE and
+    predictions.ROW=FOLDER; `others` are further words that make it another table.
     """
 
     seeds: Sequence[int]
@@ -92,42 +127,29 @@ class TableWords:
 def make_request(
     name: str, table: Table, words: TableWords
 ) -> tuple[TableRequest, list[ExternalRow]]:
-    """The request of a table, and its rows that are evaluated and not trained.
-
-    Args:
-        name: of the table.
-        table: its file, see `read_named`.
-        words: of the command.
-
-    Raises:
-        InputError: no such scale, row or network.
-    """
-    rows, scale = words.rows, words.scale
-    check_choice("scale", scale, available("scale"))
-    table = select_rows(table, rows) if rows else table
+    """The request of a table, and its rows that are evaluated and not trained."""
+    check_choice("scale", words.scale, available("scale"))
+    table = select_rows(table, words.rows) if words.rows else table
     external, others = external_rows(words.overrides, table)
     files = [word.removeprefix(PRETRAINED) for word in others if word.startswith(PRETRAINED)]
-    pretrained = {word.partition("=")[0]: word.partition("=")[2] for word in files}
+    rows = [f"rows={words.rows}"] if words.rows else []
+    paths = [f"{row.kind}.{row.label}={row.path}" for row in external]
     request = TableRequest(
         name,
         table,
-        scale,
+        words.scale,
         tuple(words.seeds),
         tuple(word for word in others if not word.startswith(PRETRAINED)),
-        pretrained,
+        pretrained={word.partition("=")[0]: word.partition("=")[2] for word in files},
         form=words.form,
         until_decided=words.until_decided,
         evaluated=tuple(row.label for row in external),
-        typed=(*words.others, *([f"rows={rows}"] if rows else []), *map(_word, external)),
+        typed=(*words.others, *rows, *paths),
     )
-    for model in pretrained:
+    for model in request.pretrained:
         if model not in request.models():
             raise InputError(
                 f"{PRETRAINED}{model}: no row of {name} uses that network at "
-                f"scale={scale}; {nearest(model, request.models())}."
+                f"scale={words.scale}; {nearest(model, request.models())}."
             )
     return request, external
-
-
-def _word(row: ExternalRow) -> str:
-    return f"{row.kind}.{row.label}={row.path}"

@@ -17,21 +17,15 @@ from sweeps.table.table import Form, Row, Table
 if TYPE_CHECKING:
     from sweeps.point import Outcome
 
-DEFAULT_SCALE = "demo"
-"""The scale of a run without ``scale=...``."""
+DEFAULT_SCALE = "demo"  # The scale of a run without ``scale=...``
 
-TAG = "rgbt.table/"
-"""Prefix of the tag that names a run's row: rgbt.table/spatialseg/table3 = "Ny/4"."""
-
-PRETRAINED = "pretrained."
-"""pretrained.mask2former_swin_b=FILE: initial weights of the rows that train this network."""
+TAG = "rgbt.table/"  # prefix of the tag that names the rows of a run
+PRETRAINED = "pretrained."  # pretrained.NETWORK=FILE: initial weights of its rows
+TAG_LENGTH = 5000
 
 UNTIL_DECIDED = "rgbt.until_decided/"
 """Prefix of the tag of runs whose number depends on what earlier ones have shown: intervals of
 their table must be valid at any time."""
-
-SEPARATOR = " | "
-TAG_LENGTH = 5000
 
 
 @dataclass(frozen=True)
@@ -39,15 +33,10 @@ class TableRequest:
     """A table to compute.
 
     Attributes:
-        table: with the rows that are shown; see `sweeps.table.rows.select_rows`.
-        scale: "demo" or "paper".
-        seeds: of every row.
+        table: with the rows that are shown; see `sweeps.table.make_request.select_rows`.
         extra: overrides that win over those of the rows.
-        pretrained: files of initial weights by the name of the network, for tables of several
-            backbones.
-        form: what the rows are run as.
-        evaluated: labels of rows that are evaluated and not trained, see
-            `sweeps.table.external.external_rows`.
+        pretrained: files of initial weights by the name of the network.
+        evaluated: labels of rows that are evaluated and not trained (`sweeps.table.external`).
         typed: further options that make it another table, as they were typed.
         until_decided: whether seeds are added until claims are decided, which runs record.
     """
@@ -68,15 +57,12 @@ class TableRequest:
         (row,) = (row for row in self.table.rows if row.label == label)
         experiment, *others = self.table.overrides(row, self.scale, self.form)
         scale = () if self.scale == DEFAULT_SCALE else (f"scale={self.scale}",)
-        file = self.pretrained.get(_model_of(others) or "")
+        file = self.pretrained.get(_model_of(others))
         weights = () if file is None else readable_paths([f"model.weights={file}"])
         return (experiment, *scale, *others, *self.extra, *weights, f"seed={seed}")
 
     def row_seeds(self) -> list[tuple[str, int]]:
-        """(label, seed) of every run; all rows of a seed before the next seed.
-
-        Empty where no column is a score: columns of efficiency need no run.
-        """
+        """(label, seed) of every run, seed by seed; columns of efficiency need none."""
         if not any(map(is_counted, self.table.columns)):
             return []
         return [(row.label, seed) for seed in self.seeds for row in self.trained_rows]
@@ -87,20 +73,16 @@ class TableRequest:
         return [row for row in self.table.runnable_rows if row.label not in self.evaluated]
 
     def points(self, row_seeds: Sequence[tuple[str, int]] | None = None) -> list[Point]:
-        """The points of some rows and seeds, by default of all.
-
-        Rows with equal overrides share one point.
-        """
+        """The points of some rows and seeds, by default of all; equal runs share one point."""
         sharing: dict[tuple[str, ...], list[str]] = {}
         for label, seed in self.row_seeds() if row_seeds is None else row_seeds:
             sharing.setdefault(self.overrides(label, seed), []).append(label)
         points = []
         for overrides, labels in sharing.items():
             more = f" (and {len(labels) - 1} more)" if len(labels) > 1 else ""
-            label = f"{labels[0]}{more} {overrides[-1]}"
-            tags = {TAG + self.name: SEPARATOR.join(labels)[:TAG_LENGTH]}
+            tags = {TAG + self.name: " | ".join(labels)[:TAG_LENGTH]}
             tags |= {UNTIL_DECIDED + self.name: "true"} if self.until_decided else {}
-            evaluations = self.evaluations(labels)
+            label, evaluations = f"{labels[0]}{more} {overrides[-1]}", self.evaluations(labels)
             points.append(Point(label, overrides, tags=tags, evaluations=evaluations))
         return points
 
@@ -112,19 +94,15 @@ class TableRequest:
         counted = (each for each in self.table.columns if is_counted(each) and each.name in names)
         evaluations = (evaluation_of(column, self.table) for column in counted)
         worlds = (each for row in named for each in world_evaluations(self.table, row).values())
-        found = (each for each in evaluations if each is not None)
-        return tuple(dict.fromkeys([*found, *worlds]))
+        return tuple(dict.fromkeys([*filter(None, evaluations), *worlds]))
 
     def runs(self, outcomes: Sequence[Outcome]) -> Mapping[tuple[str, int], Outcome]:
         """The outcome of every row and seed."""
         by_overrides = {outcome.point.overrides: outcome for outcome in outcomes}
-        runs = {}
-        for row in self.trained_rows:
-            for seed in sorted({seed_of(overrides) for overrides in by_overrides}):
-                outcome = by_overrides.get(self.overrides(row.label, seed))
-                if outcome is not None:
-                    runs[row.label, seed] = outcome
-        return runs
+        seeds = sorted({seed_of(overrides) for overrides in by_overrides})
+        pairs = ((row.label, seed) for row in self.trained_rows for seed in seeds)
+        found = {each: by_overrides.get(self.overrides(*each)) for each in pairs}
+        return {each: outcome for each, outcome in found.items() if outcome is not None}
 
     def typed_overrides(self) -> tuple[str, ...]:
         """Further overrides, as they were typed."""
@@ -143,13 +121,13 @@ class TableRequest:
     def models(self) -> set[str]:
         """Networks (`model=...`) of the rows."""
         rows = self.table.runnable_rows
-        models = (_model_of(self.table.overrides(row, self.scale, self.form)) for row in rows)
-        return {model for model in models if model is not None}
+        return {_model_of(self.table.overrides(row, self.scale, self.form)) for row in rows} - {""}
 
 
-def _model_of(overrides: Sequence[str]) -> str | None:
+def _model_of(overrides: Sequence[str]) -> str:
+    """The network that is chosen last, or ""."""
     named = [word.partition("=")[2] for word in overrides if word.startswith("model=")]
-    return named[-1] if named else None
+    return named[-1] if named else ""
 
 
 def seed_of(overrides: Sequence[str]) -> int:
@@ -158,22 +136,14 @@ def seed_of(overrides: Sequence[str]) -> int:
 
 
 def seeds_of(text: str) -> tuple[int, ...]:
-    """Seeds of ``seeds=3`` (these are 0, 1, 2) or of ``seeds=0,4,7``.
-
-    Raises:
-        InputError: something else.
-    """
-    is_list = text.startswith("[") and text.endswith("]")
-    words = (text[1:-1] if is_list else text).split(",")
-    numbers = tuple(int(word) for word in words if word.strip().isdecimal())
-    counted = len(numbers) == 1 and not is_list
-    if (
-        len(numbers) != len(words)
-        or len(set(numbers)) != len(numbers)
-        or (counted and not any(numbers))
-    ):
-        raise InputError(
-            f"seeds={text}: expected a number of seeds (3: seeds 0, 1, 2), a list of different "
-            "seeds (0,4,7), or until_decided."
-        )
-    return tuple(range(numbers[0])) if counted else numbers
+    """Seeds of ``seeds=3`` (these are 0, 1, 2), of ``seeds=0,4,7`` or of ``seeds=[7]``."""
+    words = text.strip("[]").split(",")
+    if all(word.strip().isdecimal() for word in words):
+        numbers = tuple(map(int, words))
+        seeds = tuple(range(numbers[0])) if text.isdecimal() else numbers
+        if seeds and len(set(seeds)) == len(seeds):
+            return seeds
+    raise InputError(
+        f"seeds={text}: expected a number (3: seeds 0, 1, 2), a list of different seeds (0,4,7), "
+        "or until_decided."
+    )

@@ -1,45 +1,37 @@
-"""The parts of a table file: columns, rows, the printed values."""
+"""The parts of a table file: columns, rows, the printed values; and what they must fulfil."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any, Literal
 
-from rgbt.checks import InputError
-from rgbt.config.compose import chosen_scale
+from annotated_types import MinLen
+from pydantic import model_validator
+
+from rgbt.checks import InputError, check_choice
+from rgbt.config.compose import available, chosen_scale
+from rgbt.config.values import check_value
+from rgbt.metrics.named import OF_PAIRS, parse
 from rgbt.metrics.pairs import Protocol
+from rgbt.ranges import Size
 from sweeps.evaluation import BatchNorm, Head
-from sweeps.table.claim import Claim
+from sweeps.table.claim import OTHERS, PREVIOUS, Claim, Strict
 from sweeps.table.design import Design
 
-Origin = Literal[
-    "own_method",
-    "own_baseline",
-    "own_run_of_other_method",
-    "own_run_of_other_method_inferred",
-    "imported",
-    "imported_inferred",
-    "mixed",
-]
-Form = Literal["paper", "released"]
-"""What a row is run as: as the paper's text describes it, or as its release made it."""
+Form = Literal["paper", "released"]  # what a row is run as
 
 Efficiency = Literal["parameters", "gflops", "peak_memory", "latency", "images_per_second"]
-"""What a network needs: millions of parameters, GFLOPs, MiB, milliseconds for one image, images per
-second."""
+"""Millions of parameters, GFLOPs, MiB, milliseconds for one image, images per second."""
 
 COUNTED: tuple[Efficiency, ...] = ("parameters", "gflops")
-"""The same on every machine."""
-
 MEASURED: tuple[Efficiency, ...] = ("peak_memory", "latency", "images_per_second")
-"""Of one device; shown with the ratio to the first row."""
-
-STRICT: dict[str, Any] = {"extra": "forbid", "allow_inf_nan": False}
+"""The same on every machine; of one device, shown with the ratio to the first row."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Column:
+class Column(Strict):
     """One column: a score, a difference or mean of others, or the efficiency of the network.
 
     Attributes:
@@ -48,17 +40,13 @@ class Column:
             details (`rgbt.metrics.details`) with their default bins, such as distance/10-20;
             ``{key}`` is replaced by that entry of the row's settings.
         minus: (a, b): column a minus column b.
-        mean: mean of two or more other columns of the row, e.g. of day and night.
-        efficiency: of the row's network, counted or measured without any run and always at
-            scale=paper (`sweeps.table.efficiency`); discriminators are not part of it. The images
-            have the size `settings.image_hw` of the row, or 480 x 640.
+        mean: of two or more other columns of the row, e.g. of day and night.
+        efficiency: of the row's network at scale=paper (`sweeps.table.efficiency`), without any
+            run; on images of the size `settings.image_hw` of the row, or 480 x 640.
         modality: what is predicted from; "default": what the network is made for.
-        frames: of a consistency metric: which two predictions it compares, see
-            `rgbt.metrics.pairs`.
-        head: of a network with a head per domain, the one that predicts; see
-            `sweeps.evaluation.Head`.
-        corruption: of the images, NAME or NAME:IMAGE with a file of ``conf/corruption``; None: they
-            are clean.
+        frames: of a consistency metric: its protocol, see `rgbt.metrics.pairs`.
+        head: of a network with a head per domain, the one that predicts.
+        corruption: of the images, NAME or NAME:IMAGE with a file of ``conf/corruption``.
         severity: of the corruption; may be omitted if the corruption has a single one.
         batch_norm: statistics of batch normalisation, see `sweeps.evaluation.BatchNorm`.
         batch_norm_splits: splits whose images give them; (): the test split.
@@ -66,12 +54,10 @@ class Column:
         best: which value of the column is marked.
     """
 
-    __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
-
     name: str
     metric: str | None = None
     minus: tuple[str, str] | None = None
-    mean: tuple[str, ...] | None = None
+    mean: Annotated[tuple[str, ...], MinLen(2)] | None = None
     efficiency: Efficiency | None = None
     modality: Literal["default", "rgbt", "rgb", "thermal"] = "default"
     frames: Protocol | None = None
@@ -88,34 +74,36 @@ class Column:
         """The columns that it is computed from; () for all but differences and means."""
         return self.minus or self.mean or ()
 
+    @model_validator(mode="after")
+    def _check(self) -> Column:
+        kinds = ("metric", "minus", "mean", "efficiency")
+        given = [key for key in kinds if getattr(self, key) is not None]
+        if len(given) != 1:
+            raise ValueError(f"expected one of {', '.join(kinds)}, got {given}.")
+        of_pairs = (self.metric or "").rpartition("/")[2] in OF_PAIRS
+        if of_pairs != (self.frames is not None):
+            raise ValueError(f"'frames' is needed for {', '.join(OF_PAIRS)}, and only for these.")
+        if of_pairs or self.metric is None:  # these would have no effect
+            for key in ("modality", "head", "corruption", "batch_norm"):
+                if getattr(self, key) not in (None, "as trained", "default"):
+                    raise ValueError(f"'{key}' is only for scores of single frames.")
+        return self
+
 
 @dataclass(frozen=True, kw_only=True)
-class Factor:
-    """The x axis of the figure.
-
-    Attributes:
-        name: its label.
-        axis: "log" for values > 0.
-    """
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
+class Factor(Strict):
+    """The x axis of the figure: its label, and "log" for values > 0."""
 
     name: str
     axis: Literal["linear", "log"] = "linear"
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReleasedForm:
+class ReleasedForm(Strict):
     """How the release makes a row; what is None is as in the paper's form.
 
-    Attributes:
-        experiment: instead of `Row.experiment`.
-        overrides: instead of `Row.overrides`.
-        at: instead of `Row.at`.
-        remarks: what the release does differently, one sentence each.
+    `remarks` say what the release does differently, one sentence each.
     """
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
 
     experiment: str | None = None
     overrides: tuple[str, ...] | None = None
@@ -124,7 +112,7 @@ class ReleasedForm:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Row:
+class Row(Strict):
     """One row.
 
     Attributes:
@@ -137,8 +125,7 @@ class Row:
         overrides: of `python -m rgbt.run`, at every scale.
         at: further overrides by scale; they win over all others of the row.
         released: how the release makes the row; None: the same way, as far as known.
-        same_as: label of an earlier row that may be the same run, e.g. where one small network
-            stands for two backbones at scale=demo.
+        same_as: label of an earlier row that may be the same run.
         network: overrides that describe the row's network for an evaluation with a file of weights;
             (): those of `experiment`, if there is one.
         x: where the row lies on the axis of `Table.factor`.
@@ -150,11 +137,9 @@ class Row:
         remarks: one sentence each.
     """
 
-    __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
-
     label: str
     group: str = ""
-    origin: Origin | None = None
+    origin: str | None = None
     proposed: bool = False
     settings: Mapping[str, Any] = field(default_factory=dict)
     experiment: str | None = None
@@ -170,31 +155,35 @@ class Row:
     doubtful: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
 
+    @model_validator(mode="after")
+    def _check(self) -> Row:
+        if self.experiment is None and (self.overrides or self.released):
+            raise ValueError("'experiment' has no value; without it overrides have no effect.")
+        released = self.released.experiment if self.released else None
+        for experiment in (self.experiment, released):
+            if experiment is not None:
+                check_choice("experiment", experiment, available("experiment"))
+        if size := self.settings.get("image_hw"):
+            check_value("settings.image_hw", size, Size)
+        return self
+
 
 @dataclass(frozen=True, kw_only=True)
-class Table:
+class Table(Strict):
     """One table.
 
     Attributes:
         paper: folder of its file; in a table of the user, any name.
-        number: as printed, e.g. "TABLE III".
-        caption: in our words.
         data: what the printed values were measured on.
-        unit: of the values, e.g. "percent".
         at: overrides of every row by scale.
         regions: a file of ``conf/metric`` the table is evaluated with, or "as trained".
         absent: how a class without a pixel scores, see `rgbt.metrics.scores`; None: by the
             convention of the data set (`rgbt.metrics.counts.Counts.absent`).
-        columns: in order.
         factor: x axis of the figure; None: no figure over a factor.
         forms: one sentence per form that says what the rows are run as.
-        claims: what the paper says about the table.
         remarks: footnotes of the whole table, one sentence each.
-        design: a factorial design whose rows follow `rows`; None: there is none.
-        rows: in order; may be omitted beside a design.
+        design: a factorial design whose rows follow `rows`.
     """
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
 
     paper: str
     number: str
@@ -212,6 +201,74 @@ class Table:
     design: Design | None = None
     rows: tuple[Row, ...] = ()
 
+    @model_validator(mode="after")
+    def _add_rows_of_design(self) -> Table:
+        if not self.rows and self.design is None:
+            raise ValueError("'rows' has no value.")
+        of_design = () if self.design is None else self.design.rows()
+        return replace(self, rows=(*self.rows, *(Row(**each) for each in of_design)))
+
+    @model_validator(mode="after")
+    def _check_names(self) -> Table:
+        for each in (self.columns, self.rows, self.claims):
+            names = [getattr(part, "label", None) or getattr(part, "name", "") for part in each]
+            if len(set(names)) < len(names):
+                raise ValueError(f"'{max(names, key=names.count)}' is used twice.")
+        released = (row.released.at for row in self.rows if row.released)
+        for at in (self.at, *(row.at for row in self.rows), *released):
+            for scale in at or ():
+                check_choice("at", scale, available("scale"))
+        if self.regions != "as trained":
+            check_choice("regions", self.regions, available("metric"))
+        return self
+
+    @model_validator(mode="after")
+    def _check_columns(self) -> Table:
+        scores = [each.name for each in self.columns if each.metric is not None]
+        for index, column in enumerate(self.columns):
+            before = [each.name for each in self.columns[:index] if each.sources]
+            for name in column.sources:  # they are computed in order
+                check_choice(f"column '{column.name}'", name, [*scores, *before])
+        for name in self.design.outcomes if self.design else ():
+            check_choice("design.outcomes", name, [each.name for each in self.columns])
+        return self
+
+    @model_validator(mode="after")
+    def _check_rows(self) -> Table:
+        names = [each.name for each in self.columns]
+        printed = [each.name for each in self.columns if each.printed]
+        labels = [each.label for each in self.rows]
+        for index, row in enumerate(self.rows):
+            where = f"row '{row.label}'"
+            if row.same_as is not None:
+                check_choice(f"{where}, same_as (an earlier row)", row.same_as, labels[:index])
+            for name in row.without:
+                check_choice(f"{where}, without", name, names)
+            for name in (*row.values, *row.doubtful):
+                check_choice(f"{where}, printed column", name, printed)
+            is_log = self.factor is not None and self.factor.axis == "log"
+            if row.x is not None and (self.factor is None or (is_log and row.x <= 0)):
+                raise ValueError(f"{where}: 'x' needs a factor, and must be > 0 on a log axis.")
+            for metric in (each.metric for each in self.columns if each.metric is not None):
+                for key in re.findall(r"{(\w+)}", metric):
+                    check_choice(f"{where}, settings for '{metric}'", key, row.settings)
+                parse(metric.format_map(row.settings))
+        return self
+
+    @model_validator(mode="after")
+    def _check_claims(self) -> Table:
+        labels = [each.label for each in self.rows]
+        for claim in self.claims:
+            named = claim.against if claim.against not in ((OTHERS,), (PREVIOUS,)) else ()
+            for label in (*claim.rows, *named):
+                check_choice(f"claim '{claim.name}', rows", label, labels)
+            for name in (*claim.columns, *([claim.minus_column] if claim.minus_column else [])):
+                known = [each.name for each in self.columns]
+                check_choice(f"claim '{claim.name}', columns", name, known)
+            if not claim.columns or not any(True for _ in claim.pairs(labels)):
+                raise ValueError(f"claim '{claim.name}': there is nothing to compare.")
+        return self
+
     @property
     def runnable_rows(self) -> list[Row]:
         """The rows that the project can run today."""
@@ -226,11 +283,7 @@ class Table:
         return tuple(column for column in self.columns if column.name not in left_out)
 
     def overrides(self, row: Row, scale: str, form: Form = "paper") -> tuple[str, ...]:
-        """Overrides of `python -m rgbt.run` that make the row, beside ``scale=...`` itself.
-
-        Raises:
-            InputError: the row has no experiment.
-        """
+        """Overrides of `python -m rgbt.run` that make the row, beside ``scale=...`` itself."""
         if row.experiment is None:
             raise InputError(f"row '{row.label}' has no experiment; it is shown as published only.")
         chosen = row.released if form == "released" and row.released else ReleasedForm()

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from sweeps.table.cells import published
 from sweeps.table.claim import Claim
-from sweeps.table.scoring import published
 from sweeps.table.table import Column, Row, Table
 
 

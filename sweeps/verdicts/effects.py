@@ -22,8 +22,17 @@ from rgbt.metrics import names
 from rgbt.metrics.counts import Counts
 from sweeps.point import Outcome
 from sweeps.table.cells import counts_path, is_counted, metric_of, world_evaluations
-from sweeps.table.design import Design, DesignMethod, Part, cell_name, sign_of
-from sweeps.table.design_rows import TESTED, TRAINED, tested_label, trained_label
+from sweeps.table.design import (
+    TESTED,
+    TRAINED,
+    Design,
+    DesignMethod,
+    Part,
+    cell_name,
+    sign_of,
+    tested_label,
+    trained_label,
+)
 from sweeps.table.table import Column, Table
 from sweeps.verdicts.contrasts import base_scores
 from sweeps.verdicts.judge import RESAMPLES, CellRunId, finished_runs_of

@@ -10,11 +10,9 @@ from typing import Any
 import numpy as np
 
 from rgbt.metrics.counts import Counts
-from rgbt.metrics.pairs import Protocol, partition_name
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Outcome, Point
-from sweeps.table.cells import OWN_COUNTS, CellId
-from sweeps.table.scoring import ScoredTable, score
+from sweeps.table.cells import OWN_COUNTS, CellId, ScoredTable, score
 from sweeps.table.table import Column, Row, Table
 
 DAY = [[[2, 0], [0, 2]], [[1, 1], [0, 2]]]
@@ -39,15 +37,6 @@ def counts_of(*images: Any, night: tuple[bool, ...] | None = (False, True)) -> C
 def right(share: int) -> Counts:
     """One region and image whose pixel accuracy is `share` percent."""
     return counts_of([[[share, 100 - share], [0, 0]]], night=None)
-
-
-def pairs_of(same: int, other: int, protocol: Protocol = "aligned") -> Counts:
-    """One pair of frames: `same` pixels are road in both, of `other` the second says car.
-
-    All are labelled road: TC of road is same / (same + other), that of car 0.
-    """
-    pairs = [[[same, other], [0, 0]], [[0, 0], [0, 0]], [[0, 0], [0, 0]]]
-    return replace(counts_of(pairs, night=None), partition=partition_name(protocol, 1))
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,8 @@ from sweeps.report.records import record
 from sweeps.report.study_data import read
 from sweeps.report.tables import trials_csv
 from sweeps.study import markdown
+from sweeps.table.cells import score
 from sweeps.table.load_table import load_table
-from sweeps.table.scoring import score
 from sweeps.verdicts.judge import TableJudge
 from tests.sweeps.tabled import outcome
 

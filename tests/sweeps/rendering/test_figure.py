@@ -1,21 +1,12 @@
 from __future__ import annotations
 
-from pathlib import Path
-
-import cv2
-import pytest
-
 from sweeps.rendering.figure import (
-    OURS,
-    PUBLISHED,
-    are_far_apart,
-    draw_table,
     figure_of,
     main_columns,
 )
-from sweeps.table.scoring import score
+from sweeps.table.cells import score
 from sweeps.table.table import Column, Factor, Row
-from tests.sweeps.tabled import Made, counts_of, outcome, table
+from tests.sweeps.tabled import counts_of, outcome, table
 
 MIOU = Column(name="mIoU", metric="mIoU")
 VAR = Column(name="Var", metric="Var", best="lowest")
@@ -43,56 +34,6 @@ def test_factor_against_both_metrics_in_order_of_x() -> None:
     assert list(printed.get_ydata()) == [69.0, 70.0, 72.0]
     levels = [line.get_ydata()[0] for line in upper.lines if line.get_label().startswith("base")]
     assert levels[1:] == [68.0]
-
-
-def test_figure_distant_published_values_get_second_axis() -> None:
-    near, far = figure_of(factor_table()), figure_of(factor_table(shift=-40.0))
-    assert len(far.axes) > len(near.axes)
-
-
-@pytest.mark.parametrize(
-    ("ours", "theirs", "expected"),
-    [
-        ([48.0, 50.0], [60.0, 61.0], True),
-        ([48.0, 60.0], [60.0, 61.0], False),
-        ([48.0, 52.0], [57.0, 61.0], False),
-        ([50.0], [50.0], False),
-        ([], [50.0], False),
-    ],
-)
-def test_far_apart(ours: list[float], theirs: list[float], expected: bool) -> None:
-    assert are_far_apart(ours, theirs) is expected
-
-
-def test_rows_below_each_other_without_a_factor() -> None:
-    scored = Made({"a long label": ((40, 60), 48.0), "b": ((), 50.0)}).scored()
-    axes = figure_of(scored).axes[0]
-    assert [label.get_text() for label in axes.get_yticklabels()] == ["a long label", "b"]
-    assert axes.get_ylim()[0] > axes.get_ylim()[1]  # the first row on top
-
-
-def test_one_panel_per_row_for_tables_of_regions() -> None:
-    columns = tuple(Column(name=f"R{n}", metric=f"region/{n}") for n in range(1, 7))
-    rows = tuple(Row(label=label, values={"R1": 3.0, "R2": 4.0}) for label in ("Car", "Bike"))
-    scored = score("t", table(rows, columns), {}, scale="demo")
-    assert main_columns(scored) == [columns[0], columns[1]]
-    many = tuple(Row(label=r.label, values={c.name: 1.0 for c in columns}) for r in rows)
-    figure = figure_of(score("t", table(many, columns), {}, scale="demo"))
-    assert [axes.get_title() for axes in figure.axes] == ["Car", "Bike"]
-
-
-def test_png_holds_both_colours(tmp_path: Path) -> None:
-    assert draw_table(factor_table(), tmp_path / "figure.png")
-    image = cv2.imread(str(tmp_path / "figure.png"))[..., ::-1].reshape(-1, 3)
-    for colour in (OURS, PUBLISHED):
-        rgb = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
-        assert (image == rgb).all(1).sum() > 100
-
-
-def test_nothing_to_draw(tmp_path: Path) -> None:
-    scored = score("t", table((Row(label="a"),)), {}, scale="demo")
-    assert not draw_table(scored, tmp_path / "figure.png")
-    assert not (tmp_path / "figure.png").exists()
 
 
 def test_main_columns_are_headlines_of_day_and_night() -> None:

@@ -35,17 +35,6 @@ class Trained:
         self.folder = folder
 
 
-def test_preview_lists_each_evaluation_command_once() -> None:
-    wanted, outcomes = request_of((*FRAMES, RGB))
-    assert summary(wanted, outcomes, 2) == [
-        "2 runs: 2 waiting.",
-        "Time left with workers=2: known when one run is finished.",
-        "Evaluations of every run that still lacks them: rgbt consistency frames=virtual; "
-        "rgbt consistency frames=next; "
-        "rgbt evaluate modality=rgb 'regions=as trained'.",
-    ]
-
-
 def test_preview_names_worlds_in_one_command() -> None:
     wanted, outcomes = request_of((RGB,))
     worlds = {"N-": ("dataset.rgb_noise=0.0",), "N+": ("dataset.rgb_noise=0.1",)}

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rgbt.runs.result import RunResult
 from sweeps.point import Outcome, Point
-from sweeps.rendering.seed_groups import configuration, group_grid, unfinished_grid
+from sweeps.rendering.seed_groups import group_grid, unfinished_grid
 from tests.sweeps.fakes import finish
 
 
@@ -40,16 +40,3 @@ def test_group_grid_shows_mean_and_sample_sd(tmp_path: Path) -> None:
         ("sigma_div=3 seed=0", "running", "l", ""),
         ("sigma_div=3 seed=1", "failed", "m", "a bad day"),
     )
-
-
-def test_configurations_of_one_run_show_its_key(tmp_path: Path) -> None:
-    outcomes = [made(tmp_path, f"sigma_div={n}", mIoU=0.4, Var=2.0) for n in (1, 2)]
-    grid = group_grid("study", outcomes)
-    assert grid.header[-1] == "run"
-    assert grid.rows[1] == ("sigma_div=2", "1", "40.00", "2.00", "sigma_div=2")
-    assert not unfinished_grid(outcomes).rows
-
-
-def test_configuration_of_seeds_only_is_experiment() -> None:
-    assert configuration(Point("seed=3", ("+experiment=grbm", "seed=3"))) == "grbm"
-    assert configuration(Point("seed=3", ("seed=3",))) == "-"

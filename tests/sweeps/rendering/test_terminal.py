@@ -6,15 +6,13 @@ import math
 from dataclasses import replace
 from typing import Any
 
-import pytest
 from rich.console import Console
 
 from rgbt.terminal import WIDTH
 from sweeps.rendering.file_formats import latex, markdown, tidy_csv
-from sweeps.rendering.rendered_table import COUNTED, FORMS, NOT_PRINTED, SMALL, render_table
+from sweeps.rendering.rendered_table import COUNTED, NOT_PRINTED, SMALL, render_table
 from sweeps.rendering.terminal import terminal
-from sweeps.table.cells import TableCell
-from sweeps.table.scoring import ScoredTable, score, size_marks
+from sweeps.table.cells import ScoredTable, TableCell, score, size_marks
 from sweeps.table.table import Column, Row
 from tests.sweeps.tabled import Made, failed, outcome, right, table
 
@@ -50,87 +48,12 @@ def test_terminal_few_columns_are_on_one_line() -> None:
     assert shown[5] == ["theirs", "-", "50.0", "-"]
 
 
-def test_terminal_shows_remarks_below() -> None:
-    shown = lines(Made({"a": ((1,), 1.0), "b": ((2,), 3.0), "c": ((3,), 2.0)}).scored())
-    assert shown[6:9] == [
-        *("Published: somewhere; percent.", "Ours: scale=demo, of seed 0."),
-        FORMS["paper"],
-    ]
-    assert SMALL.format(scale="demo") in shown
-
-
-def test_terminal_names_the_form_and_many_seeds() -> None:
-    forms = {"released": "The rows use the masks of the release."}
-    made = Made({"a": (tuple(range(5)), 1.0)}, {"forms": forms}).scored()
-    assert "Ours: scale=demo, mean ± standard deviation (n - 1) over seeds 0 to 4." in lines(made)
-    assert FORMS["paper"] in lines(made)
-    assert forms["released"] in lines(replace(made, form="released"))
-
-
-def test_unprinted_column_has_no_published_cell() -> None:
-    columns = (
-        Column(name="acc", metric="pixel_accuracy"),
-        Column(name="own", metric="pixel_accuracy", printed=False),
-    )
-    rows = tuple(
-        Row(label=label, experiment="crm", values={"acc": printed})
-        for label, printed in (("a", 48.5), ("b", 47.5), ("c", 46.5))
-    )
-    runs = {(label, 0): outcome(label, right(share)) for label, share in zip("abc", (3, 2, 1))}
-    scored = score("t", table(rows, columns), runs, scale="demo")
-    shown = words(scored)
-    assert shown[1] == ["seeds", "acc", "published", "difference", "own[1]"]
-    assert shown[3] == ["a", "1", "3.00", "48.5", "-45.50", "3.00"]
-    assert "[1] Not in the paper." in lines(scored)
-    body = [line for line in latex(render_table(scored)).splitlines() if line.endswith(r"\\")]
-    assert {line.count(" & ") for line in body} == {5}
-    assert "| own<sup>1</sup> |" in markdown(render_table(scored))
-    last = list(csv.DictReader(io.StringIO(tidy_csv(scored))))[-1]
-    assert (last["column"], last["mean"]) == ("own", "1.0")
-    assert last["published"] == last["difference"] == ""
-
-
 def test_terminal_many_columns_use_separate_lines() -> None:
     shown = words(wide(STACKED))
     assert shown[3] == ["a", "ours", "2", *["50.00", "±", "14.14"] * 4]
     assert shown[4] == ["published", "48.00", "49.25", "-", "-"]
     assert shown[5] == ["difference", "+2.00", "+0.75", "-", "-"]
     assert SMALL.format(scale="paper") not in lines(wide(STACKED))  # scale=paper
-
-
-def test_terminal_wide_table_breaks_names_and_puts_sd_below() -> None:
-    shown = words(wide(WIDE))
-    assert shown[1] == ["name"] * 13
-    assert shown[2] == ["seeds", *map(str, range(13))]
-    assert shown[4] == ["a", "ours", "2", *["50.00"] * 13]
-    assert shown[5] == ["±", "sd", *["14.14"] * 13]
-
-
-@pytest.mark.parametrize("columns", [WIDE, STACKED, STACKED[:3]], ids=len)
-def test_terminal_narrow_width_keeps_numbers_whole(columns: tuple[Column, ...]) -> None:
-    whole, narrow = ("\n".join(lines(wide(columns), width)) for width in (WIDTH, 60))
-    for number in ("50.00", "14.14", "48.0", "49.25", "+2.00", "+0.75"):
-        assert narrow.count(number) == whole.count(number)
-
-
-def test_terminal_aligns_numbers_behind_footnotes() -> None:
-    runs = {
-        **{("a", 0): outcome("k", right(40)), ("a", 1): failed("gone")},
-        ("b", 0): outcome("l", right(5)),
-    }
-    rows = (Row(label="a", experiment="crm"), Row(label="b", experiment="crm"))
-    shown = lines(score("t", table(rows), runs, scale="demo"))
-    assert shown[3].index(".00") == shown[4].index(".00")
-    assert " 40.00[1]" in shown[3], "a mean over fewer seeds is no best"
-
-
-def test_terminal_styles_best_where_shown() -> None:
-    console = Console(width=WIDTH, record=True, file=io.StringIO(), force_terminal=True)
-    console.print(terminal(render_table(Made(ROWS).scored(MARKS)), plain=False))
-    shown = console.export_text(styles=True)
-    assert "\x1b[1m70.00\x1b[0m" in shown
-    assert "\x1b[4m50.00\x1b[0m" in shown
-    assert "Bold: shown to be the best of our rows, underlined: the second best." in shown
 
 
 def test_render_table_numbers_and_shares_footnotes() -> None:
@@ -189,17 +112,6 @@ def test_render_table_of_sizes_has_no_seeds() -> None:
     assert (first["mean"], first["sd"], first["n"], first["runs"]) == ("54.361", "", "0", "")
 
 
-def test_markdown_read_back() -> None:
-    text = markdown(render_table(Made(ROWS).scored(MARKS)))
-    rows = [
-        [cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines()[2:7]
-    ]
-    assert rows[0] == ["", "seeds", "acc", "published", "difference"]
-    assert rows[2] == ["a_1", "3", "<u>50.00 ± 10.00</u>", "48.0", "+2.00"]
-    assert rows[3][2] == "**70.00 ± 10.00**"
-    assert "- Bold: shown to be the best of our rows, underlined: the second best." in text
-
-
 def test_latex_escapes_and_omits_differences() -> None:
     text = latex(render_table(Made(ROWS).scored(MARKS)))
     assert r"\begin{tabular}{lrrrr}" in text
@@ -211,20 +123,3 @@ def test_latex_escapes_and_omits_differences() -> None:
     for each in (text, stacked):
         body = [line for line in each.splitlines() if line.endswith(r"\\")]
         assert len({line.count(" & ") for line in body}) == 1
-
-
-def test_csv_read_back() -> None:
-    rows = (
-        Row(label="a, b", experiment="crm", values={"acc": 48.0}),
-        Row(label="theirs", values={"acc": 4.0}),
-    )
-    runs = {("a, b", 0): outcome("k0", right(40)), ("a, b", 1): outcome("k1", right(45))}
-    first, second = csv.DictReader(
-        io.StringIO(tidy_csv(score("own/t", table(rows), runs, scale="demo")))
-    )
-    assert first == {
-        **{"table": "own/t", "row": "a, b", "column": "acc", "mean": "42.5", "sd": "3.535534"},
-        **{"n": "2", "published": "48.0", "difference": "-5.5", "reason": "", "runs": "k0 k1"},
-    }
-    assert second["mean"] == second["runs"] == ""
-    assert (second["n"], second["published"], second["reason"]) == ("0", "4.0", "")

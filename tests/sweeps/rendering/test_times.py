@@ -23,11 +23,6 @@ def test_time_line_counts_each_run_once(tmp_path: Path) -> None:
     assert time_line([*runs, runs[0]]) == "Time: 3 runs, 19 min in total, 80 s for a run (median)."
 
 
-def test_time_line_without_finished_runs_is_empty(tmp_path: Path) -> None:
-    assert time_line([]) == ""
-    assert time_line([RunResult(tmp_path / "nowhere")]) == ""
-
-
 @dataclass(frozen=True)
 class Spec:
     """Stands for `rgbt.runs.run_spec.RunSpec`."""
@@ -72,7 +67,3 @@ def test_upstream_line_counts_shared_and_indirect_runs_once(tmp_path: Path) -> N
     assert line == (
         "Upstream of these: 3 runs (start: 1 of 2 finished, 3 min; teacher: 1 of 1 finished, 40 s)."
     )
-
-
-def test_upstream_line_without_upstream_runs_is_empty(tmp_path: Path) -> None:
-    assert upstream_line([("a",)], planner_of({"a": Spec("crm", tmp_path)})) == ""

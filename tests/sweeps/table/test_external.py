@@ -1,130 +1,87 @@
-"""Words that name external rows, and the overrides that carry the table's data set."""
+"""Rows of weights and of predictions: their words, commands, counts and folders."""
 
 from __future__ import annotations
 
+import json
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
+import cv2
+import numpy as np
 import pytest
-from hydra.core.override_parser.overrides_parser import OverridesParser
 
+from analysis import score as score_command
+from rgbt import consistency, evaluate, predict
 from rgbt.checks import InputError
-from rgbt.config.compose import compose
-from sweeps.table.cells import evaluation_of
-from sweeps.table.external import ExternalRow, external_rows
-from sweeps.table.external_data import as_typed, data_of
-from sweeps.table.external_evaluations import content_hash
-from sweeps.table.load_table import load_table
+from rgbt.metrics.counts import Counts
+from rgbt.metrics.pairs import tc
+from rgbt.runs.result import RunResult
+from sweeps.point import Outcome
+from sweeps.table import external
+from sweeps.table.cells import score
+from sweeps.table.external import ExternalRow, ExternalRun, content_hash, external_rows
+from sweeps.table.make_request import TableWords, make_request
 from sweeps.table.table import Column, Row, Table
+from tests.commands import SMALL, SPLITS, Call, Trained, code_of, short
+from tests.conftest import pair, write_data
+from tests.sweeps.tabled import table as table_of
 
-COLUMN = Column(name="mIoU", metric="mIoU")
-
-
-def table_of(*labels: str, **common: Any) -> Table:
-    rows = tuple(Row(label=label, **common) for label in labels)
-    return Table(paper="p", number="1", caption="c", data="d", columns=(COLUMN,), rows=rows)
-
-
-TABLE = table_of(
-    *("(A)", "(B)", "CMX (MiT-B2)", "RTFNet (ResNet-50)", "RTFNet (ResNet-152)", "sigma=H/4"),
-    *("Ours", "Ours (Swin-S), MFNet"),
-    network=("model=mfnet",),
+ROOT = Path(__file__).resolve().parents[3]
+REAL = Path(os.environ.get("RGBT_SHARED", ROOT.parent / "shared")) / "realdata"
+ENTRIES = {
+    "rgbt.evaluate": evaluate.entry,
+    "rgbt.consistency": consistency.entry,
+    "analysis.score": score_command.entry,
+}
+ONE = ("+experiment=mfnet", "masker.patch_size=null", *short(1))
+COLUMNS = (
+    Column(name="mIoU", metric="mIoU"),
+    Column(name="no RGB", metric="mIoU", corruption="removed:rgb"),
+    Column(name="TC", metric="TC", frames="aligned"),
 )
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    (tmp_path / "predicted").mkdir()
-    (tmp_path / "a=b.pth").write_bytes(b"weights")
-    return tmp_path / "predicted"
+ROWS = (
+    Row(label="CMNeXt"),
+    Row(label="MFNet", experiment="mfnet", overrides=ONE[1:]),
+    Row(label="RTFNet", network=("model=rtfnet_tiny",)),
+    *(Row(label="sigma"), Row(label="sigma=H/4"), Row(label="7")),
+)
+TABLE = table_of(ROWS, COLUMNS)
 
 
 @pytest.mark.parametrize(
     ("name", "label"),
-    [
-        ("(A)", "(A)"),
-        ("a", "(A)"),
-        ("CMX", "CMX (MiT-B2)"),
-        ("cmx (mit-b2)", "CMX (MiT-B2)"),
-        ("CMX-B2", "CMX (MiT-B2)"),
-        ("rtfnet-152", "RTFNet (ResNet-152)"),
-        ("RTFNet ResNet-50", "RTFNet (ResNet-50)"),
-        ("sigma=H/4", "sigma=H/4"),
-        ("Ours", "Ours"),
-    ],
+    [("CMNeXt", "CMNeXt"), ("sigma=H/4", "sigma=H/4"), ("2", "MFNet"), ("7", "7")],
 )
-def test_a_label_is_found_in_several_spellings(folder: Path, name: str, label: str) -> None:
-    found, others = external_rows([f"predictions.{name}={folder}", "seed=1"], TABLE)
-    assert found == [ExternalRow(label, "predictions", folder)]
-    assert others == ["seed=1"]
-
-
-def test_rows_are_in_the_order_of_the_table(folder: Path) -> None:
-    weights = folder.parent / "a=b.pth"
-    words = [f"weights.CMX={weights}", "dataset=mfnet", f"predictions.B={folder}"]
-    found, others = external_rows(words, TABLE)
-    assert found == [
-        ExternalRow("(B)", "predictions", folder),
-        ExternalRow("CMX (MiT-B2)", "weights", weights),
-    ]
-    assert others == ["dataset=mfnet"]
-
-
-WRONG = {
-    "typo": ("predictions.Orus={folder}", "has no row 'Orus'; did you mean 'Ours'"),
-    "not the first word": ("predictions.MFNet={folder}", "has no row 'MFNet'"),
-    "several": ("predictions.RTFNet={folder}", "'RTFNet' may be any of the rows 'RTFNet (ResNet-"),
-    "no path": ("weights.A", "expected weights.LABEL=FILE"),
-    "a folder": ("weights.A={folder}", "is not a file of weights; give the path of one"),
-    "a file": ("predictions.A={folder}/x.png", "is not a folder of predicted label images"),
-    "nothing": ("predictions.A=", "is not a folder of predicted label images"),
-    "a network": (
-        "weights.mask2former_swin_t={folder}",
-        "Initial weights of trained rows are given with pretrained.mask2former_swin_t=FILE",
-    ),
-}
-
-
-@pytest.mark.parametrize(("word", "sentence"), WRONG.values(), ids=WRONG)
-def test_a_wrong_word_is_refused(folder: Path, word: str, sentence: str) -> None:
-    with pytest.raises(InputError) as error:
-        external_rows([word.format(folder=folder)], TABLE)
-    assert sentence in str(error.value)
-
-
-def test_a_row_has_one_source_and_weights_need_a_network(folder: Path) -> None:
-    word = f"predictions.A={folder}"
-    with pytest.raises(InputError, match=r"row '\(A\)' already has predictions"):
-        external_rows([word, f"predictions.(A)={folder}"], TABLE)
-    printed = table_of("CMNeXt")
-    with pytest.raises(InputError, match="has no network that weights can be loaded into; give"):
-        external_rows([f"weights.CMNeXt={folder.parent / 'a=b.pth'}"], printed)
-    assert external_rows([f"predictions.cmnext={folder}"], printed)[0][0].label == "CMNeXt"
+def test_external_row_is_named_by_label_or_number(tmp_path: Path, name: str, label: str) -> None:
+    folder = tmp_path / "a=b"
+    folder.mkdir()
+    words = [f"predictions.{name}={folder}", "dataset=mfnet"]
+    assert external_rows(words, TABLE) == (
+        [ExternalRow(label, "predictions", folder)],
+        ["dataset=mfnet"],
+    )
 
 
 @pytest.mark.parametrize(
-    "value",
-    ["/data/MF net", "a=b", "it's", r"C:\d", r"a\'b", "end\\", "", "null", "NaN", "12", "{a}"]
-    + [1, 0.5, None, True, ["a b", 1, None], ("x",)],
+    "word",
+    [
+        "predictions.CMNext={folder}",
+        "predictions.cmnext={folder}",
+        "predictions.9={folder}",
+        "weights.MFNet",
+        "weights.MFNet={folder}",
+        "predictions.MFNet={folder}/x.png",
+        "predictions.MFNet=",
+        "weights.CMNeXt={folder}/w.pth",
+    ],
 )
-def test_as_typed_is_read_back_by_hydra(value: Any) -> None:
-    read = OverridesParser.create().parse_override(f"key={as_typed(value)}").value()
-    plain = getattr(read, "text", read)
-    assert plain == (list(value) if isinstance(value, tuple) else value)
-    assert type(plain) is type(list(value) if isinstance(value, tuple) else value)
-
-
-@pytest.mark.parametrize("scale", ["demo", "paper"])
-def test_words_of_the_data_set_give_the_same_node_in_another_command(scale: str) -> None:
-    """The data set of a row, its scale included, without the row's experiment."""
-    rows = table_of("a", experiment="mfnet", overrides=("dataset.num_test=3", "dataset.seed=2"))
-    settings: Any = {"scale": "demo", "form": "paper", "base": ["tracking=none"]}
-    data = data_of(rows, {**settings, "extra": ["dataset.absent=exclude", "metric=ring9"]})
-    for group in ("dataset", "metric"):
-        again = compose([f"scale={scale}", *data.words(group, scale)])
-        assert again[group] == data.config[group]
-    assert data.regions("as trained").name == "ring9"
-    assert data.regions("vertical5").name == "vertical5"
+def test_wrong_external_word_is_refused(tmp_path: Path, word: str) -> None:
+    (tmp_path / "w.pth").touch()
+    with pytest.raises(InputError, match="row|ROW"):
+        external_rows([word.format(folder=tmp_path)], TABLE)
 
 
 def test_content_hash_covers_names_and_contents(tmp_path: Path) -> None:
@@ -137,17 +94,184 @@ def test_content_hash_covers_names_and_contents(tmp_path: Path) -> None:
     assert len(seen) == 5
     before = content_hash(folder)
     (folder / ".DS_Store").write_bytes(b"")
-    moved = folder.rename(tmp_path / "moved")
-    assert content_hash(moved) == before
+    assert content_hash(folder.rename(tmp_path / "moved")) == before
 
 
-def test_table_iv_of_temporal_has_tc_and_ca_of_both_protocols() -> None:
-    """A row of predictions gets them from the folder of its mIoU."""
-    table = load_table("temporal/table4")
-    counted = {column.name: evaluation_of(column, table) for column in table.columns}
-    frames = {name: each.frames for name, each in counted.items() if each is not None}
-    assert frames == {
-        **{"TC": "released", "CA": "released"},
-        **{"TC aligned": "aligned", "CA aligned": "aligned"},
-    }
-    assert not any(column.printed for column in table.columns if column.name in frames)
+Commands = list[tuple[str, ...]]
+Runs = Callable[..., dict[str, Outcome]]
+
+
+@pytest.fixture
+def commands(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Commands:
+    """The commands that are called, in this process and not in one of their own."""
+    called: Commands = []
+
+    def run(command: Sequence[str], log: Path) -> str:
+        called.append(tuple(command))
+        module, *words = command
+        code = code_of(ENTRIES[module], [word for word in words if word != "trust=my_lab"])
+        _, err = capfd.readouterr()
+        return err.strip().splitlines()[-1].removeprefix("rgbt: ") if code else ""
+
+    monkeypatch.setattr(external, "run_command", run)
+    return called
+
+
+@pytest.fixture
+def predictions(data: Path, tmp_path: Path) -> Path:
+    """Labels of split test with the left third taken for class 0."""
+    folder = tmp_path / "method"
+    folder.mkdir()
+    for name in SPLITS["test"]:
+        prediction = pair(name, (48, 64))[2].copy()
+        prediction[:, :21] = 0
+        cv2.imwrite(str(folder / f"{name}.png"), prediction)
+    return folder
+
+
+@pytest.fixture
+def runs_of(data: Path, tmp_path: Path) -> Runs:
+    def run(*words: str, table: Table = TABLE, trust: str = "") -> dict[str, Outcome]:
+        place = ("dataset=mfnet", f"dataset.root={data}", "data.num_workers=0")
+        every = TableWords(seeds=(0,), scale="demo", overrides=[*place, *SMALL, *words])
+        request, rows = make_request("my/t", table, every)
+        base, runs_dir = ("tracking=none",), tmp_path / "runs"
+        return {
+            row.label: ExternalRun.of(row, request, base, runs_dir).outcome(table, trust)
+            for row in rows
+        }
+
+    return run
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("regions", ["as trained", "ring9", "vertical5"])
+def test_predictions_have_the_counts_of_rgbt_score(
+    call: Call,
+    commands: Commands,
+    runs_of: Runs,
+    data: Path,
+    predictions: Path,
+    tmp_path: Path,
+    regions: str,
+) -> None:
+    run = runs_of(f"predictions.CMNeXt={predictions}", table=replace(TABLE, regions=regions))
+    (result,) = run["CMNeXt"].results
+    file = "ring5" if regions == "as trained" else regions
+    words = (f"predictions={predictions}", "dataset=mfnet", f"dataset.root={data}")
+    shape = (f"partition={file[:-1]}", f"regions={file[-1]}", "resamples=0")
+    assert call(score_command.entry, *words, *shape, f"out={tmp_path / 'out'}")[0] == 0
+    expected = Counts.load(tmp_path / "out" / f"counts_{file}.npz")
+    own = regions == "as trained"
+    found = result.counts("counts_test.npz" if own else f"evaluations/table_default_{regions}.npz")
+    assert np.array_equal(found.counts, expected.counts)
+    assert (found.dataset, found.partition) == (expected.dataset, file)
+    other = f"evaluations/table_default_{regions.replace(' ', '-')}_rgb_removed.npz"
+    assert set(run["CMNeXt"].missing) == {other, "evaluations/consistency_aligned_test.npz"}
+    assert [command[0] for command in commands] == ["analysis.score"]
+
+
+def test_weights_have_the_counts_of_the_run_that_trained_them(
+    trained: Trained, commands: Commands, runs_of: Runs
+) -> None:
+    run = trained(*ONE)
+    outcome = runs_of(f"weights.MFNet={run / 'best.pt'}", trust="my_lab")["MFNet"]
+    (found,), expected = outcome.results, RunResult(run).counts()
+    assert np.array_equal(found.counts().counts, expected.counts)
+    assert found.counts().dataset == expected.dataset
+    without = found.counts("evaluations/table_default_as-trained_rgb_removed.npz")
+    assert not np.array_equal(without.counts, expected.counts)
+    assert without.partition == expected.partition == "ring5"
+    pairs = found.counts("evaluations/consistency_aligned_test.npz")
+    scored = score("my/1", TABLE, {("MFNet", 0): outcome}, scale="demo")
+    mean = 100 * tc(pairs.by_region(), "released").mean()
+    assert scored.cells["MFNet", "TC"].mean == pytest.approx(mean)
+    assert scored.cells["MFNet", "no RGB"].reason == ""
+    assert found.folder.joinpath("evaluations/consistency_released_test.npz").is_file()
+    assert len(commands) == 3  # both protocols in one call
+    assert all("trust=my_lab" in command for command in commands)
+
+
+@pytest.mark.slow
+def test_predictions_of_exported_pairs_have_a_consistency(
+    call: Call, commands: Commands, runs_of: Runs, trained: Trained, data: Path, tmp_path: Path
+) -> None:
+    run, pairs, folder = trained(*ONE), tmp_path / "pairs", tmp_path / "written"
+    place = ("dataset=mfnet", f"dataset.root={data}")
+    assert call(consistency.entry, f"export={pairs}", *place)[0] == 0
+    assert call(predict.entry, f"run={run}", f"input={pairs}", f"out={folder}")[0] == 0
+    shutil.copy(pairs / "pairs.json", folder)
+    (found,) = runs_of(f"predictions.CMNeXt={folder}")["CMNeXt"].results
+    (network,) = runs_of(f"weights.MFNet={run / 'best.pt'}")["MFNet"].results
+    for path in ("counts_test.npz", "evaluations/consistency_aligned_test.npz"):
+        assert np.array_equal(found.counts(path).counts, network.counts(path).counts)
+
+
+def test_counts_are_made_once_unless_content_changes(
+    commands: Commands, runs_of: Runs, predictions: Path, tmp_path: Path
+) -> None:
+    (first,) = runs_of(f"predictions.CMNeXt={predictions}")["CMNeXt"].results
+    moved = predictions.rename(tmp_path / "moved")
+    word = f"predictions.CMNeXt={moved}"
+    (second,) = runs_of(word)["CMNeXt"].results
+    assert (second.folder, len(commands)) == (first.folder, 1)
+    cv2.imwrite(str(moved / "00201D.png"), np.zeros((48, 64), np.uint8))
+    (third,) = runs_of(word)["CMNeXt"].results
+    assert third.folder != first.folder
+    assert len(commands) == 2
+
+
+def test_interrupted_call_leaves_no_counts(
+    commands: Commands, runs_of: Runs, predictions: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = external.run_command
+
+    def interrupted(command: Sequence[str], log: Path) -> str:
+        run(command, log)
+        raise KeyboardInterrupt
+
+    word = f"predictions.CMNeXt={predictions}"
+    with monkeypatch.context() as patch:
+        patch.setattr(external, "run_command", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            runs_of(word)
+    assert not list((predictions.parent / "runs" / "external").rglob("*.npz"))
+    assert runs_of(word)["CMNeXt"].state == "finished"
+
+
+def test_weights_of_another_network_fail_once(
+    trained: Trained, commands: Commands, runs_of: Runs
+) -> None:
+    run = runs_of(f"weights.RTFNet={trained(*ONE) / 'best.pt'}")["RTFNet"]
+    assert (run.state, len(commands)) == ("failed", 1)
+    assert "cannot be loaded into RTFNet" in run.reason
+
+
+METHODS = ("LASNet", "SGFNet", "MMSMCNet")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not (REAL / "predictions20").is_dir(), reason="real data is not here")
+def test_published_methods_have_their_known_counts(tmp_path: Path) -> None:
+    """On the 20 real test pairs of MFNet, with two pairs of noise to train on."""
+    data = tmp_path / "mf"
+    write_data(data, {"train": ["1D", "2D"], "val": ["3D"]}, (48, 64))
+    for kind in ("images", "labels"):
+        shutil.copytree(REAL / "mfnet20" / kind, data / kind, dirs_exist_ok=True)
+    for name in ("test.txt", "test_day.txt", "test_night.txt"):
+        shutil.copy(REAL / "mfnet20" / name, data)
+    authors = Row(label="MFNet_final_pth", network=("model=mfnet",))
+    rows = (*(Row(label=label) for label in METHODS), authors, Row(label="a", experiment="mfnet"))
+    words = [f"predictions.{name}={REAL / 'predictions20' / name}" for name in METHODS]
+    words += [f"weights.MFNet_final_pth={REAL / 'mfnet_weights' / 'final.pth'}"]
+    words += ["dataset=mfnet", f"dataset.root={data}", "trainer.threads=1", "data.num_workers=0"]
+    every = TableWords(seeds=(0,), scale="demo", overrides=words)
+    request, given = make_request("my/1", table_of(rows, COLUMNS[:1]), every)
+    known = json.loads((REAL / "predictions20" / "expected_confusions.json").read_text())
+    for row in given:
+        run = ExternalRun.of(row, request, ("tracking=none",), tmp_path / "runs")
+        counts = run.outcome(request.table, "").results[0].counts()
+        assert (len(counts.names), counts.partition) == (20, "ring5")
+        parts = {"test": counts, **{f"test_{key}": each for key, each in counts.parts().items()}}
+        for split, part in parts.items():
+            assert np.array_equal(part.whole(), known[f"{row.label}/{split}"]["confusion"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import FrozenInstanceError
 from pathlib import Path
 from typing import Any
@@ -39,13 +40,13 @@ def row(**keys: Any) -> dict[str, Any]:
 
 
 def column(**keys: Any) -> dict[str, Any]:
-    return {"columns": [{"name": "mIoU", "metric": "mIoU"}, {"name": "b", **keys}], "rows": []}
+    return {"columns": [{"name": "mIoU", "metric": "mIoU"}, {"name": "b", **keys}]}
 
 
 def behind(**keys: Any) -> dict[str, Any]:
     """A difference of a column that follows it."""
     columns = column(minus=["mIoU", "c"])["columns"]
-    return {"columns": [*columns, {"name": "c", **keys}], "rows": []}
+    return {"columns": [*columns, {"name": "c", **keys}]}
 
 
 def test_own_table_needs_no_printed_values(tmp_path: Path) -> None:
@@ -61,83 +62,76 @@ def test_own_table_needs_no_printed_values(tmp_path: Path) -> None:
         table.rows[0].label = "other"  # type: ignore[misc]
 
 
+ONE_CLAIM = {
+    **{"name": "c", "says": "", "source": "", "rows": ["small"], "against": ["large"]},
+    **{"columns": ["mIoU"], "expected": "higher"},
+}
+
+
+def claim(**keys: Any) -> dict[str, Any]:
+    return {"claims": [{**ONE_CLAIM, **keys}]}
+
+
 @pytest.mark.parametrize(
-    ("changes", "sentence"),
+    ("changes", "key"),
     [
-        ({"colums": []}, "'colums' is not a key; did you mean 'columns'"),
-        (row(overides=["a=1"]), "row 'small': 'overides' is not a key; did you mean 'overrides'"),
-        (row(overrides=["a=1"]), "row 'small': the row has no experiment; add one, or remove"),
-        (row(origin="own_methode"), "row 'small': 'origin': input should be 'own_method'"),
-        (
-            row(values={"mIuO": 1}),
-            "row 'small', column: 'mIuO' is not a valid choice; did you mean",
-        ),
-        (
-            row(without=["Vra"]),
-            "row 'small', without: 'Vra' is not a valid choice; did you mean 'Var'",
-        ),
-        (row(values={"mIoU": "61"}), "row 'small', values: 'mIoU': input should be a valid number"),
-        (row(values={"mIoU": float("nan")}), "'mIoU': input should be a finite number"),
-        (row(overrides=[4]), "row 'small': 'overrides[0]': input should be a valid string"),
-        (row(experiment="grmb"), "experiment: 'grmb' is not a valid choice; did you mean 'grbm'"),
-        (row(at={"papr": ["a=1"]}), "row 'small', at: 'papr' is not a valid choice; did you mean"),
-        (row(x=0), "'x' must be > 0 on a log axis, got 0"),
-        ({**row(x=1), "factor": None}, "'x' has no effect without the table's 'factor'"),
-        ({"rows": [{"experiment": "grbm"}]}, "row 1: 'label' has no value"),
-        ({"rows": [{"label": "a"}, {"label": "a"}]}, "rows: 'a' is used twice"),
-        ({"rows": ["a"]}, "'rows[0]': input should be an object"),
-        ({"at": {"big": []}}, "at: 'big' is not a valid choice; known: bench, demo, paper"),
-        ({"regions": "ring7"}, "regions: 'ring7' is not a valid choice"),
-        ({"absent": "exlude"}, "'absent': input should be 'released' or 'exclude'"),
-        (column(metric="Var", name="mIoU"), "columns: 'mIoU' is used twice"),
-        (column(metric="Var", best="low"), "column 'b': 'best': input should be 'highest'"),
-        (column(), "expected one of metric, minus, mean and efficiency, got none"),
-        (column(metric="Var", efficiency="latency"), "got metric and efficiency"),
-        (column(minus=["mIoU"]), "column 'b': 'minus[1]' has no value"),
-        (column(minus=["mIoU", "IoU"]), "column 'b', minus: 'IoU' is not a valid choice"),
-        (column(mean=["mIoU", "IoU"]), "column 'b', mean: 'IoU' is not a valid choice"),
-        (column(mean=["mIoU", "mIoU"]), "two or more different columns, got mIoU, mIoU."),
-        (column(mean=["mIoU", "b"]), "'b' is computed from other columns itself; move it in front"),
-        (behind(efficiency="parameters"), "minus: 'c' is the efficiency of networks and no score"),
-        (behind(mean=["mIoU", "b"]), "minus: 'c' is computed from other columns itself; move it"),
-        (column(metric="Var", head="target "), "'head': input should be 'as trained', 'own'"),
-        (column(mean=["mIoU", "b"], head="source"), "'head' is only for scores of single frames"),
-        (column(metric="TC", frames="aligned", head="target"), "remove head: target"),
-        (
-            column(metric="Var", corruption="nois"),
-            "corruption: 'nois' is not a valid choice; did you",
-        ),
-        (column(metric="Var", corruption="noise"), "needs a severity (grey levels (std)); one of"),
-        (column(metric="Var", corruption="noise", severity=300), "'b': severity (standard dev"),
-        (column(metric="Var", severity=8), "'severity' needs a corruption; add corruption"),
-        (
-            column(efficiency="latency", corruption="removed:rgb"),
-            "only for scores of single frames; remove",
-        ),
-        (column(metric="TC", frames="aligned", corruption="removed:rgb"), "remove corruption: re"),
-        (column(mean=["mIoU", "b"], batch_norm="adabn"), "single frames; remove batch_norm: adabn"),
-        (
-            column(metric="Var", batch_norm_splits=["val"]),
-            "'batch_norm_splits' needs batch_norm: a",
-        ),
-        (
-            column(metric="distance/0-15"),
-            "distance: '0-15' is not a valid choice; did you mean '0-10",
-        ),
-        (column(metric="night/region/1/size/0-65"), "'0-65' is not a valid choice; did you mean"),
-        ({**column(metric="class/{kind}"), **row()}, "'kind' of metric class/{kind}"),
-        (column(metric="TC"), "TC compares two frames; add frames: aligned, released or next"),
-        (column(metric="Var", frames="aligned"), "'frames' is only for TC, CA, CA_released"),
-        (column(metric="TC", frames="aligned", modality="thermal"), "remove modality: thermal"),
-        ({**column(metric="Var", printed=False), **row(values={"b": 3})}, "'b' is not printed"),
-        ({**column(metric="Var", printed=False), **row(doubtful=["b"])}, "'b' is not printed"),
+        ({"colums": []}, "colums"),
+        ({"rows": []}, "rows"),
+        (row(overides=["a=1"]), r"rows\[0\].overides"),
+        (row(overrides=["a=1"]), r"rows\[0\].*experiment"),
+        (row(values={"mIuO": 1}), "'mIuO'.*did you mean 'mIoU'"),
+        (row(without=["Vra"]), "without: 'Vra'"),
+        (row(values={"mIoU": "61"}), "values.mIoU"),
+        (row(values={"mIoU": float("nan")}), "finite"),
+        (row(overrides=[4]), r"overrides\[0\]"),
+        (row(experiment="grmb"), "experiment: 'grmb'.*did you mean 'grbm'"),
+        (row(at={"papr": ["a=1"]}), "at: 'papr'"),
+        (row(same_as="large"), "same_as"),
+        (row(settings={"image_hw": [480]}), "image_hw"),
+        (row(x=0), "'x'"),
+        ({**row(x=1), "factor": None}, "'x'"),
+        ({"rows": [{"experiment": "grbm"}]}, r"rows\[0\].label"),
+        ({"rows": [{"label": "a"}, {"label": "a"}]}, "'a' is used twice"),
+        ({"at": {"big": []}}, "at: 'big'"),
+        ({"regions": "ring7"}, "regions: 'ring7'"),
+        ({"absent": "exlude"}, "absent"),
+        (column(metric="Var", name="mIoU"), "'mIoU' is used twice"),
+        (column(metric="mIou"), "did you mean 'mIoU'"),
+        (column(metric="Var", best="low"), "best"),
+        (column(), r"columns\[1\].*metric"),
+        (column(metric="Var", efficiency="latency"), r"columns\[1\].*efficiency"),
+        (column(minus=["mIoU"]), "minus"),
+        (column(minus=["mIoU", "IoU"]), "'IoU'"),
+        (column(mean=["mIoU"]), "mean"),
+        (column(mean=["mIoU", "b"]), "column 'b': 'b'"),
+        (behind(efficiency="parameters"), "column 'b': 'c'"),
+        (behind(mean=["mIoU", "b"]), "column 'b': 'c'"),
+        (column(metric="Var", head="target "), "head"),
+        (column(mean=["mIoU", "mIoU"], head="source"), "'head'"),
+        (column(metric="TC", frames="aligned", corruption="noise"), "'corruption'"),
+        (column(efficiency="latency", batch_norm="adabn"), "'batch_norm'"),
+        (column(metric="TC", frames="aligned", modality="thermal"), "'modality'"),
+        (column(metric="TC"), "'frames'"),
+        (column(metric="Var", frames="aligned"), "'frames'"),
+        (column(metric="class/{kind}"), "'kind'"),
+        ({**column(metric="Var", printed=False), **row(values={"b": 3})}, "'b'"),
+        ({**column(metric="Var", printed=False), **row(doubtful=["b"])}, "'b'"),
+        (claim(rows=["smal"]), "'smal'.*did you mean 'small'"),
+        (claim(against=["others", "large"]), "'others'"),
+        (claim(columns=["acc"]), "columns: 'acc'"),
+        (claim(minus_column="acc"), "columns: 'acc'"),
+        (claim(against=["small"]), "nothing to compare"),
+        (claim(expected="similar"), "at_most"),
+        (claim(at_least=2, at_most=1), "at_most"),
+        ({"claims": [ONE_CLAIM, copy.deepcopy(ONE_CLAIM)]}, "'c' is used twice"),
     ],
 )
-def test_refuses(tmp_path: Path, changes: dict[str, Any], sentence: str) -> None:
+def test_table_that_does_not_fit_is_refused(
+    tmp_path: Path, changes: dict[str, Any], key: str
+) -> None:
     path = write(tmp_path, **changes)
-    with pytest.raises(InputError) as raised:
+    with pytest.raises(InputError, match=key) as raised:
         load_table("my/ablation", tmp_path)
-    assert sentence in str(raised.value)
     assert str(path) in str(raised.value)
     assert "\n" not in str(raised.value)
 
@@ -145,7 +139,7 @@ def test_refuses(tmp_path: Path, changes: dict[str, Any], sentence: str) -> None
 def test_unknown_name_gets_the_nearest(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="did you mean 'spatialseg/table3'"):
         load_table("spatialseg/tabel3", tmp_path)
-    with pytest.raises(InputError, match="there is no such file"):
+    with pytest.raises(InputError, match="none.yaml"):
         load_table(str(tmp_path / "none.yaml"))
 
 

@@ -18,17 +18,12 @@ def test_one_factor(tmp_path: Path) -> None:
     table = load_table("my/ablation", tmp_path)
     assert path == tmp_path / "my" / "ablation.yaml"
     assert [row.label for row in table.rows] == ["sigma_div=1", "sigma_div=4", "sigma_div=16"]
-    assert [row.x for row in table.rows] == [1.0, 4.0, 16.0]
     assert table.rows[1].overrides == ("masker.sigma_div=4", "masker.patch_size=32")
     assert table.rows[1].experiment == "grbm"
-    assert table.factor is not None
-    assert (table.factor.name, table.factor.axis) == ("sigma_div", "log")
     names = [column.name for column in table.columns]
     assert names == ["IoU1", "IoU2", "IoU3", "IoU4", "IoU5", "mIoU", "Var"]
     assert table.columns[-1].best == "lowest"
-    text = path.read_text()
-    assert text.count("#") >= 7
-    assert "{name: TC, metric: TC, frames: aligned}" in text
+    assert "rgbt reproduce table=my/ablation" in path.read_text()
 
 
 def test_a_product_has_no_axis(tmp_path: Path) -> None:
@@ -39,8 +34,6 @@ def test_a_product_has_no_axis(tmp_path: Path) -> None:
         "sigma_div=1 patch_size=32",
     ]
     assert len(table.rows) == 4
-    assert table.factor is None
-    assert table.rows[0].x is None
 
 
 @pytest.mark.parametrize(
@@ -49,8 +42,8 @@ def test_a_product_has_no_axis(tmp_path: Path) -> None:
         (("grbm", ["masker.sigma_dv=1,2"]), "did you mean 'sigma_div'"),
         (("grbm", ["masker.sigma_div=1,abc"]), "masker.sigma_div"),
         (("grbn", ["masker.sigma_div=1,2"]), "did you mean 'grbm'"),
-        (("grbm", ["seed=0,1"]), "seeds=3"),
-        (("grbm", ["masker.sigma_div=1,2", "runs_dir=/tmp/r"]), "when you run the table"),
+        (("grbm", ["seed=0,1"]), "seed"),
+        (("grbm", ["masker.sigma_div=1,2", "runs_dir=/tmp/r"]), "runs_dir"),
         (("grbm", ["masker.sigma_div=1"]), "no key is varied"),
     ],
 )
@@ -58,12 +51,6 @@ def test_refused(tmp_path: Path, arguments: tuple[str, list[str]], sentence: str
     with pytest.raises(InputError, match=sentence):
         write_new("my/bad", *arguments, tmp_path)
     assert not (tmp_path / "my").exists()
-
-
-@pytest.mark.parametrize("name", ["spatialseg/table3", "../up", "my/x.yaml", "/abs"])
-def test_refused_names(tmp_path: Path, name: str) -> None:
-    with pytest.raises(InputError, match="another name|such as my/ablation"):
-        write_new(name, "grbm", ["masker.sigma_div=1,2"], tmp_path)
 
 
 def test_the_command_writes_once(

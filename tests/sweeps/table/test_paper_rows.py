@@ -6,15 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from omegaconf import DictConfig, OmegaConf
 
 from rgbt.config.component import build
-from rgbt.runs.specify import specify
-from sweeps.evaluation import ExtraEvaluation
 from sweeps.table.load_table import load_table, table_names
 from sweeps.table.request import TableRequest
 from sweeps.table.table import Row, Table
-from tests.composed import row_spec, specified
-from tests.sweeps.composed import checked, row_config
+from tests.composed import row_spec
 
 TABLES = {name: load_table(name) for name in table_names(Path("none"))}
 SECOND = {"none": [], "dice": ["dice2"], "con": ["con"], "con_acc": ["con-acc"]}
@@ -40,6 +38,11 @@ def request(name: str, scale: str = "demo") -> TableRequest:
     return TableRequest("t", TABLES[name], scale, (0,))
 
 
+def row_config(table: Table, row: Row) -> DictConfig:
+    """The configuration of a row at demo size."""
+    return OmegaConf.create(dict(row_spec(table, row).plain))
+
+
 def assert_printed(row: Row, found: dict[str, Any]) -> None:
     """What is found of a row's configuration is what the paper prints about it."""
     printed = {key: value for key, value in row.settings.items() if value is not None}
@@ -49,7 +52,7 @@ def assert_printed(row: Row, found: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize(("table", "row"), rows_of(""))
 def test_row_masks_match_printed_settings(table: Table, row: Row) -> None:
-    config = row_config(table, row, "demo")
+    config = row_config(table, row)
     masker, loss = config.masker, config.loss
     assert min(build(masker).grid_hw(tuple(config.transform.crop_hw))) > 1
     found = {
@@ -84,33 +87,6 @@ def test_temporal_row_has_printed_losses_and_views(table: Table, row: Row) -> No
         assert_printed(row, {key: mode in modes for key, modes in views.items()})
 
 
-@pytest.mark.parametrize(("table", "row"), rows_of("multihead"))
-def test_multihead_row_has_printed_heads_and_adaptation(table: Table, row: Row) -> None:
-    config = row_config(table, row)
-    source, target = config.domains.source, config.domains.target
-    before = str(config.model.weights).removeprefix("experiment:").partition("/")[0]
-    first = config if before == "None" else checked((f"+experiment={before}", "scale=demo"))
-    scheme = str(config.scheme["_target_"]) + str(config.scheme.get("unlabelled"))
-    adaptations = {"Adversarial": "adversarial", "MaxSquares": "maximum_squares_loss"}
-    found = {
-        "heads": len({each.head for each in (source, target) if each is not None}),
-        "modified_decoder": config.model.get("decoder", "basic") != "basic",
-        "adaptation": next((a for word, a in adaptations.items() if word in scheme), None),
-        "seg_loss_on_thermal": first.domains.target is not None,
-        "init_from_rgb_to_thermal": "thermal" in str(first.model.weights),
-    }
-    shared = set(found) & set(row.settings)
-    assert {key: found[key] for key in shared} == {key: row.settings[key] for key in shared}
-
-
-@pytest.mark.slow  # that of its experiment is looked at in tests/test_config.py
-@pytest.mark.parametrize(("table", "row"), rows_of("multihead"))
-def test_multihead_row_at_paper_scale_trains_on_freiburg(table: Table, row: Row) -> None:
-    config = row_config(table, row, "paper")
-    assert (config.dataset.name, config.dataset.num_classes) == ("freiburg", 14)
-    assert config.model.num_classes == 14
-
-
 TWICE = (
     "spatialseg/table3 Ny/4 | spatialseg/table4 PS 64 | spatialseg/table5 alpha 0"
     " | spatialseg/table6 no weighting",
@@ -133,46 +109,11 @@ def test_rows_printed_twice_are_one_run(cells: str, scale: str) -> None:
     keys, printed = set(), set()
     for name, _, label in (cell.partition(" ") for cell in cells.split(" | ")):
         row = row_of(name, label)
-        keys.add(specify(row_config(TABLES[name], row, scale)).key)
+        keys.add(row_spec(TABLES[name], row, scale).key)
         value = next(row.values[key] for key in MAIN if row.values.get(key) is not None)
         assert value is not None
         printed.add(round(value, 1))
     assert (len(keys), len(printed)) == (1, 1)
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["crm/table3a", "crm/table3b", "crm/table4"]
-    + [f"spatialseg/table{number}" for number in (3, 4, 5, 6)]
-    + [f"temporal/table{number}" for number in (1, 2, 3)],
-)
-def test_rows_of_an_ablation_are_different_runs(name: str) -> None:
-    table = TABLES[name]
-    keys = {specify(row_config(table, row, "demo")).key for row in table.rows}
-    assert len(keys) == len(table.rows)
-
-
-@pytest.mark.parametrize("name", ["crm/table3b", "crm/table4", "spatialseg/table4"])
-def test_x_is_the_printed_factor(name: str) -> None:
-    key = "masking_ratio" if name == "crm/table4" else "patch_size"
-    assert [row.x for row in TABLES[name].rows] == [row.settings[key] for row in TABLES[name].rows]
-
-
-def test_gaussian_x_equals_share_of_rows() -> None:
-    shares: dict[str | None, float | None]
-    shares = {"Ny" if n == 1 else f"Ny/{n}": 1 / n for n in (1, 2, 4, 8, 16, 32)}
-    found = {row.settings["sigma_p"]: row.x for row in TABLES["spatialseg/table3"].rows}
-    assert found == shares | {None: None}
-
-
-def test_own_row_of_a_paper_can_be_run() -> None:
-    silent = [
-        (name, row.label)
-        for name, table in TABLES.items()
-        for row in table.rows
-        if (row.origin or "").startswith("own") and row.experiment is None
-    ]
-    assert silent == []
 
 
 @pytest.mark.parametrize("number", [3, 4, 5, 6])
@@ -186,12 +127,6 @@ def test_printed_variance_is_the_population_variance_of_the_rings(number: int) -
         assert (abs(variance - printed) > 0.02) == ("Var" in row.doubtful), (row.label, variance)
 
 
-def test_doubtful_cells_are_explained() -> None:
-    doubtful = [row for table in TABLES.values() for row in table.rows if row.doubtful]
-    assert len(doubtful) == 11
-    assert all(row.remarks for row in doubtful)
-
-
 @pytest.mark.parametrize("number", [2, 3, 4])
 def test_printed_mean_is_that_of_both_columns(number: int) -> None:
     table = TABLES[f"multihead/table{number}"]
@@ -201,59 +136,3 @@ def test_printed_mean_is_that_of_both_columns(number: int) -> None:
         if None not in known:
             first, second, printed = (value or 0.0 for value in known)
             assert printed == pytest.approx((first + second) / 2, abs=0.0501), row.label
-
-
-def test_columns_without_a_score_of_the_network_are_omitted() -> None:
-    three, four = request("multihead/table3"), request("multihead/table4")
-    assert three.evaluations(["HeatNet*"]) == four.evaluations(["HeatNet RGB-only*"]) == ()
-    assert three.evaluations(["Multi-head"]) == (ExtraEvaluation("thermal"),)
-    assert four.evaluations(["Multi-head"]) == (ExtraEvaluation(head="source"),)
-    columns = three.table.columns_of(row_of("multihead/table3", "HeatNet*"))
-    assert [column.name for column in columns] == ["mIoU_rgb"]
-
-
-@pytest.mark.parametrize("number", [1, 2, 3])
-def test_printed_consistency_is_of_released_protocol(number: int) -> None:
-    wanted = request(f"temporal/table{number}")
-    columns = wanted.table.columns[-4:]
-    assert [(c.name, c.metric, c.frames, c.printed) for c in columns] == [
-        ("TC", "TC", "released", True),
-        ("CA", "CA_released", "released", True),
-        ("TC aligned", "TC", "aligned", False),
-        ("CA aligned", "CA", "aligned", False),
-    ]
-    protocols = [evaluation.frames for evaluation in wanted.evaluations()]
-    assert protocols == ["released", "aligned"]
-    assert any("use the released protocol" in remark for remark in wanted.table.remarks)
-
-
-def test_rtfnet_backbones_differ_at_paper_scale_only() -> None:
-    wanted = [request("temporal/table5", scale) for scale in ("demo", "paper")]
-    assert [len(each.points()) for each in wanted] == [2, 4]
-    assert wanted[1].models() == {"rtfnet_50", "rtfnet_152"}
-
-
-RTFNET = {
-    "RTFNet (ResNet-50)": ("rtfnet", 3),
-    "Ours-con (ResNet-50)": ("rtfnet_temporal_con", 3),
-    "RTFNet (ResNet-152)": ("rtfnet_152", 2),
-    "Ours-con (ResNet-152)": ("rtfnet_152_temporal_con", 2),
-}
-"""Row of Temporal, Table V -> its experiment, and images of a batch in the release of RTFNet."""
-
-
-@pytest.mark.parametrize("label", RTFNET)
-def test_rtfnet_rows_are_experiments_with_the_recipe_of_their_backbone(label: str) -> None:
-    experiment, batch = RTFNET[label]
-    table = request("temporal/table5").table
-    (row,) = (each for each in table.rows if each.label == label)
-    words = (f"+experiment={experiment}", "scale=paper", "dataset.root=/data")
-    spec = specified(words)
-    assert spec.key == row_spec(table, row, "paper").key
-    epoch = 1568 // batch  # of the training list, which holds every image twice
-    assert spec.plain["data"]["batch_size"] == batch
-    # The release keeps the last, smaller batch; the loader here drops it.
-    assert spec.plain["schedule"]["epoch_steps"] == -(-1568 // batch)
-    assert spec.trainer.max_steps == 100 * epoch
-    assert spec.trainer.eval_every == 5 * epoch
-    assert specified((words[0],)).key == row_spec(table, row, "demo").key

@@ -1,15 +1,26 @@
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
 from rgbt.checks import InputError
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Outcome
-from sweeps.table.make_request import TableWords, make_request, read_named
+from sweeps.table.claim import Claim
+from sweeps.table.load_table import load_table
+from sweeps.table.make_request import (
+    TableWords,
+    check_equal_runs,
+    make_request,
+    read_named,
+    select_rows,
+)
 from sweeps.table.request import TableRequest, seeds_of
 from sweeps.table.table import Column, Row
+from sweeps.worker.planner import Planner
 from tests.sweeps.tabled import table
 
 COLUMNS = (
@@ -46,15 +57,6 @@ def test_points_share_runs_of_equal_rows() -> None:
     assert points[0].evaluations == (ExtraEvaluation("thermal", "as trained"),)
 
 
-def test_points_at_paper_scale_use_user_overrides() -> None:
-    points = wanted("paper").points()
-    assert len(points) == 6
-    assert points[1].overrides == (
-        *("+experiment=crm", "scale=paper", "recipe.batch_size=5", "model=mask2former_swin_b"),
-        *("a.b=1", "seed=0"),
-    )
-
-
 def test_frames_are_evaluated_whatever_the_regions_of_the_table() -> None:
     columns = (
         Column(name="mIoU", metric="mIoU"),
@@ -69,20 +71,6 @@ def test_frames_are_evaluated_whatever_the_regions_of_the_table() -> None:
             ExtraEvaluation(frames="released"),
             ExtraEvaluation(frames="aligned"),
         )
-
-
-def test_heads_are_evaluated_apart_and_sizes_need_no_run() -> None:
-    columns = (
-        Column(name="night", metric="night/mIoU"),
-        Column(name="by day", metric="night/mIoU", head="source"),
-        Column(name="both", mean=("night", "by day")),
-        Column(name="size", efficiency="parameters"),
-    )
-    asked = TableRequest("own/t", table(ROWS, columns), "demo", (0,))
-    assert asked.points()[0].evaluations == (ExtraEvaluation(head="source"),)
-    alone = TableRequest("own/t", table(ROWS, columns[3:]), "demo", (0, 1))
-    assert (alone.row_seeds(), alone.points(), alone.runs([])) == ([], [], {})
-    assert alone.models() == set()
 
 
 def test_outcomes_go_back_to_their_cells() -> None:
@@ -109,7 +97,7 @@ def test_seeds(text: str, seeds: tuple[int, ...]) -> None:
 
 @pytest.mark.parametrize("text", ["0", "", "a", "1,1", "-2", "1.5", "1,"])
 def test_no_seeds(text: str) -> None:
-    with pytest.raises(InputError, match="expected a number of seeds"):
+    with pytest.raises(InputError, match="^seeds="):
         seeds_of(text)
 
 
@@ -148,15 +136,61 @@ def test_form_and_rows_make_another_table() -> None:
     assert made[2].overrides("Ny/4", 0)[0] == "+experiment=grbm_released"
 
 
-def test_seeds_of_rows_may_differ() -> None:
-    asked = wanted()
-    points = asked.points([("other", 5), ("small", 7), ("large", 7)])
-    assert [point.overrides[-1] for point in points] == ["seed=5", "seed=7"]
-    outcomes = [Outcome(point, "failed", point.label) for point in points]
-    assert sorted(asked.runs(outcomes)) == [("large", 7), ("other", 5), ("small", 7)]
+def claim(name: str, rows: tuple[str, ...], against: tuple[str, ...]) -> Claim:
+    about: Any = {"says": "", "source": "", "columns": ("acc",), "expected": "higher"}
+    return Claim(name=name, rows=rows, against=against, **about)
 
 
-def test_evaluated_rows_are_not_trained() -> None:
-    asked = replace(wanted(), evaluated=("other",))
-    assert {label for label, _ in asked.row_seeds()} == {"small", "large"}
-    assert len(asked.points()) == 2
+def test_selected_rows_keep_their_claims() -> None:
+    rows = (
+        Row(label="a", experiment="crm"),
+        Row(label="b", experiment="crm", same_as="a"),
+        Row(label="c", experiment="grbm"),
+    )
+    claims = (claim("b_a", ("b",), ("a",)), claim("c_a", ("c",), ("a",)))
+    made = table(rows, claims=(*claims, claim("best", ("c",), ("others",))))
+    chosen = select_rows(made, "c,1")
+    assert [row.label for row in chosen.rows] == ["a", "c"]
+    assert [each.name for each in chosen.claims] == ["c_a"]
+    assert select_rows(made, "b").rows[0].same_as is None
+    assert select_rows(made, "a,b,c").claims == made.claims
+
+
+def test_twins_of_a_row_that_is_left_out_stay_declared() -> None:
+    rows = (
+        Row(label="a", experiment="crm"),
+        Row(label="b", experiment="crm", same_as="a"),
+        Row(label="c", experiment="crm", same_as="b"),
+        Row(label="d, with comma", experiment="grbm"),
+    )
+    chosen = select_rows(table(rows), "b,c,d, with comma")
+    assert [(row.label, row.same_as) for row in chosen.rows] == [
+        *(("b", None), ("c", "b"), ("d, with comma", None)),
+    ]
+    with pytest.raises(InputError, match="'e'"):
+        select_rows(table(rows), "e")
+
+
+def test_rows_that_are_one_run_are_refused_unless_the_table_says_so() -> None:
+    first, third = (Row(label=each, experiment="baseline") for each in "ac")
+    same = Row(label="b", experiment="baseline", same_as="a")
+    with pytest.raises(InputError, match=r"'a' and 'c' of own/t would be the same run .* same_as"):
+        check_equal_runs(TableRequest("own/t", table((first, third)), "demo", (0,)), Planner())
+    third = replace(third, same_as="b")
+    check_equal_runs(TableRequest("own/t", table((first, same, third)), "demo", (0,)), Planner())
+
+
+@pytest.mark.parametrize(
+    ("words", "is_refused"),
+    [
+        (("masker=grbm_released", "masker.sigma_div=4"), True),
+        (("recipe.batch_size=1", "dataset.root=/data", "model.queries=8"), False),
+    ],
+)
+def test_overrides_that_make_rows_equal_are_refused(
+    words: tuple[str, ...], is_refused: bool
+) -> None:
+    made = select_rows(load_table("spatialseg/table3"), "Ny,Ny/4")
+    request = TableRequest("t", made, "demo", (0,), words)
+    with pytest.raises(InputError, match="'Ny' and 'Ny/4'") if is_refused else nullcontext():
+        check_equal_runs(request, Planner())

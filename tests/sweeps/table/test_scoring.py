@@ -7,13 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from sweeps.evaluation import ExtraEvaluation
-from sweeps.table.cells import TableCell
-from sweeps.table.scoring import ScoredTable, check_metrics, published, score, size_marks
+from sweeps.table.cells import ScoredTable, TableCell, published, score, size_marks
 from sweeps.table.table import Column, Row
-from tests.sweeps.tabled import Made, counts_of, failed, outcome, pairs_of, right, table
+from tests.sweeps.tabled import Made, counts_of, failed, outcome, right, table
 
 ACC = Column(name="acc", metric="pixel_accuracy")
 RGB = Column(name="rgb", metric="pixel_accuracy", modality="rgb")
@@ -58,21 +56,6 @@ def test_score_derived_columns_are_per_seed() -> None:
     assert cells["a", "gain"].mean == -7.5  # -5 and -10
 
 
-@pytest.mark.parametrize(
-    ("column", "reason"),
-    [
-        (Column(name="x", metric="class/bus"), "no class 'bus'"),
-        (Column(name="x", metric="TC", frames="aligned"), "rgbt consistency run=..."),
-    ],
-)
-def test_score_missing_values_have_reason(column: Column, reason: str) -> None:
-    run = outcome("k", {None: right(40), ExtraEvaluation(frames="aligned"): right(40)})
-    both = Column(name="both", mean=("acc", "x"))
-    cell = scored((ACC, column, both), {("a", 0): run}).cells["a", "both"]
-    assert (cell.seeds, cell.mark, math.isnan(cell.mean)) == (0, "no value", True)
-    assert reason in cell.reason
-
-
 def test_score_omitted_rows_and_columns_have_no_cell() -> None:
     rows = (
         *(Row(label="a", without=("rgb",)), Row(label="b")),
@@ -88,24 +71,6 @@ def test_score_omitted_rows_and_columns_have_no_cell() -> None:
     }
     assert published(rows[2], RGB) is None
     assert math.isnan(found.difference(rows[2], ACC))
-
-
-@pytest.mark.parametrize(
-    ("settings", "evaluation"),
-    [
-        ({"head": "source", "modality": "rgb"}, ExtraEvaluation("rgb", head="source")),
-        (
-            {"corruption": "noise", "severity": 16},
-            ExtraEvaluation(corruption="noise", severity=16.0),
-        ),
-    ],
-)
-def test_score_heads_and_corruptions_have_own_counts(
-    settings: dict[str, Any], evaluation: ExtraEvaluation
-) -> None:
-    column = Column(name="other", metric="pixel_accuracy", **settings)
-    runs = {("a", 0): outcome("k", {None: right(50), evaluation: right(30)})}
-    assert [cell.mean for cell in scored((ACC, column), runs).cells.values()] == [50.0, 30.0]
 
 
 def details_of(partition: str, *rows: list[list[int]]) -> Counts:
@@ -140,15 +105,6 @@ def test_score_details_have_own_counts() -> None:
     assert values["road", "acc"] == 50.0
 
 
-def test_score_regions_of_table_and_placeholders() -> None:
-    column = Column(name="R2", metric="class/{class}/region/2")
-    rows = tuple(Row(label=name, settings={"class": name}) for name in ("road", "car"))
-    run = outcome("k", {ExtraEvaluation("default", "ring9"): counts_of()})
-    found = scored((column,), {("road", 0): run, ("car", 0): run}, rows, regions="ring9")
-    assert found.cells["road", "R2"].mean == pytest.approx(75.0)
-    assert found.cells["car", "R2"].mean == pytest.approx(80.0)
-
-
 def test_score_sizes_have_marks_without_seeds() -> None:
     size = Column(name="size", efficiency="parameters", best="lowest")
     rows = tuple(
@@ -173,62 +129,12 @@ def test_score_sizes_have_marks_without_seeds() -> None:
     assert scored((size,), {}, rows).cells == {}
 
 
-def test_score_protocols_have_separate_counts() -> None:
-    """TC of road 6/8 and 8/10, of car 0. CA of road alike; as released 6/10 and 8/12."""
-    columns = (
-        ACC,
-        Column(name="TC", metric="TC", frames="released"),
-        Column(name="CA", metric="CA_released", frames="released"),
-        Column(name="TC aligned", metric="class/road/TC", frames="aligned", printed=False),
-    )
-    rows = tuple(
-        Row(label=label, experiment="crm", values={"TC": printed})
-        for label, printed in (("a", 30.0), ("b", 31.0), ("c", 32.0))
-    )
-    made = {
-        label: {
-            None: right(share),
-            ExtraEvaluation(frames="released"): pairs_of(same, 2, "released"),
-            ExtraEvaluation(frames="aligned"): pairs_of(same + 2, 0 if label == "c" else 2),
-        }
-        for label, share, same in (("a", 40, 6), ("b", 50, 8), ("c", 60, 2))
-    }
-    found = scored(
-        columns, {(label, 0): outcome(label, each) for label, each in made.items()}, rows
-    )
-    means = {place: cell.mean for place, cell in found.cells.items()}
-    assert means["a", "TC"] == pytest.approx(100 * 6 / 8 / 2)
-    assert means["b", "TC"] == pytest.approx(100 * 8 / 10 / 2)
-    assert means["a", "CA"] == pytest.approx(100 * 6 / (6 + 8 + 8 - 2 * 6) / 2)
-    assert means["b", "CA"] == pytest.approx(100 * 8 / (8 + 10 + 10 - 2 * 8) / 2)
-    assert means["a", "TC aligned"] == pytest.approx(80.0)
-    assert means["c", "TC aligned"] == 100.0
-    assert math.isnan(found.difference(rows[0], columns[3]))
-
-
 def test_score_failed_seed_keeps_reason() -> None:
     lost = failed("out of memory")
     runs = {("a", 0): outcome("k", right(40)), ("a", 1): lost, ("a", 2): lost}
     cell = scored((ACC,), runs).cells["a", "acc"]
     assert (cell.mean, cell.seeds, cell.mark) == (40.0, 1, "failed")
     assert cell.reason == "seeds 1, 2: out of memory"
-
-
-def test_score_counts_commits_by_run() -> None:
-    runs = {
-        ("a", 0): outcome("k0", right(1), "aaa"),
-        ("a", 1): outcome("k1", right(2), "bbb"),
-        ("b", 0): outcome("k0", right(1), "aaa"),
-        ("b", 1): outcome("k2", right(1), None),
-    }
-    rows = (Row(label="a"), Row(label="b"))
-    assert scored((ACC,), runs, rows).commits == {"aaa": 1, "bbb": 1}
-
-
-def test_check_metrics_refuses_misspelt_metric() -> None:
-    with pytest.raises(InputError, match="did you mean 'mIoU'"):
-        check_metrics(table(ROW, (Column(name="x", metric="mIou"),)))
-    check_metrics(table(ROW, (ACC, RGB, LESS)))
 
 
 @pytest.mark.parametrize(("absent", "wanted"), [("released", 50.0), ("exclude", 100.0)])

@@ -2,31 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
-from rgbt.checks import InputError
-from sweeps.table.load_table import STUDIES, load_table, study_names, table_names
-from sweeps.table.make_request import TableWords, make_request, read_named
-from sweeps.verdicts.contrasts import contrasts_of
+from sweeps.table.load_table import load_table
+from sweeps.table.make_request import TableWords, make_request
 from sweeps.worker.planner import Planner
 
 MISSING = "missing_image"
-
-
-def test_study_is_found_by_name_and_by_path() -> None:
-    assert MISSING in study_names()
-    assert MISSING not in table_names(Path("none"))
-    named, by_name = read_named(MISSING)
-    at_path, by_path = read_named(str(STUDIES / "missing_image.yaml"))
-    assert named == at_path == MISSING
-    assert by_name == by_path
-
-
-def test_study_that_does_not_exist_is_refused_with_the_nearest_name() -> None:
-    with pytest.raises(InputError, match="did you mean 'missing_image'"):
-        load_table("mising_image")
 
 
 def test_missing_image_has_the_runs_of_the_ablation_of_crm() -> None:
@@ -50,20 +32,6 @@ def test_missing_image_has_the_runs_of_the_ablation_of_crm() -> None:
     request, _ = make_request(MISSING, load_table(MISSING), TableWords(seeds=(0,), scale="demo"))
     corruptions = [each.corruption for each in request.evaluations()]
     assert corruptions == ["removed:rgb", "removed:thermal"]
-
-
-def test_missing_image_claims_are_the_contrasts_that_they_state() -> None:
-    table = load_table(MISSING)
-    labels = {
-        claim.name: [each.label for each in contrasts_of(claim, table)] for claim in table.claims
-    }
-    assert labels["crm_loses_less"] == [
-        "CRM - Baseline, no_rgb - both",
-        "CRM - Baseline, no_thermal - both",
-    ]
-    assert labels["night_needs_thermal"] == [
-        "Baseline, night_loss_no_thermal - day_loss_no_thermal"
-    ]
 
 
 @pytest.mark.parametrize("task", ["night", pytest.param("thermal", marks=pytest.mark.slow)])

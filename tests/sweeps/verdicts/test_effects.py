@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from rgbt.metrics.counts import Counts
-from sweeps.rendering.effects import CSV_HEADER, effects_csv, effects_grids
-from sweeps.rendering.effects_figure import draw_effects
 from sweeps.table.cells import world_evaluations
 from sweeps.table.design import Design, DesignFactor, DesignMethod, Part
-from sweeps.table.design_rows import with_design_rows
-from sweeps.table.rows import select_rows
-from sweeps.table.table import Column, Table
+from sweeps.table.table import Column, Row, Table
 from sweeps.verdicts.effects import MEAN, DesignJudge
-from tests.sweeps.tabled import counts_of, failed, outcome
+from tests.sweeps.tabled import counts_of, failed, outcome, table
 
 WHOLE = Part()
 """All combinations of the levels."""
@@ -53,8 +48,8 @@ def design_table(trained: Part | None = WHOLE, tested: Part | None = None) -> Ta
         Column(name="two", metric="region/2"),
         Column(name="contrast", minus=("one", "two")),
     )
-    table = Table(paper="my", number="1", caption="", data="", columns=columns, design=design)
-    return with_design_rows(table, "file")
+    rows = tuple(Row(**each) for each in design.rows())
+    return table(rows, columns, design=design)
 
 
 def with_rates(first: float, second: float) -> Counts:
@@ -106,14 +101,6 @@ def test_effects_are_of_contrasts_within_runs() -> None:
     assert found["crm", "baseline", "noise"].value == pytest.approx(own - EFFECT)
 
 
-def test_effect_is_shown_and_null_effect_is_not() -> None:
-    found = estimates(design_table(), trained())
-    assert found["baseline", "", "noise"].is_shown()
-    assert found["baseline", "", "noise"].value == pytest.approx(EFFECT, abs=0.5)
-    assert not found["baseline", "", "texture"].is_shown()
-    assert found["baseline", "", "noise"].seeds == 2
-
-
 def test_method_with_a_missing_cell_is_named_and_others_are_analysed() -> None:
     runs = trained()
     for seed in (0, 1):
@@ -144,58 +131,6 @@ def test_networks_tested_in_worlds_use_the_counts_of_each_world() -> None:
     found = estimates(table, runs)
     assert found["baseline", "", "noise"].value == pytest.approx(EFFECT)
     assert ("crm", "", "noise") not in found
-
-
-def test_part_whose_rows_are_not_chosen_is_left_out() -> None:
-    table = select_rows(design_table(tested=Part()), "trained")
-    found = DesignJudge(table, resamples=100).effects(trained())
-    assert {line.part for line in found.lines} == {"trained"}
-    assert found.missing == ()
-
-
-def test_method_with_rows_that_are_not_chosen_says_which() -> None:
-    table = select_rows(design_table(), "baseline N-T-")
-    found = DesignJudge(table, resamples=100).effects({})
-    assert found.lines == ()
-    assert found.missing == ("trained, baseline: row 'baseline N-T-' has no finished run.",)
-
-
-def test_outcome_of_corrupted_images_is_refused_by_name() -> None:
-    table = design_table()
-    noisy = replace(table.columns[0], corruption="noise", severity=16.0)
-    table = replace(table, columns=(noisy, *table.columns[1:]))
-    found = DesignJudge(table, resamples=100).effects(trained())
-    assert "'one' is no score of the plain test images" in found.missing[0]
-
-
-def test_grids_and_csv_have_a_line_for_each_effect(tmp_path: Path) -> None:
-    table = design_table()
-    assert table.design is not None
-    effects = DesignJudge(table, resamples=100).effects(trained())
-    (grid,) = effects_grids(effects, table.design)
-    # Three methods and differences, each with the mean, two main effects and an interaction.
-    assert len(grid.rows) == 3 * 4
-    noise = next(row for row in grid.rows if row[:2] == ("baseline", "noise"))
-    assert noise[4] == "lower"
-    texture = next(row for row in grid.rows if row[:2] == ("crm - baseline", "texture"))
-    assert texture[4] == "no"
-    assert grid.notes[0] == "N, noise: - little; + much."
-    lines = effects_csv(effects.lines).splitlines()
-    assert lines[0] == ",".join(CSV_HEADER)
-    assert len(lines) == 1 + 12
-    figure = tmp_path / "figure.png"
-    assert draw_effects(effects, "my/design", figure)
-    assert figure.stat().st_size > 1000
-
-
-def test_one_seed_has_no_interval_and_no_figure(tmp_path: Path) -> None:
-    table = design_table()
-    assert table.design is not None
-    runs = {key: run for key, run in trained().items() if key[1] == 0}
-    effects = DesignJudge(table, resamples=100).effects(runs)
-    (grid,) = effects_grids(effects, table.design)
-    assert {row[4] for row in grid.rows if row[1] != MEAN} == {"2 seeds needed"}
-    assert not draw_effects(effects, "my/design", tmp_path / "figure.png")
 
 
 def test_scenes_are_paired_although_labels_differ() -> None:

@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 
 from analysis.uncertainty.contrasts import FIXED
-from analysis.uncertainty.verdicts import AnyTime, FixedSeeds
 from sweeps.point import Outcome
 from sweeps.table.claim import Claim
 from sweeps.table.table import Column, Row, Table
@@ -123,17 +122,6 @@ def test_mean_and_any_combine_contrasts() -> None:
     assert mean.printed == pytest.approx((49.0 + 50.0) / 2 - 50.5)
 
 
-def test_any_time_rule_needs_more_seeds() -> None:
-    one = claim(rows=("high",), against=("low",))
-    words = [
-        TableJudge("own/t", of(one), rule, resamples=200)
-        .judge(one, planted(SHARES))  # type: ignore[arg-type]
-        .word
-        for rule in (FixedSeeds(), AnyTime())
-    ]
-    assert words == ["holds", "undecided"]
-
-
 @pytest.mark.parametrize(
     ("best", "marks"),
     [("highest", {"high": 1, "mid": 2}), ("lowest", {"low": 1, "mid": 2}), ("none", {})],
@@ -162,15 +150,6 @@ def test_rows_of_the_same_runs_share_a_mark() -> None:
     found = made.judge(one, runs)  # type: ignore[arg-type]
     assert found.word == "not run"
     assert found.reason == "rows 'high' and 'again' are the same runs at this scale."
-
-
-def test_nothing_is_marked_while_a_row_has_no_score() -> None:
-    rows = tuple(Row(label=label, experiment="crm") for label in ("low", "high", "later"))
-    runs: dict[CellRunId, Outcome] = {
-        **planted({"low": (50.0, 51.0, 49.0), "high": (60.0, 61.0, 60.0)}),
-        ("later", 0): failed("out of memory"),
-    }
-    assert TableJudge("own/t", table(rows, (ACC,)), resamples=200).marks(runs) == {}
 
 
 def test_claims_about_counted_sizes_are_exact() -> None:

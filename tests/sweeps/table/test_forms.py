@@ -1,0 +1,356 @@
+"""Rows of the papers' tables in both forms: what each row changes, and which rows are one run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from fnmatch import fnmatch
+from functools import cache
+from itertools import product
+from pathlib import Path
+from typing import get_args
+
+import pytest
+
+from rgbt.config.compose import flatten
+from rgbt.runs.run_spec import RunSpec
+from sweeps.table.efficiency import million_parameters
+from sweeps.table.load_table import load_table, study_names, table_names
+from sweeps.table.make_request import check_equal_runs
+from sweeps.table.request import TableRequest
+from sweeps.table.table import Form, Row, Table
+from sweeps.worker.planner import Planner, specify_run
+from tests.composed import specified
+
+TABLES = {name: load_table(name) for name in table_names(Path("none"))}
+FORMS: tuple[Form, ...] = get_args(Form)
+SLOW = pytest.mark.slow
+SCALES = pytest.mark.parametrize("scale", ["demo", pytest.param("paper", marks=SLOW)])
+
+IGNORED = ("name", "seed", "consistency", "recipe", "scale")
+"""Nodes that are not compared: labels, evaluations, and what other nodes take their values from."""
+
+ANOTHER = "another method"
+"""Of a row whose network is another one than that of the row above; all else may differ too."""
+
+SIZES = "data.batch_size trainer.eval_every trainer.max_steps"
+CELLS = "masker.pairing masker.patch_size masker.ratio masker.sampler"
+GAUSSIAN = "masker.anchor masker.cell_position masker.sampler masker.sigma_div"
+SWIN = {"(Swin-S)": "| model.depths", "(Swin-B)": "| model.embed_dim model.num_heads"}
+SMALLER = "model.depths model.embed_dim model.num_heads"
+OURS = f"loss.spatial.alpha {GAUSSIAN}"
+CMX_INPUTS = (
+    "model.inputs.rgb_mean model.inputs.rgb_order model.inputs.rgb_std model.inputs.thermal_mean "
+    "model.inputs.thermal_scale model.inputs.thermal_std model.decoder_norm_eps_eval transform"
+)
+"""Between CMX as its own release trains it and CMX of Temporal."""
+LATE_POLY = "schedule.counted_steps schedule.epoch_steps schedule.epochs"
+RELEASED_CMX = f"loss scheme {CMX_INPUTS} {LATE_POLY} | {SIZES} schedule.warmup_steps"
+FIRST_CON = f"loss scheme // {RELEASED_CMX}"
+TWO_HEADS = "domains.source.head domains.target.head domains.target_is model.heads"
+DECODER = "model.align_corners model.ceil_mode model.decoder"
+OF_ONE_HEAD = "loss model.auxiliary model.weights scheme transform.blur_probability"
+NIGHT_LABELS = "domains.target.confidence domains.target.labels domains.target.teacher_view"
+
+EXPECTED: dict[str, dict[str, str]] = {
+    "crm/table1": {"CMXNet": ANOTHER, "Ours": ANOTHER},
+    **dict.fromkeys(
+        ("crm/table2a", "crm/table2c"),
+        dict.fromkeys(("RTFNet", "CMX", "Ours (Swin-T)"), ANOTHER) | {"Ours": "Swin"},
+    ),
+    "crm/table2b": {"Ours": "Swin"},
+    "crm/table3a": {
+        **{"(1)": "scheme", "(2)": CELLS, "(3)": "scheme.complementary_weight"},
+        "(4)": "scheme.complementary_weight scheme.nonlocal_weight",
+        "Ours": "scheme.complementary_weight",
+    },
+    "crm/table3b": {
+        # The square moves by tokens of 4 pixels, which is a patch of 8 at scale=demo.
+        "Patch (8)": "masker.sampler | masker.patch_size",
+        **dict.fromkeys(("Patch (16)", "Patch (32)", "Patch (64)"), "masker.patch_size"),
+        "Baseline (Table 3a)": f"{CELLS} scheme",
+    },
+    "crm/table4": {
+        "IRM 0.3": "masker.pairing masker.ratio",
+        **dict.fromkeys([f"IRM 0.{tenths}" for tenths in (4, 5, 6, 7)], "masker.ratio"),
+        "CRM as written (Eq. 1)": "masker.pairing masker.ratio",
+    },
+    "spatialseg/table2": dict.fromkeys(
+        ("Person", "Bike", "Curve", "Car Stop", "Guardrail", "Color Cone", "Bump"), ""
+    ),
+    "spatialseg/table3": {
+        "Ny": f"{GAUSSIAN} masker.patch_size masker.ratio"
+        f" // {GAUSSIAN} masker.patch_size | {SIZES}",
+        **dict.fromkeys([f"Ny/{divisor}" for divisor in (2, 4, 8, 16, 32)], "masker.sigma_div"),
+    },
+    "spatialseg/table4": dict.fromkeys(("PS 16", "PS 32", "PS 64"), "masker.patch_size"),
+    "spatialseg/table5": dict.fromkeys(
+        [f"alpha {alpha}" for alpha in (1, 1.5, 2, 2.5, 3)], "loss.spatial.alpha"
+    ),
+    "spatialseg/table6": {"Edge": "loss.spatial.alpha", "Center": "loss.spatial.focus"},
+    "spatialseg/table7": {
+        **dict.fromkeys(("CMX", "CMNeXt", "CRM (Swin-T)"), ANOTHER),
+        **{"CRM": "Swin", "Ours": "Swin"},
+        "Ours (Swin-T)": f"{OURS} masker.patch_size masker.ratio | {SIZES} {SMALLER}"
+        f" // {OURS} masker.patch_size | {SIZES} {SMALLER}",
+    },
+    "spatialseg/table8": {
+        **dict.fromkeys(("CMX", "CRM (Swin-T)"), ANOTHER),
+        **{"CRM": "Swin", "Ours": "Swin"},
+        "Ours (Swin-T)": f"{OURS} masker.patch_size masker.ratio | {SMALLER} // {OURS} | {SMALLER}",
+    },
+    "temporal/table1": {
+        **{"(B)": FIRST_CON, "(C)": "loss.beta loss.second", "(F)": "loss.alpha loss.beta "},
+        **dict.fromkeys(("(D)", "(E)", "(H)", "(I)"), "loss.second"),
+        **{"(F)": "loss.alpha loss.beta loss.second", "(G)": "loss.beta loss.second"},
+    },
+    "temporal/table2": {
+        "(B)": FIRST_CON,
+        **dict.fromkeys(("(C)", "(D)"), "scheme.view.mode"),
+    },
+    "temporal/table3": {
+        **dict.fromkeys(("(B)", "(C)", "(E)", "(F)", "(H)", "(I)"), "loss.beta"),
+        **dict.fromkeys(("(D)", "(G)"), "loss.alpha loss.beta"),
+    },
+    "temporal/table4": {
+        **{"CMX (MiT-B2)": ANOTHER, "CMX (MiT-B4)": "| model.depths"},
+        **{"CMNeXt": ANOTHER, "Ours-dice": ANOTHER},
+        **dict.fromkeys(("Ours-con", "Ours-con-acc"), "loss.second"),
+    },
+    "temporal/table5": {
+        **dict.fromkeys(
+            ("Ours-con (ResNet-50)", "Ours-con (ResNet-152)"),
+            "loss scheme // loss scheme transform",
+        ),
+        "RTFNet (ResNet-152)": f"loss scheme | {SIZES} model.depth schedule.epoch_steps"
+        f" // loss scheme transform | {SIZES} model.depth schedule.epoch_steps",
+    },
+    "multihead/table1": {"Thermal teacher": "model.modalities"},
+    "multihead/table2": {
+        "HeatNet (reproduced)": (
+            f"{NIGHT_LABELS} scheme.supervise_target scheme.weighed_by_confidence"
+        ),
+        "HeatNet RGB-only (reproduced)": (
+            f"{NIGHT_LABELS} model.modalities scheme trainer.max_steps"
+        ),
+    },
+    "multihead/table3": {
+        "SH-Adv": f"{OF_ONE_HEAD} | {SIZES}",
+        "SH-Adv(Seg. on IR)": "model.weights",
+        "Multi-head": f"{TWO_HEADS} model.weights | {SIZES}",
+        "Multi-head*": f"{DECODER} model.weights | model.dropout",
+        **{"HeatNet*": ANOTHER, "RGB alone": ANOTHER},
+        "SH, first stage with labels on IR": "domains.source.view domains.target scheme",
+        "Multi-head, first stage": f"{TWO_HEADS} | {SIZES}",
+    },
+    "multihead/table4": {
+        "Multi-head*": f"{DECODER} model.weights | {SIZES} model.dropout",
+        "Multi-head**": f"model.weights | {SIZES}",
+        **{"HeatNet RGB-only*": ANOTHER, "RGB by day alone": ANOTHER},
+        "Multi-head, first stage": (
+            "domains.source.head domains.source.view domains.target domains.target_is model.heads "
+            f"scheme | {SIZES}"
+        ),
+        "Multi-head, labels kept": "model.weights scheme | trainer.max_steps",
+        "Multi-head, labels kept, no critic": "scheme",
+    },
+    "multihead/table5": {
+        "Multi-head network": ANOTHER,
+        "Multi-head*, decoder as in the text": (
+            f"{DECODER} model.weights | {SIZES} | model.base_width model.depths model.rates "
+            "model.summed_rates"
+        ),
+        "Multi-head*, decoder of the unused file": "model.decoder model.dropout",
+    },
+}
+"""Settings in which a row differs from the row above it that is run: at both scales | at
+scale=paper too | at scale=demo too // the same in the released form, where that differs. A
+component that is replaced by another is one setting."""
+
+CRM_RELEASED = "schedule.per trainer.selection_split transform.colour"
+FIXED_COUNT = "masker.anchor masker.ratio masker.sampler"
+RELEASES = {
+    "crm/table1 CMXNet": ANOTHER,
+    "crm/table2[ac] MFNet": "transform trainer.tested",
+    "* RTFNet": "transform",
+    "* CMNeXt": "trainer.selection_split",
+    "spatialseg/table3 CRM baseline": f"{CRM_RELEASED} | {SIZES}",
+    "spatialseg/table8 Ours *": (f"{CRM_RELEASED} masker.patch_size masker.ratio masker.sampler"),
+    "spatialseg/table[78] CRM *": CRM_RELEASED,
+    **dict.fromkeys(("crm/*", "spatialseg/table2 *"), CRM_RELEASED),
+    "spatialseg/*": f"{CRM_RELEASED} {FIXED_COUNT}",
+}
+"""What the released form changes of a row; the first pattern of table and row that fits."""
+
+
+@cache
+def runs(name: str, form: Form, scale: str) -> Mapping[str, RunSpec]:
+    """The run of every row of a table that can be run, by its label, in the order of the table."""
+    table = TABLES[name]
+    return {row.label: run_of(table, row, form, scale) for row in table.runnable_rows}
+
+
+def run_of(table: Table, row: Row, form: Form, scale: str) -> RunSpec:
+    rooted = ("dataset.root=/data",) if scale == "paper" else ()
+    return specified((*table.overrides(row, scale, form), f"scale={scale}", *rooted))
+
+
+def difference(one: RunSpec, other: RunSpec) -> set[str]:
+    """Keys in which two runs differ; of a component of another class, its node alone."""
+    first, second = (
+        {
+            key: value
+            for key, value in flatten(run.plain).items()
+            if key.split(".")[0] not in IGNORED
+        }
+        for run in (one, other)
+    )
+    keys = {key for key in {*first, *second} if first.get(key) != second.get(key)}
+    replaced = sorted(key.removesuffix("._target_") for key in keys if key.endswith("._target_"))
+    return {
+        next((node for node in replaced if key == node or key.startswith(f"{node}.")), key)
+        for key in keys
+    }
+
+
+def check_difference(found: set[str], text: str, scale: str, what: str) -> None:
+    """Compare settings with their notation; a node stands for one or more of its settings."""
+    if text == ANOTHER:
+        assert any(key.startswith("model") for key in found), what
+        return
+    both, at_paper, at_demo, *_ = *text.split("|"), "", ""
+    words = f"{both} {at_paper if scale == 'paper' else at_demo}".split()
+    nodes = {key: [word for word in words if f"{key}.".startswith(f"{word}.")] for key in found}
+    assert {word for key in found for word in nodes[key] or [key]} == set(words), what
+
+
+# Rows of several releases differ in more than a row is about.
+SEVERAL = [(name, "released") for name in ("multihead/table3", "multihead/table4")]
+EVERY = [each for each in product(EXPECTED, FORMS) if each not in SEVERAL]
+
+
+@SCALES
+@pytest.mark.parametrize(("name", "form"), EVERY)
+def test_row_differs_from_the_row_above_in_intended_settings(
+    name: str, form: Form, scale: str
+) -> None:
+    found = runs(name, form, scale)
+    for above, label in zip(found, list(found)[1:], strict=False):
+        paper, _, released = EXPECTED[name].get(label, "Swin").partition(" // ")
+        text = released or paper if form == "released" else paper
+        text = SWIN[label.rpartition(" ")[2]] if text == "Swin" else text
+        check_difference(difference(found[label], found[above]), text, scale, label)
+
+
+@SCALES
+@pytest.mark.parametrize("name", [name for name in TABLES if name[0] in "cs"])
+def test_released_form_changes_the_intended_settings(name: str, scale: str) -> None:
+    paper, released = (runs(name, form, scale) for form in FORMS)
+    for row in (each for each in TABLES[name].runnable_rows if each.released is not None):
+        full = f"{name} {row.label}"
+        text = next(text for pattern, text in RELEASES.items() if fnmatch(full, pattern))
+        check_difference(difference(paper[row.label], released[row.label]), text, scale, full)
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_row_has_a_released_form_where_its_run_differs(name: str) -> None:
+    paper, released = (runs(name, form, "demo") for form in FORMS)
+    for row in TABLES[name].runnable_rows:
+        is_same = paper[row.label].key == released[row.label].key
+        assert is_same == (row.released is None), row.label
+
+
+@pytest.mark.parametrize("scale", ["demo", pytest.param("bench", marks=SLOW), "paper"])
+@pytest.mark.parametrize("name", [*TABLES, *study_names()])
+def test_rows_of_one_run_are_declared(name: str, scale: str) -> None:
+    """What a command checks of the tables of a user alone."""
+    extra = ("dataset.root=/data",) if scale == "paper" and name in TABLES else ()
+    for form in FORMS:
+        request = TableRequest(name, load_table(name), scale, (0,), extra, form=form)
+        check_equal_runs(request, Planner())
+
+
+def test_rows_declared_as_the_same_share_a_run_at_demo_scale() -> None:
+    pairs = [(name, row) for name, table in TABLES.items() for row in table.rows if row.same_as]
+    assert pairs
+    for name, row in pairs:
+        found = runs(name, "paper", "demo")
+        assert found[row.label].key == found[row.same_as or ""].key
+
+
+def upstream_names(run: RunSpec) -> set[str]:
+    """Names of all upstream runs, those of upstream runs included."""
+    return {each.name for each in run.upstream}.union(*map(upstream_names, run.upstream))
+
+
+def test_upstream_runs_of_released_rows_are_released() -> None:
+    """Earlier stages, and the teachers of pseudo-labels."""
+    found = {
+        f"{name} {row.label}": upstream_names(runs(name, "released", "demo")[row.label])
+        for name in ("multihead/table2", "multihead/table3", "multihead/table4")
+        for row in TABLES[name].runnable_rows
+        if row.released is not None
+    }
+    stage, teacher = "multi_head_{}_stage1_released".format, "thermal_teacher_semseg"
+    assert {key: names for key, names in found.items() if names} == {
+        "multihead/table2 HeatNet (reproduced)": {teacher},
+        "multihead/table2 HeatNet RGB-only (reproduced)": {"heatnet_released", teacher},
+        "multihead/table3 SH-Maximum squares loss": {"sh_max_squares_stage1_released"},
+        "multihead/table3 Multi-head*": {stage("thermal")},
+        "multihead/table3 HeatNet*": {teacher},
+        "multihead/table4 Multi-head": {teacher},
+        "multihead/table4 Multi-head*": {stage("night"), teacher},
+        "multihead/table4 Multi-head**": {stage("night_init"), stage("thermal"), teacher},
+        "multihead/table4 HeatNet RGB-only*": {"heatnet_released", teacher},
+    }
+
+
+# Table and row -> per stage batch size and steps of 12,170 pairs: 50 and 100 epochs.
+STARRED = {
+    ("multihead/table3", "Multi-head*"): ((16, 50 * 761), (16, 100 * 761)),
+    ("multihead/table4", "Multi-head*"): ((8, 50 * 1522), (8, 100 * 1522)),
+    ("multihead/table4", "Multi-head**"): ((16, 50 * 761), (16, 100 * 761)),
+}
+
+
+@pytest.mark.parametrize(("name", "label"), STARRED)
+def test_starred_rows_as_released_are_the_basic_network_in_two_stages(
+    name: str, label: str
+) -> None:
+    """The scripts import the basic network; the modified decoder is that of the paper's form."""
+    (row,) = (each for each in TABLES[name].rows if each.label == label)
+    paper, second = (run_of(TABLES[name], row, form, "paper") for form in FORMS)
+    assert paper.model.plain["decoder"] == "modified_heatnet"
+    (first,) = (each.run for each in second.dependencies if each.key == "model.weights")
+    for run, sizes, gradients in zip(
+        (first, second), STARRED[name, label], ("kept", "together"), strict=True
+    ):
+        assert run.model.plain["decoder"] == "basic"
+        assert list(run.model.plain["heads"]) == ["source", "target"]
+        assert (run.data.batch_size, run.trainer.max_steps) == sizes
+        assert run.scheme.plain["gradients"] == gradients
+
+
+NETWORKS = {
+    row.network: name for name, table in TABLES.items() for row in table.rows if row.network
+}
+MILLIONS = {
+    **{"cmx_b2": 66.57, "cmx_b4": 139.86, "rtfnet_50": 185.24, "cmnext_b4": 116.56},
+    **{"rtfnet_152": 254.51, "heatnet": 54.36, "heatnet_rgb": 53.32, "mfnet": 0.735},
+}
+"""Parameters as the releases have them, with the classes of the data set."""
+
+
+@pytest.mark.parametrize("network", NETWORKS, ids=" ".join)
+def test_network_for_weights_is_the_published_one(network: tuple[str, ...]) -> None:
+    words = ("scale=paper", *network, "dataset.root=/data")
+    run = specify_run(words)
+    papers = {"temporal": "mfnet", "multihead": "freiburg", "crm": "mfnet"}
+    expected = papers[NETWORKS[network].partition("/")[0]]
+    expected = "pst900" if "dataset=pst900" in network else expected
+    assert run.dataset.plain["name"] == expected
+    assert run.model.plain["num_classes"] == run.dataset.plain["num_classes"]
+    model = next(word for word in network if word.startswith("model=")).removeprefix("model=")
+    assert million_parameters(words) == pytest.approx(MILLIONS[model], rel=1e-3)
+    inputs = run.model.plain["inputs"]
+    if "cmx" in model:  # the public weights
+        assert (inputs["rgb_order"], run.model.plain["decoder_norm_eps_eval"]) == ("bgr", 1e-5)
