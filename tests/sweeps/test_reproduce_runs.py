@@ -56,11 +56,10 @@ rows:
 
 
 def test_failed_cells_have_a_reason_and_cost_nothing_else(data: Path, tmp_path: Path) -> None:
-    """Nor does a tracking server that is away."""
     (tmp_path / "ablation.yaml").write_text(BREAKING)
     (tmp_path / "broken.py").write_text(BROKEN)
     runs = tmp_path / "runs"
-    place = (f"dataset.root={data}", f"runs_dir={runs}", "tracking.uri=http://127.0.0.1:9")
+    place = (f"dataset.root={data}", f"runs_dir={runs}", "tracking=none")
     small = [word for word in SMALL if not word.startswith("masker.")]
     table = f"table={tmp_path / 'ablation.yaml'}"
     words = (table, "workers=2", "dataset=mfnet", *place, *small, *short(2))
@@ -74,7 +73,6 @@ def test_failed_cells_have_a_reason_and_cost_nothing_else(data: Path, tmp_path: 
     )
     assert done.returncode == 1, done.stderr[-3000:]
     assert "Traceback" not in done.stderr
-    assert "MLflow cannot be used" in done.stderr
     (file,) = (runs / "tables" / "my").glob("ablation_demo-*/table.md")
     for word in ("the loss has no shape for this", "SIGSEGV", "memory"):
         assert word in file.read_text()
