@@ -39,7 +39,7 @@ from sweeps.worker.progress import ProgressView, duration
 from sweeps.worker.run_store import RunStore, open_run_store
 from sweeps.worker.storage import find_study, open_storage, open_study
 from sweeps.worker.trial_sources import SamplerSource
-from sweeps.worker.trial_store import Owner, TrialStore, counted_trials
+from sweeps.worker.trial_store import TrialStore, counted_trials
 
 PATHS = ("runs_dir", "dataset.root", "dataset.cache_dir", "tracking")
 """Beginnings of overrides that may differ between two calls of the same sweep."""
@@ -210,7 +210,7 @@ def search(request: Search, settings: SweepSettings) -> None:
     study = open_study(request.study, storage, settings.objectives, attributes, sampler, pruner)
     if names.COMMAND not in study.user_attrs:
         study.set_user_attr(names.COMMAND, command_line(sys.orig_argv))
-    store = TrialStore(study, storage, Owner.this_process())
+    store = TrialStore(study, storage)
     info(f"study {request.study}: run the same command on other machines to share it.")
 
     def num_done() -> int:

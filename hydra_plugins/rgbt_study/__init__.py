@@ -40,9 +40,6 @@ class StudySweeper(Sweeper):
         """
         assert self.hydra_context is not None, "Hydra calls setup() before sweep()"
         assert self.config is not None, "as above"
-        from sweeps.worker.executors import limit_spinning
-
-        limit_spinning(2 if self.config.hydra.sweeper.get("workers") != 1 else 1)
         from sweeps.sweep import sweep
 
         sweep(arguments, self.config, self.hydra_context.config_loader)

@@ -33,7 +33,7 @@ from sweeps.point import Outcome, Point
 from sweeps.table.cells import OWN_COUNTS, evaluation_of, is_counted
 from sweeps.table.request import TableRequest
 from sweeps.table.table import Row, Table
-from sweeps.worker.command_process import run_command
+from sweeps.worker.processes import run_command
 
 FOLDER = "external"  # Folder inside the folder of runs
 

@@ -34,11 +34,7 @@ class PlannedPoint:
 
 
 def specify_run(overrides: Sequence[str]) -> RunSpec:
-    """The specification of one run.
-
-    Raises:
-        InputError: Hydra or a component refuses an override, in the words of the command line.
-    """
+    """The specification of one run; InputError in the words of the command line."""
     with composing(overrides):
         return specify(compose(overrides), overrides)
 
@@ -56,56 +52,38 @@ class Planner:
         self._specified: dict[tuple[str, ...], RunSpec] = {}
 
     def plan(self, point: Point) -> PlannedPoint:
-        """Compose and check all runs of `point`.
-
-        Raises:
-            InputError: a configuration or a data set that does not fit, in one sentence.
-        """
+        """Compose and check all runs of `point`; InputError where something does not fit."""
         runs = tuple(self.specify((*self.base, *overrides)) for overrides in point.runs())
-        fingerprints = {run.key: self.fingerprint(run) for run in runs}
         key = runs[0].key
         if len(runs) > 1 or point.evaluations:
-            evaluations = [_identity(evaluation) for evaluation in point.evaluations]
-            parts = [[run.key for run in runs], evaluations]
+            defaults = vars(ExtraEvaluation())
+            changed = [
+                {name: value for name, value in vars(each).items() if value != defaults[name]}
+                for each in point.evaluations
+            ]
+            parts = [[run.key for run in runs], changed]
             key = hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:12]
         label = with_pixels(point.label, runs[0].scale.pixel_factor)
+        fingerprints = {run.key: self.fingerprint(run) for run in runs}
         return PlannedPoint(replace(point, label=label), key, runs, fingerprints)
 
     def fingerprint(self, run: RunSpec) -> str:
-        """The fingerprint of the data set of a run.
-
-        Raises:
-            InputError: a data set that does not fit, or that has no image.
-        """
+        """The fingerprint of the data set of a run; InputError for one without an image."""
         name = json.dumps(run.dataset.plain, sort_keys=True)
         if name not in self._fingerprints:
             dataset: Any = run.dataset.build()
             if not any(dataset.has(split) for split in dataset.splits):
                 paths = ", ".join(dict.fromkeys(dataset.splits.values()))
-                raise InputError(
-                    f"{dataset.root} contains none of the lists or files {paths} of the data set; "
-                    "set dataset.root=... to its folder"
-                )
+                raise InputError(f"dataset.root={dataset.root}: it has none of the files {paths}.")
             self._fingerprints[name] = str(dataset.fingerprint())
         return self._fingerprints[name]
 
     def specify(self, overrides: tuple[str, ...]) -> RunSpec:
-        """The specification of one run; seeds of the same run are composed once.
-
-        Raises:
-            InputError: see `specify_run`.
-        """
+        """The specification of one run; seeds of the same run are composed once."""
         *others, last = overrides
         seed = last.removeprefix("seed=")
         is_seed = seed != last and seed.isdecimal()
         same = tuple(others) if is_seed else overrides
         if same not in self._specified:
             self._specified[same] = specify_run(overrides)
-        found = self._specified[same]
-        return found.with_seed(int(seed)) if is_seed else found
-
-
-def _identity(evaluation: ExtraEvaluation) -> dict[str, object]:
-    """The attributes of an evaluation that keys of points hold."""
-    defaults = vars(ExtraEvaluation())
-    return {name: value for name, value in vars(evaluation).items() if value != defaults[name]}
+        return self._specified[same].with_seed(int(seed)) if is_seed else self._specified[same]

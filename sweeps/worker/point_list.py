@@ -2,40 +2,35 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from statistics import median
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from rgbt.checks import InputError, RunError
+from rgbt.config.stored_config import check_targets, parse_trust
+from rgbt.runs.naming import VARIED
+from rgbt.runs.result import RunResult
 from sweeps import attributes as names
-from sweeps.point import UNFINISHED, Outcome, Point
+from sweeps.point import COLOUR, UNFINISHED, Outcome, Point, State, colour, varied_keys
 from sweeps.settings import SweepSettings
 from sweeps.worker.driver import drive
-from sweeps.worker.planned_points import PlannedPoints
 from sweeps.worker.planner import PlannedPoint, Planner
-from sweeps.worker.progress import ProgressView
+from sweeps.worker.progress import ProgressView, bars
 from sweeps.worker.run_store import RunStore
 from sweeps.worker.storage import find_study, open_storage, open_study
-from sweeps.worker.trial_sources import (
-    ListSource,
-    finished_runs,
-    is_evaluated,
-    outcome_of,
-    reason_of,
-)
-from sweeps.worker.trial_store import Owner, TrialStore, counted_trials, trials_by_key
+from sweeps.worker.trial_sources import ClaimedTrial, trial_attributes
+from sweeps.worker.trial_store import TrialStore, counted_trials, trials_by_key
 
-PLANNED_FIRST_S = 2.0
-"""Seconds of planning before the first run of a grid starts; about 100 points."""
+if TYPE_CHECKING:
+    from optuna.trial import FrozenTrial
 
 
 @dataclass(frozen=True)
 class PointList:
-    """A named list of points.
+    """A list of points, run as the study of that name.
 
     Attributes:
-        study: its name.
         title: shown above the progress.
         kind: "grid" or "list".
         runs: finished runs; the points' overrides name the same folder.
@@ -54,46 +49,172 @@ class PointList:
     more: Callable[[Sequence[Outcome]], Sequence[Point]] | None = None
 
 
-def other_code_line(outcomes: Sequence[Outcome]) -> str:
-    """How many runs other code made, in a sentence; "" for none."""
-    results = {result.key: result for outcome in outcomes for result in outcome.results}
-    others = sum(result.other_code is not None for result in results.values())
-    if not others:
-        return ""
-    return (
-        f"{others} of {len(results)} runs were made by other code; fresh=true retrains them "
-        "and keeps the old runs."
-    )
+class ListSource:
+    """Plans the points of a list, and claims them in their order; `store` is set in between.
+
+    With `strict`, one wrong point is refused, and not only a list of wrong points.
+    """
+
+    requeues, rejected = False, 0
+    store: TrialStore
+
+    def __init__(
+        self,
+        points: PointList,
+        settings: SweepSettings,
+        planner: Planner | None = None,
+        *,
+        strict: bool = False,
+    ) -> None:
+        self._list, self._settings, self._strict = points, settings, strict
+        self._planner = planner or Planner(points.base)
+        self._points: list[Point] = []
+        self._plans: dict[int, PlannedPoint] = {}
+        self._errors: dict[int, str] = {}
+        self._same: dict[str, list[int]] = {}
+        """Indices of equal points, by key; the first one is run."""
+        self._forgiven: set[int] | None = None
+        self._finished: dict[str, tuple[RunResult, ...]] = {}
+        self._add(points.points)
+
+    def _add(self, points: Sequence[Point]) -> bool:
+        """Add and plan points; whether there are more different ones than before."""
+        before, first = len(self._same), len(self._points)
+        self._points += points
+        with bars() as shown:
+            title = f"{self._list.title}: planning"
+            for index, point in enumerate(shown.track(points, description=title), first):
+                self._plan(index, point)
+        if self._errors and (self._strict or not self._plans):
+            # An error of every point is one of the command and not of a point.
+            index, reason = next(iter(self._errors.items()))
+            raise InputError(f"{self._points[index].label}: {reason}" if self._plans else reason)
+        varied = " ".join(varied_keys(self._points))
+        for number, indices in enumerate(self._same.values()):
+            # Points of the same run in other words (1 and 1.0) get the tags of all of them.
+            tags: dict[str, dict[str, None]] = {}
+            for name, value in (pair for i in indices for pair in self._points[i].tags.items()):
+                tags.setdefault(name, {})[value] = None
+            merged = {name: " | ".join(values) for name, values in tags.items()}
+            merged |= {VARIED: varied, COLOUR: colour(self._list.study, number)}
+            for index in indices:
+                plan = self._plans[index]
+                self._plans[index] = replace(plan, point=replace(plan.point, tags=merged))
+        return len(self._same) > before
+
+    def _plan(self, index: int, point: Point) -> None:
+        try:
+            plan = self._planner.plan(point)
+            for run in plan.runs if point.evaluations else ():
+                check_targets(run.plain, parse_trust(self._settings.trust), point.label)
+        except InputError as error:
+            self._errors[index] = str(error)
+        else:
+            self._plans[index] = plan
+            self._same.setdefault(plan.key, []).append(index)
+
+    def next(self) -> ClaimedTrial | None:
+        """See `TrialSource.next`."""
+        more, claimed = self._list.more, self._claim()
+        # Points that were added before this command was stopped are finished: others follow them.
+        while claimed is None and more and self._add(more(self.outcomes())):
+            claimed = self._claim()
+        return claimed
+
+    def _claim(self) -> ClaimedTrial | None:
+        by_key = self.store.by_key()
+        known = self._list.distributions or {}
+        for plan in self._different():
+            if self.status(plan, by_key).state != "waiting":
+                continue
+            params = {k: v for k, v in plan.point.params.items() if k in known}
+            # Failed trials of the point, and those whose runs were deleted.
+            replaced = [trial.number for trial in by_key.get(plan.key, ())]
+            own = {name: known[name] for name in params}
+            number = self.store.claim(trial_attributes(plan), params, own, replaced)
+            if number is not None:
+                return ClaimedTrial(plan, number)
+        return None
+
+    def is_exhausted(self, *, wait: bool) -> bool:
+        """See `TrialSource.is_exhausted`."""
+        states = self.states()
+        return "waiting" not in states and not (wait and "running" in states)
+
+    def states(self) -> list[State]:
+        """The states of the different points."""
+        by_key = self.store.by_key()
+        return [self.status(plan, by_key).state for plan in self._different()]
+
+    def outcomes(self, status: Callable[[PlannedPoint], Outcome] | None = None) -> list[Outcome]:
+        """One outcome per point, in order; by the study, or by `status`."""
+        by_key = {} if status else self.store.by_key()
+        status = status or (lambda plan: self.status(plan, by_key))
+        return [
+            Outcome(point, "failed", self._errors[index])
+            if index in self._errors
+            else status(self._plans[index])
+            for index, point in enumerate(self._points)
+        ]
+
+    def _different(self) -> Iterator[PlannedPoint]:
+        return (self._plans[indices[0]] for indices in self._same.values())
+
+    def status(self, plan: PlannedPoint, by_key: Mapping[str, list[FrozenTrial]]) -> Outcome:
+        """The state of a point by the study and the finished runs."""
+        if self._forgiven is None:
+            before = sum(by_key.values(), []) if self._settings.retry == "failed" else []
+            self._forgiven = {trial.number for trial in before if trial.state.name == "FAIL"}
+        trials = by_key.get(plan.key, ())
+        states = {trial.state.name for trial in trials}
+        if "COMPLETE" in states and plan.key not in self._finished:
+            results = finished_runs(plan, self._list.runs)
+            if is_evaluated(plan, results):
+                self._finished[plan.key] = results
+        failed = [trial for trial in trials if trial.state.name == "FAIL"]
+        counted = [trial for trial in failed if trial.number not in self._forgiven]
+        outcome = Outcome(plan.point, "waiting", keys=tuple(run.key for run in plan.runs))
+        if plan.key in self._finished:
+            return replace(outcome, state="finished", results=self._finished[plan.key])
+        if "RUNNING" in states:
+            return replace(outcome, state="running")
+        if len(counted) > self._settings.retries:
+            reason = str(counted[-1].user_attrs[names.REASON])
+            return replace(outcome, state="failed", reason=reason)
+        return outcome
+
+
+def finished_runs(plan: PlannedPoint, runs: RunStore) -> tuple[RunResult, ...]:
+    """The runs of a point if all are finished, evaluated or not; () otherwise."""
+    try:
+        found = [runs.find(run.key, plan.fingerprints[run.key]) for run in plan.runs]
+    except RunError:  # raised again when the point is executed
+        return ()
+    results = tuple(result for result in found if result is not None)
+    return results if len(results) == len(found) else ()
+
+
+def is_evaluated(plan: PlannedPoint, results: Sequence[RunResult]) -> bool:
+    """Whether there are runs, and all further evaluations of them."""
+    wanted = plan.point.evaluations
+    return bool(results) and all(each.is_stored(result) for result in results for each in wanted)
 
 
 def preview_points(
     points: PointList, settings: SweepSettings, planner: Planner | None = None
 ) -> list[Outcome]:
-    """The present state of the points; nothing is run and nothing written.
-
-    Args:
-        points: to preview.
-        settings: of their execution.
-        planner: with the same `base`, shared by several lists; None: one of this list alone.
-    """
-    planned = _planned(points, planner)
-    planned.plan_and_show(points.title)
+    """The present state of the points; nothing is run and nothing written."""
+    source = ListSource(points, settings, planner)
     study = find_study(points.study, settings.storage, points.runs.runs_dir)
     trials = trials_by_key(() if study is None else counted_trials(study))
 
     def status(plan: PlannedPoint) -> Outcome:
-        results = finished_runs(plan, points.runs) or ()
-        if results and is_evaluated(plan, results):
-            return outcome_of(plan, "finished", results=results)
-        same = trials.get(plan.key, [])
-        states = [trial.state.name for trial in same]
-        if "RUNNING" in states:
-            return outcome_of(plan, "running")
-        if states and states[-1] == "FAIL":
-            return outcome_of(plan, "failed", reason_of(same[-1]), results)
-        return outcome_of(plan, "waiting", results=results)
+        results = finished_runs(plan, points.runs)
+        known = source.status(plan, trials)
+        state: State = "finished" if is_evaluated(plan, results) else known.state
+        return replace(known, state=state, results=results)
 
-    return planned.outcomes(status)
+    return source.outcomes(status)
 
 
 def run_points(
@@ -105,61 +226,22 @@ def run_points(
 ) -> list[Outcome]:
     """Run all unfinished points; a failed point does not stop the others. Outcomes in their order.
 
-    Args:
-        points: their overrides.
-        settings: of execution.
-        planner: that has planned some of them already; None: a new one.
-        strict: refuse a point with a wrong configuration. All points that are planned in the first
-            `PLANNED_FIRST_S` seconds are checked before a run starts. The others are planned while
-            the first runs train; if one of them is wrong, these runs are stopped and resume in the
-            next call.
-
     Raises:
-        InputError: the storage or the executor cannot be used, all points are wrong, or with
-            `strict` one of them.
+        InputError: the storage or the executor cannot be used, all points have a wrong
+            configuration, or with `strict` one of them.
     """
-    planned = _planned(points, planner, strict=strict)
-    planned.plan_and_show(points.title, PLANNED_FIRST_S if strict else math.inf)
-    runs = points.runs
-    storage = open_storage(settings.storage, runs.runs_dir)
-    runs.create_tables()
+    source = ListSource(points, settings, planner, strict=strict)
+    storage = open_storage(settings.storage, points.runs.runs_dir)
     study = open_study(points.study, storage, settings.objectives, {names.KIND: points.kind})
-    store = TrialStore(study, storage, Owner.this_process())
-    plans = list(planned.plans.values())
-    source = ListSource(plans, store, runs, settings, points.distributions or {})
-
-    def outcomes() -> list[Outcome]:
-        trials = store.by_key()
-        return planned.outcomes(lambda plan: source.status(plan, trials))
+    source.store = TrialStore(study, storage)
 
     def num_done() -> int:
-        return sum(status.state in ("finished", "failed") for status in source.statuses())
+        return sum(state in ("finished", "failed") for state in source.states())
 
-    view = ProgressView(points.title, len(source.plans), settings.workers, num_done)
-
-    def plan_more(seconds: float) -> list[PlannedPoint] | None:
-        if not planned.num_left:
-            return None
-        added = planned.plan(seconds)
-        view.planned(planned.num_runs, planned.num_left)
-        return added
-
-    def more() -> list[PlannedPoint]:
-        planned.append(points.more(outcomes()) if points.more else [])
-        added = planned.plan()
-        if added:
-            view.added([plan.point.label for plan in added])
-        return added
-
-    source.plan_more, source.more = plan_more, more
-    view.planned(planned.num_runs, planned.num_left)
-    drive(view, source, store, runs, settings)
-    return outcomes()
-
-
-def _planned(points: PointList, planner: Planner | None, *, strict: bool = False) -> PlannedPoints:
-    planner = planner or Planner(points.base)
-    return PlannedPoints(points.study, points.points, planner, strict=strict)
+    total = lambda: len(source.states())  # noqa: E731
+    view = ProgressView(points.title, total, settings.workers, num_done)
+    drive(view, source, source.store, points.runs, settings)
+    return source.outcomes()
 
 
 def estimated_seconds(outcomes: Sequence[Outcome], workers: int) -> float | None:
@@ -167,3 +249,11 @@ def estimated_seconds(outcomes: Sequence[Outcome], workers: int) -> float | None
     durations = [outcome.seconds for outcome in outcomes if outcome.seconds is not None]
     missing = sum(outcome.state in UNFINISHED and not outcome.is_trained for outcome in outcomes)
     return missing * median(durations) / workers if durations else None
+
+
+def other_code_line(outcomes: Sequence[Outcome]) -> str:
+    """How many runs other code made, in a sentence; "" for none."""
+    results = {result.key: result for outcome in outcomes for result in outcome.results}
+    others = sum(result.other_code is not None for result in results.values())
+    made = f"{others} of {len(results)} runs were made by other code; fresh=true retrains them"
+    return f"{made} and keeps the old runs." if others else ""

@@ -1,17 +1,34 @@
-"""Imported last by the process that all runs of a sweep are forked from: records its code.
+"""Imported by the fork server alone: the modules of rgbt, and a record of the code of all of them.
 
-The runs then have the digests of the code that they execute, even if files are edited meanwhile.
+The runs then execute, and record, the code of this moment, even if files are edited meanwhile.
 """
 
+import gc
+import importlib
+import pkgutil
+
+import rgbt
+from rgbt.config.compose import compose
 from rgbt.runs.provenance import code, packages
 from rgbt.runs.source_code import loaded_modules, user_code
 
+PROGRAMS = ("rgbt.run", "rgbt.evaluate", "rgbt.consistency", "rgbt.api")
+"""Not imported before: what runs execute as programs, a few lines each, or do not use."""
 
-def record_code() -> None:
-    """Keep the digests of all modules imported until now, and the versions of packages."""
-    code()
-    packages()
-    user_code(f"{module}.any" for module in loaded_modules())
+LIBRARIES = (
+    *("torch", "hydra", "scipy.optimize", "sweeps.worker.processes"),
+    *("mlflow", "mlflow.store.tracking.sqlalchemy_store"),
+)
 
-
-record_code()
+gc.disable()  # nothing that is imported here is garbage
+for _library in LIBRARIES:
+    importlib.import_module(_library)
+for _module in pkgutil.walk_packages(rgbt.__path__, "rgbt."):
+    if _module.name not in PROGRAMS and not _module.name.endswith("__main__"):
+        importlib.import_module(_module.name)
+code()
+packages()
+user_code(f"{name}.any" for name in loaded_modules())
+compose(["+experiment=grbm"])  # for what Hydra keeps: its plugins and its grammar
+gc.freeze()  # nor need the collector of a run visit it
+gc.enable()

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-import signal
+import os
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import fmean
@@ -16,9 +17,8 @@ from rgbt.runs.folder import MetricLine, is_finished
 from rgbt.runs.result import RunResult
 from rgbt.runs.run_spec import RunSpec
 from sweeps.evaluation import ExtraEvaluation
-from sweeps.worker.executors import GRACE_S, Job
 from sweeps.worker.planner import PlannedPoint
-from sweeps.worker.run_monitor import MetricsReader, failure_reason, signal_lock_holder
+from sweeps.worker.processes import Job, failure_reason
 from sweeps.worker.run_store import RunStore
 
 LOGS = ".logs"
@@ -39,17 +39,45 @@ class TrialPruned(Exception):  # noqa: N818 - not an error, Optuna's name for it
     """The trial was pruned; the message names the step."""
 
 
+class MetricsReader:
+    """Reads ``metrics.jsonl`` of a run as it grows; the run folder need not exist yet."""
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / "metrics.jsonl"
+        self._inode, self._offset = -1, 0
+        self.step = 0
+        """Last step seen."""
+
+    def new_lines(self) -> list[MetricLine]:
+        """Whole lines since the last call; all of them again where the run has resumed."""
+        try:
+            with self._path.open("rb") as file:
+                inode = os.fstat(file.fileno()).st_ino
+                if inode != self._inode:  # a run that resumes writes the file anew
+                    self._inode, self._offset = inode, 0
+                file.seek(self._offset)
+                whole, newline, _ = file.read().rpartition(b"\n")
+        except FileNotFoundError:
+            return []
+        self._offset += len(whole) + len(newline)
+        lines: list[MetricLine] = []
+        with suppress(ValueError):  # the run itself reports a damaged line when it resumes
+            lines = MetricLine.read_all(whole.splitlines())
+        self.step = lines[-1].step if lines else self.step
+        return lines
+
+
 @dataclass(eq=False)
 class RunningTrial:
     """Executes one trial; never blocks.
 
     Attributes:
-        runs: finished runs.
-        start: starts processes.
         timeout_s: of a run; None for no limit.
         report: called with every validation of the first run, or None.
+        trust: as ``trust=`` of the commands that open a finished run.
         status: its present activity, in a few words.
         score: last mIoU on the selection split, a fraction.
+        log: output of its last process.
     """
 
     plan: PlannedPoint
@@ -58,14 +86,14 @@ class RunningTrial:
     start: Start
     timeout_s: float | None = None
     report: PruningCallback | None = None
+    trust: str = ""
     status: str = field(default="starting", init=False)
     score: float = field(default=math.nan, init=False)
+    log: Path | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         self._began = time.monotonic()
         self._job: Job | None = None
-        self._adopted: Path | None = None
-        self._index = 0
         self._metrics = MetricsReader(Path())
         self._results: tuple[RunResult, ...] = ()
         self._end: Exception | None = None
@@ -76,9 +104,9 @@ class RunningTrial:
     @property
     def done_share(self) -> float:
         """Steps done of all steps of the trial, 0..1."""
-        run = self.plan.runs[min(self._index, len(self.plan.runs) - 1)]
-        done = self._index + min(1.0, self._metrics.step / run.trainer.max_steps)
-        return min(1.0, done / len(self.plan.runs))
+        index, count = len(self._results), len(self.plan.runs)
+        run = self.plan.runs[min(index, count - 1)]
+        return min(1.0, (index + min(1.0, self._metrics.step / run.trainer.max_steps)) / count)
 
     @property
     def seconds(self) -> float:
@@ -92,8 +120,7 @@ class RunningTrial:
             TrialError: a run failed.
             TrialPruned: the callback asked for it; the process has ended.
         """
-        # A driver calls again where the storage could not record the end.
-        if self._end is not None:
+        if self._end is not None:  # a driver calls again where the storage could not record the end
             raise self._end
         self._report_lines()
         try:
@@ -101,26 +128,21 @@ class RunningTrial:
         except StopIteration:
             self._report_lines()
             return self._results
-        except (TrialError, TrialPruned) as end:
-            self._end = end
-            raise
-        except RunError as error:
-            self._end = TrialError(str(error))
-            raise self._end from error
+        except (TrialError, TrialPruned, RunError) as end:
+            self._end = TrialError(str(end)) if isinstance(end, RunError) else end
+            raise self._end from end
         self._report_lines()
         return None
 
     def _report_lines(self) -> None:
         """Report new lines; not in the generator, which an error of the storage would end."""
-        while self._unreported and not self._prune_reason:
-            assert self.report is not None, "lines are kept for a callback alone"
+        while self._unreported and not self._prune_reason and self.report is not None:
             self._prune_reason = self.report(self._unreported[0])
             del self._unreported[0]
 
     def stop(self) -> None:
         """End the process of this trial, if any; its run resumes from its checkpoint later."""
-        if not self.is_stopped():
-            assert self._job is not None, "a trial that is not stopped has a process"
+        if self._job is not None and self._job.poll() is None:
             self._job.stop()
 
     def is_stopped(self) -> bool:
@@ -128,8 +150,7 @@ class RunningTrial:
         return self._job is None or self._job.poll() is not None
 
     def _execute(self) -> Iterator[None]:
-        for index, run in enumerate(self.plan.runs):
-            self._index = index
+        for run in self.plan.runs:
             result = self.runs.find(run.key, self.plan.fingerprints[run.key])
             if result is None:
                 yield from self._train(run)
@@ -141,9 +162,9 @@ class RunningTrial:
                 )
             self.runs.tag(result, self.plan.point.tags)
             for evaluation in self.plan.point.evaluations:
-                yield from self._evaluate(run, result, evaluation)
+                if not evaluation.is_stored(result):
+                    yield from self._evaluate(run, result, evaluation)
             self._results = (*self._results, result)
-        self._index = len(self.plan.runs)
 
     def _train(self, run: RunSpec) -> Iterator[None]:
         folder = self.runs.runs_dir / run.key
@@ -153,24 +174,19 @@ class RunningTrial:
             if is_held(folder / "lock"):
                 # A killed driver left it running, or it was started by hand. Its result is used
                 # when it finishes; otherwise the run resumes from its checkpoint.
-                self._adopted = folder
                 self.status = "adopted"
                 yield from self._wait(lambda: 0 if not is_held(folder / "lock") else None)
-                self._adopted = None
                 continue
             self.status = "training"
-            code, reason = yield from self._run(("rgbt.run", *run.overrides), run.key)
-            if code == 0:
+            reason = yield from self._run(("rgbt.run", *run.overrides), run.key)
+            if reason is None:
                 return
-            finished = is_finished(folder)
-            if not finished and not is_held(folder / "lock"):
-                raise TrialError(reason())
+            if not is_finished(folder) and not is_held(folder / "lock"):
+                raise TrialError(reason)
 
     def _evaluate(
         self, run: RunSpec, result: RunResult, evaluation: ExtraEvaluation
     ) -> Iterator[None]:
-        if evaluation.is_stored(result):
-            return
         if result.run_id:
             if self.runs.fetch_counts(result, evaluation):
                 return
@@ -186,56 +202,45 @@ class RunningTrial:
         command = (
             *(module, f"run={result.folder}", *arguments),
             out if evaluation.frames is None else f"runs_dir={result.folder.parent}",
+            *([f"trust={self.trust}"] if self.trust else []),
             # The run may come from a machine with another data folder.
             *(word for word in run.overrides if word.startswith("dataset.root=")),
         )
-        code, reason = yield from self._run(command, result.key)
-        if code != 0 or not evaluation.is_stored(result):
-            raise TrialError(reason())
+        reason = yield from self._run(command, result.key)
+        if reason is not None or not evaluation.is_stored(result):
+            raise TrialError(reason or f"it wrote no {evaluation.path}")
         self.runs.sync(result)
 
-    def _run(
-        self, command: Sequence[str], key: str
-    ) -> Generator[None, None, tuple[int, Callable[[], str]]]:
-        """Run a command to its exit code, and a function that reads from its log why it failed."""
-        log = self.runs.runs_dir / LOGS / f"{key}.log"
+    def _run(self, command: Sequence[str], key: str) -> Generator[None, None, str | None]:
+        """Run a command to its end; why it failed, or None."""
+        self.log = log = self.runs.runs_dir / LOGS / f"{key}.log"
         begin = log.stat().st_size if log.exists() else 0
         try:
             self._job = self.start(command, log)
         except OSError as error:
             raise TrialError(f"its process could not be started ({error})") from error
         code = yield from self._wait(self._job.poll)
-        return code, lambda: failure_reason(code, log, begin)
+        return failure_reason(code, log, begin) if code else None
 
     def _wait(self, poll: Callable[[], int | None]) -> Generator[None, None, int]:
         """Wait for an exit code, and read the metrics of the run meanwhile."""
-        limit = self.timeout_s
-        began = time.monotonic()
+        until = math.inf if self.timeout_s is None else time.monotonic() + self.timeout_s
         while True:
             code = poll()
             lines = [line for line in self._metrics.new_lines() if line.kind == "val"]
             if lines:
                 self.score = lines[-1].values.get("mIoU", math.nan)
-            if self.report is not None and self._index == 0:
+            if self.report is not None and not self._results:
                 self._unreported += lines
             if code is not None:
                 return code
-            if self._prune_reason:
-                yield from self._terminate(poll)
-                raise TrialPruned(self._prune_reason)
-            if limit is not None and time.monotonic() - began > limit:
-                yield from self._terminate(poll)
-                raise TrialError(f"stopped after {limit / 60:g} minutes (timeout_minutes)")
-            yield
-
-    def _terminate(self, poll: Callable[[], int | None]) -> Iterator[None]:
-        if self._adopted is not None:
-            signal_lock_holder(self._adopted, signal.SIGTERM)
-        self.stop()
-        kill_at = time.monotonic() + GRACE_S
-        while poll() is None:
-            if self._adopted is not None and time.monotonic() > kill_at:
-                signal_lock_holder(self._adopted, signal.SIGKILL)
+            if self._prune_reason or time.monotonic() > until:
+                self.stop()  # an adopted run continues
+                while not self.is_stopped():
+                    yield
+                if self._prune_reason:
+                    raise TrialPruned(self._prune_reason)
+                raise TrialError("stopped after timeout_minutes")
             yield
 
 

@@ -1,4 +1,4 @@
-"""The storage of studies: a journal file, SQLite, or PostgreSQL for several machines."""
+"""The storage of studies: SQLite, or PostgreSQL for several machines."""
 
 from __future__ import annotations
 
@@ -9,118 +9,91 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from rgbt.checks import InputError, nearest, one_line
+from rgbt.checks import InputError, nearest
 from rgbt.runs.provenance import without_passwords
 from sweeps import attributes as names
 from sweeps.settings import Objective
 
 if TYPE_CHECKING:
     import optuna
+    from optuna.trial import FrozenTrial
 
 Opened = TypeVar("Opened")
 
-JOURNAL = "studies.journal"
 NAME = r"[\w\-. :/]+"
 """Pattern of the name of a study or a table: it is part of MLflow tags."""
 
-SCHEMES = ("sqlite", "postgresql", "postgres")
-ATTEMPTS = 8
-PAUSE_S = 0.7
-FIXED = {
-    names.METRICS: "other objectives",
-    names.KIND: "points of another kind",
-    names.SIGNATURE: "another space or other overrides",
-}
-"""Attributes of a study that must not change, and how messages name a change."""
+HEARTBEAT_S, STALE_S = 20, 120
+"""Seconds between two heartbeats of a trial, and without one until it is lost."""
 
-UNREACHABLE = ("connection refused", "could not translate", "authentication", "does not exist")
-"""Words of errors of a connection that no later attempt cures."""
+ATTEMPTS, PAUSE_S = 8, 0.7
+FINAL = ("refused", "could not translate", "authentication", "unable to open", "parse", "plugin")
+"""Words of errors that no later attempt cures."""
 
 
-def open_storage(storage: str | None, runs_dir: Path) -> optuna.storages.BaseStorage:
-    """Open the storage; create it if it does not exist.
-
-    Args:
-        storage: None for the journal file ``<runs_dir>/studies.journal``; a path that ends in
-            .journal; or a database: sqlite:///file.db, postgresql://user@host/name (psycopg 3; the
-            password belongs in ~/.pgpass).
-        runs_dir: the folder of runs.
-
-    Raises:
-        InputError: the storage cannot be opened, or a package for it is missing.
-    """
-    import optuna
-    from optuna.storages.journal import JournalFileBackend
-
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
-    url = _checked(storage, runs_dir)
-    if not url.endswith(".journal"):
-        return _retry(lambda: _database(url), url)
-    path = Path(url).expanduser().resolve()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        return optuna.storages.JournalStorage(JournalFileBackend(str(path)))
-    except (OSError, MemoryError):
-        raise
-    except Exception as error:  # The border to Optuna, which assumes a whole journal.
-        raise InputError(
-            f"storage={path} is damaged ({type(error).__name__}: {one_line(error)}); restore it "
-            "from a copy, or remove it: finished runs are reused, other trials restart."
-        ) from error
-
-
-def _checked(storage: str | None, runs_dir: Path) -> str:
-    """The address of the storage; refused if it has none of the forms, or no folder."""
-    url = str(runs_dir / JOURNAL) if storage is None else storage
-    scheme = url.partition("://")[0].partition("+")[0]
-    if not url.endswith(".journal") and ("://" not in url or scheme not in SCHEMES):
-        raise InputError(
-            f"storage={without_passwords(url)}: expected a file that ends in .journal, "
-            "sqlite:///FILE or postgresql://USER@HOST/NAME."
-        )
-    if url.startswith("sqlite:///") and not Path(url.removeprefix("sqlite:///")).parent.is_dir():
-        raise InputError(f"storage={url}: its folder does not exist; create it first.")
-    return url
+def _url(storage: str | None, runs_dir: Path) -> str:
+    url = storage or f"sqlite:///{runs_dir / 'studies.db'}"
+    # SQLAlchemy before 2.1 takes a bare postgresql:// for psycopg2, which we do not install.
+    return re.sub(r"^postgres(ql)?://", "postgresql+psycopg://", url)
 
 
 def storage_file(url: str) -> Path | None:
     """The file of a storage; None for a database server."""
     path = url.removeprefix("sqlite:///")
-    return None if "://" in path else Path(path).expanduser()
+    return None if "://" in path else Path(path)
 
 
-def _database(url: str, *, create: bool = True) -> optuna.storages.RDBStorage:
+def open_storage(storage: str | None, runs_dir: Path) -> optuna.storages.RDBStorage:
+    """Open the storage; create it if it does not exist.
+
+    Args:
+        storage: None for the file ``<runs_dir>/studies.db``; or sqlite:///FILE, or
+            postgresql://USER@HOST/NAME (psycopg 3; the password belongs in ~/.pgpass).
+        runs_dir: the folder of runs.
+    """
     import optuna
 
-    scheme, mark, rest = url.partition("://")
-    if scheme in ("postgresql", "postgres"):
-        # SQLAlchemy before 2.1 takes a bare postgresql:// for psycopg2, which we do not install.
-        url = f"postgresql+psycopg{mark}{rest}"
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    warnings.filterwarnings("ignore", category=optuna.exceptions.ExperimentalWarning)
+    warnings.filterwarnings("ignore", message="Heartbeat of storage")  # for optimize(), it says
+    url = _url(storage, runs_dir)
+    if storage is None:
+        runs_dir.mkdir(parents=True, exist_ok=True)
     # A firewall may cut a connection that is idle while a run trains for hours.
-    options = {"pool_pre_ping": True}
-    return optuna.storages.RDBStorage(url, engine_kwargs=options, skip_table_creation=not create)
+    options: dict[str, Any] = {"pool_pre_ping": True}
+    if url.startswith("sqlite"):
+        options["connect_args"] = {"timeout": 60.0}
+    return _retry(
+        lambda: optuna.storages.RDBStorage(
+            url,
+            options,
+            heartbeat_interval=HEARTBEAT_S,
+            grace_period=STALE_S,
+            heartbeat_stale_trial_callback=enqueue_again,
+        ),
+        f"storage={url}",
+    )
 
 
-def _retry(opening: Callable[[], Opened], url: str) -> Opened:
+def enqueue_again(study: optuna.Study, trial: FrozenTrial) -> None:
+    """Enqueue a lost trial of a search whose point was noted; a list claims the point itself."""
+    from optuna.storages import RetryHeartbeatStaleTrialCallback
+
+    is_search = study.user_attrs.get(names.KIND) == "search"
+    if is_search and names.LABEL in trial.user_attrs and names.REASON not in trial.user_attrs:
+        RetryHeartbeatStaleTrialCallback()(study, trial)
+
+
+def _retry(opening: Callable[[], Opened], what: str) -> Opened:
     """Retry: of two processes that create the tables of a new database at once, one may fail."""
-    import sqlalchemy.exc
-
-    shown = without_passwords(url)
     for attempt in range(ATTEMPTS):
         try:
             return opening()
-        except ImportError as error:
-            raise InputError(
-                f"storage={shown}: {error}; for PostgreSQL install pip install 'rgbt[cluster]'."
-            ) from error
-        except sqlalchemy.exc.ArgumentError as error:
-            raise InputError(f"storage={shown}: {error}.") from error
         except Exception as error:  # Any error of the driver: a later try finds the tables.
-            text = str(error).lower()
-            is_final = "connection" in text and any(word in text for word in UNREACHABLE)
-            if attempt == ATTEMPTS - 1 or is_final:
-                reason = str(error).splitlines()[0]
-                raise InputError(f"storage={shown} cannot be opened: {reason}") from error
+            is_final = isinstance(error, ImportError) or any(w in str(error).lower() for w in FINAL)
+            if is_final or attempt == ATTEMPTS - 1:
+                reason = without_passwords(f"{what}: {str(error).splitlines()[0]}")
+                raise InputError(reason) from error
             time.sleep(PAUSE_S * (1 + attempt))
     raise AssertionError("the last attempt returns or raises")
 
@@ -142,23 +115,13 @@ def open_study(
 ) -> optuna.Study:
     """The study called `name`, created if it does not exist.
 
-    Args:
-        name: of the study.
-        storage: its storage.
-        objectives: of its trials.
-        attributes: of the study; those of `FIXED` must not have changed.
-        sampler: of a search.
-        pruner: of a search.
-
     Raises:
-        InputError: there is a study of that name with another space or other objectives.
+        InputError: there is one with other objectives, points of another kind or another space.
     """
     import optuna
 
     if not re.fullmatch(NAME, name):
-        raise InputError(
-            f"study={name}: MLflow allows only letters, digits, spaces and _ - . : / in names."
-        )
+        raise InputError(f"study={name}: only letters, digits, spaces and _ - . : / are possible.")
     study = _retry(
         lambda: optuna.create_study(
             study_name=name,
@@ -168,62 +131,36 @@ def open_study(
             pruner=pruner,
             load_if_exists=True,
         ),
-        name,
+        f"study={name}",
     )
     metrics = [objective.metric for objective in objectives]
-    wanted = {names.METRICS: metrics, **attributes}
-    known = study.user_attrs
-    for fixed, what in FIXED.items():
+    wanted, known = {names.METRICS: metrics, **attributes}, study.user_attrs
+    for fixed in (names.METRICS, names.KIND, names.SIGNATURE):
         if fixed in known and known[fixed] != wanted.get(fixed):
-            raise InputError(
-                f"a study '{name}' with {what} already exists; choose another name: "
-                "hydra.sweeper.study=..."
-            )
+            what = fixed.removeprefix("rgbt.")
+            raise InputError(f"study={name}: a study '{name}' with another {what} exists.")
     for key, value in wanted.items():
         if known.get(key) != value:
             study.set_user_attr(key, value)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-        study.set_metric_names(metrics)
+    study.set_metric_names(metrics)
     return study
 
 
 def find_study(name: str, storage: str | None, runs_dir: Path) -> optuna.Study | None:
-    """The study called `name`; None where it does not exist. Nothing is created.
-
-    Raises:
-        InputError: the storage cannot be reached, or its address is of no known form.
-    """
-    import optuna
-
-    url = _checked(storage, runs_dir)
-    file = storage_file(url)
+    """The study called `name`; None where it does not exist."""
+    file = storage_file(_url(storage, runs_dir))
     if file is not None and not file.exists():
         return None
-    try:
-        is_journal = url.endswith(".journal")
-        found = open_storage(storage, runs_dir) if is_journal else _database(url, create=False)
-        return load_study(name, found) if name in study_names(found) else None
-    except optuna.exceptions.StorageInternalError as error:
-        if "connection" in str(error.__cause__).lower():
-            raise InputError(
-                f"storage={without_passwords(url)} cannot be reached: {error}"
-            ) from error
-        return None  # a database without Optuna's tables holds no study
+    found = open_storage(storage, runs_dir)
+    return load_study(name, found) if name in study_names(found) else None
 
 
 def load_study(name: str, storage: optuna.storages.BaseStorage) -> optuna.Study:
-    """The study called `name`.
-
-    Raises:
-        InputError: there is none; the message lists the existing ones.
-    """
+    """The study called `name`; InputError, which names the nearest one, if there is none."""
     import optuna
 
-    names = study_names(storage)
-    if name not in names:
-        known = nearest(name, names) if names else "the storage has none"
-        raise InputError(f"there is no study '{name}'; {known}.")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-        return optuna.load_study(study_name=name, storage=storage)
+    known = study_names(storage)
+    if name not in known:
+        hint = nearest(name, known) if known else "the storage has none"
+        raise InputError(f"there is no study '{name}'; {hint}.")
+    return optuna.load_study(study_name=name, storage=storage)

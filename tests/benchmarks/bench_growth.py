@@ -1,8 +1,8 @@
 """Growth of the cost with the number of points, finished runs and trials; CPU seconds.
 
-* points: planning a grid of different points (`sweeps.worker.planned_points`);
+* points: planning a grid of different points (`sweeps.worker.point_list`);
 * runs: listing the groups of runs and opening one by its name, as `rgbt compare` does;
-* trials: a study of random points on the journal file, each proposed, recorded and finished, with
+* trials: a study of random points in SQLite, each proposed, recorded and finished, with
   nothing trained in between.
 
 A cost per item that grows with their number is worse than linear growth.
@@ -23,14 +23,15 @@ import numpy as np
 
 from analysis.results import groups_in, open_counts
 from rgbt.runs.naming import GROUP
+from rgbt.tracking.mlflow_store import NoTracking
 from sweeps import attributes as names
 from sweeps.point import Point
 from sweeps.settings import Objective
-from sweeps.worker.planned_points import PlannedPoints
-from sweeps.worker.planner import Planner
+from sweeps.worker.point_list import ListSource, PointList
+from sweeps.worker.run_store import RunStore
 from sweeps.worker.storage import open_storage, open_study
-from sweeps.worker.trial_store import Owner, TrialStore
-from tests.sweeps.fakes import finish
+from sweeps.worker.trial_store import TrialStore
+from tests.sweeps.fakes import finish, settings
 
 POINTS = (10, 100, 500)
 MANY_POINTS = 2000
@@ -46,8 +47,9 @@ def points(count: int) -> float:
         Point(str(n), ("+experiment=grbm", f"optimizer.lr={1e-4 * (n + 1)}", f"seed={n % 5}"))
         for n in range(count)
     ]
-    planned = PlannedPoints("growth", grid, Planner(("runs_dir=runs",)))
-    return seconds(planned.plan)[0]
+    runs = RunStore(Path("runs"), NoTracking())
+    wanted = PointList("growth", "growth", "grid", tuple(grid), runs, ("runs_dir=runs",))
+    return seconds(lambda: ListSource(wanted, settings()))[0]
 
 
 def runs(count: int) -> float:
@@ -67,7 +69,7 @@ def trials(count: int) -> float:
     with tempfile.TemporaryDirectory() as folder:
         storage = open_storage(None, Path(folder))
         study = open_study("growth", storage, (objective,), {names.KIND: "search"})
-        store = TrialStore(study, storage, Owner.this_process())
+        store = TrialStore(study, storage)
 
         def search() -> None:
             for number in range(count):
@@ -75,7 +77,7 @@ def trials(count: int) -> float:
                 assert trial is not None, "fewer trials than requested"
                 value = trial.suggest_float("optimizer.lr", 1e-4, 1e-2, log=True)
                 store.by_key()
-                store.set_attributes(trial.number, {names.KEY: f"{number:012x}"})
+                store.set_attributes(trial.number, {names.KEY: f"{number:012x}", names.LABEL: "x"})
                 store.complete(trial.number, [value], {names.SECONDS: 1.0})
 
         return seconds(search)[0]

@@ -27,6 +27,7 @@ from pathlib import Path
 
 from sweeps import attributes as names
 from sweeps.worker.storage import load_study, open_storage, study_names
+from sweeps.worker.trial_store import counted_trials
 from tests.benchmarks.process_cost import cpu_seconds
 from tests.benchmarks.timing import seconds
 
@@ -53,7 +54,7 @@ def inside(run: Path) -> float:
 def trials_of(runs: Path) -> list:
     storage = open_storage(None, runs)
     (name,) = study_names(storage)
-    return [t for t in load_study(name, storage).trials if not t.user_attrs.get(names.DROPPED)]
+    return counted_trials(load_study(name, storage))
 
 
 def overhead(place: Path) -> None:
@@ -86,8 +87,7 @@ def workers(place: Path) -> None:
     walls = {}
     for count in (1, 2):
         one = f"hydra.sweeper.workers={count}"
-        threads = "hydra.sweeper.threads=1"
-        walls[count] = call(*words, one, threads, f"runs_dir={place / f'workers{count}'}")
+        walls[count] = call(*words, one, f"runs_dir={place / f'workers{count}'}")
     print(
         f"4 points, one thread each: 1 worker {walls[1]:.1f} s, 2 workers {walls[2]:.1f} s: "
         f"{walls[1] / walls[2]:.2f}x"

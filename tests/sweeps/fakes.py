@@ -15,6 +15,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 import pytest
+import sqlalchemy
 
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
@@ -26,24 +27,18 @@ from sweeps.settings import Objective, SweepSettings
 from sweeps.space.samplers import build_sampler
 from sweeps.space.space import parse_space
 from sweeps.worker import driver as drivers
-from sweeps.worker import trial_sources
 from sweeps.worker.driver import Driver
 from sweeps.worker.planner import PlannedPoint
+from sweeps.worker.point_list import ListSource, PointList
 from sweeps.worker.run_store import RunStore
 from sweeps.worker.running_trial import RunningTrial
-from sweeps.worker.storage import open_study
-from sweeps.worker.trial_sources import ListSource, SamplerSource
-from sweeps.worker.trial_store import STALE_S, Owner, TrialStore
+from sweeps.worker.storage import STALE_S, open_storage, open_study
+from sweeps.worker.trial_sources import SamplerSource
+from sweeps.worker.trial_store import TrialStore
 
 DATASET = "fingerprint-of-the-data"
 DEADLINE_S = 60.0
 """Generous: the machine may be busy. Nothing waits for it but a test that fails."""
-
-DEAD = Owner("elsewhere", 1, "1")
-"""A driver on another machine."""
-
-GONE = Owner(Owner.this_process().host, 2**22 + 1, "1")
-"""A process of this machine that cannot exist: a number above the kernel's largest."""
 
 
 def settings(**changes: Any) -> SweepSettings:
@@ -72,6 +67,7 @@ def plan_of(point: Point, steps: int = 4) -> PlannedPoint:
         SimpleNamespace(
             key=key_of(words),
             overrides=words,
+            plain={},
             trainer=SimpleNamespace(max_steps=steps),
             scale=SimpleNamespace(pixel_factor=1.0),
         )
@@ -83,19 +79,21 @@ def plan_of(point: Point, steps: int = 4) -> PlannedPoint:
     return PlannedPoint(point, runs[0].key if is_one else key_of(whole), runs, fingerprints)
 
 
-def plans(count: int, **point: Any) -> list[PlannedPoint]:
-    """Plans of that many points: x=0, x=1, ..."""
-    return [plan_of(Point(f"x={x}", (f"x={x}",), {"x": x}, **point)) for x in range(count)]
+def points(count: int, **point: Any) -> list[Point]:
+    """That many points: x=0, x=1, ..."""
+    return [Point(f"x={x}", (f"x={x}",), {"x": x}, **point) for x in range(count)]
 
 
 class FakePlanner:
-    """Stands for `Planner`."""
+    """Stands for `Planner`; points with "wrong" do not fit."""
 
     def plan(self, point: Point) -> PlannedPoint:
+        if "wrong" in point.overrides:
+            raise InputError("wrong=1 is no key.")
         return plan_of(point)
 
 
-class PickyPlanner(FakePlanner):
+class PickyPlanner:
     """Takes no point."""
 
     def plan(self, point: Point) -> PlannedPoint:
@@ -303,6 +301,10 @@ class Desk:
     view: FakeView
     plans: list[PlannedPoint] = field(default_factory=list)
 
+    @property
+    def source(self) -> Any:
+        return self.driver.source
+
     def run(self) -> Desk:
         self.driver.run()
         return self
@@ -319,46 +321,45 @@ class Desk:
 
 
 def memory() -> Any:
-    import optuna
-
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
-    return optuna.storages.InMemoryStorage()
+    """A storage of its own, of one thread."""
+    return open_storage("sqlite://", Path("unused"))
 
 
 def store_on(
-    storage: Any, owner: Owner | None = None, wanted: SweepSettings | None = None, **study: Any
+    storage: Any, wanted: SweepSettings | None = None, kind: str = "list", **study: Any
 ) -> TrialStore:
     """The study "study" of a storage; with `sampler` and `pruner` as of a search."""
-    wanted = wanted or settings()
-    began = open_study("study", storage, wanted.objectives, {}, **study)
-    return TrialStore(began, storage, owner or Owner.this_process())
+    objectives = (wanted or settings()).objectives
+    began = open_study("study", storage, objectives, {names.KIND: kind}, **study)
+    return TrialStore(began, storage)
 
 
-def silent(storage: Any, number: int, seconds: float = 2 * STALE_S) -> None:
-    """The owner of a trial was not heard of for so long."""
-    study_id = storage.get_study_id_from_name("study")
-    trial_id = storage.get_trial_id_from_study_id_trial_number(study_id, number)
-    storage.set_trial_user_attr(trial_id, names.HEARTBEAT, time.time() - seconds)
+def silence(storage: Any, seconds: float = 2 * STALE_S) -> None:
+    """No trial was heard of for so long."""
+    change = f"UPDATE trial_heartbeats SET heartbeat = datetime('now', '-{seconds} seconds')"
+    with storage.engine.begin() as connection:
+        connection.execute(sqlalchemy.text(change))
 
 
 def list_desk(
     runs_dir: Path,
-    points: list[PlannedPoint],
+    given: Sequence[Point],
     behaviour: Behaviour = succeed,
     *,
     storage: Any = None,
     view: FakeView | None = None,
-    owner: Owner | None = None,
+    more: Any = None,
+    distributions: Mapping[str, Any] | None = None,
     **changes: Any,
 ) -> Desk:
-    """A driver of a list of points."""
-    wanted = settings(**changes)
-    store = store_on(memory() if storage is None else storage, owner, wanted)
-    runs = RunStore(runs_dir, NoTracking())
-    source = ListSource(points, store, runs, wanted, {})
+    """A driver of a list of points, which are planned."""
+    wanted, runs = settings(**changes), RunStore(runs_dir, NoTracking())
+    wished = PointList("study", "s", "list", tuple(given), runs, (), distributions, more)
+    source = ListSource(wished, wanted, FakePlanner())  # type: ignore[arg-type]
+    source.store = store_on(memory() if storage is None else storage, wanted)
     executor, seen = FakeExecutor(runs_dir, behaviour), view or FakeView()
-    driver = Driver(store, source, runs, executor, wanted, seen)  # type: ignore[arg-type]
-    return Desk(driver, store, executor, runs, seen, list(source.plans.values()))
+    driver = Driver(source.store, source, runs, executor, wanted, seen)  # type: ignore[arg-type]
+    return Desk(driver, source.store, executor, runs, seen, [plan_of(point) for point in given])
 
 
 def search_desk(
@@ -368,7 +369,6 @@ def search_desk(
     space: Mapping[str, Any] | None = None,
     storage: Any = None,
     view: FakeView | None = None,
-    owner: Owner | None = None,
     planner: Any = None,
     pruner: Any = None,
     **changes: Any,
@@ -377,7 +377,7 @@ def search_desk(
     wanted = settings(pruner=None if pruner is None else {"_target_": "given"}, **changes)
     sampler = build_sampler(wanted.sampler)
     storage = memory() if storage is None else storage
-    store = store_on(storage, owner, wanted, sampler=sampler, pruner=pruner)
+    store = store_on(storage, wanted, "search", sampler=sampler, pruner=pruner)
     runs = RunStore(runs_dir, NoTracking())
     searched = parse_space(space or {"x": {"type": "float", "low": 0, "high": 1}})
     executor, seen = FakeExecutor(runs_dir, behaviour), view or FakeView()
@@ -392,7 +392,6 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Drivers that look again at once."""
     monkeypatch.setattr(drivers, "POLL_S", 0.001)
     monkeypatch.setattr(drivers, "CLAIM_S", 0.002)
-    monkeypatch.setattr(trial_sources, "PAUSE_S", 0.002)
 
 
 def until(condition: Callable[[], Any], what: str) -> Any:

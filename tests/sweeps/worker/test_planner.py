@@ -10,13 +10,9 @@ import pytest
 from rgbt.checks import InputError
 from rgbt.config.compose import compose
 from rgbt.runs.specify import specify
-from rgbt.tracking.mlflow_store import NoTracking
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Point
 from sweeps.worker.planner import Planner
-from sweeps.worker.point_list import PointList, preview_points
-from sweeps.worker.run_store import RunStore
-from tests.sweeps.fakes import finish, settings
 
 
 @pytest.fixture
@@ -95,26 +91,3 @@ def test_conflicting_settings_are_reported_in_one_sentence(
         planner.plan(Point("p", (override,)))
     assert said in str(error.value)
     assert "\n" not in str(error.value)
-
-
-def test_survey_writes_nothing_and_lists_existing_runs(
-    base: tuple[str, ...], planner: Planner, tmp_path: Path
-) -> None:
-    runs_dir = tmp_path / "runs"
-    points = (Point("a", ("seed=1",)), Point("b", ("seed=2",)), Point("c", ("masker=grid",)))
-    wanted = PointList("table/x", "x", "list", points, RunStore(runs_dir, NoTracking()), base, None)
-    outcomes = preview_points(wanted, settings())
-    assert [outcome.state for outcome in outcomes] == ["waiting", "waiting", "failed"]
-    assert "there is no masker 'grid'" in outcomes[2].reason
-    assert outcomes[2].keys == ()
-    assert not runs_dir.exists()
-
-    plan = planner.plan(points[1])
-    (run,) = plan.runs
-    finish(runs_dir / run.key, dataset=plan.fingerprints[run.key])
-    before = sorted(runs_dir.rglob("*"))
-    outcomes = preview_points(wanted, settings())
-    assert [outcome.state for outcome in outcomes] == ["waiting", "finished", "failed"]
-    assert outcomes[1].keys == (run.key,)
-    assert outcomes[1].seconds == 2.5
-    assert sorted(runs_dir.rglob("*")) == before

@@ -1,132 +1,56 @@
-"""Points known in advance: their estimated time, and the tags of a shared run."""
+"""Lists of points: planned once while the first runs train, claimed in order, each run once."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Sequence
+import shutil
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
-import numpy as np
 import pytest
+from optuna.distributions import CategoricalDistribution
 
 from rgbt.checks import InputError
 from rgbt.runs.naming import VARIED
 from rgbt.runs.provenance import code
 from rgbt.runs.result import RunResult
+from rgbt.tracking.mlflow_store import NoTracking
+from sweeps import attributes as names
+from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import COLOUR, Outcome, Point, colour
 from sweeps.worker import driver as drivers
 from sweeps.worker import point_list
 from sweeps.worker.planner import PlannedPoint
 from sweeps.worker.point_list import (
+    ListSource,
     PointList,
     estimated_seconds,
+    finished_runs,
+    is_evaluated,
     other_code_line,
     preview_points,
     run_points,
 )
 from sweeps.worker.run_store import RunStore
+from sweeps.worker.trial_sources import ClaimedTrial
 from tests.sweeps.fakes import (
+    Desk,
     FakeExecutor,
     FakePlanner,
     fail,
     finish,
+    list_desk,
+    memory,
     only,
     plan_of,
+    points,
     quick,
     settings,
 )
 
 __all__ = ["quick"]
-
-
-def made(folder: Path, seconds: float) -> Outcome:
-    run = finish(folder)
-    (folder / "result.json").write_text(f'{{"seconds_of_last_process": {seconds}}}')
-    return Outcome(Point("p", ()), "finished", results=(RunResult(run.path),))
-
-
-def test_estimated_seconds_is_median_over_workers(tmp_path: Path) -> None:
-    known = [made(tmp_path / str(seconds), seconds) for seconds in (10, 20, 90)]
-    left = [Outcome(Point("q", ()), state) for state in ("waiting", "failed", "running")]
-    assert estimated_seconds([*known, *left], 1) == 40.0  # type: ignore[list-item]
-    assert estimated_seconds([*known, *left], 2) == 20.0  # type: ignore[list-item]
-    assert estimated_seconds(left, 1) is None
-
-
-class OneKey:
-    """Plans every point as the same run."""
-
-    def __init__(self, base: object) -> None:
-        del base
-
-    def plan(self, point: Point) -> PlannedPoint:
-        if "wrong" in point.overrides:
-            raise InputError("wrong=1 is no key.")
-        return replace(plan_of(replace(point, overrides=("x=1",))), point=point)
-
-
-def wanted(tmp_path: Path, *points: Point) -> PointList:
-    from rgbt.tracking.mlflow_store import NoTracking
-
-    return PointList("s", "s", "list", points, RunStore(tmp_path, NoTracking()))
-
-
-def test_points_that_are_one_run_share_their_tags(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(point_list, "Planner", OneKey)
-    rows = [Point(label, (f"x={label}",), tags={"table": label}) for label in ("1", "1.0")]
-    prepared = point_list._planned(wanted(tmp_path, *rows), None)
-    prepared.plan()
-    first, second = (plan.point.tags for plan in prepared.plans.values())
-    assert first == second == {"table": "1 | 1.0", VARIED: "x", COLOUR: colour("s", 0)}
-
-
-def test_colours_of_a_grid_are_distinct() -> None:
-    colours = [colour("s", index) for index in range(20)]
-    assert all(re.fullmatch("#[0-9a-f]{6}", each) for each in colours)
-    assert len(set(colours)) == 20
-    channels = np.array([[int(each[n : n + 2], 16) for n in (1, 3, 5)] for each in colours[:9]])
-    apart = np.abs(channels[:, None] - channels[None]).sum(-1) + 999 * np.eye(9, dtype=int)
-    assert apart.min() > 40
-
-
-def test_runs_of_other_code_are_counted_in_one_line(tmp_path: Path) -> None:
-    found = []
-    for name, digest in (("a", "0" * 64), ("b", code()["code"]), ("c", "1" * 64)):
-        run = finish(tmp_path / name)
-        run.add_provenance({"code": digest, "diff": ""})
-        found.append(RunResult(run.path))
-    outcomes = [Outcome(Point("p", ()), "finished", results=tuple(found[:2]))] * 2
-    assert other_code_line(outcomes[:0]) == ""
-    assert other_code_line([Outcome(Point("p", ()), "finished", results=(found[1],))]) == ""
-    outcomes.append(Outcome(Point("q", ()), "finished", results=(found[2],)))
-    assert other_code_line(outcomes) == (
-        "2 of 3 runs were made by other code; fresh=true retrains them and keeps the old runs."
-    )
-
-
-def test_point_list_all_points_wrong_raises(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(point_list, "Planner", OneKey)
-    wrong, good = Point("a", ("wrong",)), Point("b", ("x=1",))
-    with pytest.raises(InputError, match="wrong=1 is no key"):
-        preview_points(wanted(tmp_path, wrong, wrong), settings())
-    states = [
-        outcome.state for outcome in preview_points(wanted(tmp_path, wrong, good), settings())
-    ]
-    assert states == ["failed", "waiting"]
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_estimated_seconds_ignores_trained_points(tmp_path: Path) -> None:
-    trained = replace(made(tmp_path / "a", 40), state="waiting")
-    waiting = Outcome(Point("q", ()), "waiting")
-    assert [each.is_trained for each in (trained, waiting)] == [True, False]
-    assert estimated_seconds([trained, waiting], 1) == 40.0
-    assert estimated_seconds([trained], 1) == 0.0
 
 
 @pytest.fixture
@@ -139,39 +63,191 @@ def executor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quick: None) -> Fa
     return made
 
 
-def growing(tmp_path: Path, last: int) -> PointList:
-    """A list of x=0, to which x=1, ... `last` are added, each when all others are finished."""
+def a_list(runs: Path, *words: str, more: Any = None) -> PointList:
+    given = tuple(Point(word, (word,), tags={"t": "grid"}) for word in words)
+    return PointList("s", "s", "grid", given, RunStore(runs, NoTracking()), more=more)
+
+
+def test_run_points_strict_with_wrong_point_starts_nothing(
+    tmp_path: Path, executor: FakeExecutor
+) -> None:
+    with pytest.raises(InputError, match="wrong: wrong=1"):
+        run_points(a_list(tmp_path, "x=0", "wrong"), settings(), strict=True)
+    assert executor.calls == []
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_run_points_without_strict_runs_the_other_points(
+    tmp_path: Path, executor: FakeExecutor
+) -> None:
+    outcomes = run_points(a_list(tmp_path, "x=0", "wrong", "x=1"), settings())
+    assert [each.state for each in outcomes] == ["finished", "failed", "finished"]
+    assert len(executor.calls) == 2
+
+
+def test_all_points_wrong_is_an_error_of_the_command(
+    tmp_path: Path, executor: FakeExecutor
+) -> None:
+    with pytest.raises(InputError, match=r"^wrong=1 is no key"):
+        preview_points(a_list(tmp_path, "wrong", "wrong"), settings())
+    previews = preview_points(a_list(tmp_path, "wrong", "x=1"), settings())
+    assert [outcome.state for outcome in previews] == ["failed", "waiting"]
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("trust", "is_refused"), [("", True), ("my_lab", False)])
+def test_untrusted_class_is_refused_before_training(
+    tmp_path: Path, trust: str, is_refused: bool
+) -> None:
+    class OwnLoss(FakePlanner):
+        def plan(self, point: Point) -> PlannedPoint:
+            planned = plan_of(point)
+            loss = {"_target_": "my_lab.Loss"}
+            runs: Any = [SimpleNamespace(**{**vars(planned.runs[0]), "plain": {"loss": loss}})]
+            return replace(planned, runs=tuple(runs))
+
+    (tmp_path / "my_lab.py").write_text("class Loss: ...\n")
+    given = (Point("a", ("x=1",)), Point("b", ("x=2",), evaluations=(ExtraEvaluation(),)))
+    wanted = replace(a_list(tmp_path), points=given)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(tmp_path))
+        source = ListSource(wanted, settings(trust=trust), OwnLoss())  # type: ignore[arg-type]
+    states = {
+        each.point.label: each for each in source.outcomes(lambda p: Outcome(p.point, "waiting"))
+    }
+    assert states["a"].state == "waiting", "nothing opens its run"
+    assert ("my_lab.Loss" in states["b"].reason) == is_refused
+
+
+def test_equal_points_are_one_run_and_share_their_tags(tmp_path: Path) -> None:
+    class SameRun(FakePlanner):
+        def plan(self, point: Point) -> PlannedPoint:
+            return replace(plan_of(replace(point, overrides=("x=1",))), point=point)
+
+    rows = tuple(Point(label, (f"x={label}",), tags={"table": label}) for label in ("1", "1.0"))
+    source = ListSource(replace(a_list(tmp_path), points=rows), settings(), SameRun())  # type: ignore[arg-type]
+    found: list[PlannedPoint] = []
+    source.outcomes(lambda plan: found.append(plan) or Outcome(plan.point, "waiting"))
+    tags = {"table": "1 | 1.0", VARIED: "x", COLOUR: colour("s", 0)}
+    assert [plan.point.tags for plan in found] == [tags, tags]
+
+
+def taken(desk: Desk) -> ClaimedTrial:
+    task: ClaimedTrial | None = desk.source.next()
+    assert task is not None
+    return task
+
+
+def done(desk: Desk, task: ClaimedTrial) -> None:
+    """The task's runs are finished, and the study knows."""
+    for run in task.plan.runs:
+        finish(desk.runs.runs_dir / run.key)
+    desk.store.complete(task.number, [25.0], {names.RESULTS: {"test/mIoU": 25.0}})
+
+
+def test_list_source_claims_points_in_order(tmp_path: Path) -> None:
+    known = {"x": CategoricalDistribution((0, 1))}
+    desk = list_desk(tmp_path, points(2), distributions=known)
+    assert [taken(desk).plan.point.label for _ in range(2)] == ["x=0", "x=1"]
+    assert desk.source.next() is None
+    trial = desk.store.trials()[1]
+    assert trial.params == {"x": 1}
+    assert trial.user_attrs[names.LABEL] == "x=1"
+    assert trial.user_attrs[names.OVERRIDES] == ["x=1"]
+    assert trial.user_attrs[names.RUNS] == [desk.plans[1].runs[0].key]
+
+
+def test_list_source_retries_are_shared_by_drivers(tmp_path: Path) -> None:
+    storage = memory()
+    a, b = (list_desk(tmp_path, points(1), storage=storage, retries=2) for _ in range(2))
+    for desk in (a, b, a):
+        desk.store.fail(taken(desk).number, "a bad day", {})
+    assert a.source.next() is None
+    assert b.source.next() is None
+    assert len(a.store.trials()) == 3
+
+
+def test_a_point_whose_run_was_deleted_is_run_again(tmp_path: Path) -> None:
+    storage = memory()
+    before = list_desk(tmp_path, points(1), storage=storage)
+    done(before, taken(before))
+    assert before.source.next() is None
+    (tmp_path / before.plans[0].key / "result.json").unlink()
+    desk = list_desk(tmp_path, points(1), storage=storage)
+    assert desk.source.states() == ["waiting"]
+    assert taken(desk).number == 1
+
+
+def test_finished_runs_require_all_runs_and_evaluations(tmp_path: Path) -> None:
+    ring = ExtraEvaluation(regions="ring9")
+    plan = plan_of(Point("p", (), seeds=(0, 1), evaluations=(ring,)))
+    runs = RunStore(tmp_path, NoTracking())
+    for run in plan.runs:
+        assert finished_runs(plan, runs) == ()
+        finish(tmp_path / run.key)
+    both = finished_runs(plan, runs)
+    assert [found.key for found in both] == [run.key for run in plan.runs]
+    assert not is_evaluated(plan, both)
+    for found in both:
+        (found.folder / "evaluations").mkdir()
+        shutil.copyfile(found.folder / "counts_test.npz", found.folder / ring.path)
+    assert is_evaluated(plan, both)
+    finish(tmp_path / plan.runs[0].key, dataset="another")
+    assert finished_runs(plan, runs) == ()
+
+
+def growing(last: int) -> Callable[[Sequence[Outcome]], list[Point]]:
+    """Adds x=1, ... `last` to x=0, each when all others are finished."""
 
     def more(outcomes: Sequence[Outcome]) -> list[Point]:
         x = len(outcomes)
-        done = all(outcome.state == "finished" for outcome in outcomes)
-        return [Point(f"x={x}", (f"x={x}",))] if done and x <= last else []
+        is_done = all(outcome.state == "finished" for outcome in outcomes)
+        return [Point(f"x={x}", (f"x={x}",))] if is_done and x <= last else []
 
-    return replace(wanted(tmp_path, Point("x=0", ("x=0",))), more=more)
-
-
-def test_run_points_runs_added_points_and_returns_their_outcomes(
-    tmp_path: Path, executor: FakeExecutor
-) -> None:
-    outcomes = run_points(growing(tmp_path, 3), settings())
-    assert [outcome.point.label for outcome in outcomes] == [f"x={x}" for x in range(4)]
-    assert {outcome.state for outcome in outcomes} == {"finished"}
-    assert executor.started() == [(f"x={x}",) for x in range(4)]
+    return more
 
 
 def test_run_points_resumed_continues_behind_the_added_points(
     tmp_path: Path, executor: FakeExecutor
 ) -> None:
-    run_points(growing(tmp_path, 2), settings())
-    again = run_points(growing(tmp_path, 4), settings())
+    outcomes = run_points(a_list(tmp_path, "x=0", more=growing(2)), settings())
+    assert [outcome.point.label for outcome in outcomes] == [f"x={x}" for x in range(3)]
+    again = run_points(a_list(tmp_path, "x=0", more=growing(4)), settings())
     assert [outcome.state for outcome in again] == ["finished"] * 5
-    assert executor.started()[3:] == [("x=3",), ("x=4",)], "nothing is run twice"
+    assert executor.started() == [(f"x={x}",) for x in range(5)], "nothing is run twice"
 
 
 def test_run_points_failed_added_point_ends_the_list(
     tmp_path: Path, executor: FakeExecutor
 ) -> None:
     executor.behaviour = only("x=1", fail)
-    outcomes = run_points(growing(tmp_path, 3), settings())
+    outcomes = run_points(a_list(tmp_path, "x=0", more=growing(3)), settings())
     assert [outcome.state for outcome in outcomes] == ["finished", "failed"]
     assert outcomes[1].reason == "ValueError: a bad day"
+
+
+def made(folder: Path, seconds: float) -> Outcome:
+    run = finish(folder)
+    (folder / "result.json").write_text(f'{{"seconds_of_last_process": {seconds}}}')
+    return Outcome(Point("p", ()), "finished", results=(RunResult(run.path),))
+
+
+def test_estimated_seconds_is_median_of_untrained_over_workers(tmp_path: Path) -> None:
+    known = [made(tmp_path / str(seconds), seconds) for seconds in (10, 20, 90)]
+    left = [Outcome(Point("q", ()), state) for state in ("waiting", "failed", "running")]
+    assert estimated_seconds([*known, *left], 1) == 40.0  # type: ignore[list-item]
+    assert estimated_seconds([*known, *left], 2) == 20.0  # type: ignore[list-item]
+    assert estimated_seconds(left, 1) is None
+    trained = replace(known[0], state="waiting")
+    assert estimated_seconds([trained], 1) == 0.0
+
+
+def test_runs_of_other_code_are_counted_in_one_line(tmp_path: Path) -> None:
+    found = []
+    for name, digest in (("a", "0" * 64), ("b", code()["code"]), ("c", "1" * 64)):
+        run = finish(tmp_path / name)
+        run.add_provenance({"code": digest, "diff": ""})
+        found.append(RunResult(run.path))
+    assert other_code_line([Outcome(Point("p", ()), "finished", results=(found[1],))]) == ""
+    outcomes = [Outcome(Point("p", ()), "finished", results=tuple(found))] * 2
+    assert other_code_line(outcomes).startswith("2 of 3 runs")

@@ -29,11 +29,8 @@ class Shown:
         self.done_share = share
         self.seconds = seconds
         self.status = "training"
+        self.number, self.log = 0, "runs/.logs/k.log"
         self.plan = type("Plan", (), {"point": type("Point", (), {"label": label})})
-
-
-def works(*shown: Shown) -> Any:
-    return list(shown)
 
 
 @pytest.fixture
@@ -64,46 +61,38 @@ def test_progress_in_log_prints_begin_and_end(console: Make) -> None:
     assert lines == [
         "started  Ny/4 seed=1",
         "finished Ny/4 seed=1  100 s  val mIoU 45.67",
-        "failed   Ny/4 seed=1  100 s  val mIoU 45.67: ValueError: [red]not a colour[/red] [1,2]",
+        "failed   Ny/4 seed=1  100 s  val mIoU 45.67: ValueError: [red]not a colour[/red] [1,2]; "
+        "see runs/.logs/k.log",
         "failed   p: x does not fit.",
     ]
 
 
-def test_progress_in_terminal_prints_failures_only(console: Make) -> None:
+def test_progress_in_terminal_draws_bars_and_prints_failures(console: Make) -> None:
     text = console(True)
-    view = ProgressView("table", 4, 2, lambda: 1)
+    view = ProgressView("table", lambda: 4, 2, lambda: 1)
     with view:
         one: Any = Shown("fresh=[decoder] files=[/data/a]", score=0.5)
         view.began(one)
-        view.update(works(one))
-        drawn = view._live.get_renderable()  # type: ignore[union-attr]
-        probe = Console(file=io.StringIO(), width=160)
-        probe.print(drawn)
-        seen = probe.file.getvalue()  # type: ignore[attr-defined]
-        assert "table: 1 of 4 done, 1 running, about" in seen
-        assert "fresh=[decoder] files=[/data/a]" in seen
-        assert "50 %" in seen
-        assert "training" in seen
-        assert "val mIoU 50.00" in seen
         view.ended(one, "finished", "")
         view.ended(one, "failed", "a bad day")
-        view.ended(one, "pruned", "pruned at step 2")
-        headline = view._headline([])
-        assert headline.startswith("table: 4 of 4 done, 1 failed, 1 pruned, 0 running")
-    assert "a bad day" in text.getvalue()
+        view.update([one])
+        probe = Console(file=io.StringIO(), width=160)
+        probe.print(view._bars.get_renderable())
+        seen = probe.file.getvalue()  # type: ignore[attr-defined]
+        for part in (
+            "table, 2 at a time, 1 failed",
+            "1/4",
+            "fresh=[decoder] files=[/data/a]",
+            "50/100",
+        ):
+            assert part in seen
+        assert "training  val mIoU 50.00" in seen
+        view.update([])
+        assert len(view._bars.tasks) == 1
+    assert "failed   fresh=[decoder] files=[/data/a]  100 s  val mIoU 50.00: a bad day" in (
+        text.getvalue()
+    )
     assert "finished fresh" not in text.getvalue()
-
-
-def test_progress_time_left_uses_finished_trials(console: Make) -> None:
-    console(False)
-    view = ProgressView("table", 10, 2, lambda: 0)
-    assert view._left([]) == ""
-    # None is finished: one half took 100 s, so each takes 200 s; 9 wait and a half is left.
-    assert view._left(works(Shown())) == f", about {duration(9.5 * 200 / 2)} left"
-    for seconds in (10.0, 20.0, 60.0, 1.0):  # the last one was known already
-        view.ended(works(Shown(seconds=seconds))[0], "finished", "")
-    assert view._left(works(Shown())) == f", about {duration(5.5 * 20 / 2)} left"
-    assert ProgressView("search", None, 2, lambda: 0)._left(works(Shown())) == ""
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,9 @@
-"""One running trial: its processes, adopted runs, reasons of failures."""
+"""One running trial: its processes, adopted runs, failures, and the files it reads meanwhile."""
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,7 @@ from sweeps.worker.planner import PlannedPoint
 from sweeps.worker.run_store import RunStore
 from sweeps.worker.running_trial import (
     LOGS,
+    MetricsReader,
     PruningCallback,
     RunningTrial,
     TrialError,
@@ -25,7 +28,6 @@ from sweeps.worker.running_trial import (
     mean_scores,
 )
 from tests.sweeps.fakes import (
-    DEADLINE_S,
     Behaviour,
     Call,
     FakeExecutor,
@@ -33,11 +35,9 @@ from tests.sweeps.fakes import (
     counts,
     fail,
     finish,
-    first,
     hang,
     held_by_another,
     leave,
-    only,
     plan_of,
     say,
     scored,
@@ -66,10 +66,11 @@ class Bench:
         behaviour: Behaviour = succeed,
         report: PruningCallback | None = None,
         timeout_s: float | None = None,
+        trust: str = "",
     ) -> None:
         self.executor = FakeExecutor(runs_dir, behaviour)
         self.runs = RunStore(runs_dir, NoTracking())
-        self.work = RunningTrial(plan, 0, self.runs, self._start, timeout_s, report)
+        self.work = RunningTrial(plan, 0, self.runs, self._start, timeout_s, report, trust)
 
     def _start(self, command: Any, log: Path) -> Any:
         return self.executor.start(command, {}, log)
@@ -198,7 +199,6 @@ def test_running_trial_restarts_adopted_run_that_died(tmp_path: Path) -> None:
         assert bench.work.advance() is None
         process.kill()
         process.wait()
-        assert (tmp_path / KEY / "lock").exists()
         bench.run()
     assert len(bench.executor.calls) == 1
 
@@ -221,15 +221,9 @@ def test_running_trial_adopts_run_taken_meanwhile(
     assert len(bench.executor.calls) == 1
 
 
-def test_running_trial_result_wins_over_exit_code(tmp_path: Path) -> None:
-    refused = say("rgbt: it is being trained by process 1", 2)
-    (found,) = Bench(tmp_path, PLAN, lambda call: finish(call.folder) and refused(call)).run()
-    assert found.result["test"] == {"mIoU": 0.25, "Var": 9.0}
-
-
-def test_running_trial_timeout_stops_own_and_adopted_run(tmp_path: Path) -> None:
+def test_running_trial_timeout_stops_own_run_only(tmp_path: Path) -> None:
     bench = Bench(tmp_path, PLAN, hang, timeout_s=0.03)
-    with pytest.raises(TrialError, match=r"stopped after 0.0005 minutes \(timeout_minutes\)"):
+    with pytest.raises(TrialError, match="timeout_minutes"):
         bench.run()
     assert bench.executor.calls[0].stops == 1
     assert bench.work.is_stopped()
@@ -237,8 +231,7 @@ def test_running_trial_timeout_stops_own_and_adopted_run(tmp_path: Path) -> None
     with held_by_another(tmp_path / KEY) as process:
         with pytest.raises(TrialError, match="timeout_minutes"):
             bench.run()
-        assert process.wait(DEADLINE_S) == -15
-    assert bench.executor.calls == []
+        assert process.poll() is None
 
 
 def test_running_trial_pruned_names_step(tmp_path: Path) -> None:
@@ -251,16 +244,6 @@ def test_running_trial_pruned_names_step(tmp_path: Path) -> None:
     assert bench.executor.calls[0].stops == 1
     with pytest.raises(TrialPruned, match="pruned at step 2"):
         bench.work.advance()
-
-
-def test_running_trial_finished_at_pruning_line_is_complete(tmp_path: Path) -> None:
-    def at_once(call: Call) -> Process:
-        RunFolder(call.folder).append(4, "val", {"mIoU": 0.5})
-        finish(call.folder)
-        return 0
-        yield
-
-    assert len(Bench(tmp_path, PLAN, at_once, lambda line: "pruned").run()) == 1
 
 
 def evaluating(call: Call) -> Process:
@@ -281,47 +264,25 @@ def evaluating(call: Call) -> Process:
 
 def test_running_trial_evaluates_finished_run(tmp_path: Path) -> None:
     plan = evaluated(evaluations=(ExtraEvaluation(), RING, RELEASED, ALIGNED, NEXT))
-    bench = Bench(tmp_path, plan, evaluating)
+    bench = Bench(tmp_path, plan, evaluating, trust="my_lab")
     (found,) = bench.run()
-    run, root = f"run={found.folder}", "dataset.root=/x"
+    run, own, root = f"run={found.folder}", "trust=my_lab", "dataset.root=/x"
     outs = [f"out={found.folder / each.path}" for each in (ExtraEvaluation(), RING)]
     assert [(call.module, *call.words) for call in bench.executor.calls[1:]] == [
-        ("rgbt.evaluate", run, "modality=default", "regions=as trained", outs[0], root),
-        ("rgbt.evaluate", run, "modality=thermal", "regions=ring9", outs[1], root),
-        ("rgbt.consistency", run, "frames=virtual", f"runs_dir={tmp_path}", root),
-        ("rgbt.consistency", run, "frames=next", f"runs_dir={tmp_path}", root),
+        ("rgbt.evaluate", run, "modality=default", "regions=as trained", outs[0], own, root),
+        ("rgbt.evaluate", run, "modality=thermal", "regions=ring9", outs[1], own, root),
+        ("rgbt.consistency", run, "frames=virtual", f"runs_dir={tmp_path}", own, root),
+        ("rgbt.consistency", run, "frames=next", f"runs_dir={tmp_path}", own, root),
     ]
     for evaluation in plan.point.evaluations:
         assert found.counts(evaluation.path).counts[0, 0, 0, 0] == 7
     assert Bench(tmp_path, plan, fail).work.advance() is not None, "all there: nothing is started"
 
 
-def test_running_trial_accepts_counts_of_another_world(tmp_path: Path) -> None:
-    def in_world(call: Call) -> Process:
-        if call.module == "rgbt.run":
-            return (yield from succeed(call))
-        yield
-        Path(call.value("out")).parent.mkdir(exist_ok=True)
-        counts(dataset="another").save(Path(call.value("out")))
-        return 0
-
-    world = ExtraEvaluation(world="N+", dataset=("dataset.rgb_noise=0.1",))
-    plan = evaluated(evaluations=(world,))
-    bench = Bench(tmp_path, plan, in_world)
-    (found,) = bench.run()
-    assert "dataset.rgb_noise=0.1" in bench.executor.calls[-1].words
-    assert found.counts(world.path).dataset == "another"
-    assert Bench(tmp_path, plan, fail).work.advance() is not None, "all there: nothing is started"
-    # Of the run's own data set, counts of another one are refused.
-    other = evaluated(evaluations=(RING,))
-    with pytest.raises(TrialError):
-        Bench(tmp_path, other, in_world).run()
-
-
 def test_running_trial_failed_evaluation_fails_trial(tmp_path: Path) -> None:
     plan = evaluated(evaluations=(RING,))
     finish(tmp_path / plan.runs[0].key)
-    for behaviour, reason in ((fail, "a bad day"), (leave(0), "exit code 0")):
+    for behaviour, reason in ((fail, "a bad day"), (leave(0), RING.path)):
         with pytest.raises(TrialError, match=reason):
             Bench(tmp_path, plan, behaviour).run()
 
@@ -335,15 +296,6 @@ def test_running_trial_remote_run_cannot_be_evaluated(
     with pytest.raises(TrialError, match="trained on another machine: .*thermal, ring9"):
         bench.run()
     assert bench.executor.calls == []
-
-
-def test_running_trial_failed_seed_keeps_finished_seeds(tmp_path: Path) -> None:
-    plan = plan_of(Point("p", ("x=1",), seeds=(0, 1)))
-    with pytest.raises(TrialError, match="a bad day"):
-        Bench(tmp_path, plan, only("seed=1", first(fail, succeed))).run()
-    again = Bench(tmp_path, plan)
-    again.run()
-    assert again.executor.started() == [("x=1", "seed=1")]
 
 
 def test_running_trial_unsent_report_is_retried(tmp_path: Path) -> None:
@@ -361,3 +313,38 @@ def test_running_trial_unsent_report_is_retried(tmp_path: Path) -> None:
         bench.work.advance()
     assert len(bench.run()) == 1
     assert told == [2, 2, 4]
+
+
+def test_lines_come_once_and_whole(tmp_path: Path) -> None:
+    follower = MetricsReader(tmp_path / "run")
+    assert follower.new_lines() == []
+    run = RunFolder(tmp_path / "run")
+    run.append(1, "train", {"loss": 2.0})
+    run.append(2, "val", {"mIoU": 0.5, "class/car": math.nan})
+    seen = follower.new_lines()
+    assert [(line.step, line.kind) for line in seen] == [(1, "train"), (2, "val")]
+    assert seen[1].values["mIoU"] == 0.5
+    assert math.isnan(seen[1].values["class/car"])
+    assert follower.step == 2
+    assert follower.new_lines() == []
+
+    text = json.dumps({"step": 3, "kind": "val", "time": 0.0, "values": {"mIoU": 0.6}})
+    with (run.path / "metrics.jsonl").open("a") as file:
+        file.write(text[:20])
+        file.flush()
+        assert follower.new_lines() == [], "half a line"
+        file.write(text[20:] + "\n")
+    assert [line.step for line in follower.new_lines()] == [3]
+    assert follower.step == 3
+
+
+def test_a_run_that_resumes_is_read_from_its_begin(tmp_path: Path) -> None:
+    run = RunFolder(tmp_path)
+    follower = MetricsReader(tmp_path)
+    for step in (2, 4, 6):
+        run.append(step, "val", {"mIoU": 0.1})
+    assert len(follower.new_lines()) == 3
+    run.truncate_after(2)
+    run.append(4, "val", {"mIoU": 0.2})
+    assert [line.step for line in follower.new_lines()] == [2, 4]
+    assert follower.step == 4

@@ -1,26 +1,20 @@
-"""Trials of a study: claims, valid trials, and the trials of a dead driver."""
+"""Trials of a study: claims, trials that count, and the trials of a lost driver."""
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
-from optuna.distributions import IntDistribution
+from optuna.distributions import CategoricalDistribution
 
 from sweeps import attributes as names
 from sweeps.space.samplers import build_sampler
 from sweeps.worker.storage import open_storage
-from sweeps.worker.trial_store import STALE_S, Owner, TrialStore
-from tests.sweeps.fakes import DEAD, GONE, memory, silent, store_on
-
-HOST = os.uname().nodename
+from sweeps.worker.trial_store import TrialStore
+from tests.sweeps.fakes import memory, silence, store_on
 
 
 @pytest.fixture
@@ -40,11 +34,10 @@ def states(store: TrialStore) -> list[str]:
     return [each.state.name for each in store.trials()]
 
 
-def searching(storage: Any, owner: Owner | None = None) -> TrialStore:
+def searching(storage: Any) -> TrialStore:
     """The store of a search; every driver has a study object and a sampler of its own."""
-    return store_on(
-        storage, owner, sampler=build_sampler({"_target_": "optuna.samplers.RandomSampler"})
-    )
+    sampler = build_sampler({"_target_": "optuna.samplers.RandomSampler"})
+    return store_on(storage, None, "search", sampler=sampler)
 
 
 def taken(store: TrialStore, total: int | None = None) -> tuple[int, float]:
@@ -56,10 +49,6 @@ def taken(store: TrialStore, total: int | None = None) -> tuple[int, float]:
     return asked.number, x
 
 
-def stale_trials(store: TrialStore, *mine: int) -> list[int]:
-    return [each.number for each in store.stale_trials(mine)]
-
-
 def at_once(works: list[Callable[[], None]]) -> None:
     threads = [threading.Thread(target=work) for work in works]
     for thread in threads:
@@ -68,14 +57,11 @@ def at_once(works: list[Callable[[], None]]) -> None:
         thread.join()
 
 
-def test_claim_adds_running_trial_with_attributes(store: TrialStore) -> None:
-    assert claim(store, params={"x": 3}, distributions={"x": IntDistribution(0, 9)}) == 0
-    found = trial(store, 0)
-    assert (found.state.name, found.params) == ("RUNNING", {"x": 3})
-    assert found.user_attrs[names.KEY] == "k"
-    assert found.user_attrs[names.LABEL] == "point k"
-    assert found.user_attrs[names.OWNER] == str(Owner.this_process())
-    assert abs(found.user_attrs[names.HEARTBEAT] - time.time()) < 60
+def test_claim_with_other_choices_of_a_grid_loses_only_the_parameter(store: TrialStore) -> None:
+    for number, choices in enumerate([(1, 2), (1, 2, 3)]):
+        known = {"x": CategoricalDistribution(choices)}
+        assert claim(store, f"k{number}", params={"x": 1}, distributions=known) == number
+    assert [trial(store, number).params for number in (0, 1)] == [{"x": 1}, {}]
 
 
 def test_claim_of_running_point_is_dropped(store: TrialStore) -> None:
@@ -83,7 +69,6 @@ def test_claim_of_running_point_is_dropped(store: TrialStore) -> None:
     assert claim(store) is None
     assert claim(store, "other") == 2
     assert [each.number for each in store.trials()] == [0, 2]
-    assert "trial 0" in trial(store, 1).user_attrs[names.REASON]
 
 
 @pytest.mark.parametrize("how", ["complete", "prune"])
@@ -92,53 +77,29 @@ def test_claim_of_finished_point_requires_replaced(store: TrialStore, how: str) 
     if how == "complete":
         store.complete(0, [1.0], {})
     else:
-        store.prune(0, "hopeless", {})
+        store.fail(0, "hopeless", {}, "PRUNED")
     assert claim(store) is None
     assert claim(store, replaced=[0]) == 2
 
 
-def opener(tmp_path: Path, kind: str) -> Callable[[], Any]:
-    where = {"journal": str(tmp_path / "s.journal"), "sqlite": f"sqlite:///{tmp_path / 's.db'}"}
-    return lambda: open_storage(where[kind], tmp_path)
-
-
-@pytest.mark.parametrize(("kind", "keys"), [("journal", "abcdefgh"), ("sqlite", "abc")])
-def test_claim_by_two_drivers_succeeds_once_per_point(tmp_path: Path, kind: str, keys: str) -> None:
-    opened = opener(tmp_path, kind)
-    stores = [store_on(opened()) for _ in range(2)]
+def test_claim_by_two_drivers_succeeds_once_per_point(tmp_path: Path) -> None:
+    stores = [store_on(open_storage(None, tmp_path)) for _ in range(2)]
     got: list[str] = []
     barrier = threading.Barrier(2)
 
     def work(store: TrialStore) -> None:
-        for key in keys:
+        for key in "abcdef":
             barrier.wait()
             got.extend(key for _ in "k" if claim(store, key) is not None)
 
     at_once([lambda store=store: work(store) for store in stores])  # type: ignore[misc]
-    assert sorted(got) == list(keys)
-    assert states(stores[0]) == ["RUNNING"] * len(keys)
-
-
-@pytest.mark.parametrize(("kind", "total"), [("journal", 20), ("sqlite", 7)])
-def test_ask_by_three_drivers_respects_total(tmp_path: Path, kind: str, total: int) -> None:
-    opened = opener(tmp_path, kind)
-    stores = [searching(opened()) for _ in range(3)]
-    drawn: list[float] = []
-
-    def work(store: TrialStore) -> None:
-        while len(store.trials()) < total:
-            asked = store.ask(total)
-            if asked is not None:
-                drawn.append(asked.suggest_float("x", 0, 1))
-
-    at_once([lambda store=store: work(store) for store in stores])  # type: ignore[misc]
-    assert states(stores[0]) == ["RUNNING"] * total
-    assert len(set(drawn)) == len(drawn) == total
+    assert sorted(got) == list("abcdef")
+    assert states(stores[0]) == ["RUNNING"] * 6
 
 
 def test_ask_last_trial_goes_to_lower_number(monkeypatch: pytest.MonkeyPatch) -> None:
     storage = memory()
-    mine, theirs = searching(storage), searching(storage, DEAD)
+    mine, theirs = searching(storage), searching(storage)
     ask = mine.study.ask
 
     def both_saw_room() -> Any:
@@ -150,197 +111,125 @@ def test_ask_last_trial_goes_to_lower_number(monkeypatch: pytest.MonkeyPatch) ->
     assert [each.number for each in mine.trials()] == [0]
 
 
-def test_heartbeat_renews_trial() -> None:
-    storage = memory()
-    store = store_on(storage, DEAD)
-    claim(store)
-    silent(storage, 0)
-    store.send_heartbeat([0])
-    assert stale_trials(store_on(storage)) == []
-
-
 def test_finish_twice_keeps_first_end(store: TrialStore) -> None:
     claim(store)
     with pytest.raises(ValueError, match="did not match the number of the objectives"):
         store.complete(0, [1.0, 2.0], {})
     store.complete(0, [1.0], {})
-    store.send_heartbeat([0])
+    store.send_heartbeats([0])
     store.fail(0, "too late", {})
-    store.release(0, "its driver was stopped", requeue=True)
+    store.release(0)
     assert (states(store), trial(store, 0).values) == (["COMPLETE"], [1.0])
     assert names.REASON not in trial(store, 0).user_attrs
 
 
-@pytest.mark.parametrize(
-    ("owner", "seconds", "is_gone"),
-    [(GONE, 0.0, True), (DEAD, STALE_S / 2, False), (DEAD, 2 * STALE_S, True)],
-    ids=["a process that ended", "another host, heard of", "another host, silent"],
-)
-def test_stale_trials_depend_on_owner(owner: Owner, seconds: float, is_gone: bool) -> None:
+def test_stale_trial_of_list_is_free_again_and_heartbeats_keep_it() -> None:
     storage = memory()
-    gone = store_on(storage, owner)
-    for key in "abcd":
-        claim(gone, key)
-    for number in range(4):
-        silent(storage, number, seconds)
-    gone.complete(0, [1.0], {})
-    gone.fail(1, "a bad day", {})
-    gone.drop(2, "not needed")
-    assert stale_trials(store_on(storage)) == ([3] if is_gone else [])
+    store = store_on(storage)
+    for key in "abc":
+        claim(store, key)
+    store.complete(0, [1.0], {})
+    silence(storage)
+    store.send_heartbeats([2])
+    other = store_on(storage)
+    other.fail_stale()
+    assert states(other) == ["COMPLETE", "RUNNING"]
+    assert claim(other, "b") == 3
+    assert claim(other, "c") is None
 
 
-def test_stale_trials_include_own_lost_trial(store: TrialStore) -> None:
-    claim(store, "a")
-    claim(store, "b")
-    assert stale_trials(store, 0, 1) == []
-    assert stale_trials(store, 1) == [0]
-
-
-def test_stale_trials_exclude_fresh_unowned_trial(monkeypatch: pytest.MonkeyPatch) -> None:
-    store = searching(memory())
+def test_running_trial_that_never_had_a_beat_becomes_stale() -> None:
+    """Its driver was killed between the trial and the first heartbeat."""
+    storage = memory()
+    store = searching(storage)
     store.study.ask()
-    assert stale_trials(store) == []
-    later = time.time() + 2 * STALE_S
-    monkeypatch.setattr(time, "time", lambda: later)
-    assert stale_trials(store) == [0]
+    for expected in (["RUNNING"], []):
+        store.fail_stale()
+        assert states(store) == expected
+        silence(storage)
+    assert store.ask(1) is not None
 
 
-def test_release_requeues_search_trial_with_parameters() -> None:
+def test_stale_trial_of_search_is_enqueued_with_its_point() -> None:
     storage = memory()
-    number, x = taken(searching(storage, GONE), 1)
+    _, x = taken(searching(storage), 1)
+    silence(storage)
     mine = searching(storage)
-    mine.release(number, "its driver had ended", requeue=True)
+    mine.fail_stale()
     assert states(mine) == ["WAITING"]
     again = mine.ask(1)
     assert again is not None
     assert again.suggest_float("x", 0, 1) == x
     assert again.user_attrs[names.KEY] == f"x={x}"
+    mine.release(again.number)
+    third = mine.ask(1)
+    assert third is not None, "as often as it is lost"
+    assert third.suggest_float("x", 0, 1) == x
     assert states(mine) == ["RUNNING"]
-    assert trial(mine, again.number).user_attrs[names.OWNER] == str(Owner.this_process())
 
 
-def test_release_trial_without_point_is_not_enqueued() -> None:
+def test_release_without_point_or_after_its_failure_enqueues_nothing() -> None:
+    store = searching(memory())
+    store.ask(2)
+    store.release(0)
+    assert states(store) == []
+    number, _ = taken(store)
+    store.set_attributes(number, {names.REASON: "killed while its failure was noted"})
+    store.release(number)
+    assert states(store) == ["FAIL"]
+
+
+@pytest.mark.parametrize("end", ["runs", "is complete"])
+def test_point_enqueued_twice_is_run_once(end: str) -> None:
+    """Two drivers may fail the same stale trial."""
     storage = memory()
-    searching(storage, GONE).ask(1)
-    mine = searching(storage)
-    mine.release(0, "its driver had ended", requeue=True)
-    assert states(mine) == []
-    assert mine.ask(1) is not None
-
-
-def test_release_after_crash_enqueues_once() -> None:
-    storage = memory()
-    number, x = taken(searching(storage, GONE))
+    number, _ = taken(searching(storage))
     a, b = searching(storage), searching(storage)
-    a.study.enqueue_trial({"x": x}, user_attrs={names.KEY: f"x={x}"})
-    assert stale_trials(b) == [number]
-    b.release(number, "gone", requeue=True)
-    assert states(b) == ["WAITING"]
+    lost = trial(a, number)
+    a.release(number)
+    b._storage.get_heartbeat_stale_trial_callback()(b.study, lost)
+    again = a.ask(1)
+    assert again is not None
+    if end == "is complete":
+        a.complete(again.number, [1.0], {})
+    assert b.ask(1) is None
+    assert states(b) == ["COMPLETE" if end == "is complete" else "RUNNING"]
 
 
-def test_ask_drops_second_requeued_trial() -> None:
-    """Two drivers may enqueue the trial of a dead one at the same time."""
+def test_ask_at_once_for_a_point_enqueued_twice_keeps_one() -> None:
     storage = memory()
-    number, x = taken(searching(storage, GONE))
-    store = searching(storage)
-    store.release(number, "gone", requeue=True)
-    store.study.enqueue_trial({"x": x}, user_attrs={names.KEY: f"x={x}"})
-    assert store.ask(2) is not None
-    assert store.ask(2) is None
-    assert states(store) == ["RUNNING"]
-
-
-def test_ask_at_once_for_a_point_requeued_twice_keeps_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    storage = memory()
-    number, x = taken(searching(storage, GONE), 1)
+    number, _ = taken(searching(storage))
     a, b = searching(storage), searching(storage)
-    a.release(number, "gone", requeue=True)
-    a.study.enqueue_trial({"x": x}, user_attrs={names.KEY: f"x={x}", names.REPLACES: number})
-    by_key, drop = a.by_key, b.drop
-    seen, answers = [], []
+    lost = trial(a, number)
+    a.release(number)
+    b._storage.get_heartbeat_stale_trial_callback()(b.study, lost)
+    waiting = [each.number for each in a.trials()]
+    pop, answers = a.study.ask, []
 
-    def drop_after_a(*arguments: Any) -> None:
-        seen.append(by_key())
-        drop(*arguments)
-
-    def look_after_b() -> Any:
+    def both_pop() -> Any:
+        mine = pop()
         answers.append(b.ask(1))
-        return seen.pop()
+        return mine
 
-    monkeypatch.setattr(b, "drop", drop_after_a)
-    monkeypatch.setattr(a, "by_key", look_after_b)
+    a.study.ask = both_pop  # type: ignore[method-assign]
     answers.append(a.ask(1))
-    assert [trial is None for trial in answers].count(False) == 1, "the point was lost"
-    assert states(a) == ["RUNNING"]
+    assert [answer is None for answer in answers] == [True, False], "the lower number wins"
+    assert [each.number for each in a.trials()] == waiting[:1]
 
 
-def test_release_keeps_point_that_another_driver_takes_before_the_drop(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_release_keeps_point_that_another_driver_takes_before_the_end() -> None:
     storage = memory()
-    number, x = taken(searching(storage, GONE), 1)
+    number, x = taken(searching(storage), 1)
     slow, fast = searching(storage), searching(storage)
-    drop, answers = slow.drop, []
+    finish, answers = slow._finish, []
 
     def ask_first(*arguments: Any) -> None:
         answers.append(fast.ask(1))
-        drop(*arguments)
+        finish(*arguments)
 
-    monkeypatch.setattr(slow, "drop", ask_first)
-    slow.release(number, "its driver had ended", requeue=True)
+    slow._finish = ask_first  # type: ignore[method-assign]
+    slow.release(number)
     (again,) = answers
     assert again is not None, "the point was lost"
     assert again.suggest_float("x", 0, 1) == x
     assert states(slow) == ["RUNNING"]
-    assert fast.ask(1) is None
-
-
-@pytest.mark.parametrize("finished", [False, True], ids=["runs there", "is finished there"])
-def test_release_of_resumed_trial_enqueues_nothing(finished: bool) -> None:
-    storage = memory()
-    number, _ = taken(searching(storage, GONE))
-    a, b = searching(storage), searching(storage)
-    (seen,) = stale_trials(b)
-    a.release(number, "gone", requeue=True)
-    again = a.ask(1)
-    assert again is not None
-    if finished:
-        a.complete(again.number, [1.0], {})
-    b.release(seen, "gone", requeue=True)
-    assert states(b) == ["COMPLETE" if finished else "RUNNING"]
-
-
-@pytest.fixture
-def child() -> Iterator[subprocess.Popen[str]]:
-    """Another process on this machine that prints its owner, and waits."""
-    code = (
-        "from sweeps.worker.trial_store import Owner;"
-        "print(Owner.this_process(), flush=True); input()"
-    )
-    process = subprocess.Popen(
-        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    )
-    yield process
-    process.kill()
-    process.communicate()
-
-
-def test_owner_local_process_alive_until_exit(child: subprocess.Popen[str]) -> None:
-    assert child.stdout is not None
-    owner = Owner.parse(child.stdout.readline().strip())
-    assert (owner.host, owner.pid) == (HOST, child.pid)
-    assert owner.is_alive(heartbeat=0.0)
-    child.kill()
-    os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)
-    assert Path(f"/proc/{child.pid}").exists(), "still a zombie"
-    assert not owner.is_alive(heartbeat=time.time())
-
-
-def test_owner_parse_reused_pid_and_other_host() -> None:
-    me = Owner.this_process()
-    assert Owner.parse(str(me)) == me
-    assert Owner.parse("node:7:12:345") == Owner("node:7", 12, "345")
-    assert not Owner(HOST, os.getpid(), "12").is_alive(heartbeat=time.time())
-    other = Owner(f"not-{HOST}", os.getpid(), me.started)
-    assert other.is_alive(time.time() - STALE_S / 2)
-    assert not other.is_alive(time.time() - 2 * STALE_S)

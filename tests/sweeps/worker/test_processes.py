@@ -17,10 +17,8 @@ from typing import Any
 import pytest
 
 from rgbt.checks import InputError
-from sweeps.evaluation import ExtraEvaluation
-from sweeps.worker import executors
-from sweeps.worker.executors import Job, LocalExecutor, check_gpus, fork_template
-from sweeps.worker.template import Template
+from sweeps.worker import processes
+from sweeps.worker.processes import Job, LocalExecutor, check_gpus, failure_reason, run_command
 from tests.sweeps.fakes import DEADLINE_S, is_alive, until
 
 MODULE = """
@@ -76,21 +74,13 @@ def module(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     sys.path.remove(str(folder))
 
 
-@pytest.fixture(scope="module", params=["fork server", "template"])
-def executor(module: Path, request: pytest.FixtureRequest) -> Iterator[LocalExecutor]:
+@pytest.fixture(scope="module")
+def executor(module: Path) -> Iterator[LocalExecutor]:
     # Nothing here needs torch. The server is one of the whole process: later tests start their own.
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(executors, "PRELOADED", ())
-        patch.setattr(executors, "MLFLOW", ())
-        patch.setattr(executors, "own_modules", list)
-        patch.setattr(executors, "_templates", [])
-        if request.param == "template":
-            fork_template(with_mlflow=False)
+        patch.setattr(processes, "PRELOADED", "json")
         yield LocalExecutor()
-        for template in executors._templates:
-            template.close()
-    if request.param == "fork server":
-        forkserver._forkserver._stop()
+    forkserver._forkserver._stop()
 
 
 Start = Callable[..., Job]
@@ -180,7 +170,7 @@ def test_stop_kills_after_grace_with_children(
     _, child = pids(tmp_path / "pids")
     job.stop()
     assert job.poll() is None, "it has its time of grace"
-    monkeypatch.setattr(executors, "GRACE_S", 0.0)
+    monkeypatch.setattr(processes, "GRACE_S", 0.0)
     job.stop()
     assert code(job) == -signal.SIGKILL
     until(lambda: not is_alive(child), "the end of the child")
@@ -189,16 +179,14 @@ def test_stop_kills_after_grace_with_children(
 DRIVER = """
 import sys, time
 from pathlib import Path
-from sweeps.worker import executors
+from sweeps.worker import processes
 
 if __name__ == "__main__":
     sys.path.insert(0, sys.argv[1])
-    executors.PRELOADED, executors.own_modules = (), list
-    if sys.argv[3] == "template":
-        executors.fork_template(with_mlflow=False)
+    processes.PRELOADED = "json"
     folder = Path(sys.argv[2])
     command = ("tiny_run", "wait", str(folder / "pid"))
-    job = executors.LocalExecutor().start(command, {}, folder / "log")
+    job = processes.LocalExecutor().start(command, {}, folder / "log")
     try:
         while True:
             job.poll()
@@ -212,18 +200,16 @@ if __name__ == "__main__":
 """
 
 
-@pytest.fixture(params=["fork server", "template"])
-def driver(
-    module: Path, tmp_path: Path, request: pytest.FixtureRequest
-) -> Iterator[subprocess.Popen[str]]:
+@pytest.fixture
+def driver(module: Path, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
     """A driver in a process group of its own, as a shell starts it."""
     (tmp_path / "a_driver.py").write_text(DRIVER)
     process = subprocess.Popen(
-        [sys.executable, str(tmp_path / "a_driver.py"), str(module), str(tmp_path), request.param],
+        [sys.executable, str(tmp_path / "a_driver.py"), str(module), str(tmp_path)],
         stdout=subprocess.PIPE,
         text=True,
         start_new_session=True,
-        env={**os.environ, "PYTHONPATH": str(Path(executors.__file__).parents[2])},
+        env={**os.environ, "PYTHONPATH": str(Path(processes.__file__).parents[2])},
         # Where the suite itself runs in the background of a shell, Ctrl-C is ignored and inherited.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
@@ -252,57 +238,76 @@ def test_run_continues_when_driver_is_killed(driver: subprocess.Popen[str], tmp_
     until(lambda: not is_alive(pid), "its end")
 
 
-def test_template_that_ended_fails_the_start_and_ends_the_wait(module: Path) -> None:
-    template = Template((), lambda: None)
-    process = template.start(time.sleep, (600,), ())
-    assert process.exitcode is None
-    os.kill(template._pid, signal.SIGKILL)
-    os.waitpid(template._pid, 0)
-    with pytest.raises(OSError, match="the process that starts runs has ended"):
-        template.start(time.sleep, (600,), ())
-    assert process.exitcode is None, "the run continues"
-    os.kill(process.pid, signal.SIGKILL)
-    until(lambda: process.exitcode == 255, "the end of a process without a parent")
+def test_run_command_returns_the_reason_of_a_failure(
+    executor: LocalExecutor, tmp_path: Path
+) -> None:
+    log = tmp_path / "logs" / "log"
+    assert run_command(("tiny_run", "leave", "x", "0"), log) == ""
+    assert run_command(("tiny_run", "raise", "x"), log) == "ValueError: a bad day"
 
 
-def test_template_imports_modules_before_it_forks(module: Path, tmp_path: Path) -> None:
-    (module / "late.py").write_text("NUMBER = 1\n")
-    template = Template((), lambda: None)
-    try:
-        for name in ("first", "second"):
-            process = template.start(_write_number, (str(tmp_path / name),), ("late", "no_such"))
-            until(lambda job=process: job.exitcode is not None, "its end")
-            (module / "late.py").write_text("NUMBER = 2\n")
-    finally:
-        template.close()
-    assert [(tmp_path / name).read_text() for name in ("first", "second")] == ["1", "1"]
+SERVER = """
+import sys
+from sweeps.worker import preload
+from rgbt.runs import provenance
+before = provenance.code()["code"]
+provenance.package_digest = lambda package: "edited since"
+assert provenance.code()["code"] == before
+from rgbt.runs import source_code
+assert set(preload.PROGRAMS).isdisjoint(sys.modules), "executed by runs as programs"
+assert "rgbt.training.train" in sys.modules
+"""
 
 
-def _write_number(path: str) -> None:
-    import late
+@pytest.mark.slow
+def test_fork_server_keeps_the_code_that_it_has_loaded() -> None:
+    assert importlib.util.find_spec(processes.PRELOADED) is not None
+    subprocess.run([sys.executable, "-c", SERVER], check=True)
 
-    Path(path).write_text(str(late.NUMBER))
 
-
-def test_preloaded_modules_exist_and_commands_are_not_among_them() -> None:
-    """A misspelt name would be left out in silence, and every run would take seconds longer."""
-    names = (*executors.PRELOADED, *executors.MLFLOW, executors.PRELOADED_LAST)
-    assert all(importlib.util.find_spec(name) is not None for name in names)
-    evaluations = (ExtraEvaluation(), ExtraEvaluation(frames="aligned"))
-    called = {"rgbt.run", *(evaluation.command[0] for evaluation in evaluations)}
-    assert called == set(executors.COMMANDS)
-    assert not called & set(executors.own_modules())
+TRACEBACK = """\
+Traceback (most recent call last):
+  File "run.py", line 1, in <module>
+    train()
+torch.cuda.OutOfMemoryError: CUDA out of memory. Tried to allocate 2 GiB
+See the documentation.
+"""
 
 
 @pytest.mark.parametrize(
-    ("shown", "gpus", "sentence"),
+    ("code", "text", "said"),
     [
-        ("2,3", (3, 5), "there is no GPU 5, CUDA_VISIBLE_DEVICES=2,3 shows the GPUs"),
-        ("", (0,), "there is no GPU 0, CUDA_VISIBLE_DEVICES= shows no GPU; omit gpus."),
-        (None, (0, 99), "there is no GPU "),
+        (1, "warning\nrgbt: masker.sigma_div must be positive.\n", "masker.sigma_div must be"),
+        (1, TRACEBACK, "torch.cuda.OutOfMemoryError: CUDA out of memory. Tried to allocate 2 GiB"),
+        (1, f"{TRACEBACK}rgbt: the loss is not finite.\n", "the loss is not finite."),
+        (1, "step 1\rstep 2\rfull disk\n", "full disk"),
+        (1, "\udcff\udcfe broken\n", "\ufffd\ufffd broken"),
+        (1, "ValueError: " + "x" * 5000, "ValueError: " + "x" * 288),
+        (3, "", "it ended with exit code 3 and no output; see"),
+        (-9, "rgbt: x", "stopped by SIGKILL"),
+        (-99, "rgbt: x", "stopped by signal 99"),
+    ],
+)
+def test_failure_reason_is_last_message_or_signal(
+    tmp_path: Path, code: int, text: str, said: str
+) -> None:
+    before = "rgbt: an old mistake é\n".encode()
+    log = tmp_path / "run.log"
+    log.write_bytes(before + text.encode(errors="surrogateescape"))
+    reason = failure_reason(code, log, len(before))
+    assert reason.startswith(said)
+    assert len(reason) <= max(300, len(f"{said} {log}"))
+
+
+@pytest.mark.parametrize(
+    ("shown", "gpus", "named"),
+    [
+        ("2,3", (3, 5), "gpus: no GPU 5;"),
+        ("", (0,), "gpus: no GPU 0;"),
+        (None, (0, 99), "gpus: no GPU "),
         ("2,3", (3, 2), None),
         ("2,3", ((3, 2),), None),
-        ("2,3", ((2, 3), (4,)), "gpus=[[2, 3], [4]]: there is no GPU 4"),
+        ("2,3", ((2, 3), (4,)), "gpus: no GPU 4;"),
         ("2,3", None, None),
     ],
 )
@@ -310,14 +315,13 @@ def test_check_gpus_refuses_hidden_ones(
     monkeypatch: pytest.MonkeyPatch,
     shown: str | None,
     gpus: tuple[int | tuple[int, ...], ...] | None,
-    sentence: str | None,
+    named: str | None,
 ) -> None:
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     if shown is not None:
         monkeypatch.setenv("CUDA_VISIBLE_DEVICES", shown)
-    if sentence is None:
+    if named is None:
         check_gpus(gpus)
         return
-    with pytest.raises(InputError) as error:
+    with pytest.raises(InputError, match=named):
         check_gpus(gpus)
-    assert sentence in str(error.value)
