@@ -1,6 +1,6 @@
 """Named mutants: faults that a test must find. ``python -m tests.mutants [ROOM ...] [jobs=2]``.
 
-``tests/mutants/ROOM.yaml`` lists mutants by name: `file`, the text `old` that occurs once in it, the
+``tests/mutants/ROOM.yaml`` lists mutants by name: `file`, the text `old` (once in the file), the
 text `new` that replaces it, and `test`, the words given to pytest. Each mutant is written into a
 copy of the tree. A mutant dies if a test fails; the same tests must pass without it. The exit code
 is 1 if one survives.
@@ -38,7 +38,7 @@ def mutants(rooms: list[str]) -> dict[str, Mutant]:
 
 
 def copy_of_tree(folder: Path) -> Path:
-    """The files that git lists, in a folder of their own beside a link to the reference material."""
+    """The files that git lists, in a folder beside a link to the reference material."""
     command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
     listed = subprocess.run(command, cwd=ROOT, capture_output=True, check=True).stdout
     tree = folder / "rgbt"
