@@ -205,10 +205,10 @@ def absent_classes(every: Sequence[Counts], absent: Absent | None) -> tuple[str,
     """
     import numpy as np
 
-    from rgbt.metrics.absent import absent_notes
     from rgbt.metrics.counts import convention
     from rgbt.metrics.details import details_of
     from rgbt.metrics.pairs import protocol_of
+    from rgbt.metrics.scores import absent_notes
 
     first = every[0]
     if protocol_of(first.partition) is not None or details_of(first.partition) is not None:

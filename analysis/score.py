@@ -20,8 +20,8 @@ from rgbt.config.command import built
 from rgbt.config.common_options import PredictionFormatOptions
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
+from rgbt.metrics.metric import MAX_REGIONS, Partition
 from rgbt.metrics.names import DAY, MIOU, NIGHT, subset
-from rgbt.metrics.regions import MAX_REGIONS, Partition
 
 if TYPE_CHECKING:
     from analysis.predictions.scoring import FolderScores

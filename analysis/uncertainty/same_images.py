@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError
-from rgbt.metrics import boundary, calibration
 from rgbt.metrics.counts import Counts, check_same_means
-from rgbt.metrics.details import details_of
+from rgbt.metrics.details import LABEL, NUMBER, details_of
 from rgbt.metrics.pairs import protocol_of
 
 
@@ -133,12 +132,12 @@ def _labelled(counts: Counts) -> NDArray[np.int64]:
         case None | "distance" | "size":
             labelled = array.sum(-1, dtype=np.int64)
         case "boundary":
-            labelled = array[:, :, boundary.LABEL].astype(np.int64)
+            labelled = array[:, :, LABEL].astype(np.int64)
         case "calibration":
             # Bins and classes are those of the prediction; only their sum over a region is not.
             details = details_of(counts.partition)
             groups = 1 if details is None else details.groups
-            number = array[:, :, calibration.NUMBER].sum(-1, dtype=np.int64)
+            number = array[:, :, NUMBER].sum(-1, dtype=np.int64)
             labelled = number.reshape(len(array), -1, groups).sum(-1)
         case "triples":
             # Every index is a predicted class; only the number of pixels is that of the images.

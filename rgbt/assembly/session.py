@@ -36,7 +36,7 @@ from rgbt.terminal import info
 from rgbt.transforms.view_sets import ViewSets
 
 if TYPE_CHECKING:  # most runs start at random, and few map classes
-    from rgbt.checkpoints.report import Report
+    from rgbt.checkpoints.load import Plan
     from rgbt.data.label_map import LabelMap
 
 
@@ -65,7 +65,7 @@ class Session:
     trainer: TrainerSettings
     device: torch.device
     model: nn.Module
-    weights: Report | None
+    weights: Plan | None
     step: int = 0
     evaluations: Path = Path()
     label: str = ""
@@ -150,7 +150,7 @@ def open_session(
     )
 
 
-def start_from_weights(model: nn.Module, spec: RunSpec) -> Report | None:
+def start_from_weights(model: nn.Module, spec: RunSpec) -> Plan | None:
     """Load the weights that `model.weights` names and report this on stderr; None without weights.
 
     A second line warns if the network has other inputs or settings than the weights were trained
@@ -168,13 +168,13 @@ def start_from_weights(model: nn.Module, spec: RunSpec) -> Report | None:
 
     dependency = spec.dependency(WEIGHTS)
     is_common = dependency is not None and dependency.is_common
-    report = load_weights(model, source, fresh, other_classes=is_common)
-    info(report.sentence())
-    node, facts = spec.model.plain, report.facts
-    others = differences(node, facts.convention)
-    noted, own = facts.inputs, node.get("inputs")
+    plan = load_weights(model, source, fresh, other_classes=is_common)
+    info(f"{plan.sentence()}.")
+    node = spec.model.plain
+    others = differences(node, plan.convention)
+    noted, own = plan.inputs, node.get("inputs")
     beside = source.parent / "config.yaml"  # of a checkpoint of a run
-    if noted is None and facts.layout == "own" and beside.is_file():
+    if noted is None and plan.is_own and beside.is_file():
         noted = read_settings(beside).get("model", {}).get("inputs")
     if not others and None not in (noted, own) and noted != own:
         others.append("other inputs")
@@ -183,7 +183,7 @@ def start_from_weights(model: nn.Module, spec: RunSpec) -> Report | None:
             f"{source} was trained with {' '.join(others)}, but this network has other settings: "
             "its scores will differ from those of the trained network."
         )
-    return report
+    return plan
 
 
 def differences(node: Mapping[str, Any], convention: Iterable[str]) -> list[str]:

@@ -16,10 +16,10 @@ from analysis.uncertainty import Resampling, compare, estimate
 from analysis.uncertainty.contrasts import Resampler, Term
 from analysis.uncertainty.same_images import aligned, aligned_images
 from rgbt.checks import InputError
-from rgbt.metrics.calibration import ece
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.details import Details
 from rgbt.metrics.named import value
+from rgbt.metrics.scores import ece
 from tests.analysis.test_results import make_run
 from tests.commands import Call, assert_one_sentence
 

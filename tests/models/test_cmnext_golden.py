@@ -13,7 +13,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from rgbt.checkpoints.cmnext import released_name
+from rgbt.checkpoints.kinds import CMNEXT
 from rgbt.models.cmnext.model import CMNeXt
 from rgbt.models.cmnext.ppx import PoolingGate
 from rgbt.models.inputs import Images
@@ -30,7 +30,7 @@ def filled(name: str, size: str) -> tuple[CMNeXt, golden.Golden]:
     recorded = golden.load(name)
     classes = recorded.classes("decode_head.linear_pred.bias")
     net: CMNeXt = golden.network(f"cmnext_{size}", classes).eval()
-    golden.fill_network(net, recorded, named=released_name)
+    golden.fill_network(net, recorded, named=CMNEXT.source)
     return net, recorded
 
 
@@ -74,7 +74,7 @@ def record(net: CMNeXt, rgb: Tensor, thermal: Tensor) -> dict[str, Tensor]:
 @pytest.mark.parametrize(("name", "size"), RECORDS)
 def test_every_tensor_equals_the_release(name: str, size: str) -> None:
     net, recorded = filled(name, size)
-    released = {released_name(key) for key in net.state_dict()}
+    released = {CMNEXT.source(key) for key in net.state_dict()}
     assert released == set(recorded.facts["keys"])
     found = record(net, *recorded.image)
     outputs = {key for key in recorded.facts["outputs"] if not key.startswith(("grad.", "obj"))}
@@ -100,7 +100,7 @@ def test_every_gradient_equals_the_release(name: str, size: str) -> None:
     weights = torch.from_numpy(recorded.fill.normal(seed, tuple(logits.shape)))
     objective = (logits.double() * weights).sum()
     objective.backward()
-    found = {f"grad.{released_name(key)}": p.grad for key, p in net.named_parameters()}
+    found = {f"grad.{CMNEXT.source(key)}": p.grad for key, p in net.named_parameters()}
     found |= {
         "grad.network_input_rgb": images.rgb.grad,
         "grad.network_input_x": images.thermal.grad,
