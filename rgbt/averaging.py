@@ -6,11 +6,11 @@ One class for the moving average and the mean of the last steps that are evaluat
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
+
+Tensors = tuple[Tensor, ...] | list[Tensor]
 
 
 class AveragedNetwork(AveragedModel):
@@ -40,7 +40,7 @@ class AveragedNetwork(AveragedModel):
         self.update_parameters(network)
 
     @torch.no_grad()
-    def _average(self, means: Sequence[Tensor], values: Sequence[Tensor], count: object) -> None:
+    def _average(self, means: Tensors, values: Tensors, count: object) -> None:
         """Of tensors of one device and dtype; the count of torch is not used."""
         del count
         if self._share < 1 and means[0].is_floating_point():
