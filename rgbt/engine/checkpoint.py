@@ -5,16 +5,16 @@ When a run starts, the first of these that exists is used:
 2. `model.weights` (read by `rgbt.weights`);
 3. random weights.
 
-``last.pt`` commits a state: model, optimisers, step, and which step is the best. ``best.pt`` and
-the files of its evaluation (``counts_val.npz``, ...) follow at once. A process that is killed in
-between left the best weights in ``last.pt``, and `Checkpoints.load` writes ``best.pt`` from it.
+``best.pt`` is written before the ``last.pt`` that names its step, each under a temporary name. A
+process that is killed in between resumes from the state before, and makes the same best weights
+again.
 """
 
 from __future__ import annotations
 
-import shutil
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -92,8 +92,7 @@ class State:
 
 
 def training_payload(
-    weights: dict[str, Tensor],
-    unaveraged: dict[str, Tensor] | None,
+    weights: dict[str, dict[str, Tensor]],
     others: dict[str, nn.Module],
     optimizers: dict[str, torch.optim.Optimizer],
     state: State,
@@ -101,15 +100,13 @@ def training_payload(
     """Everything a run needs to resume as if it had not stopped.
 
     Args:
-        weights: of the network, as they are evaluated.
-        unaveraged: those of the last step, where `weights` are averaged.
+        weights: of the network (`rgbt.engine.averaging.EvaluatedWeights.state`).
         others: further networks that are trained, by name.
         optimizers: by name.
         state: progress.
     """
     return {
-        "model": weights,
-        **({} if unaveraged is None else {UNAVERAGED: unaveraged}),
+        **weights,
         "others": {name: module.state_dict() for name, module in others.items()},
         "optimizers": {name: optimizer.state_dict() for name, optimizer in optimizers.items()},
         "state": asdict(state),
@@ -230,7 +227,7 @@ def _some(what: str, keys: list[str]) -> str:
 
 
 class Checkpoints:
-    """Read and commit the checkpoints of one run folder (see the module).
+    """Read and write the checkpoints of one run folder (see the module).
 
     Args:
         folder: of the run.
@@ -240,87 +237,53 @@ class Checkpoints:
         self.folder = folder
         self.last = folder / "last.pt"
         self.best = folder / "best.pt"
-        self._evaluations = folder / "checkpoints"
-        self._committed: tuple[int, int] | None = None
-
-    def begin_evaluation(self, step: int) -> Path:
-        """The empty folder for the files of the evaluation at `step`."""
-        folder = self._evaluations / str(step)
-        shutil.rmtree(self._evaluations, ignore_errors=True)
-        folder.mkdir(parents=True)
-        return folder
 
     def commit(self, payload: dict[str, Any], state: State) -> None:
-        """Write the state of a run, unless it is already committed; then its best weights."""
-        if self._committed == (state.step, state.evaluated_step):
-            return
+        """Write the weights if this step is the best, then the state."""
         self.folder.mkdir(parents=True, exist_ok=True)
+        if state.step == state.best_step > 0:
+            # The same bytes after resuming: without the versions of modules.
+            save(self.best, {"model": dict(payload["model"]), "step": state.step})
         save(self.last, payload)
-        self._committed = state.step, state.evaluated_step
-        self._publish(payload, state)
 
-    def load(self) -> tuple[dict[str, Any], State] | None:
-        """The committed payload and its state; None before there is any.
+    def load(self) -> tuple[dict[str, Any], State]:
+        """The payload of the last checkpoint and its state.
 
         Raises:
             RunError: last.pt or best.pt is missing or damaged.
         """
-        if not self.last.exists():
-            return None
-        try:
-            payload, state = self.committed()
-            self._publish(payload, state)
-            if state.best_step:
-                self.load_best(state.best_step)
-        except (InputError, TypeError) as error:
-            raise RunError(f"{str(error).rstrip('.')}; {self._begin_again()}") from error
-        self._committed = state.step, state.evaluated_step
+        with self._saying_what_to_do():
+            payload = load_checkpoint(self.last)
+            state = State.of(payload)
+        if state.best_step:
+            self.load_best(state)
         return payload, state
 
-    def committed(self) -> tuple[dict[str, Any], State]:
-        """What `load` returned in another process of this run.
+    def load_best(self, state: State) -> dict[str, Any]:
+        """The best weights of a run, by name.
 
         Raises:
-            InputError: this machine does not see the files.
-            TypeError: it is no state.
+            RunError: the file is missing or damaged, or holds the weights of another step.
         """
-        payload = load_checkpoint(self.last)
-        return payload, State.of(payload)
-
-    def load_best(self, step: int) -> dict[str, Any]:
-        """The weights of the best step, by name.
-
-        Raises:
-            InputError: the file is missing or damaged.
-            RunError: it holds the weights of another step.
-        """
-        payload = load_checkpoint(self.best)
-        found = step_of(payload, self.best)
-        if found != step:
-            raise RunError(
-                f"{self.best} is of step {found}, but the best evaluation of this run is of step "
-                f"{step}; {self._begin_again()}"
-            )
+        with self._saying_what_to_do():
+            payload = load_checkpoint(self.best)
+            found = step_of(payload, self.best)
+            # Weights of a later step were written just before the run was killed.
+            if found != state.best_step and found <= state.step:
+                raise InputError(
+                    f"{self.best} is of step {found}, but the best evaluation of this run is of "
+                    f"step {state.best_step}."
+                )
         weights: dict[str, Any] = payload["model"]
         return weights
 
-    def tidy(self) -> None:
-        """Remove the files that are only needed to resume, after training has ended."""
-        shutil.rmtree(self._evaluations, ignore_errors=True)
-
-    def _begin_again(self) -> str:
-        return f"remove {self.folder} and rerun the command to train the run from the start."
-
-    def _publish(self, payload: dict[str, Any], state: State) -> None:
-        """Write the weights and files of an evaluation that is the best, if they are not there."""
-        step = state.best_step
-        if step != state.step or step == 0:
-            return
-        for file in (self._evaluations / str(step)).glob("*"):
-            file.replace(self.folder / file.name)
-        if not self.best.exists() or step_of(load_checkpoint(self.best), self.best) != step:
-            # The same bytes from a network and from last.pt: without the versions of its modules.
-            save(self.best, {"model": dict(payload["model"]), "step": step})
+    @contextmanager
+    def _saying_what_to_do(self) -> Iterator[None]:
+        try:
+            yield
+        except (InputError, TypeError) as error:
+            advice = f"remove {self.folder} and rerun the command to train the run from the start."
+            raise RunError(f"{str(error).rstrip('.')}; {advice}") from error
 
 
 def check_weights(modules: Mapping[str, nn.Module], step: int) -> None:
