@@ -63,8 +63,8 @@ class EvaluatedWeights:
     @property
     def network(self) -> nn.Module:
         """The network to evaluate: the average, or the trained one before an average begins."""
-        has_average = self._average is not None and self._is_begun
-        return self._average.module if has_average else self._model
+        average = self._average if self._is_begun else None
+        return self._model if average is None else average.module
 
     def state(self) -> dict[str, dict[str, Tensor]]:
         """Weights to evaluate ("model"), and to resume from where these are others."""

@@ -13,7 +13,7 @@ from rgbt.checks import InputError, RunError
 from rgbt.engine.settings import TrainerSettings
 from rgbt.runs.run_spec import RunSpec
 from rgbt.runtime.group import Group, group_from_environment
-from rgbt.runtime.signals import WORDS
+from rgbt.runtime.signals import WORDS, Stopped
 from rgbt.terminal import info
 
 OF_GLOO = "gloo/transport"
@@ -85,7 +85,10 @@ def _take_part(group: Group, run: RunSpec, extra_tags: Mapping[str, str]) -> Non
         if group.rank == 0 and not is_lost:
             raise
         # The process that failed first reports it; this one is ended meanwhile, or failed alone.
-        time.sleep(GRACE_S)
+        try:
+            time.sleep(GRACE_S)
+        except Stopped as stop:
+            sys.exit(stop.code)
         sys.stdout, sys.stderr = sys.__stdout__, sys.__stderr__
         title = f"process {group.rank} of {group.size}"
         if is_lost:
@@ -103,7 +106,7 @@ def launch(num_processes: int, words: Sequence[str]) -> int:
     from torch.distributed.run import get_args_parser, main
 
     # Threads of one process that wait in a loop would take the cores of the others.
-    preferred = {"OMP_WAIT_POLICY": "PASSIVE", "OMP_NUM_THREADS": "1", "LOGLEVEL": "CRITICAL"}
+    preferred = {"OMP_WAIT_POLICY": "PASSIVE", "OMP_NUM_THREADS": "1"}
     if any(name == "lo" for _, name in socket.if_nameindex()):
         # Otherwise gloo looks up the name of this machine, which containers may not know.
         preferred["GLOO_SOCKET_IFNAME"] = "lo"

@@ -18,6 +18,7 @@ from torch import nn
 from rgbt.assembly.session import names_key
 from rgbt.assembly.training_setup import TrainingSetup, set_up_training
 from rgbt.checks import InputError
+from rgbt.data.domains import TestedHead
 from rgbt.engine.checkpoint import Checkpoints, State, restore_weights
 from rgbt.engine.trainer import WAIT_SHARE, Loaded, Trainer
 from rgbt.evaluation.prediction import decode_ahead, view_of
@@ -114,7 +115,7 @@ class SilentFolder(RunFolder):
     def _nothing(self, *_: object) -> None:
         """Write nothing."""
 
-    write_config = add_provenance = describe = append = finish = mark = _nothing
+    write_config = add_provenance = describe = append = finish = mark = _nothing  # type: ignore[assignment]
 
     def truncate_after(self, *_: object) -> list[MetricLine]:
         """No lines."""
@@ -284,7 +285,7 @@ class Run:
         session = self.setup.session
         result = evaluate(session, network, EvaluationRequest(split=split, keep=tuple(keep)))
         counts[split] = result.counts
-        view = session.domains.target and session.domains.target.view
+        view = None if session.domains.target is None else session.domains.target.view
         if view is None or view == view_of(session):
             return result, {}
         found = evaluate(session, network, EvaluationRequest(split=split, view=view)).counts
@@ -390,7 +391,7 @@ class Run:
         session = self.setup.session
         if session.domains.target_is != "night":
             return {}
-        head = "target" if session.domains.tested_head == "source" else "source"
+        head: TestedHead = "target" if session.domains.tested_head == "source" else "source"
         request = EvaluationRequest(split="test", head=head)
         found = evaluate(session, session.model, request).counts
         counts[f"test_{head}_head"] = found
