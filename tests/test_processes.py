@@ -73,7 +73,7 @@ def sharing() -> dict[str, Any]:
         "sums": (total.detach(), part.grad, processes.total(torch.tensor(rank))),
         "mean_count": processes.mean_count(torch.tensor(3 * rank)),
         "largest": processes.largest(5 - rank),
-        "gradients": averaged(),
+        "averaged": averaged(),
         "objects": (processes.agreed(rank), processes.collected(("of", rank))),
     }
 
@@ -103,7 +103,7 @@ def test_parts_wholes_and_sums(size: int) -> None:
         assert found["mean_count"] == 3 * ranks / size
         assert found["largest"] == 5
         # Of each parameter the mean of rank and of 10 rank; the one without a gradient has none.
-        assert found["gradients"] == [ranks / size, None, 10 * ranks / size]
+        assert found["averaged"] == [ranks / size, None, 10 * ranks / size]
         assert found["objects"] == (0, [("of", other) for other in range(size)])
 
 
