@@ -23,12 +23,10 @@ from rgbt.data.cache.dataset import cached_dataset
 from rgbt.data.domains import Domains
 from rgbt.data.loader_settings import LoaderSettings
 from rgbt.dataset import LabelledDataset
-from rgbt.engine.allocator import keep_memory
-from rgbt.engine.device import autocast, choose_device
+from rgbt.engine.device import autocast, choose_device, fix_threads, keep_memory
 from rgbt.engine.network_settings import place
 from rgbt.engine.prediction import Prediction
 from rgbt.engine.settings import TrainerSettings
-from rgbt.engine.threads import fix_threads
 from rgbt.metrics.metric import Regions
 from rgbt.randomness import derive
 from rgbt.runs.run_spec import WEIGHTS, RunSpec

@@ -130,7 +130,7 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
     loss = spec.loss.build()
     checked = CheckedLoss(loss) if is_own(loss) else loss
     _share_batch_norm(session.model, session.trainer)
-    prepare_training(session.model, session.trainer, fabric.device)
+    prepare_training(session.model, session.trainer)
     model = fabric.setup_module(session.model)
     collaborators = {"model": model, "loss": checked, "masker": masker, "domains": domains}
     with torch.random.fork_rng(devices=[]):

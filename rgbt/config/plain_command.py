@@ -15,9 +15,8 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 from rgbt.checks import InputError, RunError, nearest, without_controls
 from rgbt.config.options import help_text, parse, readable_paths
-from rgbt.runtime.member import write_error
 from rgbt.runtime.resources import reporting_exhaustion
-from rgbt.runtime.signals import Stopped, answered, ending_command, handled
+from rgbt.runtime.signals import Stopped, answered, ending_command
 
 T = TypeVar("T")
 HELP = ("-h", "--help")
@@ -70,7 +69,6 @@ def exit_code(work: Callable[[], int | None], *, catch_interrupt: bool = True) -
     except KeyboardInterrupt as stop:
         if not catch_interrupt:
             raise
-        handled()
         if isinstance(stop, Stopped):
             return say(str(stop), stop.code)
         return say("interrupted; rerun the command to resume.", 130)  # a second Ctrl-C
@@ -90,7 +88,8 @@ def say(sentence: str, code: int) -> int:
     with suppress(OSError):  # output may go to a file on a disk that is full
         sys.stdout.flush()
     # Names of files and words of damaged files may hold anything.
-    write_error(without_controls(sentence))
+    sys.stderr.write(f"rgbt: {without_controls(sentence)}\n")
+    sys.stderr.flush()
     return code
 
 

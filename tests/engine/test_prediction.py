@@ -12,8 +12,7 @@ import torch
 from lightning_fabric import Fabric
 from torch import Tensor, nn
 
-from rgbt.engine.evaluate import class_maps, confident_class_maps, probabilities
-from rgbt.engine.predicted_scores import windows
+from rgbt.engine.evaluate import class_maps, confident_class_maps, probabilities, windows
 from rgbt.engine.prediction import Prediction
 from rgbt.types import Batch, Output
 
