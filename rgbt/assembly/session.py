@@ -50,6 +50,7 @@ class Session:
         step: the optimiser step of trained weights; 0 where none is known.
         evaluations: folder where evaluations of trained weights are written by default.
         label: name of the trained network in tables.
+        run: key of the run whose network it is; "" for others.
     """
 
     spec: RunSpec
@@ -67,6 +68,7 @@ class Session:
     step: int = 0
     evaluations: Path = Path()
     label: str = ""
+    run: str = ""
 
     def autocast(self) -> AbstractContextManager[Any]:
         """Context of a forward pass at the precision of the run."""

@@ -125,6 +125,7 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
     missing = () if upstream_finished else [each.key for each in spec.dependencies]
     fabric = open_fabric(spec.trainer)
     session = open_session(spec, load_weights=WEIGHTS not in missing, device=fabric.device)
+    session = replace(session, run=spec.key)
     domains, loading = session.domains, session.loading
     masker: AnyMasker = spec.masker.build()
     loss = spec.loss.build()

@@ -142,6 +142,7 @@ def counts_of(
         split=split,
         unscored=dataset.unscored,
         absent=data.regions.absent,
+        run=data.run if isinstance(data, Session) else "",
     )
 
 
