@@ -9,10 +9,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.models.cmnext.model import CMNeXt
+from rgbt.models.cmnext import CMNeXt
 from rgbt.models.cmx.model import CMX
 from rgbt.models.critic import Critic
-from rgbt.models.deeplabv2.model import DeepLabV2
+from rgbt.models.deeplabv2 import DeepLabV2
 from rgbt.models.dinov2.model import DinoMask2Former
 from rgbt.models.inputs import Inputs
 from rgbt.models.mask2former.model import Mask2Former

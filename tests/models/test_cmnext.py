@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from rgbt.checks import InputError
-from rgbt.models.cmnext.model import CMNeXt
-from rgbt.models.cmnext.ppx import ConvFfn, PoolingGate, PpxBlock, window_mean
+from rgbt.models.cmnext import CMNeXt
+from rgbt.models.cmnext import ConvFfn, PoolingGate, PpxBlock, window_mean
 from rgbt.models.cmx.mit import MitBlock
 from tests.models import plain
 from tests.models.golden import network

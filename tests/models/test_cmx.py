@@ -12,9 +12,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.checks import InputError
-from rgbt.models.cmx.decoder import MlpDecoder
-from rgbt.models.cmx.mit import MitAttention, MitBlock, MixFfn, drop_rates
-from rgbt.models.cmx.model import CMX
+from rgbt.models.cmx.network import MlpDecoder
+from rgbt.models.cmx.mit import MitAttention, MitBlock, MixFfn
+from rgbt.models.cmx.model import CMX, drop_rates
 from tests.models import plain
 from tests.models.golden import network
 from tests.models.plain import generator as seeded

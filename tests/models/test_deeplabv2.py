@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.checks import InputError
-from rgbt.models.deeplabv2.model import DeepLabV2
+from rgbt.models.deeplabv2 import DeepLabV2
 from tests.models.golden import compose, network
 from tests.models.plain import Plain, count, generator, images, nano, randomise
 from tests.models.test_contract import LITERAL, MODIFIED

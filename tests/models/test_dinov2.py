@@ -12,7 +12,7 @@ from torch.nn import functional as F
 
 from rgbt.checks import InputError
 from rgbt.engine.optimizers import AdamW
-from rgbt.models.dinov2.backbone import Level, Pyramid
+from rgbt.models.dinov2.model import Level, Pyramid
 from rgbt.types import MaskPair
 from tests.models import plain
 from tests.models.plain import generator, half, images, normal, randomise

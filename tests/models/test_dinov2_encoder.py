@@ -9,8 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from rgbt.checks import InputError
-from rgbt.models.dinov2.encoder import Encoder, ViTShape, resized_positions
-from rgbt.models.dinov2.lora import LoraBlocks
+from rgbt.models.dinov2.encoder import Encoder, LoraProjection, resized_positions
+
 from tests.models.golden import network
 from tests.models.plain import count, normal, randomise
 
@@ -19,7 +19,7 @@ def encoder(**changes: Any) -> Encoder:
     sizes = {"patch": 4, "embed_dim": 12, "depth": 3, "num_heads": 3, "mlp_ratio": 4.0}
     positions = {"num_registers": 2, "position_grid": 5, "position_resize": "size"}
     form = {"rope_base": None, "norm_eps": 1e-6, "key_bias": True, "mlp": "gelu"}
-    net = Encoder(ViTShape(**{**sizes, **positions, **form, **changes})).eval()
+    net = Encoder(**{**sizes, **positions, **form, **changes}).eval()
     randomise(net)
     return net
 

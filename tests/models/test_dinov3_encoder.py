@@ -12,7 +12,7 @@ from torch import Tensor
 
 from rgbt.checks import InputError
 from rgbt.models.dinov2.encoder import Encoder
-from rgbt.models.dinov2.rotary import RotaryPositions, rotated
+from rgbt.models.dinov2.encoder import RotaryPositions, rotated
 from tests.models import test_dinov2_encoder as dinov2
 from tests.models.golden import network
 from tests.models.plain import count, normal

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from rgbt.checks import InputError
-from rgbt.models.mask2former.head import semantic_logits
+from rgbt.models.mask2former.network import semantic_logits
 from rgbt.types import MaskPair
 from tests.models import plain
 from tests.models.golden import network

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.models.mask2former.decoder import QueryAttention
-from rgbt.models.mask2former.deformable import DeformableAttention, centre_grid
+from rgbt.models.mask2former.pixel_decoder import DeformableAttention, centre_grid
 from rgbt.models.mask2former.pixel_decoder import shrink, sine_code
 from rgbt.models.mask2former.swin import (
     PatchMerging,

@@ -7,6 +7,7 @@ of Swin and in the CRM and SpatialSeg releases, and unlike the ImageNet classifi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -14,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.models.parts import Mlp, add_residual, keep_factors
+from rgbt.models.parts import ALL_KEPT, Keep, Mlp, add_residual, stochastic_depth
 
 PATCH = 4
 
@@ -153,9 +154,9 @@ class SwinBlock(nn.Module):
         self.norm2 = nn.LayerNorm(dim)
         self.mlp = Mlp(dim, int(dim * shape.mlp_ratio))
 
-    def forward(self, x: Tensor, keep: Tensor | None) -> Tensor:
-        """(N, H, W, C) -> the same; `keep`: (2, N, 1, 1, 1) factors of both residuals, or None."""
-        first, second = (None, None) if keep is None else keep.unbind()
+    def forward(self, x: Tensor, keep: Keep = ALL_KEPT) -> Tensor:
+        """(N, H, W, C) -> the same."""
+        first, second = keep
         x = add_residual(x, self._attend(self.norm1(x)), first)
         return add_residual(x, self.mlp(self.norm2(x)), second)
 
@@ -207,10 +208,10 @@ class Stage(nn.Module):
         )
         self.downsample = PatchMerging(dim) if index < 3 else nn.Identity()
 
-    def forward(self, x: Tensor, keep: Tensor | None) -> Tensor:
-        """(N, H, W, C) -> (N, H, W, C), before merging; `keep` is (blocks, 2, N, 1, 1, 1)."""
-        for number, block in enumerate(self.blocks):
-            x = block(x, None if keep is None else keep[number])
+    def forward(self, x: Tensor, keeps: Sequence[Keep]) -> Tensor:
+        """(N, H, W, C) -> (N, H, W, C), before merging; `keeps` has one for every block."""
+        for block, keep in zip(self.blocks, keeps, strict=True):
+            x = block(x, keep)
         return x
 
 
@@ -245,12 +246,10 @@ class Swin(nn.Module):
         x = self.patch_embed(image)
         if hidden is not None:
             x = torch.where(hidden[..., None], self.mask_token.view(-1), x)
-        keeps: list[Tensor | None] = [None] * 4
-        if self.training and self.shape.drop_path_rate > 0:
-            # Factors of every residual of every sample; rates rise from 0.
+        rates = None
+        if self.training and self.shape.drop_path_rate > 0:  # rates rise from 0
             rates = torch.linspace(0, self.shape.drop_path_rate, sum(self.shape.depths))
-            drawn = keep_factors(rates, (2, len(x), 1, 1, 1), generator, x.device, dim=1)
-            keeps = list(torch.split(drawn, list(self.shape.depths)))
+        keeps = stochastic_depth(rates, self.shape.depths, x, generator)
         maps = []
         for index, (stage, keep) in enumerate(zip(self.layers, keeps, strict=True)):
             x = stage(x, keep)
