@@ -14,8 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from rgbt.checkpoints.cmnext import released_name
-from rgbt.models.cmnext import CMNeXt
-from rgbt.models.cmnext import PoolingGate
+from rgbt.models.cmnext import CMNeXt, PoolingGate
 from rgbt.models.inputs import Images
 from tests.models import golden
 from tests.models.test_cmx_golden import arranged as arranged_as_in_cmx

@@ -13,8 +13,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from rgbt.models.mask2former.network import LEVELS
 from rgbt.models.mask2former.model import Mask2Former
+from rgbt.models.mask2former.network import LEVELS
 from rgbt.types import MaskPair
 from tests.models.golden import check_all, fill_network, load, network, recorded
 
