@@ -12,7 +12,7 @@ from torch.nn import functional as F
 
 from rgbt.checks import InputError
 from rgbt.models.cmnext import ConvFfn, PoolingGate, PpxBlock, window_mean
-from rgbt.models.cmx.fusion import CrossAttention
+from rgbt.models.cmx.fusion import CrossAttention, Rectification
 from rgbt.models.cmx.mit import MitAttention, MitBlock, MixFfn
 from rgbt.models.cmx.model import drop_rates
 from rgbt.models.cmx.network import MlpDecoder
@@ -94,6 +94,20 @@ def test_attention_by_loops(reduction: int) -> None:
                 expected[n, token, part] = (scores.exp() / scores.exp().sum()) @ v
     expected = layer.proj(expected).view(2, 5, 4, 6)
     torch.testing.assert_close(layer(x), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_rectification_by_hand() -> None:
+    """Weights from biases alone: 1/4 by channel and 1/2 by place of x1, 3/4 and 9/10 of x2."""
+    layer = Rectification(1)
+    for parameter in layer.parameters():
+        nn.init.zeros_(parameter)
+    biases = (layer.channel_weights.mlp[-1].bias, layer.spatial_weights.mlp[-1].bias)
+    for bias, shares in zip(biases, ((0.25, 0.75), (0.5, 0.9)), strict=True):
+        bias.data = torch.tensor(shares).logit()
+    x1, x2 = torch.tensor(2.0).view(1, 1, 1, 1), torch.tensor(10.0).view(1, 1, 1, 1)
+    first, second = layer(x1, x2)
+    assert first.item() == pytest.approx(2 + 0.5 * (0.75 + 0.9) * 10)
+    assert second.item() == pytest.approx(10 + 0.5 * (0.25 + 0.5) * 2)
 
 
 def test_cross_attention_by_loops() -> None:
