@@ -124,22 +124,7 @@ class CMNeXt(CmxNetwork):
     Source: J. Zhang et al., Delivering Arbitrary-Modal Semantic Segmentation, CVPR 2023.
     Released: jamycheung/DELIVER. With two modalities its self-query hub does not exist.
 
-    Args:
-        num_classes: as the following ones, see `CMX`; both streams have the same sizes.
-        embed_dims: see there.
-        depths: see there.
-        num_heads: heads per stage, of the RGB stream's attention and of fusion.
-        sr_ratios: of the RGB stream.
-        mlp_ratio: of the RGB stream.
-        thermal_mlp_ratios: the same of the thermal blocks, per stage.
-        pool_windows: sides of the windows whose means a thermal block adds up, odd; none: it sees
-            its 7x7 convolution alone.
-        layer_scale: what both residuals of a thermal block are multiplied by at the start.
-        decoder_dim: see `CMX`.
-        drop_path_rate: see there.
-        decoder_dropout: see there.
-        decoder_norm_eps: see there.
-        inputs: normalisation of the images.
+    The arguments are the keys of ``conf/model/cmnext_b2.yaml``.
     """
 
     # ImageNet's file covers the RGB stream alone.

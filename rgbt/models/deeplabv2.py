@@ -133,27 +133,7 @@ class DeepLabV2(nn.Module):
     Source: DeepLab v2; thesis (J. Sun, Multi-head), Sec. III.   Released: AdaptSegNet, ADVENT and
     MaxSquareLoss (one head, with or without the auxiliary one); the thesis' code (two heads).
 
-    Args:
-        num_classes: K; 14 in the thesis.
-        depths: bottlenecks per stage: (3, 4, 23, 3) for ResNet-101.
-        base_width: channels of the stem; the other widths are multiples of it.
-        ceil_mode: the pooling rounds up (released); false: down, which the modified decoders need
-            to come back to the size of the image.
-        train_norm: "all": the backbone's normalisations are trained (thesis' code);
-            "statistics": scale and shift are not, statistics are (AdaptSegNet, ADVENT).
-        heads: their names, the first is the default; ("main",), or one per domain.
-        auxiliary: a further pyramid on the third stage (AdaptSegNet and MaxSquareLoss).
-        decoder: "basic": the pyramid's K maps, which the uploaded training scripts of the thesis
-            run; "modified_thesis": K maps throughout, as its text describes; "modified_heatnet":
-            1024, 256, 64, 64 and K maps at base width 64, the widths of HeatNet's decoder, as in an
-            uploaded network file that no script imports.
-        rates: dilations of the pyramid.
-        summed_rates: those that count: all (DeepLab v2, ADVENT), or the first two (AdaptSegNet,
-            MaxSquareLoss, thesis' code). The parameters are the same.
-        dropout: of channels, before the first up block and after each; (0, 0) without up blocks.
-        align_corners: of all enlargements: true where the releases enlarge the scores themselves,
-            false in the thesis' up blocks.
-        inputs: normalisation of the images.
+    The arguments are the keys of ``conf/model/deeplabv2.yaml``.
 
     Raises:
         InputError: `ceil_mode` with a modified decoder, or names that no module can have.

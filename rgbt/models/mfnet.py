@@ -69,16 +69,8 @@ class MFNet(nn.Module):
 
     Source: MFNet (Ha et al., IROS 2017).   Released: haqishen/MFNet-pytorch.
 
-    Args:
-        num_classes: K.
-        rgb_widths: channels of the RGB encoder at strides 1, 2, 4 and 8, the last even; stride 16
-            has those of stride 8, since the decoder adds the two.
-        thermal_widths: of the thermal encoder, likewise.
-        decoder_width: channels of the decoder's last features, at stride 2.
-        final_activation: whether the logits are the output of a leaky ReLU, as of every other
-            unit. Released: true. false: its input, with the same weights and the same class at
-            every pixel, for the leaky ReLU rises.
-        inputs: normalisation of the images.
+    The arguments are the keys of ``conf/model/mfnet.yaml``. Stride 16 has the channels of stride 8,
+    since the decoder adds the two. `final_activation` does not change the class of any pixel.
     """
 
     record = Record(views=("rgbt",), recomputed=("conv*", "decode*"))

@@ -37,17 +37,7 @@ class PSPNet(nn.Module):
     Source: HeatNet, Sec. III; PSPNet.   Released: JohanVer/heatnet, jzuern/heatnet-pub
     (architecture "pspnet"; the names of the weights are theirs without "trgb_segnet.").
 
-    Args:
-        num_classes: K; 13 in the release, 14 in the thesis.
-        depths: bottlenecks per stage.
-        base_width: channels of the stem; the encoder's other widths are multiples of it.
-        decoder_width: channels of the last two up blocks; the first has four times as many.
-        modalities: "late_fusion", a stem and two stages for each image (HeatNet); "early_fusion",
-            one stem for all channels; "rgb" or "thermal", one image alone.
-        dropout: of channels, before the decoder and after each of its blocks.
-        align_corners: of all enlargements; false is the release on current PyTorch, true the
-            thesis' port of it.
-        inputs: normalisation of the images.
+    The arguments are the keys of ``conf/model/heatnet.yaml``.
     """
 
     def __init__(  # noqa: PLR0913 - each is a key of conf/model/*.yaml

@@ -74,17 +74,8 @@ class RTFNet(nn.Module):
 
     Source: RTFNet (Sun, Zuo, Liu, RA-L 2019).   Released: yuxiangsun/RTFNet.
 
-    Args:
-        num_classes: K.
-        depth: of both ResNets; the release edits a constant, 152 by default.
-        base_width: channels of the stem, a positive even number; everything scales with it. 64 is
-            ResNet's own.
-        final_relu: whether the logits are the output of the last block's ReLU, hence never
-            negative. Released: true. false: the sum before it, with the same weights.
-        thermal_stem: start of the thermal encoder's first convolution. "rgb_mean": the mean of the
-            RGB encoder's over its input channels (released), or a copy where `inputs` repeats
-            thermal three times; "xavier": drawn anew (paper). Holds for weights from ImageNet too.
-        inputs: normalisation of the images.
+    The arguments are the keys of ``conf/model/rtfnet_50.yaml``. A thermal stem of three channels
+    starts as a copy of RGB's instead of its mean; `thermal_stem` holds for ImageNet's weights too.
     """
 
     def __init__(

@@ -29,13 +29,7 @@ class SemsegPSPNet(nn.Module):
     Source: PSPNet, Fig. 3; thesis (J. Sun), Sec. V-C.   Released: hszhao/semseg; the names of the
     weights are its own.
 
-    Args:
-        num_classes: K; 66 for Mapillary Vistas, 14 for Freiburg.
-        depths: bottlenecks per stage: (3, 4, 6, 3) for ResNet-50.
-        base_width: channels of the first two stem convolutions, 64; other widths are multiples.
-        modalities: "rgb" or "thermal".
-        dropout: share of channels dropped before the scores of both heads, 0.1.
-        inputs: normalisation of the images.
+    The arguments are the keys of ``conf/model/semseg.yaml``.
     """
 
     def __init__(

@@ -29,23 +29,9 @@ class CMX(CmxNetwork):
     huaaaliu/RGBX_Semantic_Segmentation; lab-sun/Temporal-Consistent-RGBT-Segmentation (the same
     network, other inputs, and an unused layer `voting`).
 
-    Args:
-        num_classes: K.
-        embed_dims: channels per stage.
-        depths: blocks per stage.
-        num_heads: heads per stage, of attention and of fusion.
-        sr_ratios: how many times smaller per side the map is that a stage attends to.
-        mlp_ratio: width of a block's feed-forward network divided by the width of the block.
-        decoder_dim: E, channels of the decoder.
-        drop_path_rate: stochastic depth of the last block, 0 at the first, in [0, 1).
-        drop_path_stage2: "ramp": rates rise from block to block, as in MiT.   Released:
-            "released": all RGB blocks of stage 2 have the rate of its first block, all thermal
-            ones that of its second.
-        decoder_dropout: share of channels dropped in front of the classifier, in [0, 1).
-        decoder_norm_eps: of the decoder's batch normalisation, > 0.
-        decoder_norm_eps_eval: of the same in evaluation; None: the same.   Released: CMX trains
-            with 1e-3 and, as its evaluation skips the set-up of weights, evaluates with 1e-5.
-        inputs: normalisation of the images.
+    The arguments are the keys of ``conf/model/cmx_b2.yaml``. The release trains with a
+    `decoder_norm_eps` of 1e-3 and, as its evaluation skips the set-up of weights, evaluates with
+    1e-5.
     """
 
     def __init__(  # noqa: PLR0913 - each is a key of conf/model/*.yaml

@@ -141,43 +141,11 @@ class DinoMask2Former(MaskNetwork):
     ViTDet, Sec. 3; fusion: CRM, Sec. III-B; head: Mask2Former, Sec. 3.2. The combination is ours.
     With the weights of a published file, the patch tokens of an RGB image are those of its network.
 
-    Settings with a default are those of DINOv3, which configurations of DINOv2 do not name.
+    The arguments are the keys of ``conf/model/dinov2_vits14.yaml``, and those of DINOv3. With
+    `thermal_embedding`, a frozen encoder keeps the activations of thermal images for its gradient.
 
     Args:
-        num_classes: K, without the no-object class.
-        patch: side of a patch in the resized image, pixels.
-        embed_dim: d, width of the encoder, a multiple of 4.
-        depth: its blocks.
-        num_heads: its attention heads.
-        mlp_ratio: width of a block's MLP divided by the width of the block.
-        num_registers: its register tokens; 4 in the files with registers, else 0.
-        position_grid: side of the grid of its position embedding, 37 in the files of DINOv2; None:
-            positions are rotary.
-        position_resize: how positions are resized: "factor" without and "size" with registers
-            (`rgbt.models.dinov2.encoder.resized_positions`); None: positions are rotary.
-        token_px: pixels of the image per token and side. Images, padded to multiples of 32, are
-            resized by patch / token_px, so that the tokens fit the strides 4 to 32 of the head.
-        layers: numbers of the blocks whose tokens are used, rising: one for all levels, or four.
-        tuning: "full": the encoder is trained; "frozen": it is not; "lora": low-rank updates of its
-            attention are.
-        lora_rank: rank of an update; this and the other settings of LoRA are read for "lora" only.
-        lora_alpha: factor of an update, divided by the rank.
-        lora_parts: updated projections, of "q", "k" and "v".
-        lora_per_modality: whether RGB and thermal have updates of their own.
-        thermal_embedding: whether a learned vector is added to the patch tokens of thermal images.
-            A frozen encoder then keeps the activations of thermal images for its gradient.
-        fusion: as the following ones, see `rgbt.models.mask2former.model.Mask2Former`.
-        hidden_dim: see there.
-        num_queries: see there.
-        encoder_layers: see there.
-        encoder_ffn_dim: see there.
-        decoder_layers: see there.
-        decoder_ffn_dim: see there.
-        attention_heads: see there.
-        pixel_decoder_fp32: see there.
-        inputs: normalisation of the images.
-        rope_base: base of the periods of rotary positions
-            (`rgbt.models.dinov2.encoder.RotaryPositions`), 100 in DINOv3; None: positions are
+        rope_base: base of the periods of rotary positions, 100 in DINOv3; None: positions are
             learned.
         norm_eps: epsilon of the layer normalisations of the encoder; 1e-6 in DINOv2, 1e-5 in
             DINOv3.

@@ -74,28 +74,8 @@ class Mask2Former(MaskNetwork):
     Source: CRM, Sec. III; SpatialSeg, Sec. III-A.   Released: UkcheolShin/CRM_RGBTSeg,
     lab-sun/SpatialSeg (the same network).
 
-    Args:
-        num_classes: K, without the no-object class.
-        embed_dim: channels of the first stage; doubles from stage to stage.
-        depths: blocks per stage.
-        num_heads: attention heads per stage.
-        window_size: side of an attention window, in tokens.
-        mlp_ratio: width of a block's MLP divided by the width of the block.
-        drop_path_rate: stochastic depth of a branch's last block, 0 at the first, in [0, 1).
-        share_start: stages from this index on (0..4) are the same in both branches; 4 = none.
-        fusion: "max" or "add" of the two branches.
-        mask_token: what hidden cells show: a learned token of each branch (CRM, Eq. 1: L_rgb and
-            L_thr; both releases), or "shared", the same one in both (SpatialSeg, Eqs. 12 and 13:
-            one tau). A token has `embed_dim` values and stands behind the patch embedding.
-        hidden_dim: channels of both decoders, a multiple of 32.
-        num_queries: Q.
-        encoder_layers: deformable layers of the pixel decoder.
-        encoder_ffn_dim: width of their feed-forward networks.
-        decoder_layers: layers of the query decoder, without the initial prediction.
-        decoder_ffn_dim: width of theirs.
-        attention_heads: heads of both decoders.
-        pixel_decoder_fp32: keep the pixel decoder in single precision under autocast.
-        inputs: normalisation of the images.
+    The arguments are the keys of ``conf/model/mask2former_swin_t.yaml``. A mask token stands behind
+    the patch embedding.
     """
 
     record = replace(
