@@ -17,7 +17,7 @@ from annotated_types import Interval, Len, Predicate, doc
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.models.cmx.mit import NORM_EPS, MitBlock, initialise
+from rgbt.models.cmx.mit import NORM_EPS, initialise, mit_blocks
 from rgbt.models.cmx.model import Reductions, drop_rates
 from rgbt.models.cmx.network import CmxEncoder, CmxNetwork, MlpDecoder, Stream
 from rgbt.models.inputs import Inputs
@@ -151,14 +151,11 @@ class CMNeXt(CmxNetwork):
         decoder_norm_eps: Epsilon,
         inputs: Inputs,
     ) -> None:
-        def rgb(stage: int) -> nn.Module:
-            dim, heads, reduction = embed_dims[stage], num_heads[stage], sr_ratios[stage]
-            return MitBlock(dim, heads, reduction, int(dim * mlp_ratio), norm_eps=NORM_EPS)
-
         def thermal(stage: int) -> nn.Module:
             dim, ratio = embed_dims[stage], thermal_mlp_ratios[stage]
             return PpxBlock(dim, int(dim * ratio), windows=pool_windows, layer_scale=layer_scale)
 
+        rgb = mit_blocks(embed_dims, num_heads, sr_ratios, mlp_ratio, norm_eps=NORM_EPS)
         streams = (
             Stream(3, rgb, NORM_EPS, NORM_EPS),
             Stream(inputs.thermal_channels, thermal, MAP_NORM_EPS, MAP_NORM_EPS),

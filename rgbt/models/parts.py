@@ -94,6 +94,25 @@ class Mlp(nn.Module):
         return out
 
 
+class ResidualBlock(nn.Module):
+    """Attention and a feed-forward network, each normalised before and added to its input."""
+
+    def __init__(
+        self, dim: int, attn: nn.Module, mlp: nn.Module, *, norm_eps: float = 1e-5
+    ) -> None:
+        super().__init__()
+        self.norm1 = nn.LayerNorm(dim, eps=norm_eps)
+        self.attn = attn
+        self.norm2 = nn.LayerNorm(dim, eps=norm_eps)
+        self.mlp = mlp
+
+    def forward(self, x: Tensor, keep: Keep = ALL_KEPT) -> Tensor:
+        """(N, H, W, C) -> the same."""
+        first, second = keep
+        x = add_residual(x, self.attn(self.norm1(x)), first)
+        return add_residual(x, self.mlp(self.norm2(x)), second)
+
+
 class UpBlock(nn.Module):
     """Twice the size (bilinear), 3x3 convolution, normalisation, PReLU with one slope.
 

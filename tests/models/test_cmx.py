@@ -13,7 +13,7 @@ from torch.nn import functional as F
 from rgbt.checks import InputError
 from rgbt.models.cmnext import ConvFfn, PoolingGate, PpxBlock, window_mean
 from rgbt.models.cmx.fusion import CrossAttention, Rectification
-from rgbt.models.cmx.mit import MitAttention, MitBlock, MixFfn
+from rgbt.models.cmx.mit import MitAttention, MixFfn, mit_blocks
 from rgbt.models.cmx.model import drop_rates
 from rgbt.models.cmx.network import MlpDecoder
 from tests.models.golden import network
@@ -257,7 +257,7 @@ def test_rates_reach_the_blocks_of_each_stream(
 
 
 def test_a_dropped_residual_leaves_the_sample_alone() -> None:
-    block: MitBlock = drawn(MitBlock(4, 2, 1, 8, norm_eps=1e-6))
+    block = drawn(mit_blocks((4,) * 4, (2,) * 4, (1,) * 4, 2.0, norm_eps=1e-6)(0))
     x = normal(3, 2, 2, 4)
     out = block(x, torch.tensor([[0.0, 1, 0], [0, 1, 2]]).view(2, 3, 1, 1, 1))
     torch.testing.assert_close(out[0], x[0])

@@ -53,7 +53,7 @@ def modules_of_crm() -> dict[str, str]:
     """Name in the record -> module."""
     head = "sem_seg_head.pixel_decoder"
     paths = {
-        "backbone": "backbone",
+        "backbone": "backbone.norm_layers",
         "pyramid": head,
         "pixel_decoder.adapter_1": f"{head}.adapter_1",
     }

@@ -7,11 +7,13 @@ take as it is (channels last), so that nothing is copied between the two.
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Callable
 
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.models.parts import ALL_KEPT, Keep, add_residual
+from rgbt.models.parts import ResidualBlock
+from rgbt.ranges import Widths
 
 NORM_EPS = 1e-5
 """Of the normalisations in patch embeddings and of keys, and of all of CMNeXt's RGB stream."""
@@ -88,23 +90,17 @@ class MixFfn(nn.Module):
         return out
 
 
-class MitBlock(nn.Module):
-    """Attention and feed-forward, each normalised before and added to its input."""
+def mit_blocks(
+    dims: Widths, heads: Widths, reductions: Widths, ratio: float, *, norm_eps: float
+) -> Callable[[int], ResidualBlock]:
+    """What makes a block of stage 0..3; arguments as in `CMX`."""
 
-    def __init__(
-        self, dim: int, heads: int, reduction: int, hidden: int, *, norm_eps: float
-    ) -> None:
-        super().__init__()
-        self.norm1 = nn.LayerNorm(dim, eps=norm_eps)
-        self.attn = MitAttention(dim, heads, reduction)
-        self.norm2 = nn.LayerNorm(dim, eps=norm_eps)
-        self.mlp = MixFfn(dim, hidden)
+    def block(stage: int) -> ResidualBlock:
+        attention = MitAttention(dims[stage], heads[stage], reductions[stage])
+        mlp = MixFfn(dims[stage], int(dims[stage] * ratio))
+        return ResidualBlock(dims[stage], attention, mlp, norm_eps=norm_eps)
 
-    def forward(self, x: Tensor, keep: Keep = ALL_KEPT) -> Tensor:
-        """(N, H, W, C) -> the same."""
-        first, second = keep
-        x = add_residual(x, self.attn(self.norm1(x)), first)
-        return add_residual(x, self.mlp(self.norm2(x)), second)
+    return block
 
 
 def initialise(module: nn.Module, *, divide_groups: bool = True) -> None:

@@ -6,9 +6,9 @@ from typing import Annotated, Literal
 
 import torch
 from annotated_types import Interval
-from torch import Tensor, nn
+from torch import Tensor
 
-from rgbt.models.cmx.mit import NORM_EPS, MitBlock, initialise
+from rgbt.models.cmx.mit import NORM_EPS, initialise, mit_blocks
 from rgbt.models.cmx.network import CmxEncoder, CmxNetwork, MlpDecoder, Stream
 from rgbt.models.inputs import Inputs
 from rgbt.ranges import Channels, Depths, Epsilon, MlpRatio, NumClasses, ShareBelowOne, Widths
@@ -51,12 +51,7 @@ class CMX(CmxNetwork):
         decoder_norm_eps_eval: Epsilon | None,
         inputs: Inputs,
     ) -> None:
-        sizes = list(zip(embed_dims, num_heads, sr_ratios, strict=True))
-
-        def block(stage: int) -> nn.Module:
-            dim, heads, reduction = sizes[stage]
-            return MitBlock(dim, heads, reduction, int(dim * mlp_ratio), norm_eps=BLOCK_NORM_EPS)
-
+        block = mit_blocks(embed_dims, num_heads, sr_ratios, mlp_ratio, norm_eps=BLOCK_NORM_EPS)
         streams = (
             Stream(3, block, NORM_EPS, BLOCK_NORM_EPS),
             Stream(inputs.thermal_channels, block, NORM_EPS, BLOCK_NORM_EPS),

@@ -16,7 +16,6 @@ from rgbt.models.inputs import Inputs, as_rgb
 from rgbt.models.mask2former.network import (
     MODALITIES,
     RECORD,
-    Backbone,
     Fusion,
     FusionKind,
     HiddenDim,
@@ -80,7 +79,7 @@ class Pyramid(nn.ModuleList):
         return [level(source) for level, source in zip(self, sources, strict=True)]
 
 
-class DinoBackbone(Backbone):
+class DinoBackbone(nn.Module):
     """RGB and thermal through the same encoder, a pyramid each, and their fusion.
 
     Sources: fusion: CRM, Sec. III-B. Ours: the shared encoder, with a vector that is added to the
@@ -112,12 +111,12 @@ class DinoBackbone(Backbone):
 
     def maps(
         self,
-        modality: Literal["rgb", "thermal"],
+        modality: str,
         image: Tensor,
         hidden: Tensor | None,
         generator: torch.Generator | None,  # noqa: ARG002 - nothing is dropped at random
     ) -> Maps:
-        """As `Backbone.maps`; the image is resized so that a patch covers `token_px` pixels."""
+        """(N, c, H, W) and (N, h, w); images are resized so that a patch has `token_px` pixels."""
         image, patch = as_rgb(image), self.encoder.patch
         if patch != self.token_px:
             height, width = (side // self.token_px * patch for side in image.shape[-2:])

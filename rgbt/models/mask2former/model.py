@@ -7,12 +7,11 @@ from typing import Annotated, Literal
 
 import torch
 from annotated_types import Interval
-from torch import Tensor
+from torch import Tensor, nn
 
 from rgbt.models.inputs import Inputs
 from rgbt.models.mask2former.network import (
     RECORD,
-    Backbone,
     Fusion,
     FusionKind,
     HiddenDim,
@@ -26,7 +25,7 @@ from rgbt.models.parts import check_heads
 from rgbt.ranges import Blocks, Channels, Depths, MlpRatio, NumClasses, ShareBelowOne, Widths
 
 
-class RgbtBackbone(Backbone):
+class RgbtBackbone(nn.Module):
     """RGB branch, thermal branch, and their fusion.
 
     Source: CRM, Sec. III-B.   Stages from `share_start` on (0..4) are the RGB branch's own in both
@@ -55,12 +54,12 @@ class RgbtBackbone(Backbone):
 
     def maps(
         self,
-        modality: Literal["rgb", "thermal"],
+        modality: str,
         image: Tensor,
         hidden: Tensor | None,
         generator: torch.Generator | None,
     ) -> Maps:
-        """As `Backbone.maps`."""
+        """(N, c, H, W) with sides that are multiples of 32, and (N, H / 4, W / 4)."""
         branch = self.RGB_branch if modality == "rgb" else self.THR_branch
         found: Maps = branch(image, hidden, generator)
         return found

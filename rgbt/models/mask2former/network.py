@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
 from annotated_types import Interval, MultipleOf
@@ -12,7 +12,7 @@ from torch.nn import functional as F
 
 from rgbt.checks import check_choice
 from rgbt.geometry.padding import STRIDE, padded_hw
-from rgbt.models.inputs import Images, Inputs, expand_cells
+from rgbt.models.inputs import Inputs, expand_cells
 from rgbt.models.mask2former.decoder import Predictor
 from rgbt.models.mask2former.pixel_decoder import GROUPS, HeadShape, PixelDecoder
 from rgbt.models.parts import check_heads
@@ -100,63 +100,24 @@ def _parts(stacked: Tensor, passes: int) -> Sequence[Tensor]:
     return (stacked,) if passes == 1 else stacked.chunk(passes)
 
 
-class Backbone(nn.Module):
-    """Maps of each modality and their fusion, `norm_layers`; a subclass defines `maps`."""
-
-    token_px: int
-    """Side of a token, of which a hidden cell has several."""
-    norm_layers: Fusion
-
-    def maps(
-        self,
-        modality: Literal["rgb", "thermal"],
-        image: Tensor,
-        hidden: Tensor | None,
-        generator: torch.Generator | None,
-    ) -> Maps:
-        """Maps of one normalised image (N, c, H, W), sides multiples of 32.
-
-        `hidden` (N, H / token_px, W / token_px) bool: True = the token is hidden; None: none is.
-        """
-        raise NotImplementedError
-
-    def forward(
-        self,
-        images: Images,
-        hidden: MaskPair | None,
-        request: Request,
-        generator: torch.Generator | None,
-    ) -> Maps:
-        """Features of all predictions as one batch; what no view needs is not computed.
-
-        `generator` draws what is dropped at random, first for RGB, then for thermal.
-        """
-        maps: dict[str, Maps] = {}
-        for index, modality in enumerate(MODALITIES):
-            if request.views != (MODALITIES[1 - index],):
-                mask = None if hidden is None else hidden[index]
-                maps[modality] = self.maps(modality, images[index], mask, generator)
-        fused: Maps = self.norm_layers(maps, request)
-        return fused
-
-
 class MaskNetwork(nn.Module):
     """Two images through a backbone to classes and masks of queries.
 
     Source: Mask2Former, Sec. 3.2.
 
-    Raises:
-        InputError: heads that do not divide `hidden_dim`.
+    A backbone has `maps(modality, image, hidden, generator)`, the maps of one normalised image with
+    tokens that are hidden, (N, h, w) bool or None; `token_px`, the side of a token; and a `Fusion`
+    under the name of the release, `norm_layers`.
     """
 
-    backbone: Backbone
+    backbone: Any
 
-    def __init__(self, backbone: Backbone, shape: HeadShape, inputs: Inputs) -> None:
+    def __init__(self, backbone: nn.Module, shape: HeadShape, inputs: Inputs) -> None:
         super().__init__()
         check_heads("model.attention_heads", (shape.attention_heads,), (shape.hidden_dim,))
         self.num_classes = shape.num_classes
         self.backbone = backbone
-        pixel_decoder = PixelDecoder(backbone.norm_layers.widths, shape)
+        pixel_decoder = PixelDecoder(self.backbone.norm_layers.widths, shape)
         self.sem_seg_head = nn.ModuleDict(
             {"pixel_decoder": pixel_decoder, "predictor": Predictor(shape)}
         )
@@ -223,8 +184,12 @@ class MaskNetwork(nn.Module):
             padded = padded_hw(image_hw)
             hidden = expand_cells(masks, rgb.shape[0], padded, self.backbone.token_px)
         images = self.inputs(rgb, thermal, masks, multiple=STRIDE)
-        request = Request(views, passes, predictions)
-        features = self.backbone(images, hidden, request, generator)
+        maps: dict[str, Maps] = {}
+        for index, modality in enumerate(MODALITIES):
+            if views != (MODALITIES[1 - index],):
+                mask = None if hidden is None else hidden[index]
+                maps[modality] = self.backbone.maps(modality, images[index], mask, generator)
+        features = self.backbone.norm_layers(maps, Request(views, passes, predictions))
         pyramid = self.sem_seg_head["pixel_decoder"](features, with_masks * count)
         class_logits, mask_logits = self.sem_seg_head["predictor"](pyramid)
         logits = None

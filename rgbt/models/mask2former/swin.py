@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.models.parts import ALL_KEPT, Keep, Mlp, add_residual, stochastic_depth
+from rgbt.models.parts import Keep, Mlp, ResidualBlock, stochastic_depth
 
 PATCH = 4
 
@@ -100,14 +100,14 @@ class WindowAttention(nn.Module):
 
         softmax(q k' / sqrt(d) + bias + shift mask) v
 
-    Source: Swin Transformer, Eq. (4).
+    Source: Swin Transformer, Eq. (4). Maps are rolled by -`shift`.
     """
 
     relative_position_index: Tensor
 
-    def __init__(self, dim: int, heads: int, window: int) -> None:
+    def __init__(self, dim: int, heads: int, window: int, shift: int) -> None:
         super().__init__()
-        self.heads, self.window = heads, window
+        self.heads, self.window, self.shift = heads, window, shift
         self.scale = (dim // heads) ** -0.5
         self.qkv = nn.Linear(dim, 3 * dim)
         self.proj = nn.Linear(dim, dim)
@@ -116,13 +116,16 @@ class WindowAttention(nn.Module):
         index = relative_index(window)
         self.register_buffer("relative_position_index", index, persistent=False)
 
-    def forward(self, x: Tensor, shift: int) -> Tensor:
-        """Attention in every window of (N, H, W, C), before the output projection.
-
-        H and W are multiples of the window; the map has been rolled by -`shift` already.
-        """
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, H, W, C) of any size -> the same."""
+        hw, side, shift = x.shape[1:3], self.window, self.shift
+        below, right = ((-length) % side for length in hw)
+        if below or right:
+            x = F.pad(x, (0, 0, 0, right, 0, below))
+        if shift:
+            x = x.roll((-shift, -shift), (1, 2))
         n, height, width, dim = x.shape
-        side, rows, columns = self.window, height // self.window, width // self.window
+        rows, columns = height // side, width // side
         # Windows and heads are cut out of the projected map in one copy.
         qkv = self.qkv(x).view(n, rows, side, columns, side, 3, self.heads, -1)
         qkv = qkv.permute(5, 0, 1, 3, 6, 2, 4, 7).reshape(
@@ -139,40 +142,11 @@ class WindowAttention(nn.Module):
         out = (scores + bias).softmax(-1) @ v
 
         out = out.view(n, rows, columns, self.heads, side, side, -1)
-        merged: Tensor = out.permute(0, 1, 4, 2, 5, 3, 6).reshape(n, height, width, dim)
-        return merged
-
-
-class SwinBlock(nn.Module):
-    """Window attention and MLP, each normalised before and added to its input."""
-
-    def __init__(self, dim: int, heads: int, shape: SwinShape, *, shift: int) -> None:
-        super().__init__()
-        self.shift = shift
-        self.norm1 = nn.LayerNorm(dim)
-        self.attn = WindowAttention(dim, heads, shape.window_size)
-        self.norm2 = nn.LayerNorm(dim)
-        self.mlp = Mlp(dim, int(dim * shape.mlp_ratio))
-
-    def forward(self, x: Tensor, keep: Keep = ALL_KEPT) -> Tensor:
-        """(N, H, W, C) -> the same."""
-        first, second = keep
-        x = add_residual(x, self._attend(self.norm1(x)), first)
-        return add_residual(x, self.mlp(self.norm2(x)), second)
-
-    def _attend(self, x: Tensor) -> Tensor:
-        """Window attention on a map of any size."""
-        height, width = x.shape[1:3]
-        below, right = (-height) % self.attn.window, (-width) % self.attn.window
-        if below or right:
-            x = F.pad(x, (0, 0, 0, right, 0, below))
-        if self.shift:
-            x = x.roll((-self.shift, -self.shift), (1, 2))
-        x = self.attn(x, self.shift)
-        if self.shift:
-            x = x.roll((self.shift, self.shift), (1, 2))
-        out: Tensor = self.attn.proj(x[:, :height, :width])
-        return out
+        out = out.permute(0, 1, 4, 2, 5, 3, 6).reshape(n, height, width, dim)
+        if shift:
+            out = out.roll((shift, shift), (1, 2))
+        projected: Tensor = self.proj(out[:, : hw[0], : hw[1]])
+        return projected
 
 
 class PatchMerging(nn.Module):
@@ -200,12 +174,12 @@ class Stage(nn.Module):
 
     def __init__(self, shape: SwinShape, index: int) -> None:
         super().__init__()
-        dim, heads = shape.widths[index], shape.num_heads[index]
-        shifts = (0, shape.window_size // 2)
-        self.blocks = nn.ModuleList(
-            SwinBlock(dim, heads, shape, shift=shifts[block % 2])
-            for block in range(shape.depths[index])
-        )
+        dim, heads, window = shape.widths[index], shape.num_heads[index], shape.window_size
+        self.blocks = nn.ModuleList()
+        for block in range(shape.depths[index]):
+            attention = WindowAttention(dim, heads, window, shift=block % 2 * (window // 2))
+            mlp = Mlp(dim, int(dim * shape.mlp_ratio))
+            self.blocks.append(ResidualBlock(dim, attention, mlp))
         self.downsample = PatchMerging(dim) if index < 3 else nn.Identity()
 
     def forward(self, x: Tensor, keeps: Sequence[Keep]) -> Tensor:
