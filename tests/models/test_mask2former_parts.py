@@ -10,28 +10,21 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.models.mask2former.decoder import QueryAttention
-from rgbt.models.mask2former.deformable import DeformableAttention, centre_grid
-from rgbt.models.mask2former.pixel_decoder import shrink, sine_code
+from rgbt.models.mask2former.pixel_decoder import (
+    DeformableAttention,
+    centre_grid,
+    shrink,
+    sine_code,
+)
 from rgbt.models.mask2former.swin import (
     PatchMerging,
-    SwinBlock,
-    SwinShape,
+    WindowAttention,
     relative_index,
     shift_mask,
 )
-from tests.models import plain
+from tests.models.plain import nano, normal, randomise
 
 CPU = torch.device("cpu")
-
-
-def seeded(*shape: int, seed: int = 0) -> Tensor:
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
-
-
-def randomise(module: nn.Module, scale: float = 0.3) -> None:
-    with torch.no_grad():
-        for number, parameter in enumerate(module.parameters()):
-            parameter.copy_(scale * seeded(*parameter.shape, seed=number))
 
 
 def test_relative_index_by_hand() -> None:
@@ -54,21 +47,14 @@ def test_shift_mask_by_hand() -> None:
 
 
 @pytest.mark.parametrize("shift", [0, 1])
+@torch.no_grad()
 def test_block_attention_equals_a_loop_over_tokens(shift: int) -> None:
     """5 x 7 tokens padded to 6 x 9, windows of 3; padding is attended to, as released."""
-    block = SwinBlock(8, 2, SwinShape(8, (1,) * 4, (2,) * 4, 3, 2.0, 0.0), shift=shift)
-    randomise(block)
-    x = seeded(1, 5, 7, 8, seed=9)
-    with torch.no_grad():
-        found = block._attend(x)[0]
-        expected = _attend_by_loop(block, x[0], shift)
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
-
-
-def _attend_by_loop(block: SwinBlock, x: Tensor, shift: int) -> Tensor:
-    attn, out = block.attn, torch.zeros_like(x)
-    padded = F.pad(x, (0, 0, 0, 2, 0, 1))
-    q, k, v = attn.qkv(padded).chunk(3, -1)
+    attn = WindowAttention(8, 2, 3, shift)
+    randomise(attn)
+    x = normal(1, 5, 7, 8, seed=9)
+    expected = torch.zeros(5, 7, 8)
+    q, k, v = attn.qkv(F.pad(x[0], (0, 0, 0, 2, 0, 1))).chunk(3, -1)
     table = attn.relative_position_bias_table.view(5, 5, 2)
     for r in range(5):
         for c in range(7):
@@ -76,8 +62,7 @@ def _attend_by_loop(block: SwinBlock, x: Tensor, shift: int) -> Tensor:
                 (y, z)
                 for y in range(6)
                 for z in range(9)
-                if _window(y, 6, shift) == _window(r, 6, shift)
-                and _window(z, 9, shift) == _window(c, 9, shift)
+                if _window(y, shift) == _window(r, shift) and _window(z, shift) == _window(c, shift)
             ]
             heads = []
             for h in range(2):
@@ -88,11 +73,11 @@ def _attend_by_loop(block: SwinBlock, x: Tensor, shift: int) -> Tensor:
                 ]
                 values = torch.stack([v[y, z, part] for y, z in peers])
                 heads.append(torch.stack(scores).softmax(0) @ values)
-            out[r, c] = attn.proj(torch.cat(heads))
-    return out
+            expected[r, c] = attn.proj(torch.cat(heads))
+    torch.testing.assert_close(attn(x)[0], expected, rtol=1e-4, atol=1e-5)
 
 
-def _window(position: int, size: int, shift: int) -> int:
+def _window(position: int, shift: int) -> int:
     """Number of the window; the first `shift` tokens wrap around into a group of their own."""
     return -1 if position < shift else (position - shift) // 3
 
@@ -112,42 +97,40 @@ def test_sine_code_equals_its_formula() -> None:
         for x in range(3):
             expected = []
             for position, size in ((y, 2), (x, 3)):
-                for k in range(4):
-                    angle = (
-                        2 * math.pi * (position + 1) / (size + 1e-6) / 10000 ** (2 * (k // 2) / 4)
-                    )
-                    expected.append(math.cos(angle) if k % 2 else math.sin(angle))
+                angle = 2 * math.pi * (position + 1) / (size + 1e-6)
+                for slower in (angle, angle / 10000 ** (2 / 4)):
+                    expected += [math.sin(slower), math.cos(slower)]
             torch.testing.assert_close(code[y, x], torch.tensor(expected), rtol=1e-5, atol=1e-5)
 
 
 def test_centre_grid_by_hand() -> None:
-    assert centre_grid(((1, 2),), CPU).tolist() == [[-0.5, 0.5], [0.0, 0.0]]
+    centre, scale = centre_grid(((1, 2),), CPU)
+    assert centre.tolist() == [[-0.5, 0.5], [0.0, 0.0]]
+    assert scale.flatten().tolist() == [1.0, 2.0]
 
 
+@torch.no_grad()
 def test_deformable_attention_equals_a_loop_over_samples() -> None:
     levels = ((2, 3), (4, 5))
     layer = DeformableAttention(8, heads=2, num_levels=2)
     randomise(layer)
-    query, tokens = seeded(2, 26, 8, seed=50), seeded(2, 26, 8, seed=51)
-    with torch.no_grad():
-        found = layer(query, tokens, levels)
-        value = layer.value_proj(tokens).view(2, 26, 2, 4)
-        offsets = layer.sampling_offsets(query).view(2, 26, 2, 2, 4, 2)
-        weights = layer.attention_weights(query).view(2, 26, 2, 8).softmax(-1).view(2, 26, 2, 2, 4)
-        out = torch.zeros(2, 26, 2, 4)
-        centres = [
-            ((r + 0.5) / h, (c + 0.5) / w) for h, w in levels for r in range(h) for c in range(w)
-        ]
-        for b, s, m, e, j in torch.cartesian_prod(
-            *(torch.arange(n) for n in (2, 26, 2, 2, 4))
-        ).tolist():
-            (h, w), start = levels[e], (0, 6)[e]
-            dx, dy = offsets[b, s, m, e, j].tolist()
-            row, column = centres[s][0] * h + dy - 0.5, centres[s][1] * w + dx - 0.5
-            grid = value[b, start : start + h * w, m].view(h, w, 4)
-            out[b, s, m] += weights[b, s, m, e, j] * _bilinear(grid, row, column)
-        expected = layer.output_proj(out.flatten(2))
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
+    query, tokens = normal(2, 26, 8, seed=50), normal(2, 26, 8, seed=51)
+    value = layer.value_proj(tokens).view(2, 26, 2, 4)
+    offsets = layer.sampling_offsets(query).view(2, 26, 2, 2, 4, 2)
+    weights = layer.attention_weights(query).view(2, 26, 2, 8).softmax(-1).view(2, 26, 2, 2, 4)
+    out = torch.zeros(2, 26, 2, 4)
+    centres = [
+        ((r + 0.5) / h, (c + 0.5) / w) for h, w in levels for r in range(h) for c in range(w)
+    ]
+    indices = torch.cartesian_prod(*(torch.arange(n) for n in (2, 26, 2, 2, 4)))
+    for b, s, m, e, j in indices.tolist():
+        (h, w), start = levels[e], (0, 6)[e]
+        dx, dy = offsets[b, s, m, e, j].tolist()
+        row, column = centres[s][0] * h + dy - 0.5, centres[s][1] * w + dx - 0.5
+        grid = value[b, start : start + h * w, m].view(h, w, 4)
+        out[b, s, m] += weights[b, s, m, e, j] * _bilinear(grid, row, column)
+    expected = layer.output_proj(out.flatten(2))
+    torch.testing.assert_close(layer(query, tokens, levels), expected, rtol=1e-4, atol=1e-5)
 
 
 def _bilinear(grid: Tensor, row: float, column: float) -> Tensor:
@@ -174,36 +157,36 @@ def test_deformable_attention_starts_by_looking_around() -> None:
 
 def test_attention_equals_torch_module() -> None:
     ours, theirs = QueryAttention(8, 2), nn.MultiheadAttention(8, 2, batch_first=True)
-    randomise(ours)
-    theirs.load_state_dict(ours.state_dict())
-    query, key, value = seeded(2, 3, 8, seed=1), seeded(2, 5, 8, seed=2), seeded(2, 5, 8, seed=3)
-    allowed = torch.rand(2, 3, 5, generator=torch.Generator().manual_seed(4)) < 0.6
+    theirs.load_state_dict(randomise(ours))
+    query, key, value = normal(2, 3, 8, seed=1), normal(2, 5, 8, seed=2), normal(2, 5, 8, seed=3)
+    allowed = normal(2, 3, 5, seed=4) < 0.3
     allowed |= ~allowed.any(-1, keepdim=True)
     blocked = ~allowed.repeat_interleave(2, dim=0)
-    torch.testing.assert_close(
-        ours(query, key, value, allowed), theirs(query, key, value, attn_mask=blocked)[0]
-    )
+    found = ours(query, key, value, allowed)
+    torch.testing.assert_close(found, theirs(query, key, value, attn_mask=blocked)[0])
     torch.testing.assert_close(ours(query, key, value, None), theirs(query, key, value)[0])
+    with torch.autocast("cpu", torch.bfloat16):
+        rounded = ours(query, key, value, allowed)
+    assert rounded.dtype == torch.bfloat16
+    torch.testing.assert_close(rounded.float(), found, rtol=0.05, atol=0.05)
 
 
 @pytest.mark.parametrize("factor", [2, 4, 8])
 def test_shrink_equals_bilinear_interpolation(factor: int) -> None:
-    x = seeded(2, 3, 16, 24)
-    expected = F.interpolate(
-        x, size=(16 // factor, 24 // factor), mode="bilinear", align_corners=False
-    )
+    x, size = normal(2, 3, 16, 24), (16 // factor, 24 // factor)
+    expected = F.interpolate(x, size=size, mode="bilinear", align_corners=False)
     torch.testing.assert_close(shrink(x, factor), expected)
 
 
 def test_head_without_masks_of_some_samples_has_the_same_gradients() -> None:
     """In double precision: what differs in single precision is the order of the sums."""
-    head = plain.nano("mask2former").sem_seg_head.double()
+    head = nano("mask2former").sem_seg_head.double()
     head.pixel_decoder.fp32 = False
     widths, sides = (8, 16, 32, 64), ((16, 24), (8, 12), (4, 6), (2, 3))
     sizes = [(5, width, *side) for width, side in zip(widths, sides, strict=True)]
     found = []
     for num_masks in (None, 3):
-        features = [seeded(*size, seed=i).double() for i, size in enumerate(sizes)]
+        features = [normal(*size, seed=i).double() for i, size in enumerate(sizes)]
         leaves = [each.requires_grad_() for each in features]
         classes, masks = head.predictor(head.pixel_decoder(leaves, num_masks))
         assert masks.shape[1] == (num_masks or 5)
@@ -212,16 +195,3 @@ def test_head_without_masks_of_some_samples_has_the_same_gradients() -> None:
         found.append([classes, masks[:, :3], *torch.autograd.grad(loss, wanted)])
     for every, fewer in zip(*found, strict=True):
         torch.testing.assert_close(fewer, every, rtol=1e-10, atol=1e-10)
-
-
-def test_query_attention_under_autocast_is_near_single_precision() -> None:
-    attention = QueryAttention(8, 2)
-    randomise(attention)
-    query, key = seeded(2, 3, 8), seeded(2, 5, 8, seed=1)
-    allowed = seeded(2, 3, 5, seed=2) > 0
-    allowed[..., 0] = True
-    with torch.autocast("cpu", torch.bfloat16):
-        found = attention(query, key, key, allowed)
-    expected = attention(query, key, key, allowed)
-    assert found.dtype == torch.bfloat16
-    torch.testing.assert_close(found.float(), expected, rtol=0.05, atol=0.05)

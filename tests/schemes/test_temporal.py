@@ -16,7 +16,7 @@ from rgbt.geometry.halving import halved_all, halved_label, halved_mean
 from rgbt.geometry.warp import Warp
 from rgbt.losses.cross_entropy import CrossEntropy
 from rgbt.losses.temporal import TemporalLoss
-from rgbt.models.mask2former.head import semantic_logits
+from rgbt.models.mask2former.network import semantic_logits
 from rgbt.models.mask2former.model import Mask2Former
 from rgbt.requirements import Record, Requirement
 from rgbt.schemes.temporal import Temporal

@@ -366,7 +366,7 @@ def test_network_entries_parameters_are_those_of_the_built_network(
     text = page_texts(replace(report(0), tables=()), (found,))["networks.md"]
     assert "| MFNet | `model=mfnet` | 0.74 |" in text
     assert "| MFNet | MFNet (final.pth) | <https://github.com/haqishen/MFNet-pytorch> |" in text
-    assert "| MFNet | `tests/models/test_rtfnet_mfnet_golden.py` |" in text
+    assert "| MFNet | `tests/models/test_golden.py` |" in text
 
 
 def test_command_markdown_writes_the_pages_and_leaves_others(

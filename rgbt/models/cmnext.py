@@ -1,18 +1,28 @@
-"""Parallel pooling mixer (PPX): the stages of CMNeXt's thermal stream, without attention.
+"""CMNeXt for RGB and thermal: a MiT stream for RGB, a pooling stream for thermal.
 
-Maps are (N, H, W, C) between the blocks, as in `rgbt.models.cmx.mit`, and (N, C, H, W) inside.
+The rest is CMX's: what lies between the streams, and the decoder. Not here: the self-query hub,
+which exists from three modalities on. Maps are (N, H, W, C) between the blocks, as in
+`rgbt.models.cmx.mit`, and (N, C, H, W) inside those of the parallel pooling mixer (PPX).
 """
 
 from __future__ import annotations
 
 from collections import OrderedDict
+from dataclasses import replace
+from functools import partial
+from typing import Annotated
 
 import torch
+from annotated_types import Interval, Len, Predicate, doc
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.models.cmx.mit import MitShape, patch_embed
-from rgbt.models.parts import add_residual
+from rgbt.models.cmx.mit import NORM_EPS, initialise, mit_blocks
+from rgbt.models.cmx.model import Reductions, drop_rates
+from rgbt.models.cmx.network import CmxEncoder, CmxNetwork, MlpDecoder, Stream
+from rgbt.models.inputs import Inputs
+from rgbt.models.parts import ALL_KEPT, Keep, add_residual
+from rgbt.ranges import Channels, Depths, Epsilon, MlpRatio, NumClasses, ShareBelowOne, Widths
 
 MAP_NORM_EPS = 1e-6
 """Of the layer normalisations in patch embeddings and after a stage; the RGB stream's are 1e-5."""
@@ -91,9 +101,9 @@ class PpxBlock(nn.Module):
         self.layer_scale_2 = nn.Parameter(torch.full((dim,), layer_scale))
         self.c_nets = nn.Sequential(nn.Conv1d(1, 1, 3, padding=1, bias=False), nn.Sigmoid())
 
-    def forward(self, x: Tensor, keep: Tensor | None = None) -> Tensor:
-        """(N, H, W, C) -> the same; `keep`: (2, N, 1, 1, 1) factors of both residuals, or None."""
-        first, second = (None, None) if keep is None else keep.unbind()
+    def forward(self, x: Tensor, keep: Keep = ALL_KEPT) -> Tensor:
+        """(N, H, W, C) -> the same."""
+        first, second = keep
         x = x.permute(0, 3, 1, 2)
         y = add_residual(x, self.layer_scale_1[:, None, None] * self.attn(self.norm1(x)), first)
         weights = self.c_nets(y.mean((2, 3))[:, None]).view(*y.shape[:2], 1, 1)
@@ -101,23 +111,64 @@ class PpxBlock(nn.Module):
         return add_residual(weights * y, residual, second).permute(0, 2, 3, 1)
 
 
-def stage_modules(
-    shape: MitShape,
-    stage: int,
-    *,
-    in_channels: int,
-    mlp_ratios: tuple[float, float, float, float],
-    windows: tuple[int, ...],
-    layer_scale: float,
-) -> dict[str, nn.Module]:
-    """As `rgbt.models.cmx.mit.stage_modules`; the other settings as in `CMNeXt`."""
-    dim = shape.embed_dims[stage]
-    hidden = int(dim * mlp_ratios[stage])
-    return {
-        "patch_embed": patch_embed(shape, stage, in_channels, norm_eps=MAP_NORM_EPS),
-        "block": nn.ModuleList(
-            PpxBlock(dim, hidden, windows=windows, layer_scale=layer_scale)
-            for _ in range(shape.depths[stage])
-        ),
-        "norm": nn.LayerNorm(dim, eps=MAP_NORM_EPS),
-    }
+def _is_odd(number: int) -> bool:
+    return number % 2 == 1
+
+
+Window = Annotated[int, Interval(ge=1, le=99), Predicate(_is_odd), doc("positions, odd")]
+
+
+class CMNeXt(CmxNetwork):
+    """CMNeXt for RGB and one further modality, thermal.
+
+    Source: J. Zhang et al., Delivering Arbitrary-Modal Semantic Segmentation, CVPR 2023.
+    Released: jamycheung/DELIVER. With two modalities its self-query hub does not exist.
+
+    The arguments are the keys of ``conf/model/cmnext_b2.yaml``.
+    """
+
+    # ImageNet's file covers the RGB stream alone.
+    record = replace(
+        CmxNetwork.record,
+        pretrained_parts=("backbone.patch_embed", "backbone.block", "backbone.norm"),
+    )
+
+    def __init__(  # noqa: PLR0913 - each is a key of conf/model/*.yaml
+        self,
+        *,
+        num_classes: NumClasses,
+        embed_dims: Widths,
+        depths: Depths,
+        num_heads: Widths,
+        sr_ratios: Reductions,
+        mlp_ratio: MlpRatio,
+        thermal_mlp_ratios: tuple[MlpRatio, MlpRatio, MlpRatio, MlpRatio],
+        pool_windows: Annotated[tuple[Window, ...], Len(0, 10)],
+        layer_scale: Annotated[float, Interval(gt=0, le=1)],
+        decoder_dim: Channels,
+        drop_path_rate: ShareBelowOne,
+        decoder_dropout: ShareBelowOne,
+        decoder_norm_eps: Epsilon,
+        inputs: Inputs,
+    ) -> None:
+        def thermal(stage: int) -> nn.Module:
+            dim, ratio = embed_dims[stage], thermal_mlp_ratios[stage]
+            return PpxBlock(dim, int(dim * ratio), windows=pool_windows, layer_scale=layer_scale)
+
+        rgb = mit_blocks(embed_dims, num_heads, sr_ratios, mlp_ratio, norm_eps=NORM_EPS)
+        streams = (
+            Stream(3, rgb, NORM_EPS, NORM_EPS),
+            Stream(inputs.thermal_channels, thermal, MAP_NORM_EPS, MAP_NORM_EPS),
+        )
+        rates = drop_rates(depths, drop_path_rate) if drop_path_rate else None
+        backbone = CmxEncoder(streams, embed_dims, depths, num_heads, drop_rates=rates)
+        decode_head = MlpDecoder(
+            embed_dims,
+            num_classes,
+            dim=decoder_dim,
+            dropout=decoder_dropout,
+            norm_eps=(decoder_norm_eps, decoder_norm_eps),
+            mix_bias=False,
+        )
+        super().__init__(backbone, decode_head, inputs, sr_ratios)
+        self.apply(partial(initialise, divide_groups=False))

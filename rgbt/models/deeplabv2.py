@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated, Literal
 
 import torch
-from annotated_types import Len
+from annotated_types import Interval, Len
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.checks import InputError, check_choice
 from rgbt.geometry.padding import padded_hw
-from rgbt.models.deeplabv2.heads import AtrousPyramid, Decoder, DeepLabHead, HeadShape, Rates
-from rgbt.models.inputs import Inputs, only_view
-from rgbt.models.parts import DropRates
+from rgbt.models.inputs import Inputs, as_rgb, only_view
+from rgbt.models.parts import DropRates, UpBlock, enlarge
 from rgbt.models.resnet import bottleneck_stage
 from rgbt.ranges import BaseWidth, Depths, Names, NumClasses
 from rgbt.requirements import Record, Requirement
@@ -23,6 +23,9 @@ STRIDE = 8
 """Of the backbone; the modified decoders double the size three times."""
 
 TrainNorm = Literal["all", "statistics"]
+Decoder = Literal["basic", "modified_heatnet", "modified_thesis"]
+Rates = Annotated[tuple[Annotated[int, Interval(ge=1, le=1024)], ...], Len(1, 64)]
+"""Dilations."""
 
 
 class Backbone(nn.Module):
@@ -37,25 +40,17 @@ class Backbone(nn.Module):
     """
 
     def __init__(
-        self,
-        depths: tuple[int, int, int, int],
-        width: int,
-        *,
-        ceil_mode: bool,
-        train_norm: TrainNorm,
+        self, depths: tuple[int, int, int, int], width: int, *, ceil_mode: bool, train_norm: str
     ) -> None:
         super().__init__()
+        stage = partial(bottleneck_stage, stride_at="1x1")
         self.pool = nn.MaxPool2d(3, stride=2, padding=1, ceil_mode=ceil_mode)
         self.conv1 = nn.Conv2d(3, width, 7, stride=2, padding=3, bias=False)
         self.bn1 = nn.BatchNorm2d(width)
-        self.layer1 = bottleneck_stage(width, width, depths[0], stride_at="1x1")
-        self.layer2 = bottleneck_stage(4 * width, 2 * width, depths[1], stride=2, stride_at="1x1")
-        self.layer3 = bottleneck_stage(
-            8 * width, 4 * width, depths[2], dilations=(2, 2), stride_at="1x1"
-        )
-        self.layer4 = bottleneck_stage(
-            16 * width, 8 * width, depths[3], dilations=(4, 4), stride_at="1x1"
-        )
+        self.layer1 = stage(width, width, depths[0])
+        self.layer2 = stage(4 * width, 2 * width, depths[1], stride=2)
+        self.layer3 = stage(8 * width, 4 * width, depths[2], dilations=(2, 2))
+        self.layer4 = stage(16 * width, 8 * width, depths[3], dilations=(4, 4))
         for module in self.modules():
             if isinstance(module, nn.BatchNorm2d):
                 module.requires_grad_(train_norm == "all")
@@ -70,6 +65,65 @@ class Backbone(nn.Module):
         return layer3, self.layer4(layer3)
 
 
+class AtrousPyramid(nn.Module):
+    """Sum of parallel dilated 3x3 convolutions, nothing else (ASPP).
+
+    Source: DeepLab v2, Sec. 3.2 and Fig. 7: all four count.   Released: AdaptSegNet,
+    MaxSquareLoss and the thesis leave their loop early, so that only the first two (`summed_rates`)
+    count, while the others still belong to the parameters; ADVENT sums all.
+    """
+
+    def __init__(
+        self, in_channels: int, out_channels: int, *, rates: Rates, summed_rates: Rates
+    ) -> None:
+        super().__init__()
+        self.conv2d_list = nn.ModuleList(
+            nn.Conv2d(in_channels, out_channels, 3, padding=rate, dilation=rate) for rate in rates
+        )
+        self.summed = [rates.index(rate) for rate in summed_rates]
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, in, h, w) -> (N, out, h, w)."""
+        first, *others = self.summed
+        result: Tensor = self.conv2d_list[first](x)
+        for index in others:
+            result = result + self.conv2d_list[index](x)
+        return result
+
+
+class DeepLabHead(nn.Module):
+    """A pyramid, and in the modified decoders three up blocks, between maps of `widths` channels.
+
+    Source: thesis, Sec. III-B and Fig. 5: a modified decoder keeps the number of channels.
+    Released: the training scripts import the network without up blocks. A file that no script
+    imports has a modified decoder of HeatNet's widths, which ends with a 1x1 convolution (`final`).
+    """
+
+    def __init__(
+        self,
+        aspp: AtrousPyramid,
+        widths: tuple[int, ...],
+        final: int | None,
+        *,
+        dropout: DropRates,
+        align_corners: bool,
+    ) -> None:
+        super().__init__()
+        self.dropout = dropout
+        self.aspp = aspp
+        self.ups = nn.ModuleList(
+            UpBlock(before, after, align_corners=align_corners)
+            for before, after in zip(widths, widths[1:], strict=False)
+        )
+        self.final = nn.Identity() if final is None else nn.Conv2d(widths[-1], final, 1)
+
+    def forward(self, x: Tensor, generator: torch.Generator | None) -> Tensor:
+        """(N, in, h, w) -> (N, K, h, w), or (N, K, 8 h, 8 w) from a modified decoder."""
+        rates = self.dropout if self.training else (0.0, 0.0)
+        result: Tensor = self.final(enlarge(self.aspp(x), self.ups, rates, generator))
+        return result
+
+
 class DeepLabV2(nn.Module):
     """DeepLab v2 with a backbone that all domains share and one head, or one per domain.
 
@@ -79,29 +133,10 @@ class DeepLabV2(nn.Module):
     Source: DeepLab v2; thesis (J. Sun, Multi-head), Sec. III.   Released: AdaptSegNet, ADVENT and
     MaxSquareLoss (one head, with or without the auxiliary one); the thesis' code (two heads).
 
-    Args:
-        num_classes: K; 14 in the thesis.
-        depths: bottlenecks per stage: (3, 4, 23, 3) for ResNet-101.
-        base_width: channels of the stem; the other widths are multiples of it.
-        ceil_mode: the pooling rounds up (released); false: down, which the modified decoders need
-            to come back to the size of the image.
-        train_norm: "all": the backbone's normalisations are trained (thesis' code);
-            "statistics": scale and shift are not, statistics are (AdaptSegNet, ADVENT).
-        heads: their names, the first is the default; ("main",), or one per domain.
-        auxiliary: a further pyramid on the third stage (AdaptSegNet and MaxSquareLoss).
-        decoder: see `HeadShape`. "basic" is what the uploaded training scripts of the thesis run,
-            "modified_thesis" what its text describes, and "modified_heatnet" that of an uploaded
-            network file that no script imports.
-        rates: dilations of the pyramid.
-        summed_rates: those that count: all (DeepLab v2, ADVENT), or the first two (AdaptSegNet,
-            MaxSquareLoss, thesis' code). The parameters are the same.
-        dropout: of channels, before the first up block and after each; (0, 0) without up blocks.
-        align_corners: of all enlargements: true where the releases enlarge the scores themselves,
-            false in the thesis' up blocks.
-        inputs: normalisation of the images, with three thermal channels.
+    The arguments are the keys of ``conf/model/deeplabv2.yaml``.
 
     Raises:
-        InputError: values that do not fit each other.
+        InputError: `ceil_mode` with a modified decoder, or names that no module can have.
     """
 
     def __init__(  # noqa: PLR0913 - each is a key of conf/model/*.yaml
@@ -122,35 +157,38 @@ class DeepLabV2(nn.Module):
         inputs: Inputs,
     ) -> None:
         super().__init__()
-        shape = HeadShape(
-            32 * base_width, num_classes, decoder, rates, summed_rates, dropout, align_corners
-        )
-        usable = all(name.isidentifier() and not hasattr(nn.ModuleDict, name) for name in heads)
-        if len(set(heads)) < len(heads) or not usable:
-            raise InputError(
-                "model.heads must be different names made of letters, such as [main] or [source, "
-                f"target], got {list(heads)}."
-            )
-        if inputs.thermal_channels != 3:
-            raise InputError(
-                "model.inputs must repeat thermal for three channels, because RGB and thermal "
-                "images pass the same backbone; choose model/inputs=half_three."
-            )
+        if not set(summed_rates) <= set(rates):
+            raise InputError(f"model.summed_rates must be some of {rates}, got {summed_rates}.")
+        if not all(name.isidentifier() and not hasattr(nn.ModuleDict, name) for name in heads):
+            raise InputError(f"model.heads must be names such as source, got {list(heads)}.")
         if ceil_mode and decoder != "basic":
-            raise InputError(
-                f"model.decoder={decoder} enlarges 8 times, which gives the size of the image "
-                "only with model.ceil_mode=false; set it."
-            )
+            raise InputError(f"model.ceil_mode must be false with model.decoder={decoder}.")
         self.record = self.record_from(heads=heads, auxiliary=auxiliary)
         self.num_classes = num_classes
         self.align_corners = align_corners
         # Scores that are interpolated fit images of any size.
         self.multiple = 1 if decoder == "basic" else STRIDE
         self.backbone = Backbone(depths, base_width, ceil_mode=ceil_mode, train_norm=train_norm)
-        self.heads = nn.ModuleDict({name: DeepLabHead(shape) for name in heads})
-        self.auxiliary = (
-            AtrousPyramid(16 * base_width, num_classes, rates, summed_rates) if auxiliary else None
+        channels = 32 * base_width
+        widths: dict[str, tuple[int, ...]] = {
+            "basic": (num_classes,),
+            "modified_heatnet": tuple(channels // each for each in (2, 8, 32, 32)),
+            "modified_thesis": (num_classes,) * 4,
+        }
+        pyramid = partial(AtrousPyramid, rates=rates, summed_rates=summed_rates)
+        self.heads = nn.ModuleDict(
+            {
+                name: DeepLabHead(
+                    pyramid(channels, widths[decoder][0]),
+                    widths[decoder],
+                    num_classes if decoder == "modified_heatnet" else None,
+                    dropout=dropout,
+                    align_corners=align_corners,
+                )
+                for name in heads
+            }
         )
+        self.auxiliary = pyramid(16 * base_width, num_classes) if auxiliary else None
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.normal_(module.weight, 0.0, 0.01)
@@ -192,8 +230,7 @@ class DeepLabV2(nn.Module):
         name = next(iter(self.heads)) if head is None else head
         check_choice("head", name, self.heads)
         images = self.inputs(rgb, thermal, masks, multiple=self.multiple)
-        layer3, layer4 = self.backbone(images.rgb if view == "rgb" else images.thermal)
-
+        layer3, layer4 = self.backbone(images.rgb if view == "rgb" else as_rgb(images.thermal))
         image_hw = rgb.shape[2], rgb.shape[3]
         aux = {"features": layer4}
         if self.auxiliary is not None:
