@@ -83,6 +83,9 @@ def test_individual_masks_have_the_ratio_each_and_overlap(ratio) -> None:
     # Independent: both hidden in ratio^2 of the cells.
     both = (masks.rgb & masks.thermal).double().mean().item()
     assert both == pytest.approx(ratio**2, abs=0.02)
+    # No mask of thermal is that of RGB of any sample.
+    rgb, thermal = (mask.flatten(1) for mask in masks)
+    assert not (thermal[:, None] == rgb).all(-1).any()
 
 
 def test_cells_of_mic_are_independent_and_the_same_in_both_images() -> None:
@@ -118,6 +121,12 @@ def test_pattern_probabilities_in_their_order() -> None:
         found = random_complementary(taken, probabilities, torch_generator(0, "m"))
         assert [mask.flatten().tolist() for mask in found] == [rgb, thermal]
     assert torch.equal(complementary(taken).thermal, found.thermal)
+
+
+def test_given_pattern_probabilities_are_used() -> None:
+    masks = drawn("crm", 64, pattern_probabilities=[0.0, 1.0, 0.0])
+    assert masks.rgb.any((1, 2)).all()
+    assert not masks.thermal.any()
 
 
 def gaussian(sigma: float) -> list[float]:

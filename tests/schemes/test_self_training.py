@@ -150,6 +150,20 @@ def test_masked_images_of_both_domains_have_half_of_the_weight_each() -> None:
     torch.testing.assert_close(phase.parts["target/masked_cross_entropy"], 0.25 * target)
 
 
+def test_masks_of_source_and_target_are_drawn_apart() -> None:
+    seen: list[Tensor] = []
+
+    class Drawn(Halves):
+        def __call__(self, image_hw: Any, centre_yx: Tensor, generator: Any) -> MaskPair:
+            hidden = torch.rand(len(centre_yx), 2, 2, generator=generator) < 0.5
+            seen.append(hidden)
+            return MaskPair(hidden, ~hidden)
+
+    phase_of(scheme_of(network(False), masker=Drawn(), masked_images="both"), batches())
+    source, target = seen
+    assert not torch.equal(source, target)
+
+
 def test_mix_and_masked_target_are_augmented_and_pseudo_labels_are_not() -> None:
     model, data = network(False), batches()
     plain = phase_of(scheme_of(model), data)
@@ -202,7 +216,12 @@ def test_initial_network_sees_the_source_with_its_own_statistics() -> None:
 
 
 def test_ignored_rows_leave_rows_for_pseudo_labels() -> None:
-    scheme_of(network(False), ignored_top=0.5, ignored_bottom=0.4)
+    model, data = network(False), batches()
+    scheme = scheme_of(model, ignored_top=0.5, ignored_bottom=0.25, mixing="none")
+    label, share = teacher_labels(model, data.target)
+    third_row = torch.tensor([0.0, 0.0, 1.0, 0.0])[:, None].expand(2, 4, 4)
+    expected = cost(logits(model, data.target.rgb), label, share.float() * third_row)
+    torch.testing.assert_close(phase_of(scheme, data).parts["target/cross_entropy"], expected)
     with pytest.raises(InputError, match="their sum must be below 1"):
         scheme_of(network(False), ignored_top=0.5, ignored_bottom=0.5)
 

@@ -279,6 +279,26 @@ def test_half_resolution_of_frames_that_agree_is_agreement(warps: Any) -> None:
     torch.testing.assert_close(loss.warped, halved_mean(loss.second.logits).softmax(1))
 
 
+class Smaller(Half):
+    """A view in which a step of one pixel is one of three pixels of the first frame."""
+
+    def warp(self, angles: Tensor, image_hw: tuple[int, int]) -> Warp:
+        still = super().warp(angles, image_hw)
+        shrink = torch.eye(3, dtype=torch.float64).repeat(len(angles), 1, 1)
+        shrink[:, 0, 0], shrink[:, 0, 2] = 1 / 3, 4 - 4.4 / 3  # the last pixel shows column 4.4
+        return replace(still, homography=shrink)
+
+
+def test_half_pixel_beyond_the_first_frame_does_not_count() -> None:
+    """The last of five columns shows 4.4, and half a pixel further is 5.9, beyond 5.5."""
+    shown = scheme(Net(nn.Identity()), view=Smaller(), loss=Halved(), resolution="half")
+    loss = step(shown, batch(1, (2, 5)))
+    full = Smaller().warp(torch.zeros(1, 3), (2, 5))
+    assert full.inside()[0, 0].tolist() == [False, False, False, True, True]
+    assert halved_all(full.inside()).tolist() == [[[False, False, True]]]
+    assert not loss.valid.any()
+
+
 @pytest.mark.parametrize("second", ["con", "con_acc"])
 def test_half_resolution_changes_the_part_of_agreement_alone(second: Any) -> None:
     parts = {}
