@@ -31,7 +31,7 @@ from rgbt.engine.network_settings import prepare_training
 from rgbt.engine.schedules import Schedule
 from rgbt.engine.settings import TrainerSettings
 from rgbt.engine.trainer import Scheme
-from rgbt.maskers.contract import check_masker
+from rgbt.maskers.masker import check_masker
 from rgbt.processes import num_processes
 from rgbt.randomness import derive, numpy_generator, torch_generator
 from rgbt.requirements import Record, record_of
