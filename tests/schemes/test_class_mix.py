@@ -10,7 +10,7 @@ from torch import Tensor
 
 from rgbt.checks import InputError
 from rgbt.randomness import torch_generator
-from rgbt.schemes.class_mix import mixed, pasted_pixels, seen_as
+from rgbt.schemes.self_training import mixed, pasted_pixels, seen_as
 from rgbt.types import Batch
 from tests.losses.problems import batch_of
 
@@ -39,25 +39,11 @@ def test_half_of_the_values_of_the_batch_are_pasted(values: list[int], pasted: i
     assert len(values) == 1 or not all(torch.equal(masks[0], each) for each in masks)
 
 
-def test_every_class_is_pasted_in_half_of_the_images() -> None:
-    label = torch.tensor([1, 4, 6, 255]).expand(2000, 1, -1).contiguous()
-    shares = drawn(label).double().mean((0, 1))
-    torch.testing.assert_close(shares, torch.full((4,), 0.5).double(), atol=0.05, rtol=0)
-
-
 def test_a_drawn_class_may_be_of_another_image() -> None:
     label = torch.tensor([[[1, 1, 1]], [[2, 2, 2]]])
     found = [drawn(label, number)[0] for number in range(40)]
     assert all(each.all() or not each.any() for each in found)
     assert {bool(each.any()) for each in found} == {True, False}
-
-
-def test_the_generator_alone_decides() -> None:
-    label = torch.arange(12).view(1, 3, 4).expand(4, 3, 4).contiguous()
-    before = torch.get_rng_state()
-    assert torch.equal(drawn(label), drawn(label))
-    assert not torch.equal(drawn(label), drawn(label, 1))
-    assert torch.equal(before, torch.get_rng_state())
 
 
 def test_both_images_label_and_weight_are_pasted_with_one_mask() -> None:

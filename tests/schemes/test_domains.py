@@ -129,40 +129,6 @@ def test_view_and_head_are_passed_to_the_network() -> None:
     assert model.calls == [(("rgb",), "day", True), (("thermal",), "dark", True)]
 
 
-def test_null_view_is_not_passed_to_the_network() -> None:
-    model = network(False)
-    scheme = labelled(model, False, "apart", view=None)
-    list(scheme.phases(next(pairs()).to("cpu"), generator_of))
-    assert model.calls == [(("rgb",), None, True), ((), None, True)]
-
-
-def test_the_network_draws_from_the_generator_of_its_pass() -> None:
-    """What is dropped of the target does not follow from what is dropped of the source."""
-    drawn: dict[str, Tensor] = {}
-
-    class Drawing(Linear):
-        def forward(self, *images: Tensor, **requested: Any) -> Any:
-            drawn[f"{requested['head']} network"] = torch.rand(4, generator=requested["generator"])
-            return super().forward(*images, **requested)
-
-    def loss(output: Any, batch: Any, generator: torch.Generator) -> dict[str, Tensor]:
-        drawn[f"{batch.name[0]} loss"] = torch.rand(4, generator=generator)
-        return cross_entropy(output, batch, torch.Generator())
-
-    model = Drawing(("day", "dark"))
-    scheme = LabelledDomains(model=model, loss=loss, domains=domains(True), gradients="apart")
-    pair = next(pairs()).to("cpu")
-    pair = replace(pair, target=replace(pair.target, name=("t", "u")))
-    list(scheme.phases(pair, generator_of))
-    names = {
-        **{"day network": "source network", "dark network": "target network"},
-        **{"a loss": "source loss", "t loss": "target loss"},
-    }
-    assert drawn.keys() == names.keys()
-    for name, purpose in names.items():
-        assert torch.equal(drawn[name], torch.rand(4, generator=generator_of(purpose))), name
-
-
 # ---- without labels of the target -----------------------------------------------------------
 
 
