@@ -13,10 +13,10 @@ from rgbt.losses.unlabelled import (
     Entropy,
     Judged,
     MaxSquares,
-    logistic,
     guidance,
     judged,
     least_squares,
+    logistic,
     pseudo_labels,
 )
 from tests.losses.problems import seeded
