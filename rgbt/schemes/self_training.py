@@ -28,7 +28,6 @@ CONFIDENT_SHARE, CONFIDENCE = "teacher/confident_share", "teacher/confidence"
 """Names in the log: share of the target's pixels whose highest probability reaches the threshold,
 and the mean of the highest probabilities."""
 
-
 NUM_VALUES = 256
 """Values of a label: the classes and 255, which is pasted like a class."""
 
@@ -112,11 +111,7 @@ class SelfTraining:
 
     def __post_init__(self) -> None:
         if self.ignored_top + self.ignored_bottom >= 1:
-            raise InputError(
-                f"scheme.ignored_top={self.ignored_top:g} and scheme.ignored_bottom="
-                f"{self.ignored_bottom:g} leave no row for pseudo-labels; their sum must be below "
-                "1."
-            )
+            raise InputError("scheme.ignored_top + scheme.ignored_bottom must be below 1.")
         self.passes = Passes(
             model=self.model, loss=self.loss, domains=self.domains, gradients="apart"
         )
@@ -235,17 +230,7 @@ def mixed(source: Batch, target: Batch, pasted: Tensor) -> Batch:
     """The target with the pixels `pasted` (B, H, W) of the source in both images and the label.
 
     Pasted pixels have weight 1; the others keep the confidence of the target, which it must have.
-
-    Raises:
-        InputError: images of another size.
     """
-    sizes = [tuple(batch.rgb.shape[-2:]) for batch in (source, target)]
-    if sizes[0] != sizes[1]:
-        own, other = (" x ".join(map(str, size)) for size in sizes)
-        raise InputError(
-            f"scheme.mixing=classes requires source and target images of one size, got {own} and "
-            f"{other} pixels; choose a transform that crops to one size, or scheme.mixing=none."
-        )
     assert target.confidence is not None, "pseudo-labels have a weight"
     return replace(
         target,

@@ -13,12 +13,11 @@ import torch
 from torch import Tensor
 
 from rgbt.engine.checkpoint import State
-from rgbt.losses.unlabelled import Entropy, MaxSquares
+from rgbt.losses.unlabelled import MaxSquares
 from rgbt.schemes.supervised import Supervised
 from rgbt.schemes.two_domains import LabelledDomains, UnlabelledTarget
 from rgbt.types import IGNORE
 from tests.schemes.linear import (
-    K,
     Linear,
     Momentum,
     Nothing,
@@ -159,22 +158,6 @@ def test_labels_of_an_unlabelled_target_are_not_read(tmp_path: Path) -> None:
         made.fit(iter([pair]), State(seed=0))
         found.append(values_of(model))
     assert all(torch.equal(found[0][name], found[1][name]) for name in found[0])
-
-
-def test_entropy_of_two_heads_trains_the_targets(tmp_path: Path) -> None:
-    model = network(True)
-    values = values_of(model)
-    day, dark = Momentum((SHARED, DAY)), Momentum((SHARED, DARK))
-    pair = next(pairs())
-
-    def entropy(v: Values) -> Tensor:
-        p = scores(v, pixels(pair.target, "thermal")[0], DARK).softmax(1)
-        return -0.3 * (p * p.log()).sum(1).mean() / torch.tensor(float(K)).log()
-
-    written_out(values, "apart", day, dark, supervised_costs(pair, True)[0], entropy)
-    scheme = unlabelled(model, heads=True, unlabelled=Entropy(weight=0.3))
-    trained(scheme, model, tmp_path, 1)
-    assert_same(model, values)
 
 
 def test_guidance_trains_the_auxiliary_head_alone_and_what_is_below(tmp_path: Path) -> None:

@@ -225,7 +225,7 @@ def test_ignored_rows_leave_rows_for_pseudo_labels() -> None:
     third_row = torch.tensor([0.0, 0.0, 1.0, 0.0])[:, None].expand(2, 4, 4)
     expected = cost(logits(model, data.target.rgb), label, share.float() * third_row)
     torch.testing.assert_close(phase_of(scheme, data).parts["target/cross_entropy"], expected)
-    with pytest.raises(InputError, match="their sum must be below 1"):
+    with pytest.raises(InputError, match="must be below 1"):
         scheme_of(network(False), ignored_top=0.5, ignored_bottom=0.5)
 
 

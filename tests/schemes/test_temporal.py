@@ -14,8 +14,6 @@ from torch.nn import functional as F
 from rgbt.geometry.camera import Camera
 from rgbt.geometry.halving import halved_all, halved_label, halved_mean
 from rgbt.geometry.warp import Warp
-from rgbt.losses.cross_entropy import CrossEntropy
-from rgbt.losses.temporal import TemporalLoss
 from rgbt.models.mask2former.head import semantic_logits
 from rgbt.models.mask2former.model import Mask2Former
 from rgbt.requirements import Record
@@ -274,27 +272,6 @@ def test_half_pixel_beyond_the_first_frame_does_not_count() -> None:
     assert full.inside()[0, 0].tolist() == [False, False, False, True, True]
     assert halved_all(full.inside()).tolist() == [[[False, False, True]]]
     assert not loss.valid.any()
-
-
-@pytest.mark.parametrize("second", ["con", "con_acc"])
-def test_half_resolution_changes_the_part_of_agreement_alone(second: Any) -> None:
-    parts = {}
-    for resolution in ("full", "half"):
-        net = Net(nn.Identity())
-        loss = TemporalLoss(
-            segmentation=CrossEntropy(class_weights=None),
-            **{"alpha": 1.0, "beta": 1.0, "second": second, "form": "paper"},
-        )
-        (phase,) = scheme(net, loss=loss, resolution=resolution).phases(batch(), generator_of)
-        parts[resolution] = phase.parts
-        phase.parts[second].backward()
-        assert all(bool(each.any()) for each in gradients(net))
-    full, half = ({k: v.detach() for k, v in each.items()} for each in parts.values())
-    assert list(full) == list(half)
-    for name in full.keys() - {second}:
-        assert torch.equal(full[name], half[name])
-    assert float(full[second]) != float(half[second])
-    assert float(half[second]) == pytest.approx(float(full[second]), rel=0.05)
 
 
 def test_mask2former_passes_equal_two_calls() -> None:
