@@ -21,7 +21,7 @@ from rgbt.assembly.contracts import (
     is_own,
 )
 from rgbt.assembly.session import Session, open_session
-from rgbt.checks import InputError
+from rgbt.checks import InputError, one_line
 from rgbt.config.stored_config import EXTERNAL
 from rgbt.data.domains import GIVEN, NONE, Domain
 from rgbt.data.loaders import Batches, steps_per_epoch, train_batches
@@ -31,7 +31,7 @@ from rgbt.engine.network_settings import prepare_training
 from rgbt.engine.schedules import Schedule
 from rgbt.engine.settings import TrainerSettings
 from rgbt.engine.trainer import Scheme
-from rgbt.maskers.contract import check_masker
+from rgbt.maskers.masker import check_masker
 from rgbt.processes import num_processes
 from rgbt.randomness import derive, numpy_generator, torch_generator
 from rgbt.requirements import Record, record_of
@@ -212,8 +212,17 @@ def _probe_external(session: Session, train_hw: tuple[int, int], test_hw: tuple[
         model.train(is_training)
         count = min(2, session.loading.batch_size) if is_training else 1
         images = [torch.zeros(count, each, *image_hw, device=session.device) for each in (3, 1)]
-        with torch.set_grad_enabled(is_training), session.autocast():
-            output = model(*images, generator=torch_generator(session.spec.seed, "probe"))
+        try:
+            with torch.set_grad_enabled(is_training), session.autocast():
+                output = model(*images, generator=torch_generator(session.spec.seed, "probe"))
+        except (InputError, torch.OutOfMemoryError):
+            raise
+        except Exception as error:
+            size = " x ".join(map(str, image_hw))
+            raise InputError(
+                f"model: the network cannot predict {count} images of {size} pixels "
+                f"({type(error).__name__}: {one_line(error)})."
+            ) from error
     for name, value in model.named_buffers():
         value.copy_(before[name])
     if not output.logits.requires_grad:

@@ -15,7 +15,7 @@ from torch import nn
 from rgbt.assembly import contracts
 from rgbt.checks import InputError
 from rgbt.data.mfnet import MFNet
-from rgbt.maskers.contract import check_masker
+from rgbt.maskers.masker import check_masker
 from rgbt.requirements import Record, record_of
 from rgbt.types import MaskPair, Output, Sample
 from tests.conftest import WriteMFNet

@@ -11,12 +11,10 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from rgbt.checks import InputError
-from rgbt.config.component import Component, build
 from rgbt.geometry.halving import halved_label
 from rgbt.losses.cross_entropy import CrossEntropy
-from rgbt.losses.overlap import con, con_acc, dice
-from rgbt.losses.temporal import TemporalLoss
-from rgbt.requirements import Record, Requirement
+from rgbt.losses.temporal import TemporalLoss, con, con_acc, dice
+from rgbt.requirements import Requirement
 from rgbt.types import Frame, Output
 from tests.losses.problems import (
     NOTHING,
@@ -26,7 +24,7 @@ from tests.losses.problems import (
     recorded_losses,
     seeded,
 )
-from tests.models.golden import compose, requires_golden
+from tests.models.golden import requires_golden
 
 
 def loss_of(**changes: Any) -> TemporalLoss:
@@ -148,55 +146,16 @@ def test_masks_of_queries() -> None:
     assert torch.equal(torch.stack([parts[name] for name in segmentation]), torch.stack(expected))
 
 
-def test_passes_are_summed(frames: Any) -> None:
-    def two_passes(*_: Any) -> dict[str, Tensor]:
-        return {"some": torch.tensor([1.0, 2.0])}
-
-    loss = loss_of(segmentation=two_passes, alpha=0.0, beta=0.0, second="none")
-    assert loss.record.requires == (Requirement("scheme", "frames", 2),)
-    first, second, _, valid = frames
-    parts = loss(first, second, None, valid, NOTHING)
-    assert parts == {"some_1": torch.tensor(3.0), "some_2": torch.tensor(3.0)}
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"second": "none"}, r"^loss\.beta=1 .* loss\.second=none; set loss\.beta=0"),
-        ({"beta": 0.0}, r"^loss\.second=con .* loss\.beta=0; set loss\.second=none"),
+        ({"second": "none"}, r"^loss\.second=none does not fit loss\.beta=1"),
+        ({"beta": 0.0}, r"^loss\.second=con does not fit loss\.beta=0"),
     ],
 )
 def test_settings_that_do_not_fit(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         loss_of(**changes)
-
-
-def test_raises(frames: Any) -> None:
-    first, second, warped, valid = frames
-    with pytest.raises(ValueError, match="warped: needed for the part con"):
-        loss_of()(first, second, None, valid, NOTHING)
-    with pytest.raises(ValueError, match="warped"):
-        loss_of()(first, second, warped[:, :, 1:], valid, NOTHING)
-
-
-def built(*overrides: str) -> TemporalLoss:
-    node = compose(*overrides).loss
-    Component.from_node(node, "loss")
-    loss = build(node)
-    assert isinstance(loss, TemporalLoss)
-    return loss
-
-
-@pytest.mark.parametrize(
-    ("form", "criterion"), [("paper", "set_criterion"), ("released", "set_criterion_spatial")]
-)
-def test_another_segmentation_loss_can_be_chosen(form: str, criterion: str) -> None:
-    config = compose(f"loss=temporal_{form}", f"loss@loss.segmentation={criterion}")
-    loss = built(f"loss=temporal_{form}", f"loss@loss.segmentation={criterion}")
-    (required,) = [each for each in loss.record.requires if each.key == "outputs"]
-    assert required.is_met_by(build(config.model).record)
-    assert not required.is_met_by(Record(outputs="scores"))
-    assert config.loss.segmentation == compose(f"loss={criterion}").loss
 
 
 class Recorded:

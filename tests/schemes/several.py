@@ -12,8 +12,7 @@ from torch import Tensor, nn
 from rgbt.data.domains import Domain, Domains
 from rgbt.engine.batch_norm import synchronise_batch_norm
 from rgbt.geometry.camera import Camera
-from rgbt.losses.auxiliary import WithAuxiliary
-from rgbt.losses.cross_entropy import CrossEntropy
+from rgbt.losses.cross_entropy import CrossEntropy, WithAuxiliary
 from rgbt.losses.spatial import PLAIN
 from rgbt.losses.temporal import TemporalLoss
 from rgbt.losses.unlabelled import Entropy, MaxSquares
@@ -218,8 +217,8 @@ def self_training(*, heads: bool = False, **changes: Any) -> Case:
         **{"heads": heads, "loss": weighted, "masker": INDEPENDENT},
         **{"augmentation": augmentation, **settings},
     )
-    for each in () if case.scheme.initial is None else case.scheme.initial.buffers():
-        each.mul_(0.5)  # as if the network had been trained since
+    for each in () if case.scheme.initial is None else case.scheme.initial.parameters():
+        each.data.mul_(0.5)  # as if the network had been trained since
     return case
 
 

@@ -1,4 +1,8 @@
-"""Feature distance: features of thing classes stay near those of the initial network."""
+"""Distances to another pass or to another network.
+
+Self-distillation between the passes of complementary random masking (queries are compared index by
+index, without matching), and the distance of features of things from those of the initial network.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +19,30 @@ from rgbt.processes import mean_count
 from rgbt.ranges import Names, Positive
 from rgbt.requirements import Requirement
 from rgbt.types import IGNORE
+
+
+def sdc(teacher: Tensor, student: Tensor) -> Tensor:
+    """Self-distillation of complementary representations: ``mean |stopgrad(teacher) - student|``.
+
+    Source: CRM, Eq. (2).   Released: final layer only, raw logits, mean over all entries including
+    the no-object column, teacher without gradient.
+
+    (B, Q, K+1) class logits of the clean and of the masked RGB-T pass -> () float32.
+
+    Raises:
+        ValueError: the shapes differ.
+    """
+    sizes = check_shape("teacher", teacher, "B Q C")
+    check_shape("student", student, "B Q C", **sizes)
+    return (teacher.detach().float() - student.float()).abs().mean()
+
+
+def sdn(teacher: Tensor, rgb: Tensor, thermal: Tensor) -> Tensor:
+    """Self-distillation of non-local representations: `sdc` of `rgb` plus `sdc` of `thermal`.
+
+    Source: CRM, Eq. (3). `rgb` and `thermal`: the masked pass predicted from one image alone.
+    """
+    return sdc(teacher, rgb) + sdc(teacher, thermal)
 
 
 def thing_cells(

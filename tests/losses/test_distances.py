@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from rgbt.checks import InputError
-from rgbt.losses.feature_distance import FeatureDistance, feature_distance, thing_cells
+from rgbt.losses.distances import FeatureDistance, feature_distance, sdc, sdn, thing_cells
 
 CLASSES = ("road", "person", "car")
 
@@ -46,7 +46,7 @@ def test_value_is_of_single_precision_and_of_the_cells_of_all_processes(
     )
     cells = torch.ones(1, 1, 1, dtype=torch.bool)
     assert feature_distance(features, initial, cells).item() == 255.75
-    monkeypatch.setattr("rgbt.losses.feature_distance.mean_count", lambda count: 2 * count)
+    monkeypatch.setattr("rgbt.losses.distances.mean_count", lambda count: 2 * count)
     assert feature_distance(features, initial, cells).item() == 255.75 / 2
 
 
@@ -69,3 +69,19 @@ def test_things_are_named() -> None:
     wrong = FeatureDistance(weight=0.005, things=("bike",), min_share=0.75)
     with pytest.raises(InputError, match="no class 'bike'"):
         wrong.indices(CLASSES)
+
+
+def test_values_by_hand() -> None:
+    teacher = torch.tensor([[[1.0, 2.0]]])
+    # |1 - 0| and |2 - 4|: mean 1.5; |1 - 1| and |2 - 1|: mean 0.5.
+    assert sdc(teacher, torch.tensor([[[0.0, 4.0]]])) == 1.5
+    assert sdn(teacher, torch.tensor([[[0.0, 4.0]]]), torch.tensor([[[1.0, 1.0]]])) == 2.0
+
+
+def test_only_the_student_gets_a_gradient() -> None:
+    teacher = torch.zeros(1, 1, 2, requires_grad=True)
+    student = torch.tensor([[[3.0, -1.0]]], requires_grad=True)
+    sdc(teacher, student).backward()
+    assert teacher.grad is None
+    assert student.grad is not None
+    assert student.grad.tolist() == [[[0.5, -0.5]]]
