@@ -25,7 +25,7 @@ DenseLogits = Callable[[Output, tuple[int, int]], Tensor]
 
 
 class VirtualViews(Protocol):
-    """The interface of a view, which draws the second frame (`rgbt.transforms.virtual_view`)."""
+    """The interface of a view, which draws the second frame (`rgbt.transforms.views`)."""
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """(count, 3) angles."""

@@ -2,8 +2,6 @@
 
 One code path for uint8 and float32 images. What the release does to float images differs from what
 it means to do, only because OpenCV's HSV has other units there; see `Colours.rgb`.
-
-On the batch the same changes are made by `rgbt.transforms.on_batch`, with the same bits.
 """
 
 from __future__ import annotations
@@ -26,7 +24,6 @@ LEVELS = np.arange(256, dtype=np.uint8)
 
 WIDEST_VECTOR = 64
 """8-bit values that the widest vector unit takes at a time (AVX-512)."""
-
 
 Factor = Annotated[float, Interval(ge=0, le=100)]
 FactorRange = Annotated[tuple[Factor, Factor], Predicate(rising), doc("the smaller one first")]
@@ -58,30 +55,22 @@ class ColourJitter:
 
     def draw(self, rng: np.random.Generator) -> Colours:
         """What happens to one example; every draw comes from `rng`."""
-        brightness = self._drawn(rng, -self.brightness_delta, self.brightness_delta)
+
+        def drawn(low: float, high: float) -> float | None:
+            return rng.uniform(low, high) if rng.random() < self.probability else None
+
+        brightness = drawn(-self.brightness_delta, self.brightness_delta)
         # The even odds of the order belong to SSD, whatever the probability of each change.
         contrast_first = bool(rng.random() < 0.5)
-        contrast = self._drawn(rng, *self.contrast_range) if contrast_first else None
-        saturation = self._drawn(rng, *self.saturation_range)
+        contrast = drawn(*self.contrast_range) if contrast_first else None
+        saturation = drawn(*self.saturation_range)
         hue = None
-        if self._happens(rng):
+        if rng.random() < self.probability:
             hue = int(rng.integers(-self.hue_delta, self.hue_delta + 1))
         if not contrast_first:
-            contrast = self._drawn(rng, *self.contrast_range)
-        return Colours(
-            brightness=brightness,
-            contrast_first=contrast_first,
-            contrast=contrast,
-            saturation=saturation,
-            hue=hue,
-            thermal_contrast=self._drawn(rng, *self.thermal_contrast_range),
-        )
-
-    def _happens(self, rng: np.random.Generator) -> bool:
-        return bool(rng.random() < self.probability)
-
-    def _drawn(self, rng: np.random.Generator, low: float, high: float) -> float | None:
-        return rng.uniform(low, high) if self._happens(rng) else None
+            contrast = drawn(*self.contrast_range)
+        thermal = drawn(*self.thermal_contrast_range)
+        return Colours(brightness, contrast_first, contrast, saturation, hue, thermal)
 
 
 @dataclass(frozen=True)
@@ -144,9 +133,7 @@ def scale_and_truncate(image: Image, factor: float = 1.0, offset: float = 0.0) -
 def scale_saturation(image: Image, factor: float) -> Image:
     """HSV saturation times `factor`, truncated to whole numbers of OpenCV's unit."""
     hsv = cv2.cvtColor(image, cv2.COLOR_RGB2HSV)
-    if hsv.dtype == np.uint8:
-        return _rgb_of(_mapped(hsv, 1, scale_and_truncate(LEVELS, factor)))
-    hsv[..., 1] = scale_and_truncate(hsv[..., 1], factor)
+    hsv[..., 1] = scale_and_truncate(np.ascontiguousarray(hsv[..., 1]), factor)
     return _rgb_of(hsv)
 
 
@@ -156,18 +143,8 @@ def shift_hue(image: Image, shift: int) -> Image:
     The unit is OpenCV's: 2 degrees for uint8 and 1 for float32.
     """
     hsv = cv2.cvtColor(image, cv2.COLOR_RGB2HSV)
-    if hsv.dtype == np.uint8:
-        turned = (LEVELS.astype(np.int32) + shift) % 180
-        return _rgb_of(_mapped(hsv, 0, turned.astype(np.uint8)))
     hsv[..., 0] = (hsv[..., 0].astype(np.int32) + shift) % 180
     return _rgb_of(hsv)
-
-
-def _mapped(hsv: Image, channel: int, table: NDArray[np.uint8]) -> Image:
-    """One channel of an 8-bit image through a table of its 256 values."""
-    tables = np.repeat(LEVELS[:, None], 3, axis=1)
-    tables[:, channel] = table.ravel()
-    return np.asarray(cv2.LUT(hsv, tables[None]))
 
 
 def _rgb_of(hsv: Image) -> Image:

@@ -17,7 +17,7 @@ from rgbt.assembly.training_setup import TrainingSetup
 from rgbt.data.loaders import eval_batches
 from rgbt.evaluation.prediction import Predictor
 from rgbt.evaluation.request import EvaluationRequest
-from tests.benchmarks.gpu.project import Training, setup_of, smoke_words
+from tests.benchmarks.gpu.project import Training, setup_of
 from tests.on_device.simulated import DEVICE, simulation
 
 CPU = torch.device("cpu")
@@ -38,11 +38,6 @@ class SimulatedRun:
     classes: list[Tensor]
     step_waits: Counter[str]
     evaluation_waits: Counter[str]
-
-
-def words_of(experiment: str, augment: str = "loader") -> list[str]:
-    """Overrides of a step at smoke size."""
-    return [*smoke_words(experiment), f"data.augment={augment}"]
 
 
 def on_cpu(words: Sequence[str], folder: Path, steps: int = 2) -> SimulatedRun:

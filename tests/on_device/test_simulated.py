@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from rgbt.config.compose import available
+from tests.benchmarks.gpu.project import smoke_words
 from tests.on_device.simulated import (
     DEVICE,
     DeviceMismatchError,
@@ -16,7 +17,7 @@ from tests.on_device.simulated import (
     line_of_ours,
     simulation,
 )
-from tests.on_device.simulated_run import on_cpu, simulated, words_of
+from tests.on_device.simulated_run import on_cpu, simulated
 
 SOME = ("crm", "temporal_con", "sh_adversarial")
 MOST_WAITS = {"crm": 16, "temporal_con": 20, "sh_adversarial": 6}
@@ -77,7 +78,7 @@ def test_lines_of_tests_are_not_ours() -> None:
     "experiment", ["crm", pytest.param("temporal_con", marks=pytest.mark.slow), "sh_adversarial"]
 )
 def test_steps_and_classes_are_those_of_the_cpu(experiment: str, tmp_path: Path) -> None:
-    words = words_of(experiment, "device" if experiment == "crm" else "loader")
+    words = smoke_words(experiment)
     here, found = on_cpu(words, tmp_path), simulated(words, tmp_path)
     assert found.losses == pytest.approx(here.losses, rel=1e-5)
     differing = sum(int((a != b).sum()) for a, b in zip(here.classes, found.classes))
@@ -89,5 +90,5 @@ def test_steps_and_classes_are_those_of_the_cpu(experiment: str, tmp_path: Path)
 @pytest.mark.slow
 @pytest.mark.parametrize("experiment", [e for e in available("experiment") if e not in SOME])
 def test_every_experiment_runs_on_one_device(experiment: str, tmp_path: Path) -> None:
-    found = simulated(words_of(experiment), tmp_path)
+    found = simulated(smoke_words(experiment), tmp_path)
     assert all(np.isfinite(found.losses))
