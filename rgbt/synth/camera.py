@@ -13,7 +13,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from rgbt.data.synth.factors import EgoMotion, SceneFactors
+from rgbt.synth.factors import EgoMotion, SceneFactors
 
 Floats = NDArray[np.float32]
 Real = TypeVar("Real", np.float32, np.float64)

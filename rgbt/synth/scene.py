@@ -8,19 +8,21 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rgbt.data.synth import rgb, thermal
-from rgbt.data.synth.camera import Floats, SynthCamera, camera_of, flow_between
-from rgbt.data.synth.facets import Facets, facets_of, sorted_for_drawing
-from rgbt.data.synth.factors import EgoMotion, SceneFactors
-from rgbt.data.synth.glare import veil_of
-from rgbt.data.synth.layout import place_objects
-from rgbt.data.synth.light import Lamp, Light, draw_light, lamps_of
-from rgbt.data.synth.placement import Placed
-from rgbt.data.synth.raster import draw
-from rgbt.data.synth.road import draw_road, ground_quads
-from rgbt.data.synth.scenery import place_scenery
-from rgbt.data.synth.surface import shadow_map, surface_of
 from rgbt.randomness import numpy_generator
+from rgbt.synth.camera import Floats, SynthCamera, camera_of, flow_between
+from rgbt.synth.factors import EgoMotion, SceneFactors
+from rgbt.synth.light import Lamp, Light, draw_light, lamps_of, veil_of
+from rgbt.synth.objects import place_objects, place_scenery
+from rgbt.synth.raster import Facets, draw, facets_of, sorted_for_drawing
+from rgbt.synth.render import (
+    develop_rgb,
+    develop_thermal,
+    eight_bits,
+    render_rgb,
+    render_thermal,
+)
+from rgbt.synth.street import Placed, draw_road, ground_quads
+from rgbt.synth.surface import shadow_map, surface_of
 
 
 @dataclass(frozen=True)
@@ -33,7 +35,7 @@ class Scene:
         label: (H, W) uint8, MFNet's class ids 0..8.
         depth: (H, W) float32, metres along the optical axis; infinity for the sky.
         grey: (H, W) float32, `thermal` before it became bytes: 1 = full scale, and not clipped.
-        material: (H, W) index into `MATERIALS` of what each pixel shows.
+        material: (H, W) index of the material that each pixel shows.
         owner: (H, W) index into `placed` of the object that it shows; -1 for ground and sky.
         placed: the objects of the scene, far ones before near ones.
         is_night: whether it is night.
@@ -113,14 +115,14 @@ def _frame(
     shadow = shadow_map(world.placed, camera, light, whole=factors.whole_shadows)
     surface = surface_of(drawing, facets, camera, shadow, (seed, index))
     veil = veil_of(world.placed, camera, light, factors.glare, (seed, index))
-    image = rgb.render_rgb(surface, light, world.lamps, veil, factors, seed)
-    heat = thermal.render_thermal(surface, light, factors)
+    image = render_rgb(surface, light, world.lamps, veil, factors, seed)
+    heat = render_thermal(surface, light, factors)
     rgb_noise = numpy_generator(seed, "synth/rgb_noise", index, frame)
     thermal_noise = numpy_generator(seed, "synth/thermal_noise", index, frame)
-    grey = thermal.develop(heat, factors, seed, index, thermal_noise)
+    grey = develop_thermal(heat, factors, seed, index, thermal_noise)
     return Scene(
-        rgb=rgb.develop(image, factors, rgb_noise),
-        thermal=rgb.eight_bits(grey.copy()),
+        rgb=develop_rgb(image, factors, rgb_noise),
+        thermal=eight_bits(grey.copy()),
         label=np.take(np.concatenate([[0], facets.label]).astype(np.uint8), drawing.ids),
         depth=surface.depth,
         grey=grey,

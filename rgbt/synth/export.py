@@ -1,16 +1,19 @@
-"""Write scenes in the layout of a data set, with several processes if there are many.
+"""Write scenes in the layout of a data set, once, with several processes if there are many.
 
-The layouts are defined in `dataset` (MFNet), `kp`, `pst900` and `freiburg`.
+The layouts are defined in `rgbt.synth.datasets`.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
 import multiprocessing
 import os
 import sys
+import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,13 +24,13 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import Progress
 
-from rgbt.data.synth.cache import written_once
-from rgbt.data.synth.factors import EgoMotion, SceneFactors
-from rgbt.data.synth.light import is_night
-from rgbt.data.synth.scene import Scene, render_pair, render_scene
+from rgbt.checks import InputError
+from rgbt.synth.factors import EgoMotion, SceneFactors
+from rgbt.synth.light import is_night
+from rgbt.synth.scene import Scene, render_pair, render_scene
 
-VERSION = 2
-"""Of the scenes. Raise it with every change that changes a byte, so that no cache is stale."""
+VERSION = 3
+"""Of the files. Raise it with every change that changes a byte, so that no cache is stale."""
 
 _WORTH_A_POOL = 200
 """Scenes; fewer are written before a pool has started."""
@@ -50,12 +53,14 @@ class Plan:
     """The plan of a written data set; equal plans give equal files.
 
     Attributes:
+        name: of the data set; its folder begins with it.
         seed: of the data set.
-        numbers: scenes by key of the configuration, such as "num_train".
+        numbers: scenes by split.
         factors: what the scenes are made of.
         motion: of the camera to a second frame of every scene, or None for single frames.
     """
 
+    name: str
     seed: int
     numbers: Mapping[str, int]
     factors: SceneFactors
@@ -63,10 +68,10 @@ class Plan:
 
     @property
     def splits(self) -> Iterator[tuple[str, range]]:
-        """Every number, without "num_", and its scenes; none is in two of them."""
+        """Every split and its scenes; none is in two of them."""
         first = 0
-        for key, number in self.numbers.items():
-            yield key.removeprefix("num_"), range(first, first + number)
+        for split, number in self.numbers.items():
+            yield split, range(first, first + number)
             first += number
 
     def is_night(self, scene: int) -> bool:
@@ -84,57 +89,75 @@ class Shot(NamedTuple):
     folder: str = ""
 
 
-def _no_lists(shots: Sequence[Shot]) -> dict[str, list[str]]:
-    del shots
-    return {}
-
-
-@dataclass(frozen=True, kw_only=True)
-class Layout:
+class Layout(NamedTuple):
     """Which files of which scenes a data set has.
 
     Attributes:
-        name: of the data set; the name of its folder begins with it.
-        versions: of what writes it; a part of the folder's name.
         shots: every scene, in the order of their numbers.
         images: the files of a scene.
-        lists: the split lists, by path.
-        named: entries of the plan that plan.json names where they are None.
+        lists: the split lists, by path, if there are any.
     """
 
-    name: str
-    versions: Mapping[str, int]
     shots: Callable[[Plan], list[Shot]]
     images: Callable[[Scene, Shot], Images]
-    lists: Callable[[Sequence[Shot]], dict[str, list[str]]] = _no_lists
-    named: dict[str, Any] = field(default_factory=lambda: {"motion": None})
+    lists: Callable[[Sequence[Shot]], dict[str, list[str]]] | None = None
 
-    def cached(self, plan: Plan, cache_dir: str | Path | None) -> Path:
-        """The folder of `plan`, see `written_once`."""
-        motion = {} if plan.motion is None else {"motion": asdict(plan.motion)}
-        content = {
-            **self.versions,
-            "seed": plan.seed,
-            **plan.numbers,
-            "factors": plan.factors.values(),
-            **self.named,
-            **motion,
-        }
-        return written_once(self.name, content, cache_dir, partial(self.write, plan))
 
-    def write(self, plan: Plan, folder: Path) -> None:
-        """Write the whole data set into `folder`, which exists; OSError if that is impossible."""
-        shots = self.shots(plan)
-        work = partial(write_shot, self, plan, folder)
-        hidden = len(shots) < _WORTH_A_BAR
-        with Progress(console=Console(stderr=True), transient=True, disable=hidden) as progress:
-            task = progress.add_task("writing synthetic scenes", total=len(shots))
-            for _ in _for_each(work, shots):
-                progress.advance(task)
-        for root in [folder, folder / FRAMES] if plan.motion else [folder]:
-            for path, lines in self.lists(shots).items():
-                text = "".join(f"{line}\n" for line in lines)
-                (root / path).write_text(text, encoding="utf-8")
+def exported(layout: Layout, plan: Plan, cache_dir: str | Path | None) -> Path:
+    """The folder of a data set, written now if it is not there yet.
+
+    It is written under another name and renamed when complete, so that an interrupted generation
+    leaves nothing that looks like a data set, and two at once cannot mix.
+
+    Args:
+        layout: of its files.
+        plan: all settings that determine its bytes; stored in it as plan.json.
+        cache_dir: folder that holds written data sets; None: `default_cache`.
+
+    Raises:
+        InputError: the cache cannot be written.
+    """
+    text = json.dumps({"version": VERSION, **asdict(plan)}, sort_keys=True, indent=1)
+    cache = Path(cache_dir).expanduser() if cache_dir else default_cache()
+    folder = cache / f"{plan.name}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
+    if folder.is_dir():
+        return folder
+    try:
+        cache.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".synth-", dir=cache) as scratch:
+            made = Path(scratch) / "made"
+            made.mkdir()
+            write(layout, plan, made)
+            (made / "plan.json").write_text(text + "\n", encoding="utf-8")
+            made.rename(folder)
+    except OSError as error:
+        # Where another process was first, its folder is as good: equal plans give equal files.
+        if not folder.is_dir():
+            reason = error.strerror or error
+            raise InputError(f"dataset.cache_dir: cannot write {folder} ({reason}).") from error
+    return folder
+
+
+def default_cache() -> Path:
+    """$XDG_CACHE_HOME/rgbt, or ~/.cache/rgbt where that is not set."""
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "rgbt"
+
+
+def write(layout: Layout, plan: Plan, folder: Path) -> None:
+    """Write the whole data set into `folder`, which exists; OSError if that is impossible."""
+    shots = layout.shots(plan)
+    work = partial(write_shot, layout, plan, folder)
+    hidden = len(shots) < _WORTH_A_BAR
+    with Progress(console=Console(stderr=True), transient=True, disable=hidden) as progress:
+        task = progress.add_task("writing synthetic scenes", total=len(shots))
+        for _ in _for_each(work, shots):
+            progress.advance(task)
+    lists = layout.lists(shots) if layout.lists else {}
+    for root in [folder, folder / FRAMES] if plan.motion else [folder]:
+        for path, lines in lists.items():
+            text = "".join(f"{line}\n" for line in lines)
+            (root / path).write_text(text, encoding="utf-8")
 
 
 def write_shot(layout: Layout, plan: Plan, folder: Path, shot: Shot) -> None:
@@ -159,11 +182,6 @@ def _write(images: Images, folder: Path) -> None:
             continue
         _, encoded = cv2.imencode(path.suffix, image, _FAST_PNG if path.suffix == ".png" else ())
         path.write_bytes(encoded.tobytes())
-
-
-def bgr(scene: Scene) -> NDArray[np.uint8]:
-    """RGB of a scene in the order in which OpenCV stores channels."""
-    return np.ascontiguousarray(scene.rgb[..., ::-1])
 
 
 def _for_each(work: partial[None], shots: Sequence[Shot]) -> Iterator[None]:

@@ -1,18 +1,70 @@
-"""Draw the road: its course, and markings and kerbs on the ground, as strips of quads."""
+"""The street of a scene: the road, its strips on the ground, and the record of a placed object."""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rgbt.data.synth.camera import Floats
-from rgbt.data.synth.factors import SceneFactors
-from rgbt.data.synth.materials import INDEX
-from rgbt.data.synth.shapes import CURVE, MAX_CORNERS, UNLABELED
 from rgbt.randomness import numpy_generator
+from rgbt.synth.camera import Floats
+from rgbt.synth.factors import SceneFactors
+from rgbt.synth.shapes import CURVE, INDEX, MAX_CORNERS, UNLABELED, Shape, shapes
+
+Paint = tuple[float, float, float]
+
+GROUND, BACKDROP, STANDING = range(3)
+"""Drawing layers, first to last; within a layer far objects are drawn before near ones."""
+
+NO_SHADOW = -1.0
+
+
+class Placed(NamedTuple):
+    """One object in the world.
+
+    Attributes:
+        shape: what it is.
+        x: metres right of the camera's start.
+        z: metres ahead of it.
+        yaw: turn to the right in radians; 0 shows the shape's back.
+        scale: factors on the shape's x, y, z.
+        paints: first and second paint, reflectance (R, G, B).
+        warmth: 0 cold (parked, well wrapped) to 1 (engine on, lightly dressed).
+        lit: 0 or 1: whether its lamps are on by night.
+        layer: drawing layer.
+        shadow_from: share of the height from which it casts a shadow, or `NO_SHADOW`.
+        y: height above the ground.
+    """
+
+    shape: Shape
+    x: float
+    z: float
+    yaw: float = 0.0
+    scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    paints: tuple[Paint, Paint] = ((0.5, 0.5, 0.5), (0.3, 0.3, 0.3))
+    warmth: float = 0.0
+    lit: float = 0.0
+    layer: int = STANDING
+    shadow_from: float = 0.0
+    y: float = 0.0
+
+
+Row = list[float]
+"""Uniform numbers in [0, 1) of one object: kind, place, pose (0-7), colour (8-11), heat (12-13)."""
+
+COLOUR, HEAT = 8, 12
+
+
+def draw_rows(seed: int, index: int, pool: str, num: int) -> list[Row]:
+    """Numbers for the first `num` objects of the pool `pool` in scene `index`.
+
+    Rows are drawn one after the other, so that the first rows do not depend on their number.
+    """
+    rows: list[Row] = numpy_generator(seed, f"synth/{pool}", index).random((num, 14)).tolist()
+    return rows
+
 
 KERB_M = (0.24, 0.17)
 """Width and height of a kerb. Wider than a real one, so that it is seen at 120 x 160 pixels."""
@@ -59,6 +111,14 @@ class Road(NamedTuple):
     def heading(self, z: float) -> float:
         """Direction of the road at distance `z`, radians to the right of Z."""
         return math.atan(self.curvature * z)
+
+    def sidewalk_of(self, side: int) -> float:
+        """Width of the sidewalk of a side, -1 left or 1 right."""
+        return self.sidewalk[0 if side < 0 else 1]
+
+    def place(self, name: str, z: float, lateral: float, **settings: Any) -> Placed:
+        """The shape of this name `lateral` metres right of the centre line at distance `z`."""
+        return Placed(shapes()[name], self.x(z, lateral), z, **settings)
 
 
 def draw_road(seed: int, index: int, factors: SceneFactors) -> Road:

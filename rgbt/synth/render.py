@@ -1,4 +1,9 @@
-"""Render the RGB image: sun or lamps on coloured surfaces, sky, haze, glow and camera noise."""
+"""Render RGB and thermal images of a surface.
+
+RGB has sun or lamps on coloured surfaces, sky, haze, glow and camera noise. Thermal has
+temperatures with blur, drift and noise. It follows the materials, not the classes: an engine
+differs from a door, a parked car is as cold as the street, a warm outlet shines like a person.
+"""
 
 from __future__ import annotations
 
@@ -8,21 +13,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rgbt.data.synth import materials
-from rgbt.data.synth.camera import Floats, SynthCamera, floats
-from rgbt.data.synth.facets import Facets
-from rgbt.data.synth.factors import SceneFactors
-from rgbt.data.synth.light import Lamp, Light, headlight, lamplight
-from rgbt.data.synth.raster import average
-from rgbt.data.synth.surface import Surface, sample_tile
+from rgbt.randomness import numpy_generator
+from rgbt.synth.camera import Floats, SynthCamera, floats
+from rgbt.synth.factors import SceneFactors
+from rgbt.synth.light import Lamp, Light, headlight, lamplight
+from rgbt.synth.raster import Facets, average
+from rgbt.synth.shapes import INDEX, column
+from rgbt.synth.surface import Surface, sample_tile
 
 _GLOW_RANGE = 4.0
 """Glow is stored in eight bits up to this brightness."""
 
 _GLASS = np.array([0.035, 0.045, 0.055], np.float32)[:, None, None]
 _WINDOW_GLOW = np.array([0.95, 0.80, 0.48], np.float32)[:, None, None]
-_GLOWS = materials.column("glow")
-_TEXTURES = materials.column("rgb_texture")
+_GLOWS = column("glow_red", "glow_green", "glow_blue")
+_RGB_TEXTURES = column("rgb_texture")
 
 
 def render_rgb(
@@ -42,7 +47,7 @@ def render_rgb(
     glow = average(_glow_table(surface.facets, light), surface.drawing)
     image = _decoded(colour)
     image *= np.maximum(
-        1.0 + np.take(_TEXTURES, surface.material) * strength * surface.texture, 0.1
+        1.0 + np.take(_RGB_TEXTURES, surface.material) * strength * surface.texture, 0.1
     )
     image += surface.window * (_GLASS - image)
     image *= _lamplight(surface, light, lamps) if light.is_night else 1.0 - 0.72 * surface.shadow
@@ -145,7 +150,7 @@ def _sky(rays: Floats, light: Light, camera: SynthCamera, seed: int) -> Floats:
     )
 
 
-def develop(
+def develop_rgb(
     image: Floats, factors: SceneFactors, generator: np.random.Generator
 ) -> NDArray[np.uint8]:
     """Vignette, noise and eight bits of an image (3, H, W) in 0..1: (H, W, 3) uint8.
@@ -153,33 +158,15 @@ def develop(
         sd(p) = rgb_noise (1 + radius_gain r(p)^2) (1 + dark_gain (1 - brightness))
 
     with r the distance from the centre (1 at the corners) and the brightness the mean of the image:
-    a camera in the dark raises its gain, and its noise. The lens blurs before the sensor adds it.
+    a camera in the dark raises its gain, and its noise.
     """
     radius_squared = squared_radius(*image.shape[1:])
-    image = blurred(image, factors.rgb_blur, factors.rgb_blur_radius_gain)
     sd = factors.rgb_noise * (1 + factors.rgb_noise_radius_gain * radius_squared)
     sd *= 1 + factors.rgb_noise_dark_gain * (1 - float(image.mean()))
     noisy = generator.standard_normal(image.shape, np.float32)
     noisy *= sd
     noisy += image * (1 - factors.vignette * radius_squared)
     return np.asarray(cv2.merge(list(eight_bits(noisy))), np.uint8)
-
-
-def blurred(image: Floats, sd: float, radius_gain: float) -> Floats:
-    """An image (3, H, W) behind a lens whose blur has the standard deviation sd (1 + gain r^2).
-
-    In pixels of an image that is 160 wide. Each pixel is a mix of the sharp image and of the one
-    with the strongest blur, which gives the point spread that variance exactly.
-    """
-    if sd == 0:
-        return image
-    height, width = image.shape[1:]
-    growth = 1 + np.float32(radius_gain) * squared_radius(height, width)
-    strongest = max(1.0, 1.0 + radius_gain)
-    share = np.square(growth / np.float32(strongest))
-    pixels = sd * strongest * width / 160
-    soft = np.stack([cv2.GaussianBlur(plane, (0, 0), pixels) for plane in image])
-    return np.asarray(image + share * (soft - image), np.float32)
 
 
 def texture_strength(factors: SceneFactors) -> Floats | float:
@@ -205,3 +192,85 @@ def squared_radius(height: int, width: int) -> Floats:
     columns = np.linspace(-1, 1, width, dtype=np.float32)
     aspect = np.float32(height / width)
     return np.asarray((columns**2 + (rows * aspect) ** 2) / (1 + aspect**2), np.float32)
+
+
+_COLDEST, _SPAN = -45.0, 95.0
+"""Range in degrees above the air that eight bits per facet cover."""
+
+_LEVEL, _PER_DEGREE = 0.21, 0.026
+"""Grey level (1 = full scale) of air temperature, and per degree, as MFNet's camera shows them."""
+
+_DAY, _NIGHT, _HEAT = (column(name) for name in ("day", "night", "heat"))
+_HEAT_TEXTURES = column("heat_texture")
+_PASSIVE = column("passive") > 0
+"""Materials that nothing heats but the sun."""
+
+
+def render_thermal(surface: Surface, light: Light, factors: SceneFactors) -> Floats:
+    """Temperature of each pixel, (H, W) float32 degrees above the air; not yet blurred or noisy."""
+    strength = texture_strength(factors)
+    table = np.zeros((len(surface.facets.material) + 1, 4), np.uint8)
+    degrees = np.concatenate([[-34.0], _facet_degrees(surface, light, factors)])
+    table[:, 0] = np.clip((degrees - _COLDEST) / _SPAN * 255, 0, 255)
+    table[0, 1] = 255
+    mean = average(table, surface.drawing)
+    heat = mean[..., 0].astype(np.float32) * np.float32(_SPAN / 255) + np.float32(_COLDEST)
+    heat += np.take(_HEAT_TEXTURES, surface.material) * strength * surface.patches
+    heat -= surface.window * np.where(
+        surface.window_lit < light.lit_windows, np.float32(-4), np.float32(5)
+    )
+    if not light.is_night:
+        heat -= 5.0 * light.direct * surface.shadow
+    # The sky is warmer towards the horizon, where the path through the air is longer.
+    up = surface.camera.turned(surface.rays)[1]
+    lower = 14 * np.exp(-6 * np.maximum(up, 0)) * (mean[..., 1] / np.float32(255))
+    return np.asarray(heat + lower, np.float32)
+
+
+def _facet_degrees(surface: Surface, light: Light, factors: SceneFactors) -> Floats:
+    facets = surface.facets
+    of_material = _NIGHT if light.is_night else _DAY
+    degrees = of_material[facets.material]
+    degrees = degrees + _HEAT[facets.material] * facets.warmth
+    if not light.is_night:
+        facing = np.maximum(surface.drawing.normals[1:] @ light.sun, 0)
+        degrees = degrees + 4.0 * light.direct * (facing - 0.5) * ~facets.on_ground
+    if factors.passive_contrast != 1:
+        road = of_material[INDEX["asphalt"]]
+        closer = road + factors.passive_contrast * (degrees - road)
+        degrees = np.where(_PASSIVE[facets.material], closer, degrees)
+    return np.asarray(degrees, np.float32)
+
+
+def develop_thermal(
+    heat: Floats, factors: SceneFactors, seed: int, index: int, generator: np.random.Generator
+) -> Floats:
+    """Contrast, lens, drift and noise of `heat` (H, W): grey levels, some below 0 or above 1.
+
+    The noise has three parts of the same strength factor: per pixel, per column, and smeared over
+    neighbours. The drift is an offset that varies slowly over the image and a gain per scene; both
+    belong to the scene (`seed`, `index`), so two frames of one scene share them; `generator` is
+    that of the noise of this frame.
+    """
+    height, width = heat.shape
+    drift = numpy_generator(seed, "synth/drift", index)
+    gain = 1.0 + 2.0 * factors.thermal_drift * float(drift.standard_normal())
+    coarse = drift.standard_normal((4, 5)).astype(np.float32)
+    offset = (
+        cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC) * factors.thermal_drift
+    )
+    grey = _LEVEL + _PER_DEGREE * factors.thermal_contrast * gain * _softened(heat) + offset
+    pixel, column = (
+        generator.standard_normal(heat.shape, np.float32),
+        generator.standard_normal(width, np.float32),
+    )
+    noise = 0.75 * pixel + 0.35 * column + 1.4 * _softened(pixel)
+    if factors.thermal_noise_radius_gain != 0:
+        noise *= 1 + factors.thermal_noise_radius_gain * squared_radius(height, width)
+    grey += factors.thermal_noise * noise
+    return np.asarray(grey, np.float32)
+
+
+def _softened(image: Floats) -> Floats:
+    """The thermal lens is softer than the RGB lens: 0.7 pixels at a width of 160."""
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), 0.7 * image.shape[1] / 160))

@@ -10,17 +10,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rgbt.data.synth import materials
-from rgbt.data.synth.camera import NEAR_M, Floats, SynthCamera, floats
-from rgbt.data.synth.facets import Facets
-from rgbt.data.synth.light import Light
-from rgbt.data.synth.placement import Placed
-from rgbt.data.synth.raster import Drawing, beyond_near
 from rgbt.randomness import numpy_generator
+from rgbt.synth.camera import NEAR_M, Floats, SynthCamera, floats
+from rgbt.synth.light import Light
+from rgbt.synth.raster import Drawing, Facets, beyond_near
+from rgbt.synth.shapes import INDEX
+from rgbt.synth.street import Placed
 
 _TILE = 256
 _LAST_SHADOW_M = 45.0
-_FACADES = [materials.INDEX["facade"], materials.INDEX["facade_side"]]
+_FACADES = [INDEX["facade"], INDEX["facade_side"]]
 
 
 @dataclass(frozen=True)

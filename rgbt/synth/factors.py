@@ -1,4 +1,4 @@
-"""The factors of the scene generator; no factor changes the random draws of another."""
+"""The factors of the scenes; no factor changes the random draws of another."""
 
 from __future__ import annotations
 
@@ -51,9 +51,6 @@ class SceneFactors:
         camera_pitch_deg: downward tilt of the camera in degrees.
         field_of_view_deg: horizontal field of view in degrees.
         thermal_noise_radius_gain: as for RGB.
-        rgb_blur: standard deviation of a Gaussian blur of RGB at the centre, in pixels of an image
-            that is 160 wide; 0: none.
-        rgb_blur_radius_gain: as for the noise.
         texture_radius_gain: the same for the strength of the texture, in RGB and thermal.
         night_light: factor on all light by night except lamps seen directly.
         glare: strength of the veil around headlights that point at the camera, and around a low
@@ -91,10 +88,7 @@ class SceneFactors:
     camera_height_m: Annotated[float, Interval(ge=0.9, le=4)] = 1.6
     camera_pitch_deg: Annotated[float, Interval(ge=-10, le=20)] = 2.0
     field_of_view_deg: Annotated[float, Interval(ge=20, le=110)] = 64.0
-    # Those below are keys of calibrated data sets alone; see `NEUTRAL`.
     thermal_noise_radius_gain: RadiusGain = 0.0
-    rgb_blur: Strength = 0.0
-    rgb_blur_radius_gain: RadiusGain = 0.0
     texture_radius_gain: RadiusGain = 0.0
     night_light: Strength = 1.0
     glare: Strength = 0.0
@@ -109,22 +103,6 @@ class SceneFactors:
     kerb_scale: Multiple = 1.0
     vignette: Share = 0.18
     whole_shadows: bool = False
-
-    def values(self) -> dict[str, Any]:
-        """All factors by name, without those of `NEUTRAL` that have their default value.
-
-        The folder of a written data set is named by them.
-        """
-        return {
-            factor.name: getattr(self, factor.name)
-            for factor in fields(self)
-            if factor.name not in NEUTRAL or getattr(self, factor.name) != factor.default
-        }
-
-
-_NAMES = [factor.name for factor in fields(SceneFactors)]
-NEUTRAL = frozenset(_NAMES[_NAMES.index("thermal_noise_radius_gain") :])
-"""Factors that change nothing at their default value, which most data sets keep."""
 
 
 ForwardMetres = Annotated[float, Interval(ge=-3, le=3)]
@@ -146,43 +124,41 @@ class EgoMotion:
 
 
 def with_factors(
-    *left_out: str, calibrated: bool = False, **defaults: float | str
+    *left_out: str, **defaults: float
 ) -> Callable[[Callable[..., Made]], Callable[..., Made]]:
     """Lets a function of ``factors: SceneFactors`` take each factor as a keyword of its own.
 
     The keys of a data set in the configuration are the arguments of the function that makes it, so
-    its signature shows every factor without naming it a second time. What is made takes keywords
-    alone.
+    its signature shows every factor without naming it a second time.
 
     Args:
         left_out: factors that the data set decides itself; they keep their default.
-        calibrated: whether the factors of `NEUTRAL` are keywords, too.
         defaults: of factors that have another one in this data set.
     """
 
     def with_keywords(function: Callable[..., Made]) -> Callable[..., Made]:
         own = inspect.signature(function)
         types = get_type_hints(SceneFactors, include_extras=True)
-        added = [
-            inspect.Parameter(
-                factor.name,
+        added = {
+            each.name: inspect.Parameter(
+                each.name,
                 inspect.Parameter.KEYWORD_ONLY,
-                default=defaults.get(factor.name, factor.default),
-                annotation=types[factor.name],
+                default=defaults.get(each.name, each.default),
+                annotation=types[each.name],
             )
-            for factor in fields(SceneFactors)
-            if factor.name not in left_out and (calibrated or factor.name not in NEUTRAL)
-        ]
+            for each in fields(SceneFactors)
+            if each.name not in left_out
+        }
 
         @wraps(function)
         def made(**settings: Any) -> Made:
-            chosen = {each.name: settings.pop(each.name, each.default) for each in added}
+            chosen = {name: settings.pop(name, each.default) for name, each in added.items()}
             return function(factors=SceneFactors(**chosen), **settings)
 
         kept = [each for each in own.parameters.values() if each.name != "factors"]
-        made.__signature__ = own.replace(parameters=[*kept, *added])  # type: ignore[attr-defined]
-        made.__annotations__ = {each.name: each.annotation for each in [*kept, *added]}
-        made.__annotations__["return"] = own.return_annotation
+        parameters = [*kept, *added.values()]
+        made.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]
+        made.__annotations__ = {each.name: each.annotation for each in parameters}
         return made
 
     return with_keywords

@@ -1,22 +1,23 @@
-"""Draw time of day, sun, sky and lamps of one scene, for the RGB and the thermal image.
+"""Draw time of day, sun, sky, lamps and glare of one scene, for the RGB and the thermal image.
 
-Lamps light by night: the own headlights, street lamps, oncoming cars, vending machines.
+Lamps light by night: the own headlights, street lamps, oncoming cars, vending machines. Strong
+lights in view lay a veil over RGB, because the lens scatters them: headlights that point at the
+camera by night, and a low sun by day.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from rgbt.data.synth import backdrop, cars
-from rgbt.data.synth.camera import Floats, SynthCamera, floats
-from rgbt.data.synth.placement import Placed
 from rgbt.randomness import numpy_generator
+from rgbt.synth.camera import NEAR_M, Floats, SynthCamera, floats
+from rgbt.synth.street import Placed
 
 _GOLDEN = 0.6180339887
 
@@ -140,7 +141,6 @@ def _dimmed(light: Light, factor: float) -> Light:
 
 
 _MAX_LAMPS = 6
-_CARS = {cars.car(kind) for kind in range(cars.NUM_CARS)}
 
 
 class Lamp(NamedTuple):
@@ -185,17 +185,78 @@ def lamps_of(placed: Sequence[Placed], light: Light) -> list[Lamp]:
 
 def is_oncoming(thing: Placed) -> bool:
     """Whether it is a car whose headlights point at the camera."""
-    return thing.shape in _CARS and math.cos(thing.yaw) < 0
+    return thing.shape.name.startswith("car_") and math.cos(thing.yaw) < 0
 
 
 def _lamps(thing: Placed, light: Light) -> list[Lamp]:
-    if thing.shape is backdrop.street_lamp():
+    if thing.shape.name == "street_lamp":
         reach = 1.35 * math.cos(thing.yaw)
         return [Lamp((thing.x + reach, 5.4, thing.z), light.lamp, 5.5)]
-    if thing.shape is backdrop.vending_machine():
+    if thing.shape.name == "vending_machine":
         colour = floats([0.30, 0.33, 0.36]) * np.float32(light.others)
         return [Lamp((thing.x, 1.0, thing.z - 0.7), colour, 1.6)]
     if is_oncoming(thing):
         colour = floats([0.9, 0.85, 0.75]) * np.float32(light.others)
         return [Lamp((thing.x, 0.4, thing.z - 4.0), colour, 1.8)]
     return []
+
+
+_SUN_SHARE = 0.33
+_SUN = floats([1.0, 0.95, 0.85])
+_HEADLAMP = floats([1.0, 0.97, 0.90])
+_REACH = 0.16
+"""Distance at which a veil has half its strength, as a share of the image width."""
+
+
+def veil_of(
+    placed: Sequence[Placed],
+    camera: SynthCamera,
+    light: Light,
+    strength: float,
+    key: tuple[int, int],
+) -> Floats | None:
+    """(3, H, W) light that is added to the image; None where there is no source of glare.
+
+    Args:
+        placed: objects of the scene.
+        camera: of the frame.
+        light: of the scene.
+        strength: factor; a headlight pair 10 m ahead has this brightness, 1 = white of the day.
+        key: (seed, index) of the scene, which draw whether and where there is a low sun.
+    """
+    if strength == 0:
+        return None
+    sources = list(_headlamps(placed, camera) if light.is_night else _low_sun(camera, light, key))
+    if not sources:
+        return None
+    rows, columns = np.mgrid[: camera.height, : camera.width].astype(np.float32)
+    reach = np.float32(_REACH * camera.width)
+    veil = np.zeros((camera.height, camera.width), np.float32)
+    for column, row, brightness in sources:
+        squared = (columns - np.float32(column)) ** 2 + (rows - np.float32(row)) ** 2
+        veil += np.float32(strength * brightness) / (1 + squared / reach**2)
+    colour = _HEADLAMP if light.is_night else _SUN
+    return np.asarray(colour[:, None, None] * veil, np.float32)
+
+
+def _headlamps(
+    placed: Sequence[Placed], camera: SynthCamera
+) -> Iterator[tuple[float, float, float]]:
+    """Column, row and brightness of each pair of headlights in view."""
+    oncoming = (thing for thing in placed if thing.lit and is_oncoming(thing))
+    points = (camera.to_camera(floats([thing.x, 0.7, thing.z])) for thing in oncoming)
+    for point in points:
+        column, row = camera.project(point).tolist()
+        inside = 0 <= column < camera.width and 0 <= row < camera.height
+        if inside and point[2] > NEAR_M:
+            yield column, row, 10 / max(float(point[2]), 10.0)
+
+
+def _low_sun(
+    camera: SynthCamera, light: Light, key: tuple[int, int]
+) -> Iterator[tuple[float, float, float]]:
+    """The sun just above the end of the road, in a share of the clear days."""
+    seed, index = key
+    u = numpy_generator(seed, "synth/glare", index).random(3).tolist()
+    if light.clear and u[0] < _SUN_SHARE:
+        yield camera.width * (0.3 + 0.4 * u[1]), camera.height * (0.2 + 0.25 * u[2]), 1.0
