@@ -30,15 +30,9 @@ NEAR_M = 0.3
 
 @dataclass(frozen=True)
 class SynthCamera:
-    """Where the camera stands and how it looks.
+    """Size of the image and focal length in pixels, position in metres, angles in radians.
 
-    Attributes:
-        height: image height in pixels.
-        width: image width in pixels.
-        focal: focal length in pixels.
-        position: (X, Y, Z) in metres.
-        pitch: downward tilt in radians.
-        yaw: turn to the right in radians.
+    `pitch` tilts downward, `yaw` turns to the right.
     """
 
     height: int
@@ -127,16 +121,9 @@ def flow_between(depth_HW: Floats, source: SynthCamera, target: SynthCamera) -> 
 
     with R, C rotation and position of `source`, R', C' those of `target`, z the depth.
 
-    Args:
-        depth_HW: depth along the optical axis of `source` in metres; infinity for the sky.
-        source: camera that the depth belongs to.
-        target: the other camera.
-
-    Returns:
-        (H, W, 2) float32, displacement (rows, columns) in pixels; NaN behind the target camera.
-
-    Raises:
-        ValueError: the two cameras differ in image size or focal length.
+    `depth_HW` is that along the optical axis of `source` in metres, infinity for the sky. Returns
+    (H, W, 2) float32 (rows, columns) in pixels, NaN behind `target`; ValueError if the two cameras
+    differ in image size or focal length.
     """
     shift = target.rotation @ (np.asarray(source.position) - np.asarray(target.position))
     rays = source.rays()

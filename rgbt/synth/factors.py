@@ -31,46 +31,8 @@ Multiple = Annotated[float, Interval(ge=0.1, le=10)]
 class SceneFactors:
     """The factors of a scene; a study varies one of them and keeps the others fixed.
 
-    Attributes:
-        height: image height in pixels.
-        width: image width in pixels.
-        num_objects: groups of near objects (a car, some persons, a row of cones), 4 to 26 m away.
-        num_far_objects: objects 26 to 90 m away, small and around the vanishing point.
-        texture_strength: factor on surface texture, in RGB and thermal; 1 looks natural, 0 is flat.
-        rgb_noise: standard deviation of the sensor noise at the centre of a white image,
-            1 = full scale.
-        rgb_noise_radius_gain: noise at the corners is (1 + this) times the noise at the centre;
-            in between it changes with the squared radius. Negative: more noise in the centre.
-        rgb_noise_dark_gain: noise of a black image is (1 + this) times the noise of a white one.
-        thermal_noise: standard deviation of the thermal noise, 1 = full scale.
-        thermal_contrast: factor on all temperature differences; 1 looks natural, 0 is flat.
-        thermal_drift: standard deviation of the low-frequency offset of the thermal image,
-            1 = full scale.
-        night_share: share of scenes at night.
-        camera_height_m: height of the camera above the road in metres.
-        camera_pitch_deg: downward tilt of the camera in degrees.
-        field_of_view_deg: horizontal field of view in degrees.
-        thermal_noise_radius_gain: as for RGB.
-        texture_radius_gain: the same for the strength of the texture, in RGB and thermal.
-        night_light: factor on all light by night except lamps seen directly.
-        glare: strength of the veil around headlights that point at the camera, and around a low
-            sun in a third of the clear days; 0: none.
-        passive_contrast: factor on the difference between the temperature of the road and that of
-            markings, kerbs, cones, car stops, bumps, guardrails and bicycles; 0: only RGB
-            distinguishes them from the road.
-        far_object_scale: factor on the size of far objects.
-        object_mix: shares of the kinds of objects; demo: each kind is frequent; mfnet: more cars,
-            fewer cones and car stops, as in the labels of MFNet.
-        rail_share: share of scenes with a guardrail.
-        bump_share: share of scenes with a bump.
-        bump_nearest_m: distance of the nearest bumps in metres.
-        bump_farthest_m: distance of the farthest bumps in metres.
-        kerb_share: factor on the share of streets with kerbs.
-        kerb_scale: factor on the width and height of kerbs.
-        vignette: share of the light that the lens takes at the corners of RGB; 0: none.
-        whole_shadows: whether an object's shadow by day is drawn although a part of it lies behind
-            the camera; false leaves such shadows out, so that a camera that drives past an object
-            loses them.
+    The comments of ``conf/dataset/synth.yaml`` say what each of them is. A gain by radius changes
+    with the squared radius, from 1 at the centre to (1 + gain) at the corners.
     """
 
     height: Side = 120
@@ -112,12 +74,7 @@ YawDegrees = Annotated[float, Interval(ge=-15, le=15)]
 
 @dataclass(frozen=True)
 class EgoMotion:
-    """Motion of the camera between two consecutive frames: first it turns, then it drives ahead.
-
-    Attributes:
-        forward_m: metres along the new viewing direction, on the ground plane.
-        yaw_deg: degrees to the right.
-    """
+    """Motion of the camera between two frames: it turns to the right, then it drives ahead."""
 
     forward_m: ForwardMetres
     yaw_deg: YawDegrees = 0.0
@@ -128,12 +85,8 @@ def with_factors(
 ) -> Callable[[Callable[..., Made]], Callable[..., Made]]:
     """Lets a function of ``factors: SceneFactors`` take each factor as a keyword of its own.
 
-    The keys of a data set in the configuration are the arguments of the function that makes it, so
-    its signature shows every factor without naming it a second time.
-
-    Args:
-        left_out: factors that the data set decides itself; they keep their default.
-        defaults: of factors that have another one in this data set.
+    The keys of a data set in the configuration are the arguments of the function that makes it.
+    `left_out` are factors that the data set decides itself; `defaults` are those that differ.
     """
 
     def with_keywords(function: Callable[..., Made]) -> Callable[..., Made]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -20,42 +20,42 @@ from rgbt.synth.camera import NEAR_M, Floats, SynthCamera, floats
 from rgbt.synth.street import Placed
 
 _GOLDEN = 0.6180339887
+_DARK = floats([0, 0, 0])
 
 
 class Light(NamedTuple):
     """The light sources of a scene.
 
     Attributes:
-        is_night: night.
         sun: (3,) unit vector towards the sun.
-        direct: strength of the sun, 0 under clouds.
-        ambient: strength of the sky.
-        zenith: colour of the sky above.
-        horizon: colour of the sky at the horizon, and of the haze.
-        cloud: how much clouds show, 0..1.
         exposure: factor on all light.
         tint: colour cast of the camera.
         headlight: strength of the own headlights by night.
         lamp: colour of the street lamps; zero where they are off.
         lit_windows: share of windows with light by night.
         visibility_m: distance at which 37 % of the light comes through.
+        direct: strength of the sun, 0 under clouds.
+        ambient: strength of the sky.
+        zenith: colour of the sky above.
+        horizon: colour of the sky at the horizon, and of the haze.
+        cloud: how much clouds show, 0..1.
         clear: a day without a cover of clouds.
         others: factor on the light that cars and vending machines cast.
     """
 
     is_night: bool
     sun: Floats
-    direct: float
-    ambient: float
-    zenith: Floats
-    horizon: Floats
-    cloud: float
     exposure: float
     tint: Floats
     headlight: float
     lamp: Floats
     lit_windows: float
     visibility_m: float
+    direct: float = 0.0
+    ambient: float = 0.0
+    zenith: Floats = _DARK
+    horizon: Floats = _DARK
+    cloud: float = 0.0
     clear: bool = False
     others: float = 1.0
 
@@ -76,18 +76,12 @@ def draw_light(seed: int, index: int, night_share: float, night_light: float = 1
     `night_light` is a factor on everything that lights the night.
     """
     u = numpy_generator(seed, "synth/light", index).random(16).tolist()
-    dark = floats([0, 0, 0])
     angle, height = 2 * math.pi * u[2], math.radians(22 + 43 * u[3])
     flat = math.cos(height)
     lamp = floats([1.0, 0.72, 0.38] if u[8] < 0.5 else [0.85, 1.0, 0.85])
     common = Light(
         is_night=is_night(seed, index, night_share),
         sun=floats([math.sin(angle) * flat, math.sin(height), math.cos(angle) * flat]),
-        direct=0.0,
-        ambient=0.0,
-        zenith=dark,
-        horizon=dark,
-        cloud=0.0,
         exposure=1.6 ** (u[12] - 0.5),
         tint=floats([0.96 + 0.08 * u[0], 1.0, 0.96 + 0.08 * u[1]]),
         headlight=0.5 + 0.8 * u[4],
@@ -96,7 +90,7 @@ def draw_light(seed: int, index: int, night_share: float, night_light: float = 1
         lit_windows=0.06 + 0.4 * u[5] ** 2,
         visibility_m=140 + 300 * u[6],
     )
-    return _dimmed(_night(common, u), night_light) if common.is_night else _day(common, u)
+    return _night(common, u, night_light) if common.is_night else _day(common, u)
 
 
 def _day(light: Light, u: list[float]) -> Light:
@@ -104,38 +98,24 @@ def _day(light: Light, u: list[float]) -> Light:
     brighter = light._replace(exposure=1.25 * light.exposure)
     if u[9] < 0.35:
         grey = floats([0.74, 0.77, 0.82]) * (0.85 + 0.3 * u[10])
-        return brighter._replace(
-            direct=0.15, ambient=0.72, zenith=grey * 0.9, horizon=grey, cloud=0.25
-        )
-    return brighter._replace(
-        clear=True,
-        direct=0.95,
-        ambient=0.42,
-        zenith=floats([0.28, 0.50, 0.95]),
-        horizon=floats([0.80, 0.88, 0.98]),
-        cloud=0.9 * u[11],
-    )
+        sky: dict[str, Any] = {"zenith": grey * 0.9, "horizon": grey}
+        return brighter._replace(direct=0.15, ambient=0.72, cloud=0.25, **sky)
+    sky = {"zenith": floats([0.28, 0.50, 0.95]), "horizon": floats([0.80, 0.88, 0.98])}
+    return brighter._replace(clear=True, direct=0.95, ambient=0.42, cloud=0.9 * u[11], **sky)
 
 
-def _night(light: Light, u: list[float]) -> Light:
+def _night(light: Light, u: list[float], factor: float) -> Light:
     """A dark sky with some glow at the horizon; the camera sees a little green, as MFNet's does."""
+    single = np.float32(factor)
     return light._replace(
-        ambient=0.010 + 0.022 * u[10],
-        zenith=floats([0.004, 0.005, 0.010]),
-        horizon=floats([0.026, 0.022, 0.018]) * (0.6 + u[11]),
+        ambient=(0.010 + 0.022 * u[10]) * factor,
+        zenith=floats([0.004, 0.005, 0.010]) * single,
+        horizon=floats([0.026, 0.022, 0.018]) * (0.6 + u[11]) * single,
         cloud=0.3,
         exposure=1.5 * light.exposure,
         tint=light.tint * floats([0.93, 1.03, 0.92]),
-    )
-
-
-def _dimmed(light: Light, factor: float) -> Light:
-    return light._replace(
-        ambient=light.ambient * factor,
-        zenith=light.zenith * np.float32(factor),
-        horizon=light.horizon * np.float32(factor),
         headlight=light.headlight * factor,
-        lamp=light.lamp * np.float32(factor),
+        lamp=light.lamp * single,
         others=factor,
     )
 
@@ -166,7 +146,7 @@ def lamplight(world_3HW: Floats, lamps: list[Lamp]) -> Floats:
 
 
 def headlight(world_3HW: Floats, camera: SynthCamera) -> Floats:
-    """(H, W) light of the own low beams at each world point: a pool ahead, cut off at the waist."""
+    """(H, W) light of the own low beams: a pool ahead, cut off at the waist."""
     dx, dz = world_3HW[0] - camera.position[0], world_3HW[2] - camera.position[2]
     sin, cos = np.float32(np.sin(camera.yaw)), np.float32(np.cos(camera.yaw))
     ahead, aside = np.maximum(dx * sin + dz * cos, 0.1), dx * cos - dz * sin
@@ -217,12 +197,8 @@ def veil_of(
 ) -> Floats | None:
     """(3, H, W) light that is added to the image; None where there is no source of glare.
 
-    Args:
-        placed: objects of the scene.
-        camera: of the frame.
-        light: of the scene.
-        strength: factor; a headlight pair 10 m ahead has this brightness, 1 = white of the day.
-        key: (seed, index) of the scene, which draw whether and where there is a low sun.
+    A headlight pair 10 m ahead has the brightness `strength`, 1 = white of the day. `key`, (seed,
+    index) of the scene, draws whether and where there is a low sun.
     """
     if strength == 0:
         return None

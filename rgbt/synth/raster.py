@@ -29,19 +29,10 @@ _SMALLEST = 0.8
 
 @dataclass(frozen=True)
 class Facets:
-    """N facets, far to near.
+    """N facets, far to near: (N,) each, corners (N, 8, 3) world points, colour (N, 3) reflectance.
 
-    Attributes:
-        corners: (N, 8, 3) float32 world points; the last one is repeated.
-        num_corners: (N,) int.
-        material: (N,) index into `MATERIALS`.
-        label: (N,) class id.
-        thin: (N,) bool, seen from both sides.
-        colour: (N, 3) reflectance.
-        warmth: (N,) see `Placed`.
-        lit: (N,) see `Placed`; for buildings the style of the windows.
-        on_ground: (N,) bool, receives shadows and lies flat.
-        owner: (N,) index of the object that it is a part of; -1 for the ground.
+    `warmth` and `lit` are as in `Placed`, for buildings `lit` is the style of the windows; what is
+    `on_ground` lies flat and receives shadows; `owner` is the number of the object, -1 the ground.
     """
 
     corners: Floats
@@ -113,8 +104,8 @@ class Drawing:
     """What the camera sees, as numbers of facets; 0 is the sky, n + 1 is facet n.
 
     Attributes:
-        fine: (2H, 2W) int; the entry (2i, 2j) lies at the centre of pixel (i, j).
-        ids: (H, W) int, the entries at pixel centres.
+        fine: (2H, 2W); the entry (2i, 2j) lies at the centre of pixel (i, j).
+        ids: (H, W), the entries at pixel centres.
         planes: (N + 1, 3) float32; inverse depth of a pixel is ``planes[id] @ ray``.
         bounds: (N + 1, 2) float32, smallest and largest inverse depth of each facet's corners.
         normals: (N + 1, 3) float32 unit normals in world coordinates, towards the camera.
@@ -199,7 +190,9 @@ def _paint(
     fine = np.zeros((camera.height * SCALE, camera.width * SCALE), np.uint16)
     polygons = [points[row, :count] for row, count in enumerate(counts)]
     for row in np.flatnonzero(crosses[drawn]).tolist():
-        polygons[row] = _clipped(by_corner[: counts[row], drawn[row]].tolist(), camera)
+        polygons[row] = _fixed_point(
+            beyond_near(by_corner[: counts[row], drawn[row]].tolist(), camera)
+        )
     for number, polygon in zip(numbers[drawn].tolist(), polygons, strict=True):
         cv2.fillConvexPoly(fine, polygon, number + 1, cv2.LINE_8, _SHIFT)
     return fine
@@ -210,20 +203,10 @@ def _fixed_point(columns_rows: Floats) -> NDArray[np.int32]:
     return np.clip(np.rint(columns_rows * (SCALE << _SHIFT)), -limit, limit).astype(np.int32)
 
 
-def _clipped(polygon: list[list[float]], camera: SynthCamera) -> NDArray[np.int32]:
-    """The part of a polygon beyond the near plane, in fixed point."""
-    return _fixed_point(beyond_near(polygon, camera))
-
-
 def beyond_near(polygon: list[list[float]], camera: SynthCamera) -> Floats:
-    """The part of a polygon beyond the near plane (Sutherland-Hodgman).
+    """The part of a polygon beyond the near plane (Sutherland-Hodgman), (M, 2) as (column, row).
 
-    Args:
-        polygon: corners (x, y, z) in camera coordinates, at least one beyond the plane.
-        camera: that projects them.
-
-    Returns:
-        (M, 2) float32, (column, row).
+    `polygon` has corners (x, y, z) in camera coordinates, at least one beyond the plane.
     """
     kept = []
     for start, end in zip(polygon, polygon[1:] + polygon[:1], strict=True):

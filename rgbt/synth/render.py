@@ -53,10 +53,10 @@ def render_rgb(
     image *= _lamplight(surface, light, lamps) if light.is_night else 1.0 - 0.72 * surface.shadow
 
     through = cv2.exp(
-        np.where(surface.is_sky, 0, surface.depth) * np.float32(-1 / light.visibility_m)
+        np.where(surface.drawing.ids == 0, 0, surface.depth) * np.float32(-1 / light.visibility_m)
     )
     image *= through
-    image += _column(light.horizon) * (1.0 - through)
+    image += light.horizon[:, None, None] * (1.0 - through)
     if light.is_night:
         shining = _decoded(glow) * np.float32(_GLOW_RANGE)
         brightness = (
@@ -73,14 +73,10 @@ def render_rgb(
     image[:, :last] += share * _sky(surface.rays[:, :last], light, surface.camera, seed)
     if veil is not None:
         image += veil
-    optical = image * _column(light.tint * np.float32(-1.7 * light.exposure))
+    optical = image * (light.tint * np.float32(-1.7 * light.exposure))[:, None, None]
     # cv2.exp is five times as fast as NumPy's; it takes two dimensions.
     exposed = 1.0 - cv2.exp(optical.reshape(-1, image.shape[2])).reshape(image.shape)
     return np.asarray(np.sqrt(np.maximum(exposed, 0)), np.float32)
-
-
-def _column(colour: Floats) -> Floats:
-    return colour[:, None, None]
 
 
 def _colour_table(surface: Surface, light: Light) -> NDArray[np.uint8]:
@@ -116,8 +112,9 @@ def _decoded(encoded_HW4: NDArray[np.uint8]) -> Floats:
 
 def _lamplight(surface: Surface, light: Light, lamps: list[Lamp]) -> Floats:
     total = lamplight(surface.world, lamps)
-    total += headlight(surface.world, surface.camera) * _column(
-        floats([1.0, 0.96, 0.86]) * light.headlight
+    total += (
+        headlight(surface.world, surface.camera)
+        * (floats([1.0, 0.96, 0.86]) * light.headlight)[:, None, None]
     )
     total *= 1.0 - 0.5 * surface.shadow
     return total + np.float32(light.ambient)
@@ -144,7 +141,7 @@ def _sky(rays: Floats, light: Light, camera: SynthCamera, seed: int) -> Floats:
     ahead = np.maximum(z, 0.05) * (up + 0.12)
     clouds = sample_tile(seed, x / ahead * 9, up / (up + 0.12) * 90)
     cover = np.clip(clouds * 0.6, 0, 1) * np.float32(light.cloud)
-    colour = _column(light.horizon) + _column(light.zenith - light.horizon) * high
+    colour = light.horizon[:, None, None] + (light.zenith - light.horizon)[:, None, None] * high
     return np.asarray(
         colour + cover * (np.float32(1.05) * light.horizon.max() - colour), np.float32
     )
@@ -247,10 +244,8 @@ def develop_thermal(
 ) -> Floats:
     """Contrast, lens, drift and noise of `heat` (H, W): grey levels, some below 0 or above 1.
 
-    The noise has three parts of the same strength factor: per pixel, per column, and smeared over
-    neighbours. The drift is an offset that varies slowly over the image and a gain per scene; both
-    belong to the scene (`seed`, `index`), so two frames of one scene share them; `generator` is
-    that of the noise of this frame.
+    The noise is per pixel, per column, and smeared over neighbours; `generator` draws that of this
+    frame. The drift, an offset that varies slowly and a gain, belongs to the scene.
     """
     height, width = heat.shape
     drift = numpy_generator(seed, "synth/drift", index)

@@ -59,8 +59,6 @@ class ScenePair:
     """Two consecutive frames of one scene in which nothing moves but the camera.
 
     Attributes:
-        first: the frame before the motion.
-        second: the frame after it.
         flow: (H, W, 2) float32, for each pixel of `second` the displacement (rows, columns) to
             where its surface point lies in `first`; NaN where that is behind the first camera.
         visible: (H, W) bool, for each pixel of `second`: its surface point is seen in `first`.

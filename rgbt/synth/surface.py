@@ -24,23 +24,21 @@ _FACADES = [INDEX["facade"], INDEX["facade_side"]]
 
 @dataclass(frozen=True)
 class Surface:
-    """Maps of one frame.
+    """Maps (H, W) of one frame.
 
     Attributes:
         facets: what there is.
         camera: where it is seen from.
         drawing: which facet is where.
-        rays: (3, H, W) float32 in camera coordinates.
-        world: (3, H, W) float32, metres.
-        depth: (H, W) float32, metres along the optical axis; infinity for the sky.
-        is_sky: (H, W) bool.
-        on_ground: (H, W) bool.
-        material: (H, W) material index.
-        texture: (H, W) float32, zero mean, about unit variance near the camera.
-        patches: (H, W) float32, its coarse part: heat spreads, so its fine grain is not seen.
-        window: (H, W) float32, share of the pixel that is a window.
-        window_lit: (H, W) float32, 0..1, draw of the window: lit where below the share of lit ones.
-        shadow: (H, W) float32, 0..1.
+        rays: (3, H, W) in camera coordinates.
+        world: (3, H, W), metres.
+        depth: metres along the optical axis; infinity for the sky.
+        material: material index.
+        texture: zero mean, about unit variance near the camera.
+        patches: its coarse part: heat spreads, so its fine grain is not seen.
+        window: share of the pixel that is a window.
+        window_lit: 0..1, draw of the window: lit where below the share of lit ones.
+        shadow: 0..1.
     """
 
     facets: Facets
@@ -49,8 +47,6 @@ class Surface:
     rays: Floats
     world: Floats
     depth: Floats
-    is_sky: NDArray[np.bool_]
-    on_ground: NDArray[np.bool_]
     material: NDArray[np.intp]
     texture: Floats
     patches: Floats
@@ -87,8 +83,6 @@ def surface_of(
         rays=rays,
         world=world,
         depth=depth,
-        is_sky=drawing.ids == 0,
-        on_ground=on_ground,
         material=material,
         texture=texture,
         patches=patches,
