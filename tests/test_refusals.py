@@ -43,7 +43,7 @@ RUN = [
     *(
         (f"+experiment=temporal_con {words}", word)
         for words, word in (
-            ("consistency.splits=[]", "consistency.splits is empty"),
+            ("consistency.splits=[]", "consistency.splits"),
             ("scheme.view.camera.height=1024", "set the intrinsics of your camera"),
             ("consistency.view.camera.cx=900", "principal point"),
             ("scheme.view.yaw=[-50,50]", "leave no rectangle"),

@@ -29,22 +29,6 @@ class CrmTransform:
     Released: images are float32 before resizing, which changes what the colour steps do
         (`Colours.rgb`): ``colour="released"``. Values between steps are not rounded.
     Both resize bilinearly with half-pixel centres and without antialiasing, and labels by nearest.
-
-    Attributes:
-        sizes: short edges in pixels, one is drawn with equal odds; None keeps the size of the file.
-        max_size: limit of the long edge in pixels, which wins over `sizes`; None for no limit.
-        crop_hw: size of the crop, clipped to the resized image; None takes all of it.
-        flip_probability: in [0, 1].
-        colour: "intended" (uint8 images) or "released" (float32 images).
-        colour_probability: of each colour change, in [0, 1].
-        brightness_delta: largest change in grey levels.
-        contrast_range: (low, high) factor.
-        saturation_range: (low, high) factor.
-        hue_delta: largest change, in OpenCV's hue units.
-        thermal_contrast_range: (low, high) factor for thermal.
-        test_short_edge: short edge of evaluated images in pixels; labels keep the size of the
-            file. None keeps the images as well.
-        track_position: whether examples carry the map of source positions.
     """
 
     sizes: Lengths | None

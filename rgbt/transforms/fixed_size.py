@@ -32,15 +32,7 @@ LUMA = (0.2989, 0.587, 0.114)
 
 @dataclass(frozen=True, kw_only=True)
 class FixedSize:
-    """What the transforms here share.
-
-    Attributes:
-        crop_hw: size of the result in pixels, always.
-        flip_probability: in [0, 1].
-        test_short_edge: short edge of evaluated images in pixels; None keeps their size. Labels
-            keep the size of the file.
-        track_position: whether examples carry the map of source positions.
-    """
+    """What the transforms here share."""
 
     crop_hw: Size
     flip_probability: Share
@@ -65,12 +57,6 @@ class CmxTransform(FixedSize):
     Networks here normalise images themselves (`rgbt.models.inputs`), so padding is their mean
     colour: 0 for them but for rounding to whole grey levels, and, where thermal is repeated for
     three channels of different means, but for the distance of each mean from the three's mean.
-
-    Attributes:
-        factors: of the size of the file, one is drawn with equal odds.
-        padding_rgb: mean colour in grey levels 0..255, in the order of `padding_order`.
-        padding_order: "rgb", or "bgr" for a network that is fed blue first.
-        padding_thermal: mean of every channel that the network takes thermal for, likewise.
     """
 
     factors: Annotated[tuple[SizeFactor, ...], Len(1, 1000)]
@@ -112,13 +98,6 @@ class CmnextTransform(FixedSize):
     Source: CMNeXt release (DELIVER), MFNet configuration; colours and blur as torchvision makes
     them of 8-bit images, resizing without smoothing. The release normalises after padding, so that
     padding is black, and not the mean, for the network.
-
-    Attributes:
-        colour_probability: that brightness, contrast and saturation of RGB change, all three.
-        colour_range: smallest and largest factor of each of them.
-        blur_probability: that RGB is blurred by a Gaussian kernel of 3x3 pixels.
-        blur_deviation: of this kernel.
-        scale_range: smallest and largest factor of both sides of the file, drawn uniformly.
     """
 
     colour_probability: Share
@@ -197,9 +176,6 @@ class RtfnetTransform(FixedSize):
     The releases leave the resampling of images to Pillow: nearest in the version that MFNet pins,
     bicubic in newer ones, where thermal, stored as the alpha channel, also weights the colours.
     Here RGB and thermal are resized for themselves, bilinearly, and labels by nearest.
-
-    Attributes:
-        cut_share: largest part of a side that is cut off at either end, in [0, 0.5].
     """
 
     cut_share: Annotated[float, Interval(ge=0, le=0.5)]
@@ -241,12 +217,6 @@ class ThesisTransform(FixedSize):
 
     Confidences of labels are resized by nearest, and mirrored with the image, the label and the
     thermal image (the thesis' code forgets them).
-
-    Attributes:
-        blur_probability: in [0, 1].
-        blur_kernel: side of OpenCV's Gaussian kernel in pixels, odd; of 5 pixels, the weights are
-            1, 4, 6, 4 and 1 sixteenths along each axis.
-        label_resize: "nearest" (intended) or "bilinear" (released).
     """
 
     blur_probability: Share

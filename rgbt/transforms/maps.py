@@ -35,15 +35,8 @@ class Window(NamedTuple):
 class Maps:
     """The maps of one sample, all of one size, and the place in the file of each of their pixels.
 
-    Attributes:
-        rgb: (H, W, 3) uint8 or float32, 0..255.
-        thermal: (H, W), dtype of `rgb`.
-        label: (H, W) uint8; all 255 where the sample has none.
-        confidence: (H, W) float32, or None.
-        rows: (H,) row of the file of every row.
-        columns: (W,) column of the file of every column.
-        source_hw: size of the file.
-        name: of the sample.
+    As in `rgbt.types.Example`; the label is 255 where the sample has none. `rows` (H,) and
+    `columns` (W,) are those of the file, whose size is `source_hw`.
     """
 
     rgb: NDArray[Any]
@@ -292,7 +285,7 @@ def _block(source: int, resized: int, span: slice) -> _Block:
 
     With source : resized = p : q in lowest terms, resized pixel k q + i samples at p k plus the
     place of pixel i. So any run of whole periods may be resized by itself; one more period on
-    either side holds the neighbours that the kernel reaches for. It halves the time of a crop.
+    either side holds the neighbours that the kernel reaches for.
     """
     periods = math.gcd(source, resized)
     p, q = source // periods, resized // periods

@@ -32,18 +32,12 @@ HueDelta = Annotated[int, Interval(ge=0, le=180)]
 
 @dataclass(frozen=True)
 class ColourJitter:
-    """SSD's colour jitter for RGB, and its contrast step for thermal.
+    """SSD's colour jitter for RGB, and its contrast step for thermal; 0 <= `probability` <= 1.
+
+    Factors and the added brightness (grey levels) are uniform real numbers; the added hue is a
+    whole number, both ends included, in OpenCV's units (2 degrees for uint8 images).
 
     Source: augmentation step 3 of the CRM release (COLOR_AUG_SSD), after SSD (ECCV 2016).
-
-    Attributes:
-        probability: of each change, in [0, 1]; 0 switches the jitter off.
-        brightness_delta: added value is uniform in [-delta, delta], grey levels.
-        contrast_range: factor of all channels is uniform in [low, high].
-        saturation_range: factor of the HSV saturation is uniform in [low, high].
-        hue_delta: added hue is a whole number uniform in -delta..delta, in OpenCV's units (2
-            degrees for uint8 images).
-        thermal_contrast_range: factor of thermal is uniform in [low, high].
     """
 
     probability: Share
@@ -77,13 +71,7 @@ class ColourJitter:
 class Colours:
     """Changes of one example, drawn by `ColourJitter.draw`; None where one does not happen.
 
-    Attributes:
-        brightness: added to RGB, grey levels.
-        contrast_first: whether contrast comes before saturation and hue, or after them.
-        contrast: factor of RGB.
-        saturation: factor of the HSV saturation.
-        hue: added hue, whole steps in OpenCV's units.
-        thermal_contrast: factor of thermal.
+    `contrast_first` is whether contrast comes before saturation and hue, or after them.
     """
 
     brightness: float | None

@@ -79,18 +79,6 @@ class SemsegTransform:
 
     Source: semseg (PSPNet), training script; thesis (J. Sun), configuration of its teacher (scale
     0.5 to 2, 10 degrees, crop 473 x 473).
-
-    Attributes:
-        scale_range: smallest and largest factor of both sides, drawn uniformly.
-        rotate_probability: in [0, 1].
-        rotate_degrees: largest angle to either side.
-        blur_probability: that RGB and thermal are blurred.
-        blur_kernel: side of OpenCV's Gaussian kernel in pixels, odd.
-        flip_probability: in [0, 1].
-        crop_hw: size of the result in pixels, always.
-        padding_rgb: mean colour in grey levels, red first.
-        padding_thermal: mean grey level of thermal; of three channels, that of all.
-        test_short_edge: short edge of evaluated images in pixels; None keeps their size.
     """
 
     scale_range: SizeFactors
@@ -167,21 +155,6 @@ class HeatNetTransform:
     alone; here they are made for every image and in every step. The teacher's labels at night are
     rotated with the image here; there the teacher predicts rotated images. Brought-in pixels have
     label 0 (road) as released, and confidence 0.
-
-    Attributes:
-        resize_hw: size of the whole image after resizing, in pixels; the aspect is not kept.
-        crop_hw: size of a training example.
-        side_margin: columns at either side of the resized image that no training example shows.
-        flip_probability: in [0, 1].
-        rotate_probability: in [0, 1].
-        rotate_degrees: largest angle to either side.
-        drop_probability: that one block of RGB or of thermal, with equal odds, is dropped.
-        drop_height: smallest and largest number of rows of a block, the largest excluded.
-        drop_width: the same for columns.
-        thermal_probability: that the thermal image is scaled.
-        class_probability: that the thermal pixels of each class are scaled by a factor of their
-            own; one of the two releases.
-        thermal_range: smallest and largest factor of thermal.
 
     Raises:
         InputError: crops larger than the image without margins; blocks larger than crops.

@@ -46,12 +46,6 @@ class StrongAugmentation:
     Released: as here, whether an image is changed is drawn for the batch, and by how much for each
     image. The order is drawn for each image, here for the batch; the kernel of the blur has a tenth
     of the image, here 4 sigma on each side.
-
-    Attributes:
-        jitter_probability: in [0, 1], of the batch.
-        jitter_strength: s.
-        blur_probability: in [0, 1], of the batch.
-        blur_sigma: the standard deviation is uniform in [low, high], pixels.
     """
 
     jitter_probability: Share

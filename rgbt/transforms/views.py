@@ -59,20 +59,6 @@ class VirtualView:
         rounded to bytes each time, empty pixels are background. Its intrinsics are those of
         another camera (see ``conf/camera``).
 
-    Attributes:
-        camera: intrinsics, scaled to the size of the images.
-        order: of the rotations: "zyx" as in the paper, "zxy" as released.
-        yaw: (low, high) degrees about the vertical axis; positive moves what is seen to the right.
-        pitch: likewise about the horizontal axis; positive moves it up.
-        roll: likewise about the viewing direction; positive turns it clockwise.
-        angles: "uniform" real numbers, or "integer": whole degrees without the upper end.
-        mode: "both"; "rotation" leaves out cutting and enlarging, "translation" does nothing else
-            (Temporal, Table II, whose definitions are not published).
-        rectangle: "largest" by area, or "corners" as released. "rotation" does not cut.
-        resampling: "once" or "twice"; "twice" rounds images to bytes, as released.
-        outside: what pixels are that the first frame does not show: "ignore" leaves them out of
-            every loss, "background" gives them class 0 and trains on them, as released.
-
     Raises:
         InputError: angles out of range, or so large that no rectangle is left.
     """
