@@ -31,7 +31,7 @@ from rgbt.metrics.metric import Regions
 from rgbt.randomness import derive
 from rgbt.runs.run_spec import WEIGHTS, RunSpec
 from rgbt.terminal import info
-from rgbt.transforms.view_sets import ViewSets
+from rgbt.transforms.views import ViewSets
 
 if TYPE_CHECKING:  # most runs start at random, and few map classes
     from rgbt.checkpoints.load import Plan

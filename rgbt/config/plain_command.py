@@ -53,9 +53,7 @@ COMMANDS = {
     "weights": Entry("rgbt.weights", "inspect a file of weights, or export the weights of a run"),
     "sync": Entry("rgbt.tracking.sync", "send run folders to MLflow"),
     "ui": Entry("rgbt.tracking.ui", "open MLflow at the runs of a folder"),
-    "corruptions": Entry("rgbt.corruptions.__main__", "draw the corruptions of a pair of images"),
     "masks": Entry("rgbt.maskers.sketch", "draw examples of a masker"),
-    "scenes": Entry("rgbt.data.synth.sheet", "draw scenes of the embedded data set"),
 }
 
 

@@ -1,12 +1,11 @@
 """The augmentation chain of CRM and SpatialSeg: resize, crop, colour, flip.
 
-Results are not padded: networks pad images to a multiple of 32 with
-their mean colour, and losses pad labels with "ignore" (`rgbt.geometry.padding`).
+Results are not padded: networks pad images to a multiple of 32 with their mean colour, and losses
+pad labels with "ignore" (`rgbt.geometry.padding`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -14,10 +13,8 @@ import numpy as np
 
 from rgbt.ranges import GreyLevel, Lengths, Pixels, Share, Size
 from rgbt.requirements import Record
-from rgbt.transforms.example import evaluated, image_hw, viewed
-from rgbt.transforms.joint import View, draw_view, short_edge_hw
-from rgbt.transforms.on_batch import Drawn, DrawnBatch
-from rgbt.transforms.photometric import ColourJitter, Colours, FactorRange, HueDelta
+from rgbt.transforms.maps import Maps, drawn_window, evaluated, short_edge_hw
+from rgbt.transforms.photometric import ColourJitter, FactorRange, HueDelta
 from rgbt.types import Example, Sample
 
 
@@ -32,22 +29,6 @@ class CrmTransform:
     Released: images are float32 before resizing, which changes what the colour steps do
         (`Colours.rgb`): ``colour="released"``. Values between steps are not rounded.
     Both resize bilinearly with half-pixel centres and without antialiasing, and labels by nearest.
-
-    Attributes:
-        sizes: short edges in pixels, one is drawn with equal odds; None keeps the size of the file.
-        max_size: limit of the long edge in pixels, which wins over `sizes`; None for no limit.
-        crop_hw: size of the crop, clipped to the resized image; None takes all of it.
-        flip_probability: in [0, 1].
-        colour: "intended" (uint8 images) or "released" (float32 images).
-        colour_probability: of each colour change; 0 for none.
-        brightness_delta: largest change, grey levels.
-        contrast_range: (low, high) factor for RGB.
-        saturation_range: (low, high) factor.
-        hue_delta: largest change, in OpenCV's hue units.
-        thermal_contrast_range: (low, high) factor for thermal.
-        test_short_edge: short edge of evaluated images in pixels; labels keep the size of the
-            file. None keeps the images as well.
-        track_position: whether examples carry the map of source positions.
     """
 
     sizes: Lengths | None
@@ -75,45 +56,27 @@ class CrmTransform:
             thermal_contrast_range=self.thermal_contrast_range,
         )
 
-    def train(self, sample: Sample, rng: np.random.Generator) -> Example:
-        """Augmented example."""
-        view, colours = self._draw(sample, rng)
-        # Colours change pixel by pixel, so that it does not matter that the flip comes before.
-        example = viewed(sample, view, self.dtype, track_position=self.track_position)
-        rgb = colours.rgb(example.rgb)
-        thermal = colours.thermal(example.thermal)
-        return replace(
-            example,
-            rgb=rgb.astype(self.dtype, copy=False),
-            thermal=thermal.astype(self.dtype, copy=False),
-        )
-
     @property
     def record(self) -> Record:
-        """`drawn` and `stack` make what `train` makes of uint8 images alone."""
-        return Record(crop_hw=self.crop_hw, works_on_batches=self.dtype == np.uint8)
+        """The size of its examples."""
+        return Record(crop_hw=self.crop_hw)
 
-    def drawn(self, sample: Sample, rng: np.random.Generator) -> Drawn:
-        """The data and draws of `train`, not yet applied."""
-        return Drawn.of(sample, *self._draw(sample, rng))
-
-    def stack(self, drawn: Sequence[Drawn]) -> DrawnBatch:
-        """Examples of one size in one value, which `DrawnBatch.to` augments on a device.
-
-        Raises:
-            InputError: sizes differ.
-        """
-        return DrawnBatch.of(drawn, track_position=self.track_position)
-
-    def _draw(self, sample: Sample, rng: np.random.Generator) -> tuple[View, Colours]:
-        source_hw = image_hw(sample)
-        resized_hw = source_hw
+    def train(self, sample: Sample, rng: np.random.Generator) -> Example:
+        """Augmented example."""
+        maps = Maps.of(sample)
+        hw = maps.hw
         if self.sizes is not None:
-            short_edge = int(rng.choice(self.sizes))
-            resized_hw = short_edge_hw(source_hw, short_edge, self.max_size)
-        crop_hw = self.crop_hw or resized_hw
-        view = draw_view(source_hw, resized_hw, crop_hw, self.flip_probability, rng)
-        return view, self.jitter.draw(rng)
+            hw = short_edge_hw(hw, int(rng.choice(self.sizes)), self.max_size)
+        window = drawn_window(hw, self.crop_hw or hw, rng)
+        flipped = bool(rng.random() < self.flip_probability)
+        # Colours change pixel by pixel, so that it does not matter that the flip comes before.
+        shown = maps.resize(hw, window, dtype=self.dtype).flip(flipped)
+        example, colours = shown.example(self.track_position), self.jitter.draw(rng)
+        return replace(
+            example,
+            rgb=colours.rgb(example.rgb).astype(self.dtype, copy=False),
+            thermal=colours.thermal(example.thermal).astype(self.dtype, copy=False),
+        )
 
     def test(self, sample: Sample) -> Example:
         """Whole image, resized to `test_short_edge` where that is set; the label as it is."""

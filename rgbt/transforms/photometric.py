@@ -2,8 +2,6 @@
 
 One code path for uint8 and float32 images. What the release does to float images differs from what
 it means to do, only because OpenCV's HSV has other units there; see `Colours.rgb`.
-
-On the batch the same changes are made by `rgbt.transforms.on_batch`, with the same bits.
 """
 
 from __future__ import annotations
@@ -27,7 +25,6 @@ LEVELS = np.arange(256, dtype=np.uint8)
 WIDEST_VECTOR = 64
 """8-bit values that the widest vector unit takes at a time (AVX-512)."""
 
-
 Factor = Annotated[float, Interval(ge=0, le=100)]
 FactorRange = Annotated[tuple[Factor, Factor], Predicate(rising), doc("the smaller one first")]
 HueDelta = Annotated[int, Interval(ge=0, le=180)]
@@ -35,18 +32,12 @@ HueDelta = Annotated[int, Interval(ge=0, le=180)]
 
 @dataclass(frozen=True)
 class ColourJitter:
-    """SSD's colour jitter for RGB, and its contrast step for thermal.
+    """SSD's colour jitter for RGB, and its contrast step for thermal; 0 <= `probability` <= 1.
+
+    Factors and the added brightness (grey levels) are uniform real numbers; the added hue is a
+    whole number, both ends included, in OpenCV's units (2 degrees for uint8 images).
 
     Source: augmentation step 3 of the CRM release (COLOR_AUG_SSD), after SSD (ECCV 2016).
-
-    Attributes:
-        probability: of each change, in [0, 1]; 0 switches the jitter off.
-        brightness_delta: added value is uniform in [-delta, delta], grey levels.
-        contrast_range: factor of all channels is uniform in [low, high].
-        saturation_range: factor of the HSV saturation is uniform in [low, high].
-        hue_delta: added hue is a whole number uniform in -delta..delta, in OpenCV's units (2
-            degrees for uint8 images).
-        thermal_contrast_range: factor of thermal is uniform in [low, high].
     """
 
     probability: Share
@@ -58,43 +49,29 @@ class ColourJitter:
 
     def draw(self, rng: np.random.Generator) -> Colours:
         """What happens to one example; every draw comes from `rng`."""
-        brightness = self._drawn(rng, -self.brightness_delta, self.brightness_delta)
+
+        def drawn(low: float, high: float) -> float | None:
+            return rng.uniform(low, high) if rng.random() < self.probability else None
+
+        brightness = drawn(-self.brightness_delta, self.brightness_delta)
         # The even odds of the order belong to SSD, whatever the probability of each change.
         contrast_first = bool(rng.random() < 0.5)
-        contrast = self._drawn(rng, *self.contrast_range) if contrast_first else None
-        saturation = self._drawn(rng, *self.saturation_range)
+        contrast = drawn(*self.contrast_range) if contrast_first else None
+        saturation = drawn(*self.saturation_range)
         hue = None
-        if self._happens(rng):
+        if rng.random() < self.probability:
             hue = int(rng.integers(-self.hue_delta, self.hue_delta + 1))
         if not contrast_first:
-            contrast = self._drawn(rng, *self.contrast_range)
-        return Colours(
-            brightness=brightness,
-            contrast_first=contrast_first,
-            contrast=contrast,
-            saturation=saturation,
-            hue=hue,
-            thermal_contrast=self._drawn(rng, *self.thermal_contrast_range),
-        )
-
-    def _happens(self, rng: np.random.Generator) -> bool:
-        return bool(rng.random() < self.probability)
-
-    def _drawn(self, rng: np.random.Generator, low: float, high: float) -> float | None:
-        return rng.uniform(low, high) if self._happens(rng) else None
+            contrast = drawn(*self.contrast_range)
+        thermal = drawn(*self.thermal_contrast_range)
+        return Colours(brightness, contrast_first, contrast, saturation, hue, thermal)
 
 
 @dataclass(frozen=True)
 class Colours:
     """Changes of one example, drawn by `ColourJitter.draw`; None where one does not happen.
 
-    Attributes:
-        brightness: added to RGB, grey levels.
-        contrast_first: whether contrast comes before saturation and hue, or after them.
-        contrast: factor of RGB.
-        saturation: factor of the HSV saturation.
-        hue: added hue, whole steps in OpenCV's units.
-        thermal_contrast: factor of thermal.
+    `contrast_first` is whether contrast comes before saturation and hue, or after them.
     """
 
     brightness: float | None
@@ -144,9 +121,7 @@ def scale_and_truncate(image: Image, factor: float = 1.0, offset: float = 0.0) -
 def scale_saturation(image: Image, factor: float) -> Image:
     """HSV saturation times `factor`, truncated to whole numbers of OpenCV's unit."""
     hsv = cv2.cvtColor(image, cv2.COLOR_RGB2HSV)
-    if hsv.dtype == np.uint8:
-        return _rgb_of(_mapped(hsv, 1, scale_and_truncate(LEVELS, factor)))
-    hsv[..., 1] = scale_and_truncate(hsv[..., 1], factor)
+    hsv[..., 1] = scale_and_truncate(np.ascontiguousarray(hsv[..., 1]), factor)
     return _rgb_of(hsv)
 
 
@@ -156,18 +131,8 @@ def shift_hue(image: Image, shift: int) -> Image:
     The unit is OpenCV's: 2 degrees for uint8 and 1 for float32.
     """
     hsv = cv2.cvtColor(image, cv2.COLOR_RGB2HSV)
-    if hsv.dtype == np.uint8:
-        turned = (LEVELS.astype(np.int32) + shift) % 180
-        return _rgb_of(_mapped(hsv, 0, turned.astype(np.uint8)))
     hsv[..., 0] = (hsv[..., 0].astype(np.int32) + shift) % 180
     return _rgb_of(hsv)
-
-
-def _mapped(hsv: Image, channel: int, table: NDArray[np.uint8]) -> Image:
-    """One channel of an 8-bit image through a table of its 256 values."""
-    tables = np.repeat(LEVELS[:, None], 3, axis=1)
-    tables[:, channel] = table.ravel()
-    return np.asarray(cv2.LUT(hsv, tables[None]))
 
 
 def _rgb_of(hsv: Image) -> Image:

@@ -20,7 +20,7 @@ from rgbt.models.mask2former.network import semantic_logits
 from rgbt.models.mask2former.model import Mask2Former
 from rgbt.requirements import Record
 from rgbt.schemes.temporal import Temporal
-from rgbt.transforms.virtual_view import VirtualView
+from rgbt.transforms.views import VirtualView
 from rgbt.types import Batch, Frame, Output
 from tests.losses.problems import batch_of
 from tests.models.plain import images

@@ -120,7 +120,15 @@ def test_thermal_gets_contrast_alone_half_of_the_time() -> None:
     assert abs((found[:, 1] == 100).mean() - 0.5) < 0.08
 
 
-def test_same_generator_same_colours() -> None:
-    image = np.random.default_rng(0).integers(0, 256, (8, 8, 3), dtype=np.uint8)
-    one, other = (jitter().draw(np.random.default_rng(5)).rgb(image) for _ in range(2))
-    np.testing.assert_array_equal(one, other)
+def test_hue_reaches_both_ends() -> None:
+    draws = np.random.default_rng(4)
+    found = {jitter(probability=1.0, hue_delta=2).draw(draws).hue for _ in range(200)}
+    assert found == {-2, -1, 0, 1, 2}
+
+
+def test_pixels_do_not_depend_on_their_place_in_a_row() -> None:
+    """OpenCV rounds the last pixels of a row of HSV in another way than those before them."""
+    pixels = np.random.default_rng(5).integers(0, 256, (1, 131, 3), dtype=np.uint8)
+    whole = shift_hue(pixels, 7)
+    for end in (1, 31, 64, 100):
+        np.testing.assert_array_equal(shift_hue(pixels[:, :end].copy(), 7), whole[:, :end])

@@ -95,7 +95,7 @@ def test_index_without_paper_gpu_and_real_data_says_so_first() -> None:
 
 
 def test_index_runs_on_gpu_and_real_data_are_counted() -> None:
-    synth = {"dataset._target_": "rgbt.data.synth.dataset.synth"}
+    synth = {"dataset._target_": "rgbt.synth.datasets.synth"}
     runs = (
         replace(run_entry(0, 0), hardware="NVIDIA H100", scale="paper", config={}),
         replace(run_entry(0, 1), hardware="EPYC, 2 cores", config=synth),
