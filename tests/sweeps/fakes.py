@@ -24,8 +24,7 @@ from rgbt.tracking.mlflow_store import NoTracking
 from sweeps import attributes as names
 from sweeps.point import Point
 from sweeps.settings import Objective, SweepSettings
-from sweeps.space.samplers import build_sampler
-from sweeps.space.space import parse_space
+from sweeps.space import build_sampler, parse_space
 from sweeps.worker import driver as drivers
 from sweeps.worker.driver import Driver
 from sweeps.worker.planner import PlannedPoint
@@ -146,10 +145,6 @@ class Call:
         (found,) = [word.partition("=")[2] for word in self.words if word.startswith(f"{name}=")]
         return found
 
-    def say(self, text: str) -> None:
-        with self.log.open("a") as file:
-            file.write(text + "\n")
-
 
 Process = Generator[None, None, int]
 Behaviour = Callable[[Call], Process]
@@ -177,23 +172,19 @@ succeed = scored(0.2, 0.4)
 """A run of two validations."""
 
 
-def say(text: str, code: int) -> Behaviour:
+def leave(code: int, text: str = "") -> Behaviour:
     """Says this and ends."""
 
     def process(call: Call) -> Process:
         yield
-        call.say(text) if text else None
+        with call.log.open("a") as file:
+            file.write(text)
         return code
 
     return process
 
 
-def leave(code: int) -> Behaviour:
-    """Ends at once, says and writes nothing."""
-    return say("", code)
-
-
-fail = say("Traceback (most recent call last):\n  File x\nValueError: a bad day", 1)
+fail = leave(1, "Traceback (most recent call last):\n  File x\nValueError: a bad day\n")
 
 
 def hang(call: Call) -> Generator[None, None, NoReturn]:

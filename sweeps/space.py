@@ -1,16 +1,17 @@
-"""What a sweep varies: points of a grid or a list, and ranges of a search, as overrides of Hydra.
+"""What a sweep varies: points of a grid or a list, ranges of a search, samplers and pruners.
 
 A space maps keys of the configuration to `optuna.distributions`, as in ``conf/search``::
 
     masker.sigma_div: {type: float, low: 0.5, high: 32, log: true}
     masker.patch_size: {type: categorical, choices: ["${px:8}", "${px:64}"]}
+
+Samplers and pruners are nodes such as ``{_target_: optuna.samplers.TPESampler, seed: 0}``.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import product
 from typing import Any
 
@@ -19,28 +20,28 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import IntervalSweep, Override, Quote, QuotedString
 from hydra.errors import HydraException
 from optuna import distributions as kinds
-from optuna.trial import BaseTrial
+from optuna.pruners import BasePruner
+from optuna.samplers import BaseSampler
+from optuna.study import Study
+from optuna.trial import FrozenTrial, TrialState
 
 from rgbt.checks import InputError, check_choice, one_line
 from rgbt.config.component import Component
 from rgbt.config.values import check_value
-from sweeps.point import Value
+from sweeps.point import Point, Value
 
 Distribution = kinds.FloatDistribution | kinds.IntDistribution | kinds.CategoricalDistribution
 Space = Mapping[str, Distribution]
 """Key of the configuration (dotted, or a group such as ``loss``) -> what Optuna samples."""
-
-TYPES = {"float": "Float", "int": "Int", "categorical": "Categorical"}
-"""Type of an entry -> beginning of the name of its distribution."""
 
 
 def parse_space(entries: Mapping[str, Mapping[str, Any]]) -> Space:
     """The distributions of a space, in the order of the file.
 
     Args:
-        entries: key -> type (of `TYPES`) and arguments of the distribution. Interpolations are kept
-            as text: ``${px:64}`` is resolved by the run that gets it. A list among the choices is
-            text too, because Optuna's storages hold plain values.
+        entries: key -> type (float, int, categorical) and arguments of the distribution.
+            Interpolations are kept as text: ``${px:64}`` is resolved by the run that gets it. A
+            list among the choices is text too, because Optuna's storages hold plain values.
 
     Raises:
         InputError: what the distribution refuses, or choices that Optuna takes for equal.
@@ -50,7 +51,7 @@ def parse_space(entries: Mapping[str, Mapping[str, Any]]) -> Space:
         path = f"hydra.sweeper.space.{key}"
         options = dict(entry)
         kind = str(options.pop("type", None))
-        check_choice(f"{path}.type", kind, TYPES)
+        check_choice(f"{path}.type", kind, ("float", "int", "categorical"))
         if "choices" in options:
             choices = check_value(f"{path}.choices", options["choices"], list[Any])
             choices = [_text(one) if isinstance(one, list) else one for one in choices]
@@ -59,7 +60,7 @@ def parse_space(entries: Mapping[str, Mapping[str, Any]]) -> Space:
             if twice:
                 raise InputError(f"'{path}.choices': {twice[0]!r} equals another choice.")
             options["choices"] = choices
-        target = f"optuna.distributions.{TYPES[kind]}Distribution"
+        target = f"optuna.distributions.{kind.capitalize()}Distribution"
         space[key] = build_optuna({"_target_": target, **options}, path)
     return space
 
@@ -72,19 +73,6 @@ def build_optuna(node: Mapping[str, Any], path: str, **collaborators: Any) -> An
         raise
     except ValueError as error:
         raise InputError(f"'{path}': {one_line(error)}.") from error
-
-
-def suggest(trial: BaseTrial, space: Space) -> dict[str, Any]:
-    """Values of a trial, by key."""
-    values: dict[str, Any] = {}
-    for key, one in space.items():
-        if isinstance(one, kinds.CategoricalDistribution):
-            values[key] = trial.suggest_categorical(key, one.choices)
-        elif isinstance(one, kinds.IntDistribution):
-            values[key] = trial.suggest_int(key, one.low, one.high, step=one.step, log=one.log)
-        else:
-            values[key] = trial.suggest_float(key, one.low, one.high, step=one.step, log=one.log)
-    return values
 
 
 def ends(space: Space) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -126,25 +114,11 @@ def _text(value: Any) -> str:
 
 
 def signature(*parts: Any) -> str:
-    """Hash of what makes a study (12 hexadecimal digits): plain values, dataclasses."""
+    """Hash of what makes a study (12 hexadecimal digits)."""
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:12]
 
 
-SweptValues = dict[str, list[str]]
-"""Key -> values of an override, as they may stand after ``=``."""
-
-
-@dataclass(frozen=True)
-class GridPoint:
-    """One point of a grid or a list.
-
-    Attributes:
-        params: varied keys -> values as Hydra reads them, lists and mappings as they were typed.
-        overrides: all that make it, the fixed ones first.
-    """
-
-    params: Mapping[str, Value]
-    overrides: tuple[str, ...]
+SweptValues = dict[str, list[str]]  # Key -> values of an override, as they stand after ``=``
 
 
 def split(
@@ -189,25 +163,18 @@ def split(
     return tuple(fixed), swept, intervals
 
 
-def grid_points(fixed: Sequence[str], swept: SweptValues) -> list[GridPoint]:
-    """All combinations, in Hydra's order: the last key changes fastest.
-
-    Args:
-        fixed: overrides of every point.
-        swept: as `split` returns it; empty: the one point that `fixed` makes.
-    """
+def grid_points(fixed: Sequence[str], swept: SweptValues) -> list[Point]:
+    """All combinations of the `swept` values, in Hydra's order: the last key changes fastest."""
     return [
         _point(fixed, [f"{key}={value}" for key, value in zip(swept, values, strict=True)])
         for values in product(*swept.values())
     ]
 
 
-def list_points(points: Sequence[Sequence[str]], fixed: Sequence[str]) -> list[GridPoint]:
+def list_points(points: Sequence[Sequence[str]], fixed: Sequence[str]) -> list[Point]:
     """Points written out one by one, so that values vary together (Hydra's issue 3082).
 
-    Args:
-        points: the overrides of each.
-        fixed: overrides of every point; a point's own override of the same key has priority.
+    A point's own override has priority over the `fixed` one of the same key.
     """
     taken = [{key_of(word) for word in own} for own in points]
     return [
@@ -221,7 +188,7 @@ def key_of(override: str) -> str:
     return override.partition("=")[0].lstrip("+~")
 
 
-def distributions(points: Sequence[GridPoint]) -> dict[str, kinds.BaseDistribution]:
+def distributions(points: Sequence[Point]) -> dict[str, kinds.BaseDistribution]:
     """Distributions of the parameters of a grid or a list, for Optuna's figures.
 
     Numbers are ranges, which may grow in a study; other choices may not.
@@ -265,7 +232,7 @@ def _parsed(overrides: Iterable[str]) -> list[Override]:
     return OverridesParser.create().parse_overrides(list(overrides))
 
 
-def _point(fixed: Sequence[str], own: Sequence[str]) -> GridPoint:
+def _point(fixed: Sequence[str], own: Sequence[str]) -> Point:
     params: dict[str, Value] = {}
     for override in (one for one in _parsed(own) if not one.is_delete()):
         value = override.value()
@@ -275,4 +242,101 @@ def _point(fixed: Sequence[str], own: Sequence[str]) -> GridPoint:
             params[override.get_key_element()] = value
         else:
             params[override.get_key_element()] = override.get_value_element_as_str()
-    return GridPoint(params, (*fixed, *own))
+    return Point("", (*fixed, *own), params)
+
+
+SAMPLERS = [f"optuna.samplers.{n}Sampler" for n in ("TPE", "Random", "GP", "NSGAII")]
+"""Samplers without state outside the storage: others (QMC, grid, brute force) keep a counter or
+stop the study, which neither several drivers nor a resumed search can share."""
+
+PRUNERS = [
+    f"optuna.pruners.{name}Pruner"
+    for name in ("Nop", "Median", "Percentile", "SuccessiveHalving", "Hyperband", "Patient")
+]
+
+
+class PerTrialSampler(BaseSampler):
+    """Draws of a trial follow from the seed and the number of the trial, and the trials before it.
+
+    Optuna's samplers draw from one generator for all trials: two drivers with one seed, or a search
+    that is resumed, would propose the same points again. Here every trial draws by its own number
+    in the storage. No two trials share draws, and one worker repeats a search exactly, even if it
+    was stopped and resumed.
+
+    Args:
+        make: the sampler that chooses, from a seed; it keeps nothing outside the storage.
+        seed: of the search.
+    """
+
+    def __init__(self, make: Callable[[int], BaseSampler], seed: int) -> None:
+        self.make = make
+        self.seed = seed
+        self._inner: dict[int, BaseSampler] = {}
+
+    def before_trial(self, study: Study, trial: FrozenTrial) -> None:
+        """Begin a trial, also one that another process began and this one resumes."""
+        self._inner[trial.number] = self.make(trial_seed(self.seed, trial.number))
+        self._inner[trial.number].before_trial(study, trial)
+
+    def infer_relative_search_space(
+        self, study: Study, trial: FrozenTrial
+    ) -> dict[str, kinds.BaseDistribution]:
+        """See `BaseSampler`."""
+        return self._of(trial).infer_relative_search_space(study, trial)
+
+    def sample_relative(
+        self, study: Study, trial: FrozenTrial, search_space: dict[str, kinds.BaseDistribution]
+    ) -> dict[str, Any]:
+        """See `BaseSampler`."""
+        return self._of(trial).sample_relative(study, trial, search_space)
+
+    def sample_independent(
+        self, study: Study, trial: FrozenTrial, param_name: str, param_distribution: Any
+    ) -> Any:
+        """See `BaseSampler`."""
+        return self._of(trial).sample_independent(study, trial, param_name, param_distribution)
+
+    def after_trial(
+        self, study: Study, trial: FrozenTrial, state: TrialState, values: Sequence[float] | None
+    ) -> None:
+        """End a trial; one that this process never began is ended all the same."""
+        self._of(trial).after_trial(study, trial, state, values)
+        self._inner.pop(trial.number, None)
+
+    def _of(self, trial: FrozenTrial) -> BaseSampler:
+        return self._inner.get(trial.number) or self.make(trial_seed(self.seed, trial.number))
+
+
+def trial_seed(seed: int, number: int) -> int:
+    """32-bit seed that depends on both arguments (SHA-256), the same on every machine."""
+    digest = hashlib.sha256(f"{seed}:trial:{number}".encode()).digest()
+    return int.from_bytes(digest[:4], "big")
+
+
+def build_sampler(node: Mapping[str, Any]) -> PerTrialSampler:
+    """The sampler of a search.
+
+    Args:
+        node: with `_target_`, one of `SAMPLERS`, and options of its constructor; one worker with
+            the same `seed` (0 if it has none) proposes the same points, see `PerTrialSampler`.
+    """
+    path = "hydra.sweeper.sampler"
+    check_choice(f"{path}._target_", str(node.get("_target_")), SAMPLERS)
+    build_optuna(node, path)
+    return PerTrialSampler(lambda seed: build_optuna(node, path, seed=seed), node.get("seed") or 0)
+
+
+def build_pruner(node: Mapping[str, Any] | None) -> BasePruner:
+    """The pruner of a search; trials report at their validation steps.
+
+    Args:
+        node: with `_target_`, one of `PRUNERS`, and options of its constructor; None: no pruner.
+            Those that count steps (``n_warmup_steps``, ``min_resource``) count steps of the
+            optimizer, not validations.
+    """
+    path, node = "hydra.sweeper.pruner", node or {"_target_": "optuna.pruners.NopPruner"}
+    check_choice(f"{path}._target_", str(node.get("_target_")), PRUNERS)
+    # A patient pruner may wrap another one, which the node then holds.
+    alone = {} if "wrapped_pruner" in node else {"wrapped_pruner": None}
+    pruner: BasePruner = build_optuna(node, path, **alone)
+    return pruner
