@@ -1,4 +1,4 @@
-"""Check components against each other, and a user's own ones against the interfaces of rgbt.
+"""Check a user's own components against the interfaces of rgbt.
 
 Classes outside this package need the members of `MEMBERS` before training starts; what they return
 is checked where a wrong value would be trained on or counted without an error. InputError names the
@@ -7,7 +7,6 @@ member or the returned value, and what was expected.
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -15,7 +14,7 @@ import numpy as np
 from torch import Tensor, nn
 
 from rgbt.checks import InputError, check_members, described
-from rgbt.requirements import Record, Requirement, record_of
+from rgbt.requirements import name_of, record_of
 from rgbt.types import IGNORE, Output, Sample
 
 DATASET = ("root", "name", "num_classes", "classes", "palette", "unscored", "background", "splits")
@@ -191,7 +190,7 @@ class CheckedLoss:
         """Call the loss; check what the first call returns."""
         found = self._loss(*arguments)
         if not self._is_checked:
-            returned = f"loss: {_name(self._loss)} returned"
+            returned = f"loss: {name_of(self._loss)} returned"
             check_type(returned, found, dict)
             check_arrays(returned, found, dict.fromkeys(found, (self._shape, "")))
             if not any(isinstance(each, Tensor) and each.requires_grad for each in found.values()):
@@ -199,35 +198,3 @@ class CheckedLoss:
                 raise InputError(f"{what}, none of which depends on the network.")
             self._is_checked = True
         return found
-
-
-WITHOUT_RECORD = {"loss": Record(requires=(Requirement("model", "outputs", "scores"),))}
-"""Record, by node, of a component that states none: a loss reads class scores."""
-
-
-def check_requirements(components: Mapping[str, Any]) -> None:
-    """Refuse components, by their keys in the configuration, of which one lacks what another needs.
-
-    InputError names the first requirement, in their order, that is not met.
-    """
-    records = {
-        node: WITHOUT_RECORD.get(node, Record()) if not hasattr(part, "record") else record_of(part)
-        for node, part in components.items()
-    }
-    for node, record in records.items():
-        for need in record.requires:
-            other = records.get(need.node)
-            if other is None or need.is_met_by(other):
-                continue
-            subject = _name(components[node]) + (f" with {need.setting}" if need.setting else "")
-            change = need.advice or f"change {need.setting.partition('=')[0] or node}"
-            raise InputError(
-                f"{node}: {subject} requires {need.key}={need.value} of the {need.node}, "
-                f"which provides {need.key}={other.get(need.key)}; "
-                f"{change}, or choose another {need.node}."
-            )
-
-
-def _name(component: Any) -> str:
-    is_callable = inspect.isfunction(component) or inspect.isclass(component)
-    return str(component.__name__) if is_callable else type(component).__name__

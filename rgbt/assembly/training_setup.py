@@ -17,7 +17,6 @@ from rgbt.assembly.contracts import (
     check_dataset,
     check_part,
     check_regions,
-    check_requirements,
     is_own,
 )
 from rgbt.assembly.session import Session, open_session
@@ -34,7 +33,7 @@ from rgbt.engine.trainer import Scheme
 from rgbt.maskers.contract import check_masker
 from rgbt.processes import num_processes
 from rgbt.randomness import derive, numpy_generator, torch_generator
-from rgbt.requirements import Record, record_of
+from rgbt.requirements import Record, check_requirements, record_of
 from rgbt.runs.run_spec import WEIGHTS, RunSpec, labels_key
 from rgbt.terminal import info
 from rgbt.types import AnyMasker, Loadable, Sample
@@ -143,14 +142,14 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
         **{"dataset": session.dataset, "consistency": session.consistency},
         WEIGHTS: SimpleNamespace(record=Record(pretrained=spec.weights is not None)),
     }
-    check_requirements(components)
+    records = check_requirements(components)
     names = {split: session.dataset.names(split) for split in session.read_splits()}
     datasets = {}
     for name, domain in domains.named.items():
         steps_per_epoch(session.dataset, loading, domain.split)
         is_missing = labels_key(name) in missing
         datasets[name] = session.dataset if is_missing else _labelled(session, name, domain, names)
-    _probe(session, names, masker, scheme)
+    _probe(session, names, masker, records)
     if upstream_finished:
         _report_unpublished_settings(session, names)
     rare = None
@@ -158,14 +157,16 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
         from rgbt.data.rare_classes import count_rare_classes  # most runs draw no classes
 
         rare = count_rare_classes(datasets["source"], domains.source.split, loading)
-    others, optimizers = _networks_and_optimizers(session, fabric, scheme)
+    others, optimizers = _networks_and_optimizers(session, fabric, records["scheme"])
     schedule: Schedule = spec.schedule.build()
     return TrainingSetup(
         session, fabric, names, datasets, model, others, optimizers, rare, scheme, schedule
     )
 
 
-def _probe(session: Session, names: Lists, masker: AnyMasker, scheme: object) -> None:
+def _probe(
+    session: Session, names: Lists, masker: AnyMasker, records: Mapping[str, Record]
+) -> None:
     """Use a user's own parts, another author's network, the masker and the cameras once."""
     transform, seed = session.transform, session.spec.seed
     check_dataset(reader_of(session.dataset), names)
@@ -177,10 +178,10 @@ def _probe(session: Session, names: Lists, masker: AnyMasker, scheme: object) ->
     tested = transform.test(shown)
     if session.spec.model.target == EXTERNAL:
         _probe_external(session, example_hw, tested.thermal.shape)
-    crop_hw = example_hw if is_own(masker) else record_of(transform).crop_hw
-    if crop_hw is not None and record_of(masker).hides_cells:
+    crop_hw = example_hw if is_own(masker) else records["transform"].crop_hw
+    if crop_hw is not None and records["masker"].hides_cells:
         check_masker(masker, crop_hw, torch_generator(seed, "probe"))
-    cameras = [("scheme", record_of(scheme).camera, example_hw)]
+    cameras = [("scheme", records["scheme"].camera, example_hw)]
     if session.consistency.sets:
         camera = session.consistency.view.camera
         cameras += [("consistency", camera, each.shape[:2]) for each in (tested.rgb, tested.label)]
@@ -315,11 +316,10 @@ def _share_batch_norm(network: nn.Module, trainer: TrainerSettings) -> None:
 
 
 def _networks_and_optimizers(
-    session: Session, fabric: Fabric, scheme: Any
+    session: Session, fabric: Fabric, record: Record
 ) -> tuple[dict[str, nn.Module], dict[str, torch.optim.Optimizer]]:
     """Further networks of a scheme, wrapped in place, and all optimisers."""
     builder = session.spec.optimizer.build()
-    record = record_of(scheme)
     parts, others = record.optimizers, record.networks
     built = {name: builder(session.model, without=without) for name, without in parts.items()}
     for name in record.builders:
