@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from lightning_fabric import Fabric
@@ -14,37 +12,32 @@ from torch import nn
 
 from rgbt.assembly.contracts import (
     CheckedLoss,
-    check_dataset,
+    Lists,
     check_part,
-    check_regions,
+    check_parts,
+    first_readable,
     is_own,
 )
 from rgbt.assembly.session import Session, open_session
 from rgbt.checks import InputError
-from rgbt.config.stored_config import EXTERNAL
 from rgbt.data.domains import GIVEN, NONE, Domain
 from rgbt.data.loaders import Batches, steps_per_epoch, train_batches
-from rgbt.dataset import LabelledDataset, reader_of
+from rgbt.dataset import LabelledDataset
 from rgbt.engine.fabric import open_fabric
 from rgbt.engine.network_settings import prepare_training
 from rgbt.engine.schedules import Schedule
 from rgbt.engine.settings import TrainerSettings
 from rgbt.engine.trainer import Scheme
-from rgbt.maskers.contract import check_masker
 from rgbt.processes import num_processes
-from rgbt.randomness import derive, numpy_generator, torch_generator
+from rgbt.randomness import derive
 from rgbt.requirements import Record, check_requirements, record_of
 from rgbt.runs.run_spec import WEIGHTS, RunSpec, labels_key
 from rgbt.terminal import info
-from rgbt.types import AnyMasker, Loadable, Sample
+from rgbt.types import AnyMasker, Loadable
 
 if TYPE_CHECKING:  # most runs have one domain, draw no classes, and train a network of this package
     from rgbt.data.pairs import PairedBatches
     from rgbt.data.rare_classes import RareClasses
-
-
-Lists: TypeAlias = Mapping[str, tuple[str, ...]]
-"""Split -> names of its images."""
 
 
 @dataclass(frozen=True)
@@ -149,7 +142,7 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
         steps_per_epoch(session.dataset, loading, domain.split)
         is_missing = labels_key(name) in missing
         datasets[name] = session.dataset if is_missing else _labelled(session, name, domain, names)
-    _probe(session, names, masker, records)
+    check_parts(session, names, masker, records)
     if upstream_finished:
         _report_unpublished_settings(session, names)
     rare = None
@@ -162,65 +155,6 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
     return TrainingSetup(
         session, fabric, names, datasets, model, others, optimizers, rare, scheme, schedule
     )
-
-
-def _probe(
-    session: Session, names: Lists, masker: AnyMasker, records: Mapping[str, Record]
-) -> None:
-    """Use a user's own parts, another author's network, the masker and the cameras once."""
-    transform, seed = session.transform, session.spec.seed
-    check_dataset(reader_of(session.dataset), names)
-    check_part("transform", transform)
-    first = _first_readable(session, names[session.domains.source.split])
-    shown = _first_readable(session, names["test"])
-    check_regions(session.regions, shown.thermal.shape)
-    example_hw = transform.train(first, numpy_generator(seed, "probe")).thermal.shape
-    tested = transform.test(shown)
-    if session.spec.model.target == EXTERNAL:
-        _probe_external(session, example_hw, tested.thermal.shape)
-    crop_hw = example_hw if is_own(masker) else records["transform"].crop_hw
-    if crop_hw is not None and records["masker"].hides_cells:
-        check_masker(masker, crop_hw, torch_generator(seed, "probe"))
-    cameras = [("scheme", records["scheme"].camera, example_hw)]
-    if session.consistency.sets:
-        camera = session.consistency.view.camera
-        cameras += [("consistency", camera, each.shape[:2]) for each in (tested.rgb, tested.label)]
-    for node, camera, image_hw in cameras:
-        try:
-            if camera is not None:
-                camera.matrix(image_hw)
-        except InputError as error:
-            raise InputError(f"{node}.view.{error}") from error
-
-
-def _first_readable(session: Session, names: tuple[str, ...]) -> Sample:
-    """The first of these samples; unreadable ones are passed over where the run does so too."""
-    for name in names if session.loading.on_error != "raise" else ():
-        with suppress(InputError):
-            return session.dataset.read(name)
-    return session.dataset.read(names[0])
-
-
-def _probe_external(session: Session, train_hw: tuple[int, int], test_hw: tuple[int, int]) -> None:
-    """Call another author's network once per size of image, so that it is refused before a run.
-
-    In training too, as its output may have another form there; its statistics do not change.
-    """
-    model = session.model
-    before = {name: value.clone() for name, value in model.named_buffers()}
-    for image_hw, is_training in ((train_hw, False), (test_hw, False), (train_hw, True)):
-        model.train(is_training)
-        count = min(2, session.loading.batch_size) if is_training else 1
-        images = [torch.zeros(count, each, *image_hw, device=session.device) for each in (3, 1)]
-        with torch.set_grad_enabled(is_training), session.autocast():
-            output = model(*images, generator=torch_generator(session.spec.seed, "probe"))
-    for name, value in model.named_buffers():
-        value.copy_(before[name])
-    if not output.logits.requires_grad:
-        raise InputError(
-            f"model.constructor={session.spec.model.values['constructor']}: the class scores have "
-            "no gradient in training; choose others with model.train_scores."
-        )
 
 
 def _shared_with_test(names: Lists, split: str) -> int:
@@ -269,7 +203,7 @@ def _labelled(session: Session, name: str, domain: Domain, names: Lists) -> Labe
     """
     dataset, key, split = session.dataset, f"domains.{name}", domain.split
     if domain.labels == GIVEN:
-        if _first_readable(session, names[split]).label is None:
+        if first_readable(session, names[split]).label is None:
             raise InputError(f"{key}.labels=given, but {dataset.name} has no labels for {split}.")
         if shared := _shared_with_test(names, split):
             info(
