@@ -14,10 +14,8 @@ from torch.nn import functional as F
 from rgbt.geometry.camera import Camera
 from rgbt.geometry.halving import halved_all, halved_label, halved_mean
 from rgbt.geometry.warp import Warp
-from rgbt.losses.cross_entropy import CrossEntropy
-from rgbt.losses.temporal import TemporalLoss
-from rgbt.models.mask2former.network import semantic_logits
 from rgbt.models.mask2former.model import Mask2Former
+from rgbt.models.mask2former.network import semantic_logits
 from rgbt.requirements import Record
 from rgbt.schemes.temporal import Temporal
 from rgbt.transforms.views import VirtualView
