@@ -184,7 +184,7 @@ class Resampler:
             seeds=seeds,
             error=math.nan if of_images is None else of_images.error,
             blocks=used,
-            said=blocks.said,
+            said=blocks.said if used == blocks.count else f"{used} of {blocks.said}",
             reason=blocks.reason,
             drawn=drawn,
             trainings=over_seeds(values) if paired else over_seeds(*parts),

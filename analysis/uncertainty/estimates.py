@@ -204,7 +204,7 @@ def compare(
 
     Raises:
         InputError: other images, classes, scored classes, regions or labels; fewer than `FEWEST`
-            blocks; no such metric.
+            blocks of images of every metric; no such metric.
         ValueError: paired, but not as many.
     """
     if paired and len(a) != len(b):
@@ -216,17 +216,15 @@ def compare(
             _term(weight, metric, each) for weight, each in zip((-1.0, 1.0), runs, strict=True)
         ]
         evidence = engine.contrast(terms, paired=paired)
-        if evidence.blocks < FEWEST:
-            raise InputError(
-                f"{metric}: {evidence.said}, {evidence.blocks} of them with images of it, are too "
-                f"few to compare two methods; {FEWEST} are the least."
-            )
         sides = [
             estimate_of(engine.contrast([replace(term, weight=1.0)]), settings.level, metric)
             for term in terms
         ]
         difference = estimate_of(evidence, settings.level)
         found.append(Difference(metric=metric, a=sides[0], b=sides[1], difference=difference))
+    if all(each.difference.evidence.blocks < FEWEST for each in found):
+        said = found[0].difference.said
+        raise InputError(f"{said} are too few to compare two methods; {FEWEST} are the least.")
     ps = holm([each.difference.p for each in found])
     return Comparison(
         differences=tuple(replace(each, p_corrected=p) for each, p in zip(found, ps, strict=True)),
