@@ -17,6 +17,7 @@ import json
 import lzma
 import tempfile
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,7 +45,10 @@ PACKAGES = ("torch", "numpy", "opencv-python-headless", "lightning-fabric", "hyd
 """Entries of the provenance, and the packages whose versions are archived. Paths and the name of
 the machine are of no use elsewhere."""
 
-DAMAGED = (*(zipfile.BadZipFile, lzma.LZMAError, KeyError, ValueError, TypeError, OSError),)
+DAMAGED = (
+    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, NotImplementedError),
+    *(KeyError, ValueError, TypeError, OSError),
+)
 
 
 @dataclass(frozen=True)
@@ -75,9 +79,7 @@ class ArchivedRun:
         with tempfile.TemporaryDirectory(dir=folder) as scratch:
             unpacked = Path(scratch, "run")
             try:
-                with zipfile.ZipFile(self.path) as archive:
-                    for entry in archive.namelist():
-                        self._unpack(archive.read(entry), unpacked, entry)
+                self._write(unpacked)
             except DAMAGED as error:
                 raise InputError(f"{self.path} is damaged ({one_line(error)}).") from error
             result = RunResult(unpacked).result
@@ -86,15 +88,18 @@ class ArchivedRun:
             unpacked.rename(target)
         return RunResult(target)
 
-    def _unpack(self, content: bytes, folder: Path, entry: str) -> None:
-        path = folder / entry.removesuffix(".xz")
-        if not path.resolve().is_relative_to(folder.resolve()):
-            raise ValueError(f"'{entry}' leads out of the folder")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        if entry.endswith(".npz.xz"):
-            _unpack_counts(content, self.path.parent / SHARED).save(path)
-        else:
-            write_atomic(path, content)
+    def _write(self, folder: Path) -> None:
+        """Write every member as a file in `folder`."""
+        with zipfile.ZipFile(self.path) as archive:
+            for entry in archive.namelist():
+                path = folder / entry.removesuffix(".xz")
+                if not path.resolve().is_relative_to(folder.resolve()):
+                    raise ValueError(f"'{entry}' leads out of the folder")
+                path.parent.mkdir(parents=True, exist_ok=True)
+                if entry.endswith(".npz.xz"):
+                    _unpack_counts(archive.read(entry), self.path.parent / SHARED).save(path)
+                else:
+                    write_atomic(path, archive.read(entry))
 
 
 def archived(folder: Path) -> list[ArchivedRun]:
