@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 from hydra.core.config_loader import ConfigLoader
 from omegaconf import DictConfig
+from rich.console import Group
 
 from rgbt.checks import InputError, RunError
 from rgbt.runs.provenance import command_line, without_passwords
@@ -118,9 +119,12 @@ def _grid(points: PointList, settings: SweepSettings) -> None:
     else:
         # A typing error should not cost hours of other runs.
         outcomes = point_list.run_points(points, settings, strict=True)
-    for table in (group_grid(points.title, outcomes), unfinished_grid(outcomes)):
-        if table.rows:
-            print_rich(rich_table(table))
+    is_begun = any(outcome.results for outcome in outcomes)
+    tables = [
+        *([group_grid(points.title, outcomes)] if is_begun else []),
+        unfinished_grid(outcomes),
+    ]
+    print_rich(Group(*(rich_table(each) for each in tables if each.rows)))
     if other_code := point_list.other_code_line(outcomes):
         info(other_code)
     if settings.dry_run:

@@ -11,6 +11,7 @@ from rgbt.checks import InputError, RunError
 from rgbt.config.stored_config import check_targets, parse_trust
 from rgbt.runs.naming import VARIED
 from rgbt.runs.result import RunResult
+from rgbt.terminal import info
 from sweeps import attributes as names
 from sweeps.point import UNFINISHED, Outcome, Point, State, varied_keys
 from sweeps.settings import SweepSettings
@@ -158,6 +159,10 @@ class ListSource:
             for index, point in enumerate(self._points)
         ]
 
+    def errors(self) -> list[tuple[str, str]]:
+        """Label of each point that cannot be run, and why."""
+        return [(self._points[index].label, reason) for index, reason in self._errors.items()]
+
     def _different(self) -> Iterator[PlannedPoint]:
         return (self._plans[indices[0]] for indices in self._same.values())
 
@@ -242,6 +247,8 @@ def run_points(
     def num_done() -> int:
         return sum(state in ("finished", "failed") for state in source.states())
 
+    for label, reason in source.errors():  # before hours of training
+        info(f"{label}: {reason.removeprefix(f'{label}: ')}")
     total = lambda: len(source.states())  # noqa: E731
     view = ProgressView(points.title, total, settings.workers, num_done)
     drive(view, source, source.store, points.runs, settings)

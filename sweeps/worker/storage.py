@@ -153,5 +153,5 @@ def load_study(name: str, storage: optuna.storages.BaseStorage) -> optuna.Study:
 
     known = [study.study_name for study in storage.get_all_studies()]
     if name not in known:
-        raise InputError(f"name: there is no study '{name}'; {nearest(name, known)}.")
+        raise InputError(f"name={name}: there is no such study; {nearest(name, known)}.")
     return optuna.load_study(study_name=name, storage=storage)

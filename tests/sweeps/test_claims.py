@@ -127,7 +127,6 @@ def test_dry_run_says_what_deciding_may_cost(call: Call, place: Path) -> None:
         (reproduce, "form=both", "form=both"),
         (reproduce, "rows=lowest", "'lowest'"),
         (reproduce, "masker=none", "would be the same run"),
-        (claims, "masker=none", "would be the same run"),
         (claims, "weights.low=file.pth", "weights.low"),
         (claims, "seed=3", "'seed=3'"),
         (claims, "runs_dir=nowhere", "runs_dir=nowhere"),

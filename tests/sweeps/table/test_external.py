@@ -82,7 +82,7 @@ def test_content_hash_covers_names_and_contents(tmp_path: Path) -> None:
         (folder / name).write_bytes(content)
         seen.add(content_hash(folder))
     assert len(seen) == 5
-    (folder / "a.png").rename(folder / "d.png")
+    (folder / "a.png").rename(folder / "aa.png")
     seen.add(before := content_hash(folder))
     assert len(seen) == 6
     (folder / ".DS_Store").write_bytes(b"")

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -10,7 +9,6 @@ from rgbt.checks import InputError
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Outcome
 from sweeps.table.claim import Claim
-from sweeps.table.load_table import load_table
 from sweeps.table.request import TableRequest, seeds_of
 from sweeps.table.table import Column, Row
 from sweeps.table_plan import (
@@ -165,19 +163,3 @@ def test_rows_that_are_one_run_are_refused_unless_the_table_says_so() -> None:
         check_equal_runs(TableRequest("own/t", table((first, third)), "demo", (0,)), Planner())
     third = replace(third, same_as="b")
     check_equal_runs(TableRequest("own/t", table((first, same, third)), "demo", (0,)), Planner())
-
-
-@pytest.mark.parametrize(
-    ("words", "is_refused"),
-    [
-        (("masker=grbm_released", "masker.sigma_div=4"), True),
-        (("recipe.batch_size=1", "dataset.root=/data", "model.queries=8"), False),
-    ],
-)
-def test_overrides_that_make_rows_equal_are_refused(
-    words: tuple[str, ...], is_refused: bool
-) -> None:
-    made = select_rows(load_table("spatialseg/table3"), "Ny,Ny/4")
-    request = TableRequest("t", made, "demo", (0,), words)
-    with pytest.raises(InputError, match="'Ny' and 'Ny/4'") if is_refused else nullcontext():
-        check_equal_runs(request, Planner())

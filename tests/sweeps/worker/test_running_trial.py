@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from rgbt.files.atomic import holding
 from rgbt.runs.folder import RunFolder
 from rgbt.runs.result import RunResult
 from rgbt.tracking.mlflow_store import NoTracking
@@ -37,7 +38,6 @@ from tests.sweeps.fakes import (
     fail,
     finish,
     hang,
-    held_by_another,
     leave,
     plan_of,
     scored,
@@ -161,7 +161,7 @@ def test_running_trial_adopts_run_of_other_process(tmp_path: Path) -> None:
     run = RunFolder(tmp_path / KEY)
     scores: list[float] = []
     bench = Bench(tmp_path, report=lambda line: scores.append(line.values["mIoU"]) or "")
-    with held_by_another(run.path) as process:
+    with holding(run.path / "lock"):
         for _ in range(3):
             assert bench.work.advance() is None
         assert bench.work.status == "adopted"
@@ -169,18 +169,15 @@ def test_running_trial_adopts_run_of_other_process(tmp_path: Path) -> None:
         assert bench.work.advance() is None
         assert scores == [0.3], "followed as if it were ours"
         finish(run.path)
-        process.communicate("\n")
-        assert [found.key for found in bench.run()] == [KEY]
+    assert [found.key for found in bench.run()] == [KEY]
     assert bench.executor.calls == []
 
 
 def test_running_trial_restarts_adopted_run_that_died(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
-    with held_by_another(tmp_path / KEY) as process:
+    with holding(RunFolder(tmp_path / KEY).path / "lock"):
         assert bench.work.advance() is None
-        process.kill()
-        process.wait()
-        bench.run()
+    bench.run()
     assert len(bench.executor.calls) == 1
 
 
@@ -190,15 +187,14 @@ def test_running_trial_adopts_run_taken_meanwhile(
     """Two drivers start the same run at the same moment: the lock decides."""
     held: Callable[[Path], bool] = works.is_held
     looks: list[Path] = []
-    with held_by_another(tmp_path / KEY) as other:
+    with holding(RunFolder(tmp_path / KEY).path / "lock"):
         monkeypatch.setattr(
             works, "is_held", lambda path: bool(looks.append(path) or looks[1:] and held(path))
         )
         bench = Bench(tmp_path, PLAN, leave(2, "rgbt: it is being trained by process 1"))
         until(lambda: bench.work.advance() or bench.work.status == "adopted", "the adoption")
         finish(tmp_path / KEY)
-        other.communicate("\n")
-        bench.run()
+    bench.run()
     assert len(bench.executor.calls) == 1
 
 
@@ -209,10 +205,12 @@ def test_running_trial_timeout_stops_own_run_only(tmp_path: Path) -> None:
     assert bench.executor.calls[0].stops == 1
     assert bench.work.is_stopped()
     bench = Bench(tmp_path, timeout_s=0.03)
-    with held_by_another(tmp_path / KEY) as process:
-        with pytest.raises(TrialError, match="timeout_minutes"):
-            bench.run()
-        assert process.poll() is None
+    with (
+        holding(RunFolder(tmp_path / KEY).path / "lock"),
+        pytest.raises(TrialError, match="timeout_minutes"),
+    ):
+        bench.run()
+    assert bench.executor.calls == []
 
 
 def test_running_trial_pruned_names_step(tmp_path: Path) -> None:
