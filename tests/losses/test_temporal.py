@@ -210,44 +210,6 @@ def test_released_values_and_gradients(name: str) -> None:
         assert case.deviation(f"grad.{part.replace('_1', '1')}", gradient) <= 5e-10
 
 
-def test_printed_numbers_of_a_small_case() -> None:
-    """Nine classes, 2x3 pixels; numbers computed with the released modules (paper: by formula)."""
-    c, y, x = torch.meshgrid(
-        *(torch.arange(n, dtype=torch.float64) for n in (9, 2, 3)), indexing="ij"
-    )
-    logits = [
-        torch.sin(c + 0.7 * y + 0.3 * x)[None],
-        torch.cos(0.5 * c - 0.4 * y + 0.9 * x)[None],
-    ]
-    batch = batch_of(torch.tensor([[[0, 1, 2], [2, 0, 4]]]))
-    first, second = (Frame(Output(scores, {}), batch, scores) for scores in logits)
-    valid = torch.ones(1, 2, 3, dtype=torch.bool)
-
-    def loss_parts(which: str, form: str) -> dict[str, Tensor]:
-        loss = loss_of(second=which, form=form)
-        return loss(first, second, first.logits.softmax(1), valid, NOTHING)
-
-    released = (
-        loss_parts("dice", "released")
-        | loss_parts("con", "released")
-        | loss_parts("con_acc", "released")
-    )
-    expected = {
-        "cross_entropy_1": 2.288202,
-        "cross_entropy_2": 2.019732,
-        "dice_1": 0.281165,
-        "dice_2": 0.279143,
-        "con": 0.892285,
-        "con_acc": 0.325286,
-    }
-    assert {key: part.item() for key, part in released.items()} == pytest.approx(expected, abs=1e-6)
-    paper = loss_parts("con", "paper") | loss_parts("con_acc", "paper")
-    assert paper["con"].item() == pytest.approx(0.892285, abs=1e-6)
-    assert paper["con_acc"].item() == pytest.approx(0.992046, abs=1e-6)
-    p = first.logits.softmax(1)
-    assert con(p, p, valid, "released").item() == pytest.approx(0.881330, abs=1e-6)
-
-
 @pytest.mark.parametrize(
     ("changes", "requires"),
     [

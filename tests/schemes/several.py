@@ -250,17 +250,6 @@ CASES: dict[str, Callable[[], Case]] = {
 }
 """Every scheme and every loss."""
 
-SLOW: dict[str, Callable[[], Case]] = {
-    "crm plain": crm,
-    "rtfnet": lambda: supervised("rtfnet", CrossEntropy(class_weights=None)),
-    "pspnet": lambda: supervised("pspnet", WEIGHTED),
-    "deeplab": lambda: supervised("deeplabv2", WithAuxiliary(loss=WEIGHTED, weight=0.4)),
-    "cmx": lambda: supervised("cmx", WEIGHTED, drop_path_rate=0.5, decoder_dropout=0.5),
-    "temporal batch norm": lambda: temporal("mfnet", "con", "released"),
-}
-"""The other networks, whose normalisations wait for each other hundreds of times."""
-
-
 # ---- steps ----------------------------------------------------------------------------------
 
 
@@ -281,7 +270,7 @@ def averaged_gradients(network: nn.Module) -> list[Tensor]:
 
 def run_case(name: str) -> Values:
     """Loss parts and gradients of every phase, and the buffers afterwards, by name."""
-    case = (CASES | SLOW)[name]()
+    case = CASES[name]()
     for net in case.networks.values():
         assert synchronise_batch_norm(net.train()) is net
     found: Values = {}
@@ -308,7 +297,7 @@ def run_cases(names: tuple[str, ...]) -> dict[str, Values]:
 
 def ten_steps(name: str) -> list[float]:
     """The losses of ten steps with AdamW, on a new batch each."""
-    case = (CASES | SLOW)[name]()
+    case = CASES[name]()
     net = case.networks["model"]
     synchronise_batch_norm(net.train())
     optimizer = torch.optim.AdamW(net.parameters(), lr=1e-4)  # as in the paper
