@@ -58,8 +58,8 @@ def run_pipeline(run: RunSpec, extra_tags: Mapping[str, str]) -> None:
     if rank() == 0:
         _validate(specs, run)
     for spec in specs:
+        teachers = [each for each in spec.dependencies if each.key != WEIGHTS]
         with _naming(spec, run):
-            teachers = [each for each in spec.dependencies if each.key != WEIGHTS]
             for teacher in teachers if rank() == 0 else ():
                 _predict_labels(spec, teacher)
             agreed(None)  # process 0 has written the labels
