@@ -13,7 +13,7 @@ from torch.nn import functional as F
 from rgbt.checks import InputError
 from rgbt.geometry.padding import padded_hw
 from rgbt.types import VIEWS, MaskPair
-from tests.models.golden import alone, network
+from tests.models.golden import network
 from tests.models.plain import cells, count, generator, images, nano, normal, randomise
 
 MODIFIED = {
@@ -297,17 +297,3 @@ def test_parameter_counts_are_the_published_ones(
 def test_state_dicts_have_as_many_entries_as_released(yaml: str, entries: int) -> None:
     with torch.device("meta"):
         assert len(network(yaml).state_dict()) == entries
-
-
-@pytest.mark.parametrize(
-    ("name", "changes"),
-    [
-        ("deeplabv2", ["model.auxiliary=true"]),
-        ("deeplabv2_two_heads_modified", []),
-        ("heatnet", ["model.modalities=rgb"]),
-    ],
-)
-def test_tiny_networks_differ_in_sizes_and_dropout_alone(name: str, changes: list[str]) -> None:
-    small, large = (alone(f"model/{each}", *changes).model for each in (f"{name}_tiny", name))
-    sizes = {"depths", "base_width", "decoder_width", "rates", "summed_rates", "dropout"}
-    assert [k for k in large if k not in ("num_classes", *sizes) and small[k] != large[k]] == []
