@@ -14,7 +14,7 @@ from rgbt.checks import InputError
 from rgbt.geometry.padding import padded_hw
 from rgbt.types import VIEWS, MaskPair
 from tests.models.golden import network
-from tests.models.plain import cells, count, generator, images, nano, normal, randomise
+from tests.models.plain import NANO, cells, count, generator, images, nano, normal, randomise
 
 MODIFIED = {
     **{"ceil_mode": False, "decoder": "modified_heatnet"},
@@ -22,19 +22,18 @@ MODIFIED = {
 }
 LITERAL = {"ceil_mode": False, "decoder": "modified_thesis", "align_corners": False}
 CASES: list[tuple[str, dict[str, Any]]] = [
-    ("mfnet", {}),
-    ("rtfnet", {}),
-    *(("pspnet", {"modalities": m}) for m in ("late_fusion", "early_fusion", "rgb", "thermal")),
+    *((name, {}) for name in NANO if name != "critic"),
+    *(("pspnet", {"modalities": m}) for m in ("early_fusion", "rgb", "thermal")),
     *(("semseg", changes) for changes in ({"modalities": "thermal"}, {"dropout": 0.5})),
-    *(("deeplabv2", changes) for changes in ({}, MODIFIED, LITERAL)),
-    ("cmx", {}),
+    *(("deeplabv2", changes) for changes in (MODIFIED, LITERAL)),
     ("cmx", {"drop_path_rate": 0.5, "drop_path_stage2": "released"}),
     ("cmx", {"decoder_dropout": 0.5}),
-    *(("cmnext", changes) for changes in ({}, {"drop_path_rate": 0.5})),
-    *(("mask2former", changes) for changes in ({}, {"drop_path_rate": 0.2})),
-    *(("dinov2", {"layers": layers}) for layers in ((4,), (1, 2, 3, 4))),
-    ("dinov2", {"tuning": "lora"}),
+    ("cmnext", {"drop_path_rate": 0.5}),
+    ("mask2former", {"drop_path_rate": 0.2}),
+    *(("dinov2", changes) for changes in ({"layers": (1, 2, 3, 4)}, {"tuning": "lora"})),
 ]
+"""Every network as it is in `NANO`, and settings that change what it computes."""
+
 NETWORKS = pytest.mark.parametrize(("name", "changes"), CASES)
 DROPS = {"dropout", "drop_path_rate", "decoder_dropout"}
 
