@@ -184,11 +184,6 @@ class Plain:
             block += 1
         return x
 
-    def doubled(self, conv: str, norm: str, x: Tensor) -> Tensor:
-        """Transposed 2x2 convolution with stride 2: every pixel becomes its own 2x2 square."""
-        squares = torch.einsum("nihw,iokl->nohkwl", x, self.state[f"{conv}.weight"])
-        return self.norm(norm, squares.flatten(4, 5).flatten(2, 3))
-
     def up(self, name: str, x: Tensor, *, align_corners: bool) -> Tensor:
         """Twice the size, convolution, normalisation, one slope for what is negative."""
         size = (2 * x.shape[2], 2 * x.shape[3])

@@ -11,11 +11,10 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.checks import InputError
-from rgbt.models.cmnext import ConvFfn, PoolingGate, PpxBlock, window_mean
+from rgbt.models.cmnext import PoolingGate, PpxBlock, window_mean
 from rgbt.models.cmx.fusion import CrossAttention, Rectification
-from rgbt.models.cmx.mit import MitAttention, MixFfn, mit_blocks
+from rgbt.models.cmx.mit import mit_blocks
 from rgbt.models.cmx.model import drop_rates
-from rgbt.models.cmx.network import MlpDecoder
 from tests.models.golden import network
 from tests.models.plain import generator, images, nano, normal, randomise
 
@@ -72,30 +71,6 @@ def test_eps_of_every_normalisation() -> None:
             assert getattr(module, "eps", expected) == expected, path
 
 
-@pytest.mark.parametrize("reduction", [1, 2])
-def test_attention_by_loops(reduction: int) -> None:
-    """Three heads of two channels; a map of 5 x 4 is attended to as 2 x 2 where it is reduced."""
-    layer: MitAttention = drawn(MitAttention(6, 3, reduction))
-    x = normal(2, 5, 4, 6)
-    expected = torch.empty(2, 20, 6)
-    for n in range(2):
-        seen = x[n].flatten(0, 1)
-        if reduction > 1:
-            weight = layer.sr.weight
-            patches = [x[n, 2 * r : 2 * r + 2, 2 * c : 2 * c + 2] for r in (0, 1) for c in (0, 1)]
-            seen = torch.stack([torch.einsum("hwi,oihw->o", p, weight) for p in patches])
-            seen = layer.norm(seen + layer.sr.bias)
-        q, kv = layer.q(x[n].flatten(0, 1)), layer.kv(seen)
-        for head in range(3):
-            part = slice(2 * head, 2 * head + 2)
-            k, v = kv[:, :6][:, part], kv[:, 6:][:, part]
-            for token in range(20):
-                scores = torch.stack([q[token, part] @ key for key in k]) / math.sqrt(2)
-                expected[n, token, part] = (scores.exp() / scores.exp().sum()) @ v
-    expected = layer.proj(expected).view(2, 5, 4, 6)
-    torch.testing.assert_close(layer(x), expected, rtol=1e-4, atol=1e-5)
-
-
 def test_rectification_by_hand() -> None:
     """Weights from biases alone: 1/4 by channel and 1/2 by place of x1, 3/4 and 9/10 of x2."""
     layer = Rectification(1)
@@ -124,54 +99,6 @@ def test_cross_attention_by_loops() -> None:
     torch.testing.assert_close(layer(*u), tuple(expected))
 
 
-@pytest.mark.parametrize("layer", [MixFfn(2, 3), ConvFfn(2, 3)])
-def test_feed_forward_sees_its_neighbours_only(layer: Any) -> None:
-    """Values by loops over places, zero outside the map; GELU by its definition."""
-    drawn(layer)
-    x = normal(1, 3, 4, 2)
-    kernel, bias = layer.dwconv.dwconv.weight[:, 0], layer.dwconv.dwconv.bias
-    first, last = (fc.weight.flatten(1) for fc in (layer.fc1, layer.fc2))
-    wide = x[0] @ first.T + layer.fc1.bias
-    if isinstance(layer, ConvFfn):
-        found = layer(x.permute(0, 3, 1, 2)).permute(0, 2, 3, 1)
-    else:
-        found = layer(x)
-    for r in range(3):
-        for c in range(4):
-            total = bias.clone()
-            for y in range(max(r - 1, 0), min(r + 2, 3)):
-                for z in range(max(c - 1, 0), min(c + 2, 4)):
-                    total = total + wide[y, z] * kernel[:, y - r + 1, z - c + 1]
-            gelu = 0.5 * total * (1 + torch.erf(total / math.sqrt(2)))
-            expected = gelu @ last.T + layer.fc2.bias
-            torch.testing.assert_close(found[0, r, c], expected, rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.parametrize("training", [False, True])
-def test_decoder_equals_the_released_order(training: bool) -> None:
-    """Projected, enlarged, joined from the smallest to the largest, then convolved."""
-    sizes, scores, gradients = ((9, 13), (5, 7), (3, 4), (2, 2)), [], []
-    maps = [normal(2, *hw, 3 + i, seed=i).double() for i, hw in enumerate(sizes)]
-    for released in (False, True):
-        head = MlpDecoder((3, 4, 5, 6), 2, dim=7, dropout=0.0, norm_eps=(1e-3, 1e-3))
-        net: MlpDecoder = drawn(head).double().train(training)
-        if released:
-            joined = []
-            for number in (4, 3, 2, 1):
-                small = net.get_submodule(f"linear_c{number}.proj")(maps[number - 1])
-                small = small.permute(0, 3, 1, 2)
-                joined.append(F.interpolate(small, (9, 13), mode="bilinear", align_corners=False))
-            found = net.linear_pred(net.linear_fuse(torch.cat(joined, 1)))
-            found = F.interpolate(found.float(), (36, 50), mode="bilinear", align_corners=False)
-        else:
-            found = net(maps, (36, 50))
-        scores.append(found)
-        (found * normal(*found.shape, seed=9).double()).sum().backward()
-        gradients.append([parameter.grad for parameter in net.parameters()])
-    torch.testing.assert_close(*scores, rtol=1e-10, atol=1e-10)
-    torch.testing.assert_close(*gradients, rtol=1e-9, atol=1e-9)
-
-
 @pytest.mark.parametrize(("eps", "evaluated"), [(None, 1e-3), (1e-5, 1e-5)])
 def test_decoder_eps_in_evaluation(eps: float | None, evaluated: float) -> None:
     """A constant map c, statistics mean 0 and variance v: c / sqrt(v + eps)."""
@@ -182,19 +109,6 @@ def test_decoder_eps_in_evaluation(eps: float | None, evaluated: float) -> None:
     for mode, expected in ((False, evaluated), (True, 1e-3), (False, evaluated)):
         assert decoder.train(mode).linear_fuse[1].eps == expected
     torch.testing.assert_close(norm(x), torch.full_like(x, 3 / math.sqrt(variance + evaluated)))
-
-
-def test_decoder_drops_whole_channels() -> None:
-    head = nano("cmx", decoder_dropout=0.5).decode_head.train()
-    seen, wholes = [], []
-    head.linear_pred.register_forward_pre_hook(lambda _m, args: seen.append(args[0]))
-    head.linear_fuse[2].register_forward_hook(lambda _m, _i, out: wholes.append(out))
-    maps = [normal(2, 8 // s, 8 // s, d) for s, d in ((1, 8), (2, 8), (4, 12), (8, 16))]
-    head(maps, (32, 32), generator())
-    (whole,) = wholes
-    dropped = ~seen[0].flatten(2).any(-1) & whole.flatten(2).any(-1)
-    assert 0 < int(dropped.sum()) < dropped.numel()
-    torch.testing.assert_close(seen[0], whole * 2 * ~dropped[..., None, None])
 
 
 # ---- stochastic depth ----------------------------------------------------------------------------
