@@ -52,12 +52,7 @@ FRAMES = "next"
 class Plan:
     """The plan of a written data set; equal plans give equal files.
 
-    Attributes:
-        name: of the data set; its folder begins with it.
-        seed: of the data set.
-        numbers: scenes by split.
-        factors: what the scenes are made of.
-        motion: of the camera to a second frame of every scene, or None for single frames.
+    `numbers` are scenes by split; `motion` leads to a second frame of every scene.
     """
 
     name: str
@@ -107,15 +102,8 @@ def exported(layout: Layout, plan: Plan, cache_dir: str | Path | None) -> Path:
     """The folder of a data set, written now if it is not there yet.
 
     It is written under another name and renamed when complete, so that an interrupted generation
-    leaves nothing that looks like a data set, and two at once cannot mix.
-
-    Args:
-        layout: of its files.
-        plan: all settings that determine its bytes; stored in it as plan.json.
-        cache_dir: folder that holds written data sets; None: `default_cache`.
-
-    Raises:
-        InputError: the cache cannot be written.
+    leaves nothing that looks like a data set, and two at once cannot mix. The plan is stored in it.
+    `cache_dir` None: `default_cache`; InputError if it cannot be written.
     """
     text = json.dumps({"version": VERSION, **asdict(plan)}, sort_keys=True, indent=1)
     cache = Path(cache_dir).expanduser() if cache_dir else default_cache()

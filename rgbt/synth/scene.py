@@ -30,16 +30,12 @@ class Scene:
     """One frame.
 
     Attributes:
-        rgb: (H, W, 3) uint8, RGB order.
-        thermal: (H, W) uint8.
-        label: (H, W) uint8, MFNet's class ids 0..8.
+        label: MFNet's class ids 0..8.
         depth: (H, W) float32, metres along the optical axis; infinity for the sky.
         grey: (H, W) float32, `thermal` before it became bytes: 1 = full scale, and not clipped.
         material: (H, W) index of the material that each pixel shows.
         owner: (H, W) index into `placed` of the object that it shows; -1 for ground and sky.
         placed: the objects of the scene, far ones before near ones.
-        is_night: whether it is night.
-        camera: where the frame was taken from.
     """
 
     rgb: NDArray[np.uint8]

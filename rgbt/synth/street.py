@@ -22,20 +22,15 @@ NO_SHADOW = -1.0
 
 
 class Placed(NamedTuple):
-    """One object in the world.
+    """One object in the world, `x` metres right of the camera's start, `z` ahead, `y` above ground.
 
     Attributes:
-        shape: what it is.
-        x: metres right of the camera's start.
-        z: metres ahead of it.
         yaw: turn to the right in radians; 0 shows the shape's back.
         scale: factors on the shape's x, y, z.
         paints: first and second paint, reflectance (R, G, B).
         warmth: 0 cold (parked, well wrapped) to 1 (engine on, lightly dressed).
         lit: 0 or 1: whether its lamps are on by night.
-        layer: drawing layer.
         shadow_from: share of the height from which it casts a shadow, or `NO_SHADOW`.
-        y: height above the ground.
     """
 
     shape: Shape
@@ -76,18 +71,15 @@ Numbers = float | NDArray[np.float64] | Floats
 
 
 class Road(NamedTuple):
-    """Course and cross-section.
+    """Course and cross-section, in metres; pairs are (left, right).
 
     Attributes:
-        half_width: metres from the centre line to the kerb.
+        half_width: from the centre line to the kerb.
         centre: X of the centre line beside the camera; positive, traffic keeps left.
         curvature: 1 / metres, positive to the right.
-        sidewalk: widths in metres (left, right).
-        kerb: whether there is one (left, right).
         kerb_m: width and height of kerbs.
         crossing_z: distance of a zebra crossing, or None.
         line_phase: where in a dash the centre line begins, 0..1.
-        edge_line: whether there are solid lines along the edges.
         patches: (n, 4) rows of Z, lateral position, width and length of repaired asphalt.
         manhole: (Z, lateral position).
     """

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from rgbt.ranges import GreyLevel, Pixels, Share, Size, rising
 from rgbt.requirements import Record
+from rgbt.transforms.crm import FactorRange
 from rgbt.transforms.maps import Maps, Window, evaluated, mixed
-from rgbt.transforms.photometric import FactorRange
 from rgbt.types import Example, Sample
 
 SizeFactor = Annotated[float, Interval(ge=0.01, le=16)]

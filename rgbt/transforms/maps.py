@@ -1,8 +1,8 @@
 """Everything of a sample that moves together, and what moves it: crop, flip, resize, pad.
 
 Every transform has `train(sample, rng)`, for which all draws come from `rng`, and `test(sample)`;
-of a sample without a label, all pixels are ignored. Photometric changes are in
-`rgbt.transforms.photometric`.
+of a sample without a label, all pixels are ignored. Colours are in
+`rgbt.transforms.crm`.
 """
 
 from __future__ import annotations
@@ -142,6 +142,8 @@ class Maps:
             corner_yx: where the maps begin; None: in the middle, of odd margins the larger one is
                 below and right.
         """
+        if hw == self.hw:
+            return self
         height, width = self.hw
         top, left = corner_yx or ((hw[0] - height) // 2, (hw[1] - width) // 2)
 

@@ -15,7 +15,6 @@ import pytest
 from omegaconf import OmegaConf
 
 from rgbt.checks import InputError
-from rgbt.config.component import Component, build
 from rgbt.config.compose import compose
 from rgbt.data import freiburg, kp, pst900
 from rgbt.data.freiburg import Freiburg
@@ -38,7 +37,7 @@ from rgbt.synth.datasets import (
     synth_kp,
     synth_pst900,
 )
-from rgbt.synth.export import Layout, Plan, default_cache, exported, write
+from rgbt.synth.export import Layout, Plan, exported, write
 from rgbt.synth.factors import EgoMotion, SceneFactors, with_factors
 from rgbt.synth.scene import Scene, render_pair, render_scene
 from rgbt.synth.shapes import (
@@ -202,16 +201,6 @@ def test_configuration_has_the_settings_with_their_defaults(each: Embedded) -> N
         )
 
 
-def test_command_line_chooses_data_set(each: Embedded, folder: Path) -> None:
-    numbers = {f"num_{split}": number for split, number in each.plan.numbers.items()}
-    factors = each.plan.factors
-    values = {**numbers, "height": factors.height, "width": factors.width, "cache_dir": folder}
-    words = [f"dataset.{key}={value}" for key, value in values.items()]
-    config = compose([f"dataset={each.plan.name}", *words])
-    Component.from_node(config.dataset, "dataset")
-    assert build(config.dataset).name == each.plan.name
-
-
 def test_factors_are_keywords_of_a_data_set() -> None:
     def plain(*, seed: int = 3, factors: SceneFactors) -> tuple[int, SceneFactors]:
         return seed, factors
@@ -257,13 +246,6 @@ def test_first_of_two_generations_is_kept(tmp_path: Path) -> None:
     assert exported(Layout(shots, lambda scene, shot: {}), plan, tmp_path) == other[0]
     assert (other[0] / "first.txt").is_file()
     assert list(tmp_path.iterdir()) == other
-
-
-def test_default_cache_follows_system(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", "/somewhere")
-    assert default_cache() == Path("/somewhere/rgbt")
-    monkeypatch.delenv("XDG_CACHE_HOME")
-    assert default_cache() == Path.home() / ".cache/rgbt"
 
 
 def test_wrong_settings_are_refused(tmp_path: Path) -> None:
@@ -332,14 +314,6 @@ def test_pst900_names_are_those_of_archive() -> None:
     assert set(bags[60:]) == {21, 22, 23, 24, 25}
 
 
-def test_pst900_without_val_bags_trains_on_them(folder: Path) -> None:
-    each = EMBEDDED["synth_pst900"]
-    released = each.made(folder, val_bags=())
-    assert released.root == each.made(folder).root
-    assert len(released.names("train")) == 8
-    assert released.names("val") == released.names("test")
-
-
 def test_pst900_objects_are_present_and_rare() -> None:
     stands = {0: "background", CAR: "background", COLOR_CONE: "fire_extinguisher"}
     stands |= {CAR_STOP: "backpack", BUMP: "hand_drill", PERSON: "survivor"}
@@ -399,22 +373,6 @@ def test_kp_rider_is_not_person(scenes: list[Scene]) -> None:
         persons, riders = persons + person.any(), riders + rider.any()
     assert persons > 8
     assert riders > 3
-
-
-def test_owner_is_object_except_ground_and_sky(scenes: list[Scene]) -> None:
-    ground = [INDEX[name] for name in ("grass", "asphalt", "paving", "line")]
-    for scene in scenes[:3]:
-        nobody = np.isinf(scene.depth) | np.isin(scene.material, ground)
-        assert (scene.owner[nobody] == -1).all()
-        assert (scene.owner[scene.label == CAR] >= 0).all()
-
-
-def test_every_present_class_of_kp_is_frequent(scenes: list[Scene]) -> None:
-    shown = sum(np.bincount(kp_ids(scene).ravel(), minlength=20) > 0 for scene in scenes)
-    absent = {"traffic_light", "truck", "bus", "train", "motorcycle"}
-    assert {name for name, times in zip(kp.CLASSES, shown, strict=False) if not times} == absent
-    assert min(n for name, n in zip(kp.CLASSES, shown, strict=False) if name not in absent) >= 4
-    assert shown[19] > 6
 
 
 # ---- synth_freiburg -------------------------------------------------------------------------
@@ -494,15 +452,6 @@ def test_freiburg_counts_and_margins_by_hand() -> None:
     assert seen.sum(1).min() > 180
     assert len(set(seen.argmax(1))) > 3
     assert 0 < (~seen[1:97, 48:240]).mean() < 0.01
-
-
-def test_freiburg_reader_gets_its_settings(folder: Path) -> None:
-    each = EMBEDDED["synth_freiburg"]
-    data, whole = each.made(folder), each.made(folder, crop=None, ignored_test=())
-    assert whole.root == data.root
-    assert whole.read(whole.names("test")[0]).label.max() == 13
-    other, name = each.made(folder, thermal_range=(21800, 25000)), data.names("train")[0]
-    assert other.read(name).thermal.mean() < 0.7 * data.read(name).thermal.mean()
 
 
 # ---- classes --------------------------------------------------------------------------------

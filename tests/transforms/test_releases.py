@@ -85,7 +85,7 @@ def crm(t: Any, sample: Sample, rng: np.random.Generator) -> Arrays:
     crop = np.minimum(t.crop_hw or (height, width), (height, width)).tolist()
     top, left = (int(rng.integers(a - b + 1)) for a, b in zip((height, width), crop, strict=True))
     arrays = mirrored(cut(arrays, top, left, *crop), rng.random() < t.flip_probability)
-    colours = t.jitter.draw(rng)
+    colours = t.draw_colours(rng)
     return {
         **arrays,
         "rgb": colours.rgb(np.ascontiguousarray(arrays["rgb"])).astype(t.dtype),
@@ -202,7 +202,7 @@ def assert_is(found: Example, expected: Arrays, name: str) -> None:
 
 @pytest.mark.parametrize("name", STEPS)
 def test_training_is_the_steps_of_the_release(name: str) -> None:
-    # Truncation after a float32 resize shows its last bit: no colours there, see test_photometric.
+    # Truncation after a float32 resize shows its last bit: no colours there, see test_crm.
     words = ["transform.colour_probability=0"] if name == "crm_released" else []
     transform = made(name, *words)
     for number in range(90):

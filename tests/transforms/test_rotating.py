@@ -53,15 +53,6 @@ def heatnet(original: Sample, number: int, **changes: Any) -> Example:
 
 
 @pytest.mark.parametrize("number", range(3))
-def test_semseg_scales_as_opencv(number: int) -> None:
-    original, factor = sample(), float(np.random.default_rng(number).uniform(0.5, 2.0))
-    size = (round(HW[1] * factor), round(HW[0] * factor))
-    found = semseg(original, number, scale_range=(0.5, 2.0), crop_hw=(size[1], size[0]))
-    rgb = cv2.resize(original.rgb.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
-    np.testing.assert_allclose(found.rgb, rgb, atol=2e-3)
-
-
-@pytest.mark.parametrize("number", range(3))
 def test_semseg_rotates_as_opencv(number: int) -> None:
     """About (w / 2, h / 2), with the mean colour and ignored labels outside."""
     original = sample(label=np.full(HW, 3, np.uint8))
@@ -114,18 +105,6 @@ def test_semseg_crops_reach_every_place() -> None:
         assert int(each.label[each.centre_yx]) == 52  # row 1, column 2, in every crop
 
 
-def test_semseg_of_unlabelled_images_and_in_evaluation() -> None:
-    original, made = sample(), SemsegTransform(**STILL)
-    changes = {"rotate_probability": 1.0, "scale_range": (0.5, 2.0), "flip_probability": 0.5}
-    bare = semseg(replace(original, label=None, confidence=None), 1, **changes)
-    assert (bare.label == IGNORE).all()
-    assert bare.confidence is None
-    example = made.test(original)
-    np.testing.assert_array_equal(example.rgb, original.rgb)
-    np.testing.assert_array_equal(example.label, original.label)
-    assert replace(made, test_short_edge=32).test(original).rgb.shape == (32, 64, 3)
-
-
 def test_published_numbers_of_the_teacher() -> None:
     """Configuration mv_pspnet50 of the thesis' code; batch and auxiliary weight of semseg."""
     spec = specified(("+experiment=thermal_teacher_semseg", "scale=paper", "dataset.root=x"))
@@ -151,19 +130,6 @@ def test_heatnet_crops_lie_between_the_margins_and_reach_both() -> None:
     assert all((np.diff(label[0].astype(int)) == 2).all() for label in labels)
     assert {label.shape for label in labels} == {(32, 56)}
     assert {int(label[0, 0]) // 2 for label in labels} == {2, 3, 4, 5, 6}
-
-
-def test_heatnet_resizes_as_opencv_and_mirrors() -> None:
-    original = sample()
-    example, flipped = (
-        heatnet(original, 1, crop_hw=(32, 60), flip_probability=p) for p in (0.0, 1.0)
-    )
-    for found, image in ((example.rgb, original.rgb), (example.thermal, original.thermal)):
-        resized = cv2.resize(image.astype(np.float32), (64, 32), interpolation=cv2.INTER_LINEAR)
-        np.testing.assert_allclose(found, resized[:, 2:62], atol=1e-3)
-        assert found.dtype == np.float32
-    for name in ("rgb", "thermal", "label", "confidence"):
-        np.testing.assert_array_equal(getattr(flipped, name), getattr(example, name)[:, ::-1])
 
 
 def rotated_by_hand(array: np.ndarray, angle: float, fill: float) -> np.ndarray:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rgbt.transforms.photometric import (
+from rgbt.transforms.crm import (
     ColourJitter,
     scale_and_truncate,
     scale_saturation,
@@ -16,7 +16,7 @@ from tests.transforms.recipes import JITTER
 
 
 def jitter(**changes: Any) -> ColourJitter:
-    values = {"probability": 0.5, **JITTER}
+    values = {"colour_probability": 0.5, **JITTER}
     return ColourJitter(**{**values, **changes})
 
 
@@ -81,39 +81,39 @@ def test_hue_of_float_is_folded() -> None:
 def test_intended_stays_uint8_and_released_may_turn_grey() -> None:
     """Grey needs: no brightness (1/2), saturation (1/2), and no contrast before it (3/4)."""
     rng = np.random.default_rng(0)
-    images = [jitter().draw(rng).rgb(flat(200, 120, 100, np.float32)) for _ in range(3000)]
+    images = [jitter().draw_colours(rng).rgb(flat(200, 120, 100, np.float32)) for _ in range(3000)]
     grey = np.mean([np.ptp(image[0, 0]) == 0 for image in images])
     assert abs(grey - 3 / 16) < 0.03
     rng = np.random.default_rng(0)
-    images = [jitter().draw(rng).rgb(flat(200, 120, 100)) for _ in range(1000)]
+    images = [jitter().draw_colours(rng).rgb(flat(200, 120, 100)) for _ in range(1000)]
     assert all(image.dtype == np.uint8 for image in images)
     assert not any(np.ptp(image[0, 0]) == 0 for image in images)
 
 
 def test_probability_zero_changes_nothing() -> None:
     image = np.random.default_rng(0).integers(0, 256, (4, 5, 3), dtype=np.uint8)
-    off = jitter(probability=0.0)
+    off = jitter(colour_probability=0.0)
     rng = np.random.default_rng(1)
-    np.testing.assert_array_equal(off.draw(rng).rgb(image), image)
-    np.testing.assert_array_equal(off.draw(rng).thermal(image[..., 0]), image[..., 0])
+    np.testing.assert_array_equal(off.draw_colours(rng).rgb(image), image)
+    np.testing.assert_array_equal(off.draw_colours(rng).thermal(image[..., 0]), image[..., 0])
 
 
 def test_brightness_and_contrast_alone() -> None:
     """The published ranges, each alone, on a mid grey, which saturation and hue leave alone."""
     rng = np.random.default_rng(2)
     grey = flat(100, 100, 100)
-    only_brightness = jitter(probability=1.0, contrast_range=(1, 1))
-    values = [int(only_brightness.draw(rng).rgb(grey)[0, 0, 0]) for _ in range(500)]
+    only_brightness = jitter(colour_probability=1.0, contrast_range=(1, 1))
+    values = [int(only_brightness.draw_colours(rng).rgb(grey)[0, 0, 0]) for _ in range(500)]
     assert (min(values), max(values)) == pytest.approx((68, 131), abs=1)
-    only_contrast = jitter(probability=1.0, brightness_delta=0.0)
-    values = [int(only_contrast.draw(rng).rgb(grey)[0, 0, 0]) for _ in range(500)]
+    only_contrast = jitter(colour_probability=1.0, brightness_delta=0.0)
+    values = [int(only_contrast.draw_colours(rng).rgb(grey)[0, 0, 0]) for _ in range(500)]
     assert (min(values), max(values)) == pytest.approx((50, 149), abs=1)
 
 
 def test_thermal_gets_contrast_alone_half_of_the_time() -> None:
     rng = np.random.default_rng(3)
     image = np.array([[0, 100]], np.uint8)
-    found = np.array([jitter().draw(rng).thermal(image)[0] for _ in range(1000)])
+    found = np.array([jitter().draw_colours(rng).thermal(image)[0] for _ in range(1000)])
     assert (found[:, 0] == 0).all()  # brightness would lift the zero
     assert 50 <= found[:, 1].min() < 52
     assert 148 < found[:, 1].max() <= 150
@@ -122,7 +122,9 @@ def test_thermal_gets_contrast_alone_half_of_the_time() -> None:
 
 def test_hue_reaches_both_ends() -> None:
     draws = np.random.default_rng(4)
-    found = {jitter(probability=1.0, hue_delta=2).draw(draws).hue for _ in range(200)}
+    found = {
+        jitter(colour_probability=1.0, hue_delta=2).draw_colours(draws).hue for _ in range(200)
+    }
     assert found == {-2, -1, 0, 1, 2}
 
 
