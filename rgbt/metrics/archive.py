@@ -34,7 +34,7 @@ class Archive:
         arrays[FORMAT] = np.array(self.mark)
         arrays[DIGEST] = np.array(_digest(arrays))
         with replacing(path) as file:
-            np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+            np.savez_compressed(file, **arrays)
 
     def load(self, path: Path, build: Callable[[dict[str, Any]], T]) -> T:
         """What `build` makes of the arrays that `save` wrote; nothing in the file is executed.

@@ -11,7 +11,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -255,7 +254,7 @@ def images_of(parsed: ParsedMetric, counts: Counts) -> Counts:
 def details_of_metric(metric: str) -> DetailKind | None:
     """The kind of details that a metric name needs; None: other counts, or no metric."""
     found = NAME.fullmatch(metric)
-    return cast("DetailKind | None", KIND_OF.get(found["score"] or "")) if found else None
+    return KIND_OF.get(found["score"] or "") if found else None
 
 
 def _of_region(parsed: ParsedMetric, by_region: Matrices) -> Matrices:

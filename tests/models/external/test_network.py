@@ -152,8 +152,7 @@ def test_weights_that_do_not_fit_are_refused_in_one_sentence(tmp_path: Path) -> 
     torch.save({"conv.weight": STATE["conv.weight"], "head": torch.ones(1)}, tmp_path / "w.pth")
     net = external(folder)
     before = copy.deepcopy(net.state_dict())
-    with pytest.raises(InputError, match=r"1 entry of the network missing .*conv\.bias.*1 entry of "
-                                         r"the file unknown .*head"):  # fmt: skip
+    with pytest.raises(InputError, match=r"conv\.bias is missing; head is unknown"):
         load_weights(net, tmp_path / "w.pth")
     assert all(torch.equal(before[key], value) for key, value in net.state_dict().items())
     torch.save(net.state_dict(), tmp_path / "own.pth")  # names of this project
