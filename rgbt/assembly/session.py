@@ -15,7 +15,7 @@ import torch
 from omegaconf import OmegaConf
 from torch import nn
 
-from rgbt.assembly.contracts import check_dataset, check_requirements, watch_model
+from rgbt.assembly.contracts import check_dataset, watch_model
 from rgbt.checks import InputError
 from rgbt.config.compose import compose
 from rgbt.config.stored_config import read_settings
@@ -29,9 +29,10 @@ from rgbt.engine.prediction import Prediction
 from rgbt.engine.settings import TrainerSettings
 from rgbt.metrics.metric import Regions
 from rgbt.randomness import derive
+from rgbt.requirements import check_requirements
 from rgbt.runs.run_spec import WEIGHTS, RunSpec
 from rgbt.terminal import info
-from rgbt.transforms.view_sets import ViewSets
+from rgbt.transforms.views import ViewSets
 
 if TYPE_CHECKING:  # most runs start at random, and few map classes
     from rgbt.checkpoints.load import Plan

@@ -34,7 +34,7 @@ from rgbt.engine.schedules import Schedule
 from rgbt.engine.settings import TrainerSettings
 from rgbt.processes import agreed, collected, largest, mean_count, num_processes, rank
 from rgbt.randomness import generators_of_step
-from rgbt.runtime.signals import Stopped, at_once, deferred, noted, raise_noted
+from rgbt.runtime.signals import Stopped, at_once, deferred, ending_command, noted, raise_noted
 from rgbt.types import Batch, GeneratorOf, Phase, TwoDomains
 
 RecordStep = Callable[[int, dict[str, float]], None]
@@ -187,16 +187,19 @@ class Trainer:
             check_weights({"model": self.model, **self.others}, state.step)
         try:
             raise_noted(signalled)
-            with at_once():
-                self.after_step()
+            if rank() == 0:  # a signal to another process alone waits for the next step
+                with at_once():
+                    self.after_step()
             if due:
-                self._select(state)
+                with ending_command():  # another process may have left its evaluation before
+                    self._select(state)
             if saves:
                 self._save(state)
             if due:
+                self.model.train()
+            if due and rank() == 0:
                 with at_once():
                     self.committed()
-                self.model.train()
         except Stopped as stop:
             self._save(state)
             stop.step = state.step

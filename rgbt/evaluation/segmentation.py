@@ -32,7 +32,7 @@ from rgbt.processes import collected, num_processes
 from rgbt.tables import ClassTable, RegionTable, ResultTables, TextTable, number
 from rgbt.terminal import result_view, rich_table
 from rgbt.tracking.pictures import Legend, PanelExample
-from rgbt.transforms.joint import whole_view
+from rgbt.transforms.maps import nearest
 from rgbt.types import View
 
 NUM_PANELS = 6
@@ -191,8 +191,8 @@ def _example(session: Session, name: str, classes: NDArray[np.uint8]) -> PanelEx
     sample = session.dataset.read(name)
     label = sample.label if sample.label is not None else np.full_like(sample.thermal, 255)
     # Classes may be counted at another size than that of the label file.
-    shown = whole_view((classes.shape[0], classes.shape[1]), (label.shape[0], label.shape[1]))
-    return PanelExample(name, sample.rgb, sample.thermal, label, shown.nearest(classes))
+    shown = nearest(classes, (label.shape[0], label.shape[1]))
+    return PanelExample(name, sample.rgb, sample.thermal, label, shown)
 
 
 def result_tables(counts: Counts, regions: Regions, label: str, step: int) -> ResultTables:

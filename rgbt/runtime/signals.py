@@ -142,9 +142,10 @@ def noted() -> int:
 
 def raise_noted(number: int | None = None) -> None:
     """Raise `Stopped` for the signal that came, or for `number`, which another process noted."""
-    _signals.number = noted() if number is None else number
-    if _signals.number:
-        raise Stopped(_signals.number)
+    number = noted() if number is None else number
+    if number:
+        _signals.number = number
+        raise Stopped(number)
 
 
 def _leave(terminals: list[int]) -> None:

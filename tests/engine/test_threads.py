@@ -29,7 +29,6 @@ def test_fix_threads_does_not_depend_on_the_cores() -> None:
 @pytest.mark.parametrize(
     ("name", "value", "is_refused"),
     [
-        ("OMP_DYNAMIC", "true", True),
         ("OMP_DYNAMIC", "TRUE", True),
         ("OMP_DYNAMIC", "false", False),
         ("OMP_THREAD_LIMIT", "1", True),

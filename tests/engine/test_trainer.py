@@ -293,12 +293,15 @@ def test_accumulated_phases_equal_those_of_the_whole_batch(
 ) -> None:
     found = []
     for where, accumulate in (("whole", 1), ("halves", 2)):
-        trainer, _ = make(tmp_path / where, max_steps=2, accumulate=accumulate, clip_norm=clip_norm)
+        trainer, log = make(
+            tmp_path / where, max_steps=2, accumulate=accumulate, clip_norm=clip_norm
+        )
         trainer.scheme = Shared(trainer.model, clear)
         builder = SGD(lr=0.05, backbone_multiplier=1.0, momentum=0.9, weight_decay=0.01)
         trainer.optimizers = {"main": builder(trainer.model), "second": builder(trainer.model)}
         trainer.fit(batches(0) if accumulate == 1 else halves(), State(seed=0))
-        found.append([p.detach().clone() for p in trainer.model.parameters()])
+        logged = torch.tensor([log[0][1][name] for name in ("loss", "loss/one", "loss/two")])
+        found.append([logged, *(p.detach().clone() for p in trainer.model.parameters())])
     for a, b in zip(*found, strict=True):
         torch.testing.assert_close(a, b)
 

@@ -97,6 +97,19 @@ def test_an_evaluation_is_left_at_once_and_made_on_resuming(tmp_path: Path) -> N
     assert evaluated == [3, 6]
 
 
+def test_signal_that_comes_while_processes_agree_is_not_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def signalled(number: int) -> int:
+        send(signal.SIGTERM)
+        return number
+
+    trainer, _ = train(tmp_path)
+    monkeypatch.setattr("rgbt.engine.trainer.largest", signalled)
+    with pytest.raises(Stopped, match="at step 1, and"):
+        trainer.fit(batches(0), State(seed=7))
+
+
 def test_a_second_ctrl_c_stops_in_the_middle_of_a_step(tmp_path: Path) -> None:
     trainer, _ = train(tmp_path)
     with pytest.raises(KeyboardInterrupt) as interrupt:
