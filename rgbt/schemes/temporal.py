@@ -22,7 +22,7 @@ from rgbt.types import Batch, Frame, GeneratorOf, Output, Phase
 
 
 class VirtualViews(Protocol):
-    """What is called of a view, which draws the second frame (`rgbt.transforms.virtual_view`)."""
+    """What is called of a view, which draws the second frame (`rgbt.transforms.views`)."""
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor: ...  # noqa: D102
     def warp(self, angles: Tensor, image_hw: tuple[int, int]) -> Warp: ...  # noqa: D102

@@ -28,7 +28,7 @@ from rgbt.schemes.supervised import Supervised
 from rgbt.schemes.temporal import Temporal
 from rgbt.schemes.two_domains import LabelledDomains, UnlabelledTarget
 from rgbt.transforms.strong import StrongAugmentation
-from rgbt.transforms.virtual_view import VirtualView
+from rgbt.transforms.views import VirtualView
 from rgbt.types import IGNORE, Batch, TwoDomains
 from tests.losses.problems import batch_of, criterion_of, whole_image
 from tests.models.plain import nano

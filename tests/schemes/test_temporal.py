@@ -14,11 +14,11 @@ from torch.nn import functional as F
 from rgbt.geometry.camera import Camera
 from rgbt.geometry.halving import halved_all, halved_label, halved_mean
 from rgbt.geometry.warp import Warp
-from rgbt.models.mask2former.head import semantic_logits
 from rgbt.models.mask2former.model import Mask2Former
+from rgbt.models.mask2former.network import semantic_logits
 from rgbt.requirements import Record
 from rgbt.schemes.temporal import Temporal
-from rgbt.transforms.virtual_view import VirtualView
+from rgbt.transforms.views import VirtualView
 from rgbt.types import Batch, Frame, Output
 from tests.losses.problems import batch_of
 from tests.models.plain import images
