@@ -95,7 +95,7 @@ def convention_line(table: ScoreTable) -> str:
 def remarks_on(scored: FolderScores) -> list[str]:
     """Remarks about the folder that a reader of the numbers needs, one sentence each."""
     found = scored.found
-    remarks = [" ".join(filter(None, (scored.format.sentence, found.affixes.sentence)))]
+    remarks = []
     if found.missing:
         number = len(found.missing) + len(found.paths)
         remarks.append(

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import torch
 from lightning_fabric import Fabric
@@ -24,7 +24,7 @@ from rgbt.assembly.session import Session, open_session
 from rgbt.checks import InputError
 from rgbt.config.stored_config import EXTERNAL
 from rgbt.data.domains import GIVEN, NONE, Domain
-from rgbt.data.loaders import Batches, steps_per_epoch, train_batches
+from rgbt.data.loaders import Batches, PairedBatches, steps_per_epoch, train_batches
 from rgbt.dataset import LabelledDataset, reader_of
 from rgbt.engine.fabric import open_fabric
 from rgbt.engine.network_settings import prepare_training
@@ -40,7 +40,6 @@ from rgbt.terminal import info
 from rgbt.types import AnyMasker, Loadable, Sample
 
 if TYPE_CHECKING:  # most runs have one domain, draw no classes, and train a network of this package
-    from rgbt.data.pairs import PairedBatches
     from rgbt.data.rare_classes import RareClasses
 
 
@@ -83,14 +82,12 @@ class TrainingSetup:
     def batches(self, steps: range) -> Batches[Loadable] | PairedBatches:
         """Training batches of these steps: of one domain, or a pair of batches of both."""
         session, seed = self.session, self.session.spec.drawn.order
-        loading = replace(session.loading, augment=_where_to_augment(session))
+        loading = session.loading
         data, split = self.datasets["source"], session.domains.source.split
         source = train_batches(data, split, session.transform, loading, seed, steps, self.rare)
         target = session.domains.named.get("target")
         if target is None:
             return source
-        from rgbt.data.pairs import PairedBatches  # most runs have one domain
-
         transform = record_of(session.transform).for_target or session.transform
         seed = derive(seed, "target domain")  # shuffled and augmented by draws of its own
         data = self.datasets["target"]
@@ -249,16 +246,6 @@ def _report_unpublished_settings(session: Session, names: Lists) -> None:
             f"trainer.selection_split={picked}: the best checkpoint is selected on {shared} test "
             "images."
         )
-
-
-def _where_to_augment(session: Session) -> Literal["loader", "device"]:
-    """What `LoaderSettings.augment` comes to on this device with this transform."""
-    requested = session.loading.augment
-    if requested == "auto":
-        redraws = session.loading.sampling == "rare_classes"  # crops, by their labels
-        can = record_of(session.transform).works_on_batches and not redraws
-        return "device" if can and session.device.type == "cuda" else "loader"
-    return requested
 
 
 def _labelled(session: Session, name: str, domain: Domain, names: Lists) -> LabelledDataset:

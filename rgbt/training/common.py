@@ -4,19 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rgbt.assembly.session import Session
 from rgbt.assembly.training_setup import TrainingSetup
 from rgbt.data.domains import TestedHead
-from rgbt.data.loaders import Batches
+from rgbt.data.loaders import Batches, PairedBatches
 from rgbt.engine.checkpoint import Checkpoints, State, restore_weights
 from rgbt.engine.trainer import Loaded, Trainer
 from rgbt.evaluation.prediction import view_of
 from rgbt.evaluation.request import EvaluationRequest
-
-if TYPE_CHECKING:
-    from rgbt.data.pairs import PairedBatches
 
 
 def make_trainer(setup: TrainingSetup, folder: Path, **of_process: Any) -> Trainer:

@@ -15,7 +15,6 @@ from torch import nn
 from rgbt.assembly.training_setup import TrainingSetup, set_up_training
 from rgbt.checks import InputError, RunError
 from rgbt.engine.checkpoint import State
-from rgbt.evaluation.prediction import decode_ahead
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.evaluation.segmentation import evaluate, panel_names
 from rgbt.metrics import names, scores
@@ -62,12 +61,6 @@ def _take_part(spec: RunSpec) -> None:
         reason = str(error)
     if not agreed(False):
         return
-    # Process 0 has written what was missing in the cache of images.
-    if not reason:
-        try:
-            decode_ahead(setup.session, *setup.names)
-        except InputError as error:
-            reason = str(error)
     if any(collected(reason)):
         sys.exit(LOST)  # process 0 reports it
     _Part(setup).complete()

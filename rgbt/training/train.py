@@ -16,7 +16,6 @@ from rgbt.assembly.training_setup import TrainingSetup, set_up_training
 from rgbt.checks import InputError
 from rgbt.engine.checkpoint import Checkpoints, State
 from rgbt.engine.trainer import WAIT_SHARE, Trainer
-from rgbt.evaluation.prediction import decode_ahead
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.evaluation.segmentation import evaluate, legend_of, panel_names, result_tables
 from rgbt.metrics import names, scores
@@ -93,7 +92,6 @@ def _train_unfinished(
             announce_upstream(setup, description.name, upstream_of)
         else:
             announce_training(setup, description.name, spec.folder)
-        decode_ahead(setup.session, *setup.names)
         if spec.is_finished:
             kept = set_aside(RunFolder(spec.folder))
             known = None if kept is None else read_description(kept.path)

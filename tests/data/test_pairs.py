@@ -9,9 +9,8 @@ import pytest
 import torch
 
 from rgbt.checks import InputError
-from rgbt.data.loaders import LoaderSettings, train_batches
+from rgbt.data.loaders import LoadedPair, LoaderSettings, PairedBatches, train_batches
 from rgbt.data.mfnet import MFNet
-from rgbt.data.pairs import LoadedPair, PairedBatches
 from rgbt.transforms.thesis import ThesisTransform
 from rgbt.types import Batch
 

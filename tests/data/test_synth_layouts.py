@@ -19,12 +19,10 @@ from rgbt.config.compose import compose
 from rgbt.data.freiburg import CLASSES as FREIBURG_CLASSES
 from rgbt.data.freiburg import Freiburg
 from rgbt.data.kp import CLASSES as KP_CLASSES
-from rgbt.data.kp import KP
-from rgbt.data.kp_layout import set_of
+from rgbt.data.kp import KP, set_of
 from rgbt.data.mfnet import MFNet
 from rgbt.data.pst900 import CLASSES as PST900_CLASSES
-from rgbt.data.pst900 import PST900
-from rgbt.data.pst900_layout import bag_of
+from rgbt.data.pst900 import PST900, bag_of
 from rgbt.data.synth import cache, dataset, freiburg, kp, people, pst900, writer
 from rgbt.data.synth.factors import EgoMotion, SceneFactors
 from rgbt.data.synth.freiburg import counts_of, freiburg_ids, seen_in_thermal, synth_freiburg

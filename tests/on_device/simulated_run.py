@@ -40,9 +40,9 @@ class SimulatedRun:
     evaluation_waits: Counter[str]
 
 
-def words_of(experiment: str, augment: str = "loader") -> list[str]:
+def words_of(experiment: str) -> list[str]:
     """Overrides of a step at smoke size."""
-    return [*smoke_words(experiment), f"data.augment={augment}"]
+    return list(smoke_words(experiment))
 
 
 def on_cpu(words: Sequence[str], folder: Path, steps: int = 2) -> SimulatedRun:

@@ -77,7 +77,7 @@ def test_lines_of_tests_are_not_ours() -> None:
     "experiment", ["crm", pytest.param("temporal_con", marks=pytest.mark.slow), "sh_adversarial"]
 )
 def test_steps_and_classes_are_those_of_the_cpu(experiment: str, tmp_path: Path) -> None:
-    words = words_of(experiment, "device" if experiment == "crm" else "loader")
+    words = words_of(experiment)
     here, found = on_cpu(words, tmp_path), simulated(words, tmp_path)
     assert found.losses == pytest.approx(here.losses, rel=1e-5)
     differing = sum(int((a != b).sum()) for a, b in zip(here.classes, found.classes))

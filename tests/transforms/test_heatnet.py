@@ -193,14 +193,12 @@ def test_training_takes_the_transform_of_each_domain(monkeypatch: pytest.MonkeyP
     from types import SimpleNamespace
 
     from rgbt.assembly import training_setup
-    from rgbt.data import pairs
 
     taken: list[Any] = []
     monkeypatch.setattr(
         training_setup, "train_batches", lambda *given: taken.append(given[2]) or SimpleNamespace()
     )
-    monkeypatch.setattr(training_setup, "_where_to_augment", lambda _: "loader")
-    monkeypatch.setattr(pairs, "PairedBatches", lambda *_, **__: None)
+    monkeypatch.setattr(training_setup, "PairedBatches", lambda *_, **__: None)
     transform = heatnet(drop_probability=1.0)
     spec = specified(("+experiment=heatnet_original",))
     session: Any = SimpleNamespace(

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from rgbt.checks import InputError
-from rgbt.data.batches import collate
+from rgbt.data.loaders import collate
 from rgbt.randomness import numpy_generator
 from rgbt.transforms.crm import CrmTransform
 from rgbt.transforms.hsv import to_hsv, to_rgb

@@ -1,4 +1,4 @@
-"""The input path: cache and augmentation on the device, alone and in front of a CRM step."""
+"""The input path: cache and loader, alone and in front of a CRM step."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from statistics import median
 
 from rgbt.assembly.training_setup import TrainingSetup
 from rgbt.engine.trainer import WAIT_SHARE
-from rgbt.evaluation.prediction import decode_ahead
 from rgbt.runtime.resources import is_out_of_memory
 from tests.benchmarks.gpu.device import arithmetic, checked, reset_peak, wait
 from tests.benchmarks.gpu.project import Training, crm_words, setup_of, write_mfnet
@@ -31,19 +30,16 @@ def measure(task: Task) -> None:
     for number in task.as_time_allows(workers, first=8.0):
         reset_peak(device)
         setup = setup_of(_words(task, root, size, number), device)
-        began = time.perf_counter()
-        decode_ahead(setup.session, "train")
-        decoding = time.perf_counter() - began
         row = {
             "num_workers": int(number),
             "images per second, loader": _loader_alone(setup, size, 4 if task.smoke else 40),
         }
         row |= _in_training(task, setup, size)
-        task.row(**row, **{"decoding, s": decoding})
+        task.row(**row)
         shares[number] = row.get(WAIT_SHARE, float("nan"))
     cores = len(os.sched_getaffinity(0))
     where = "synthetic images" if task.data is None else str(task.data)
-    task.note(f"Batch {size}, {where}, cache and augmentation on the device, {cores} CPU cores.")
+    task.note(f"Batch {size}, {where}, cache, {cores} CPU cores.")
     task.headline("wait_share: " + ", ".join(f"{n} workers {s:.2g}" for n, s in shares.items()))
 
 
@@ -52,7 +48,7 @@ def _words(task: Task, root: Path, size: int, workers: str) -> list[str]:
     if task.smoke:
         words += ["dataset=mfnet", f"dataset.root={root}"]
     cache = task.folder / "cache"
-    words += [f"data.num_workers={workers}", f"data.cache={cache}", "data.augment=device"]
+    words += [f"data.num_workers={workers}", f"data.cache={cache}"]
     return [*words, "trainer.precision=bf16-mixed"]
 
 
