@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -61,6 +61,7 @@ class TrainingSetup:
         rare: how images of the source are drawn by class; None: each once per epoch.
         scheme: yields the phases of a step.
         schedule: learning rate factor per step.
+        sizes: height and width of the first image: "stored", "trained" and "predicted".
     """
 
     session: Session
@@ -73,6 +74,7 @@ class TrainingSetup:
     rare: RareClasses | None
     scheme: Scheme
     schedule: Schedule
+    sizes: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
 
     def steps_per_epoch(self) -> int:
         """Batches of one epoch of the source."""
@@ -147,7 +149,7 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
         steps_per_epoch(session.dataset, loading, domain.split)
         is_missing = labels_key(name) in missing
         datasets[name] = session.dataset if is_missing else _labelled(session, name, domain, names)
-    _probe(session, names, masker, scheme)
+    sizes = _probe(session, names, masker, scheme)
     if upstream_finished:
         _report_unpublished_settings(session, names)
     rare = None
@@ -158,12 +160,18 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
     others, optimizers = _networks_and_optimizers(session, fabric, scheme)
     schedule: Schedule = spec.schedule.build()
     return TrainingSetup(
-        session, fabric, names, datasets, model, others, optimizers, rare, scheme, schedule
+        *(session, fabric, names, datasets, model, others, optimizers, rare, scheme, schedule),
+        sizes=sizes,
     )
 
 
-def _probe(session: Session, names: Lists, masker: AnyMasker, scheme: object) -> None:
-    """Use a user's own parts, another author's network, the masker and the cameras once."""
+def _probe(
+    session: Session, names: Lists, masker: AnyMasker, scheme: object
+) -> dict[str, tuple[int, ...]]:
+    """Use a user's own parts, another author's network, the masker and the cameras once.
+
+    Returns the sizes of an image.
+    """
     transform, seed = session.transform, session.spec.seed
     check_dataset(reader_of(session.dataset), names)
     check_part("transform", transform)
@@ -174,8 +182,8 @@ def _probe(session: Session, names: Lists, masker: AnyMasker, scheme: object) ->
     tested = transform.test(shown)
     if session.spec.model.target == EXTERNAL:
         _probe_external(session, example_hw, tested.thermal.shape)
-    crop_hw = example_hw if is_own(masker) else record_of(transform).crop_hw
-    if crop_hw is not None and record_of(masker).hides_cells:
+    crop_hw = (not is_own(masker) and record_of(transform).crop_hw) or example_hw
+    if record_of(masker).hides_cells:
         check_masker(masker, crop_hw, torch_generator(seed, "probe"))
     cameras = [("scheme", record_of(scheme).camera, example_hw)]
     if session.consistency.sets:
@@ -187,6 +195,8 @@ def _probe(session: Session, names: Lists, masker: AnyMasker, scheme: object) ->
                 camera.matrix(image_hw)
         except InputError as error:
             raise InputError(f"{node}.view.{error}") from error
+    predicted = tested.thermal.shape
+    return {"stored": shown.thermal.shape, "trained": example_hw, "predicted": predicted}
 
 
 def _first_readable(session: Session, names: tuple[str, ...]) -> Sample:
