@@ -10,6 +10,7 @@ from dataclasses import replace
 from analysis.predictions.folder import listed
 from analysis.predictions.scoring import FolderScores
 from analysis.predictions.table import ALL, Metric, Score, ScoreKey, ScoreTable
+from rgbt.checks import without_controls
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.names import MACC, MIOU
 from rgbt.tables import ABSENT, TextTable, class_labels, csv_text, number
@@ -118,7 +119,8 @@ def remarks_on(scored: FolderScores) -> list[str]:
 
 def markdown(title: str, tables: Sequence[ScoreTable], remarks: Sequence[str]) -> str:
     """One page: remarks, then the tables of each partition."""
-    lines = [f"# {title}", "", *(f"- {remark}" for remark in remarks)]
+    heading = [f"# {title}", "", *(f"- {remark}" for remark in remarks)]
+    lines = [without_controls(line.replace("\n", "?")) for line in heading]
     for table in tables:
         lines += ["", *filter(None, (convention_line(table), table.intervals))]
         lines += [f"\n{grid.to_markdown()}".rstrip("\n") for grid in grids(table)]

@@ -123,16 +123,24 @@ class FileDataset:
             "[low, high], the values that become black and white",
         )
 
+    def listed(self, split: str) -> tuple[str, ...]:
+        """Names of a known split, in order; () if there are none, InputError if unreadable."""
+        return self.rule.names(split)
+
     def has(self, split: str) -> bool:
         """Whether any sample of `split` exists; InputError if the split is unknown."""
         self.check_split(split)
-        return self.rule.has(split)
+        if split not in self._names:
+            self._names[split] = self.listed(split)
+        return bool(self._names[split])
 
     def names(self, split: str) -> tuple[str, ...]:
         """Names of a split, in order; InputError if it is unknown, missing or empty."""
-        self.check_split(split)
-        if split not in self._names:
-            self._names[split] = self.rule.names(split)
+        if not self.has(split):
+            raise InputError(
+                f"split '{split}' of {self.name} is empty: expected "
+                f"{self.splits.get(split, 'nothing')} in {self.root}."
+            )
         return self._names[split]
 
     def frame(self, name: str) -> Frame:
@@ -200,8 +208,7 @@ class FileDataset:
 
     def fingerprint(self) -> str:
         """See `hash_of_files`; splits that are not there are empty."""
-        names = {split: self.names(split) if self.has(split) else () for split in self.splits}
-        return hash_of_files(names, self.files)
+        return hash_of_files({split: self.listed(split) for split in self.splits}, self.files)
 
     # Members for `rgbt check`.
 

@@ -128,9 +128,7 @@ class Folder(FileDataset):
     def fingerprint(self) -> str:
         """SHA-256 in hexadecimal over `hash_of_files` and the map of label values."""
         listed = {
-            split: tuple(name for name in self.names(split) if name in self.frames)
-            if self.has(split)
-            else ()
+            split: tuple(name for name in self.listed(split) if name in self.frames)
             for split in self.splits
         }
         meaning = json.dumps([sorted(self.codes.codes.items()), self.codes.of_colours])
@@ -155,8 +153,7 @@ class Folder(FileDataset):
 
     @cached_property
     def _without_labels(self) -> frozenset[str]:
-        present = [split for split in self.unlabelled if self.has(split)]
-        return frozenset(name for split in present for name in self.names(split))
+        return frozenset(name for split in self.unlabelled for name in self.listed(split))
 
     def _rule_of(
         self,

@@ -170,27 +170,22 @@ class Freiburg(FileDataset):
         """Split -> the pattern of its files."""
         return {key: each for key, each in SPLITS.items() if key != "val" or self.val_sequences}
 
-    def has(self, split: str) -> bool:
-        """Whether `split` has frames; InputError if the split is unknown ("val" is known)."""
-        return bool(self._of(split))
+    def check_split(self, split: str) -> None:
+        """Refuse a split that is not one of `splits`; "val" is empty where no sequence is held out."""
+        if split != "val":
+            super().check_split(split)
 
-    def names(self, split: str) -> tuple[str, ...]:
+    def listed(self, split: str) -> tuple[str, ...]:
         """Names of a split, sorted by folder and file, the day before the night.
 
         Raises:
-            InputError: unknown split, no frame of it, a missing sequence of "val".
+            InputError: `val_sequences` names none.
         """
-        found = self._of(split)
         days = [frame for frame in self._frames.values() if _time_of(frame) == "train_day"]
         known = sorted({word for frame in days for word in _sequences(frame)})
         for word in self.val_sequences if known and split in ("train", "train_day", "val") else ():
             check_choice("dataset.val_sequences", word, known)
-        if not found:
-            raise InputError(
-                f"split '{split}' of {self.name} is empty: expected {SPLITS[split]} in {self.root};"
-                f" dataset.val_sequences={list(self.val_sequences)}."
-            )
-        return found
+        return self._of(split)
 
     def read(self, name: str) -> Sample:
         """See `FileDataset`; cut, thermal as grey levels, without a label in training at night."""
@@ -321,20 +316,10 @@ class Freiburg(FileDataset):
             label=labels.get(words, expected.label) if is_test or times == ["day"] else None,
         )
 
-    @cached_property
-    def _of_split(self) -> dict[str, tuple[str, ...]]:
-        wanted = {**{split: split for split in SPLITS}, "train": "train_day", "val": "val_day"}
-        return {
-            split: tuple(
-                name for name, frame in self._frames.items() if self._part(frame).startswith(part)
-            )
-            for split, part in wanted.items()
-        }
-
     def _of(self, split: str) -> tuple[str, ...]:
-        if split != "val":  # empty by choice where no sequence is held out
-            self.check_split(split)
-        return self._of_split[split]
+        part = {"train": "train_day", "val": "val_day"}.get(split, split)
+        frames = self._frames.items()
+        return tuple(name for name, frame in frames if self._part(frame).startswith(part))
 
     def _part(self, frame: Frame) -> str:
         """The part and time of a frame: "val_day" of training days that are held out."""

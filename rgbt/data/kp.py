@@ -135,30 +135,22 @@ class KP(FileDataset):
             return self._files
         return {split: f"labels of the sets {self._sets(split)}" for split in SPLITS}
 
-    def has(self, split: str) -> bool:
-        """Whether any sample of `split` exists; InputError if the split is unknown."""
-        self.check_split(split)
+    def listed(self, split: str) -> tuple[str, ...]:
+        """Names of a split, in the order of its list, or sorted; InputError for invalid names."""
         if self.by_set:
-            return bool(self._of_sets(split))
+            wanted = self._sets(split)
+            return tuple(name for name in self._labels if set_of(name) in wanted)
         sources = self.sources(split)
-        # The list of the whole may contain days or nights only.
-        return bool(self._read(split) if sources and sources[0] != self._files[split] else sources)
-
-    def names(self, split: str) -> tuple[str, ...]:
-        """Names of a split, in the order of its list, or sorted.
-
-        Raises:
-            InputError: unknown split, missing or empty list, an invalid name, no label of the sets.
-        """
-        self.check_split(split)
-        if split not in self._names:
-            self._names[split] = self._of_sets(split) if self.by_set else self._read(split)
-        if not self._names[split]:
-            raise InputError(
-                f"split '{split}' of {self.name} is empty: expected {self.splits[split]} in "
-                f"{self.root}."
-            )
-        return self._names[split]
+        lines = [
+            line for each in sources for line in read_names(self.root / each, "dataset.splits")
+        ]
+        names = tuple(line.removesuffix(".png") for line in lines)
+        self.nights(names)  # refuses invalid names
+        if len(sources) > 1:
+            return tuple(sorted(names))
+        if sources == (self._files[split],):
+            return names
+        return tuple(name for name in names if is_night(name) == split.endswith("_night"))
 
     def frame(self, name: str) -> Frame:
         """The files of `name`; InputError if the name is invalid."""
@@ -197,23 +189,6 @@ class KP(FileDataset):
     def _sets(self, split: str) -> list[int]:
         base, _, time = split.partition("_")
         return [n for n in SETS[base] if not time or (n in NIGHT_SETS) == (time == "night")]
-
-    def _of_sets(self, split: str) -> tuple[str, ...]:
-        wanted = self._sets(split)
-        return tuple(name for name in self._labels if set_of(name) in wanted)
-
-    def _read(self, split: str) -> tuple[str, ...]:
-        sources = self.sources(split) or (self._files[split],)
-        lines = [
-            line for each in sources for line in read_names(self.root / each, f"split '{split}'")
-        ]
-        names = tuple(line.removesuffix(".png") for line in lines)
-        self.nights(names)  # refuses invalid names
-        if len(sources) > 1:
-            return tuple(sorted(names))
-        if sources[0] == self._files[split]:
-            return names
-        return tuple(name for name in names if is_night(name) == split.endswith("_night"))
 
 
 def pick_kp(kaist: Path, labels: Path, out: Path) -> int:

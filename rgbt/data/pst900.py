@@ -100,29 +100,20 @@ class PST900(FileDataset):
             "test": "test/rgb/*.png",
         }
 
-    def has(self, split: str) -> bool:
-        """Whether any sample of `split` exists; InputError if the split is unknown."""
-        self.check_split(split)
-        return bool(self._chosen(split))
-
-    def names(self, split: str) -> tuple[str, ...]:
-        """Names of a split, sorted; InputError if it is unknown or empty, or lacks a bag."""
-        self.check_split(split)
-        if split != "test":
-            known = {bag_of(name) for name in self._names_of["train"]}
-            for bag in self.val_bags:
-                if bag not in known:
-                    raise InputError(
-                        f"dataset.val_bags: the training part of {self.root} has no bag {bag}; its "
-                        f"bags are {sorted(each for each in known if each is not None)}."
-                    )
-        names = self._chosen(split)
-        if not names:
-            raise InputError(
-                f"split '{split}' of {self.name} is empty: expected {self.splits[split]} in "
-                f"{self.root}."
-            )
-        return names
+    def listed(self, split: str) -> tuple[str, ...]:
+        """Names of a split, sorted; InputError if it lacks a bag of `val_bags`."""
+        train = self._names_of["train"]
+        if split == "test" or (split == "val" and not self.val_bags):
+            return tuple(self._names_of["test"])
+        bags = {bag_of(name) for name in train}
+        for bag in self.val_bags:
+            if bag not in bags:
+                raise InputError(
+                    f"dataset.val_bags: the training part of {self.root} has no bag {bag}; its "
+                    f"bags are {sorted(each for each in bags if each is not None)}."
+                )
+        is_val = split == "val"
+        return tuple(name for name in train if (bag_of(name) in self.val_bags) == is_val)
 
     def frame(self, name: str) -> Frame:
         """The files of `name`; InputError if no part or both have it."""
@@ -162,10 +153,3 @@ class PST900(FileDataset):
             )
             for part in PARTS
         }
-
-    def _chosen(self, split: str) -> tuple[str, ...]:
-        if split == "test" or (split == "val" and not self.val_bags):
-            return tuple(self._names_of["test"])
-        is_val = split == "val"
-        names = self._names_of["train"]
-        return tuple(name for name in names if (bag_of(name) in self.val_bags) == is_val)

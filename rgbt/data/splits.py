@@ -28,12 +28,8 @@ class SplitRule(Protocol):
         """Split -> its definition, for messages."""
         ...
 
-    def has(self, split: str) -> bool:
-        """Whether a known split has a frame or a list."""
-        ...
-
     def names(self, split: str) -> tuple[str, ...]:
-        """Names of a known split; InputError if it is missing or empty."""
+        """Names of a known split; () if there are none."""
         ...
 
 
@@ -57,23 +53,8 @@ class ByFolder:
         text = self.pattern.text
         return {split: text.replace(f"{{{SPLIT}}}", word) for split, word in self.folders.items()}
 
-    def has(self, split: str) -> bool:
-        """Whether there is a frame in its folder."""
-        return bool(self._of(split))
-
     def names(self, split: str) -> tuple[str, ...]:
-        """Names in its folder; InputError if there are none."""
-        names = self._of(split)
-        if not names:
-            known = sorted({frame.values[SPLIT] for frame in self.frames.values()})
-            raise InputError(
-                f"dataset.folders: split '{split}' is empty, because no file has "
-                f"'{self.folders[split]}' for {{{SPLIT}}} in dataset.rgb='{self.pattern.text}'; "
-                f"existing values: {', '.join(known)}."
-            )
-        return names
-
-    def _of(self, split: str) -> tuple[str, ...]:
+        """Names in its folder."""
         word = self.folders[split]
         return tuple(name for name, frame in self.frames.items() if frame.values[SPLIT] == word)
 
@@ -103,19 +84,15 @@ class ByList:
         """Split -> its list."""
         return dict(self.lists)
 
-    def has(self, split: str) -> bool:
-        """Whether its list exists."""
-        return is_there(self._path(split))
-
     def names(self, split: str) -> tuple[str, ...]:
-        """Names in the order of the list.
+        """Names in the order of the list; () if there is none.
 
         A line without a frame is kept, so that reading it raises the error. InputError if no line
-        is a frame, or if the list does not exist.
+        is a frame.
         """
-        path, key = self._path(split), f"{self.key}.{split}"
+        path, key = self.root / Path(self.lists[split]).expanduser(), f"{self.key}.{split}"
         if not is_there(path):
-            raise InputError(f"{key}: the list '{path}' does not exist; write it, one name a line.")
+            return ()
         lines = read_names(path, key)
         if not self.frames:
             return lines
@@ -127,9 +104,6 @@ class ByList:
                 f"'{lines[0]}'; expected names such as '{next(iter(self.frames))}'."
             )
         return names
-
-    def _path(self, split: str) -> Path:
-        return self.root / Path(self.lists[split]).expanduser()
 
     def _forms(self) -> dict[str, str]:
         """Everything that a line may be -> the name of the frame; names come before all else."""
@@ -188,10 +162,6 @@ class ByShare:
     def splits(self) -> dict[str, str]:
         """Split -> its share."""
         return {split: f"{share:g} of the frames" for split, share in self.shares.items()}
-
-    def has(self, split: str) -> bool:
-        """Every split has frames."""
-        return split in self.shares
 
     def names(self, split: str) -> tuple[str, ...]:
         """Names of a split in the order of all frames."""

@@ -153,18 +153,10 @@ class VideoDataset(FileDataset):
                 )
         return tuple(run for video in videos for run in consecutive(self.videos[video]))
 
-    def has(self, split: str) -> bool:
-        """Whether the list of `split` exists; InputError if the split is unknown."""
-        self.check_split(split)
-        return self._lists is None or self._lists.has(split)
-
-    def names(self, split: str) -> tuple[str, ...]:
+    def listed(self, split: str) -> tuple[str, ...]:
         """Labelled frames of a split, video by video; all frames where none is labelled."""
-        if split not in self._names:
-            every = self.all_names(split)
-            labelled = tuple(name for name in every if self.frame(name).label is not None)
-            self._names[split] = labelled or every
-        return self._names[split]
+        every = self.all_names(split)
+        return tuple(name for name in every if self.frame(name).label is not None) or every
 
     def frame(self, name: str) -> Frame:
         """The files of `name`; no label where there was none when the folder was listed."""
@@ -180,7 +172,7 @@ class VideoDataset(FileDataset):
         """
         if self._lists is None:
             return None
-        listed = {s: set(self._lists.names(s)) for s in self.splits if self._lists.has(s)}
+        listed = {split: set(self._lists.names(split)) for split in self.splits}
         at_night, by_day = set[str](), set[str]()
         for split, videos in listed.items():
             whole, _, part = split.rpartition("_")
@@ -196,8 +188,7 @@ class VideoDataset(FileDataset):
 
     def fingerprint(self) -> str:
         """See `hash_of_files`; of all frames, labelled or not."""
-        listed = {split: self.all_names(split) if self.has(split) else () for split in self.splits}
-        return hash_of_files(listed, self.files)
+        return hash_of_files({s: self.all_names(s) for s in self.splits}, self.files)
 
     def unused(self, lists: SplitNames) -> Iterable[Path]:  # noqa: ARG002 - as every data set
         """None: frames without a label belong to a video, for the rest see `own_problems`."""
