@@ -33,32 +33,8 @@ class Folder(FileDataset):
     any text. The values of the words in the path of the RGB image, joined by "_", are the name of a
     sample; thermal image and label have the same values in their paths.
 
-    Args:
-        root: folder that the patterns are relative to.
-        num_classes: see `FileDataset`, as `classes`, `name` and `palette`.
-        classes: see there.
-        rgb: pattern of the RGB images, 8 bit, three channels.
-        thermal: pattern of the thermal images, one channel or three equal ones, of the size of the
-            RGB image; the same as `rgb` for files of four channels R, G, B, thermal.
-        label: pattern of the labels, images or `.npy`; None: the data set has no labels.
-        name: see there.
-        palette: None: the colours of `colours`, or colours that differ.
-        unscored: classes that are counted but left out of every mean over classes.
-        background: classes that are no object, see `rgbt.dataset.LabelledDataset`.
-        folders: split -> value of {split}; None: train, val and test.
-        lists: split -> list file in `root`; replaces `folders`.
-        shares: split -> share of the frames, 1 in total; replaces `folders`.
-        shares_seed: seed of the draw of `shares`.
-        block: number of consecutive frames that are drawn together; None: whole sequences.
-        unlabelled: splits without labels; no label files are expected.
-        ids: label value -> class; None: values are class indices.
-        colours: class -> its colour in label images, or several; replaces `ids`.
-        ignored: label values, or colours, that do not count.
-        thermal_range: (low, high) thermal values that become black and white; None: 8 bit.
-        night: pattern of the names of night images, with * and ?; None: unknown.
-
-    Raises:
-        InputError: no such root, patterns that match nothing, or invalid settings.
+    Arguments: the keys of conf/dataset/folder.yaml, which describes each. InputError: no such
+    root, another layout, or settings that do not fit each other.
     """
 
     def __init__(  # noqa: PLR0913 - each is a key of the configuration

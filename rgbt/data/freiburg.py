@@ -98,24 +98,8 @@ class Freiburg(FileDataset):
     semantic segmentation using domain adaptation with thermal images" (TU Eindhoven, 2022) and its
     code.
 
-    Args:
-        root: folder that holds `train`, `test` or both.
-        name: see `FileDataset`, as `num_classes`, `classes` and `palette`.
-        unscored: classes that are counted but left out of every mean over classes.
-        background: classes that are no object, see `rgbt.dataset.LabelledDataset`.
-        crop: first row, row after the last, first column, column after the last of the part of
-            every frame and label that is used; None: whole frames.
-        thermal_range: (low, high) counts that become black and white: [21800, 23700] in the thesis,
-            [21800, 25000] in the HeatNet release.
-        ignored_test: classes that are ignored in "val" and "test" (they become 255):
-            "ignore" in HeatNet, none in the code of the thesis. In training they stay classes.
-        val_sequences: day sequences ("seq_04_day") or pieces of them ("seq_03_day/00") that form
-            "val". (): all 12,170 frames by day are for training, as in the thesis and its port of
-            HeatNet, and there is no "val".
-
-    Raises:
-        InputError: no such root, neither part in it, an empty crop or range, or numbers of classes,
-            names and colours that differ.
+    Arguments: the keys of conf/dataset/freiburg.yaml, which describes each. InputError: no such
+    root, another layout, or settings that do not fit each other.
     """
 
     title = "layout of Freiburg Thermal"
@@ -171,7 +155,7 @@ class Freiburg(FileDataset):
         return {key: each for key, each in SPLITS.items() if key != "val" or self.val_sequences}
 
     def check_split(self, split: str) -> None:
-        """Refuse a split that is not one of `splits`; "val" is empty where no sequence is held out."""
+        """Refuse a split that is not one of `splits`, but for "val", which may be empty."""
         if split != "val":
             super().check_split(split)
 
@@ -238,26 +222,6 @@ class Freiburg(FileDataset):
         """Thermal images and labels without an RGB image."""
         used = {path for frame in self._frames.values() for path in frame[2:]}
         return [path for path in self._listed[1] if path not in used]
-
-    def own_problems(self, lists: SplitNames) -> list[str]:
-        """Frames in two parts, by their time stamps; names differ between the parts."""
-
-        def forms(name: str) -> tuple[str, str]:
-            """The stamp without and with the number in the burst, which may be left out."""
-            stamp = self.frame(name).values["stamp"]
-            return stamp.removesuffix("0"), stamp
-
-        problems = []
-        for test in ("test_day", "test_night"):
-            for other in ("train_day", "train_night", "val"):
-                trained = {form: name for name in lists.get(other, ()) for form in forms(name)}
-                both = [name for name in lists.get(test, ()) if forms(name)[0] in trained]
-                problems += [
-                    f"splits {test} and {other} share {len(both)} frames by their time stamps; "
-                    f"the first is '{name}', which is '{trained[forms(name)[0]]}'."
-                    for name in both[:1]
-                ]
-        return problems
 
     @property
     def _frames(self) -> dict[str, Frame]:

@@ -73,9 +73,8 @@ class KP(FileDataset):
     images/setXX/VYYY/{visible,lwir}/IZZZZZ.jpg and labels/setXX_VYYY_IZZZZZ.png.
 
     Splits: "train", "val", "test" and the day and night of each. Lists hold one name per line, with
-    or without .png. Without a list SPLIT_day or SPLIT_night, that split is the part of SPLIT by set
-    number; without a list SPLIT, it is SPLIT_day and SPLIT_night together, sorted, as in the CRM
-    release.
+    or without .png. Where there are none, the labels on disk are divided by set numbers, as in the
+    CRM release.
 
     Label files hold 0 to K - 1 and K (19) for void, which becomes 255; 255 is accepted as well.
 
@@ -87,16 +86,8 @@ class KP(FileDataset):
     Source: images KAIST multispectral pedestrian data set (Hwang et al., CVPR 2015); labels MS-UDA
     (Kim et al., RA-L 2021); split CRM (Shin et al., ICRA 2024).
 
-    Args:
-        root: folder that holds `images` and `labels`.
-        name: see `FileDataset`, as `num_classes`, `classes` and `palette`.
-        background: classes that are no object, see `rgbt.dataset.LabelledDataset`.
-        splits: split -> list file in `root`.
-        lists: "sets" divides all labels on disk by set number, as CRM does; "auto" reads the lists
-            of `splits` if one of them exists, or if they are not the usual ones.
-
-    Raises:
-        InputError: no such root, no known layout, or numbers of classes, names and colours differ.
+    Arguments: the keys of conf/dataset/kp.yaml, which describes each. InputError: no such
+    root, another layout, or settings that do not fit each other.
     """
 
     images = PairReader(
@@ -140,17 +131,11 @@ class KP(FileDataset):
         if self.by_set:
             wanted = self._sets(split)
             return tuple(name for name in self._labels if set_of(name) in wanted)
-        sources = self.sources(split)
-        lines = [
-            line for each in sources for line in read_names(self.root / each, "dataset.splits")
-        ]
+        path = self.root / self._files[split]
+        lines = read_names(path, f"dataset.splits.{split}") if is_there(path) else ()
         names = tuple(line.removesuffix(".png") for line in lines)
         self.nights(names)  # refuses invalid names
-        if len(sources) > 1:
-            return tuple(sorted(names))
-        if sources == (self._files[split],):
-            return names
-        return tuple(name for name in names if is_night(name) == split.endswith("_night"))
+        return names
 
     def frame(self, name: str) -> Frame:
         """The files of `name`; InputError if the name is invalid."""
@@ -159,18 +144,6 @@ class KP(FileDataset):
     def nights(self, names: tuple[str, ...]) -> tuple[bool, ...]:
         """Whether each image was taken at night, by set number; InputError for other names."""
         return tuple(is_night(name) for name in names)
-
-    def sources(self, split: str) -> tuple[str, ...]:
-        """The lists of a split, its own or those that it is made of; or its sets."""
-        if self.by_set:
-            return super().sources(split)
-        base, _, time = split.rpartition("_")
-        parts = [f"{split}_{each}" for each in TIMES]
-        for wanted in ([split], [base] if time in TIMES else [], parts):
-            lists = [self._files[each] for each in wanted if each in self._files]
-            if lists and len(lists) == len(wanted) and all(is_there(self.root / x) for x in lists):
-                return tuple(lists)
-        return ()
 
     def unused(self, lists: SplitNames) -> list[Path]:
         """Labels of no split; images without a label are many and not meant."""

@@ -71,18 +71,22 @@ class Transform(Protocol):
 
 
 @dataclass(frozen=True)
-class SplitReader:
-    """Reads the samples of one split.
+class Examples:
+    """Reads and transforms the samples of one split.
 
     Attributes:
         dataset: reads samples.
         names: the split.
+        transform: makes examples.
         skip_errors: record an unreadable sample instead of raising.
+        seed: run seed.
     """
 
     dataset: LabelledDataset
     names: tuple[str, ...]
+    transform: Transform
     skip_errors: bool
+    seed: int = 0
 
     def read(self, name: str, skipped: dict[str, str]) -> Sample | None:
         """The sample; None, with the reason in `skipped`, if it is skipped."""
@@ -105,43 +109,15 @@ class SplitReader:
             f"first one: {skipped[names[0]]}"
         )
 
-
-@dataclass(frozen=True)
-class TrainExamples:
-    """Augmented examples; a key is (epoch, index in the split).
-
-    Attributes:
-        source: reads samples.
-        transform: augments them.
-        seed: run seed.
-    """
-
-    source: SplitReader
-    transform: Transform
-    seed: int
-
-    def __call__(self, key: tuple[int, int], skipped: dict[str, str]) -> Example:
-        """The example of `key`, or of the next readable sample of the list.
-
-        Raises:
-            InputError: no sample of the split can be read.
-        """
+    def train(self, key: tuple[int, int], skipped: dict[str, str]) -> Example:
+        """The augmented example of (epoch, index in the split), or of the next readable sample."""
         epoch, index = key
-        names = self.source.names
-        sample = self.source.first_readable((*names[index:], *names[:index]), skipped)
+        sample = self.first_readable((*self.names[index:], *self.names[:index]), skipped)
         return self.transform.train(sample, numpy_generator(self.seed, "augment", epoch, index))
 
-
-@dataclass(frozen=True)
-class EvalExamples:
-    """Examples for evaluation; a key is a name."""
-
-    source: SplitReader
-    transform: Transform
-
-    def __call__(self, key: str, skipped: dict[str, str]) -> Example | None:
-        """The example of `key`, or None if it cannot be read."""
-        sample = self.source.read(key, skipped)
+    def test(self, key: str, skipped: dict[str, str]) -> Example | None:
+        """The example of a name for evaluation, or None if it cannot be read."""
+        sample = self.read(key, skipped)
         return None if sample is None else self.transform.test(sample)
 
 
@@ -328,12 +304,12 @@ def train_batches(  # noqa: PLR0913 - most trainings draw no classes
     """
     per_epoch = steps_per_epoch(dataset, settings, split)
     names = dataset.names(split)
-    source = SplitReader(dataset, names, settings.on_error == "skip")
-    make: MakeExample = TrainExamples(source, transform, seed)
+    source = Examples(dataset, names, transform, settings.on_error == "skip", seed)
+    make: MakeExample = source.train
     if rare is not None:
         from rgbt.data.rare_classes import RareClassExamples  # few runs draw by class
 
-        make = RareClassExamples(source, transform, seed, rare)
+        make = RareClassExamples(source, rare)
     order = partial(numpy_generator, seed, "order")
     whole_batches = _train_keys(
         len(names), settings.batch_size, per_epoch, steps, None if rare else order
@@ -351,10 +327,10 @@ def eval_batches(
     Process r of W has the batches r, r + W, r + 2 W, ..., possibly none.
     """
     names = dataset.names(split)
-    source = SplitReader(dataset, names, settings.on_error == "skip")
+    source = Examples(dataset, names, transform, settings.on_error == "skip")
     size = settings.eval_batch_size
     keys = [list(names[start : start + size]) for start in range(0, len(names), size)]
-    reader = BatchReader(EvalExamples(source, transform), EVAL_ADVICE)
+    reader = BatchReader(source.test, EVAL_ADVICE)
     return Batches(reader, keys=keys[rank() :: num_processes()], settings=settings)
 
 

@@ -51,15 +51,8 @@ class MFNet(FileDataset):
     the SpatialSeg and Temporal downloads. Class 0 is a class ("unlabeled", trained and scored as
     in the published tables); 255 is ignored.
 
-    Args:
-        root: folder that holds the split lists.
-        name: see `FileDataset`, as `num_classes`, `classes` and `palette`.
-        background: classes that are no object, see `rgbt.dataset.LabelledDataset`.
-        splits: split -> list file in `root`; two splits may share one list.
-        layout: "packed", "folders", or "auto": the one with existing folders (packed first).
-
-    Raises:
-        InputError: no such root, no known layout, or numbers of classes, names and colours differ.
+    Arguments: the keys of conf/dataset/mfnet.yaml, which describes each. InputError: no such
+    root, another layout, or settings that do not fit each other.
     """
 
     images = PairReader(layouts=tuple(PairPattern(*layout[:2]) for layout in LAYOUTS.values()))

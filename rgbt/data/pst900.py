@@ -52,16 +52,8 @@ class PST900(FileDataset):
 
     Source: PST900 (Shivakumar et al., ICRA 2020). Nothing is ignored, 255 is accepted.
 
-    Args:
-        root: folder that holds `train` and `test`.
-        name: see `FileDataset`, as `num_classes`, `classes` and `palette`.
-        background: classes that are no object, see `rgbt.dataset.LabelledDataset`.
-        val_bags: recordings of the training part that form "val" instead of "train"; (): "val" as
-            described above.
-
-    Raises:
-        InputError: no such root, neither part in it, or numbers of classes, names and colours
-            differ.
+    Arguments: the keys of conf/dataset/pst900.yaml, which describes each. InputError: no such
+    root, another layout, or settings that do not fit each other.
     """
 
     images = PairReader(
@@ -122,15 +114,6 @@ class PST900(FileDataset):
             reason = "both train and test have" if parts else "neither train nor test has"
             raise InputError(f"{self.name} ({self.root}): {reason} an image called '{name}'.")
         return self.patterns.frame(self.root, name, {"name": name, "part": parts[0]})
-
-    def files(self, name: str) -> tuple[Path, ...]:
-        """RGB, thermal and label of `name`; of both parts if both have it."""
-        return tuple(
-            pattern.path(self.root, {"part": part, "name": name})
-            for part in PARTS
-            for pattern in self.patterns
-            if pattern is not None and name in self._names_of[part]
-        )
 
     def nights(self, names: tuple[str, ...]) -> None:  # noqa: ARG002 - as every data set
         """None: it is dark underground at any time."""

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from rgbt.checks import InputError
 from rgbt.data.labels import PixelCounts, label_pixels
 from rgbt.data.loader_settings import LoaderSettings
-from rgbt.data.loaders import SplitReader, Transform
+from rgbt.data.loaders import Examples
 from rgbt.dataset import LabelledDataset
 from rgbt.randomness import numpy_generator
 from rgbt.types import Example
@@ -135,15 +135,11 @@ class RareClassExamples:
     """Augmented examples of drawn classes; a key is (epoch, number of the sample in it).
 
     Attributes:
-        source: reads samples.
-        transform: augments them.
-        seed: run seed.
+        source: reads and augments samples.
         rare: how images are drawn.
     """
 
-    source: SplitReader
-    transform: Transform
-    seed: int
+    source: Examples
     rare: RareClasses
 
     def __call__(self, key: Sequence[int], skipped: dict[str, str]) -> Example:
@@ -156,14 +152,14 @@ class RareClassExamples:
         Raises:
             InputError: no image of the class can be read.
         """
-        drawn, positions = self.rare.draw(numpy_generator(self.seed, "rare class", *key))
+        drawn, positions = self.rare.draw(numpy_generator(self.source.seed, "rare class", *key))
         names = [self.source.names[position] for position in positions]
         sample = self.source.first_readable(names, skipped)
-        rng = numpy_generator(self.seed, "augment", *key)
-        example = self.transform.train(sample, rng)
+        rng = numpy_generator(self.source.seed, "augment", *key)
+        example = self.source.transform.train(sample, rng)
         least = self.rare.min_crop_pixels
         for _ in range(MOST_REDRAWS):
             if least is None or np.count_nonzero(example.label == drawn) > least:
                 break
-            example = self.transform.train(sample, rng)
+            example = self.source.transform.train(sample, rng)
         return example

@@ -233,27 +233,8 @@ class Video(VideoDataset):
     frame, whose last number counts, and {video} its video, if there are several. The name of a
     sample is that of its video and that of its frame, joined by "_".
 
-    Args:
-        root: folder that the patterns are relative to.
-        num_classes: see `FileDataset`, as `classes`, `name` and `palette`.
-        classes: see there.
-        rgb: pattern of the RGB images, 8 bit, three channels.
-        thermal: pattern of the thermal images, one channel or three equal ones, of the size of the
-            RGB image; the same as `rgb` for files of four channels R, G, B, thermal.
-        label: pattern of the labels, which some frames may lack; None: there are none.
-        name: see there.
-        palette: None: colours that differ.
-        unscored: classes that are counted but left out of every mean over classes.
-        background: classes that are no object, see `rgbt.dataset.LabelledDataset`.
-        lists: split -> list of names of videos; None: the split "test" is all videos.
-        gaps: a missing number in a video is refused, or begins another sequence ("split").
-        ids: label value -> class; None: values are class indices.
-        ignored: label values that do not count.
-        thermal_range: (low, high) thermal values that become black and white; None: 8 bit.
-
-    Raises:
-        InputError: no such root, patterns that match nothing, frames without numbers, or invalid
-            settings.
+    Arguments: the keys of conf/dataset/video.yaml, which describes each. InputError: no such
+    root, another layout, or settings that do not fit each other.
     """
 
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
@@ -301,17 +282,8 @@ class MVSeg(VideoDataset):
     Source: Ji et al., "Multispectral Video Semantic Segmentation: A Benchmark Dataset and
     Baseline", CVPR 2023.
 
-    Args:
-        root: folder that holds the lists and `data`.
-        name: see `FileDataset`, as `num_classes`, `classes` and `palette`.
-        background: classes that are no object, see `rgbt.dataset.LabelledDataset`.
-        lists: split -> list of videos in `root`.
-        unlabelled_is: what value 255 means: "ignored", or "ground" as in the authors' code.
-        gaps: see `Video`.
-
-    Raises:
-        InputError: no such root, no videos in it, or numbers of classes, names and colours that
-            differ.
+    Arguments: the keys of conf/dataset/mvseg.yaml, which describes each. InputError: no such
+    root, another layout, or settings that do not fit each other.
     """
 
     images = PairReader(

@@ -79,7 +79,7 @@ def test_lines_of_a_list(root: Path, tmp_path: Path) -> None:
     assert dataset.has("train")
     assert not dataset.has("val")
     assert refused(lambda: dataset.names("val")) == (
-        f"dataset.lists.val: the list '{root}/val.txt' does not exist; write it, one name a line."
+        f"split 'val' of folder is empty: expected val.txt in {root}."
     )
     (tmp_path / "mine.txt").write_text("test_1\n")
     dataset = listed(root, "train_1", lists={"train": str(tmp_path / "mine.txt")})
@@ -138,7 +138,6 @@ def test_shares_of_blocks() -> None:
         names = set(rule.names(split))
         assert names == set().union(*(block for block in blocks if block & names))
         assert list(rule.names(split)) == sorted(names, key=in_order)
-        assert rule.has(split)
 
 
 def test_shares_keep_cameras_of_one_moment_together() -> None:
@@ -210,7 +209,7 @@ def test_splits_by_folder_and_by_shares_of_a_folder(sound: Path) -> None:
     missing = folder(sound, folders={"train": "training", "test": "test"})
     assert not missing.has("train")
     assert missing.has("test")
-    assert "existing values: test, train, val" in refused(lambda: missing.names("train"))
+    assert "expected training/rgb/{name}.png in" in refused(lambda: missing.names("train"))
     # Without the word {sequence} the whole folder is one.
     shares = {"train": 0.5, "val": 0.5}
     drawn = [folder(sound, **PLAIN, shares=shares, block=2, shares_seed=n) for n in range(8)]

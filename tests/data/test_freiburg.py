@@ -239,7 +239,7 @@ def test_sequences_that_are_held_out(root: Path, tmp_path: Path) -> None:
     assert len(dataset.names("train_day")) == len(dataset.names("train")) == 5
     assert "val" not in dataset.splits
     assert not dataset.has("val")
-    with pytest.raises(InputError, match=r"split 'val' of freiburg is empty: .*val_sequences=\[\]"):
+    with pytest.raises(InputError, match="split 'val' of freiburg is empty"):
         dataset.names("val")
     assert not check_dataset(dataset).problems
     assert dataset.fingerprint() != reader(root).fingerprint()
@@ -283,7 +283,7 @@ def test_wrong_settings_are_named(root: Path, wrong: dict[str, object], said: st
         reader(root, **wrong)
 
 
-def test_check_reports_frames_of_two_parts_and_files_of_none(root: Path) -> None:
+def test_check_reports_files_of_no_frame(root: Path) -> None:
     dataset = reader(root)
     report = check_dataset(dataset)
     assert report.problems == ()
@@ -292,11 +292,6 @@ def test_check_reports_frames_of_two_parts_and_files_of_none(root: Path) -> None
     assert night.sizes == {(11, 18): 3}
     val = dataset.frame(dataset.names("val")[0])
     val.rgb.unlink()
-    # A frame of training under the same stamp as one for testing; its thermal lacks the zero.
-    files.write_training(root, "seq_00_day/01", "1579_009")
-    files.write_training(root, "seq_00_night/01", "1580_01000")  # ten times as many nanoseconds
     assert list(check_dataset(reader(root)).problems) == [
-        f"2 files belong to no image of a split; the first is {val.thermal}.",
-        "splits test_day and train_day share 1 frames by their time stamps; the first is "
-        "'test_day_1579_0090', which is 'seq_00_day_01_1579_009'.",
+        f"2 files belong to no image of a split; the first is {val.thermal}."
     ]

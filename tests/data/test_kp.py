@@ -29,6 +29,10 @@ ROOT = Path(__file__).resolve().parents[2]
 OFFICIAL = Path(os.environ.get("RGBT_SHARED", ROOT.parent / "shared")) / "realdata" / "kp_names"
 
 
+DAYS = {"train": TRAIN[:2], "val": VAL[:1], "test": TEST[:2]}
+NIGHTS_OF = {"train": TRAIN[2:], "val": VAL[1:], "test": TEST[2:]}
+
+
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
     return write_lists(write_kp(tmp_path / "kp"))
@@ -75,31 +79,6 @@ def test_splits_by_set_number(root: Path) -> None:
     assert dataset.splits["val_night"] == "labels of the sets [10]"
     nights = [number for number in range(12) if is_night(f"set{number:02d}_V000_I00000")]
     assert nights == [3, 4, 5, 9, 10, 11]
-
-
-def test_day_and_night_of_one_list(root: Path) -> None:
-    dataset = KP(str(root))
-    assert dataset.names("train_day") == TRAIN[:2]
-    assert dataset.names("test_night") == TEST[2:]
-    write_lists(root, {"train_day": TRAIN[1:2], "val": VAL[:1]})
-    dataset = KP(str(root))
-    assert dataset.names("train_day") == TRAIN[1:2]  # its own list comes first
-    assert dataset.has("val_day")
-    assert not dataset.has("val_night")
-    with pytest.raises(InputError, match=r"'val_night' of kp is empty: expected"):
-        dataset.names("val_night")
-    assert len(dataset.fingerprint()) == 64
-
-
-def test_split_is_union_of_day_and_night(tmp_path: Path) -> None:
-    root = write_kp(tmp_path)
-    write_lists(root, {"test_day": TEST[1::-1], "test_night": TEST[2:], "train_day": TRAIN[:1]}, "")
-    dataset = KP(str(root))
-    assert dataset.names("test") == TEST  # sorted
-    assert dataset.names("test_day") == TEST[1::-1]  # as listed
-    assert not dataset.has("train")
-    with pytest.raises(InputError, match=r"split 'train': \S+/train.txt is missing"):
-        dataset.names("train")
 
 
 @pytest.mark.parametrize(
@@ -159,15 +138,6 @@ def test_void_is_ignored_and_nothing_else(root: Path) -> None:
     assert (KP(str(root)).read(TRAIN[0]).label == 255).all()
 
 
-def test_fingerprint_is_of_names_and_not_of_lists(root: Path) -> None:
-    expected = KP(str(root)).fingerprint()
-    assert KP(str(root), lists="sets").fingerprint() == expected  # the same names
-    write_lists(root, ending="")
-    assert KP(str(root)).fingerprint() == expected
-    write_lists(root, {"test": TEST[1:]})
-    assert KP(str(root)).fingerprint() != expected
-
-
 @pytest.mark.skipif(not OFFICIAL.exists(), reason="reference material is not here")
 def test_official_lists_are_those_by_set_number(tmp_path: Path) -> None:
     for folder in ("images", "labels"):
@@ -196,7 +166,7 @@ def test_lists_are_read_if_there_are_any(root: Path, tmp_path: Path) -> None:
     for split in ("train", "val", "test"):
         (root / f"{split}.txt").unlink()
     assert KP(str(root)).by_set
-    with pytest.raises(InputError, match=r"split 'train': \S+mine.txt is missing"):
+    with pytest.raises(InputError, match="split 'train' of kp is empty: expected mine.txt"):
         KP(str(root), splits={"train": "mine.txt"}).names("train")
     dataset = KP(str(write_kp(tmp_path / "days", TRAIN)))
     assert [dataset.has(split) for split in ("train", "val", "train_night")] == [True, False, True]
@@ -222,3 +192,14 @@ def test_images_of_hand_drawn_labels_are_picked(root: Path, tmp_path: Path) -> N
         pick_kp(kaist, labels, tmp_path / "again")
     with pytest.raises(InputError, match="expected labels in"):
         pick_kp(kaist, kaist, tmp_path / "again")
+
+
+def test_splits_by_list_and_by_set_have_one_fingerprint(root: Path) -> None:
+    write_lists(root, {f"{split}_day": day for split, day in DAYS.items()})
+    write_lists(root, {f"{split}_night": night for split, night in NIGHTS_OF.items()}, "")
+    dataset = KP(str(root))
+    assert dataset.names("test_night") == TEST[2:]
+    expected = dataset.fingerprint()
+    assert KP(str(root), lists="sets").fingerprint() == expected
+    write_lists(root, {"test": TEST[1:]})
+    assert KP(str(root)).fingerprint() != expected

@@ -107,8 +107,13 @@ def test_crop_is_drawn_again_until_it_shows_enough(
         return SimpleNamespace(label=np.repeat(sample, next(left)))
 
     drawn, _ = rare.draw(numpy_generator(3, "rare class", 0, 5))
-    source: Any = SimpleNamespace(names=list(PIXELS), first_readable=lambda names, skipped: drawn)
-    RareClassExamples(source, SimpleNamespace(train=make), 3, rare)((0, 5), {})
+    source: Any = SimpleNamespace(
+        names=list(PIXELS),
+        first_readable=lambda names, skipped: drawn,
+        transform=SimpleNamespace(train=make),
+        seed=3,
+    )
+    RareClassExamples(source, rare)((0, 5), {})
     assert len(set(seen)) == len(seen) == calls
     # The draws of the augmentation are those of (seed, "augment", epoch, number) alone, and not
     # those that have chosen the class.
