@@ -131,7 +131,7 @@ FILE = "images/00003N.png"
         ("labels/00003N.png", np.full((48, 64), 9, np.uint8), "label value 9 "),
         (FILE, np.zeros((48, 64, 3), np.uint8), "expected 4 channels"),
         (FILE, 100, "00003N.png cannot be decoded"),
-        ("test.txt", None, "test.txt' does not exist"),
+        ("test.txt", None, "split 'test' of mfnet is empty: expected test.txt"),
     ],
 )
 def test_run_bad_files_are_named(

@@ -156,7 +156,7 @@ def decode(path: Path) -> NDArray[Any]:
     image: Image.Image = opened(path)[0]
     if image.mode == "P":
         image = image.convert("RGBA" if "transparency" in image.info else "RGB")
-    array = np.array(image)
+    array = np.asarray(image)
     return array.astype(np.uint16) if image.mode.startswith("I;16") else array
 
 
@@ -205,7 +205,7 @@ def read_indices(path: Path) -> NDArray[Any]:
             f"{path}: expected one channel of class indices of 8 bits, got {image.format} of mode "
             f"{image.mode}; save the indices themselves as PNG, not their colours."
         )
-    array = np.array(image)
+    array = np.asarray(image)
     return array.astype(np.uint16) if image.mode.startswith("I;16") else array
 
 

@@ -103,6 +103,9 @@ def test_png_is_read_whole_or_refused(path: Path) -> None:
     text = chunk(b"tEXt", b"Comment\0a")
     path.write_bytes(whole[:33] + text.replace(b"\0a", b"\0b") + whole[33:])  # a wrong checksum
     assert "cannot be decoded" in refused(path)
+    # A wrong checksum of the pixels, which decoders pass over.
+    path.write_bytes(whole[:-13] + bytes([whole[-13] ^ 1]) + whole[-12:])
+    assert "cannot be decoded" in refused(path)
     # With a comment, and as a card reader leaves it.
     path.write_bytes(whole[:33] + text + whole[33:] + b"\0" * 5000)
     np.testing.assert_array_equal(decode(path), image)
@@ -117,6 +120,9 @@ def test_jpeg_is_read_whole_or_refused(path: Path, thumbnail: bool) -> None:
     for size in (3, 30, len(whole) - 500, len(whole) - 2, len(whole) - 1):
         path.write_bytes(whole[:size])
         assert "cannot be decoded" in refused(path)
+    if not thumbnail:
+        path.write_bytes(whole[:-2] + b"\0" * 99)
+        assert "its end is missing" in refused(path)
     path.write_bytes(whole + b"\0\0 and what a camera appends")
     np.testing.assert_array_equal(decode(path), cv2.imread(str(path))[..., ::-1])
 
