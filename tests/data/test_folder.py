@@ -197,20 +197,6 @@ def test_label_values(root: Path) -> None:
     assert found[0, 4] == 1
 
 
-def test_label_values_are_class_indices_by_default(root: Path) -> None:
-    path = root / "train" / "mask" / "1.png"
-    label = np.full(HW, 2, np.uint8)
-    label[0, 0] = 255
-    write_png(path, label)
-    np.testing.assert_array_equal(folder(root).label("train_1"), label)
-    label[0, 1] = 3
-    write_png(path, label)
-    assert (
-        "label value 3 (1 pixels; one of 1 unknown values) has no class in dataset.ids"
-        in refused(lambda: folder(root).label("train_1"))
-    )
-
-
 def test_label_colours(root: Path) -> None:
     colours = {"background": (0, 0, 0), "person": (220, 20, 60), "car": ((0, 0, 142), (0, 0, 70))}
     image = np.zeros((*HW, 3), np.uint8)
@@ -239,15 +225,6 @@ def test_generated_colours() -> None:
 
 
 # The whole
-
-
-def test_day_and_night(sound: Path) -> None:
-    assert folder(sound).nights(("train_1",)) is None
-    dataset = folder(sound, night="t*_[23]")
-    assert dataset.nights(("train_1", "train_2", "val_2")) == (False, True, False)
-    assert refused(lambda: folder(sound, night="*nite*")) == (
-        "dataset.night: none of 6 names matches '*nite*'; the first name is 'test_1'."
-    )
 
 
 def test_fingerprint_and_decoding(tmp_path: Path) -> None:

@@ -52,12 +52,6 @@ def test_night_is_what_the_path_says(root: Path) -> None:
         dataset.nights(("other",))
 
 
-def test_val_may_be_pieces_of_sequences(root: Path) -> None:
-    dataset = reader(root, val_sequences=("seq_00_day/01",))
-    assert dataset.names("val") == ("seq_00_day_01_1572_0020",)
-    assert len(dataset.names("train_day")) == 4
-
-
 @pytest.mark.parametrize("time", ["day", "night"])
 def test_stamp_of_thermal_may_lack_last_zero(tmp_path: Path, time: str) -> None:
     files.write_test(tmp_path, time, "1570_120", thermal="1570_12")
@@ -76,16 +70,6 @@ def test_shared_thermal_image_is_refused(tmp_path: Path) -> None:
     files.write_test(tmp_path, "day", "1570_12")
     with pytest.raises(InputError, match=r"the same thermal image .*1570_12_ir.png"):
         reader(tmp_path).names("test")
-
-
-def test_what_is_no_frame_is_passed_over(root: Path) -> None:
-    expected = reader(root).names("train")
-    piece = root / "train/seq_00_day/00"
-    for stray in ("fl_rgb/._fl_rgb_1_0.png", "fl_rgb/other.png", "fl_rgb/fl_rgb_1_0.txt"):
-        (piece / stray).write_bytes(b"")
-    (root / "train/.cache/00").mkdir(parents=True)
-    (root / "train/readme.txt").write_text("")
-    assert reader(root).names("train") == expected
 
 
 @pytest.mark.parametrize("split", ["train_day", "val", "test_night"])

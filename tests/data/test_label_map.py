@@ -80,9 +80,3 @@ def test_released_maps(name: str, expected: tuple[int, ...]) -> None:
     assert label_map.targets == tuple(dataset.classes)
     ids = np.arange(label_map.num_source, dtype=np.uint8)
     assert tuple(label_map(ids).tolist()) == expected
-
-
-def test_no_map_and_no_such_map() -> None:
-    assert label_map_of("none") is None
-    with pytest.raises(InputError, match=r"no label_map 'vistas'; did you mean"):
-        label_map_of("vistas")

@@ -52,34 +52,6 @@ def assert_equal(one: Batch, other: Batch) -> None:
         assert torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b, each.name
 
 
-def test_shapes_and_dtypes(dataset: MFNet) -> None:
-    batch = next(train_batches(dataset, "train", crm(), settings(), 0, range(1)))
-    assert batch.position is not None
-    shapes = [batch.rgb.shape, batch.thermal.shape, batch.label.shape, batch.position.shape]
-    assert [tuple(shape) for shape in shapes] == [
-        (4, 3, 12, 16),
-        (4, 1, 12, 16),
-        (4, 12, 16),
-        (4, 2, 12, 16),
-    ]
-    assert (batch.rgb.dtype, batch.thermal.dtype) == (torch.uint8, torch.uint8)
-    assert (batch.label.dtype, batch.position.dtype) == (torch.uint8, torch.float32)
-    assert batch.to("cpu").label.dtype == torch.int64
-    assert (batch.centre_yx.dtype, batch.original_hw.dtype) == (torch.int64, torch.int64)
-    assert batch.original_hw.tolist() == [[24, 32]] * 4
-    assert batch.rgb.is_contiguous()
-
-
-def test_label_comes_from_the_position(dataset: MFNet, expected_pair) -> None:
-    """Through the whole chain, batch and all: label[crop] == label of the file[position]."""
-    for batch in train_batches(dataset, "train", crm(), settings(), 3, range(4)):
-        assert batch.position is not None
-        for index, name in enumerate(batch.name):
-            label = torch.from_numpy(expected_pair(name, (24, 32))[2]).long()
-            row, column = batch.position[index].long()
-            assert torch.equal(batch.label[index], label[row, column])
-
-
 def test_same_batches_whatever_the_workers(dataset: MFNet) -> None:
     runs = [
         list(train_batches(dataset, "train", crm(), settings(num_workers=n), 7, range(5)))

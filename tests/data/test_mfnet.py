@@ -28,18 +28,6 @@ def test_reads_both_layouts_in_rgb_order(write_mfnet, expected_pair, layout: str
         assert sample.name == name
 
 
-def test_known_pixel(tmp_path: Path, png) -> None:
-    """Channel by channel, so that neither B, G, R nor a dropped fourth channel can pass."""
-    image = np.zeros((2, 3, 4), np.uint8)
-    image[1, 2] = (10, 20, 30, 40)
-    png(tmp_path / "images" / "00001D.png", image)
-    png(tmp_path / "labels" / "00001D.png", np.full((2, 3), 8, np.uint8))
-    sample = MFNet(str(tmp_path)).read("00001D")
-    assert sample.rgb[1, 2].tolist() == [10, 20, 30]
-    assert sample.thermal[1, 2] == 40
-    assert sample.label.tolist() == [[8, 8, 8], [8, 8, 8]]
-
-
 def test_layout_is_detected_or_as_configured(write_mfnet, expected_pair, png) -> None:
     root = write_mfnet({"train": ["00001D"]}, layout="folders")
     with pytest.raises(InputError, match=r"does not hold the folders images\+labels\."):

@@ -122,12 +122,6 @@ def test_one_video_of_packed_images_without_labels(tmp_path: Path) -> None:
         dataset.names("train")
 
 
-def test_first_class_is_background_if_the_data_set_says_so(tmp_path: Path) -> None:
-    root = write_videos(tmp_path)
-    found = [video(root, background=each).record for each in ((), ("car",), ("background",))]
-    assert [each.first_class for each in found] == ["object", "object", "background"]
-
-
 def test_missing_files_of_mvseg_are_named(mvseg: Path) -> None:
     (mvseg / "data" / "d" / "infrared" / "00238i.png").unlink()
     with pytest.raises(InputError, match="'d_00238': its thermal image .*00238i.png is missing"):
