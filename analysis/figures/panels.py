@@ -22,10 +22,9 @@ from analysis.figures.inputs import FigureInput
 from analysis.predictions.scoring import ScoringOptions, score_folder
 from rgbt.checks import InputError
 from rgbt.data.predictions import Affixes, FormatOptions, PredictionReader, prediction_paths
-from rgbt.metrics.confusion import RegionCounter
+from rgbt.metrics.counting import RegionCounter
 from rgbt.metrics.counts import Counts, scored_classes
-from rgbt.metrics.metric import Regions
-from rgbt.metrics.regions import ring_rectangle
+from rgbt.metrics.metric import Regions, ring_rectangle
 from rgbt.metrics.scores import miou
 from rgbt.terminal import info
 from rgbt.tracking.pictures import colours

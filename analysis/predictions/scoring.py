@@ -17,10 +17,9 @@ from analysis.predictions.maps import MapSum, PixelMaps
 from rgbt.checks import InputError, check_choice
 from rgbt.data.predictions import Array, FormatOptions, PredictionReader
 from rgbt.dataset import LabelledDataset
-from rgbt.metrics.confusion import RegionCounter
+from rgbt.metrics.counting import RegionCounter
 from rgbt.metrics.counts import Counts
-from rgbt.metrics.metric import Absent, Regions
-from rgbt.metrics.regions import Partition
+from rgbt.metrics.metric import Absent, Partition, Regions
 
 Resize = Literal["refuse", "nearest", "stretch"]
 MOST_STRETCH = 0.05

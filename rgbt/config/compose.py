@@ -208,7 +208,7 @@ def register_resolvers() -> None:
 
 
 def _is_embedded(dataset: DictConfig) -> bool:
-    return str(dataset.get("_target_")).startswith(("rgbt.data.synth.", "rgbt.synth."))
+    return str(dataset.get("_target_")).startswith("rgbt.synth.")
 
 
 def _choices_of_children(overrides: Any, children: list[Any], self_added: bool) -> DictConfig:

@@ -38,7 +38,7 @@ from rgbt.evaluation.temporal_consistency import Pairs, count_predicted, to_byte
 from rgbt.metrics import pair_list
 from rgbt.metrics.metric import Regions
 from rgbt.metrics.pair_list import PAIR_LIST, Frames, ListedPair, PairList, second_name
-from rgbt.transforms.view_sets import ViewSets
+from rgbt.transforms.views import ViewSets
 from rgbt.types import Batch
 
 CPU = torch.device("cpu")

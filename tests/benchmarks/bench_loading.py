@@ -28,8 +28,8 @@ from rgbt.config.compose import compose
 from rgbt.data.cache import CachedDataset
 from rgbt.data.loaders import LoaderSettings, train_batches
 from rgbt.data.mfnet import MFNet
-from rgbt.data.synth.dataset import synth
 from rgbt.dataset import LabelledDataset
+from rgbt.synth.datasets import synth
 from rgbt.transforms.crm import CrmTransform
 from tests.benchmarks.released_loading import ReleasedSamples
 from tests.benchmarks.timing import seconds

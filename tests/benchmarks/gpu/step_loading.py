@@ -1,4 +1,4 @@
-"""The input path: cache and loader, alone and in front of a CRM step."""
+"""The input path: cache and augmentation, alone and in front of a CRM step."""
 
 from __future__ import annotations
 
@@ -30,12 +30,16 @@ def measure(task: Task) -> None:
     for number in task.as_time_allows(workers, first=8.0):
         reset_peak(device)
         setup = setup_of(_words(task, root, size, number), device)
+        began = time.perf_counter()
+        for name in setup.names["train"]:
+            setup.session.dataset.read(name)  # writes the cache
+        decoding = time.perf_counter() - began
         row = {
             "num_workers": int(number),
             "images per second, loader": _loader_alone(setup, size, 4 if task.smoke else 40),
         }
         row |= _in_training(task, setup, size)
-        task.row(**row)
+        task.row(**row, **{"decoding, s": decoding})
         shares[number] = row.get(WAIT_SHARE, float("nan"))
     cores = len(os.sched_getaffinity(0))
     where = "synthetic images" if task.data is None else str(task.data)
@@ -53,7 +57,7 @@ def _words(task: Task, root: Path, size: int, workers: str) -> list[str]:
 
 
 def _loader_alone(setup: TrainingSetup, size: int, steps: int) -> float:
-    """Images per second that are read, moved and augmented."""
+    """Images per second that are read, augmented and moved."""
     device = setup.session.device
     batches = setup.batches(range(steps + 2))
     for _ in range(2):  # processes start, memory is allocated
