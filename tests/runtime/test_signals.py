@@ -15,8 +15,7 @@ import pytest
 from torch.utils.data import DataLoader
 
 from rgbt.config.plain_command import PlainCommand
-from rgbt.data.loaders import _started
-from rgbt.data.reader import start_worker
+from rgbt.data.loaders import ENDING, start_worker
 from rgbt.engine.checkpoint import State
 from rgbt.engine.trainer import Trainer
 from rgbt.runtime.signals import Stopped, answered, at_once, deferred
@@ -229,19 +228,28 @@ def thread_after_fork() -> Iterator[None]:
     is_wanted.clear()
 
 
+def started(loader: DataLoader[int]) -> Iterator[int]:
+    """As `rgbt.data.loaders.Batches` does."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
+    try:
+        return iter(loader)
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 @pytest.mark.usefixtures("thread_after_fork")
 def test_workers_leave_signals_of_a_group_to_the_main_process() -> None:
     """Ctrl-C in a terminal and `killpg` reach them too; the step in progress needs them."""
     loader = DataLoader(
         range(40), batch_size=None, num_workers=1, worker_init_fn=start_worker, prefetch_factor=2
     )
-    found = _started(loader, 1)
+    found = started(loader)
     assert next(found) == 0
     (worker,) = found._workers  # type: ignore[attr-defined]
     for number in SIGNALS:
         subprocess.run(["kill", f"-{int(number)}", str(worker.pid)], check=True)
     assert list(found) == list(range(1, 40))
-    fresh = _started(loader, 1)
+    fresh = started(loader)
     assert next(fresh) == 0
     (worker,) = fresh._workers  # type: ignore[attr-defined]
     worker.terminate()
@@ -252,7 +260,7 @@ def test_workers_leave_signals_of_a_group_to_the_main_process() -> None:
 SERVED = """
 import multiprocessing, os, sys
 from torch.utils.data import DataLoader
-from rgbt.data.reader import start_worker
+from rgbt.data.loaders import start_worker
 
 if __name__ == "__main__":
     loader = DataLoader(
