@@ -19,7 +19,7 @@ from rgbt.data.loaders import _started
 from rgbt.data.reader import start_worker
 from rgbt.engine.checkpoint import State
 from rgbt.engine.trainer import Trainer
-from rgbt.runtime.signals import Stopped, answered, at_once, deferred
+from rgbt.runtime.signals import Stopped, answered, deferred
 from rgbt.types import Batch
 from tests.commands import Call, NoOptions, assert_one_sentence
 from tests.engine.test_trainer import batches, make
@@ -135,23 +135,6 @@ def test_an_error_after_a_signal_is_its_consequence() -> None:
         raising()
 
 
-def test_a_signal_between_two_evaluations_is_raised_at_the_next() -> None:
-    reached = []
-
-    def signalled() -> None:
-        with deferred():
-            with at_once():
-                reached.append(1)
-            send(signal.SIGHUP)
-            reached.append(2)
-            with at_once():
-                reached.append(3)
-
-    with pytest.raises(Stopped):
-        signalled()
-    assert reached == [1, 2]
-
-
 @pytest.mark.parametrize(
     ("number", "code", "said"),
     [
@@ -247,51 +230,6 @@ def test_workers_leave_signals_of_a_group_to_the_main_process() -> None:
     worker.terminate()
     worker.join(5)
     assert worker.exitcode == 0, "the main process ends them"
-
-
-SERVED = """
-import multiprocessing, os, sys
-from torch.utils.data import DataLoader
-from rgbt.data.reader import start_worker
-
-if __name__ == "__main__":
-    loader = DataLoader(
-        range(9),
-        batch_size=None,
-        num_workers=1,
-        worker_init_fn=start_worker,
-        multiprocessing_context="forkserver",
-    )
-    found = iter(loader)
-    next(found)
-    (worker,) = found._workers
-    print(worker.pid, flush=True)
-    if sys.argv[1] == "die":
-        os.kill(os.getpid(), 9)
-    worker.terminate()
-    worker.join(10)
-    print(worker.exitcode, flush=True)
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("end", ["die", "terminate"])
-def test_workers_of_a_fork_server_end_with_the_main_process(tmp_path: Path, end: str) -> None:
-    """As inside a sweep: the parent of such a worker is the server, which lives on."""
-    script = tmp_path / "served.py"
-    script.write_text(SERVED)
-    process = subprocess.Popen(
-        [sys.executable, str(script), end], stdout=subprocess.PIPE, text=True, cwd=Path.cwd()
-    )
-    assert process.stdout is not None
-    worker = int(process.stdout.readline())
-    if end == "terminate":
-        assert process.stdout.readline() == "0\n"
-    process.wait(60)
-    deadline = time.monotonic() + 20
-    while Path(f"/proc/{worker}").exists() and time.monotonic() < deadline:
-        time.sleep(0.1)
-    assert not Path(f"/proc/{worker}").exists()
 
 
 def test_an_error_of_a_library_that_a_signal_left_halfway_is_its_consequence(call: Call) -> None:
