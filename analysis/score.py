@@ -20,8 +20,8 @@ from rgbt.config.command import built
 from rgbt.config.common_options import PredictionFormatOptions
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
+from rgbt.metrics.metric import MAX_REGIONS, Partition
 from rgbt.metrics.names import DAY, MIOU, NIGHT, subset
-from rgbt.metrics.regions import MAX_REGIONS, Partition
 
 if TYPE_CHECKING:
     from analysis.predictions.scoring import FolderScores
@@ -52,9 +52,8 @@ class Options(PredictionFormatOptions):
     predictions: Annotated[
         str,
         Help(
-            "folder of predictions, or a ZIP file of one, with a PNG file for every image of the "
-            "split: class indices (8 bit, one channel), a palette PNG, or RGB in the colours of a "
-            "palette"
+            "folder of predictions, with a PNG file for every image of the split: class indices "
+            "(8 bit, one channel) or, with format=colour, the colours of a palette"
         ),
     ] = ""
     counts: Annotated[
@@ -238,8 +237,7 @@ def _show(tables: Sequence[ScoreTable], remarks: list[str], out: Path | None) ->
 
 def _scored(options: Options, overrides: list[str]) -> FolderScores:
     from analysis.predictions.scoring import PARTITIONS, ScoringOptions, score_folder
-    from rgbt.data.prediction_files import Affixes
-    from rgbt.data.prediction_format import FormatOptions
+    from rgbt.data.predictions import Affixes, FormatOptions
 
     dataset, absent = dataset_of(overrides), built("metric", overrides).absent
     counting = ScoringOptions(
@@ -298,18 +296,13 @@ def _with_intervals(table: ScoreTable, counts: Counts, settings: Resampling) -> 
     reason = ""
     for absent, part in product(table.conventions(), table.num_images):
         named = interval_cells(table, absent)[part]
-        try:
-            estimates = estimate([counts], list(named), replace(settings, absent=absent))
-        except InputError as error:
-            if part == "all":
-                raise
-            drawn[part] = f"has none ({error})"  # a part that is too small stops nothing else
-            continue
+        estimates = estimate([counts], list(named), replace(settings, absent=absent))
         for metric, each in estimates.items():
             if each.images is not None:
                 found[named[metric]] = (each.images.low, each.images.high)
-        drawn[part] = f"of {estimates[OF_PARTS[part]].said}"
-        reason = estimates[OF_PARTS[part]].reason if part == "all" else reason
+        main = estimates[OF_PARTS[part]]
+        drawn[part] = f"of {main.said}" if main.images else f"has none ({main.said} are too few)"
+        reason = main.reason if part == "all" else reason
     whole_split = drawn.pop("all")
     if not found:
         return replace(
@@ -318,7 +311,7 @@ def _with_intervals(table: ScoreTable, counts: Counts, settings: Resampling) -> 
     parts = "".join(f"; {part} {said}" for part, said in drawn.items())
     said = (
         f"{table.partition}: in brackets, {100 * settings.level:g} % intervals over images "
-        f"(percentile, of Var without its bias; {settings.resamples} resamples "
+        f"(Student, of Var without its bias; {settings.resamples} resamples "
         f"{whole_split}{parts}). {reason}".rstrip()
     )
     return with_intervals(table, found, said)

@@ -40,6 +40,8 @@ def test_a_run_starts_from_another_runs_weights(
     named = [key for key in moved if "running" not in key and "num_batches" not in key]
     assert all(key.startswith("decode1.") for key in named)
     assert ("decode1.conv.weight" in named) == bool(fresh)
+    code, _, err = call(EVALUATE, f"run={only_run(tmp_path / 'second')}")
+    assert code == 0, err
 
 
 def test_weights_are_scored_without_a_run(
@@ -77,7 +79,7 @@ def test_other_inputs_are_reported(
 @pytest.mark.parametrize(
     ("words", "key"),
     [
-        (("model.weights={run}", "model.fresh=[decode1]"), "model.fresh"),
+        (("model.weights={run}", "model.fresh=[decode1]"), "initial values (decode1."),
         (("model.weights={run}", "checkpoint=last"), "checkpoint"),
         (("model.weights=nowhere.pth",), "nowhere.pth"),
         ((), "run"),

@@ -30,10 +30,10 @@ EXTERNAL = "rgbt.models.external.network.ExternalNetwork"
 FOLDERS = ("/", "~", "./", "../")  # beginnings of a trusted folder; all else names a module
 
 
-def load_config(path: Path, trust: Collection[str] = ()) -> DictConfig:
+def load_config(path: Path, trust: Collection[str] = (), group: str = "") -> DictConfig:
     """A stored configuration whose objects may be built (see `check_targets`)."""
     settings = read_settings(path)
-    check_targets(settings, trust, str(path))
+    check_targets(settings, trust, str(path), group)
     return OmegaConf.create(settings)
 
 

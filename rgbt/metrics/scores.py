@@ -5,28 +5,24 @@ kept. Scores are fractions 0..1; variances are in squared percent points, as the
 
 A score whose denominator has no pixel (0 / 0) is, by `absent`:
     "released": 0 and takes part in means, as in the CRM and SpatialSeg releases and their tables,
-                and in the averages that the RTFNet and Temporal releases report. (These two keep
-                NaN for the class; the scalars that Temporal sends to TensorBoard are plain means,
-                NaN where a class is.)
+                and in the averages that the RTFNet and Temporal releases report.
     "exclude":  NaN and is left out of means, as in the CMX release.
-The denominator decides, by score and by region. IoU and F1 lack one where the class is neither
-labelled nor predicted: one false pixel of a class that no label holds makes its IoU 0 with either
-convention, so that "exclude" still lowers the mean. Recall lacks one where the class is not
-labelled, precision where it is not predicted; means of different scores may therefore be over
-different classes. The data set says which convention its published tables use (`dataset.absent`).
-Means are over the scored classes alone (`rgbt.metrics.counts.Counts.scored`): a class that is left
-out counts in none of them, whether it has pixels or not and whatever `absent` says.
+The denominator decides, by score and by region: IoU and F1 lack one where the class is neither
+labelled nor predicted, recall where it is not labelled, precision where it is not predicted. One
+false pixel of a class that no label holds makes its IoU 0 with either convention. Means are over
+the scored classes alone (`rgbt.metrics.counts.Counts.scored`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rgbt.metrics import names
 from rgbt.metrics.counts import Counts
+from rgbt.metrics.details import UNITS
 from rgbt.metrics.metric import Absent
 
 Scores = NDArray[np.float64]
@@ -67,18 +63,11 @@ def f1(counts: Matrices, absent: Absent) -> Scores:
     return ratio(2 * right, labelled + predicted, absent)
 
 
-def known_mean(scores: Scores) -> Scores:
-    """Mean over the last dimension, of anything but classes, without NaN: (..., X) -> (...).
-
-    NaN where nothing is left.
-    """
-    return _mean(scores, ~np.isnan(scores))
-
-
-def class_mean(scores: Scores, scored: Scored) -> Scores:
+def class_mean(scores: Scores, scored: Scored = None) -> Scores:
     """Mean over the scored classes without NaN, (..., K) -> (...); NaN where nothing is left."""
     known = ~np.isnan(scores)
-    return _mean(scores, known if scored is None else known & scored)
+    chosen = known if scored is None else known & scored
+    return _divide(np.where(chosen, scores, 0.0).sum(-1), chosen.sum(-1), np.nan)
 
 
 def miou(counts: Matrices, absent: Absent, scored: Scored) -> Scores:
@@ -101,8 +90,8 @@ def variance(region_scores: ArrayLike) -> Scores:
     all are.
     """
     percents = 100 * np.asarray(region_scores, dtype=np.float64)
-    distances = percents - known_mean(percents)[..., None]
-    return known_mean(distances**2)
+    distances = percents - class_mean(percents)[..., None]
+    return class_mean(distances**2)
 
 
 def pixel_accuracy(counts: Matrices) -> Scores:
@@ -112,6 +101,40 @@ def pixel_accuracy(counts: Matrices) -> Scores:
     """
     right, labelled, _ = _sums(counts)
     return _divide(right.sum(-1), labelled.sum(-1), np.nan)
+
+
+def boundary_iou(counts: Matrices, absent: Absent) -> Scores:
+    """``|G_d and P_d| / |G_d or P_d|`` of each class, of counts of boundaries.
+
+    Source: Cheng et al.: "Boundary IoU", CVPR 2021, Sec. 4.
+    Shapes: (..., 3, K), summed over images -> (..., K) fractions 0..1.
+    """
+    both, label, predicted = (counts[..., row, :].astype(np.float64) for row in range(3))
+    return ratio(both, label + predicted - both, absent)
+
+
+def ece(counts: Matrices) -> Scores:
+    """``sum_b |correct_b - confidence_b| / sum_b number_b``, a fraction 0..1.
+
+    That is the mean over pixels of ``|acc(B_m) - conf(B_m)|``. All pixels of all images are pooled,
+    those of unscored classes included.
+
+    Source: Guo et al.: "On Calibration of Modern Neural Networks", ICML 2017, Eq. 3, with M equal
+    bins (0, 1/M], (1/M, 2/M], ... of the highest probability of each pixel.
+    Shapes: (..., M, 3, K), summed over images -> (...); NaN without pixels.
+    """
+    number, correct, confidence = np.moveaxis(counts.sum(-1, dtype=np.float64), -1, 0)
+    gaps = np.abs(correct - confidence / UNITS).sum(-1)
+    return _divide(gaps, number.sum(-1), np.nan)
+
+
+def object_recall(counts: Matrices) -> Scores:
+    """Recall of each class among the pixels of objects: ``TP / (TP + FN)``. Shapes as in `iou`.
+
+    NaN where no object of that size has a pixel of the class, whatever the convention for absent
+    classes: most classes have no objects of most sizes, and no published table counts them as 0.
+    """
+    return recall(counts, "exclude")
 
 
 MEANS: dict[str, Callable[[Matrices, Absent, Scored], Scores]] = {
@@ -127,12 +150,9 @@ MEANS: dict[str, Callable[[Matrices, Absent, Scored], Scores]] = {
 def summary(counts: Counts, absent: Absent) -> dict[str, float]:
     """Every score that is followed over a run, by its name in `rgbt.metrics.names`.
 
-    Over all images: means over the scored classes, variance over regions, mIoU of each region, IoU
-    of each class (unscored ones too); mIoU and variance again for day and for night if the data
-    set distinguishes them.
-
-    Returns:
-        name -> fraction, or squared percent points for the variance. NaN: nothing to score.
+    Means, variance over regions, mIoU of each region, IoU of each class (unscored ones too); mIoU
+    and variance again for day and for night if the data set distinguishes them. Fractions, squared
+    percent points for the variance; NaN: nothing to score.
     """
     whole, scored = counts.whole(), counts.scored
     by_class = iou(whole, absent)
@@ -155,6 +175,39 @@ def _mean_and_variance(counts: Counts, absent: Absent) -> dict[str, float]:
     }
 
 
+def absent_notes(
+    by_region: NDArray[np.integer],
+    classes: Sequence[str],
+    scored: NDArray[np.bool_],
+    split: str,
+    absent: Absent,
+) -> tuple[str, ...]:
+    """Footnotes of a class table, about absent classes that change the means over classes.
+
+    A class is absent where it is neither labelled nor predicted.
+
+    Of the (R, K, K) counts of all images, K names and the scored ones (K,), the others not being
+    mentioned: at most three sentences without a full stop, about absent classes, classes that are
+    predicted only, and classes that some regions lack.
+    """
+    counted = {"released": "counted as 0", "exclude": "left out of the mean"}[absent]
+    labelled = by_region.sum(-1) > 0
+    there = labelled | (by_region.sum(-2) > 0)
+    gone, unlabelled = ~there.any(0), there.any(0) & ~labelled.any(0)
+    lacks = []
+    for each in np.flatnonzero(scored & there.any(0) & ~there.all(0)).tolist():
+        regions = [str(number) for number in (np.flatnonzero(~there[:, each]) + 1)]
+        lacks.append(f"{classes[each]} (region{'s' * (len(regions) > 1)} {', '.join(regions)})")
+    named = {
+        f"absent from the {split} split: {{}} ({counted})": np.array(classes)[scored & gone],
+        f"predicted, but not labelled in the {split} split: {{}} (IoU 0)": np.array(classes)[
+            scored & unlabelled
+        ],
+        f"absent from some regions: {{}}; {counted} there": lacks,
+    }
+    return tuple(note.format(", ".join(each)) for note, each in named.items() if len(each))
+
+
 def _sums(counts: Matrices) -> tuple[Scores, Scores, Scores]:
     """Right, labelled and predicted pixels of each class: TP, TP + FN, TP + FP; (..., K) each."""
     right = np.diagonal(counts, axis1=-2, axis2=-1).astype(np.float64)
@@ -166,12 +219,6 @@ def _sums(counts: Matrices) -> tuple[Scores, Scores, Scores]:
 def ratio(part: Scores, whole: Scores, absent: Absent) -> Scores:
     """``part / whole``; where that is 0 / 0 as `absent` says. Shapes are kept."""
     return _divide(part, whole, 0.0 if absent == "released" else np.nan)
-
-
-def _mean(scores: Scores, chosen: NDArray[np.bool_]) -> Scores:
-    """Mean over the last dimension of what is chosen; NaN where nothing is."""
-    total = np.where(chosen, scores, 0.0).sum(-1)
-    return _divide(total, chosen.sum(-1), np.nan)
 
 
 def _divide(part: Scores, whole: NDArray[np.generic], undefined: float) -> Scores:

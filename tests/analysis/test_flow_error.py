@@ -12,8 +12,8 @@ from analysis.details import entry as details_entry
 from analysis.flow_error import compare_flows, entry, read_measured
 from analysis.uncertainty import Resampling, compare
 from rgbt.checks import InputError
+from rgbt.metrics.counting import pair_counts
 from rgbt.metrics.counts import Counts
-from rgbt.metrics.pairs import pair_counts
 from tests.commands import Call, assert_one_sentence
 
 PAIRS = 24
@@ -62,8 +62,8 @@ def test_differences_by_hand(measured: Path) -> None:
     assert error.a.value == pytest.approx(5)
     assert error.b.value == pytest.approx(100 * 7 / 80)
     assert error.value == pytest.approx(100 * 7 / 80 - 5)
-    assert error.images is not None
-    assert error.images.low < error.value < error.images.high
+    assert error.interval is not None
+    assert error.interval.low < error.value < error.interval.high
     assert {"day/TC", "night/warning"} - set(found) == {"night/warning"}
     assert found["TC"].value < 0
 

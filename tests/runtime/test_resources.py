@@ -7,30 +7,21 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from PIL import PngImagePlugin
 
 from rgbt.checks import InputError
 from rgbt.config.plain_command import PlainCommand
 from rgbt.data.files import decode
 from rgbt.files.atomic import write_atomic
-from rgbt.metrics.archive import Archive
 from tests.commands import Call, NoOptions, assert_one_sentence, only_run, short, train
 
 SMALL_MB = 2
-
-
-@dataclass(frozen=True)
-class OutOptions:
-    out: str = ""
-
-
-RESUME = "rerun the command to resume from the last checkpoint."
 
 
 def full() -> OSError:
@@ -38,10 +29,10 @@ def full() -> OSError:
 
 
 def raising(error: Callable[[], BaseException]) -> Callable[[], None]:
-    def main(options: OutOptions, overrides: list[str]) -> None:
+    def main(options: NoOptions, overrides: list[str]) -> None:
         raise error()
 
-    return PlainCommand(OutOptions, main)
+    return PlainCommand(NoOptions, main)
 
 
 def hidden() -> BaseException:
@@ -55,39 +46,14 @@ def hidden() -> BaseException:
         return error
 
 
-def of_a_named_file() -> BaseException:
-    return OSError(errno.EDQUOT, "Disk quota exceeded", str(Path.cwd() / "none" / "a.png"))
-
-
-@pytest.mark.parametrize(
-    ("error", "words"),
-    [
-        (full, "is full ("),
-        (hidden, "is full ("),
-        (of_a_named_file, f"the disk of {Path.cwd()} has no space left for this user (quota) ("),
-        (lambda: OSError(errno.EROFS, "Read-only file system"), "is mounted read-only ("),
-    ],
-)
-def test_a_full_disk_is_one_sentence(call: Call, tmp_path: Path, error, words: str) -> None:
-    code, _, err = call(raising(error), f"out={tmp_path / 'none'}")
+@pytest.mark.parametrize("error", [full, hidden])
+def test_full_disk_is_one_message(call: Call, error) -> None:
+    code, _, err = call(raising(error))
     assert code == 1
-    assert_one_sentence(err, words)
-    assert " MB free, after the unfinished file was removed); free some space, or name a" in err
-    assert err.endswith(f"{RESUME}\n")
+    assert_one_sentence(err, "; free some space, then rerun the command to resume")
 
 
-def test_a_reader_that_names_the_setting_keeps_its_sentence(call: Call) -> None:
-    def refused() -> BaseException:
-        error = InputError("data.cache: the disk of /a filled up.")
-        error.__cause__ = full()
-        return error
-
-    code, _, err = call(raising(refused))
-    assert code == 1
-    assert_one_sentence(err, "data.cache: the disk of /a filled up; the disk of ")
-
-
-def test_a_sentence_that_hides_its_cause_stays_as_it_is(call: Call) -> None:
+def test_message_that_hides_its_cause_stays(call: Call) -> None:
     def refused() -> None:
         try:
             raise full()
@@ -104,31 +70,19 @@ def of_torch() -> BaseException:
     return told.value
 
 
-def of_numpy() -> BaseException:
-    with pytest.raises(MemoryError) as told:
-        np.empty(2**52, np.uint8)
-    return told.value
-
-
 @pytest.mark.parametrize(
-    ("error", "words"),
+    "error",
     [
-        (MemoryError, "the memory of this machine is exhausted (MemoryError); lower scale.batch"),
-        (of_numpy, "exhausted (Unable to allocate 4.00 PiB"),
-        (of_torch, "exhausted ("),
-        (
-            lambda: torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB.\nSee"),
-            "the memory of the GPU is exhausted (CUDA out of memory. Tried to allocate 2 GiB);",
-        ),
-        (lambda: OSError(errno.ENOMEM, "Cannot allocate memory"), "exhausted ([Errno 12] Cannot"),
+        MemoryError,
+        of_torch,
+        lambda: torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB.\nSee"),
+        lambda: OSError(errno.ENOMEM, "Cannot allocate memory"),
     ],
 )
-def test_exhausted_memory_is_one_sentence(call: Call, error, words: str) -> None:
+def test_exhausted_memory_is_one_message(call: Call, error) -> None:
     code, _, err = call(raising(error))
     assert code == 1
-    assert_one_sentence(err, words)
-    assert "scale.crop_hw or data.num_workers; " in err
-    assert err.endswith(f"{RESUME}\n")
+    assert_one_sentence(err, "scale.crop_hw or data.num_workers, then rerun the command")
 
 
 def test_other_errors_stay_errors(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -147,14 +101,12 @@ def test_an_image_that_does_not_fit_into_memory_is_not_called_damaged(
 ) -> None:
     path = tmp_path / "a.png"
     cv2.imwrite(str(path), np.zeros((8, 8, 3), np.uint8))
-    error = cv2.error("Insufficient memory")
-    error.code = cv2.Error.StsNoMem
 
-    def decoding(*_: object) -> None:
-        raise error
+    def load(*_: object) -> None:
+        raise MemoryError
 
-    monkeypatch.setattr(cv2, "imdecode", decoding)
-    with pytest.raises(MemoryError, match=r"a.png cannot be decoded, because its pixels do not"):
+    monkeypatch.setattr(PngImagePlugin.PngImageFile, "load", load)
+    with pytest.raises(MemoryError):
         decode(path)
 
 
@@ -175,15 +127,10 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 
 def test_what_was_whole_before_the_disk_was_full_stays_whole(small_disk: Path) -> None:
-    kind = Archive("things 1", "things", "make it", {"numbers": "u N"})
-    noise = np.random.default_rng(0).integers(0, 256, SMALL_MB * 2**20, np.uint8)
-    kind.save(small_disk / "a.npz", {"numbers": noise[:1000]})
+    noise = np.random.default_rng(0).bytes(2 * SMALL_MB * 2**20)
     write_atomic(small_disk / "a.json", b"old")
     with pytest.raises(OSError, match="No space left"):
-        kind.save(small_disk / "a.npz", {"numbers": noise})
-    with pytest.raises(OSError, match="No space left"):
-        write_atomic(small_disk / "a.json", noise.tobytes() * 2)
-    np.testing.assert_array_equal(kind.load(small_disk / "a.npz")["numbers"], noise[:1000])
+        write_atomic(small_disk / "a.json", noise)
     assert (small_disk / "a.json").read_bytes() == b"old"
 
 
@@ -197,7 +144,7 @@ def test_a_training_whose_disk_fills_up_resumes_when_there_is_space(
     subprocess.run(["mount", "-o", "remount,size=50m", str(small_disk)], check=True)
     code, _, err = train(call, data, runs, *words)
     assert code == 1
-    assert_one_sentence(err, f"the disk of {runs} is full (")
+    assert_one_sentence(err, "No space left on device")
     (folder,) = runs.iterdir()
     assert (folder / "last.pt").is_file()
     assert not (folder / "result.json").exists()

@@ -9,20 +9,18 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
 from torch.utils.data import DataLoader
 
 from rgbt.config.plain_command import PlainCommand
-from rgbt.data.loaders import _started
-from rgbt.data.reader import start_worker
-from rgbt.engine.checkpoint import State
+from rgbt.data.loaders import ENDING, start_worker
+from rgbt.engine.checkpoint import State, load_checkpoint
 from rgbt.engine.trainer import Trainer
-from rgbt.runtime import signals
-from rgbt.runtime.signals import Stopped, answered, at_once, deferred
+from rgbt.runtime.signals import Stopped, answered, deferred
 from rgbt.types import Batch
+from tests.checkpoints.test_torch_files import same
 from tests.commands import Call, NoOptions, assert_one_sentence
 from tests.engine.test_trainer import batches, make
 
@@ -51,8 +49,9 @@ def train(folder: Path, **changes: object) -> tuple[Trainer, list]:
     return make(folder, max_steps=6, checkpoint_every=100, eval_every=3, log_every=4, **changes)
 
 
-@pytest.mark.parametrize("number", SIGNALS)
-@pytest.mark.parametrize("step", [1, 2, 4])
+@pytest.mark.parametrize(
+    ("number", "step"), [(signal.SIGINT, 1), (signal.SIGTERM, 2), (signal.SIGHUP, 4)]
+)
 def test_the_step_in_progress_is_finished_and_saved(
     tmp_path: Path, number: signal.Signals, step: int
 ) -> None:
@@ -60,9 +59,8 @@ def test_the_step_in_progress_is_finished_and_saved(
     whole, log = train(tmp_path / "whole")
     whole.fit(batches(0), State(seed=7))
     first, first_log = train(tmp_path / "run")
-    with pytest.raises(
-        Stopped, match=f"at step {step + 1}, and the checkpoint is saved; rerun"
-    ) as stop:
+    saved = f"at step {step + 1}, and the checkpoint is saved; rerun"
+    with answered(), pytest.raises(Stopped, match=saved) as stop:
         first.fit(sending(number, step), State(seed=7))
     assert (stop.value.step, stop.value.code) == (step + 1, 128 + number)
     second, second_log = train(tmp_path / "run")
@@ -70,67 +68,27 @@ def test_the_step_in_progress_is_finished_and_saved(
     assert second.resume(state)
     assert state.step == step + 1
     second.fit(batches(state.step), state)
-    ends = [tmp_path / where / "last.pt" for where in ("whole", "run")]
-    assert ends[0].read_bytes() == ends[1].read_bytes()
+    ends = [load_checkpoint(tmp_path / where / "last.pt") for where in ("whole", "run")]
+    assert same(*ends)
     names = [[sorted(values) for _, values in each] for each in (log, first_log + second_log)]
     losses = [[(n, v["loss"]) for n, v in each] for each in (log, first_log + second_log)]
     assert names[0] == names[1]
     assert losses[0] == losses[1]
 
 
-class Freed:
-    """Gets a signal while it is freed, where Python drops exceptions."""
-
-    def __init__(self, number: signal.Signals) -> None:
-        self.number = number
-
-    def __del__(self) -> None:
-        send(self.number)
-        time.sleep(0.001)
-
-
-@pytest.mark.parametrize("number", SIGNALS)
-def test_a_signal_that_comes_while_an_object_is_freed_is_not_lost(
-    number: signal.Signals, capfd: pytest.CaptureFixture[str]
-) -> None:
-    def work() -> None:
-        freed = Freed(number)
-        del freed
-        time.sleep(5)
-        raise AssertionError("the signal was lost")
-
-    with pytest.raises(Stopped) as stop:
-        work()
-    assert stop.value.number == number
-    assert capfd.readouterr().err == ""
-
-
-def test_one_that_was_dropped_waits_where_signals_wait() -> None:
-    reached = []
-
-    def work() -> None:
-        with deferred():
-            with at_once():
-                Freed(signal.SIGTERM)
-            time.sleep(0.1)
-            reached.append(True)
-
-    with pytest.raises(Stopped):
-        work()
-    assert reached
-
-
 def test_an_evaluation_is_left_at_once_and_made_on_resuming(tmp_path: Path) -> None:
+    waited: list[int] = []
+
     def stopped(step: int) -> float:
-        (trainer.checkpoints.begin_evaluation(step) / "counts_val.npz").touch()
         send(signal.SIGTERM)
-        raise AssertionError("the signal waits")
+        waited.append(step)
+        return 0.0
 
     trainer, _ = train(tmp_path)
     trainer.validate = stopped
-    with pytest.raises(Stopped) as stop:
+    with answered(), pytest.raises(Stopped) as stop:
         trainer.fit(batches(0), State(seed=7))
-    assert stop.value.step == 3
+    assert (stop.value.step, waited) == (3, [])
     again, _ = train(tmp_path)
     evaluated: list[int] = []
     again.validate = lambda step: evaluated.append(step) or float(step)  # type: ignore[func-returns-value]
@@ -139,6 +97,19 @@ def test_an_evaluation_is_left_at_once_and_made_on_resuming(tmp_path: Path) -> N
     assert (state.step, state.evaluated_step) == (3, 0)
     again.fit(batches(3), state)
     assert evaluated == [3, 6]
+
+
+def test_signal_that_comes_while_processes_agree_is_not_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def signalled(number: int) -> int:
+        send(signal.SIGTERM)
+        return number
+
+    trainer, _ = train(tmp_path)
+    monkeypatch.setattr("rgbt.engine.trainer.largest", signalled)
+    with pytest.raises(Stopped, match="at step 1, and"):
+        trainer.fit(batches(0), State(seed=7))
 
 
 def test_a_second_ctrl_c_stops_in_the_middle_of_a_step(tmp_path: Path) -> None:
@@ -164,23 +135,6 @@ def test_an_error_after_a_signal_is_its_consequence() -> None:
 
     with pytest.raises(Stopped):
         raising()
-
-
-def test_a_signal_between_two_evaluations_is_raised_at_the_next() -> None:
-    reached = []
-
-    def signalled() -> None:
-        with deferred():
-            with at_once():
-                reached.append(1)
-            send(signal.SIGHUP)
-            reached.append(2)
-            with at_once():
-                reached.append(3)
-
-    with pytest.raises(Stopped):
-        signalled()
-    assert reached == [1, 2]
 
 
 @pytest.mark.parametrize(
@@ -260,19 +214,28 @@ def thread_after_fork() -> Iterator[None]:
     is_wanted.clear()
 
 
+def started(loader: DataLoader[int]) -> Iterator[int]:
+    """As `rgbt.data.loaders.Batches` does."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
+    try:
+        return iter(loader)
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 @pytest.mark.usefixtures("thread_after_fork")
 def test_workers_leave_signals_of_a_group_to_the_main_process() -> None:
     """Ctrl-C in a terminal and `killpg` reach them too; the step in progress needs them."""
     loader = DataLoader(
         range(40), batch_size=None, num_workers=1, worker_init_fn=start_worker, prefetch_factor=2
     )
-    found = _started(loader, 1)
+    found = started(loader)
     assert next(found) == 0
     (worker,) = found._workers  # type: ignore[attr-defined]
     for number in SIGNALS:
         subprocess.run(["kill", f"-{int(number)}", str(worker.pid)], check=True)
     assert list(found) == list(range(1, 40))
-    fresh = _started(loader, 1)
+    fresh = started(loader)
     assert next(fresh) == 0
     (worker,) = fresh._workers  # type: ignore[attr-defined]
     worker.terminate()
@@ -283,7 +246,7 @@ def test_workers_leave_signals_of_a_group_to_the_main_process() -> None:
 SERVED = """
 import multiprocessing, os, sys
 from torch.utils.data import DataLoader
-from rgbt.data.reader import start_worker
+from rgbt.data.loaders import start_worker
 
 if __name__ == "__main__":
     loader = DataLoader(
@@ -323,57 +286,6 @@ def test_workers_of_a_fork_server_end_with_the_main_process(tmp_path: Path, end:
     while Path(f"/proc/{worker}").exists() and time.monotonic() < deadline:
         time.sleep(0.1)
     assert not Path(f"/proc/{worker}").exists()
-
-
-@pytest.fixture
-def soon_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(signals, "AGAIN", 0.05)
-
-
-@pytest.mark.usefixtures("soon_again")
-def test_signal_that_a_library_dropped_is_raised_again() -> None:
-    """C code may clear an error, for example of an attribute that it looks up."""
-    with suppress(Stopped):
-        send(signal.SIGTERM)
-    with pytest.raises(Stopped):
-        time.sleep(5)
-
-
-@pytest.mark.usefixtures("soon_again")
-def test_signal_that_a_library_dropped_waits_until_the_step_is_complete() -> None:
-    reached = []
-
-    def work() -> None:
-        with deferred():
-            with suppress(Stopped), at_once():
-                send(signal.SIGTERM)
-            time.sleep(0.2)
-            reached.append("after the drop")
-            with at_once():
-                reached.append("inside the next block")
-
-    with pytest.raises(Stopped):
-        work()
-    assert reached == ["after the drop"]
-
-
-@pytest.mark.usefixtures("soon_again")
-def test_signal_does_not_interrupt_what_is_done_because_of_it() -> None:
-    cleaned = []
-
-    def work() -> None:
-        try:
-            send(signal.SIGTERM)
-        except KeyboardInterrupt:
-            with suppress(ValueError):
-                int("nothing")
-            time.sleep(0.2)
-            cleaned.append(True)
-            raise
-
-    with pytest.raises(Stopped):
-        work()
-    assert cleaned == [True]
 
 
 def test_an_error_of_a_library_that_a_signal_left_halfway_is_its_consequence(call: Call) -> None:

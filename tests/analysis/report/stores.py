@@ -73,7 +73,7 @@ MASKER = {
     "pattern_probabilities": None,
 }
 DATASET = {
-    "_target_": "rgbt.data.synth.dataset.synth",
+    "_target_": "rgbt.synth.datasets.synth",
     **{"num_train": 1, "num_val": 1, "num_test": 1, "height": 64, "width": 96},
 }
 
