@@ -236,4 +236,4 @@ def test_weights_of_another_network_fail_once(
 ) -> None:
     run = runs_of(f"weights.RTFNet={trained(*ONE) / 'best.pt'}")["RTFNet"]
     assert (run.state, len(commands)) == ("failed", 1)
-    assert "cannot be loaded into RTFNet" in run.reason
+    assert "does not fit this network" in run.reason
