@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, TypeAdapter
 
-from rgbt.checks import InputError
+from rgbt.checks import InputError, without_controls
 from rgbt.metrics.names import DAY, NIGHT
 
 ABSENT = "-"
@@ -98,11 +98,15 @@ class TextTable:
     notes: tuple[str, ...] = ()
 
     def to_markdown(self) -> str:
-        """The table in Markdown, with the title in bold above it and its footnotes below."""
+        """The table in Markdown, with the title in bold above it and its footnotes below.
+
+        Control characters and new lines of names become "?".
+        """
         rule = ["---", *["---:"] * (len(self.header) - 1)]
         lines = ["| " + " | ".join(row) + " |" for row in (self.header, rule, *self.rows)]
         notes = ["", *(f"- {note}" for note in self.notes)] if self.notes else []
-        return "\n".join([f"**{self.title}**", "", *lines, *notes]) + "\n"
+        every = [f"**{self.title}**", "", *lines, *notes]
+        return "\n".join(without_controls(line.replace("\n", "?")) for line in every) + "\n"
 
 
 def class_grid(tables: ResultTables) -> TextTable:

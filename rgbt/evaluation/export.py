@@ -14,9 +14,9 @@ import rgbt
 from rgbt.assembly.session import Session
 from rgbt.checks import InputError
 from rgbt.class_scores import classes_of
-from rgbt.data.batches import collate
 from rgbt.data.domains import TestedHead
-from rgbt.data.to_predict import of_split
+from rgbt.data.loaders import collate
+from rgbt.data.new_images import of_split
 from rgbt.evaluation.prediction import heads_of, view_of
 from rgbt.exported.graph import (
     OPSET,

@@ -287,3 +287,56 @@ def test_a_file_that_cannot_be_written_leaves_the_old_one(
         save(path, payload())
     assert path.read_bytes() == before
     assert [each.name for each in tmp_path.iterdir()] == ["last.pt"]
+
+
+def moment(stored: dict[str, Any]) -> None:
+    stored["state"][0]["exp_avg"] = torch.zeros(7)
+
+
+def whole_numbers(stored: dict[str, Any]) -> None:
+    stored["state"][0]["exp_avg"] = torch.zeros_like(
+        stored["state"][0]["exp_avg"], dtype=torch.int64
+    )
+
+
+def betas(stored: dict[str, Any]) -> None:
+    stored["param_groups"][0]["betas"] = "0.9"
+
+
+def groups(stored: dict[str, Any]) -> None:
+    stored["param_groups"] *= 2
+
+
+def another_parameter(stored: dict[str, Any]) -> None:
+    stored["state"][99] = stored["state"][0]
+
+
+@pytest.mark.parametrize("change", [moment, whole_numbers, betas, groups, another_parameter])
+def test_optimizer_state_of_other_shape_or_type_is_refused(change: Any) -> None:
+    parameter = torch.nn.Parameter(torch.zeros(2, 3))
+    optimizer = torch.optim.AdamW([parameter], lr=0.1)
+    parameter.grad = torch.ones(2, 3)
+    optimizer.step()
+    stored = optimizer.state_dict()
+    restore_optimizer(optimizer, stored, Path("last.pt"))
+    change(stored)
+    with pytest.raises(InputError, match=r"last\.pt holds the state of a different optimizer"):
+        restore_optimizer(optimizer, stored, Path("last.pt"))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        *({"step": -1}, {"step": 1.5}, {"seed": "3"}, {"best_score": None}, {"skipped": "a"}),
+        *(
+            {"skipped": [3]},
+            {"unlogged": [1.0]},
+            {"unlogged": {"loss": "1"}},
+        ),
+    ],
+)
+def test_state_of_other_types_is_refused(wrong: dict[str, Any]) -> None:
+    stored = payload()
+    assert State.of(stored).unlogged == {}
+    with pytest.raises(TypeError):
+        State.of({"state": stored["state"] | wrong})
