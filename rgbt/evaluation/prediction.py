@@ -137,6 +137,7 @@ def counts_of(
         split=split,
         unscored=dataset.unscored,
         absent=data.regions.absent,
+        run=data.run if isinstance(data, Session) else "",
     )
 
 

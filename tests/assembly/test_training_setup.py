@@ -18,7 +18,7 @@ from rgbt.checks import InputError
 from rgbt.config.compose import compose
 from rgbt.data import pairs, rare_classes
 from rgbt.data.pseudo_labels import FORMAT
-from rgbt.engine.recomputation import Recomputed
+from rgbt.engine.network_settings import Recomputed
 from rgbt.evaluation.prediction import decode_ahead
 from rgbt.run import main
 from rgbt.runs.run_spec import RunSpec

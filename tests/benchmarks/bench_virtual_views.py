@@ -33,7 +33,7 @@ from scipy.sparse import csc_array
 from torch import Tensor
 from torch.nn import functional as F
 
-from rgbt.engine.allocator import keep_memory
+from rgbt.engine.device import keep_memory
 from rgbt.geometry.camera import Camera
 from rgbt.geometry.halving import halved_mean
 from rgbt.geometry.homography import homography
