@@ -95,6 +95,15 @@ def mean_count(count: Tensor) -> Tensor:
     return summed / num_processes()
 
 
+def largest(number: int) -> int:
+    """The largest of the numbers of all processes."""
+    if num_processes() == 1:
+        return number
+    found = torch.tensor(number)
+    distributed.all_reduce(found, distributed.ReduceOp.MAX)
+    return int(found)
+
+
 def agreed(value: Value) -> Value:
     """The value of process 0, of any type that can be pickled."""
     if num_processes() == 1:

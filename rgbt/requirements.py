@@ -88,7 +88,6 @@ class Record:
         hides_cells: masker: whether any cell is ever hidden.
         crop_hw: transform: size of a training example; None where that differs.
         for_target: transform: that of the target domain; None: itself.
-        works_on_batches: transform: whether it can augment whole batches on the device.
         target_labels: domains: whether the target has labels.
         target_confidence: domains: whether these carry a confidence.
         separate_heads: domains: whether source and target have a head each.
@@ -124,7 +123,6 @@ class Record:
     hides_cells: bool = True
     crop_hw: tuple[int, int] | None = None
     for_target: Any = None
-    works_on_batches: bool = False
     target_labels: bool = False
     target_confidence: bool = False
     separate_heads: bool = False

@@ -20,8 +20,8 @@ def main(config: DictConfig, overrides: list[str]) -> int:
     from rgbt.config.command import words_of_run
     from rgbt.runs.naming import tags_from_environment
     from rgbt.runs.specify import requested_run
+    from rgbt.runtime.group import group_from_environment
     from rgbt.terminal import info
-    from rgbt.training.show import is_launched, show
 
     tags = tags_from_environment()
     run = requested_run(config, overrides)
@@ -32,8 +32,12 @@ def main(config: DictConfig, overrides: list[str]) -> int:
         )
     if run.out is not None:
         raise InputError(f"out={run.out} has no effect here: runs are written to runs_dir=...")
-    if run.is_finished and not run.fresh and not is_launched():
-        show(run, tags)
+    if run.is_finished and not run.fresh:
+        from rgbt.training.show import show
+
+        group = group_from_environment()
+        if group is None or group.rank == 0:
+            show(run, tags)
         return 0
     from rgbt.training.start import start
 

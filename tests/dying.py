@@ -22,10 +22,9 @@ def die_at(instant: str) -> None:
     seen: Counter[str] = Counter()
 
     def reached(now: str, target: Any) -> None:
-        path = Path(target)
-        shown = "/".join(path.parts[-1 if path.parent.parent.name != "checkpoints" else -3 :])
-        seen[f"{now} {shown}"] += 1
-        if f"{now} {shown} {seen[f'{now} {shown}']}" == instant:
+        event = f"{now} {Path(target).name}"
+        seen[event] += 1
+        if f"{event} {seen[event]}" == instant:
             os.kill(os.getpid(), signal.SIGKILL)
 
     def named(make: Any) -> Any:

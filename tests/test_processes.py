@@ -27,13 +27,14 @@ from rgbt.engine.batch_norm import (
     share_running_statistics,
     synchronise_batch_norm,
 )
+from rgbt.engine.gradients import average_gradients
 from tests.conftest import WriteMFNet
 from tests.models.plain import generator
 from tests.processes import run_in_processes
 from tests.transforms.recipes import crm
 
 SIZES = pytest.mark.parametrize("size", [2, pytest.param(4, marks=pytest.mark.slow)])
-B = 8
+B, DTYPES = 8, (torch.float32, torch.float32, torch.float64)
 SPLITS = {"train": [f"{i:05d}D" for i in range(11)], "val": [f"{i:05d}N" for i in range(5)]}
 
 
@@ -71,8 +72,19 @@ def sharing() -> dict[str, Any]:
         ],
         "sums": (total.detach(), part.grad, processes.total(torch.tensor(rank))),
         "mean_count": processes.mean_count(torch.tensor(3 * rank)),
+        "largest": processes.largest(5 - rank),
+        "averaged": averaged(),
         "objects": (processes.agreed(rank), processes.collected(("of", rank))),
     }
+
+
+def averaged() -> list[float | None]:
+    """Gradients of three parameters after `average_gradients`."""
+    parameters = [nn.Parameter(torch.zeros(2, dtype=each)) for each in DTYPES]
+    for factor, parameter in zip((1, 0, 10), parameters, strict=True):
+        parameter.grad = torch.full_like(parameter, factor * processes.rank()) if factor else None
+    average_gradients(parameters)
+    return [None if each.grad is None else float(each.grad[1]) for each in parameters]
 
 
 @SIZES
@@ -89,6 +101,9 @@ def test_parts_wholes_and_sums(size: int) -> None:
         expected = (total, 2 * total * (ranks + size), torch.tensor(ranks))
         assert all(map(torch.equal, found["sums"], expected))
         assert found["mean_count"] == 3 * ranks / size
+        assert found["largest"] == 5
+        # Of each parameter the mean of rank and of 10 rank; the one without a gradient has none.
+        assert found["averaged"] == [ranks / size, None, 10 * ranks / size]
         assert found["objects"] == (0, [("of", other) for other in range(size)])
 
 
@@ -149,8 +164,6 @@ def test_running_variance_is_unbiased_by_hand() -> None:
     assert norm.running_var.item() == pytest.approx(0.9 + 0.2)
     assert norm.num_batches_tracked == 1
     assert norm(torch.tensor([[1.0], [3.0]]).bfloat16()).dtype == torch.bfloat16
-    with pytest.raises(ValueError, match="1 dimensions"):
-        norm.eval()(torch.ones(3))
 
 
 def renamed() -> None:

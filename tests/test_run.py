@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from tests.checkpoints.test_torch_files import same
 
 from rgbt import evaluate, predict
 from rgbt.checkpoints.torch_files import save
@@ -23,7 +24,6 @@ from rgbt.config.compose import compose
 from rgbt.engine.checkpoint import load_checkpoint
 from rgbt.metrics.counts import Counts
 from rgbt.run import main
-from tests.checkpoints.test_torch_files import same
 from tests.commands import (
     DAYS_AND_NIGHTS,
     ON_CPU,

@@ -98,17 +98,22 @@ def assert_same_run(folder: Path, other: Path) -> None:
 
 
 @pytest.mark.parametrize("rank", ["0", "1"])
-def test_wrong_devices_are_refused_before_anything_starts(
+def test_batch_that_three_processes_cannot_share_is_refused(
     call: Call, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rank: str
 ) -> None:
-    """By the first process of a machine alone."""
-    torchrun = {"RANK": rank, "LOCAL_RANK": rank, "WORLD_SIZE": "4", "LOCAL_WORLD_SIZE": "2"}
-    for name, value in {**torchrun, "MASTER_ADDR": "node1", "MASTER_PORT": "29500"}.items():
+    """By process 0 alone, before anything is written."""
+    torchrun = {
+        "RANK": rank,
+        "WORLD_SIZE": "3",
+        "LOCAL_WORLD_SIZE": "3",
+        "TORCHELASTIC_RUN_ID": "1",
+    }
+    for name, value in {**torchrun, "TORCHELASTIC_RUN_ID": "1"}.items():
         monkeypatch.setenv(name, value)
     code, out, err = call(main, *settings(data, 4), f"runs_dir={tmp_path}")
     assert (code, list(tmp_path.iterdir())) == (2, [])
     if rank == "0":
-        assert_one_sentence(err, "trainer.devices=1")
+        assert_one_sentence(err, "data.batch_size is 4, which 3 devices cannot share")
     else:
         assert out == err == ""
 
@@ -156,6 +161,7 @@ def straight(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("process 1", signal.SIGKILL, 137, 4),
         ("command", signal.SIGKILL, -9, 2),
         ("command", signal.SIGTERM, 143, 1),
+        ("command", signal.SIGINT, 130, 2),
     ],
 )
 def test_killed_run_resumes_with_another_number(
@@ -171,6 +177,8 @@ def test_killed_run_resumes_with_another_number(
     assert not psutil.wait_procs(members, timeout=30)[1]
     if killed != "command":
         assert_one_sentence(first.text, f"{killed} of 2 was stopped by SIGKILL")
+    elif signal_ != signal.SIGKILL:
+        assert_one_sentence(first.text, "and the checkpoint is saved; rerun the command")
     again = Command((*lasting, f"trainer.devices={number}"), tmp_path)
     assert_same_run(again.finished(), straight)
     assert "resumes at step" in again.text
@@ -180,14 +188,14 @@ def test_killed_run_resumes_with_another_number(
 def test_torchrun_and_srun_train_the_same_run(data: Path, tmp_path: Path) -> None:
     alone = Command(settings(data, 4), tmp_path / "alone").finished()
     torchrun = ("-m", "torch.distributed.run", "--nproc-per-node=2", "-m", "rgbt.run")
-    two = Command(settings(data, 4, "trainer.devices=auto"), tmp_path / "torchrun", torchrun)
+    two = Command(settings(data, 4), tmp_path / "torchrun", torchrun)
     assert_same_run(two.finished(), alone)
     assert two.text.count("IoU by region") == 1
     job = {
-        **{"SLURM_JOB_ID": str(os.getpid()), "SLURM_STEP_ID": "0", "SLURM_STEP_NUM_TASKS": "2"},
-        **{"SLURM_STEP_TASKS_PER_NODE": "2", "SLURM_STEP_NODELIST": "127.0.0.1"},
+        **{"SLURM_JOB_ID": str(os.getpid()), "SLURM_NODELIST": "127.0.0.1", "SLURM_NODEID": "0"},
+        **dict.fromkeys(("SLURM_NTASKS", "SLURM_NTASKS_PER_NODE", "SLURM_STEP_NUM_TASKS"), "2"),
     }
-    words, srun = settings(data, 4, "trainer.devices=2"), tmp_path / "srun"
+    words, srun = settings(data, 4), tmp_path / "srun"
     first, second = (
         Command(words, srun, environment={**job, "SLURM_PROCID": rank, "SLURM_LOCALID": rank})
         for rank in "01"

@@ -15,10 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from rgbt.checks import InputError, check_members, described
+from rgbt.checks import InputError, check_members, described, one_line
 from rgbt.config.stored_config import EXTERNAL
 from rgbt.dataset import reader_of
-from rgbt.maskers.contract import check_masker
+from rgbt.maskers.masker import check_masker
 from rgbt.randomness import numpy_generator, torch_generator
 from rgbt.requirements import Record, name_of, record_of
 from rgbt.types import IGNORE, AnyMasker, Output, Sample
@@ -260,8 +260,17 @@ def _probe_external(session: Session, train_hw: tuple[int, int], test_hw: tuple[
         model.train(is_training)
         count = min(2, session.loading.batch_size) if is_training else 1
         images = [torch.zeros(count, each, *image_hw, device=session.device) for each in (3, 1)]
-        with torch.set_grad_enabled(is_training), session.autocast():
-            output = model(*images, generator=torch_generator(session.spec.seed, "probe"))
+        try:
+            with torch.set_grad_enabled(is_training), session.autocast():
+                output = model(*images, generator=torch_generator(session.spec.seed, "probe"))
+        except (InputError, torch.OutOfMemoryError):
+            raise
+        except Exception as error:
+            size = " x ".join(map(str, image_hw))
+            raise InputError(
+                f"model: the network cannot predict {count} images of {size} pixels "
+                f"({type(error).__name__}: {one_line(error)})."
+            ) from error
     for name, value in model.named_buffers():
         value.copy_(before[name])
     if not output.logits.requires_grad:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import torch
 from lightning_fabric import Fabric
@@ -75,7 +75,7 @@ class TrainingSetup:
     def batches(self, steps: range) -> Batches[Loadable] | PairedBatches:
         """Training batches of these steps: of one domain, or a pair of batches of both."""
         session, seed = self.session, self.session.spec.drawn.order
-        loading = replace(session.loading, augment=_where_to_augment(session))
+        loading = session.loading
         data, split = self.datasets["source"], session.domains.source.split
         source = train_batches(data, split, session.transform, loading, seed, steps, self.rare)
         target = session.domains.named.get("target")
@@ -117,12 +117,13 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
     missing = () if upstream_finished else [each.key for each in spec.dependencies]
     fabric = open_fabric(spec.trainer)
     session = open_session(spec, load_weights=WEIGHTS not in missing, device=fabric.device)
+    session = replace(session, run=spec.key)
     domains, loading = session.domains, session.loading
     masker: AnyMasker = spec.masker.build()
     loss = spec.loss.build()
     checked = CheckedLoss(loss) if is_own(loss) else loss
     _share_batch_norm(session.model, session.trainer)
-    prepare_training(session.model, session.trainer, fabric.device)
+    prepare_training(session.model, session.trainer)
     model = fabric.setup_module(session.model)
     collaborators = {"model": model, "loss": checked, "masker": masker, "domains": domains}
     with torch.random.fork_rng(devices=[]):
@@ -184,16 +185,6 @@ def _report_unpublished_settings(session: Session, names: Lists) -> None:
             f"trainer.selection_split={picked}: the best checkpoint is selected on {shared} test "
             "images."
         )
-
-
-def _where_to_augment(session: Session) -> Literal["loader", "device"]:
-    """What `LoaderSettings.augment` comes to on this device with this transform."""
-    requested = session.loading.augment
-    if requested == "auto":
-        redraws = session.loading.sampling == "rare_classes"  # crops, by their labels
-        can = record_of(session.transform).works_on_batches and not redraws
-        return "device" if can and session.device.type == "cuda" else "loader"
-    return requested
 
 
 def _labelled(session: Session, name: str, domain: Domain, names: Lists) -> LabelledDataset:

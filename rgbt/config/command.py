@@ -35,7 +35,7 @@ from rgbt.config.compose import (
 )
 from rgbt.config.options import readable_paths
 from rgbt.config.plain_command import exit_code
-from rgbt.runtime.member import taking_part
+from rgbt.runtime.group import taking_part
 from rgbt.runtime.signals import answered
 
 MULTIRUN = ("-m", "--multirun")

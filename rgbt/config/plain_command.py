@@ -15,9 +15,8 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 from rgbt.checks import InputError, RunError, nearest, without_controls
 from rgbt.config.options import help_text, parse, readable_paths
-from rgbt.runtime.member import write_error
 from rgbt.runtime.resources import reporting_exhaustion
-from rgbt.runtime.signals import Stopped, answered, ending_command, handled
+from rgbt.runtime.signals import Stopped, answered, ending_command
 
 T = TypeVar("T")
 HELP = ("-h", "--help")
@@ -52,11 +51,10 @@ COMMANDS = {
     "cache": Entry("rgbt.data.cache.__main__", "decode a data set into a cache, or remove it"),
     "export": Entry("rgbt.export", "write a network as ONNX, compared with the network"),
     "weights": Entry("rgbt.weights", "inspect a file of weights, or export the weights of a run"),
+    "archive": Entry("rgbt.archive", "keep the results of runs in the repository"),
     "sync": Entry("rgbt.tracking.sync", "send run folders to MLflow"),
     "ui": Entry("rgbt.tracking.ui", "open MLflow at the runs of a folder"),
-    "corruptions": Entry("rgbt.corruptions.__main__", "draw the corruptions of a pair of images"),
     "masks": Entry("rgbt.maskers.sketch", "draw examples of a masker"),
-    "scenes": Entry("rgbt.data.synth.sheet", "draw scenes of the embedded data set"),
 }
 
 
@@ -70,7 +68,6 @@ def exit_code(work: Callable[[], int | None], *, catch_interrupt: bool = True) -
     except KeyboardInterrupt as stop:
         if not catch_interrupt:
             raise
-        handled()
         if isinstance(stop, Stopped):
             return say(str(stop), stop.code)
         return say("interrupted; rerun the command to resume.", 130)  # a second Ctrl-C
@@ -90,7 +87,8 @@ def say(sentence: str, code: int) -> int:
     with suppress(OSError):  # output may go to a file on a disk that is full
         sys.stdout.flush()
     # Names of files and words of damaged files may hold anything.
-    write_error(without_controls(sentence))
+    sys.stderr.write(f"rgbt: {without_controls(sentence)}\n")
+    sys.stderr.flush()
     return code
 
 

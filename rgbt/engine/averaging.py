@@ -1,7 +1,8 @@
-"""Average the weights of a network over the steps of its training, for evaluation.
+"""Which weights of a network are evaluated: those of the last step, or an average over steps.
 
-The network trains with its own weights. Its average is put in their place for every evaluation, and
-is what `best.pt` and `last.pt` hold. Other networks, such as a discriminator, are not averaged.
+The network trains with its own weights. Its average is a copy of the network, which is evaluated in
+its place, and whose weights `best.pt` and `last.pt` hold. Other networks, such as a discriminator,
+are not averaged.
 
 Sources: "ema" is the teacher of Tarvainen and Valpola, "Mean teachers are better role models"
 (2017). "last" is stochastic weight averaging of Izmailov et al., "Averaging Weights Leads to Wider
@@ -11,120 +12,69 @@ estimated again on the training images.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 
-import torch
 from torch import Tensor, nn
-from torch.optim.swa_utils import get_ema_multi_avg_fn, get_swa_multi_avg_fn
 
-from rgbt.checks import InputError
+from rgbt.averaging import AveragedNetwork
 from rgbt.engine.checkpoint import UNAVERAGED, restore_weights
 from rgbt.engine.settings import TrainerSettings
-from rgbt.processes import agreed, num_processes
-
-AddToAverage = Callable[[Sequence[Tensor], Sequence[Tensor], int], None]
-"""Add tensors to means in place, given the number of values in each mean."""
 
 WARM_UP = 9
 """The decay of step n is at most n / (n + 9), as in TensorFlow's ExponentialMovingAverage."""
 
 
-class AveragedWeights:
-    """The average of the weights of one network, as `settings.averaging` says; "none" has none.
+class EvaluatedWeights:
+    """The weights of a network that are evaluated, as `settings.averaging` says.
 
-    Parameters and floating-point buffers, such as running statistics of batch normalisation, are
-    averaged alike. Integer buffers are those of the last step. All are derived from the weights of
+    Parameters and floating-point buffers are averaged alike. All are derived from the weights of
     each step and from its number, so that processes with equal weights have equal averages.
 
     Args:
-        model: the network that is trained, with its initial weights. Its forward may be compiled:
-            no copy of the module is made.
+        model: the network that is trained, with its initial weights.
         settings: of the training loop.
     """
 
     def __init__(self, model: nn.Module, settings: TrainerSettings) -> None:
         self._model = model
-        self._kind = settings.averaging
-        self._decay = settings.ema_decay
-        averaged_steps = max(1, round(settings.averaged_share * settings.max_steps))
-        self._before = settings.max_steps - averaged_steps
-        self._average: dict[str, Tensor] = self._copied() if self._kind == "ema" else {}
+        self._settings = settings
+        self._average = None
+        if settings.averaging != "none":
+            self._average = AveragedNetwork(model, buffers=True)
+        self._is_begun = settings.averaging == "ema"
+
+    def share(self, step: int) -> float:
+        """Weight of the network after `step` steps, >= 1, in its average; 0: it has none yet."""
+        settings = self._settings
+        if settings.averaging == "ema":
+            return 1 - min(settings.ema_decay, step / (step + WARM_UP))
+        averaged = max(1, round(settings.averaged_share * settings.max_steps))
+        number = step - (settings.max_steps - averaged)
+        return 1 / number if settings.averaging == "last" and number > 0 else 0.0
 
     def update(self, step: int) -> None:
         """Add the weights after `step` optimizer steps, >= 1; called after every step."""
-        if self._kind == "ema":
-            decay = min(self._decay, step / (step + WARM_UP))
-            self._add(get_ema_multi_avg_fn(decay), step)  # type: ignore[no-untyped-call]
-        elif self._kind == "last" and step == self._before + 1:
-            self._average = self._copied()
-        elif self._kind == "last" and step > self._before:
-            self._add(get_swa_multi_avg_fn(), step - self._before - 1)  # type: ignore[no-untyped-call]
+        share = self.share(step)
+        if self._average is not None and share:
+            self._average.update(self._model, share)
+            self._is_begun = True
 
-    def weights(self) -> dict[str, Tensor]:
-        """The weights to evaluate, by name: the average, or those of the network before it begins.
+    @property
+    def network(self) -> nn.Module:
+        """The network to evaluate: the average, or the trained one before an average begins."""
+        average = self._average if self._is_begun else None
+        return self._model if average is None else average.module
 
-        They are not copied.
-        """
-        return self._average or self._model.state_dict()
+    def state(self) -> dict[str, dict[str, Tensor]]:
+        """Weights to evaluate ("model"), and to resume from where these are others."""
+        weights = {"model": self.network.state_dict()}
+        own = {UNAVERAGED: self._model.state_dict()}
+        return weights if self.network is self._model else weights | own
 
-    def unaveraged(self) -> dict[str, Tensor] | None:
-        """The weights of the network, by name, to resume from; None where `weights` has them."""
-        return self._model.state_dict() if self._average else None
-
-    @contextmanager
-    def in_network(self) -> Iterator[None]:
-        """Within it, the network has the weights to evaluate; afterwards its own, bit for bit."""
-        if not self._average:
-            yield
-            return
-        own = self._copied()
-        self._model.load_state_dict(self._average)
-        try:
-            yield
-        finally:
-            self._model.load_state_dict(own)
-
-    def restore(self, payload: Mapping[str, dict[str, Tensor]], step: int, source: Path) -> None:
-        """Restore the network and its average from a checkpoint of `step`.
-
-        Raises:
-            InputError: it is of another network, or of a run with another averaging.
-        """
-        is_averaged = self._kind == "ema" or (self._kind == "last" and step > self._before)
-        if is_averaged != (UNAVERAGED in payload):
-            raise InputError(
-                f"{source} is a checkpoint of a run {'without' if is_averaged else 'with'} "
-                f"averaged weights, but trainer.averaging is {self._kind}. Resume with the "
-                "settings that wrote it, or train again in another runs_dir=..."
-            )
-        if is_averaged:
-            restore_weights(self._model, payload["model"], source)
-            self._average = self._copied()
-        restore_weights(self._model, payload[UNAVERAGED if is_averaged else "model"], source)
-
-    def share_buffers(self) -> None:
-        """Give every process the averaged buffers of process 0; called by all processes."""
-        if num_processes() == 1 or not self._average:
-            return
-        named = self._model.state_dict(keep_vars=True)
-        buffers = {
-            name: self._average[name]
-            for name, tensor in named.items()
-            if not isinstance(tensor, nn.Parameter)
-        }
-        for name, value in agreed({name: each.cpu() for name, each in buffers.items()}).items():
-            buffers[name].copy_(value)
-
-    def _copied(self) -> dict[str, Tensor]:
-        return {name: each.detach().clone() for name, each in self._model.state_dict().items()}
-
-    @torch.no_grad()
-    def _add(self, add: AddToAverage, count: int) -> None:
-        pairs = [(self._average[name], each) for name, each in self._model.state_dict().items()]
-        means, values = zip(*(pair for pair in pairs if pair[0].is_floating_point()), strict=True)
-        add(means, values, count)
-        for mean, value in pairs:
-            if not mean.is_floating_point():
-                mean.copy_(value)
+    def restore(self, payload: Mapping[str, dict[str, Tensor]], source: Path) -> None:
+        """Restore the network and its average from a checkpoint; InputError: of another network."""
+        self._is_begun = UNAVERAGED in payload
+        restore_weights(self.network, payload["model"], source)
+        if self._is_begun:
+            restore_weights(self._model, payload[UNAVERAGED], source)

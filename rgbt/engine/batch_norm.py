@@ -18,17 +18,11 @@ OF_TORCH = (nn.BatchNorm1d, nn.BatchNorm2d, nn.BatchNorm3d)
 
 
 def check_batch_norm_parts(parts: int, processes: int) -> None:
-    """Refuse parts of a batch that this number of processes does not make.
-
-    Raises:
-        InputError: `parts` is neither 1 nor the number of processes.
-    """
+    """Refuse parts of a batch that this number of processes does not make."""
     if parts not in (1, processes):
-        other = f" or {processes}, the number of its devices" if processes > 1 else ""
         raise InputError(
-            f"trainer.batch_norm_parts is {parts}, but a run on {processes} "
-            f"device{'s' * (processes > 1)} requires 1{other}. Set trainer.batch_norm_parts=1, or "
-            f"trainer.devices={parts}."
+            f"trainer.batch_norm_parts is {parts}, but the run has {processes} devices; set it to "
+            f"1 or {processes}."
         )
 
 
@@ -52,8 +46,7 @@ def synchronise_batch_norm(model: nn.Module) -> nn.Module:
         if isinstance(module, _BatchNorm) and type(module) not in known:
             raise InputError(
                 f"model: '{name}' is a {type(module).__name__}, a class derived from a batch "
-                f"normalisation of torch, which {num_processes()} devices cannot synchronise. Use "
-                "torch.nn.BatchNorm2d itself, or set "
+                "normalisation of torch, which several devices cannot synchronise; set "
                 f"trainer.batch_norm_parts={num_processes()}."
             )
     if any(parameter.is_cuda for parameter in model.parameters()):
@@ -68,16 +61,10 @@ def share_running_statistics(model: nn.Module) -> None:
     Needed before an evaluation or a checkpoint where each process normalises its own samples;
     the statistics have no effect on training. Called by all processes.
     """
-    if num_processes() == 1:
-        return
-    buffers = {
-        f"{name}.{key}": buffer
-        for name, module in model.named_modules()
-        if isinstance(module, _BatchNorm)
-        for key, buffer in module.named_buffers(recurse=False)
-    }
-    for name, value in agreed({name: each.cpu() for name, each in buffers.items()}).items():
-        buffers[name].copy_(value)
+    norms = [module for module in model.modules() if isinstance(module, _BatchNorm)]
+    buffers = [buffer for norm in norms for buffer in norm.buffers(recurse=False)]
+    for buffer, value in zip(buffers, agreed([each.cpu() for each in buffers]), strict=True):
+        buffer.copy_(value)
 
 
 class SynchronisedBatchNorm(_BatchNorm):
@@ -112,32 +99,19 @@ class SynchronisedBatchNorm(_BatchNorm):
         share = self.momentum
         if share is None:
             share = 1.0 / float(self.num_batches_tracked)
-        for running, new in (
-            (self.running_mean, mean),
-            (self.running_var, unbiased_variance),
-        ):
+        for running, new in ((self.running_mean, mean), (self.running_var, unbiased_variance)):
             assert running is not None, "running statistics are tracked"
             running.mul_(1 - share).add_(new, alpha=share)
 
     def _check_input_dim(self, input: Tensor) -> None:  # noqa: A002 - the name in torch
-        if input.dim() < 2:
-            raise ValueError(f"expected (N, C, ...), got {input.dim()} dimensions.")
+        """Any number of dimensions."""
 
 
 def _converted(module: nn.Module) -> nn.Module:
     """`module` with every batch normalisation of torch replaced, with its own tensors."""
     if isinstance(module, OF_TORCH):
-        made = SynchronisedBatchNorm(
-            module.num_features,
-            module.eps,
-            module.momentum,
-            module.affine,
-            module.track_running_stats,
-        )
-        made.weight, made.bias = module.weight, module.bias
-        for name, buffer in module.named_buffers(recurse=False):
-            setattr(made, name, buffer)
-        made.training = module.training
+        made = SynchronisedBatchNorm(module.num_features)
+        made.__dict__ |= module.__dict__
         return made
     for name, child in module.named_children():
         module.add_module(name, _converted(child))

@@ -5,25 +5,29 @@ When a run starts, the first of these that exists is used:
 2. `model.weights` (read by `rgbt.weights`);
 3. random weights.
 
-``last.pt`` commits a state: model, optimisers, step, and which step is the best. ``best.pt`` and
-the files of its evaluation (``counts_val.npz``, ...) follow at once. A process that is killed in
-between left the best weights in ``last.pt``, and `Checkpoints.load` writes ``best.pt`` from it.
+``best.pt`` is written before the ``last.pt`` that names its step, each under a temporary name. A
+process that is killed in between resumes from the state before, and makes the same best weights
+again.
 """
 
 from __future__ import annotations
 
-import shutil
+import json
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from annotated_types import Ge
+from pydantic import TypeAdapter
 from torch import Tensor, nn
 
-from rgbt.checkpoints.torch_files import read_torch_file, save
-from rgbt.checks import InputError, RunError, not_finite
+from rgbt.checkpoints.read import NOTE
+from rgbt.checkpoints.torch_files import is_plain, misfits, read_torch_file, save
+from rgbt.checks import InputError, RunError, not_finite, one_line
 
 UNAVERAGED = "unaveraged"
 """Entry of a checkpoint with the weights of the last step, where "model" has averaged ones."""
@@ -33,6 +37,9 @@ ADVICE = (
     "precision was mixed."
 )
 """Advice for numbers that are not finite."""
+
+
+Count = Annotated[int, Ge(0)]
 
 
 @dataclass
@@ -50,15 +57,19 @@ class State:
         evaluated_step: step of the last evaluation; below `step` where a signal came before the
             evaluation of `step`, which is then made on resuming.
         unlogged: values of the steps since the last line of ``metrics.jsonl``.
+        key: of the run.
+        settings: digest of its settings (`rgbt.runs.run_spec.settings_digest`).
     """
 
-    seed: int
-    step: int = 0
+    seed: Count
+    step: Count = 0
     best_score: float = -1.0
-    best_step: int = 0
+    best_step: Count = 0
     skipped: list[str] = field(default_factory=list)
-    evaluated_step: int = 0
+    evaluated_step: Count = 0
     unlogged: dict[str, float] = field(default_factory=dict)
+    key: str = ""
+    settings: str = ""
 
     def skip(self, names: Iterable[str]) -> None:
         """Note files that were skipped."""
@@ -66,34 +77,13 @@ class State:
 
     @classmethod
     def of(cls, payload: Mapping[str, Any]) -> State:
-        """The state in a checkpoint.
-
-        Raises:
-            TypeError: it is none.
-        """
-        stored = payload.get("state")
-        if not isinstance(stored, dict):
-            raise TypeError("no state")
-        # Before there was this entry, a checkpoint was written after the evaluation of its step.
-        state = cls(**{"evaluated_step": stored.get("step"), **stored})
-        numbers = (state.seed, state.step, state.best_step, state.evaluated_step)
-        if any(type(number) is not int or number < 0 for number in numbers):
-            raise TypeError("steps and seed are whole numbers")
-        if not isinstance(state.best_score, float):
-            raise TypeError("a score is a number")
-        values = [*state.unlogged.items()] if isinstance(state.unlogged, dict) else [("", "")]
-        if not isinstance(state.skipped, list) or any(
-            type(name) is not str for name in (*state.skipped, *(name for name, _ in values))
-        ):
-            raise TypeError("names are text")
-        if any(type(value) is not float for _, value in values):
-            raise TypeError("logged values are numbers")
-        return state
+        """The state in a checkpoint; TypeError or ValueError if there is none."""
+        text = json.dumps(payload.get("state"))
+        return TypeAdapter(cls).validate_json(text, strict=True)
 
 
 def training_payload(
-    weights: dict[str, Tensor],
-    unaveraged: dict[str, Tensor] | None,
+    weights: dict[str, dict[str, Tensor]],
     others: dict[str, nn.Module],
     optimizers: dict[str, torch.optim.Optimizer],
     state: State,
@@ -101,15 +91,13 @@ def training_payload(
     """Everything a run needs to resume as if it had not stopped.
 
     Args:
-        weights: of the network, as they are evaluated.
-        unaveraged: those of the last step, where `weights` are averaged.
+        weights: of the network (`rgbt.engine.averaging.EvaluatedWeights.state`).
         others: further networks that are trained, by name.
         optimizers: by name.
         state: progress.
     """
     return {
-        "model": weights,
-        **({} if unaveraged is None else {UNAVERAGED: unaveraged}),
+        **weights,
         "others": {name: module.state_dict() for name, module in others.items()},
         "optimizers": {name: optimizer.state_dict() for name, optimizer in optimizers.items()},
         "state": asdict(state),
@@ -124,13 +112,12 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     """
     payload = _shared(read_torch_file(path), {})
     loaded: dict[str, Any] = payload if isinstance(payload, dict) else {}
-    weights = loaded.get("model")
-    if not isinstance(weights, dict) or not all(
-        isinstance(name, str) and isinstance(tensor, Tensor) for name, tensor in weights.items()
-    ):
-        raise InputError(
-            f"{path} holds no weights under 'model'; give a checkpoint written by `rgbt run`."
-        )
+    networks = {key: loaded[key] for key in ("model", UNAVERAGED) if key in loaded}
+    for group in ("others", "optimizers"):
+        found = loaded.get(group, {})
+        networks |= found if isinstance(found, dict) else {group: None}
+    if "model" not in loaded or not all(isinstance(each, dict) for each in networks.values()):
+        raise InputError(f"{path} is no checkpoint written by `rgbt run`.")
     return loaded
 
 
@@ -145,18 +132,38 @@ def _shared(value: Any, known: dict[int, Any]) -> Any:
     return known.get(id(value), value)
 
 
-def step_of(payload: Mapping[str, Any], source: Path) -> int:
-    """The step of a last or a best checkpoint.
+def check_origin(payload: Mapping[str, Any], source: Path, key: str, settings: str) -> None:
+    """Refuse a checkpoint of another run, or of a configuration that was changed since.
+
+    Args:
+        payload: of the checkpoint.
+        source: its file.
+        key: of the run, the name of its folder.
+        settings: digest of the configuration of the run.
 
     Raises:
-        InputError: it does not say.
+        InputError: naming both runs.
     """
+    stored = payload.get(NOTE, payload.get("state"))
+    found = stored if isinstance(stored, dict) else {}
+    if found.get("key") != key:
+        raise InputError(
+            f"{source} belongs to the run {found.get('key')}, not to {key}; restore the file of "
+            "this run, or give its folder the name of the run."
+        )
+    if found.get("settings") != settings:
+        raise InputError(
+            f"{source.parent / 'config.yaml'} was changed after training; restore it, or train "
+            "with the new settings."
+        )
+
+
+def step_of(payload: Mapping[str, Any], source: Path) -> int:
+    """The step of a last or a best checkpoint; InputError if it does not say."""
     state = payload.get("state", payload)
     step = state.get("step") if isinstance(state, dict) else None
     if not isinstance(step, int):
-        raise InputError(
-            f"{source} does not contain its step; give a checkpoint written by `rgbt run`."
-        )
+        raise InputError(f"{source} does not contain its step.")
     return step
 
 
@@ -171,17 +178,19 @@ def restore_optimizer(optimizer: torch.optim.Optimizer, stored: Any, source: Pat
     """
     try:
         _check_places(optimizer, stored)
-        optimizer.load_state_dict(stored)
+        # The rate alone changes in training; how a step is computed follows from the device.
+        groups = optimizer.state_dict()["param_groups"]
+        for own, group in zip(groups, stored["param_groups"], strict=True):
+            own["lr"] = group["lr"]
+        optimizer.load_state_dict({**stored, "param_groups": groups})
     except (ValueError, TypeError, LookupError, AttributeError, RuntimeError) as error:
         raise InputError(
-            f"{source} holds the state of a different optimizer than this run uses. Resume with "
-            "the code that wrote it, or train the run again in another runs_dir=..."
+            f"{source} holds the state of a different optimizer than this run uses "
+            f"({one_line(str(error))})."
         ) from error
     for parameter, state in optimizer.state.items():
         for name, value in state.items():
-            if not isinstance(value, Tensor) or value.shape != parameter.shape:
-                continue
-            if value.stride() != parameter.stride():
+            if isinstance(value, Tensor) and value.shape == parameter.shape:
                 state[name] = torch.empty_like(parameter, dtype=value.dtype).copy_(value)
 
 
@@ -190,47 +199,51 @@ def _check_places(optimizer: torch.optim.Optimizer, stored: Any) -> None:
 
     torch compares neither: a moment of another shape ends the next step by SIGSEGV.
     """
-    for own, group in zip(optimizer.param_groups, stored["param_groups"], strict=True):
-        for key in own.keys() & group.keys() - {"params"}:
-            kinds = [float if type(each[key]) is int else type(each[key]) for each in (own, group)]
-            if type(None) not in kinds and kinds[0] is not kinds[1]:
-                raise ValueError(f"{key} is a {kinds[1].__name__}")
-    parameters = [each for group in optimizer.param_groups for each in group["params"]]
+    groups = optimizer.state_dict()["param_groups"]
+    for own, group in zip(groups, stored["param_groups"], strict=True):
+        if own["params"] != group["params"] or own.keys() - group.keys():
+            raise ValueError("other parameters or settings")
+        for key in own.keys() - {"foreach", "fused", "capturable"}:  # of the device
+            values = [each[key] for each in (own, group)]
+            if _kind(values[0]) != _kind(values[1]) or (key != "lr" and values[0] != values[1]):
+                raise ValueError(f"{key} is {group[key]}")
+    of_state = [{name: _kind(v) for name, v in each.items()} for each in stored["state"].values()]
+    if any(each != of_state[0] for each in of_state):
+        raise ValueError("the states of parameters differ in kind")
+    places = dict(enumerate(each for group in optimizer.param_groups for each in group["params"]))
     for index, state in stored["state"].items():
+        place = places[index]
         for name, value in state.items():
-            is_moment = isinstance(value, Tensor) and value.ndim > 0
-            if is_moment and (
-                value.shape != parameters[index].shape or not value.is_floating_point()
-            ):
+            if not isinstance(value, Tensor):
+                continue
+            is_fit = value.ndim == 0 or (value.shape, value.dtype) == (place.shape, place.dtype)
+            if not (is_plain(value) and value.is_floating_point() and is_fit):
                 raise ValueError(f"{name} of parameter {index} has another shape or type")
 
 
+def _kind(value: object) -> object:
+    """The type of a value, of a tuple those of its parts; a whole number is a number."""
+    if isinstance(value, tuple):
+        return tuple(map(_kind, value))
+    return float if type(value) is int else type(value)
+
+
 def restore_weights(model: nn.Module, weights: dict[str, Tensor], source: Path) -> None:
-    """Put `weights` into `model`; every key must fit.
+    """Put `weights` into `model`; every name, shape and dtype must be that of its place.
 
     Raises:
-        InputError: naming missing, unexpected and differently shaped keys.
+        InputError: naming what does not fit.
     """
-    own = model.state_dict()
-    missing = sorted(own.keys() - weights.keys())
-    unexpected = sorted(weights.keys() - own.keys())
-    reshaped = sorted(k for k in own.keys() & weights.keys() if own[k].shape != weights[k].shape)
-    if missing or unexpected or reshaped:
+    found = misfits(model.state_dict(), weights)
+    if found:
         raise InputError(
-            f"{source} is a checkpoint of another model: {_some('missing', missing)}, "
-            f"{_some('unexpected', unexpected)}, {_some('of another shape', reshaped)}; "
-            "use the model it was trained with (model=... in its config.yaml)."
+            f"{source} is a checkpoint of another model: {one_line('; '.join(found))}."
         )
     model.load_state_dict(weights)
 
 
-def _some(what: str, keys: list[str]) -> str:
-    shown = ", ".join(keys[:2] + ["..."] * (len(keys) > 2))
-    return f"{len(keys)} keys {what}" + (f" ({shown})" if keys else "")
-
-
 class Checkpoints:
-    """Read and commit the checkpoints of one run folder (see the module).
+    """Read and write the checkpoints of one run folder (see the module).
 
     Args:
         folder: of the run.
@@ -240,104 +253,65 @@ class Checkpoints:
         self.folder = folder
         self.last = folder / "last.pt"
         self.best = folder / "best.pt"
-        self._evaluations = folder / "checkpoints"
-        self._committed: tuple[int, int] | None = None
-
-    def begin_evaluation(self, step: int) -> Path:
-        """The empty folder for the files of the evaluation at `step`."""
-        folder = self._evaluations / str(step)
-        shutil.rmtree(self._evaluations, ignore_errors=True)
-        folder.mkdir(parents=True)
-        return folder
 
     def commit(self, payload: dict[str, Any], state: State) -> None:
-        """Write the state of a run, unless it is already committed; then its best weights."""
-        if self._committed == (state.step, state.evaluated_step):
-            return
+        """Write the weights if this step is the best, then the state."""
         self.folder.mkdir(parents=True, exist_ok=True)
+        if state.step == state.best_step > 0:
+            # The same bytes after resuming: without the versions of modules.
+            origin = {"key": state.key, "settings": state.settings}
+            save(self.best, {"model": dict(payload["model"]), "step": state.step, NOTE: origin})
         save(self.last, payload)
-        self._committed = state.step, state.evaluated_step
-        self._publish(payload, state)
 
-    def load(self) -> tuple[dict[str, Any], State] | None:
-        """The committed payload and its state; None before there is any.
+    def load(self) -> tuple[dict[str, Any], State]:
+        """The payload of the last checkpoint and its state.
 
         Raises:
             RunError: last.pt or best.pt is missing or damaged.
         """
-        if not self.last.exists():
-            return None
-        try:
-            payload, state = self.committed()
-            self._publish(payload, state)
-            if state.best_step:
-                self.load_best(state.best_step)
-        except (InputError, TypeError) as error:
-            raise RunError(f"{str(error).rstrip('.')}; {self._begin_again()}") from error
-        self._committed = state.step, state.evaluated_step
+        with self._saying_what_to_do():
+            payload = load_checkpoint(self.last)
+            state = State.of(payload)
+        if state.best_step:
+            self.load_best(state)
         return payload, state
 
-    def committed(self) -> tuple[dict[str, Any], State]:
-        """What `load` returned in another process of this run.
+    def load_best(self, state: State) -> dict[str, Any]:
+        """The best weights of a run, by name.
 
         Raises:
-            InputError: this machine does not see the files.
-            TypeError: it is no state.
+            RunError: the file is missing or damaged, or holds the weights of another step.
         """
-        payload = load_checkpoint(self.last)
-        return payload, State.of(payload)
-
-    def load_best(self, step: int) -> dict[str, Any]:
-        """The weights of the best step, by name.
-
-        Raises:
-            InputError: the file is missing or damaged.
-            RunError: it holds the weights of another step.
-        """
-        payload = load_checkpoint(self.best)
-        found = step_of(payload, self.best)
-        if found != step:
-            raise RunError(
-                f"{self.best} is of step {found}, but the best evaluation of this run is of step "
-                f"{step}; {self._begin_again()}"
-            )
+        with self._saying_what_to_do():
+            payload = load_checkpoint(self.best)
+            check_origin(payload, self.best, state.key, state.settings)
+            found = step_of(payload, self.best)
+            # Weights of a later step were written just before the run was killed.
+            if found != state.best_step and found <= state.step:
+                raise InputError(
+                    f"{self.best} is of step {found}, but the best evaluation of this run is of "
+                    f"step {state.best_step}."
+                )
         weights: dict[str, Any] = payload["model"]
         return weights
 
-    def tidy(self) -> None:
-        """Remove the files that are only needed to resume, after training has ended."""
-        shutil.rmtree(self._evaluations, ignore_errors=True)
-
-    def _begin_again(self) -> str:
-        return f"remove {self.folder} and rerun the command to train the run from the start."
-
-    def _publish(self, payload: dict[str, Any], state: State) -> None:
-        """Write the weights and files of an evaluation that is the best, if they are not there."""
-        step = state.best_step
-        if step != state.step or step == 0:
-            return
-        for file in (self._evaluations / str(step)).glob("*"):
-            file.replace(self.folder / file.name)
-        if not self.best.exists() or step_of(load_checkpoint(self.best), self.best) != step:
-            # The same bytes from a network and from last.pt: without the versions of its modules.
-            save(self.best, {"model": dict(payload["model"]), "step": step})
+    @contextmanager
+    def _saying_what_to_do(self) -> Iterator[None]:
+        try:
+            yield
+        except (InputError, TypeError, ValueError) as error:
+            said = one_line(str(error)).rstrip(".")
+            advice = "remove the folder and rerun the command to train the run from the start."
+            raise RunError(f"{self.folder}: {said}; {advice}") from error
 
 
 def check_weights(modules: Mapping[str, nn.Module], step: int) -> None:
     """Refuse to evaluate or save parameters and buffers that are not finite.
 
-    Args:
-        modules: by the name that they have in checkpoints.
-        step: optimiser steps done, for the message.
-
     Raises:
-        RunError: naming the first tensor with NaN or infinity.
+        RunError: naming the step and the first tensor with NaN or infinity.
     """
     for module in modules.values():
-        tensors = module.state_dict()
-        broken = not_finite(tensors)
+        broken = not_finite(module.state_dict())
         if broken:
-            raise RunError(
-                f"step {step}: '{broken[0]}' holds NaN or infinity ({len(broken)} of "
-                f"{len(tensors)} tensors do). {ADVICE}"
-            )
+            raise RunError(f"step {step}: '{broken[0]}' holds NaN or infinity. {ADVICE}")

@@ -20,25 +20,16 @@ BUCKET_BYTES = 64 * 2**20
 """Gradients are sent in pieces of about this size, so that there is no second copy of all."""
 
 
+@torch.no_grad()
 def average_gradients(parameters: Sequence[nn.Parameter]) -> None:
     """Replace each gradient by its mean over the processes; nothing with one process.
 
     Args:
         parameters: in the same order in all processes, which have gradients for the same ones.
     """
-    average_tensors([each.grad for each in parameters if each.grad is not None])
-
-
-@torch.no_grad()
-def average_tensors(gradients: Sequence[Tensor]) -> None:
-    """Replace each tensor by its mean over the processes; nothing with one process.
-
-    Args:
-        gradients: of the same sizes in the same order in all processes.
-    """
     if num_processes() == 1:
         return
-    for bucket in _buckets(gradients):
+    for bucket in _buckets([each.grad for each in parameters if each.grad is not None]):
         flat = torch.cat([gradient.reshape(-1) for gradient in bucket])
         distributed.all_reduce(flat)
         flat /= num_processes()
@@ -48,14 +39,14 @@ def average_tensors(gradients: Sequence[Tensor]) -> None:
 
 
 def check_gradients(parameters: Sequence[nn.Parameter], phase: str) -> None:
-    """Refuse processes that have gradients for different parameters.
+    """Refuse processes that have gradients for different parameters, naming the phase.
 
     Raises:
-        RunError: naming the phase and the number of parameters.
+        RunError: the mean would be of different parameters.
     """
     of_all = collected([each.grad is not None for each in parameters])
-    differing = sum(len(set(flags)) > 1 for flags in zip(*of_all, strict=False))
-    if differing or len(set(map(len, of_all))) > 1:
+    differing = sum(len(set(flags)) > 1 for flags in zip(*of_all, strict=True))
+    if differing:
         raise RunError(
             f"the processes have gradients for different parameters ({differing} of "
             f"{len(parameters)} in the phase of {phase}), so these cannot be averaged. The passes "

@@ -153,10 +153,7 @@ class Adam:
 
 
 def _group(parameters: list[nn.Parameter], lr: float) -> dict[str, Any]:
-    """A parameter group with the base rate (`base_lr`) that a schedule reads.
-
-    A group with `constant` keeps that rate.
-    """
+    """A group with the base rate that a schedule reads; one with `constant` keeps that rate."""
     return {"params": parameters, "lr": lr, "base_lr": lr}
 
 
@@ -178,22 +175,17 @@ def parameter_groups(
         ValueError: no name begins with one of `without`.
     """
     groups: dict[tuple[bool, bool], list[nn.Parameter]] = {}
-    seen: set[int] = set()
     parts = record_of(model).pretrained_parts
-    known = [name for name, _ in model.named_parameters()]
     for beginning in without:
-        if not any(name.startswith(beginning) for name in known):
+        if not any(name.startswith(beginning) for name, _ in model.named_parameters()):
             raise ValueError(f"without: no parameter's name begins with '{beginning}'.")
-    for module_name, module in model.named_modules():
-        for name, parameter in module.named_parameters(recurse=False):
-            full_name = f"{module_name}.{name}".lstrip(".")
-            if id(parameter) in seen or not parameter.requires_grad:
-                continue
-            if full_name.startswith(without):
-                continue
-            seen.add(id(parameter))
-            decayed = not isinstance(module, (*NORMS, nn.Embedding)) and name not in undecayed_names
-            groups.setdefault((full_name.startswith(parts), decayed), []).append(parameter)
+    for full_name, parameter in model.named_parameters():  # shared ones once, by their first name
+        module_name, _, name = full_name.rpartition(".")
+        if not parameter.requires_grad or full_name.startswith(without):
+            continue
+        module = model.get_submodule(module_name)
+        decayed = not isinstance(module, (*NORMS, nn.Embedding)) and name not in undecayed_names
+        groups.setdefault((full_name.startswith(parts), decayed), []).append(parameter)
     return groups
 
 

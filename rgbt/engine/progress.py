@@ -19,14 +19,12 @@ from rich.progress import (
 CONSOLE = Console(stderr=True)
 """Progress goes to stderr; stdout is for results."""
 
-REFRESHES = 4
-"""Drawings per second on a terminal."""
-
 
 @contextmanager
 def progress() -> Iterator[Progress]:
     """A progress display with columns for count, time left and a note (task field `note`)."""
-    columns = (
+    # Drawing ten times a second takes 2 % of a core. In a file only the last state is written.
+    with Progress(
         SpinnerColumn(),
         TextColumn("{task.description:<10}", markup=False),
         BarColumn(bar_width=30),
@@ -35,12 +33,8 @@ def progress() -> Iterator[Progress]:
         TextColumn("left"),
         TimeRemainingColumn(),
         TextColumn("{task.fields[note]}", markup=False),
-    )
-    # Drawing ten times a second takes 2 % of a core. In a file only the last state is written.
-    with Progress(
-        *columns,
         console=CONSOLE,
-        refresh_per_second=REFRESHES,
+        refresh_per_second=4,
         auto_refresh=CONSOLE.is_terminal,
     ) as display:
         yield display

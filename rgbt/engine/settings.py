@@ -7,7 +7,6 @@ from typing import Annotated, Literal
 
 from annotated_types import Interval
 
-from rgbt.checks import InputError
 from rgbt.ranges import (
     BaseWidth,
     BatchSize,
@@ -32,8 +31,8 @@ Compile = Literal["none", "default", "max-autotune"]
 Averaging = Literal["none", "ema", "last"]
 
 OF_MACHINE = (
-    *("accelerator", "log_every", "checkpoint_every", "devices", "strategy"),
-    *("activation_checkpointing", "memory_format", "compile", "log_gradient_shares"),
+    *("accelerator", "log_every", "checkpoint_every", "devices"),
+    *("activation_checkpointing", "memory_format", "compile"),
 )
 """Settings of the training loop that do not change the result."""
 
@@ -48,9 +47,6 @@ class TrainerSettings:
             is always evaluated.
         checkpoint_every: steps between checkpoints; every evaluation writes one too.
         log_every: steps between lines in metrics.jsonl.
-        log_gradient_shares: whether lines of metrics.jsonl hold the share of each loss term in the
-            gradient (`rgbt.engine.gradient_shares`): one more backward pass for each term in the
-            last two steps before a line, the same losses and weights.
         accumulate: batches whose gradients are averaged into one optimiser step.
         clip_norm: largest L2 norm of all gradients together; null disables clipping.
         precision: "32-true" or "bf16-mixed".
@@ -68,9 +64,8 @@ class TrainerSettings:
             weights, with d the smaller of `ema_decay` and n / (n + 9), 0 <= d < 1.
         averaged_share: averaging=last: share of all steps that are averaged, in (0, 1].
         devices: devices of each machine, with one process each; "auto": all that the accelerator
-            has. They divide every batch, so that the result does not depend on their number.
-        strategy: "ddp": each process has the whole network, and gradients are averaged; "auto": the
-            same.
+            has. They divide every batch, so that the result does not depend on their number. Under
+            torchrun or srun, the processes that were started count.
         batch_norm_parts: parts of a batch that are normalised separately in training. 1: the whole
             batch, synchronised over the devices, as in all recipes here; else the number of
             devices.
@@ -98,19 +93,10 @@ class TrainerSettings:
     ema_decay: ShareBelowOne = 0.99
     averaged_share: Annotated[float, Interval(gt=0, le=1)] = 0.25
     devices: NumDevices | Literal["auto"] = 1
-    strategy: Literal["auto", "ddp"] = "auto"
     batch_norm_parts: NumDevices = 1
     activation_checkpointing: bool = False
     memory_format: Literal["contiguous", "channels_last"] = "contiguous"
     compile: Compile = "none"
-    log_gradient_shares: bool = False
-
-    def __post_init__(self) -> None:
-        if self.log_gradient_shares and self.compile != "none":
-            raise InputError(
-                f"trainer.log_gradient_shares=true requires trainer.compile=none, got "
-                f"{self.compile}: a compiled backward pass runs once, but each loss term needs one."
-            )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -8,18 +8,20 @@ import time
 from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import torch
 from lightning_fabric import Fabric
 from torch import Tensor, nn
 
 from rgbt.checks import InputError, RunError
-from rgbt.engine.averaging import AveragedWeights
+from rgbt.engine.averaging import EvaluatedWeights
+from rgbt.engine.batch_norm import share_running_statistics
 from rgbt.engine.checkpoint import (
     ADVICE,
     Checkpoints,
     State,
+    check_origin,
     check_weights,
     restore_optimizer,
     restore_weights,
@@ -30,13 +32,10 @@ from rgbt.engine.optimizers import step_without_gradient
 from rgbt.engine.progress import progress
 from rgbt.engine.schedules import Schedule
 from rgbt.engine.settings import TrainerSettings
-from rgbt.processes import collected, mean_count, num_processes
+from rgbt.processes import agreed, collected, largest, mean_count, num_processes, rank
 from rgbt.randomness import generators_of_step
-from rgbt.runtime.signals import Stopped, at_once, deferred
+from rgbt.runtime.signals import Stopped, at_once, deferred, ending_command, noted, raise_noted
 from rgbt.types import Batch, GeneratorOf, Phase, TwoDomains
-
-if TYPE_CHECKING:
-    from rgbt.engine.gradient_shares import TermGradients
 
 RecordStep = Callable[[int, dict[str, float]], None]
 Validate = Callable[[int], float]
@@ -71,23 +70,26 @@ class Scheme(Protocol):
 class Trainer:
     """Runs a scheme to its last step, with evaluations and checkpoints.
 
+    Of several processes, each has one, with its part of every batch; process 0 writes.
+
     Attributes:
         fabric: device, precision and gradient synchronisation.
         settings: durations and limits.
         scheme: yields the phases of a step.
-        model: the network as Fabric wrapped it.
+        model: the network, not wrapped.
         others: further modules of the scheme (such as a discriminator), by name in checkpoints.
         optimizers: by the names that phases use.
         schedule: learning rate factor per step.
         steps_per_epoch: optimiser steps in one epoch.
         folder: where checkpoints go.
         record: called with (step, values) every `settings.log_every` steps.
-        validate: called with the step; returns the score that selects the best checkpoint. None:
-            nothing is evaluated, and the weights of the last step take the place of the best ones.
+        validate: called with the step; evaluates `weights.network` and returns the score that
+            selects the best checkpoint. None: nothing is evaluated, and the weights of the last
+            step take the place of the best ones.
+        keep: called where the weights just evaluated are the best, before they are saved.
         committed: called after an evaluation has been committed.
         after_step: called after every step, before its evaluation. A signal interrupts it, and the
             step is saved.
-        writes: whether this process writes the checkpoints; of several processes, process 0 does.
     """
 
     fabric: Fabric
@@ -101,13 +103,13 @@ class Trainer:
     folder: Path
     record: RecordStep
     validate: Validate | None
+    keep: Callable[[], None] = lambda: None
     committed: Callable[[], None] = lambda: None
     after_step: Callable[[], None] = lambda: None
-    writes: bool = True
 
     def __post_init__(self) -> None:
         self.checkpoints = Checkpoints(self.folder)
-        self.average = AveragedWeights(self.model, self.settings)
+        self.weights = EvaluatedWeights(self.model, self.settings)
         self._checked_phases: set[tuple[str, ...]] = set()
 
     def resume(self, state: State) -> bool:
@@ -117,18 +119,18 @@ class Trainer:
             RunError: the checkpoints are damaged.
             InputError: they are of another configuration.
         """
-        loaded = self.checkpoints.load() if self.writes else self.checkpoints.committed()
-        if loaded is None:
-            return False
-        payload, stored = loaded
         source = self.checkpoints.last
-        self.average.restore(payload, stored.step, source)
+        if not agreed(source.exists()):
+            return False
+        payload, stored = self.checkpoints.load()
+        check_origin(payload, source, state.key, state.settings)
         others, optimizers = payload.get("others", {}), payload.get("optimizers", {})
         if others.keys() != self.others.keys() or optimizers.keys() != self.optimizers.keys():
             raise InputError(
                 f"{source} is a checkpoint of other networks than those of this run. Resume with "
                 "the code that wrote it, or train again in another runs_dir=..."
             )
+        self.weights.restore(payload, source)
         for name, module in self.others.items():
             restore_weights(module, others[name], source)
         for name, optimizer in self.optimizers.items():
@@ -153,83 +155,83 @@ class Trainer:
         total = self.settings.max_steps
         with progress() as display, deferred():
             task = display.add_task("training", total=total, completed=state.step, note="")
-            if state.step:  # a signal may have come before its evaluation
-                self._save_when_due(state)
+            if self._is_due(state):  # a signal came before its evaluation
+                self._evaluate_and_save(state)
             self.model.train()
             for step in range(state.step, total):
                 # Steps may alternate between phases: a line has the last values of each.
                 values = self._step(step, batches, state.seed)
                 state.unlogged |= values
                 state.step = step + 1
-                self.average.update(state.step)
+                self.weights.update(state.step)
                 note = f"loss {values['loss']:.3f}  {values['images_per_s']:.1f} images/s"
                 display.update(task, completed=state.step, note=note)
                 if state.step % self.settings.log_every == 0 or state.step == total:
                     self.record(state.step, state.unlogged)
                     state.unlogged = {}
-                self._save_when_due(state)
+                self._evaluate_and_save(state)
 
-    def _save_when_due(self, state: State) -> None:
-        """Evaluate and save if this step is due; save and stop if a signal came."""
+    def _is_due(self, state: State) -> bool:
+        """Whether the weights of this step are to be evaluated."""
         is_last = state.step == self.settings.max_steps
-        due = is_last or state.step % self.settings.eval_every == 0
-        due = due and state.evaluated_step < state.step
+        is_step = is_last or (state.step > 0 and state.step % self.settings.eval_every == 0)
+        return is_step and state.evaluated_step < state.step
+
+    def _evaluate_and_save(self, state: State) -> None:
+        """Evaluate and save if this step is due; save and stop if a signal came to any process."""
+        due, signalled = self._is_due(state), largest(noted())
         saves = due or state.step % self.settings.checkpoint_every == 0
-        if saves:
+        if saves or signalled:
             self._exchange(state)
-        if due and self.writes:
+        if due and rank() == 0:
             check_weights({"model": self.model, **self.others}, state.step)
         try:
-            with at_once():
-                self.after_step()
+            raise_noted(signalled)
+            if rank() == 0:  # a signal to another process alone waits for the next step
+                with at_once():
+                    self.after_step()
             if due:
-                self._select(state, is_last)
+                with ending_command():  # another process may have left its evaluation before
+                    self._select(state)
             if saves:
                 self._save(state)
             if due:
+                self.model.train()
+            if due and rank() == 0:
                 with at_once():
                     self.committed()
-                self.model.train()
         except Stopped as stop:
             self._save(state)
             stop.step = state.step
             raise
 
-    def _select(self, state: State, is_last: bool) -> None:
+    def _select(self, state: State) -> None:
         """Evaluate, and keep the weights if they are the best so far or if the last are tested."""
-        keeps = is_last
+        keeps = state.step == self.settings.max_steps
         if self.validate is not None:
-            with self.average.in_network(), at_once():
+            with at_once():
                 score = self.validate(state.step)
             keeps = score > state.best_score or self.settings.tested == "last"
             state.best_score = score if keeps else state.best_score
         if keeps:
             state.best_step = state.step
+            self.keep()
         state.evaluated_step = state.step
 
     def _exchange(self, state: State) -> None:
-        """Collect in `state` what every process has by itself, before process 0 saves it."""
+        """Collect what every process has by itself, before process 0 saves it."""
         for names in collected(state.skipped):
             state.skip(names)
-        if num_processes() > 1 and self.settings.batch_norm_parts > 1:
-            from rgbt.engine.batch_norm import share_running_statistics
-
-            for module in (self.model, *self.others.values()):
+        if self.settings.batch_norm_parts > 1:
+            for module in (self.model, self.weights.network, *self.others.values()):
                 share_running_statistics(module)
-            self.average.share_buffers()
 
     def _save(self, state: State) -> None:
-        if not self.writes:
-            return
-        check_weights({"model": self.model, **self.others}, state.step)
-        payload = training_payload(
-            self.average.weights(),
-            self.average.unaveraged(),
-            self.others,
-            self.optimizers,
-            state,
-        )
-        self.checkpoints.commit(payload, state)
+        if rank() == 0:
+            check_weights({"model": self.model, **self.others}, state.step)
+            weights = self.weights.state()
+            payload = training_payload(weights, self.others, self.optimizers, state)
+            self.checkpoints.commit(payload, state)
 
     def _step(self, step: int, batches: Iterator[Loaded], seed: int) -> dict[str, float]:
         """One optimizer step of every phase; returns the values to record."""
@@ -248,12 +250,11 @@ class Trainer:
             for index, batch in enumerate(micro, start=step * self.settings.accumulate)
         ]
         values: dict[str, float] = {}
-        shares: dict[str, float] | None = {} if self._measures_shares(step) else None
         try:
             for phase in parts[0]:
                 # A phase of all batches ends before the next one of any begins: that one may
                 # read, or clear, what this one stepped.
-                _add(values, self._run_phase(phase, parts[1:], shares))
+                _add(values, self._run_phase(phase, parts[1:]))
         except RunError as error:
             raise RunError(f"step {step + 1}: {error} {ADVICE}") from error
         elapsed = time.perf_counter() - started
@@ -262,30 +263,14 @@ class Trainer:
             peak = torch.cuda.max_memory_allocated(device) / 2**20
         return {
             **values,
-            **(shares or {}),
             **rates,
             "images_per_s": num_processes() * sum(len(batch.name) for batch in micro) / elapsed,
             WAIT_SHARE: waited / elapsed,
             "peak_memory_mib": peak,
         }
 
-    def _measures_shares(self, step: int) -> bool:
-        """Whether this step is one of the last two before a line of the log.
-
-        A scheme may alternate between two phases, and the line has the last values of each.
-        """
-        settings = self.settings
-        near = (step + 1, step + 2)
-        due = any(each % settings.log_every == 0 or each == settings.max_steps for each in near)
-        return settings.log_gradient_shares and due
-
-    def _run_phase(
-        self, phase: Phase, others: list[Iterator[Phase]], shares: dict[str, float] | None
-    ) -> dict[str, float]:
-        """Backward through a phase of every accumulated batch, then its optimisers' steps.
-
-        Where `shares` are measured, those of the phase are added to it.
-        """
+    def _run_phase(self, phase: Phase, others: list[Iterator[Phase]]) -> dict[str, float]:
+        """Backward through a phase of every accumulated batch, then its optimisers' steps."""
         if phase.clear:
             for optimizer in self.optimizers.values():
                 optimizer.zero_grad()
@@ -294,15 +279,7 @@ class Trainer:
         # Once for all of them: what two optimisers share is clipped as one gradient.
         parameters = list({id(each): each for group in groups for each in group}.values())
         names = "+".join(phase.optimizers)
-        terms = None
-        if shares is not None:
-            from rgbt.engine.gradient_shares import TermGradients  # rarely logged
-
-            terms = TermGradients(parameters, self.fabric.backward)
-        losses = [self._backward(phase, terms)]
-        losses += [self._backward(next(phases), terms) for phases in others]
-        if shares is not None and terms is not None:
-            shares |= terms.shares("" if len(self.optimizers) == 1 else names)
+        losses = [self._backward(phase), *(self._backward(next(phases)) for phases in others)]
         if phase.optimizers not in self._checked_phases:  # the first time, by all processes
             check_gradients(parameters, names)
             self._checked_phases.add(phase.optimizers)
@@ -322,13 +299,9 @@ class Trainer:
             step_without_gradient(self.optimizers[name])
         return logged
 
-    def _backward(
-        self, phase: Phase, terms: TermGradients | None
-    ) -> tuple[tuple[str, ...], Tensor]:
+    def _backward(self, phase: Phase) -> tuple[tuple[str, ...], Tensor]:
         """Backward through a phase; names and values to log, not read from the device yet."""
         parts, factor = list(phase.parts.values()), 1.0 / self.settings.accumulate
-        if terms is not None:  # before the pass that frees the graph
-            terms.add(phase.parts, factor)
         self.fabric.backward(torch.stack(parts).sum() * factor)
         parts += phase.logged.values()
         values = torch.stack([part.detach().float() for part in parts])

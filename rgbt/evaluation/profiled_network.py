@@ -18,11 +18,9 @@ from rgbt.config.component import Component
 from rgbt.config.compose import check_keys, compose
 from rgbt.config.values import check_value
 from rgbt.data.domains import Domains
-from rgbt.engine.allocator import keep_memory
-from rgbt.engine.device import autocast, choose_device
+from rgbt.engine.device import autocast, choose_device, fix_threads, keep_memory
 from rgbt.engine.evaluate import class_maps
 from rgbt.engine.settings import TrainerSettings
-from rgbt.engine.threads import fix_threads
 from rgbt.exported.description import require_packages
 from rgbt.exported.onnx_network import exported_network
 from rgbt.files.yaml_files import read_yaml

@@ -1,20 +1,14 @@
 """Handle the signals that end a command, at once or between two training steps.
 
-Ctrl-C and SIGHUP (a terminal that is closed) and SIGTERM (a cluster that takes its machine away)
-raise `Stopped`. Inside `deferred` they are only noted, so that no step and no file stays
-incomplete; inside `at_once` within it they are handled at once again.
-
-A raised `Stopped` may get lost. Python drops what is raised while it frees an object (``__del__``,
-a callback of a weak reference), C code may clear it, and a ``finally`` of a library that is left
-halfway may raise another error, which the library then handles. A timer therefore raises `Stopped`
-again until it is handled.
+Ctrl-C, SIGHUP (a terminal that is closed) and SIGTERM (a cluster that takes its machine away) raise
+`Stopped`. Inside `deferred` they are only noted, so that no step and no file stays incomplete;
+inside `at_once` within it they are handled at once again.
 """
 
 from __future__ import annotations
 
 import os
 import signal
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -25,13 +19,6 @@ WORDS = {
     signal.SIGTERM: "stopped by SIGTERM",
     signal.SIGHUP: "stopped by SIGHUP",
 }
-
-
-SOON = 0.05
-"""Seconds until a `Stopped` that Python reported as dropped is raised again."""
-
-AGAIN = 1.0
-"""Seconds between two checks whether a `Stopped` was dropped without a report."""
 
 
 class Stopped(KeyboardInterrupt):
@@ -59,12 +46,10 @@ class Stopped(KeyboardInterrupt):
 
 @dataclass
 class _Signals:
-    """The first signal that came (0: none), whether it was raised, waits, or has been handled."""
+    """The first signal that came (0: none), and whether it waits."""
 
     number: int = 0
-    is_raised: bool = False
     is_deferred: bool = False
-    is_handled: bool = False
 
 
 _signals = _Signals()
@@ -88,7 +73,7 @@ def answered() -> Iterator[None]:
         if _signals.number == 0:
             _signals.number = number
             if not _signals.is_deferred:
-                _raise_noted()
+                raise Stopped(number)
         elif number == signal.SIGINT:
             raise KeyboardInterrupt
 
@@ -99,8 +84,7 @@ def answered() -> Iterator[None]:
         if handler is not signal.SIG_IGN:
             signal.signal(number, answer)
     try:
-        with _raised_again():
-            yield
+        yield
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
@@ -108,60 +92,14 @@ def answered() -> Iterator[None]:
 
 
 @contextmanager
-def _raised_again() -> Iterator[None]:
-    """Raise a `Stopped` that was dropped again, by a timer: no thread may start just there."""
-
-    def note(dropped: sys.UnraisableHookArgs) -> None:
-        if isinstance(dropped.exc_value, Stopped):
-            _signals.is_raised = False
-            signal.setitimer(signal.ITIMER_REAL, SOON, AGAIN)
-        else:
-            hook(dropped)
-
-    def again(number: int, frame: FrameType | None) -> None:
-        del number, frame
-        if _signals.is_handled:
-            return
-        if _signals.is_raised and not _is_being_handled():
-            _signals.is_raised = False
-        if not _signals.is_deferred:
-            _raise_noted()
-
-    hook, alarm = sys.unraisablehook, signal.signal(signal.SIGALRM, again)
-    sys.unraisablehook = note
-    try:
-        yield
-    finally:
-        sys.unraisablehook = hook
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, alarm)
-
-
-def _is_being_handled() -> bool:
-    """Whether an ``except``, a ``finally`` or an ``__exit__`` runs because of `Stopped`."""
-    error = sys.exception()
-    while error is not None and not isinstance(error, Stopped):
-        error = error.__context__
-    return error is not None
-
-
-@contextmanager
 def ending_command() -> Iterator[None]:
-    """Turn any error after `Stopped` was raised into `Stopped`, which the caller handles.
-
-    A library that is left halfway may raise an error of its own.
-    """
+    """Turn an error after a signal into `Stopped`: a library left halfway may raise one."""
     try:
         yield
     except Exception as error:
-        if _signals.is_raised:
+        if _signals.number:
             raise Stopped(_signals.number) from error
         raise
-
-
-def handled() -> None:
-    """Do not raise the signal again: the command ends because of it."""
-    _signals.is_handled = True
 
 
 @contextmanager
@@ -174,12 +112,12 @@ def deferred() -> Iterator[None]:
     try:
         yield
     except Exception:
-        _raise_noted()
+        raise_noted()
         raise
     finally:
         _signals.is_deferred = before
     if not before:
-        _raise_noted()
+        raise_noted()
 
 
 @contextmanager
@@ -191,17 +129,23 @@ def at_once() -> Iterator[None]:
     """
     before, _signals.is_deferred = _signals.is_deferred, False
     try:
-        _raise_noted()
+        raise_noted()
         yield
     finally:
         _signals.is_deferred = before
 
 
-def _raise_noted() -> None:
-    if _signals.number and not _signals.is_raised:
-        _signals.is_raised = True
-        signal.setitimer(signal.ITIMER_REAL, AGAIN, AGAIN)
-        raise Stopped(_signals.number)
+def noted() -> int:
+    """Number of the signal that came; 0: none."""
+    return _signals.number
+
+
+def raise_noted(number: int | None = None) -> None:
+    """Raise `Stopped` for the signal that came, or for `number`, which another process noted."""
+    number = noted() if number is None else number
+    if number:
+        _signals.number = number
+        raise Stopped(number)
 
 
 def _leave(terminals: list[int]) -> None:

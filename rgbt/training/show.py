@@ -6,7 +6,6 @@ where it lacks something of the run (`Tracking.refresh`).
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 
 from rich.text import Text
@@ -26,14 +25,6 @@ from rgbt.runs.run_spec import RunSpec
 from rgbt.tables import percent, subset_mious
 from rgbt.terminal import info, print_rich, result_view
 from rgbt.tracking.tracker import Tracking
-
-LAUNCHED = ("RANK", "SLURM_PROCID")
-"""Variables of processes that were started together for one run; one of them shows it."""
-
-
-def is_launched() -> bool:
-    """Whether this process is one of several that were started for one run."""
-    return any(name in os.environ for name in LAUNCHED)
 
 
 def show(run: RunSpec, extra_tags: Mapping[str, str] | None = None) -> None:

@@ -1,27 +1,38 @@
-"""Train one run, evaluate it, and write everything into its run folder."""
+"""Train one run, evaluate it, and write everything into its run folder.
+
+Of several processes of a run, each trains and evaluates its part; process 0 writes and reports.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from omegaconf import OmegaConf
 from torch import nn
 
-from rgbt.assembly.session import Session, names_key
+from rgbt.assembly.session import names_key
 from rgbt.assembly.training_setup import TrainingSetup, set_up_training
 from rgbt.checks import InputError
-from rgbt.engine.checkpoint import Checkpoints, State
-from rgbt.engine.trainer import WAIT_SHARE, Trainer
-from rgbt.evaluation.prediction import decode_ahead
+from rgbt.data.domains import TestedHead
+from rgbt.engine.checkpoint import Checkpoints, State, restore_weights
+from rgbt.engine.trainer import WAIT_SHARE, Loaded, Trainer
+from rgbt.evaluation.prediction import decode_ahead, view_of
 from rgbt.evaluation.request import EvaluationRequest
-from rgbt.evaluation.segmentation import evaluate, legend_of, panel_names, result_tables
+from rgbt.evaluation.segmentation import (
+    EvaluationResult,
+    evaluate,
+    legend_of,
+    panel_names,
+    result_tables,
+)
 from rgbt.metrics import names, scores
 from rgbt.metrics.counts import Counts
-from rgbt.processes import agreed, alone
+from rgbt.processes import agreed, alone, rank
 from rgbt.runs.folder import (
     Description,
     MarkerForm,
@@ -34,20 +45,12 @@ from rgbt.runs.folder import (
 )
 from rgbt.runs.naming import describe
 from rgbt.runs.provenance import provenance, warn_of_steps, without_passwords
-from rgbt.runs.run_spec import RunSpec
+from rgbt.runs.run_spec import RunSpec, settings_digest
 from rgbt.runtime.signals import deferred
 from rgbt.tables import ConsistencyTable, without_nan
 from rgbt.terminal import info, warn
 from rgbt.tracking.pictures import RegionHeat, draw_panel, draw_region_heat
 from rgbt.tracking.tracker import Tracking
-from rgbt.training.common import (
-    fit,
-    load_best,
-    make_trainer,
-    other_head_request,
-    target_request,
-)
-from rgbt.training.members import training_together
 from rgbt.training.overview import announce_training, announce_upstream
 from rgbt.training.show import print_result, print_upstream_result, show
 
@@ -70,113 +73,124 @@ def train(
         InputError: the configuration, the data or the run folder do not fit.
         RunError: the training failed.
     """
-    if spec.is_finished and not spec.fresh:
-        show(spec, extra_tags)
+    if agreed(spec.is_finished) and not spec.fresh:
+        if rank() == 0:
+            show(spec, extra_tags)
         return
     description = describe(spec, extra_tags)
+    # Everything is built before the folder is made: a wrong value leaves nothing behind.
+    setup = set_up_training(spec)
+    if upstream_of:
+        announce_upstream(setup, description.name, upstream_of)
+    else:
+        announce_training(setup, description.name, spec.folder)
+    for turn in range(2):  # process 0 writes what is missing in the cache of images
+        if turn == min(rank(), 1):
+            decode_ahead(setup.session, *setup.names)
+        agreed(None)
+    if rank() > 0:
+        Run(setup, SilentFolder(spec.folder), Tracking(), description).complete()
+        return
     tracking: Tracking = spec.tracking.build()
-    folder = _train_unfinished(spec, tracking, description, upstream_of)
+    if spec.is_finished:
+        kept = set_aside(RunFolder(spec.folder))
+        known = None if kept is None else read_description(kept.path)
+        if kept is not None and known is not None:
+            tracking.refresh(kept, known)
+    folder = RunFolder(spec.folder)
+    with folder.lock():
+        Run(setup, folder, tracking, description).complete()
     if upstream_of:
         print_upstream_result(folder, description.name)
     else:
         print_result(spec, folder, tracking)
 
 
-def _train_unfinished(
-    spec: RunSpec, tracking: Tracking, description: Description, upstream_of: str
-) -> RunFolder:
-    """Train a run, in all processes of the command, and return its folder."""
-    with training_together(spec) as start_others:
-        # Everything is built before the folder is made: a wrong value leaves nothing behind.
-        setup = set_up_training(spec)
-        if upstream_of:
-            announce_upstream(setup, description.name, upstream_of)
-        else:
-            announce_training(setup, description.name, spec.folder)
-        decode_ahead(setup.session, *setup.names)
-        if spec.is_finished:
-            kept = set_aside(RunFolder(spec.folder))
-            known = None if kept is None else read_description(kept.path)
-            if kept is not None and known is not None:
-                tracking.refresh(kept, known)
-        folder = RunFolder(spec.folder)
-        with folder.lock():
-            start_others()
-            Run(setup, folder, tracking, description).complete()
-    return folder
+class SilentFolder(RunFolder):
+    """The run folder for the processes that write nothing."""
+
+    def __init__(self, path: Any) -> None:
+        self.path = path
+
+    def _nothing(self, *_: object) -> None:
+        """Write nothing."""
+
+    write_config = add_provenance = describe = append = finish = mark = _nothing  # type: ignore[assignment]
+
+    def truncate_after(self, *_: object) -> list[MetricLine]:
+        """No lines."""
+        return []
+
+    lines = truncate_after
 
 
 @dataclass(frozen=True)
 class Run:
-    """An unfinished run: trains, evaluates and fills its folder."""
+    """An unfinished run: trains, evaluates and fills its folder.
+
+    `selected` are the counts of the last evaluation on the selection split, by the split and view.
+    """
 
     setup: TrainingSetup
     folder: RunFolder
     tracking: Tracking
     description: Description
+    selected: dict[str, Counts] = field(default_factory=dict)
 
     def complete(self) -> None:
         """Train to the last step, evaluate the best checkpoint, write the result."""
         started = time.time()
         session = self.setup.session
-        self._claim(session)
+        self._claim()
         tags = {**self.description.tags, "rgbt.key": self.folder.path.name}
-        try:
+        with self._tracked():
             self.tracking.start(self.folder, replace(self.description, tags=tags))
-            state = self._train(session)
+            settings = settings_digest(session.spec.plain)
+            key = self.folder.path.name
+            state = State(seed=session.spec.drawn.masks, key=key, settings=settings)
+            trainer = self._trainer(state)
+            self._resume(trainer, state)
+            accumulate = session.trainer.accumulate
+            steps = range(state.step * accumulate, session.trainer.max_steps * accumulate)
+            trainer.fit(self._batches(steps, state), state)
             lines = self.folder.lines()
-            self._report(session, lines)
-            agreed(None)  # the other processes may read the best checkpoint
-            load_best(session, self.folder.path, state.best_step)
-            with alone():
-                pairs = self._consistency(session)
-            tested = self._test(session, state, pairs.get("test"))
-            Checkpoints(self.folder.path).tidy()
-            self.folder.finish(
-                {
-                    "name": self.description.name,
-                    "key": self.folder.path.name,
-                    "dataset": session.dataset.fingerprint(),
-                    "steps": state.step,
-                    "best_step": state.best_step,
-                    **({"best_score": state.best_score} if session.selection_split else {}),
-                    "seconds_of_last_process": round(time.time() - started, 1),
-                    "skipped": state.skipped,
-                    **self._scores(session, state, lines, {"test": tested}, pairs),
-                }
-            )
-        except KeyboardInterrupt:
-            self.tracking.finish("KILLED")
-            raise
-        except BaseException:
-            # The tracker must not show a run that raised as running.
-            self.tracking.finish("FAILED")
+            self._report(lines)
+            agreed(None)  # process 0 has written the best checkpoint
+            checkpoints = Checkpoints(self.folder.path)
+            restore_weights(session.model, checkpoints.load_best(state), checkpoints.best)
+            pairs = self._consistency() if rank() == 0 else {}
+            reached = {"test": self._test(state, pairs.get("test"))}
+            if session.selection_split is not None:
+                reached = {"val": self._selection_scores(state, lines), **reached}
+            for kind, table in pairs.items():
+                reached[kind] = {**reached[kind], **_values_of(table)}
+            result = {
+                "name": self.description.name,
+                "key": self.folder.path.name,
+                "dataset": session.dataset.fingerprint(),
+                "steps": state.step,
+                "best_step": state.best_step,
+                **({"best_score": state.best_score} if session.selection_split else {}),
+                "seconds_of_last_process": round(time.time() - started, 1),
+                "skipped": state.skipped,
+                **{kind: without_nan(values) for kind, values in reached.items()},
+            }
+            self.folder.finish(result)
+
+    @contextmanager
+    def _tracked(self) -> Iterator[None]:
+        """Tell the tracker how the block ended: it must not show a run that raised as running."""
+        try:
+            yield
+        except BaseException as error:
+            self.tracking.finish("KILLED" if isinstance(error, KeyboardInterrupt) else "FAILED")
             raise
         with deferred():  # a signal must not leave a finished run as running in the store
             self.tracking.finish("FINISHED")
 
-    def _scores(
-        self,
-        session: Session,
-        state: State,
-        lines: Sequence[MetricLine],
-        reached: dict[str, dict[str, float]],
-        pairs: Mapping[str, ConsistencyTable],
-    ) -> dict[str, dict[str, float | None]]:
-        """Scores of the best checkpoint on the selection split, if any, and on the test split."""
-        if session.selection_split is not None:
-            of_val = {line.step: line.values for line in lines if line.kind == "val"}
-            val = of_val.get(state.best_step)
-            if not val:  # the log was cut off, which is reported
-                path = self.folder.path / counts_name(session.selection_split)
-                val = scores.summary(Counts.load(path), session.regions.absent)
-            reached = {"val": val, **reached}
-        for kind, table in pairs.items():
-            reached[kind] = {**reached[kind], **_values_of(table)}
-        return {kind: without_nan(values) for kind, values in reached.items()}
-
-    def _claim(self, session: Session) -> None:
+    def _claim(self) -> None:
         """Write what identifies the run; refuse a folder that was started on other images."""
+        session = self.setup.session
         dataset = session.dataset
         now: MarkerForm = {"names": names_key(session), "files": dataset.fingerprint()}
         before = read_marker(self.folder.path) or now
@@ -192,27 +206,20 @@ class Run:
         config = OmegaConf.to_yaml(OmegaConf.create(dict(session.spec.plain)))
         self.folder.write_config(without_passwords(config))
 
-    def _train(self, session: Session) -> State:
-        state = State(seed=session.spec.drawn.masks)
-        trainer = self._trainer(session, state)
-        if agreed(trainer.resume(state)):
+    def _resume(self, trainer: Trainer, state: State) -> None:
+        """Restore the last checkpoint, if any; report what is repeated or lost."""
+        if trainer.resume(state):
             info(f"{self.description.name} resumes at step {state.step} ({self.folder.path}).")
-        own_code = {"own_code": session.spec.own_code(), "from_step": state.step}
+        own_code = {"own_code": self.setup.session.spec.own_code(), "from_step": state.step}
         self.folder.add_provenance({**provenance(), **own_code})
         warn_of_steps(self.folder.path, state.step)
-        self._truncate(state)
-        fit(trainer, self.setup, state)
-        return state
-
-    def _truncate(self, state: State) -> None:
-        """Prepare ``metrics.jsonl`` of a run that resumes; report what is repeated or lost."""
         step = state.step
         lines = self.folder.truncate_after(step, state.evaluated_step)
         reached = max((line.step for line in lines), default=0)
         if reached > step:
             info(f"steps {step + 1} to {reached} were not saved and are repeated.")
         logged = [0, *(line.step for line in lines if line.kind == "train" and line.step <= step)]
-        every = max([self.setup.session.trainer.log_every, *(np.diff(logged[-2:]).tolist())])
+        every = max([trainer.settings.log_every, *(np.diff(logged[-2:]).tolist())])
         if step - logged[-1] >= every:
             warn(
                 f"{self.folder.path / 'metrics.jsonl'} ends at step {logged[-1]}, but the "
@@ -220,50 +227,94 @@ class Run:
                 "checkpoint are not affected."
             )
 
-    def _report(self, session: Session, lines: Sequence[MetricLine]) -> None:
-        """Report a training that mostly waited for images, what helps, and shares of gradients."""
+    def _report(self, lines: Sequence[MetricLine]) -> None:
+        """Report a training that mostly waited for images, and what helps."""
         logged = [line.values for line in lines if line.kind == "train"]
         shares = [values[WAIT_SHARE] for values in logged if WAIT_SHARE in values]
         if shares and np.median(shares) > MUCH_WAITING:
-            cache = (
-                "" if session.loading.cache else "data.cache=auto decodes every image once, and "
-            )
+            cached = self.setup.session.loading.cache
+            cache = "" if cached else "data.cache=auto decodes every image once, and "
             info(
                 f"{np.median(shares):.0%} of the time of a step was spent waiting for images; "
                 f"{cache}data.num_workers=... reads them with more processes."
             )
-        if session.trainer.log_gradient_shares:
-            from rgbt.engine.gradient_shares import shares_sentence
 
-            if sentence := shares_sentence(logged):
-                info(f"{sentence}.")
-
-    def _trainer(self, session: Session, state: State) -> Trainer:
-        split = session.selection_split
+    def _trainer(self, state: State) -> Trainer:
+        setup, session = self.setup, self.setup.session
+        split, settings = session.selection_split, session.trainer
 
         def validate(step: int) -> float:
             assert split is not None, "called only where there is one"
-            result = evaluate(session, self.setup.model, EvaluationRequest(split=split))
-            folder = trainer.checkpoints.begin_evaluation(step)
-            result.counts.save(folder / counts_name(split))
-            values = scores.summary(result.counts, session.regions.absent)
-            values |= self._of_target(session, self.setup.model, split, folder)
+            result, of_target = self._evaluate(trainer.weights.network, split, self.selected)
+            values = scores.summary(result.counts, session.regions.absent) | of_target
             self.folder.append(step, "val", values)
             state.skip(result.skipped)
             return values[names.MIOU]
 
-        trainer = make_trainer(
-            self.setup,
-            self.folder.path,
+        trainer = Trainer(
+            fabric=setup.fabric,
+            settings=settings,
+            scheme=setup.scheme,
+            model=session.model,
+            others=setup.others,
+            optimizers=setup.optimizers,
+            schedule=setup.schedule,
+            steps_per_epoch=max(1, setup.steps_per_epoch() // settings.accumulate),
+            folder=self.folder.path,
             record=lambda step, values: self.folder.append(step, "train", values),
             validate=None if split is None else validate,
+            keep=lambda: self._save(self.selected),
             committed=self.tracking.update,
             after_step=self.tracking.after_step,
         )
         return trainer
 
-    def _consistency(self, session: Session) -> dict[str, ConsistencyTable]:
+    def _batches(self, steps: range, state: State) -> Iterator[Loaded]:
+        """The batches, with unreadable files noted in `state` before a checkpoint is written."""
+        batches = self.setup.batches(steps)
+        for batch in batches:
+            state.skip(batches.skipped)
+            yield batch
+
+    def _evaluate(
+        self, network: nn.Module, split: str, counts: dict[str, Counts], keep: Sequence[str] = ()
+    ) -> tuple[EvaluationResult, dict[str, float]]:
+        """Evaluate a split, also in the view of the target where that is not the source's.
+
+        The counts are added to `counts`. Returns the evaluation, and the mIoU in the view of the
+        target by names that begin with the view.
+        """
+        session = self.setup.session
+        result = evaluate(session, network, EvaluationRequest(split=split, keep=tuple(keep)))
+        counts[split] = result.counts
+        view = None if session.domains.target is None else session.domains.target.view
+        if view is None or view == view_of(session):
+            return result, {}
+        found = evaluate(session, network, EvaluationRequest(split=split, view=view)).counts
+        counts[f"{split}_{view}"] = found
+        values = scores.summary(found, session.regions.absent)
+        kept = (names.MIOU, *(names.subset(part, names.MIOU) for part in (names.DAY, names.NIGHT)))
+        return result, {names.subset(view, name): values[name] for name in kept if name in values}
+
+    def _save(self, counts: Mapping[str, Counts]) -> None:
+        for name, each in counts.items() if rank() == 0 else ():
+            each.save(self.folder.path / counts_name(name))
+
+    def _selection_scores(self, state: State, lines: Sequence[MetricLine]) -> dict[str, float]:
+        """Scores of the best checkpoint on the selection split."""
+        for line in lines:
+            if line.kind == "val" and line.step == state.best_step:
+                return line.values
+        # The log was cut off, which is reported.
+        split = self.setup.session.selection_split
+        assert split is not None, "called only where there is one"
+        counts = Counts.load(self.folder.path / counts_name(split))
+        return scores.summary(counts, self.setup.session.regions.absent)
+
+    @alone()
+    def _consistency(self) -> dict[str, ConsistencyTable]:
         """TC and CA of the best checkpoint under "val" and "test", as far as requested."""
+        session = self.setup.session
         tables: dict[str, ConsistencyTable] = {}
         if not session.consistency.sets:
             return tables
@@ -297,25 +348,25 @@ class Run:
                 draw_pairs(pairs.kept, legend_of(session.dataset), self.folder.figure_path("pairs"))
         return tables
 
-    def _test(
-        self, session: Session, state: State, pairs: ConsistencyTable | None
-    ) -> dict[str, float]:
+    def _test(self, state: State, pairs: ConsistencyTable | None) -> dict[str, float]:
         """Counts, tables and figures of the best checkpoint on the test split; its scores."""
+        session, counts = self.setup.session, dict[str, Counts]()
         keep = panel_names(session.dataset, "test")
-        result = evaluate(session, session.model, EvaluationRequest(split="test", keep=keep))
+        result, beside = self._evaluate(session.model, "test", counts, keep)
+        beside |= self._by_other_head(counts)
         state.skip(result.skipped)
-        result.counts.save(self.folder.path / counts_name("test"))
-        values = scores.summary(result.counts, session.regions.absent)
-        of_target = self._of_target(session, session.model, "test", self.folder.path)
-        by_other = self._by_other_head(session)
-        values |= of_target | by_other | ({} if pairs is None else _values_of(pairs))
+        self._save(counts)
+        values = scores.summary(result.counts, session.regions.absent) | beside
+        values |= {} if pairs is None else _values_of(pairs)
         self.folder.append(state.step, "test", values)
+        if rank() > 0:
+            return values
         name = self.description.name
         tables = result_tables(result.counts, session.regions, name, state.best_step)
         # As rows of the table: "thermal", "thermal, day", "source head, night".
         parts = {
             ", ".join(each.replace("_", " ").split("/")[:-1]): value
-            for each, value in (of_target | by_other).items()
+            for each, value in beside.items()
         }
         subsets = {**tables.classes.subset_mious, **parts}
         classes = replace(tables.classes, subset_mious=subsets)
@@ -333,37 +384,22 @@ class Run:
         draw_region_heat(heat, self.folder.figure_path("regions"))
         return values
 
-    def _by_other_head(self, session: Session) -> dict[str, float]:
+    def _by_other_head(self, counts: dict[str, Counts]) -> dict[str, float]:
         """The mIoU at night of the head that is not selected for the night, named after the head.
 
-        Its counts are written to the run folder.
+        Nothing in a run without a head for the day and another one for the night. Its counts are
+        added to `counts`.
         """
-        request = other_head_request(session)
-        if request is None:
+        session = self.setup.session
+        if session.domains.target_is != "night":
             return {}
-        assert request.head is not None, "the request names a head"
-        counts = evaluate(session, session.model, request).counts
-        counts.save(self.folder.path / counts_name(f"test_{request.head}_head"))
-        values = scores.summary(counts, session.regions.absent)
+        head: TestedHead = "target" if session.domains.tested_head == "source" else "source"
+        request = EvaluationRequest(split="test", head=head)
+        found = evaluate(session, session.model, request).counts
+        counts[f"test_{head}_head"] = found
+        values = scores.summary(found, session.regions.absent)
         at_night = names.subset(names.NIGHT, names.MIOU)
-        kept = {at_night: values[at_night]} if at_night in values else {}
-        return {names.by_head(request.head, name): value for name, value in kept.items()}
-
-    def _of_target(
-        self, session: Session, model: nn.Module, split: str, folder: Path
-    ) -> dict[str, float]:
-        """The mIoU in the view of the target, if that is not the source's, named after the view.
-
-        Its counts are written to `folder`.
-        """
-        request = target_request(session, split)
-        if request is None or request.view is None:
-            return {}
-        counts = evaluate(session, model, request).counts
-        counts.save(folder / counts_name(f"{split}_{request.view}"))
-        values = scores.summary(counts, session.regions.absent)
-        kept = (names.MIOU, *(names.subset(part, names.MIOU) for part in (names.DAY, names.NIGHT)))
-        return {names.subset(request.view, name): values[name] for name in kept if name in values}
+        return {names.by_head(head, at_night): values[at_night]} if at_night in values else {}
 
 
 def _values_of(table: ConsistencyTable) -> dict[str, float]:

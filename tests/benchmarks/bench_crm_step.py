@@ -33,9 +33,9 @@ from torch import Tensor
 
 from rgbt.config.component import build
 from rgbt.config.compose import compose
-from rgbt.engine.allocator import keep_memory
+from rgbt.engine.device import keep_memory
 from rgbt.geometry.padding import STRIDE, padded_hw
-from rgbt.losses.distillation import sdc, sdn
+from rgbt.losses.distances import sdc, sdn
 from rgbt.losses.set_criterion import SetCriterion
 from rgbt.models.inputs import expand_cells
 from rgbt.models.mask2former.model import Mask2Former

@@ -23,7 +23,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from rgbt.engine.allocator import keep_memory
+from rgbt.engine.device import keep_memory
 from tests.models.golden import network
 
 MODULE = "tests.benchmarks.bench_networks"

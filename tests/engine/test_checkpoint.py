@@ -1,4 +1,4 @@
-"""A state is committed as a whole, with its best weights and the files of their evaluation."""
+"""The best weights and the files of their evaluation agree with the state that names them."""
 
 from __future__ import annotations
 
@@ -7,32 +7,28 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from torch import nn
 
 from rgbt.checkpoints.torch_files import save
-from rgbt.checks import RunError
+from rgbt.checks import InputError, RunError
 from rgbt.engine import checkpoint
-from rgbt.engine.checkpoint import Checkpoints, State, load_checkpoint
-from rgbt.engine.trainer import Trainer
+from rgbt.engine.checkpoint import Checkpoints, State, load_checkpoint, restore_weights
 from tests.engine.test_trainer import batches, make
 
 COUNTS = "counts_val.npz"
 
 
-def training(folder: Path, scores: dict[int, float], **changes: object) -> Trainer:
-    """A trainer whose evaluations have these scores and leave a file beside their weights."""
+def run(folder: Path, scores: dict[int, float], **changes: object) -> State:
+    """Train or resume; evaluations have these scores, and leave a file beside their weights."""
     trainer, _ = make(folder, **{"eval_every": 2, "checkpoint_every": 1, **changes})
+    latest: list[str] = []
 
     def validate(step: int) -> float:
-        place = trainer.checkpoints.begin_evaluation(step)
-        (place / COUNTS).write_text(f"step {step}: {scores[step]}")
+        latest.append(f"step {step}: {scores[step]}")
         return scores[step]
 
     trainer.validate = validate
-    return trainer
-
-
-def run(folder: Path, scores: dict[int, float], **changes: object) -> State:
-    trainer = training(folder, scores, **changes)
+    trainer.keep = lambda: (folder / COUNTS).write_text(latest[-1])
     state = State(seed=0)
     trainer.resume(state)
     trainer.fit(batches(state.step), state)
@@ -67,34 +63,20 @@ def killed_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, int], None]:
     return prepare
 
 
-def test_an_evaluation_that_was_not_committed_counts_for_nothing(
-    tmp_path: Path, killed_at: Callable[[str, int], None]
+@pytest.mark.parametrize("name", ["best.pt", "last.pt"])
+def test_killed_while_the_best_is_saved_makes_it_again(
+    tmp_path: Path, killed_at: Callable[[str, int], None], name: str
 ) -> None:
-    """Killed after the evaluation of step 4, before its state; on other hardware it scores less."""
-    killed_at("last.pt", 4)
+    """Killed after the evaluation of step 4, before its best weights or before its state."""
+    killed_at(name, {"best.pt": 2, "last.pt": 4}[name])
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path, RISING)
-    state = run(tmp_path, {4: 0.35, 6: 0.3})
-    assert (state.best_step, state.best_score) == (2, 0.4)
+    payload, state = Checkpoints(tmp_path).load()
+    assert (state.step, state.best_step) == (3, 2)
+    assert load_checkpoint(tmp_path / "best.pt")["step"] == {"best.pt": 2, "last.pt": 4}[name]
+    state = run(tmp_path, RISING)
+    assert (state.best_step, state.best_score) == (4, 0.5)
     agree(tmp_path, state)
-
-
-@pytest.mark.parametrize("moved", [False, True])
-def test_best_weights_of_a_committed_state_are_written_on_resuming(
-    tmp_path: Path, killed_at: Callable[[str, int], None], moved: bool
-) -> None:
-    """Killed after the state of step 4, before its best weights."""
-    killed_at("best.pt", 2)
-    with pytest.raises(KeyboardInterrupt):
-        run(tmp_path, RISING)
-    assert load_checkpoint(tmp_path / "best.pt")["step"] == 2
-    if not moved:  # killed a moment earlier
-        (tmp_path / COUNTS).replace(Checkpoints(tmp_path).begin_evaluation(4) / COUNTS)
-    loaded = Checkpoints(tmp_path).load()
-    assert loaded is not None
-    assert loaded[1].best_step == 4
-    agree(tmp_path, loaded[1])
-    agree(tmp_path, run(tmp_path, {6: 0.3}))
 
 
 @pytest.mark.parametrize("name", ["last.pt", "best.pt"])
@@ -110,25 +92,22 @@ def test_damaged_checkpoints_are_refused(tmp_path: Path, name: str, how: str) ->
     elif how == "of another step":
         save(path, {"model": {}, "step": 3})
     if (name, how) == ("last.pt", "missing"):
-        assert Checkpoints(tmp_path).load() is None, "the run begins anew"
+        assert run(tmp_path, RISING).step == 6, "the run begins anew"
         return
-    with pytest.raises(RunError, match="; remove .* and rerun"):
+    with pytest.raises(RunError, match="; remove the folder and rerun"):
         Checkpoints(tmp_path).load()
 
 
-def test_nothing_else_is_kept(tmp_path: Path) -> None:
+def test_finished_training_keeps_three_files_and_trains_no_more(tmp_path: Path) -> None:
     state = run(tmp_path, RISING)
-    Checkpoints(tmp_path).tidy()
-    assert {path.name for path in tmp_path.iterdir()} == {"last.pt", "best.pt", COUNTS}
     agree(tmp_path, state)
-    again = run(tmp_path, {})  # a run killed before its result has nothing more to train
-    assert again == state
+    assert {path.name for path in tmp_path.iterdir()} == {"last.pt", "best.pt", COUNTS}
+    assert run(tmp_path, {}) == state  # killed before its result
 
 
-def test_weights_of_another_step_are_refused(tmp_path: Path) -> None:
-    run(tmp_path, RISING)
-    assert Checkpoints(tmp_path).load_best(4)
-    with pytest.raises(
-        RunError, match=r"is of step 4, but the best evaluation of this run is of step 2"
-    ):
-        Checkpoints(tmp_path).load_best(2)
+def test_checkpoint_of_another_model_is_refused_with_the_keys(tmp_path: Path) -> None:
+    weights = nn.Linear(2, 3).state_dict()
+    others = (nn.Linear(2, 4), nn.Linear(2, 3, bias=False), nn.Linear(2, 3).double())
+    for model in others:
+        with pytest.raises(InputError, match="of another model: .*(weight|bias)"):
+            restore_weights(model, weights, tmp_path / "other.pt")

@@ -91,11 +91,3 @@ def test_scores_that_are_not_finite_are_refused_with_the_image(model: Heads, val
     data.rgb[1, 0, 2, 3] = value
     with pytest.raises(RunError, match="^image '1': the network's class scores are NaN or inf"):
         class_maps(model, data, fabric)
-
-
-def test_large_finite_scores_are_counted(model: Heads) -> None:
-    """Their sum is not finite, they are."""
-    with torch.no_grad():
-        model.heads["day"].bias.fill_(1e38)
-    found = class_maps(model, batch(2), Fabric(accelerator="cpu", devices=1))
-    assert found.shape == (2, 12, 16)

@@ -17,7 +17,6 @@ from rgbt.engine.settings import TrainerSettings
 from rgbt.engine.trainer import Trainer
 from rgbt.requirements import Record
 from rgbt.types import Phase
-from tests.composed import specified
 from tests.engine.test_trainer import SETTINGS, batches
 
 STEPS, RATE, SHARE, MOMENTUM, DECAY = 5, 0.1, 0.1, 0.9, 0.01
@@ -97,10 +96,3 @@ def test_five_steps_are_those_written_out(tmp_path: Path, head_rate: str, stop: 
     logged = [tuple(sorted((each["lr/main_0"], each["lr/main_1"]))) for each in log]
     assert logged == [pytest.approx(tuple(sorted(pair))) for pair in rates]
     assert by_hand("released")[1] != pytest.approx(by_hand("scheduled")[1], abs=1e-3)
-
-
-def test_only_the_released_rate_changes_the_key() -> None:
-    plain = specified(("+experiment=sh_max_squares_stage1",))
-    released = specified(("+experiment=sh_max_squares_stage1", "optimizer.head_rate=released"))
-    assert plain.optimizer.values["head_rate"] == "scheduled"
-    assert plain.key != released.key

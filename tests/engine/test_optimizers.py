@@ -73,17 +73,6 @@ def test_every_group_says_its_base_rate_and_without_nothing_is_left_out(builder:
         builder(model, without=("heads.night",))
 
 
-def test_heads_learn_ten_times_as_fast_as_the_backbone_that_they_share() -> None:
-    """Thesis: heads 2.5e-3, backbone 2.5e-4; one optimizer per head, momenta of their own."""
-    builder = SGD(lr=2.5e-3, backbone_multiplier=0.1, momentum=0.9, weight_decay=5e-4)
-    model = TwoHeads()
-    for head, other in (("source", "target"), ("target", "source")):
-        optimizer = builder(model, without=(f"heads.{other}.",))
-        rates = [group["base_lr"] for group in optimizer.param_groups]
-        assert rates == pytest.approx([2.5e-4, 2.5e-3])
-        assert names_in(model, optimizer) == [linear("backbone"), linear(f"heads.{head}")]
-
-
 def test_frozen_and_shared_parameters_come_never_and_once() -> None:
     model = TwoHeads()
     model.heads["target"].weight = model.heads["source"].weight

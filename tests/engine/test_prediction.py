@@ -13,7 +13,6 @@ from lightning_fabric import Fabric
 from torch import Tensor, nn
 
 from rgbt.engine.evaluate import class_maps, confident_class_maps, probabilities
-from rgbt.engine.predicted_scores import windows
 from rgbt.engine.prediction import Prediction
 from rgbt.types import Batch, Output
 
@@ -85,13 +84,6 @@ def test_windows_are_those_of_semseg(side: int) -> None:
     data = batch([ROW] * 4)
     shares = predicted(data, mirrored=True, window_hw=(3, side))
     np.testing.assert_allclose(shares, [by_hand(side, 2 / 3)] * 4, atol=1e-6)
-
-
-def test_windows_of_the_published_size_cover_the_image_of_the_thesis() -> None:
-    """473 pixels of 640 x 1280: steps of 316; the last window is moved to the border."""
-    rows, columns = ([each.start for each in windows(n, 473, 2 / 3)] for n in (640, 1280))
-    assert (rows, columns) == ([0, 167], [0, 316, 632, 807])
-    assert [(each.start, each.stop) for each in windows(300, 473, 2 / 3)] == [(0, 300)]
 
 
 def test_scales_are_averaged_at_the_size_of_the_label() -> None:

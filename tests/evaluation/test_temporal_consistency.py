@@ -25,7 +25,7 @@ from rgbt.evaluation.temporal_consistency import consistency_table, consistency_
 from rgbt.metrics.pairs import ca, tc
 from rgbt.requirements import Record
 from rgbt.runs.specify import specify
-from rgbt.transforms.view_sets import read_angles
+from rgbt.transforms.views import read_angles
 from rgbt.types import Output
 from tests.commands import SPLITS, words_of
 from tests.conftest import write_png

@@ -6,18 +6,18 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from rgbt.losses.adversarial import VERDICT_LOSSES, judged
 from rgbt.losses.cross_entropy import CrossEntropy
-from rgbt.losses.distillation import sdc
+from rgbt.losses.distances import sdc
 from rgbt.losses.matcher import Matcher, targets_of
-from rgbt.losses.overlap import con, con_acc, dice
 from rgbt.losses.points import Points
 from rgbt.losses.spatial import PLAIN
-from rgbt.losses.unlabelled import Entropy, MaxSquares, guidance
+from rgbt.losses.temporal import con, con_acc, dice
+from rgbt.losses.unlabelled import VERDICT_LOSSES, Entropy, MaxSquares, guidance, judged
 from rgbt.types import Batch, Output
 from tests.losses.problems import batch_of, criterion_of, problem_of, seeded
 from tests.on_device.places import ON_DEVICE, device, exact
@@ -84,15 +84,6 @@ def test_set_criterion(name: str) -> None:
     assert_same_with_gradient(loss, *output.aux.values())
 
 
-def test_set_criterion_draws_points_on_the_device() -> None:
-    output, batch = problem_of(1, 1, 2)
-    moved = Output(None, {name: each.to(device()) for name, each in output.aux.items()})
-    generator = torch.Generator(device=device()).manual_seed(0)
-    parts = criterion_of()(moved, placed(batch, device()), generator)
-    assert set(parts) == {"class", "mask", "dice"}
-    assert all(bool(each.isfinite().all()) for each in parts.values())
-
-
 def test_matches() -> None:
     output, batch = problem_of(2, 3, 2)
     matcher = Matcher(num_points=64, class_weight=2.0, mask_weight=5.0, dice_weight=5.0)
@@ -103,7 +94,7 @@ def test_matches() -> None:
         logits = (each.detach().to(to) for each in output.aux.values())
         found.append(matcher(*logits, targets, Points(seeded(2), device=to)))
     for one, other in zip(*found, strict=True):
-        assert (one == other).all()
+        assert np.array_equal(one, other)
 
 
 @pytest.mark.parametrize("weights", [None, (1.0, 2.0, 0.5, 3.0, 1.0)])

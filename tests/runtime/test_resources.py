@@ -7,7 +7,6 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -25,23 +24,15 @@ from tests.commands import Call, NoOptions, assert_one_sentence, only_run, short
 SMALL_MB = 2
 
 
-@dataclass(frozen=True)
-class OutOptions:
-    out: str = ""
-
-
-RESUME = "rerun the command to resume from the last checkpoint."
-
-
 def full() -> OSError:
     return OSError(errno.ENOSPC, "No space left on device")
 
 
 def raising(error: Callable[[], BaseException]) -> Callable[[], None]:
-    def main(options: OutOptions, overrides: list[str]) -> None:
+    def main(options: NoOptions, overrides: list[str]) -> None:
         raise error()
 
-    return PlainCommand(OutOptions, main)
+    return PlainCommand(NoOptions, main)
 
 
 def hidden() -> BaseException:
@@ -59,35 +50,14 @@ def of_a_named_file() -> BaseException:
     return OSError(errno.EDQUOT, "Disk quota exceeded", str(Path.cwd() / "none" / "a.png"))
 
 
-@pytest.mark.parametrize(
-    ("error", "words"),
-    [
-        (full, "is full ("),
-        (hidden, "is full ("),
-        (of_a_named_file, f"the disk of {Path.cwd()} has no space left for this user (quota) ("),
-        (lambda: OSError(errno.EROFS, "Read-only file system"), "is mounted read-only ("),
-    ],
-)
-def test_a_full_disk_is_one_sentence(call: Call, tmp_path: Path, error, words: str) -> None:
-    code, _, err = call(raising(error), f"out={tmp_path / 'none'}")
+@pytest.mark.parametrize("error", [full, hidden, of_a_named_file])
+def test_full_disk_is_one_message(call: Call, error) -> None:
+    code, _, err = call(raising(error))
     assert code == 1
-    assert_one_sentence(err, words)
-    assert " MB free, after the unfinished file was removed); free some space, or name a" in err
-    assert err.endswith(f"{RESUME}\n")
+    assert_one_sentence(err, "; free some space, then rerun the command to resume")
 
 
-def test_a_reader_that_names_the_setting_keeps_its_sentence(call: Call) -> None:
-    def refused() -> BaseException:
-        error = InputError("data.cache: the disk of /a filled up.")
-        error.__cause__ = full()
-        return error
-
-    code, _, err = call(raising(refused))
-    assert code == 1
-    assert_one_sentence(err, "data.cache: the disk of /a filled up; the disk of ")
-
-
-def test_a_sentence_that_hides_its_cause_stays_as_it_is(call: Call) -> None:
+def test_message_that_hides_its_cause_stays(call: Call) -> None:
     def refused() -> None:
         try:
             raise full()
@@ -111,24 +81,18 @@ def of_numpy() -> BaseException:
 
 
 @pytest.mark.parametrize(
-    ("error", "words"),
+    "error",
     [
-        (MemoryError, "the memory of this machine is exhausted (MemoryError); lower scale.batch"),
-        (of_numpy, "exhausted (Unable to allocate 4.00 PiB"),
-        (of_torch, "exhausted ("),
-        (
-            lambda: torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB.\nSee"),
-            "the memory of the GPU is exhausted (CUDA out of memory. Tried to allocate 2 GiB);",
-        ),
-        (lambda: OSError(errno.ENOMEM, "Cannot allocate memory"), "exhausted ([Errno 12] Cannot"),
+        MemoryError,
+        of_torch,
+        lambda: torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB.\nSee"),
+        lambda: OSError(errno.ENOMEM, "Cannot allocate memory"),
     ],
 )
-def test_exhausted_memory_is_one_sentence(call: Call, error, words: str) -> None:
+def test_exhausted_memory_is_one_message(call: Call, error) -> None:
     code, _, err = call(raising(error))
     assert code == 1
-    assert_one_sentence(err, words)
-    assert "scale.crop_hw or data.num_workers; " in err
-    assert err.endswith(f"{RESUME}\n")
+    assert_one_sentence(err, "scale.crop_hw or data.num_workers, then rerun the command")
 
 
 def test_other_errors_stay_errors(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -197,7 +161,7 @@ def test_a_training_whose_disk_fills_up_resumes_when_there_is_space(
     subprocess.run(["mount", "-o", "remount,size=50m", str(small_disk)], check=True)
     code, _, err = train(call, data, runs, *words)
     assert code == 1
-    assert_one_sentence(err, f"the disk of {runs} is full (")
+    assert_one_sentence(err, "No space left on device")
     (folder,) = runs.iterdir()
     assert (folder / "last.pt").is_file()
     assert not (folder / "result.json").exists()

@@ -193,7 +193,7 @@ def test_pipeline_predicts_and_validates_for_unfinished_labels(
     assert len(run("multi_head_night_stage1").validated) == 1
     monkeypatch.undo()
 
-    def opened(run: RunSpec, folder: Path, checkpoint: str) -> None:
+    def opened(run: RunSpec, folder: Path, checkpoint: str, trained_with: object) -> None:
         raise KeyError(run.key, folder, checkpoint)
 
     monkeypatch.setattr(pipeline, "with_weights", opened)

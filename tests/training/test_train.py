@@ -20,10 +20,9 @@ def stderr_of(
     """What a run with these lines in its log says of waiting."""
     kept: Any = [SimpleNamespace(kind=kind, values=values) for kind, values in lines]
     nothing: Any = None
-    trainer = SimpleNamespace(log_gradient_shares=False)
-    session: Any = SimpleNamespace(loading=SimpleNamespace(cache=cache), trainer=trainer)
+    setup: Any = SimpleNamespace(session=SimpleNamespace(loading=SimpleNamespace(cache=cache)))
     capsys.readouterr()
-    Run(nothing, nothing, nothing, nothing)._report(session, kept)
+    Run(setup, nothing, nothing, nothing)._report(kept)
     return capsys.readouterr().err
 
 
@@ -76,11 +75,15 @@ def test_steps_that_were_not_saved_are_named_on_resuming(
     folder, nothing = RunFolder(tmp_path), cast(Any, None)
     for step in range(1, 6):
         folder.append(step, "train", {"loss": 1.0})
-    prepared: Any = SimpleNamespace(session=SimpleNamespace(trainer=SimpleNamespace(log_every=1)))
+    spec = SimpleNamespace(own_code=dict)
+    setup: Any = SimpleNamespace(session=SimpleNamespace(spec=spec))
     for saved, said in (
         (5, ""),
         (2, "rgbt: steps 3 to 5 were not saved and are repeated.\n"),
     ):
         state = State(seed=0, step=saved, evaluated_step=saved)
-        Run(prepared, folder, nothing, nothing)._truncate(state)
+        trainer: Any = SimpleNamespace(
+            resume=lambda _: False, settings=SimpleNamespace(log_every=1)
+        )
+        Run(setup, folder, nothing, nothing)._resume(trainer, state)
         assert capsys.readouterr().err == said

@@ -1,34 +1,35 @@
 """Where the host waits for the GPU in a training step: line, number and time per step.
 
-On a GPU, PyTorch reports every operation that synchronises, and the profiler adds up the time. On
-the CPU the lines come from a simulated device (`tests.on_device.simulated`), without times.
+PyTorch reports every operation that synchronises, and the profiler adds up the time. On a CPU
+there is none.
 """
 
 from __future__ import annotations
 
 import time
+import traceback
 import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch.overrides import TorchFunctionMode
 
+import rgbt
 from rgbt.engine.trainer import WAIT_SHARE
 from rgbt.runtime.resources import is_out_of_memory
 from tests.benchmarks.gpu.device import checked, reset_peak
 from tests.benchmarks.gpu.project import Training, crm_words, setup_of, write_mfnet
 from tests.benchmarks.gpu.task import Task
-from tests.on_device.simulated import line_of_ours
-from tests.on_device.simulated_run import simulated, words_of
 
 WARM, STEPS = 3, 4
 LEAST = 5e-5
 """Seconds from which a call counts as waiting."""
 
-SIMULATED = ("crm", "temporal_con", "sh_adversarial")
+PACKAGE = Path(rgbt.__file__).parent
 
 
 def measure(task: Task) -> None:
@@ -37,19 +38,16 @@ def measure(task: Task) -> None:
     if device.type == "cuda":
         _measure_on_gpu(task, device)
     else:
-        _list_simulated(task)
+        task.headline("the waits of a step need a GPU")
 
 
-def _list_simulated(task: Task) -> None:
-    counts = {}
-    for name in task.as_time_allows(list(SIMULATED[:1] if task.smoke else SIMULATED), first=3.0):
-        found = simulated(words_of(name, "device" if name == "crm" else "loader"), task.folder)
-        for line, number in found.step_waits.most_common():
-            task.row(experiment=name, line=line, **{"per step": number})
-        counts[name] = sum(found.step_waits.values())
-    task.note("Lines are those of a simulated device; their times need a GPU.")
-    listed = ", ".join(f"{name} {number}" for name, number in counts.items())
-    task.headline(f"waits per step, simulated: {listed}; their times need a GPU")
+def line_of_ours() -> str:
+    """File, line and function of the last frame in our code."""
+    for frame in reversed(traceback.extract_stack()):
+        path = Path(frame.filename)
+        if path.is_relative_to(PACKAGE):
+            return f"{path.relative_to(PACKAGE.parent)}:{frame.lineno} {frame.name}"
+    return "elsewhere"
 
 
 def _measure_on_gpu(task: Task, device: torch.device) -> None:
@@ -70,7 +68,7 @@ def _measure_on_gpu(task: Task, device: torch.device) -> None:
     for line in lines:
         ms = 1e3 * clock.seconds[line] / STEPS
         task.row(line=line, **{"per step": seen[line] / STEPS, "ms per step": ms})
-    task.note(f"Swin-S, batch {size}, bf16-mixed, augmentation on the device; {step_ms:.0f} ms.")
+    task.note(f"Swin-S, batch {size}, bf16-mixed; {step_ms:.0f} ms.")
     waiting = [each[WAIT_SHARE] for each in training.recorded[WARM:]]
     task.note(f"wait_share of these steps: {max(waiting):.2g} at most.")
     number = sum(seen.values()) / STEPS
@@ -82,7 +80,7 @@ def _measure_on_gpu(task: Task, device: torch.device) -> None:
 def _warm(task: Task, root: Any, size: int, device: torch.device) -> tuple[Training, Iterator[Any]]:
     """A training after its first steps, and the batches that follow."""
     words = crm_words("mask2former_swin_s", size, root, smoke=task.smoke)
-    words += [f"data.cache={task.folder / 'cache'}", "data.augment=device", "data.num_workers=0"]
+    words += [f"data.cache={task.folder / 'cache'}", "data.num_workers=0"]
     setup = setup_of([*words, "trainer.precision=bf16-mixed"], device)
     batches = setup.batches(range(WARM + 3 * STEPS))
     training = Training(setup, task.folder)
