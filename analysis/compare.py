@@ -70,13 +70,6 @@ class Options:
     ] = "refuse"
     level: Level = 0.95
     resamples: Resamples = 10_000
-    method: Annotated[
-        Literal["auto", "percentile", "bca"],
-        Help(
-            "method of the intervals over images: percentile or bca; auto: percentile, with the "
-            "bias removed for the variance of one method"
-        ),
-    ] = "auto"
     blocks: Blocks = "auto"
     absent: Annotated[
         Literal["as counted", "released", "exclude"],
@@ -107,7 +100,6 @@ def main(options: Options, overrides: list[str]) -> int:
     settings = Resampling(
         resamples=options.resamples,
         level=options.level,
-        method=options.method,
         blocks=options.blocks,
         seed=options.seed,
         absent=None if options.absent == "as counted" else options.absent,
@@ -122,11 +114,9 @@ def main(options: Options, overrides: list[str]) -> int:
     # Scores by day and by night are over other images.
     drawn = {parse(each.metric).part: each.a.said for each in comparison.differences}
     parts = [f"{part}: {text}." for part, text in drawn.items() if part is not None]
-    method = "percentile" if settings.method == "auto" else settings.method
     remark = (
-        f"Percent points (Var: squared). Intervals: {method}, {settings.resamples} "
-        "resamples; p over images: methods exchanged at random on each block; over seeds: Welch; "
-        "Holm: corrected for the number of lines."
+        f"Percent points (Var: squared). Intervals: Student, {settings.resamples} resamples of the "
+        "images, seeds by Welch; p of the last interval; Holm: corrected for the number of lines."
     )
     print_rich(escape("\n".join(filter(None, [said, *parts, comparison.reason, remark]))))
     out = options.out
@@ -175,24 +165,25 @@ def comparison_grid(comparison: Comparison, labels: Sequence[str]) -> TextTable:
     """One line per score."""
     from rgbt.tables import TextTable, number
 
-    with_seeds = any(difference.both is not None for difference in comparison.differences)
+    with_seeds = any(each.difference.both is not None for each in comparison.differences)
     level = f"{100 * comparison.level:g} %"
-    over = [f"{level} over images", "p (images)"]
-    more = [f"{level} over images and seeds", "p (both)"] if with_seeds else []
+    over = [f"{level} over images"]
+    over += [f"{level} over images and seeds"] if with_seeds else []
     rows = []
     for each in comparison.differences:
-        both = [_shown(each.both), _p(each.p_both)] if with_seeds else []
         difference = number(each.value) if each.value != each.value else f"{each.value:+.2f}"
         spreads = ["" if side.sd != side.sd else f" ± {side.sd:.2f}" for side in (each.a, each.b)]
         scores = [number(each.a.value) + spreads[0], number(each.b.value) + spreads[1]]
-        images = [_shown(each.images), _p(each.p_images)]
-        rows.append((each.metric, *scores, difference, *images, *both, _p(each.p_corrected)))
+        intervals = [_shown(each.difference.images)]
+        intervals += [_shown(each.difference.both)] if with_seeds else []
+        ps = _p(each.difference.p), _p(each.p_corrected)
+        rows.append((each.metric, *scores, difference, *intervals, *ps))
     singles = f"{comparison.images} single images"
     drawn = (
         singles if comparison.said == singles else f"{comparison.images} images, {comparison.said}"
     )
     title = f"{labels[1]} minus {labels[0]}: {drawn}, {comparison.partition}"
-    header = ("", *labels, "difference", *over, *more, "p (Holm)")
+    header = ("", *labels, "difference", *over, "p", "p (Holm)")
     return TextTable(title, header, tuple(rows))
 
 
@@ -205,10 +196,10 @@ def absent_classes(every: Sequence[Counts], absent: Absent | None) -> tuple[str,
     """
     import numpy as np
 
-    from rgbt.metrics.absent import absent_notes
     from rgbt.metrics.counts import convention
     from rgbt.metrics.details import details_of
     from rgbt.metrics.pairs import protocol_of
+    from rgbt.metrics.scores import absent_notes
 
     first = every[0]
     if protocol_of(first.partition) is not None or details_of(first.partition) is not None:
@@ -285,13 +276,14 @@ def comparison_csv(comparison: Comparison) -> str:
     """One line per score with all digits; empty where there is no value."""
     from rgbt.tables import csv_text
 
-    ends = ("images_low", "images_high", "p_images", "both_low", "both_high", "p_both", "p_holm")
+    ends = ("images_low", "images_high", "both_low", "both_high", "p", "p_holm")
     rows: list[tuple[object, ...]] = []
     rows.append(("metric", "a", "b", "seeds_a", "seeds_b", "difference", *ends))
     for each in comparison.differences:
-        images = (each.images.low, each.images.high) if each.images else ("", "")
-        both = (each.both.low, each.both.high) if each.both else ("", "")
-        values = (*images, each.p_images, *both, each.p_both, each.p_corrected)
+        found = each.difference
+        images = (found.images.low, found.images.high) if found.images else ("", "")
+        both = (found.both.low, found.both.high) if found.both else ("", "")
+        values = (*images, *both, found.p, each.p_corrected)
         row = (each.a.value, each.b.value, each.a.seeds, each.b.seeds, each.value, *values)
         rows.append((each.metric, *("" if value != value else value for value in row)))
     return csv_text(rows)

@@ -126,7 +126,7 @@ def difference_table(measured: MeasuredFlow, comparison: Comparison) -> TextTabl
 
 
 def _row(found: Difference) -> tuple[str, ...]:
-    around = found.images
+    around = found.difference.images
     ends = f" [{around.low:+.2f}, {around.high:+.2f}]" if around else ""
     name = found.metric.replace("_", " ")
     return name, f"{found.a.value:.2f}", f"{found.b.value:.2f}", f"{found.value:+.2f}{ends}"

@@ -20,8 +20,8 @@ from rgbt.config.command import built
 from rgbt.config.common_options import PredictionFormatOptions
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
+from rgbt.metrics.metric import MAX_REGIONS, Partition
 from rgbt.metrics.names import DAY, MIOU, NIGHT, subset
-from rgbt.metrics.regions import MAX_REGIONS, Partition
 
 if TYPE_CHECKING:
     from analysis.predictions.scoring import FolderScores
@@ -298,18 +298,13 @@ def _with_intervals(table: ScoreTable, counts: Counts, settings: Resampling) -> 
     reason = ""
     for absent, part in product(table.conventions(), table.num_images):
         named = interval_cells(table, absent)[part]
-        try:
-            estimates = estimate([counts], list(named), replace(settings, absent=absent))
-        except InputError as error:
-            if part == "all":
-                raise
-            drawn[part] = f"has none ({error})"  # a part that is too small stops nothing else
-            continue
+        estimates = estimate([counts], list(named), replace(settings, absent=absent))
         for metric, each in estimates.items():
             if each.images is not None:
                 found[named[metric]] = (each.images.low, each.images.high)
-        drawn[part] = f"of {estimates[OF_PARTS[part]].said}"
-        reason = estimates[OF_PARTS[part]].reason if part == "all" else reason
+        main = estimates[OF_PARTS[part]]
+        drawn[part] = f"of {main.said}" if main.images else f"has none ({main.said} are too few)"
+        reason = main.reason if part == "all" else reason
     whole_split = drawn.pop("all")
     if not found:
         return replace(
@@ -318,7 +313,7 @@ def _with_intervals(table: ScoreTable, counts: Counts, settings: Resampling) -> 
     parts = "".join(f"; {part} {said}" for part, said in drawn.items())
     said = (
         f"{table.partition}: in brackets, {100 * settings.level:g} % intervals over images "
-        f"(percentile, of Var without its bias; {settings.resamples} resamples "
+        f"(Student, of Var without its bias; {settings.resamples} resamples "
         f"{whole_split}{parts}). {reason}".rstrip()
     )
     return with_intervals(table, found, said)

@@ -18,7 +18,7 @@ from rgbt.checks import InputError
 from rgbt.config.command import built
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
-from rgbt.metrics.regions import MAX_REGIONS
+from rgbt.metrics.metric import MAX_REGIONS
 
 if TYPE_CHECKING:  # --help answers without waiting for torch and OpenCV
     from analysis.statistics.data import SpatialStatistics

@@ -66,7 +66,7 @@ Widths = tuple[Channels, Channels, Channels, Channels]
 Depths = tuple[Blocks, Blocks, Blocks, Blocks]
 """Blocks of four stages."""
 
-MlpRatio = Annotated[float, Interval(gt=0, le=64)]
+MlpRatio = Annotated[float, Interval(ge=1, le=64)]
 """Width of a block's feed-forward network divided by the width of the block."""
 
 Names = tuple[Text, ...]

@@ -1,14 +1,16 @@
 """The record in which a component declares what it provides and what it requires of others.
 
-The attribute `record` of a network, loss, scheme, ...; `rgbt.assembly.contracts` compares them
-before anything is trained. A class that takes long to build has a static method `record_from`,
-which makes the record of an object from its settings.
+The attribute `record` of a network, loss, scheme, ...; `check_requirements` compares them before
+anything is trained. A class that takes long to build has a static method `record_from`, which makes
+the record of an object from its settings.
 """
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Literal
 
 from rgbt.checks import InputError, described
@@ -86,7 +88,6 @@ class Record:
         hides_cells: masker: whether any cell is ever hidden.
         crop_hw: transform: size of a training example; None where that differs.
         for_target: transform: that of the target domain; None: itself.
-        works_on_batches: transform: whether it can augment whole batches on the device.
         target_labels: domains: whether the target has labels.
         target_confidence: domains: whether these carry a confidence.
         separate_heads: domains: whether source and target have a head each.
@@ -115,14 +116,13 @@ class Record:
     compares_half: bool = False
     num_domains: Literal[1, 2] = 1
     shows_views: bool = False
-    optimizers: Mapping[str, tuple[str, ...]] = field(default_factory=lambda: {"main": ()})
+    optimizers: Mapping[str, tuple[str, ...]] = field(default_factory=partial(dict, main=()))
     networks: dict[str, Any] = field(default_factory=dict)
     builders: Mapping[str, Callable[..., Any]] = field(default_factory=dict)
     camera: Any = None
     hides_cells: bool = True
     crop_hw: tuple[int, int] | None = None
     for_target: Any = None
-    works_on_batches: bool = False
     target_labels: bool = False
     target_confidence: bool = False
     separate_heads: bool = False
@@ -138,11 +138,43 @@ class Record:
 PLAIN = Record()
 """The record of a component that does not declare one."""
 
+WITHOUT_RECORD = {"loss": Record(requires=(Requirement("model", "outputs", "scores"),))}
+"""The same, by node, of components that are no `PLAIN` ones: a loss reads class scores."""
 
-def record_of(component: object) -> Record:
+
+def record_of(component: object, default: Record = PLAIN) -> Record:
     """The record of a component; InputError where it is something else."""
-    record = getattr(component, "record", PLAIN)
+    record = getattr(component, "record", default)
     if not isinstance(record, Record):
         name = f"{type(component).__name__}.record"
         raise InputError(f"{name} is {described(record)}; expected rgbt.requirements.Record.")
     return record
+
+
+def check_requirements(components: Mapping[str, Any]) -> dict[str, Record]:
+    """The records of components, by their keys in the configuration.
+
+    InputError names the first requirement, in their order, that another component does not meet.
+    """
+    records = {
+        node: record_of(part, WITHOUT_RECORD.get(node, PLAIN)) for node, part in components.items()
+    }
+    for node, record in records.items():
+        for need in record.requires:
+            other = records.get(need.node)
+            if other is None or need.is_met_by(other):
+                continue
+            subject = name_of(components[node]) + (f" with {need.setting}" if need.setting else "")
+            change = need.advice or f"change {need.setting.partition('=')[0] or node}"
+            raise InputError(
+                f"{node}: {subject} requires {need.key}={need.value} of the {need.node}, "
+                f"which provides {need.key}={other.get(need.key)}; "
+                f"{change}, or choose another {need.node}."
+            )
+    return records
+
+
+def name_of(component: Any) -> str:
+    """The name of a function or class, or of the class of an object."""
+    is_callable = inspect.isfunction(component) or inspect.isclass(component)
+    return str(component.__name__) if is_callable else type(component).__name__

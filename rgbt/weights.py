@@ -8,19 +8,22 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 from omegaconf import DictConfig, OmegaConf
 
-from rgbt.checkpoints.layout import Facts
-from rgbt.checkpoints.read import Contents
-from rgbt.checks import InputError
+from rgbt.checks import InputError, one_line
 from rgbt.config.common_options import Checkpoint, RunsDir, Trust
 from rgbt.config.component import build
 from rgbt.config.compose import available, compose
 from rgbt.config.options import Help
 from rgbt.config.plain_command import CommandGroup, PlainCommand
 from rgbt.config.stored_config import check_targets, parse_trust, read_settings
+from rgbt.terminal import plain_text
+
+if TYPE_CHECKING:  # --help does not wait for torch
+    from rgbt.checkpoints.load import Plan
+    from rgbt.checkpoints.read import Contents
 
 NOT_SETTINGS = ("_target_", "weights", "fresh", "inputs")
 
@@ -34,64 +37,66 @@ class InspectOptions:
 
 
 def inspect(options: InspectOptions, overrides: list[str]) -> int:
-    """Describe a file of weights and which parameters of a network it would set.
+    """Describe a file of weights, and say what it sets in a network.
 
-    Overrides choose the network: model=mask2former_tiny model.fresh=[sem_seg_head].
+    Overrides choose the network: model=mask2former_tiny model.fresh=[sem_seg_head]. Without any it
+    is the network of the run that the file is in.
     """
+    from rgbt.checkpoints.load import recognised
+    from rgbt.checkpoints.read import read
+    from rgbt.checkpoints.starts import start_lines
+    from rgbt.runs.run_spec import file_digest
+    from rgbt.terminal import path_lines, print_rich
+
+    contents, path = read(options.file), options.file
+    kinds = sorted({str(each.dtype).removeprefix("torch.") for each in contents.tensors.values()})
+    digest = file_digest(path)
+    lines = [
+        ("file", f"{path} ({path.stat().st_size / 1e6:.1f} MB)"),
+        ("what", recognised(contents) or "unknown"),
+        ("tensors", f"{len(contents.tensors)} ({', '.join(kinds)})"),
+        ("names", ", ".join([*map(one_line, list(contents.tensors)[:4]), "..."])),
+        *((f"note {one_line(key)}", one_line(text)) for key, text in contents.note.items()),
+        ("sha256", digest),
+        *start_lines(path.name, digest, available("experiment")),
+    ]
+    print_rich(path_lines(lines))
+    node = _model_node(contents, overrides, parse_trust(options.trust))
+    if node is None:
+        return 0
+    plan = _plan(node, contents)
+    print_rich(plain_text(plan.sentence()))
+    if plan.convention:
+        print_rich(path_lines([("trained with", " ".join(plan.convention))]))
+    return int(bool(plan.problems))
+
+
+def _model_node(
+    contents: Contents, overrides: list[str], trust: tuple[str, ...]
+) -> DictConfig | None:
+    """The network of the overrides or of the run beside the file; None: there is neither."""
+    if overrides:
+        return cast(DictConfig, compose(overrides).model)
+    beside = contents.path.parent / "config.yaml"
+    if not (contents.ours and beside.is_file()):
+        return None
+    model = read_settings(beside).get("model")
+    check_targets({"model": model}, trust, str(beside), group="model")
+    return cast(DictConfig, OmegaConf.create({"model": model}).model)
+
+
+def _plan(node: DictConfig, contents: Contents) -> Plan:
+    """What the file sets in the network of a node."""
     import torch
 
     from rgbt.checkpoints.load import plan_for
-    from rgbt.checkpoints.read import read
-    from rgbt.checkpoints.recognise import recognise
-    from rgbt.checkpoints.report import PLAN_HEADER, facts_view, plan_rows
-    from rgbt.checkpoints.starts import start_lines
-    from rgbt.runs.run_spec import file_digest
-    from rgbt.tables import TextTable
-    from rgbt.terminal import path_lines, print_rich, rich_table
 
-    contents = read(options.file)
-    facts = recognise(contents)
-    more = []
-    if not contents.ours:
-        digest = file_digest(options.file)
-        more = start_lines(facts, options.file.name, digest, available("experiment"))
-    print_rich(facts_view(contents, facts, more))
-    found = _network(contents, facts, overrides, parse_trust(options.trust))
-    if found is None:
-        return 0
-    node, name = found
     try:
         with torch.device("meta"):  # no memory for its weights, where it can be built so
             network = build(node)
     except (NotImplementedError, RuntimeError):
         network = build(node)
-    _, plan, remarks = plan_for(network, contents, tuple(node.get("fresh") or ()))
-    print_rich(rich_table(TextTable(f"into {name}", PLAN_HEADER, plan_rows(plan))))
-    if remarks:
-        print_rich(path_lines([("remark", remark) for remark in remarks]))
-    return 0 if plan.fits else 1
-
-
-def _network(
-    contents: Contents, facts: Facts, overrides: list[str], trust: tuple[str, ...]
-) -> tuple[DictConfig, str] | None:
-    """The network of the file and its name; None where nothing says which."""
-    beside = contents.path.parent / "config.yaml"
-    if not overrides and contents.ours and beside.is_file():
-        model = read_settings(beside).get("model")
-        if model is None:
-            return None
-        check_targets({"model": model}, trust, str(beside), group="model")
-        return OmegaConf.create({"model": model}).model, str(beside)
-    if not any(word.startswith("model=") for word in overrides):
-        known = {f"model={name}" for name in available("model")}
-        usual = next((each for each in facts.fits if each[0] in known), ())
-        if not usual:
-            return None
-        overrides = [*usual, *overrides]
-    if facts.classes and not any(word.startswith("model.num_classes=") for word in overrides):
-        overrides = [*overrides, f"model.num_classes={facts.classes}"]
-    return compose(overrides).model, " ".join(overrides)
+    return plan_for(network, contents, tuple(node.get("fresh") or ()))
 
 
 @dataclass(frozen=True)
@@ -111,11 +116,11 @@ class ExportOptions:
 def export(options: ExportOptions, overrides: list[str]) -> int:
     """Write the weights of a run."""
     from rgbt.assembly.session import differences
-    from rgbt.checkpoints.layout import family_named
+    from rgbt.checkpoints.kinds import family_named
     from rgbt.checkpoints.read import read
-    from rgbt.checkpoints.release import CONVENTIONS, save
+    from rgbt.checkpoints.release import convention_of, save
     from rgbt.runs.folder import find_run
-    from rgbt.terminal import info, plain_text, print_rich
+    from rgbt.terminal import info, print_rich
 
     del overrides  # none is heeded
     folder = find_run(options.run, options.runs_dir)
@@ -134,7 +139,7 @@ def export(options: ExportOptions, overrides: list[str]) -> int:
         "step": str(contents.settings.get("step", 0)),
     }
     remark = save(options.out, options.format, family, contents.tensors, note)
-    others = differences(model, CONVENTIONS.get((options.format, family), ()))
+    others = differences(model, convention_of(options.format, family))
     if others:
         info(f"scores will differ in the authors' code, which uses {' '.join(others)}.")
     if remark:

@@ -1,27 +1,19 @@
 """Names of the user attributes of trials and studies in Optuna's storage."""
 
-KEY = "rgbt.key"
-"""Of a trial: key of its point, see `PlannedPoint.key`."""
-RUNS = "rgbt.runs"
-"""Of a trial: keys of its runs, one per seed."""
-OVERRIDES = "rgbt.overrides"
-"""Of a trial: overrides of `python -m rgbt.run`, without the seeds of replicates."""
-LABEL = "rgbt.label"
-"""Of a trial: the point as shown; written after the first heartbeat."""
+# Of a trial
+KEY = "rgbt.key"  # of its point, see `PlannedPoint.key`
+RUNS = "rgbt.runs"  # keys of its runs, one per seed
+OVERRIDES = "rgbt.overrides"  # of `python -m rgbt.run`, without the seeds of replicates
+LABEL = "rgbt.label"  # the point as shown; written after the first heartbeat
 REASON = "rgbt.reason"
-"""Of a trial: why it failed or was pruned. A failed one without it was lost, released or a
-duplicate: it does not count."""
-SECONDS = "rgbt.seconds"
-"""Of a trial: duration of its runs, all processes together."""
-RESULTS = "rgbt.results"
-"""Of a trial: "val/..." and "test/..." scores, mean over its seeds; percent, Var as it is."""
-PIXELS = "rgbt.pixels"
-"""Of a trial: size of its images relative to the paper's, by which ``${px:64}`` is scaled."""
-KIND = "rgbt.kind"
-"""Of a study: "search", "grid" or "list"."""
-SIGNATURE = "rgbt.signature"
-"""Of a study: hash of its space and objectives, which must not change."""
-METRICS = "rgbt.metrics"
-"""Of a study: names of the objectives, in order."""
-COMMAND = "rgbt.command"
-"""Of a study: the command that created it."""
+"""Why it failed or was pruned. A failed one without it was lost, released or a duplicate: it does
+not count."""
+SECONDS = "rgbt.seconds"  # duration of its runs, all processes together
+RESULTS = "rgbt.results"  # "val/..." and "test/..." scores, mean over its seeds; percent
+PIXELS = "rgbt.pixels"  # size of its images relative to the paper's, which scales ``${px:64}``
+
+# Of a study
+KIND = "rgbt.kind"  # "search", "grid" or "list"
+SIGNATURE = "rgbt.signature"  # hash of its space and objectives, which must not change
+METRICS = "rgbt.metrics"  # names of the objectives, in order
+COMMAND = "rgbt.command"  # that created it

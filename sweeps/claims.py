@@ -40,17 +40,16 @@ def main(options: Options, overrides: list[str]) -> int:
     Overrides are those of the runs: dataset.root=/data/MFNet. Claims about data sets alone, such as
     those on noise and sharpness, are decided by `rgbt spatial`.
     """
-    from rich.text import Text
-
     from rgbt.files.atomic import write_atomic
     from rgbt.terminal import path_lines, print_rich, rich_table
     from sweeps.rendering.claims import claims_csv, claims_grid, claims_markdown, counted
+    from sweeps.rendering.times import print_lines
 
     judged, times = judge_all(options, overrides)
     run_as = " ".join([f"scale={options.scale}", f"form={options.form}", *overrides])
     where = f"{run_as}, runs in {options.runs_dir}"
     print_rich(rich_table(claims_grid(judged, f"{counted(judged)} ({where})", tables=True)))
-    print_rich(Text("\n".join([by_paper(judged), *times])))
+    print_lines([by_paper(judged), *times])
     if options.out is not None:
         options.out.mkdir(parents=True, exist_ok=True)
         words = re.sub(r" ?dataset\.root=\S+", "", run_as)  # the folder names a machine
@@ -67,10 +66,16 @@ def judge_all(options: Options, overrides: Sequence[str]) -> tuple[list[JudgedCl
     from rich.console import Console
     from rich.progress import track
 
-    from sweeps.rendering.times import time_line, upstream_line
-    from sweeps.table import make_request as requests
+    from sweeps.rendering.times import time_lines
     from sweeps.table.efficiency import exact_sizes
     from sweeps.table.load_table import is_own, table_names
+    from sweeps.table_plan import (
+        TableWords,
+        check_equal_runs,
+        check_override,
+        make_request,
+        read_named,
+    )
     from sweeps.verdicts.judge import TableJudge
     from sweeps.verdicts.stored import finished_by_seed, rule_of, stored_runs
     from sweeps.worker.planner import Planner
@@ -78,26 +83,24 @@ def judge_all(options: Options, overrides: Sequence[str]) -> tuple[list[JudgedCl
     names = table_names(Path("none")) if options.table == ALL else [options.table]
     finished = finished_by_seed(options.runs_dir)
     for word in overrides:
-        requests.check_override(word)
-    words = requests.TableWords(
-        seeds=(0,), scale=options.scale, form=options.form, overrides=overrides
-    )
+        check_override(word)
+    words = TableWords(seeds=(0,), scale=options.scale, form=options.form, overrides=overrides)
     planner = Planner(readable_paths([f"runs_dir={options.runs_dir}"]))
     judged: list[JudgedClaim] = []
     results: dict[str, RunResult] = {}
     trained: list[tuple[str, ...]] = []
     for each in track(names, "judging", console=Console(stderr=True), transient=True):
-        name, table = requests.read_named(each)
+        name, table = read_named(each)
         if not table.claims:
             continue
-        request, external = requests.make_request(name, table, words)
+        request, external = make_request(name, table, words)
         if external:
             raise InputError(
                 f"{external[0].kind}.{external[0].label}: only finished runs are judged here; "
                 f"use rgbt reproduce table={name} for rows that are not trained."
             )
         if overrides or is_own(each):  # a test checks the others
-            requests.check_equal_runs(request, planner)
+            check_equal_runs(request, planner)
         runs = {}
         if overrides or finished:
             runs = stored_runs(request, options.runs_dir, finished, planner)
@@ -107,8 +110,7 @@ def judge_all(options: Options, overrides: Sequence[str]) -> tuple[list[JudgedCl
         judged += judge.claims(runs)
         results |= {result.key: result for result in found}
         trained += [request.overrides(label, seed) for label, seed in runs]
-    times = (time_line(results.values()), upstream_line(trained, planner))
-    return judged, [line for line in times if line]
+    return judged, time_lines(results.values(), trained, planner)
 
 
 def by_paper(judged: Sequence[JudgedClaim]) -> str:

@@ -47,13 +47,8 @@ class ExtraEvaluation:
 
     @property
     def label(self) -> str:
-        """As shown: "rgb, ring5, occluded-0.5, source head" or "consistency, aligned"."""
-        if self.frames is not None:
-            return f"consistency, {self.frames}"
-        head = "" if self.head == "as trained" else f"{self.head} head"
-        world = f"world {self.world}" if self.world else ""
-        words = (self.modality, self.regions, head, *self._changes, self.details or "", world)
-        return ", ".join(filter(None, words))
+        """As shown: the name of its counts, "table_rgb_ring5_occluded-0.5"."""
+        return self.path.rpartition("/")[2].removesuffix(".npz")
 
     @property
     def command(self) -> tuple[str, ...]:

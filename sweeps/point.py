@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import colorsys
-import hashlib
 import math
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -17,18 +16,6 @@ Value = str | int | float | bool | None
 State = Literal["finished", "failed", "running", "waiting", "missing"]
 UNFINISHED: tuple[State, ...] = ("waiting", "failed")
 """States of points that a command runs."""
-
-COLOUR = "mlflow.runColor"
-"""Tag with the colour of a run in MLflow's charts. By default a hash of the run's id: two runs
-of four share one of the twenty colours in every fourth grid."""
-
-
-def colour(study: str, index: int) -> str:
-    """Colour of the point `index` of a study, "#rrggbb"; neighbours differ in hue and lightness."""
-    # Multiples of the golden ratio, modulo 1, never come close to each other soon.
-    hue = (hashlib.sha256(study.encode()).digest()[0] / 256 + index * 0.618034) % 1.0
-    channels = colorsys.hls_to_rgb(hue, (0.36, 0.56, 0.46)[index % 3], 0.62)
-    return "#" + "".join(f"{round(255 * channel):02x}" for channel in channels)
 
 
 @dataclass(frozen=True)
@@ -54,6 +41,12 @@ class Point:
     def runs(self) -> tuple[tuple[str, ...], ...]:
         """Overrides of each run."""
         return tuple((*self.overrides, f"seed={seed}") for seed in self.seeds) or (self.overrides,)
+
+
+def short_names(names: Collection[str]) -> dict[str, str]:
+    """Keys cut to their last part where that is unique: "masker.sigma_div" -> "sigma_div"."""
+    ends = Counter(name.rpartition(".")[2] for name in names)
+    return {name: end if ends[end := name.rpartition(".")[2]] == 1 else name for name in names}
 
 
 def varied_keys(points: Sequence[Point]) -> list[str]:

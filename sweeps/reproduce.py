@@ -5,27 +5,19 @@ Rerun the command to resume. Any number of machines may run it at the same time.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 from annotated_types import Interval
 
 from rgbt.checks import InputError
-from rgbt.config.command import composing
 from rgbt.config.common_options import RunsDir, Trust
-from rgbt.config.component import Component
-from rgbt.config.options import Help, readable_paths
+from rgbt.config.options import Help
 from rgbt.config.plain_command import CommandGroup, PlainCommand
 from rgbt.metrics.names import MIOU
 from sweeps.settings import SweepSettings
 from sweeps.table.new_table import NewOptions, new
-
-if TYPE_CHECKING:
-    from sweeps.point import Outcome
-    from sweeps.table_plan import TablePlan
-    from sweeps.worker.planner import Planner
 
 ALL = "all"
 NEW = PlainCommand(NewOptions, new, name="rgbt reproduce new")
@@ -84,94 +76,36 @@ def main(options: Options, overrides: list[str]) -> int:
     To write your own table:
     rgbt reproduce new table=my/ablation experiment=grbm masker.sigma_div=1,2,4
     """
-    from rgbt.config.compose import compose
-    from sweeps.point import Outcome
+    from sweeps.rendering.preview import print_previews
     from sweeps.rendering.publish import publish_table
-    from sweeps.table.load_table import is_own, table_names
-    from sweeps.table.make_request import check_override
-    from sweeps.table_plan import plan_table
+    from sweeps.rendering.times import print_lines, time_lines
+    from sweeps.table.load_table import table_names
+    from sweeps.table_plan import plan_tables
     from sweeps.verdicts.stored import rule_of
-    from sweeps.worker.planner import Planner
-    from sweeps.worker.point_list import preview_points, run_points
-    from sweeps.worker.run_store import open_run_store
+    from sweeps.worker.point_list import run_points
 
     settings = settings_of(options)
-    for word in overrides:
-        check_override(word)
-    tracker = [word for word in overrides if word.lstrip("+~").startswith("tracking")]
     if options.table == ALL and not settings.dry_run:
         raise InputError("table=all requires dry_run=true; run one table at a time.")
-    base = (*readable_paths([f"runs_dir={options.runs_dir}"]), *tracker)
-    with composing(base):
-        config = compose([*base, f"fresh={str(options.fresh).lower()}"])
-        Component.from_node(config.tracking)
-    runs = open_run_store(config)
-    planner = Planner(base)
-    extra = [word for word in overrides if word not in tracker]
-    tables = table_names() if options.table == ALL else [options.table]
-    plans = [plan_table(each, options, extra, runs, planner) for each in tables]
+    names = table_names() if options.table == ALL else [options.table]
+    plans = plan_tables(names, options, overrides)
     if settings.dry_run:
-        # Without any run and any override, the keys of tables that a test checks do not matter.
-        is_new = not (overrides or options.storage or any(runs.runs_dir.glob("*")))
-        is_new &= options.table == ALL and config.tracking.get("uri") is None
-        previews = [
-            [Outcome(point, "waiting") for point in plan.points.points]
-            if is_new and not is_own(name)
-            else preview_points(plan.points, settings, planner)
-            for name, plan in zip(tables, plans, strict=True)
-        ]
-        _show(options.table, list(zip(plans, previews, strict=True)), settings.workers, planner)
+        previews = [(plan, plan.preview(settings)) for plan in plans]
+        print_previews(previews, settings.workers, is_all=options.table == ALL)
         return 0
-    plan = plans[0]
+    (plan,) = plans
+    runs = plan.points.runs
     plan.evaluate_external(runs.runs_dir, options.trust)
-    outcomes = run_points(plan.points, settings, planner) if plan.points.points else []
+    outcomes = run_points(plan.points, settings, plan.planner) if plan.points.points else []
     if plan.until_decided is None:  # an earlier command may have added seeds
         plan.judge.rule = rule_of(result.tags for each in outcomes for result in each.results)
     name = f"{plan.request.name}_{plan.request.variant}"
     out = options.out or options.runs_dir / "tables" / name
     code = publish_table(plan.judge, plan.request, outcomes, plan.external, out, runs.tracking)
-    _show_times([each for each in outcomes if each.results], planner)
+    results = (result for outcome in outcomes for result in outcome.results)
+    trained = (outcome.point.overrides for outcome in outcomes if outcome.results)
+    print_lines(time_lines(results, trained, plan.planner))
     return code
-
-
-def _show_times(finished: Sequence[Outcome], planner: Planner) -> None:
-    """Print how long the finished runs and those upstream of them took."""
-    from rich.text import Text
-
-    from rgbt.terminal import print_rich
-    from sweeps.rendering.times import time_line, upstream_line
-
-    took = time_line(result for outcome in finished for result in outcome.results)
-    upstream = upstream_line((outcome.point.overrides for outcome in finished), planner)
-    if took or upstream:
-        print_rich(Text("\n".join(filter(None, (took, upstream)))))
-
-
-def _show(
-    table: str,
-    previews: Sequence[tuple[TablePlan, Sequence[Outcome]]],
-    workers: int,
-    planner: Planner,
-) -> None:
-    """Print the preview of one table, or one line for each of all."""
-    from rich.text import Text
-
-    from rgbt.terminal import print_rich, rich_table
-    from sweeps.rendering.preview import cells_grid, most_line, summary, tables_grid
-    from sweeps.rendering.times import upstream_line
-
-    if table == ALL:
-        requests = [(plan.request, outcomes) for plan, outcomes in previews]
-        print_rich(rich_table(tables_grid(requests, workers)))
-        return
-    ((plan, outcomes),) = previews
-    if outcomes:
-        print_rich(rich_table(cells_grid(plan.request, outcomes)))
-    lines = summary(plan.request, outcomes, workers)
-    if plan.until_decided is not None:
-        lines.append(most_line(len(plan.until_decided.most_runs()), outcomes, workers))
-    lines.append(upstream_line((each.point.overrides for each in outcomes), planner))
-    print_rich(Text("\n".join(filter(None, lines))))
 
 
 def settings_of(options: Options) -> SweepSettings:

@@ -11,14 +11,10 @@ from omegaconf import DictConfig, OmegaConf
 from rgbt.checks import InputError, nearest
 from rgbt.config.values import check_value
 from rgbt.metrics import names as scores
+from rgbt.metrics.scores import MEANS
 from rgbt.ranges import Names, Positive, Text
 
-SCORES = (
-    *(scores.MIOU, scores.VAR, scores.MACC, scores.MPRECISION, scores.MF1),
-    *(scores.PIXEL_ACCURACY, scores.region(1), scores.class_iou("car")),
-)
-"""Scores of a run, with one region and one class as examples."""
-
+SCORES = (*MEANS, scores.VAR, "region/<n>", "class/<name>")
 AT_THE_END = tuple(
     scores.consistency(score, protocol)
     for score in (scores.TC, scores.CA)
@@ -31,10 +27,8 @@ AT_THE_END = tuple(
 class Objective:
     """One number that a search optimizes.
 
-    Attributes:
-        metric: "val/<score>" (best checkpoint on the selection split) or "test/<score>", the scores
-            being those of `rgbt.metrics.names`; of two frames "val/TC/aligned" etc.
-        direction: which way is better.
+    `metric` is "val/<score>" (best checkpoint on the selection split) or "test/<score>", the scores
+    being those of `rgbt.metrics.names`; of two frames "val/TC/aligned" etc.
     """
 
     __pydantic_config__: ClassVar[dict[str, str]] = {"extra": "forbid"}
@@ -44,9 +38,10 @@ class Objective:
 
     def __post_init__(self) -> None:
         split, _, score = self.metric.partition("/")
-        part, _, inner = score.partition("/")
-        whole = inner if part in (scores.DAY, scores.NIGHT) else score
-        is_known = whole in SCORES or score in AT_THE_END or part in ("region", "class")
+        whole = score.removeprefix(f"{scores.DAY}/").removeprefix(f"{scores.NIGHT}/")
+        is_known = {whole, score} & {*SCORES, *AT_THE_END} or score.startswith(
+            ("region/", "class/")
+        )
         if split not in ("val", "test") or not is_known:
             known = nearest(score, (*SCORES, *AT_THE_END))
             raise InputError(f"objective '{self.metric}': val/<score> or test/<score>; {known}.")

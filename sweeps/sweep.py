@@ -10,34 +10,30 @@ import shlex
 import sys
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, replace
 
 from hydra.core.config_loader import ConfigLoader
 from omegaconf import DictConfig
+from rich.console import Group
 
 from rgbt.checks import InputError, RunError
-from rgbt.metrics.names import MIOU, VAR
 from rgbt.runs.provenance import command_line, without_passwords
 from rgbt.runs.run_spec import RunSpec
-from rgbt.tables import ABSENT, TextTable, number
 from rgbt.terminal import info, print_rich, rich_table
 from sweeps import attributes as names
-from sweeps.point import UNFINISHED, Outcome, Point
+from sweeps import space as spaces
+from sweeps.point import UNFINISHED, Point, short_names
 from sweeps.rendering.seed_groups import group_grid, unfinished_grid
-from sweeps.report.study_data import short_names
+from sweeps.report.publish import publish_study, study_folder
 from sweeps.settings import SweepSettings, read_settings
-from sweeps.space import space as spaces
-from sweeps.space.samplers import build_pruner, build_sampler
-from sweeps.space.space import GridPoint, Space, as_overrides, key_of, signature
-from sweeps.study import report, storage_url, study_folder
+from sweeps.space import Space, as_overrides, build_pruner, build_sampler, key_of, signature
 from sweeps.worker import point_list
 from sweeps.worker.driver import drive
 from sweeps.worker.planner import Planner, specify_run
 from sweeps.worker.point_list import PointList
 from sweeps.worker.progress import ProgressView, duration
 from sweeps.worker.run_store import RunStore, open_run_store
-from sweeps.worker.storage import find_study, open_storage, open_study
+from sweeps.worker.storage import find_study, open_storage, open_study, storage_url
 from sweeps.worker.trial_sources import SamplerSource
 from sweeps.worker.trial_store import TrialStore, counted_trials
 
@@ -86,7 +82,7 @@ def sweep(arguments: Sequence[str], config: DictConfig, loader: ConfigLoader) ->
     grid = spaces.grid_points(fixed, swept)
     if settings.points:
         grid = [
-            GridPoint({**each.params, **own.params}, own.overrides)
+            replace(own, params={**each.params, **own.params})
             for each in grid
             for own in spaces.list_points(settings.points, each.overrides)
         ]
@@ -94,15 +90,13 @@ def sweep(arguments: Sequence[str], config: DictConfig, loader: ConfigLoader) ->
         info("no list of values was given (such as seed=0,1,2); the sweep has one point.")
     identity = signature([_plain(each.overrides) for each in grid])
     name = settings.study or _name(config.name, list(grid[0].params), identity)
-    points = tuple(
-        Point(_label(each) or name, each.overrides, each.params, {f"rgbt.study/{name}": "grid"})
-        for each in grid
-    )
+    tags = {f"rgbt.study/{name}": "grid"}
+    points = tuple(replace(each, label=_label(each) or name, tags=tags) for each in grid)
     kind, known = "list" if settings.points else "grid", spaces.distributions(grid)
     _grid(PointList(name, name, kind, points, runs, tuple(base), known), settings)
 
 
-def _label(point: GridPoint) -> str:
+def _label(point: Point) -> str:
     """The varied values of a point, as typed: "sigma_div=1 seed=0"."""
     values = {key.lstrip("+"): value for key, value in point.params.items()}
     return " ".join(f"{name}={values[key]}" for key, name in short_names(values).items())
@@ -122,14 +116,15 @@ def _plain(words: Sequence[str]) -> list[str]:
 def _grid(points: PointList, settings: SweepSettings) -> None:
     if settings.dry_run:
         outcomes = point_list.preview_points(points, settings)
-        tables = [grid_table(points, outcomes)]
     else:
         # A typing error should not cost hours of other runs.
         outcomes = point_list.run_points(points, settings, strict=True)
-        tables = [group_grid(points.title, outcomes), unfinished_grid(outcomes)]
-    for table in tables:
-        if table.rows:
-            print_rich(rich_table(table))
+    is_begun = any(outcome.results for outcome in outcomes)
+    tables = [
+        *([group_grid(points.title, outcomes)] if is_begun else []),
+        unfinished_grid(outcomes),
+    ]
+    print_rich(Group(*(rich_table(each) for each in tables if each.rows)))
     if other_code := point_list.other_code_line(outcomes):
         info(other_code)
     if settings.dry_run:
@@ -138,35 +133,15 @@ def _grid(points: PointList, settings: SweepSettings) -> None:
         guess = "" if seconds is None else f", about {duration(seconds)}"
         info(f"{missing} of {len(outcomes)} points would be run{guess}.")
         return
-    command = study_command(points.study, points.runs.runs_dir, settings.storage)
-    info(f"study {points.study}; its figures: {command}")
+    words = [f"name={points.study}", f"runs_dir={points.runs.runs_dir}"]
+    words += [f"storage={without_passwords(settings.storage)}"] if settings.storage else []
+    info(f"study {points.study}; its figures: rgbt study {shlex.join(words)}")
     failed = [outcome for outcome in outcomes if outcome.state == "failed"]
     if failed:
         raise RunError(
             f"{len(failed)} of {len(outcomes)} points failed, first {failed[0].point.label}: "
             f"{failed[0].reason} (hydra.sweeper.retry=failed retries them)."
         )
-
-
-def study_command(study: str, runs_dir: Path, storage: str | None) -> str:
-    """The command that reports a study, without passwords and default values."""
-    words = ["rgbt", "study", f"name={study}"]
-    words += [f"runs_dir={runs_dir}"] if runs_dir != Path("runs") else []
-    words += [f"storage={without_passwords(storage)}"] if storage else []
-    return shlex.join(words)
-
-
-def grid_table(points: PointList, outcomes: Sequence[Outcome]) -> TextTable:
-    """A preview, one row per point: its label, its scores on the test split, its state."""
-    metrics = (MIOU, VAR)
-    rows = []
-    for outcome in outcomes:
-        scores = outcome.results[0].recorded_scores() if outcome.results else {}
-        found = [scores.get(f"test/{metric}") for metric in metrics]
-        values = [ABSENT if score is None else number(score) for score in found]
-        key = outcome.keys[0] if outcome.keys else ABSENT
-        rows.append((outcome.point.label, *values, key, outcome.reason[:80] or outcome.state))
-    return TextTable(points.title, ("point", *metrics, "run", "state"), tuple(rows))
 
 
 @dataclass(frozen=True)
@@ -227,7 +202,7 @@ def search(request: Search, settings: SweepSettings) -> None:
     if trials and not states["COMPLETE"] and not states["RUNNING"]:
         raise RunError(f"no trial of {request.study} has finished; see the reasons above.")
     url = storage_url(settings.storage, runs_dir)
-    report(study, study_folder(runs_dir, request.study), request.runs.tracking, url)
+    publish_study(study, study_folder(runs_dir, request.study), request.runs.tracking, url)
 
 
 def probe(request: Search, settings: SweepSettings) -> RunSpec:

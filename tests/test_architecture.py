@@ -20,7 +20,16 @@ FILES = [
 ALONE = {"types", "checks", "ranges", "randomness", "processes", "class_scores", "averaging"}
 BASE = ALONE | {"dataset", "requirements", "files", "terminal", "tables"}
 SHARED = BASE | {"geometry"}
-COMPONENTS = {"data", "corruptions", "transforms", "maskers", "models", "losses", "metrics"}
+COMPONENTS = {
+    "data",
+    "synth",
+    "corruptions",
+    "transforms",
+    "maskers",
+    "models",
+    "losses",
+    "metrics",
+}
 READING = SHARED | {"config", "runs", "tracking", "metrics", "data"}
 BUILDING = READING | COMPONENTS | {"schemes", "engine", "checkpoints", "runtime", "exported"}
 RGBT: dict[str, set[str]] = {
@@ -32,6 +41,7 @@ RGBT: dict[str, set[str]] = {
     **dict.fromkeys(("files", "runtime", "geometry"), BASE),
     **dict.fromkeys((*COMPONENTS, "checkpoints", "exported"), SHARED),
     "schemes": SHARED | {"losses"},
+    "synth": SHARED | {"data"},  # its files are read by the readers of their layouts
     "engine": SHARED | {"checkpoints", "runtime"},
     "config": BASE | {"runtime"},
     "runs": SHARED | {"config", "metrics", "data", "engine.settings", "engine.prediction"},

@@ -22,7 +22,7 @@ from rgbt.metrics.named import value
 from rgbt.metrics.pairs import ca, ca_released, tc
 from rgbt.randomness import numpy_generator
 from rgbt.runs.result import RunResult
-from rgbt.transforms.view_sets import read_angles
+from rgbt.transforms.views import read_angles
 from tests.commands import SPLITS, Call, Trained, logged, only_run, short, train
 from tests.conftest import pair, write_png
 

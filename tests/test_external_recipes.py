@@ -12,6 +12,7 @@ from omegaconf import DictConfig
 from rgbt.config.component import Component
 from rgbt.config.compose import available, compose, conf_dir
 from rgbt.config.stored_config import EXTERNAL
+from rgbt.files.adapters import adapter_of
 from rgbt.models.external.network import ExternalNetwork
 
 FOLDER = conf_dir() / "model" / "external"
@@ -45,7 +46,9 @@ def test_recipe_has_the_classes_of_the_data_set(nodes: DictConfig, classes: int)
         spaces = [values["arguments"], *values["namespaces"].values()]
         counts = [each[key] for each in spaces for key in each if re.match(r"n(um)?_class", key)]
         assert counts == [classes], f"{name}: exactly one argument has the number of classes"
-        assert re.fullmatch(r"[\w.]+:\w+", values["constructor"])
+        adapter = adapter_of(values["constructor"])
+        pattern = r"[\w.]+:\w+" if adapter is None else rf"{name}\.py:network"
+        assert re.fullmatch(pattern, values["constructor"])
         assert set(values) == set(inspect.signature(ExternalNetwork).parameters)
         # A stacked tensor has four channels in all recipes; both images apart have three each.
         channels = len(nodes[name].inputs.thermal_mean)

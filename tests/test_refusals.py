@@ -43,10 +43,10 @@ RUN = [
     *(
         (f"+experiment=temporal_con {words}", word)
         for words, word in (
-            ("consistency.splits=[]", "consistency.splits is empty"),
-            ("scheme.view.camera.height=1024", "intrinsics for another image size"),
-            ("consistency.view.camera.cx=900", "intrinsics for another image size"),
-            ("scheme.view.yaw=[-50,50]", "leave no rectangle of the view without empty pixels"),
+            ("consistency.splits=[]", "consistency.splits"),
+            ("scheme.view.camera.height=1024", "set the intrinsics of your camera"),
+            ("consistency.view.camera.cx=900", "principal point"),
+            ("scheme.view.yaw=[-50,50]", "leave no rectangle"),
             *(("scheme=supervised", "frames=2"), ("loss.second=none", "set loss.beta=0")),
             ("loss@loss.segmentation=set_criterion", "outputs=masks"),
             ("consistency.sets=released_1", "'consistency.sets'"),

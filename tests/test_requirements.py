@@ -7,9 +7,8 @@ from typing import Any
 
 import pytest
 
-from rgbt.assembly.contracts import check_requirements
 from rgbt.checks import InputError
-from rgbt.requirements import PLAIN, Record, Requirement
+from rgbt.requirements import PLAIN, Record, Requirement, check_requirements
 from rgbt.types import VIEWS
 
 

@@ -23,7 +23,7 @@ from rgbt.config.compose import compose
 from rgbt.engine.checkpoint import load_checkpoint
 from rgbt.metrics.counts import Counts
 from rgbt.run import main
-from tests.checkpoints.test_torch_files import same
+from tests.checkpoints.test_damage import same
 from tests.commands import (
     DAYS_AND_NIGHTS,
     ON_CPU,

@@ -40,6 +40,8 @@ def test_a_run_starts_from_another_runs_weights(
     named = [key for key in moved if "running" not in key and "num_batches" not in key]
     assert all(key.startswith("decode1.") for key in named)
     assert ("decode1.conv.weight" in named) == bool(fresh)
+    code, _, err = call(EVALUATE, f"run={only_run(tmp_path / 'second')}")
+    assert code == 0, err
 
 
 def test_weights_are_scored_without_a_run(

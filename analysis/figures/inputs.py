@@ -104,7 +104,7 @@ class FigureInput:
 
     @cached_property
     def consistency(self) -> Any:
-        """The virtual views (`rgbt.transforms.view_sets.ViewSets`): published unless given."""
+        """The virtual views (`rgbt.transforms.views.ViewSets`): published unless given."""
         return self._built("consistency")
 
     def _built(self, node: str) -> Any:

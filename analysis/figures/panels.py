@@ -23,10 +23,9 @@ from analysis.predictions.scoring import ScoringOptions, score_folder
 from rgbt.checks import InputError
 from rgbt.data.prediction_files import Affixes, find_affixes
 from rgbt.data.prediction_format import FormatOptions, recognise_format
-from rgbt.metrics.confusion import RegionCounter
+from rgbt.metrics.counting import RegionCounter
 from rgbt.metrics.counts import Counts, scored_classes
-from rgbt.metrics.metric import Regions
-from rgbt.metrics.regions import ring_rectangle
+from rgbt.metrics.metric import Regions, ring_rectangle
 from rgbt.metrics.scores import miou
 from rgbt.terminal import info
 from rgbt.tracking.pictures import colours

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,16 +13,7 @@ from numpy.typing import NDArray
 from rgbt.metrics.archive import Archive
 from rgbt.metrics.counts import scored_classes
 
-ARCHIVE = Archive(
-    "rgbt pixel maps 1",
-    "pixel maps",
-    "it is the maps.npz that rgbt score writes",
-    {
-        **{"intersection": "iu K H W", "union": "iu K H W", "images": "iu", "classes": "U K"},
-        **{"palette": "iu K 3", "dataset": "U", "split": "U", "name": "U", "unscored": "U L"},
-    },
-    optional=("unscored",),
-)
+ARCHIVE = Archive("rgbt pixel maps 1", "pixel maps", "it is the maps.npz that rgbt score writes")
 
 Bytes = NDArray[np.uint8]
 Heat = NDArray[np.float64]
@@ -73,24 +65,26 @@ class PixelMaps:
 
     @classmethod
     def load(cls, path: Path) -> PixelMaps:
-        """Read what `save` wrote; files from before `unscored` was stored score every class.
+        """Read what `save` wrote.
 
         Raises:
             InputError: no such file, or not a file of pixel maps.
         """
-        values = ARCHIVE.load(path)
-        with ARCHIVE.refusing(path):
-            return cls(
-                intersection=values["intersection"],
-                union=values["union"],
-                images=int(values["images"]),
-                classes=tuple(values["classes"].tolist()),
-                palette=tuple((r, g, b) for r, g, b in values["palette"].tolist()),
-                dataset=str(values["dataset"]),
-                split=str(values["split"]),
-                name=str(values["name"]),
-                unscored=tuple(values["unscored"].tolist()) if "unscored" in values else (),
-            )
+        return ARCHIVE.load(path, cls._of_arrays)
+
+    @classmethod
+    def _of_arrays(cls, values: dict[str, Any]) -> PixelMaps:
+        return cls(
+            intersection=values["intersection"],
+            union=values["union"],
+            images=int(values["images"]),
+            classes=tuple(values["classes"].tolist()),
+            palette=tuple((r, g, b) for r, g, b in values["palette"].tolist()),
+            dataset=str(values["dataset"]),
+            split=str(values["split"]),
+            name=str(values["name"]),
+            unscored=tuple(values["unscored"].tolist()),
+        )
 
 
 class MapSum:

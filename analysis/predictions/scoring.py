@@ -19,10 +19,9 @@ from rgbt.data.prediction_files import opened_folder
 from rgbt.data.prediction_format import FormatOptions, RecognisedFormat, recognise_format
 from rgbt.data.prediction_images import Array
 from rgbt.dataset import LabelledDataset
-from rgbt.metrics.confusion import RegionCounter
+from rgbt.metrics.counting import RegionCounter
 from rgbt.metrics.counts import Counts
-from rgbt.metrics.metric import Absent, Regions
-from rgbt.metrics.regions import Partition
+from rgbt.metrics.metric import Absent, Partition, Regions
 
 Resize = Literal["refuse", "nearest", "stretch"]
 MOST_STRETCH = 0.05

@@ -115,8 +115,8 @@ def _measured(entry: ContrastEntry, each: Difference, found: Comparison) -> Cont
         difference=each.value,
         low=None if interval is None else interval.low,
         high=None if interval is None else interval.high,
-        covers="images and seeds" if each.both else "images" if interval else "none",
-        p=each.p,
+        covers="images and seeds" if each.difference.both else "images" if interval else "none",
+        p=each.difference.p,
         verdict=verdict(each, entry.expected, found.level),
     )
 
@@ -129,10 +129,10 @@ def verdict(found: Difference, expected: str, level: float) -> str:
         expected: "higher" or "lower".
         level: of the interval.
     """
-    if found.evidence is None:
+    if found.interval is None:
         return "Undecided: there is nothing to score."
     wanted = (0.0, math.inf) if expected == "higher" else (-math.inf, 0.0)
-    decided = decide([found.evidence], wanted, FixedSeeds(level=level), "all")
+    decided = decide([found.difference.evidence], wanted, FixedSeeds(level=level), "all")
     if decided.kind != "undecided":
         return f"{decided.kind.capitalize()}."
     if decided.seeds < 2:

@@ -154,12 +154,17 @@ def _effect(choice: Choice, pairs: Sequence[PairedRuns], settings: Resampling) -
 
 def sentence(pair: PairedRuns, compared: Comparison) -> str:
     """Released minus paper in every score, with intervals and p-values."""
-    over = "images and seeds" if all(each.both for each in compared.differences) else "images"
+    over = (
+        "images and seeds"
+        if all(each.difference.both for each in compared.differences)
+        else "images"
+    )
     shown = []
     for each in compared.differences:
         text = f"{each.metric} {each.value:+.2f}"
         if each.interval is not None:
-            text += f" [{each.interval.low:+.2f}, {each.interval.high:+.2f}], p = {each.p:.2g}"
+            low, high = each.interval.low, each.interval.high
+            text += f" [{low:+.2f}, {high:+.2f}], p = {each.difference.p:.2g}"
         shown.append(text)
     counts = (len(pair.released), len(pair.paper))
     seeds = " against ".join(f"{count} seed{'s' * (count > 1)}" for count in counts)

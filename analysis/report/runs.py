@@ -25,11 +25,10 @@ from rgbt.checks import InputError, check_choice
 from rgbt.config.compose import flatten
 from rgbt.config.stored_config import settings_of
 from rgbt.files.yaml_files import parse_yaml
-from rgbt.metrics.absent import absent_notes
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.names import in_percent
-from rgbt.metrics.scores import iou, miou, summary
+from rgbt.metrics.scores import absent_notes, iou, miou, summary
 from rgbt.runs.provenance import COMMIT_LENGTH, commit_of, without_passwords
 from sweeps.table.cells import OWN_COUNTS
 from sweeps.table.request import DEFAULT_SCALE, TAG, UNTIL_DECIDED

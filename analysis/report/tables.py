@@ -134,7 +134,8 @@ def _resampled(
         first, second = counts
         compared = compare(second, first, metrics, settings, paired=True)
         parts = [
-            (each.metric, each.images, each.both, compared.said) for each in compared.differences
+            (each.metric, each.difference.images, each.difference.both, compared.said)
+            for each in compared.differences
         ]
     found = {}
     for metric, images, both, said in parts:

@@ -32,13 +32,6 @@ ARCHIVE = Archive(
     "rgbt spatial statistics 2",
     "statistics",
     "write it with rgbt spatial dataset=... out=...",
-    {
-        **{"palette": "iu K 3", "region_map": "iu H W", "labels": "iu N R K"},
-        **{"ignored": "iu N R", "occupied": "iu P K H W", "laplacian": "f N 2 R"},
-        **{"mean": "f N 2 R", "night": "b M", NOISE: "f N 2 R"},
-        **{"classes": "U K", "background": "U B", "names": "U N", "parts": "U P"},
-        **dict.fromkeys(TEXTS, "U"),
-    },
 )
 
 
@@ -181,15 +174,14 @@ class SpatialStatistics:
         Raises:
             InputError: no such file, or not a file of statistics.
         """
-        values = ARCHIVE.load(path)
-        with ARCHIVE.refusing(path):
-            night = values["night"].astype(bool)
-            fields: dict[str, Any] = {key: values[key] for key in ARRAYS}
-            fields |= {key: str(values[key]) for key in TEXTS}
-            fields |= {key: tuple(values[key].tolist()) for key in LISTS}
-            fields["noise"] = {
-                key.removeprefix(NOISE): array
-                for key, array in values.items()
-                if key.startswith(NOISE)
-            }
-            return cls(night=night if len(night) else None, **fields)
+        return ARCHIVE.load(path, cls._of_arrays)
+
+    @classmethod
+    def _of_arrays(cls, values: dict[str, Any]) -> SpatialStatistics:
+        night = values["night"].astype(bool)
+        fields: dict[str, Any] = {key: values[key] for key in ARRAYS}
+        fields |= {key: str(values[key]) for key in TEXTS}
+        fields |= {key: tuple(values[key].tolist()) for key in LISTS}
+        noise = (key for key in values if key.startswith(NOISE))
+        fields["noise"] = {key.removeprefix(NOISE): values[key] for key in noise}
+        return cls(night=night if len(night) else None, **fields)

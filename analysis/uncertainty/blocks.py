@@ -1,4 +1,4 @@
-"""Which images are drawn together: neighbouring frames of a drive are no separate evidence."""
+"""How images are drawn anew: neighbouring frames of a drive are no separate evidence."""
 
 from __future__ import annotations
 
@@ -6,13 +6,56 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.uncertainty.settings import NamedBlocks
-from rgbt.checks import InputError
+from rgbt.checks import InputError, check_choice, check_range
+from rgbt.metrics.metric import Absent
+
+NamedBlocks = Literal["auto", "none", "sequence"]
+
+MOST = 1_000_000
+"""Most resamples: more take time without a visible effect."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Resampling:
+    """Settings of intervals and tests.
+
+    Attributes:
+        resamples: number of resamples, 100..`MOST`.
+        level: confidence level of the intervals, 0.5..0.999.
+        blocks: what is drawn together, because neighbouring frames show nearly the same:
+            "none" single images; a number: that many neighbours; "sequence": whole sequences (names
+            that are equal but for one number); "auto": runs of consecutively numbered frames, cut
+            where one is too long for that at the distance over which the scores of the images are
+            correlated (Politis and White, 2004).
+        absent: how a class without pixels scores, see `rgbt.metrics.scores`; None: as the counts
+            say (`rgbt.metrics.counts.Counts.absent`).
+
+    Raises:
+        InputError: a value out of range.
+    """
+
+    resamples: int = 10_000
+    level: float = 0.95
+    blocks: NamedBlocks | int = "auto"
+    seed: int = 0
+    absent: Absent | None = None
+
+    def __post_init__(self) -> None:
+        check_range("resamples", self.resamples, 100, MOST)
+        check_range("level", self.level, 0.5, 0.999)
+        if self.absent is not None:
+            check_choice("absent", self.absent, get_args(Absent))
+        if isinstance(self.blocks, int):
+            check_range("blocks", self.blocks, 1, MOST)
+        elif self.blocks not in get_args(NamedBlocks):
+            known = ", ".join(get_args(NamedBlocks))
+            raise InputError(f"blocks={self.blocks}: expected {known} or a number of images.")
+
 
 FEWEST = 10
 """Blocks below which an interval would rest on almost nothing."""

@@ -3,81 +3,39 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError
-from rgbt.metrics import boundary, calibration
 from rgbt.metrics.counts import Counts, check_same_means
-from rgbt.metrics.details import details_of
+from rgbt.metrics.details import LABEL, NUMBER, details_of
 from rgbt.metrics.pairs import protocol_of
 
+Alike = Literal["pixels", "labels", "names"]
+"""What counts must have in common beside the names of images and the classes: the labelled pixels
+of each region; those of the whole image where the regions differ, if both are of single frames or
+of the same pairs; or nothing else."""
 
-def aligned(first: Counts, other: Counts) -> Counts:
+
+def in_order(first: Counts, other: Counts, alike: Alike) -> Counts:
     """`other` with its images in the order of `first`.
 
     Raises:
-        InputError: other images, classes, scored classes, regions or labels.
+        InputError: other images, classes, scored classes, labels or regions.
     """
-    _check_classes(first, other)
-    if other.partition != first.partition:
-        of_pairs = protocol_of(first.partition) or protocol_of(other.partition)
-        how = "rgbt evaluate regions=..., rgbt score partition=..."
-        if of_pairs and protocol_of(first.partition) == protocol_of(other.partition):
-            raise InputError(
-                f"counts of {first.partition} and of {other.partition} are of different second "
-                "frames (other angles, camera or motion); measure both on the same with "
-                "rgbt.consistency."
-            )
-        raise InputError(
-            f"counts by {first.partition} cannot be compared with counts by {other.partition}; "
-            f"count both by one partition ({'rgbt consistency frames=...' if of_pairs else how})."
-        )
-    return _in_order(first, other)
-
-
-def aligned_images(first: Counts, other: Counts) -> Counts:
-    """As `aligned`, but the regions may differ, and one may be of pairs of frames.
-
-    Labels are compared where both are of single frames (over the whole image where the regions
-    differ) or both of the same pairs.
-
-    Raises:
-        InputError: other images, classes, scored classes or labels.
-    """
-    _check_classes(first, other)
-    return _in_order(first, other)
-
-
-def common(methods: Sequence[Sequence[Counts]]) -> list[list[Counts]]:
-    """The counts of the images that all of them hold, in the order of the first.
-
-    Raises:
-        InputError: no image is in all of them.
-    """
-    every = [counts for seeds in methods for counts in seeds]
-    shared = set(every[0].names).intersection(*(counts.names for counts in every))
-    kept = [name for name in every[0].names if name in shared]
-    if not kept:
-        splits = ", ".join(dict.fromkeys(f"'{counts.split}'" for counts in every))
-        raise InputError(
-            f"no image is in all counts, which are of {splits} with names such as "
-            f"'{every[0].names[0]}' and '{every[-1].names[0]}'; score all on one split."
-        )
-    return [[counts.select(kept) for counts in seeds] for seeds in methods]
-
-
-def _check_classes(first: Counts, other: Counts) -> None:
     if other.classes != first.classes:
         raise InputError(
             f"counts of the classes {', '.join(first.classes)} cannot be compared with counts of "
             f"{', '.join(other.classes)}; score both on one data set."
         )
     check_same_means(first, other)
-
-
-def _in_order(first: Counts, other: Counts) -> Counts:
+    if alike != "labels" and other.partition != first.partition:
+        raise InputError(
+            f"counts by {first.partition} cannot be compared with counts by {other.partition}: "
+            "the regions, or the second frames of pairs, differ. Measure both in the same way."
+        )
     if set(other.names) != set(first.names):
         if not set(other.names) & set(first.names):
             raise InputError(
@@ -97,8 +55,27 @@ def _in_order(first: Counts, other: Counts) -> Counts:
             "the counts do not agree about which images were taken at night; score both on one "
             "data set."
         )
-    _check_labels(first, same)
+    if alike != "names":
+        _check_labels(first, same)
     return same
+
+
+def common(methods: Sequence[Sequence[Counts]]) -> list[list[Counts]]:
+    """The counts of the images that all of them hold, in the order of the first.
+
+    Raises:
+        InputError: no image is in all of them.
+    """
+    every = [counts for seeds in methods for counts in seeds]
+    shared = set(every[0].names).intersection(*(counts.names for counts in every))
+    kept = [name for name in every[0].names if name in shared]
+    if not kept:
+        splits = ", ".join(dict.fromkeys(f"'{counts.split}'" for counts in every))
+        raise InputError(
+            f"no image is in all counts, which are of {splits} with names such as "
+            f"'{every[0].names[0]}' and '{every[-1].names[0]}'; score all on one split."
+        )
+    return [[counts.select(kept) for counts in seeds] for seeds in methods]
 
 
 def _check_labels(first: Counts, same: Counts) -> None:
@@ -133,12 +110,12 @@ def _labelled(counts: Counts) -> NDArray[np.int64]:
         case None | "distance" | "size":
             labelled = array.sum(-1, dtype=np.int64)
         case "boundary":
-            labelled = array[:, :, boundary.LABEL].astype(np.int64)
+            labelled = array[:, :, LABEL].astype(np.int64)
         case "calibration":
             # Bins and classes are those of the prediction; only their sum over a region is not.
             details = details_of(counts.partition)
             groups = 1 if details is None else details.groups
-            number = array[:, :, calibration.NUMBER].sum(-1, dtype=np.int64)
+            number = array[:, :, NUMBER].sum(-1, dtype=np.int64)
             labelled = number.reshape(len(array), -1, groups).sum(-1)
         case "triples":
             # Every index is a predicted class; only the number of pixels is that of the images.

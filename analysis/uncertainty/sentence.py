@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from analysis.uncertainty.compare import Comparison
+from analysis.uncertainty.estimates import Comparison
 from rgbt.metrics import names
 from rgbt.metrics.named import parse
 
@@ -31,17 +31,15 @@ def sentence(comparison: Comparison, label_a: str, label_b: str) -> str:
     if seeds[0] == seeds[1]:
         trainings = "one training each" if seeds[0] == 1 else f"{seeds[0]} trainings each"
     scores = f"{found.b.value:.2f} against {found.a.value:.2f}"
-    ends = f"{found.interval.low:+.2f} to {found.interval.high:+.2f}"
-    evidence = (
-        f"({scores}; {100 * comparison.level:g} % interval of the difference {ends}, {_p(found.p)})"
-    )
+    p, ends = _p(found.difference.p), f"{found.interval.low:+.2f} to {found.interval.high:+.2f}"
+    evidence = f"({scores}; {100 * comparison.level:g} % interval of the difference {ends}, {p})"
     # What was not drawn anew and may be all there is to the difference.
     start, basis = "As trained here, ", f"over {images}; with {trainings}, it says nothing about"
     basis += " other trainings of the two"
-    if found.both is not None:
+    if found.difference.both is not None:
         start, basis = "", f"over {trainings} and {images}"
     unit = "" if parse(found.metric).score == names.VAR else " points"
-    if found.p < 1 - comparison.level and 0.0 not in found.interval:
+    if found.difference.p < 1 - comparison.level and 0.0 not in found.interval:
         more = "higher" if found.value > 0 else "lower"
         said = (
             f"{start}the {found.metric} of {label_b} is {abs(found.value):.2f}{unit} {more} than "
@@ -52,8 +50,6 @@ def sentence(comparison: Comparison, label_a: str, label_b: str) -> str:
             said += f"; corrected for all {count} scores compared, {_p(found.p_corrected)}"
     else:
         limit = f"this data shows only differences above about {found.interval.half:.2f}{unit}"
-        if 0.0 not in found.interval:
-            limit = "the interval excludes 0, but the exchange test does not confirm it"
         said = (
             f"{start}a difference in {found.metric} between {label_b} and {label_a} is not shown "
             f"{evidence}, {basis}; {limit}"

@@ -11,7 +11,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from analysis.uncertainty.contrasts import Evidence
-from analysis.uncertainty.intervals import Interval, Spread, student, together, widest
+from analysis.uncertainty.intervals import Interval, Spread, images_and_seeds, student
 from analysis.uncertainty.sequence import half_width
 
 Combine = Literal["all", "most", "any", "mean"]
@@ -37,8 +37,7 @@ class FixedSeeds:
 
     def half(self, trainings: Spread, images: Spread, level: float) -> float:
         """Half of the width of the interval; degrees of freedom of `trainings`: n - 1."""
-        whole = together(images, trainings)
-        return student(0.0, widest(level, whole, trainings), level).half
+        return student(0.0, images_and_seeds(images, trainings, level), level).half
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -247,13 +246,12 @@ class _Claim:
 def _contrast(evidence: Evidence, low: float, high: float) -> _Contrast:
     values = np.array(evidence.values)
     estimate = float(values.mean())
-    has_error = not math.isnan(evidence.error)
     return _Contrast(
         estimate=estimate,
         margin=min(estimate - low, high - estimate),
         sd=float(values.std(ddof=1)) if len(values) > 1 else math.nan,
         seeds=len(evidence.seeds),
-        images=Spread(evidence.error, evidence.blocks - 1) if has_error else None,
+        images=evidence.images,
     )
 
 

@@ -164,12 +164,27 @@ def _source(file: ConfigFile) -> str:
     return block(file.text, "yaml", file.path)
 
 
+def comments(text: str) -> dict[str, str]:
+    """What the comments beside the keys of a file, and in the lines above them, say."""
+    found, above = {}, []
+    for line in text.splitlines():
+        if comment := re.match(r"\s*# (.*)", line):
+            above.append(comment[1])
+            continue
+        if entry := re.match(r"\s*(\w+):[^#]*(?:# (.*))?", line):
+            found[entry[1]] = " ".join([*above, entry[2] or ""]).strip()
+        above = []
+    return found
+
+
 def _settings(group: str, files: list[ConfigFile]) -> Iterator[str]:
     found: dict[str, dict[str, str]] = {}  # target -> key -> the value of the file that sets it
     default = _defaults().get(group)
+    said: dict[str, dict[str, str]] = {}
     for each in sorted(files, key=lambda file: file.name != default):
         for target, values in _targets(yaml.safe_load(each.text)):
             entry = found.setdefault(target, {})
+            said[target] = comments(each.text) | said.get(target, {})
             for key, value in values.items():
                 shown = code(_shown(value))
                 entry.setdefault(key, shown if each.name == default else f"{shown} ({each.name})")
@@ -180,7 +195,7 @@ def _settings(group: str, files: list[ConfigFile]) -> Iterator[str]:
         yield f"### {target.rpartition('.')[2]}"
         yield code(target)
         yield description(made)
-        yield _keys(made, values)
+        yield _keys(made, values, said[target])
     if group in RUN_SETTINGS:
         yield "### Settings of the run"
         yield "The run itself reads these keys; the constructor does not take them."
@@ -203,9 +218,12 @@ def _targets(node: Any) -> Iterator[tuple[str, dict[str, Any]]]:
             yield from _targets(value)
 
 
-def _keys(made: Any, values: dict[str, str]) -> str:
-    """Table of the settings of a constructor; objects that the run provides are left out."""
-    documented = parameters(made)
+def _keys(made: Any, values: dict[str, str], said: dict[str, str]) -> str:
+    """Table of the settings of a constructor; objects that the run provides are left out.
+
+    The meaning of one that the docstring does not explain is what the files of conf/ say.
+    """
+    documented = said | parameters(made)
     signature = inspect.signature(made).parameters
     rows = []
     for name, kind in setting_types(made).items():

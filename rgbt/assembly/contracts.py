@@ -1,4 +1,4 @@
-"""Check components against each other, and a user's own ones against the interfaces of rgbt.
+"""Check the components of a run, and a user's own ones against the interfaces of rgbt.
 
 Classes outside this package need the members of `MEMBERS` before training starts; what they return
 is checked where a wrong value would be trained on or counted without an error. InputError names the
@@ -7,16 +7,27 @@ member or the returned value, and what was expected.
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Iterable, Mapping
-from typing import Any
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
+import torch
 from torch import Tensor, nn
 
-from rgbt.checks import InputError, check_members, described
-from rgbt.requirements import Record, Requirement, record_of
-from rgbt.types import IGNORE, Output, Sample
+from rgbt.checks import InputError, check_members, described, one_line
+from rgbt.config.stored_config import EXTERNAL
+from rgbt.dataset import reader_of
+from rgbt.maskers.masker import check_masker
+from rgbt.randomness import numpy_generator, torch_generator
+from rgbt.requirements import Record, name_of, record_of
+from rgbt.types import IGNORE, AnyMasker, Output, Sample
+
+if TYPE_CHECKING:  # it imports this module
+    from rgbt.assembly.session import Session
+
+Lists: TypeAlias = Mapping[str, tuple[str, ...]]
+"""Split -> names of its images."""
 
 DATASET = ("root", "name", "num_classes", "classes", "palette", "unscored", "background", "splits")
 Calls = dict[str, tuple[str, ...]]
@@ -191,7 +202,7 @@ class CheckedLoss:
         """Call the loss; check what the first call returns."""
         found = self._loss(*arguments)
         if not self._is_checked:
-            returned = f"loss: {_name(self._loss)} returned"
+            returned = f"loss: {name_of(self._loss)} returned"
             check_type(returned, found, dict)
             check_arrays(returned, found, dict.fromkeys(found, (self._shape, "")))
             if not any(isinstance(each, Tensor) and each.requires_grad for each in found.values()):
@@ -201,33 +212,69 @@ class CheckedLoss:
         return found
 
 
-WITHOUT_RECORD = {"loss": Record(requires=(Requirement("model", "outputs", "scores"),))}
-"""Record, by node, of a component that states none: a loss reads class scores."""
+def check_parts(
+    session: Session, names: Lists, masker: AnyMasker, records: Mapping[str, Record]
+) -> None:
+    """Use a user's own parts, another author's network, the masker and the cameras once."""
+    transform, seed = session.transform, session.spec.seed
+    check_dataset(reader_of(session.dataset), names)
+    check_part("transform", transform)
+    first = first_readable(session, names[session.domains.source.split])
+    shown = first_readable(session, names["test"])
+    check_regions(session.regions, shown.thermal.shape)
+    example_hw = transform.train(first, numpy_generator(seed, "probe")).thermal.shape
+    tested = transform.test(shown)
+    if session.spec.model.target == EXTERNAL:
+        _probe_external(session, example_hw, tested.thermal.shape)
+    crop_hw = example_hw if is_own(masker) else records["transform"].crop_hw
+    if crop_hw is not None and records["masker"].hides_cells:
+        check_masker(masker, crop_hw, torch_generator(seed, "probe"))
+    cameras = [("scheme", records["scheme"].camera, example_hw)]
+    if session.consistency.sets:
+        camera = session.consistency.view.camera
+        cameras += [("consistency", camera, each.shape[:2]) for each in (tested.rgb, tested.label)]
+    for node, camera, image_hw in cameras:
+        try:
+            if camera is not None:
+                camera.matrix(image_hw)
+        except InputError as error:
+            raise InputError(f"{node}.view.{error}") from error
 
 
-def check_requirements(components: Mapping[str, Any]) -> None:
-    """Refuse components, by their keys in the configuration, of which one lacks what another needs.
+def first_readable(session: Session, names: tuple[str, ...]) -> Sample:
+    """The first of these samples; unreadable ones are passed over where the run does so too."""
+    for name in names if session.loading.on_error != "raise" else ():
+        with suppress(InputError):
+            return session.dataset.read(name)
+    return session.dataset.read(names[0])
 
-    InputError names the first requirement, in their order, that is not met.
+
+def _probe_external(session: Session, train_hw: tuple[int, int], test_hw: tuple[int, int]) -> None:
+    """Call another author's network once per size of image, so that it is refused before a run.
+
+    In training too, as its output may have another form there; its statistics do not change.
     """
-    records = {
-        node: WITHOUT_RECORD.get(node, Record()) if not hasattr(part, "record") else record_of(part)
-        for node, part in components.items()
-    }
-    for node, record in records.items():
-        for need in record.requires:
-            other = records.get(need.node)
-            if other is None or need.is_met_by(other):
-                continue
-            subject = _name(components[node]) + (f" with {need.setting}" if need.setting else "")
-            change = need.advice or f"change {need.setting.partition('=')[0] or node}"
+    model = session.model
+    before = {name: value.clone() for name, value in model.named_buffers()}
+    for image_hw, is_training in ((train_hw, False), (test_hw, False), (train_hw, True)):
+        model.train(is_training)
+        count = min(2, session.loading.batch_size) if is_training else 1
+        images = [torch.zeros(count, each, *image_hw, device=session.device) for each in (3, 1)]
+        try:
+            with torch.set_grad_enabled(is_training), session.autocast():
+                output = model(*images, generator=torch_generator(session.spec.seed, "probe"))
+        except (InputError, torch.OutOfMemoryError):
+            raise
+        except Exception as error:
+            size = " x ".join(map(str, image_hw))
             raise InputError(
-                f"{node}: {subject} requires {need.key}={need.value} of the {need.node}, "
-                f"which provides {need.key}={other.get(need.key)}; "
-                f"{change}, or choose another {need.node}."
-            )
-
-
-def _name(component: Any) -> str:
-    is_callable = inspect.isfunction(component) or inspect.isclass(component)
-    return str(component.__name__) if is_callable else type(component).__name__
+                f"model: the network cannot predict {count} images of {size} pixels "
+                f"({type(error).__name__}: {one_line(error)})."
+            ) from error
+    for name, value in model.named_buffers():
+        value.copy_(before[name])
+    if not output.logits.requires_grad:
+        raise InputError(
+            f"model.constructor={session.spec.model.values['constructor']}: the class scores have "
+            "no gradient in training; choose others with model.train_scores."
+        )

@@ -11,11 +11,12 @@ from rgbt.assembly.session import Session, names_key, open_session
 from rgbt.checks import InputError, check_choice
 from rgbt.config.compose import compose
 from rgbt.config.stored_config import check_targets, checkouts, read_settings, settings_of
-from rgbt.engine.checkpoint import load_checkpoint, restore_weights, step_of
+from rgbt.engine.checkpoint import check_origin, load_checkpoint, restore_weights, step_of
 from rgbt.files.plain_files import check_links
 from rgbt.files.yaml_files import parse_yaml
 from rgbt.metrics.counts import Counts
 from rgbt.runs.folder import find_run, read_marker, read_provenance
+from rgbt.runs.run_spec import RunSpec, settings_digest
 from rgbt.runs.source_code import code_of
 from rgbt.runs.specify import CHECKOUT, load_spec, specify
 from rgbt.terminal import warn
@@ -117,19 +118,37 @@ def open_run(
     spec = load_spec(trained_with, overrides)
     _warn_of_other_code(folder, trained_with)
     check_choice("checkpoint", checkpoint, CHECKPOINTS)
-    weights = folder / f"{checkpoint}.pt"
-    if not weights.is_file():
-        raise InputError(f"{folder} has no {weights.name}; rerun its command to resume it.")
-    payload = load_checkpoint(weights)
-    session = open_session(spec, label_map)
+    session = with_weights(spec, folder, checkpoint, trained_with, label_map)
     counts = sorted(folder.glob("counts_*.npz"))
     if counts and label_map is None:
         _check_classes(session, Counts.load(counts[0]).classes, folder)
-    restore_weights(session.model, payload["model"], weights)
     if trained_with["dataset"].get("name") == spec.dataset.plain.get("name"):
         _warn_of_other_splits(folder, session)
+    return session
+
+
+def with_weights(
+    spec: RunSpec,
+    folder: Path,
+    checkpoint: str,
+    trained_with: Mapping[str, Any],
+    label_map: LabelMap | None = None,
+) -> Session:
+    """The network of `spec` with the weights of a checkpoint in its folder, "best" or "last".
+
+    `trained_with` are the plain settings of the run, which the checkpoint has to belong to.
+    """
+    weights = folder / f"{checkpoint}.pt"
+    if not weights.is_file():
+        raise InputError(f"{folder} has no {weights.name}; rerun its command to resume it.")
+    check_links(folder)
+    payload = load_checkpoint(weights)
+    check_origin(payload, weights, folder.name, settings_digest(trained_with))
+    session = open_session(spec, label_map, load_weights=False)
+    restore_weights(session.model, payload["model"], weights)
     step = step_of(payload, weights)
-    return replace(session, step=step, evaluations=folder / "evaluations", label=spec.name)
+    evaluations = folder / "evaluations"
+    return replace(session, step=step, evaluations=evaluations, label=spec.name, run=folder.name)
 
 
 def _check_classes(session: Session, trained: tuple[str, ...], source: Path) -> None:

@@ -15,7 +15,7 @@ import torch
 from omegaconf import OmegaConf
 from torch import nn
 
-from rgbt.assembly.contracts import check_dataset, check_requirements, watch_model
+from rgbt.assembly.contracts import check_dataset, watch_model
 from rgbt.checks import InputError
 from rgbt.config.compose import compose
 from rgbt.config.stored_config import read_settings
@@ -29,12 +29,13 @@ from rgbt.engine.prediction import Prediction
 from rgbt.engine.settings import TrainerSettings
 from rgbt.metrics.metric import Regions
 from rgbt.randomness import derive
+from rgbt.requirements import check_requirements
 from rgbt.runs.run_spec import WEIGHTS, RunSpec
 from rgbt.terminal import info
-from rgbt.transforms.view_sets import ViewSets
+from rgbt.transforms.views import ViewSets
 
 if TYPE_CHECKING:  # most runs start at random, and few map classes
-    from rgbt.checkpoints.report import Report
+    from rgbt.checkpoints.load import Plan
     from rgbt.data.label_map import LabelMap
 
 
@@ -50,6 +51,7 @@ class Session:
         step: the optimiser step of trained weights; 0 where none is known.
         evaluations: folder where evaluations of trained weights are written by default.
         label: name of the trained network in tables.
+        run: key of the run whose network it is; "" for others.
     """
 
     spec: RunSpec
@@ -63,10 +65,11 @@ class Session:
     trainer: TrainerSettings
     device: torch.device
     model: nn.Module
-    weights: Report | None
+    weights: Plan | None
     step: int = 0
     evaluations: Path = Path()
     label: str = ""
+    run: str = ""
 
     def autocast(self) -> AbstractContextManager[Any]:
         """Context of a forward pass at the precision of the run."""
@@ -148,7 +151,7 @@ def open_session(
     )
 
 
-def start_from_weights(model: nn.Module, spec: RunSpec) -> Report | None:
+def start_from_weights(model: nn.Module, spec: RunSpec) -> Plan | None:
     """Load the weights that `model.weights` names and report this on stderr; None without weights.
 
     A second line warns if the network has other inputs or settings than the weights were trained
@@ -166,13 +169,13 @@ def start_from_weights(model: nn.Module, spec: RunSpec) -> Report | None:
 
     dependency = spec.dependency(WEIGHTS)
     is_common = dependency is not None and dependency.is_common
-    report = load_weights(model, source, fresh, other_classes=is_common)
-    info(report.sentence())
-    node, facts = spec.model.plain, report.facts
-    others = differences(node, facts.convention)
-    noted, own = facts.inputs, node.get("inputs")
+    plan = load_weights(model, source, fresh, other_classes=is_common)
+    info(f"{plan.sentence()}.")
+    node = spec.model.plain
+    others = differences(node, plan.convention)
+    noted, own = plan.inputs, node.get("inputs")
     beside = source.parent / "config.yaml"  # of a checkpoint of a run
-    if noted is None and facts.layout == "own" and beside.is_file():
+    if noted is None and plan.is_own and beside.is_file():
         noted = read_settings(beside).get("model", {}).get("inputs")
     if not others and None not in (noted, own) and noted != own:
         others.append("other inputs")
@@ -181,7 +184,7 @@ def start_from_weights(model: nn.Module, spec: RunSpec) -> Report | None:
             f"{source} was trained with {' '.join(others)}, but this network has other settings: "
             "its scores will differ from those of the trained network."
         )
-    return report
+    return plan
 
 
 def differences(node: Mapping[str, Any], convention: Iterable[str]) -> list[str]:

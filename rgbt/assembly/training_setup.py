@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import torch
 from lightning_fabric import Fabric
@@ -14,38 +12,32 @@ from torch import nn
 
 from rgbt.assembly.contracts import (
     CheckedLoss,
-    check_dataset,
+    Lists,
     check_part,
-    check_regions,
-    check_requirements,
+    check_parts,
+    first_readable,
     is_own,
 )
 from rgbt.assembly.session import Session, open_session
 from rgbt.checks import InputError
-from rgbt.config.stored_config import EXTERNAL
 from rgbt.data.domains import GIVEN, NONE, Domain
 from rgbt.data.loaders import Batches, steps_per_epoch, train_batches
-from rgbt.dataset import LabelledDataset, reader_of
+from rgbt.dataset import LabelledDataset
 from rgbt.engine.fabric import open_fabric
 from rgbt.engine.network_settings import prepare_training
 from rgbt.engine.schedules import Schedule
 from rgbt.engine.settings import TrainerSettings
 from rgbt.engine.trainer import Scheme
-from rgbt.maskers.contract import check_masker
 from rgbt.processes import num_processes
-from rgbt.randomness import derive, numpy_generator, torch_generator
-from rgbt.requirements import Record, record_of
+from rgbt.randomness import derive
+from rgbt.requirements import Record, check_requirements, record_of
 from rgbt.runs.run_spec import WEIGHTS, RunSpec, labels_key
 from rgbt.terminal import info
-from rgbt.types import AnyMasker, Loadable, Sample
+from rgbt.types import AnyMasker, Loadable
 
 if TYPE_CHECKING:  # most runs have one domain, draw no classes, and train a network of this package
     from rgbt.data.pairs import PairedBatches
     from rgbt.data.rare_classes import RareClasses
-
-
-Lists: TypeAlias = Mapping[str, tuple[str, ...]]
-"""Split -> names of its images."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +75,7 @@ class TrainingSetup:
     def batches(self, steps: range) -> Batches[Loadable] | PairedBatches:
         """Training batches of these steps: of one domain, or a pair of batches of both."""
         session, seed = self.session, self.session.spec.drawn.order
-        loading = replace(session.loading, augment=_where_to_augment(session))
+        loading = session.loading
         data, split = self.datasets["source"], session.domains.source.split
         source = train_batches(data, split, session.transform, loading, seed, steps, self.rare)
         target = session.domains.named.get("target")
@@ -125,6 +117,7 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
     missing = () if upstream_finished else [each.key for each in spec.dependencies]
     fabric = open_fabric(spec.trainer)
     session = open_session(spec, load_weights=WEIGHTS not in missing, device=fabric.device)
+    session = replace(session, run=spec.key)
     domains, loading = session.domains, session.loading
     masker: AnyMasker = spec.masker.build()
     loss = spec.loss.build()
@@ -143,14 +136,14 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
         **{"dataset": session.dataset, "consistency": session.consistency},
         WEIGHTS: SimpleNamespace(record=Record(pretrained=spec.weights is not None)),
     }
-    check_requirements(components)
+    records = check_requirements(components)
     names = {split: session.dataset.names(split) for split in session.read_splits()}
     datasets = {}
     for name, domain in domains.named.items():
         steps_per_epoch(session.dataset, loading, domain.split)
         is_missing = labels_key(name) in missing
         datasets[name] = session.dataset if is_missing else _labelled(session, name, domain, names)
-    _probe(session, names, masker, scheme)
+    check_parts(session, names, masker, records)
     if upstream_finished:
         _report_unpublished_settings(session, names)
     rare = None
@@ -158,68 +151,11 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
         from rgbt.data.rare_classes import count_rare_classes  # most runs draw no classes
 
         rare = count_rare_classes(datasets["source"], domains.source.split, loading)
-    others, optimizers = _networks_and_optimizers(session, fabric, scheme)
+    others, optimizers = _networks_and_optimizers(session, fabric, records["scheme"])
     schedule: Schedule = spec.schedule.build()
     return TrainingSetup(
         session, fabric, names, datasets, model, others, optimizers, rare, scheme, schedule
     )
-
-
-def _probe(session: Session, names: Lists, masker: AnyMasker, scheme: object) -> None:
-    """Use a user's own parts, another author's network, the masker and the cameras once."""
-    transform, seed = session.transform, session.spec.seed
-    check_dataset(reader_of(session.dataset), names)
-    check_part("transform", transform)
-    first = _first_readable(session, names[session.domains.source.split])
-    shown = _first_readable(session, names["test"])
-    check_regions(session.regions, shown.thermal.shape)
-    example_hw = transform.train(first, numpy_generator(seed, "probe")).thermal.shape
-    tested = transform.test(shown)
-    if session.spec.model.target == EXTERNAL:
-        _probe_external(session, example_hw, tested.thermal.shape)
-    crop_hw = example_hw if is_own(masker) else record_of(transform).crop_hw
-    if crop_hw is not None and record_of(masker).hides_cells:
-        check_masker(masker, crop_hw, torch_generator(seed, "probe"))
-    cameras = [("scheme", record_of(scheme).camera, example_hw)]
-    if session.consistency.sets:
-        camera = session.consistency.view.camera
-        cameras += [("consistency", camera, each.shape[:2]) for each in (tested.rgb, tested.label)]
-    for node, camera, image_hw in cameras:
-        try:
-            if camera is not None:
-                camera.matrix(image_hw)
-        except InputError as error:
-            raise InputError(f"{node}.view.{error}") from error
-
-
-def _first_readable(session: Session, names: tuple[str, ...]) -> Sample:
-    """The first of these samples; unreadable ones are passed over where the run does so too."""
-    for name in names if session.loading.on_error != "raise" else ():
-        with suppress(InputError):
-            return session.dataset.read(name)
-    return session.dataset.read(names[0])
-
-
-def _probe_external(session: Session, train_hw: tuple[int, int], test_hw: tuple[int, int]) -> None:
-    """Call another author's network once per size of image, so that it is refused before a run.
-
-    In training too, as its output may have another form there; its statistics do not change.
-    """
-    model = session.model
-    before = {name: value.clone() for name, value in model.named_buffers()}
-    for image_hw, is_training in ((train_hw, False), (test_hw, False), (train_hw, True)):
-        model.train(is_training)
-        count = min(2, session.loading.batch_size) if is_training else 1
-        images = [torch.zeros(count, each, *image_hw, device=session.device) for each in (3, 1)]
-        with torch.set_grad_enabled(is_training), session.autocast():
-            output = model(*images, generator=torch_generator(session.spec.seed, "probe"))
-    for name, value in model.named_buffers():
-        value.copy_(before[name])
-    if not output.logits.requires_grad:
-        raise InputError(
-            f"model.constructor={session.spec.model.values['constructor']}: the class scores have "
-            "no gradient in training; choose others with model.train_scores."
-        )
 
 
 def _shared_with_test(names: Lists, split: str) -> int:
@@ -251,16 +187,6 @@ def _report_unpublished_settings(session: Session, names: Lists) -> None:
         )
 
 
-def _where_to_augment(session: Session) -> Literal["loader", "device"]:
-    """What `LoaderSettings.augment` comes to on this device with this transform."""
-    requested = session.loading.augment
-    if requested == "auto":
-        redraws = session.loading.sampling == "rare_classes"  # crops, by their labels
-        can = record_of(session.transform).works_on_batches and not redraws
-        return "device" if can and session.device.type == "cuda" else "loader"
-    return requested
-
-
 def _labelled(session: Session, name: str, domain: Domain, names: Lists) -> LabelledDataset:
     """The data set with the labels that a domain is trained with; InputError without them.
 
@@ -268,7 +194,7 @@ def _labelled(session: Session, name: str, domain: Domain, names: Lists) -> Labe
     """
     dataset, key, split = session.dataset, f"domains.{name}", domain.split
     if domain.labels == GIVEN:
-        if _first_readable(session, names[split]).label is None:
+        if first_readable(session, names[split]).label is None:
             raise InputError(f"{key}.labels=given, but {dataset.name} has no labels for {split}.")
         if shared := _shared_with_test(names, split):
             info(
@@ -315,11 +241,10 @@ def _share_batch_norm(network: nn.Module, trainer: TrainerSettings) -> None:
 
 
 def _networks_and_optimizers(
-    session: Session, fabric: Fabric, scheme: Any
+    session: Session, fabric: Fabric, record: Record
 ) -> tuple[dict[str, nn.Module], dict[str, torch.optim.Optimizer]]:
     """Further networks of a scheme, wrapped in place, and all optimisers."""
     builder = session.spec.optimizer.build()
-    record = record_of(scheme)
     parts, others = record.optimizers, record.networks
     built = {name: builder(session.model, without=without) for name, without in parts.items()}
     for name in record.builders:

@@ -2,120 +2,265 @@
 
 from __future__ import annotations
 
+import json
+import re
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
-from rgbt.checkpoints.layout import FAMILIES, Facts, Rule, family_of
-from rgbt.checkpoints.plan import Plan, adapted, make_plan
+from rgbt.checkpoints.kinds import KINDS, NONE, OWN, Kind, family_of
 from rgbt.checkpoints.read import Contents, read
-from rgbt.checkpoints.recognise import LAYOUTS, recognise
-from rgbt.checkpoints.report import Report, counted, refusal
-from rgbt.checks import InputError, not_finite
+from rgbt.checkpoints.torch_files import in_words
+from rgbt.checks import InputError, not_finite, one_line
 from rgbt.requirements import record_of
+
+COUNTER = "num_batches_tracked"
+"""Last word of batch normalisation's counters, which files of old torch versions lack."""
+
+INPUT_CHANNELS = (1, 4)
+"""Of a first convolution that a file of three input channels fills."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The effect of a file on a network.
+
+    Attributes:
+        contents: the file.
+        kind: of the file.
+        num_entries: of the network.
+        num_set: of them, from the file.
+        values: these entries -> their values, of the same shape; {} once they are set.
+        zeros: counters of batch normalisation that the file lacks; they begin at 0.
+        fresh: entries that keep their initial values.
+        unused: names of the file without a place.
+        misfits: entries whose tensor in the file has another shape or kind -> that tensor.
+        problems: everything that does not fit, in words; none: the file fits.
+    """
+
+    contents: Contents
+    kind: Kind
+    num_entries: int
+    num_set: int
+    values: Mapping[str, Tensor]
+    zeros: Sequence[str] = ()
+    fresh: Sequence[str] = ()
+    unused: Sequence[str] = ()
+    misfits: Mapping[str, Tensor] = field(default_factory=dict)
+    problems: Sequence[str] = ()
+
+    @property
+    def is_own(self) -> bool:
+        """Whether rgbt wrote the file."""
+        return self.kind == OWN
+
+    @property
+    def convention(self) -> tuple[str, ...]:
+        """Overrides for the inputs and the evaluation that the weights were trained for."""
+        if self.contents.note:
+            return ()
+        settings = self.contents.settings.items()
+        fusion = [value for key, value in settings if key.endswith("FUSION.AGGREGATION")]
+        return (*self.kind.convention, *(f"model.fusion={str(each).lower()}" for each in fusion))
+
+    @property
+    def inputs(self) -> Mapping[str, object] | None:
+        """`model.inputs` as an export notes it, None where it does not."""
+        try:
+            noted = json.loads(self.contents.note.get("inputs", ""))
+        except json.JSONDecodeError:
+            return None
+        return noted if isinstance(noted, dict) else None
+
+    def sentence(self) -> str:
+        """What is set, in one line, or why the file does not fit."""
+        where = f"{self.contents.path} ({self.kind.title})"
+        if self.problems:
+            return (
+                f"{where} does not fit this network: {_some(self.problems, '; ')}. Choose the "
+                "network that it was trained with, or name parts that keep their initial values "
+                "with model.fresh=[...]"
+            )
+        parts = [f"{self.num_set} of {self.num_entries} entries set"]
+        parts += [f"{len(self.zeros)} counters begin at 0"] if self.zeros else []
+        for what, names in (("initial values", self.fresh), ("unused in the file", self.unused)):
+            parts += [f"{len(names)} {what} ({_some(names)})"] if names else []
+        return f"weights of {where}: {'; '.join(parts)}"
 
 
 def load_weights(
     model: nn.Module, path: Path | str, fresh: tuple[str, ...] = (), *, other_classes: bool = False
-) -> Report:
+) -> Plan:
     """Set the weights of a network from a file, ours or a released one.
 
     Every name of the file must be used or known to be unused. Every entry of the network must be
     set or known to be absent from such a file. Otherwise nothing is changed.
 
     Args:
-        model: the network; its class says which layouts fit.
+        model: the network; its class says which kinds of files fit.
         path: of the file (see `rgbt.checkpoints.read.read`).
         fresh: parts that keep their initial values, by the beginning of their names, such as
             "sem_seg_head.predictor.class_embed" for another number of classes.
         other_classes: whether parts whose shape differs keep their initial values too.
 
+    Returns:
+        what was set, without the values.
+
     Raises:
-        InputError: unreadable, asking for code, of another network, incomplete, of another shape,
-            or with NaN or infinity.
+        InputError: unreadable, asking for code, of another network, incomplete, of another shape
+            or type, or with NaN or infinity.
     """
-    contents = read(Path(path))
-    facts, plan, remarks = plan_for(model, contents, fresh, other_classes=other_classes)
-    state = model.state_dict()
-    if not plan.fits:
-        raise InputError(refusal(contents.path, facts, plan, family_of(type(model)), len(state)))
-    broken = not_finite({name: plan.tensors[name] for name in plan.values.values()})
-    if broken:
+    plan = plan_for(model, read(Path(path)), fresh, other_classes=other_classes)
+    if plan.problems:
+        raise InputError(f"{plan.sentence()}.")
+    if broken := not_finite(plan.values):
         raise InputError(
-            f"{contents.path}: '{broken[0]}' holds NaN or infinity ({len(broken)} of "
-            f"{len(plan.values)} tensors do), because the training that wrote it diverged. Use a "
-            "checkpoint of an earlier step."
+            f"{path}: '{broken[0]}' holds NaN or infinity ({len(broken)} of {len(plan.values)} "
+            "tensors do), because the training that wrote it diverged. Use a checkpoint of an "
+            "earlier step."
         )
+    state = model.state_dict()
     with torch.no_grad():
-        for entry, name in plan.values.items():
-            state[entry].copy_(adapted(plan.tensors[name], state[entry]))
+        for entry, value in plan.values.items():
+            state[entry].copy_(value)
         for entry in plan.zeros:
             state[entry].zero_()
-    return Report(
-        path=contents.path,
-        container=contents.container,
-        facts=facts,
-        num_entries=len(state),
-        num_set=len(plan.values),
-        num_zeros=len(plan.zeros),
-        fresh=counted(plan.fresh),
-        leftover=counted(plan.leftover),
-        remarks=(*facts.remarks, *remarks),
-    )
+    return replace(plan, contents=replace(plan.contents, tensors={}), values={})
 
 
 def plan_for(
-    model: nn.Module, contents: Contents, fresh: tuple[str, ...], *, other_classes: bool = False
-) -> tuple[Facts, Plan, tuple[str, ...]]:
-    """What a file is, where its tensors go in `model`, and remarks on that.
+    model: nn.Module,
+    contents: Contents,
+    fresh: tuple[str, ...] = (),
+    *,
+    other_classes: bool = False,
+) -> Plan:
+    """Find a place in `model` for every tensor of a file; arguments as of `load_weights`.
 
     Raises:
-        InputError: the file is of no use to this network at all.
+        InputError: `fresh` names no part of the network, or no row of `KINDS` and no network of
+            another author has such a file.
     """
-    facts = recognise(contents)
-    family = family_of(type(model))
-    rule, tensors = None, contents.tensors
-    of_any = not facts.family or (facts.layout == "own" and not family)
-    if facts.layout in LAYOUTS and (of_any or facts.family == family):
-        try:
-            rule = LAYOUTS[facts.layout].rule(family, model, facts)
-        except InputError as error:
-            raise InputError(f"{contents.path} is {error}") from error
-        tensors = tensors if rule is None else LAYOUTS[facts.layout].converted(tensors)
-    prefix = facts.prefix
-    if rule is None and contents.tensors.keys() == model.state_dict().keys():
-        rule = Rule()  # with exactly its own names, any network takes the file
-    names = record_of(model).author_names
-    if rule is None and names is not None:
-        rule, prefix = Rule(source=lambda entry: entry.removeprefix(names[0])), names[1]
-    if rule is None:
-        raise InputError(_another_network(model, contents, facts))
-    plan = make_plan(
-        model.state_dict(keep_vars=True),
-        tensors,
-        rule,
-        prefix=prefix,
-        fresh=fresh,
-        other_classes=other_classes,
+    state = model.state_dict(keep_vars=True)
+    for part in fresh:
+        if not any(_under(entry, (part,)) for entry in state):
+            raise InputError(f"model.fresh: no name in state_dict() begins with '{part}.'")
+    kind = _kind_of(model, contents)
+    # Of a backbone alone: a file of the whole network holds what was drawn.
+    drawn = tuple(record_of(model).drawn_anew) if kind.fresh != NONE else ()
+    tensors = kind.converted(contents.tensors)
+    sources = {entry: kind.prefix + kind.source(entry) for entry in state}
+    found: dict[str, list[str]] = defaultdict(list)
+    values, misfits = {}, {}
+    for entry, place in state.items():
+        name = sources[entry]
+        if _under(entry, fresh) or entry.startswith(drawn) or re.match(kind.fresh, entry):
+            found["fresh"].append(entry)
+            continue
+        if name not in tensors:
+            found["zeros" if entry.endswith(COUNTER) else "missing"].append(entry)
+            continue
+        value = _adapted(tensors[name], place, is_stem=bool(re.match(kind.stems, entry)))
+        is_kind = value.is_floating_point() == place.is_floating_point()
+        if is_kind and value.shape == place.shape:
+            values[entry] = value
+        elif is_kind and other_classes:
+            found["fresh"].append(entry)
+        else:
+            misfits[entry] = value
+    used = {sources[entry] for entry in state if not re.match(kind.fresh, entry)}
+    for name in tensors.keys() - used:
+        is_known = re.match(kind.unused, name.removeprefix(kind.prefix))
+        found["unused" if is_known else "unknown"].append(name)
+    problems = [
+        *(f"{e} is {in_words(v)} instead of {in_words(state[e])}" for e, v in misfits.items()),
+        *(f"{entry} is missing" for entry in found["missing"]),
+        *(f"{name} is unknown" for name in sorted(found["unknown"])),
+        *_torn(state, values),
+    ]
+    return Plan(
+        contents=contents,
+        kind=kind,
+        num_entries=len(state),
+        num_set=len(values),
+        values=values,
+        zeros=found["zeros"],
+        fresh=found["fresh"],
+        unused=sorted(found["unused"]),
+        misfits=misfits,
+        problems=problems,
     )
-    kinds = sorted({str(plan.tensors[name].dtype) for name in plan.values.values()})
-    short = [kind.removeprefix("torch.") for kind in kinds if kind.endswith("float16")]
-    converted = (f"{' and '.join(short)} converted",) if short else ()
-    return facts, plan, (*rule.remarks, *converted)
 
 
-def _another_network(model: nn.Module, contents: Contents, facts: Facts) -> str:
-    family = family_of(type(model))
-    if not family:
-        return (
-            f"{contents.path} ({facts.title}) has other parameter names than "
-            f"{type(model).__name__}. A network that is not part of rgbt.models can only load "
-            "files of its own runs."
+def recognised(contents: Contents) -> str:
+    """What a file is, in words; "" for an unknown one."""
+    kinds = (OWN,) if contents.ours else (each for kinds in KINDS.values() for each in kinds)
+    return next((each.title for each in kinds if each.recognises(contents.tensors)), "")
+
+
+def _kind_of(model: nn.Module, contents: Contents) -> Kind:
+    """The first kind of the network's family that recognises the file."""
+    if contents.ours:
+        return OWN
+    state, family = model.state_dict(), family_of(type(model))
+    for kind in KINDS.get(family, ()):
+        has_needed = not kind.needs or any(entry.startswith(kind.needs) for entry in state)
+        if has_needed and kind.recognises(contents.tensors):
+            return kind
+    if contents.tensors.keys() == state.keys():
+        return Kind("state_dict() of such a network")
+    if names := record_of(model).author_names:
+        beginning, prefix = names
+        return Kind(
+            "of its author",
+            prefix=prefix,
+            source=lambda entry: entry.removeprefix(beginning),
         )
-    fits = " or ".join(" ".join(each) for each in facts.fits)
-    advice = f"it fits {fits}" if fits else "`rgbt weights inspect` shows its names"
-    return (
-        f"{contents.path} ({facts.title}) cannot be loaded into {FAMILIES.get(family, family)}; "
-        f"{advice}."
+    what = recognised(contents) or f"with names such as {_some(list(contents.tensors))}"
+    raise InputError(
+        f"{contents.path} ({what}) is no file of weights for {type(model).__name__}; `rgbt weights "
+        "inspect` describes it."
     )
+
+
+def _adapted(tensor: Tensor, place: Tensor, *, is_stem: bool) -> Tensor:
+    """A file's tensor for its place; only first convolutions may have other input channels.
+
+    One input channel gets the mean over the file's three; a fourth one behind these gets it too.
+
+    Args:
+        tensor: (C, 3, k, k) where it is adapted.
+        place: (C, 1, k, k) or (C, 4, k, k).
+        is_stem: whether it may be adapted.
+    """
+    if not is_stem or tensor.dim() != 4 or place.dim() != 4 or tensor.shape == place.shape:
+        return tensor
+    if tensor.shape[1] != 3 or place.shape[1] not in INPUT_CHANNELS:
+        return tensor
+    mean = tensor.float().mean(1, keepdim=True)
+    return mean if place.shape[1] == 1 else torch.cat([tensor.float(), mean], 1)
+
+
+def _torn(state: Mapping[str, Tensor], values: Mapping[str, Tensor]) -> Iterator[str]:
+    """Entries that share one parameter but would get different values."""
+    shared: dict[int, list[str]] = defaultdict(list)
+    for entry in values:
+        shared[id(state[entry])].append(entry)
+    for first, *others in shared.values():
+        for other in others:
+            if not torch.equal(values[first], values[other]):
+                yield f"{first} and {other} are one in the network but differ in the file"
+
+
+def _under(entry: str, parts: tuple[str, ...]) -> bool:
+    return any(f"{entry}.".startswith(f"{part.rstrip('.')}.") for part in parts)
+
+
+def _some(names: Sequence[str], separator: str = ", ") -> str:
+    """The first names of a list."""
+    shown = separator.join(one_line(name) for name in names[:3])
+    return shown + f"{separator}and {len(names) - 3} more" * (len(names) > 3)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 
-from rgbt.checkpoints.torch_files import read_torch_file
+from rgbt.checkpoints.torch_files import in_words, is_plain, read_torch_file
 from rgbt.checks import InputError, one_line
 
 WRAPPERS = ("state_dict", "model", "module", "model_state_dict")
@@ -19,18 +19,12 @@ WRAPPERS = ("state_dict", "model", "module", "model_state_dict")
 PREFIXES = ("module.", "_orig_mod.")
 """Prefixes that DataParallel and torch.compile add to every name."""
 
-OURS = (
-    *({"model", "others", "optimizers", "state"}, {"model", "optimizers", "state"}),
-    {"model", "unaveraged", "others", "optimizers", "state"},
-    {"model", "step"},
-)
-"""Keys of the last checkpoint of a run, now and before there were other networks beside the model;
-of one with averaged weights; and of the best one."""
-
 NOTE = "rgbt"
-"""Key of the note in an export."""
+"""Key of the note in an export, and of the run that a checkpoint belongs to."""
 
-PLAIN = (str, int, float, bool)
+LAST = {"model", "others", "optimizers", "state"}
+OURS = (LAST, LAST | {"unaveraged"}, {"model", "step"})
+"""Other keys of the last checkpoint of a run, of one with averaged weights, and of the best."""
 
 
 @dataclass(frozen=True)
@@ -39,22 +33,14 @@ class Contents:
 
     Attributes:
         path: of the file.
-        container: format, in words.
         tensors: by name, views of the file where possible; prefixes of wrappers are taken off.
-        where: key that the tensors were found under; "" where they are all there is.
-        prefix: that was taken off every name.
-        others: names of other entries of the file.
         settings: values of configuration objects in the file, by dotted key.
         ours: written by this project, with the names of its network.
         note: the note of an export.
     """
 
     path: Path
-    container: str
     tensors: Mapping[str, Tensor]
-    where: str = ""
-    prefix: str = ""
-    others: tuple[str, ...] = ()
     settings: Mapping[str, Any] = field(default_factory=dict)
     ours: bool = False
     note: Mapping[str, str] = field(default_factory=dict)
@@ -70,8 +56,15 @@ def read(path: Path) -> Contents:
         InputError: missing, damaged, of another kind, or it would execute code.
     """
     if path.is_file() and path.open("rb").read(9)[8:] == b"{":  # behind the length of its header
-        return _read_safetensors(path)
-    return _unwrapped(path, read_torch_file(path, mapped=True), "torch.save")
+        contents = _read_safetensors(path)
+    else:
+        contents = _unwrapped(path, read_torch_file(path, mapped=True))
+    for name, tensor in contents.tensors.items():
+        if not is_plain(tensor):
+            raise InputError(
+                f"{path}: '{one_line(name)}' is {in_words(tensor)}, which is not read."
+            )
+    return contents
 
 
 def _read_safetensors(path: Path) -> Contents:
@@ -79,23 +72,19 @@ def _read_safetensors(path: Path) -> Contents:
 
     try:
         with safe_open(path, framework="pt") as file:
-            note = dict(file.metadata() or {})
+            metadata = dict(file.metadata() or {})
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
-        raise InputError(f"{path} cannot be read: {one_line(error)}.") from error
-    own = {key.removeprefix(f"{NOTE}."): note[key] for key in note if key.startswith(f"{NOTE}.")}
-    return _without_prefixes(
-        Contents(path, "safetensors", tensors, ours=bool(own), note=own), tensors
-    )
+    except (SafetensorError, OSError, ValueError, RuntimeError) as error:
+        raise InputError(f"{path} cannot be read as weights ({one_line(error)}).") from error
+    start = f"{NOTE}."
+    note = {k.removeprefix(start): v for k, v in metadata.items() if k.startswith(start)}
+    return Contents(path, _without_prefixes(tensors), ours=bool(note), note=note)
 
 
-def _unwrapped(path: Path, value: Any, container: str) -> Contents:
+def _unwrapped(path: Path, value: Any) -> Contents:
     """The tensors of a file, which are at the top level or under one known key."""
     if not isinstance(value, dict):
-        kind = "one tensor" if isinstance(value, Tensor) else f"a {type(value).__name__}"
-        raise InputError(
-            f"{path} holds {kind}, not tensors by name; give a file that holds a state_dict()."
-        )
+        raise InputError(f"{path} holds a {type(value).__name__}; give a saved state_dict().")
     inner = [key for key in WRAPPERS if _is_state(value.get(key))]
     if not inner and not _is_state(value):  # a key of the author's own
         inner = [key for key in value if type(key) is str and _is_state(value[key])]
@@ -106,25 +95,16 @@ def _unwrapped(path: Path, value: Any, container: str) -> Contents:
     if not inner and not _is_state(value):
         keys = ", ".join(one_line(key) for key in list(value)[:6])
         raise InputError(f"{path} holds no tensors by name; its keys are: {keys or 'none'}.")
-    where = inner[0] if inner else ""
-    state = value[where] if inner else value
-    tensors = {name: found for name, found in state.items() if isinstance(found, Tensor)}
-    outside = [key for key in value if key != where] if inner else []
-    inside = [key for key in state if key not in tensors]
-    # Texts by name; other values in the file are ignored.
-    own = value.get(NOTE) if inner else None
-    items = own.items() if isinstance(own, dict) else ()
-    contents = Contents(
+    state = value[inner[0]] if inner else value
+    note = value.get(NOTE) if inner else None
+    texts = note.items() if isinstance(note, dict) else ()
+    return Contents(
         path,
-        container,
-        tensors,
-        where=where,
-        others=tuple(one_line(key) for key in [*outside, *inside]),
-        settings=_settings(value) if inner else {},
-        ours=value.keys() in OURS,
-        note={key: text for key, text in items if type(key) is str and type(text) is str},
+        _without_prefixes({name: each for name, each in state.items() if isinstance(each, Tensor)}),
+        settings=dict(_settings(value)) if inner else {},
+        ours=value.keys() - {NOTE} in OURS,
+        note={key: text for key, text in texts if type(key) is str and type(text) is str},
     )
-    return _without_prefixes(contents, tensors)
 
 
 def _is_state(value: object) -> bool:
@@ -136,19 +116,17 @@ def _is_state(value: object) -> bool:
     )
 
 
-def _without_prefixes(contents: Contents, tensors: dict[str, Tensor]) -> Contents:
-    prefix = ""
+def _without_prefixes(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     while found := next((p for p in PREFIXES if all(n.startswith(p) for n in tensors)), None):
+        if not tensors or found in tensors:
+            break
         tensors = {name.removeprefix(found): tensor for name, tensor in tensors.items()}
-        prefix += found
-        if not all(tensors):
-            raise InputError(f"{contents.path} has empty names of tensors.")
-    return replace(contents, tensors=tensors, prefix=prefix)
+    return tensors
 
 
-def _settings(value: dict[Any, Any]) -> dict[str, Any]:
-    """Plain values in the configuration objects of a file, by dotted key, few levels deep."""
-    found = {key: value[key] for key in ("step", "epoch") if isinstance(value.get(key), int)}
+def _settings(value: dict[Any, Any]) -> Iterator[tuple[str, Any]]:
+    """Dotted key and value of plain values in the configuration of a file, few levels deep."""
+    yield from ((key, value[key]) for key in ("step", "epoch") if isinstance(value.get(key), int))
     seen: set[int] = set()  # one object in many places is read once, or reading might never end
     level = [("", value.get(key)) for key in ("hyper_parameters", "args", "config", "state")]
     for _ in range(5):
@@ -158,6 +136,5 @@ def _settings(value: dict[Any, Any]) -> dict[str, Any]:
                 seen.add(id(node))
                 items = {**node, **vars(node)} if isinstance(node, OrderedDict) else node
                 children += [(f"{path}.{key}".lstrip("."), items[key]) for key in items]
-        found |= {where: child for where, child in children if isinstance(child, PLAIN)}
+        yield from ((key, child) for key, child in children if isinstance(child, str | int | float))
         level = children
-    return found

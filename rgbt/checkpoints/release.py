@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from rgbt.checkpoints import cmnext, networks
-from rgbt.checkpoints.layout import FAMILIES
+from rgbt.checkpoints.kinds import CMNEXT, KINDS, TEMPORAL
 from rgbt.checkpoints.read import NOTE
 from rgbt.checks import InputError, check_choice
 from rgbt.files.atomic import replacing
@@ -21,80 +20,34 @@ FORMATS = ("safetensors", "released", "released_temporal")
 Note = Mapping[str, str]
 """The note of an export: network, inputs and run."""
 
+WRAPPED = {"mask2former": "state_dict", "semseg": "state_dict", "cmx": "model"}
+"""Family -> key under which its releases put the weights; others have them at the top."""
 
-Container = Callable[[Mapping[str, Tensor], Note], Any]
-RELEASED: Mapping[str, Container] = {
-    # Without the configuration object of the release, which its test does not read from here.
-    "mask2former": lambda state, note: {
-        "epoch": 0,
-        "global_step": int(note.get("step", 0)),
-        "pytorch-lightning_version": "1.9.2",
-        "state_dict": networks.released_mask2former(state),
-        NOTE: dict(note),
-    },
-    "cmx": lambda state, note: {"model": OrderedDict(state), NOTE: dict(note)},
-    "cmnext": lambda state, _: cmnext.released(state),
-    "rtfnet": lambda state, _: OrderedDict(state),
-    "mfnet": lambda state, _: OrderedDict(state),
-    "pspnet": lambda state, _: networks.released_heatnet(state),
-    "external": lambda state, _: networks.released_external(state),
-    "semseg": lambda state, note: {
-        "epoch": 0,
-        "state_dict": OrderedDict((f"module.{key}", value) for key, value in state.items()),
-        NOTE: dict(note),
-    },
-}
-"""Family -> value that torch.load returns for its released files."""
+PREFIXES = {"mask2former": "network.", "semseg": "module.", "pspnet": "module.trgb_segnet."}
+"""Family -> before every released name, where there is something."""
 
-CONVENTIONS: Mapping[tuple[str, str], tuple[str, ...]] = {
-    ("released", "mask2former"): ("model/inputs=crm", "model.fusion=max"),
-    ("released", "cmx"): networks.CMX_RELEASED,
-    ("released_temporal", "cmx"): networks.CMX_TEMPORAL,
-    ("released", "cmnext"): cmnext.RELEASED,
-    ("released", "rtfnet"): networks.RTFNET_RELEASED,
-    ("released", "mfnet"): networks.MFNET_RELEASED,
-    ("released", "pspnet"): networks.HEATNET_RELEASED,
-    ("released", "semseg"): networks.SEMSEG,
-}
-"""Format and family -> how the authors' code feeds and evaluates the network."""
+EXTERNAL_PREFIX = "network."
+"""Before the names of a network from elsewhere (`rgbt.models.external.network`)."""
 
-SAID: Mapping[tuple[str, str], str] = {
-    ("released", "pspnet"): (
+CLASS_WEIGHT = "sem_seg_head.predictor.class_embed.weight"
+NO_OBJECT = 0.1
+"""Last of the class weights of the released loss of CRM."""
+
+REMARKS = {
+    "pspnet": (
         "the file has no entries under module.critics., because a discriminator is not part of "
         "this network; HeatNet's code loads it with no_conf, without critics"
-    ),
-    ("released_temporal", "cmx"): (
-        "voting.weight and voting.bias are zeros, because they are never used"
-    ),
+    )
 }
-"""The remark about a format and a family."""
+"""Family -> what the authors' code needs to know."""
 
 
-def payload(layout: str, family: str, state: Mapping[str, Tensor], note: Note) -> Any:
-    """The value that torch.save writes for a released layout.
-
-    Args:
-        layout: "released", or "released_temporal" for CMX as the temporal paper uses it.
-        family: of the network.
-        state: its entries.
-        note: stored if the container supports it.
-
-    Raises:
-        InputError: there is no such layout for this family.
-    """
-    if layout == "released_temporal":
-        if family != "cmx":
-            raise InputError(
-                f"format={layout} is for CMX of the temporal release, but this network is "
-                f"{FAMILIES.get(family, 'not part of rgbt.models')}. Choose another format."
-            )
-        return networks.released_temporal(state)
-    if family not in RELEASED:
-        raise InputError(
-            f"no released format exists for {FAMILIES.get(family, 'this network')}; use "
-            "format=safetensors."
-        )
-    return RELEASED[family](state, note)
+def convention_of(layout: str, family: str) -> tuple[str, ...]:
+    """How the authors' code feeds and evaluates the network that a file of a layout is for."""
+    if layout == "safetensors" or family not in KINDS or not KINDS[family]:
+        return ()
+    kind = TEMPORAL if layout == "released_temporal" else KINDS[family][family == "cmx"]
+    return (*kind.convention, *(("model.fusion=max",) if family == "mask2former" else ()))
 
 
 def save(
@@ -104,10 +57,10 @@ def save(
 
     Args:
         path: of the new file.
-        layout: one of `FORMATS`.
+        layout: one of `FORMATS`; "released_temporal" is CMX as the temporal release has it.
         family: of the network, "" for one from elsewhere.
         state: its entries.
-        note: the note of the file.
+        note: the note of the file, stored if the format has a place for it.
 
     Returns:
         a remark about the file, or none.
@@ -118,14 +71,75 @@ def save(
     check_choice("format", layout, FORMATS)
     if path.exists():
         raise InputError(f"out={path} already exists; remove it or choose another file name.")
-    content = None if layout == "safetensors" else payload(layout, family, state, note)
+    is_safe = layout == "safetensors"
+    content = _safetensors(state, note) if is_safe else payload(layout, family, state, note)
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as file:
-        if layout == "safetensors":
-            file.write(_safetensors(state, note))
+        if isinstance(content, bytes):
+            file.write(content)
         else:
             torch.save(content, file)
-    return SAID.get((layout, family))
+    return REMARKS.get(family) if layout == "released" else None
+
+
+def payload(layout: str, family: str, state: Mapping[str, Tensor], note: Note) -> dict[str, Any]:
+    """The value that torch.save writes for a released layout; arguments as of `save`.
+
+    Raises:
+        InputError: there is no such layout for this family.
+    """
+    if layout == "released_temporal" and family == "cmx":
+        voting = torch.zeros(
+            *(len(state["decode_head.linear_pred.weight"]) * n for n in (1, 2)), 3, 3
+        )
+        unused = {"voting.weight": voting, "voting.bias": voting[:, 0, 0, 0].clone()}
+        return OrderedDict(state, **unused)  # a convolution that it never uses
+    whole = (*PREFIXES, "cmx", "cmnext", "rtfnet", "mfnet", "external")
+    if layout == "released_temporal" or family not in whole:
+        raise InputError(
+            f"format={layout} does not exist for {family or 'this network'}; use "
+            "format=safetensors."
+        )
+    prefix = PREFIXES.get(family, "")
+    named = OrderedDict((prefix + _released_name(family, key), each) for key, each in state.items())
+    if family == "mask2former":
+        for key, value in state.items():
+            if key.endswith("relative_position_bias_table"):
+                named[prefix + key.replace("bias_table", "index")] = position_index(len(value))
+        named[f"{prefix}criterion.empty_weight"] = torch.ones(len(state[CLASS_WEIGHT]))
+        named[f"{prefix}criterion.empty_weight"][-1] = NO_OBJECT
+    if family not in WRAPPED:
+        return named
+    steps = {"global_step": int(note.get("step", 0)), "pytorch-lightning_version": "1.9.2"}
+    return {
+        "epoch": 0,
+        **(steps if family == "mask2former" else {}),
+        WRAPPED[family]: named,
+        NOTE: dict(note),
+    }
+
+
+def _released_name(family: str, entry: str) -> str:
+    if family == "external":
+        return entry.removeprefix(EXTERNAL_PREFIX)
+    return CMNEXT.source(entry) if family == "cmnext" else entry
+
+
+def position_index(rows: int) -> Tensor:
+    """Row of Swin's bias table for every pair of tokens of a window.
+
+    Args:
+        rows: of the table, (2 w - 1)^2 for windows of w x w tokens.
+
+    Returns:
+        (w^2, w^2) int64: (dy + w - 1) (2 w - 1) + dx + w - 1, first token less second.
+    """
+    span = round(rows**0.5)
+    side = (span + 1) // 2
+    y, x = torch.arange(side * side) // side, torch.arange(side * side) % side
+    dy, dx = y[:, None] - y[None], x[:, None] - x[None]
+    index: Tensor = (dy + side - 1) * span + dx + side - 1
+    return index
 
 
 def _safetensors(state: Mapping[str, Tensor], note: Note) -> bytes:

@@ -51,11 +51,10 @@ COMMANDS = {
     "cache": Entry("rgbt.data.cache.__main__", "decode a data set into a cache, or remove it"),
     "export": Entry("rgbt.export", "write a network as ONNX, compared with the network"),
     "weights": Entry("rgbt.weights", "inspect a file of weights, or export the weights of a run"),
+    "archive": Entry("rgbt.archive", "keep the results of runs in the repository"),
     "sync": Entry("rgbt.tracking.sync", "send run folders to MLflow"),
     "ui": Entry("rgbt.tracking.ui", "open MLflow at the runs of a folder"),
-    "corruptions": Entry("rgbt.corruptions.__main__", "draw the corruptions of a pair of images"),
     "masks": Entry("rgbt.maskers.sketch", "draw examples of a masker"),
-    "scenes": Entry("rgbt.data.synth.sheet", "draw scenes of the embedded data set"),
 }
 
 

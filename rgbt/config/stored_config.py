@@ -30,10 +30,10 @@ EXTERNAL = "rgbt.models.external.network.ExternalNetwork"
 FOLDERS = ("/", "~", "./", "../")  # beginnings of a trusted folder; all else names a module
 
 
-def load_config(path: Path, trust: Collection[str] = ()) -> DictConfig:
+def load_config(path: Path, trust: Collection[str] = (), group: str = "") -> DictConfig:
     """A stored configuration whose objects may be built (see `check_targets`)."""
     settings = read_settings(path)
-    check_targets(settings, trust, str(path))
+    check_targets(settings, trust, str(path), group)
     return OmegaConf.create(settings)
 
 
@@ -69,7 +69,7 @@ def check_targets(
         if not any(folder.is_relative_to(each) for each in folders):
             raise InputError(
                 f"{source}: '{_shown(key)}' is {_shown(checkout)}, whose code would be executed. "
-                f"If you trust it, add trust={_shown(checkout)}; or set {_shown(key)}=..."
+                f"If you trust it, add trust={_shown(str(folder))}; or set {_shown(key)}=..."
             )
     for key, target in targets(settings).items():
         if isinstance(target, str) and (target in shipped_targets(group) or target in trust):

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError
-from rgbt.types import Batch, Example, Loadable, Sample
+from rgbt.types import Batch, Example, Sample
 
 
 class Transform(Protocol):
@@ -22,21 +22,6 @@ class Transform(Protocol):
 
     def test(self, sample: Sample) -> Example:
         """Example for evaluation, the same every time."""
-        ...
-
-
-class BatchTransform(Protocol):
-    """A transform that can augment whole batches on the device.
-
-    ``stack([drawn(sample, rng), ...]).to(device)`` is the batch of ``train(sample, rng)``.
-    """
-
-    def drawn(self, sample: Sample, rng: np.random.Generator) -> Any:
-        """The sample and the draws of `train`, not yet applied; every draw comes from `rng`."""
-        ...
-
-    def stack(self, drawn: Sequence[Any]) -> Loadable:
-        """Examples of one size; InputError if they differ."""
         ...
 
 

@@ -7,11 +7,9 @@ from typing import Annotated, Literal
 
 from annotated_types import Interval
 
-from rgbt.checks import InputError
 from rgbt.ranges import BatchSize, NonNegative, Positive, Text, Workers
-from rgbt.requirements import Record, Requirement
 
-LOADING = ("num_workers", "on_error", "eval_batch_size", "prefetch", "augment", "cache")
+LOADING = ("num_workers", "on_error", "eval_batch_size", "prefetch", "cache")
 """Settings that do not change the samples of a batch."""
 
 OF_RARE_CLASSES = ("class_temperature", "min_class_pixels", "min_crop_ratio")
@@ -28,8 +26,6 @@ class LoaderSettings:
         eval_batch_size: samples of an evaluation batch, >= 1; 1 where image sizes differ.
         num_workers: processes that decode and augment; 0: the main process does.
         prefetch: batches that each process makes in advance.
-        augment: "loader" augments in the reading processes, "device" whole batches on the device
-            of the network, with the same result; "auto": "device" on a GPU if the transform can.
         cache: images are decoded once into memory-mapped files of this folder and read from there
             (`rgbt.data.cache`); "auto": in the folder of the user's cache; None: no such files.
         on_error: "raise" stops at an unreadable file; "skip" reports it once and uses the next
@@ -42,16 +38,12 @@ class LoaderSettings:
             in the label as stored; DAFormer: 3000.
         min_crop_ratio: the same: a crop is drawn again, up to 10 times, until it has more than this
             share of `min_class_pixels`; 0: never. DAFormer: 0.5; HRDA and MIC: 2.
-
-    Raises:
-        InputError: rare classes are drawn and images are augmented on the device.
     """
 
     batch_size: BatchSize
     eval_batch_size: BatchSize
     num_workers: Workers
     prefetch: Annotated[int, Interval(ge=1, le=1024)] = 2
-    augment: Literal["auto", "loader", "device"] = "auto"
     cache: Text | None = None
     on_error: Literal["raise", "skip"] = "raise"
     sampling: Literal["shuffled", "rare_classes"] = "shuffled"
@@ -64,14 +56,3 @@ class LoaderSettings:
             from rgbt.data.cache.dataset import check_cache  # only here: it imports OpenCV
 
             check_cache("data.cache", self.cache)
-        if self.sampling == "rare_classes" and self.augment == "device":
-            raise InputError(
-                "data.sampling=rare_classes draws crops again by their labels, which the loader "
-                "must augment; set data.augment=auto instead of device."
-            )
-
-    @property
-    def record(self) -> Record:
-        """Augmentation on the device, where it is requested, is the transform's work."""
-        on_device = Requirement("transform", "works_on_batches", True, "data.augment=device")
-        return Record(requires=(on_device,) if self.augment == "device" else ())

@@ -20,7 +20,7 @@ import torch
 from torch.utils.data import DataLoader
 
 from rgbt.checks import InputError, RunError
-from rgbt.data.batches import BatchTransform, Transform, collate
+from rgbt.data.batches import Transform, collate
 from rgbt.data.loader_settings import LoaderSettings as LoaderSettings  # as conf/ names it
 from rgbt.data.reader import (
     BatchReader,
@@ -28,7 +28,6 @@ from rgbt.data.reader import (
     LoadedBatch,
     MakeExample,
     SplitReader,
-    Stack,
     TrainExamples,
     no_shared_memory,
     signals_blocked,
@@ -155,11 +154,9 @@ def train_batches(  # noqa: PLR0913 - most trainings draw no classes
 
     Epoch e is a permutation of the split drawn from (seed, "order", e), cut into whole batches; the
     incomplete last one is dropped. Sample i of epoch e is augmented from (seed, "augment", e, i).
-    So ``steps=range(10, 20)`` continues ``range(10)`` exactly. With ``augment="device"`` the
-    transform is a `BatchTransform`, which augments batches when they are moved to the device.
+    So ``steps=range(10, 20)`` continues ``range(10)`` exactly.
 
-    With `rare`, sample i of epoch e is drawn by its class from (seed, "rare class", e, i) instead;
-    the loader augments, because crops are drawn again by their labels.
+    With `rare`, sample i of epoch e is drawn by its class from (seed, "rare class", e, i) instead.
 
     Raises:
         InputError: the split is smaller than a batch, or, with on_error="skip", unreadable; the
@@ -169,21 +166,18 @@ def train_batches(  # noqa: PLR0913 - most trainings draw no classes
     names = dataset.names(split)
     source = SplitReader(dataset, names, transform, settings.on_error == "skip")
     make: MakeExample = TrainExamples(source, transform.train, seed)
-    stack: Stack = partial(collate, advice=CROP_ADVICE)
     if rare is not None:
         from rgbt.data.rare_classes import RareClassExamples  # few runs draw by class
 
         make = RareClassExamples(source, transform.train, seed, rare)
-    elif settings.augment == "device":
-        work = cast(BatchTransform, transform)
-        make, stack = TrainExamples(source, work.drawn, seed), work.stack
     order = partial(numpy_generator, seed, "order")
     whole_batches = _train_keys(
         len(names), settings.batch_size, per_epoch, steps, None if rare else order
     )
     own_samples = slice(rank(), None, num_processes())
     keys = (keys[own_samples] for keys in whole_batches)
-    return Batches(BatchReader(make, stack), keys=keys, settings=settings)
+    reader = BatchReader(make, partial(collate, advice=CROP_ADVICE))
+    return Batches(reader, keys=keys, settings=settings)
 
 
 def eval_batches(

@@ -86,7 +86,7 @@ class TrainExamples:
 
     Attributes:
         source: reads samples.
-        make: (sample, generator) -> example: the transform's `train` or `drawn`.
+        make: (sample, generator) -> example: the transform's `train`.
         seed: run seed.
     """
 

@@ -24,7 +24,8 @@ from annotated_types import Ge
 from pydantic import TypeAdapter
 from torch import Tensor, nn
 
-from rgbt.checkpoints.torch_files import read_torch_file, save
+from rgbt.checkpoints.read import NOTE
+from rgbt.checkpoints.torch_files import is_plain, misfits, read_torch_file, save
 from rgbt.checks import InputError, RunError, not_finite, one_line
 
 UNAVERAGED = "unaveraged"
@@ -55,6 +56,8 @@ class State:
         evaluated_step: step of the last evaluation; below `step` where a signal came before the
             evaluation of `step`, which is then made on resuming.
         unlogged: values of the steps since the last line of ``metrics.jsonl``.
+        key: of the run.
+        settings: digest of its settings (`rgbt.runs.run_spec.settings_digest`).
     """
 
     seed: Count
@@ -64,6 +67,8 @@ class State:
     skipped: list[str] = field(default_factory=list)
     evaluated_step: Count = 0
     unlogged: dict[str, float] = field(default_factory=dict)
+    key: str = ""
+    settings: str = ""
 
     def skip(self, names: Iterable[str]) -> None:
         """Note files that were skipped."""
@@ -109,14 +114,39 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     """
     payload = read_torch_file(path)
     loaded: dict[str, Any] = payload if isinstance(payload, dict) else {}
-    weights = loaded.get("model")
-    if not isinstance(weights, dict) or not all(
-        isinstance(name, str) and isinstance(tensor, Tensor) for name, tensor in weights.items()
-    ):
-        raise InputError(
-            f"{path} holds no weights under 'model'; give a checkpoint written by `rgbt run`."
-        )
+    networks = {key: loaded[key] for key in ("model", UNAVERAGED) if key in loaded}
+    for group in ("others", "optimizers"):
+        found = loaded.get(group, {})
+        networks |= found if isinstance(found, dict) else {group: None}
+    if "model" not in loaded or not all(isinstance(each, dict) for each in networks.values()):
+        raise InputError(f"{path} is no checkpoint written by `rgbt run`.")
     return loaded
+
+
+def check_origin(payload: Mapping[str, Any], source: Path, key: str, settings: str) -> None:
+    """Refuse a checkpoint of another run, or of a configuration that was changed since.
+
+    Args:
+        payload: of the checkpoint.
+        source: its file.
+        key: of the run, the name of its folder.
+        settings: digest of the configuration of the run.
+
+    Raises:
+        InputError: naming both runs.
+    """
+    stored = payload.get(NOTE, payload.get("state"))
+    found = stored if isinstance(stored, dict) else {}
+    if found.get("key") != key:
+        raise InputError(
+            f"{source} belongs to the run {found.get('key')}, not to {key}; restore the file of "
+            "this run, or give its folder the name of the run."
+        )
+    if found.get("settings") != settings:
+        raise InputError(
+            f"{source.parent / 'config.yaml'} was changed after training; restore it, or train "
+            "with the new settings."
+        )
 
 
 def step_of(payload: Mapping[str, Any], source: Path) -> int:
@@ -139,7 +169,11 @@ def restore_optimizer(optimizer: torch.optim.Optimizer, stored: Any, source: Pat
     """
     try:
         _check_places(optimizer, stored)
-        optimizer.load_state_dict(stored)
+        # The rate alone changes in training; how a step is computed follows from the device.
+        groups = optimizer.state_dict()["param_groups"]
+        for own, group in zip(groups, stored["param_groups"], strict=True):
+            own["lr"] = group["lr"]
+        optimizer.load_state_dict({**stored, "param_groups": groups})
     except (ValueError, TypeError, LookupError, AttributeError, RuntimeError) as error:
         raise InputError(
             f"{source} holds the state of a different optimizer than this run uses "
@@ -156,19 +190,33 @@ def _check_places(optimizer: torch.optim.Optimizer, stored: Any) -> None:
 
     torch compares neither: a moment of another shape ends the next step by SIGSEGV.
     """
-    for own, group in zip(optimizer.param_groups, stored["param_groups"], strict=True):
-        for key in own.keys() & group.keys() - {"params"}:
-            kinds = [float if type(each[key]) is int else type(each[key]) for each in (own, group)]
-            if type(None) not in kinds and kinds[0] is not kinds[1]:
-                raise ValueError(f"{key} is a {kinds[1].__name__}")
-    parameters = [each for group in optimizer.param_groups for each in group["params"]]
+    groups = optimizer.state_dict()["param_groups"]
+    for own, group in zip(groups, stored["param_groups"], strict=True):
+        if own["params"] != group["params"] or own.keys() - group.keys():
+            raise ValueError("other parameters or settings")
+        for key in own.keys() - {"foreach", "fused", "capturable"}:  # of the device
+            values = [each[key] for each in (own, group)]
+            if _kind(values[0]) != _kind(values[1]) or (key != "lr" and values[0] != values[1]):
+                raise ValueError(f"{key} is {group[key]}")
+    of_state = [{name: _kind(v) for name, v in each.items()} for each in stored["state"].values()]
+    if any(each != of_state[0] for each in of_state):
+        raise ValueError("the states of parameters differ in kind")
+    places = dict(enumerate(each for group in optimizer.param_groups for each in group["params"]))
     for index, state in stored["state"].items():
+        place = places[index]
         for name, value in state.items():
-            is_moment = isinstance(value, Tensor) and value.ndim > 0
-            if is_moment and (
-                value.shape != parameters[index].shape or not value.is_floating_point()
-            ):
+            if not isinstance(value, Tensor):
+                continue
+            is_fit = value.ndim == 0 or (value.shape, value.dtype) == (place.shape, place.dtype)
+            if not (is_plain(value) and value.is_floating_point() and is_fit):
                 raise ValueError(f"{name} of parameter {index} has another shape or type")
+
+
+def _kind(value: object) -> object:
+    """The type of a value, of a tuple those of its parts; a whole number is a number."""
+    if isinstance(value, tuple):
+        return tuple(map(_kind, value))
+    return float if type(value) is int else type(value)
 
 
 def restore_weights(model: nn.Module, weights: dict[str, Tensor], source: Path) -> None:
@@ -177,16 +225,12 @@ def restore_weights(model: nn.Module, weights: dict[str, Tensor], source: Path) 
     Raises:
         InputError: naming what does not fit.
     """
-    own = model.state_dict()
-    try:
-        for name in own.keys() & weights.keys():
-            if own[name].dtype != weights[name].dtype:
-                raise RuntimeError(f"{name} is {weights[name].dtype}, expected {own[name].dtype}")
-        model.load_state_dict(weights)
-    except RuntimeError as error:
+    found = misfits(model.state_dict(), weights)
+    if found:
         raise InputError(
-            f"{source} is a checkpoint of another model: {one_line(str(error))}"
-        ) from (error)
+            f"{source} is a checkpoint of another model: {one_line('; '.join(found))}."
+        )
+    model.load_state_dict(weights)
 
 
 class Checkpoints:
@@ -205,7 +249,8 @@ class Checkpoints:
         """Write the weights if this step is the best, then the state."""
         self.folder.mkdir(parents=True, exist_ok=True)
         if state.step == state.best_step > 0:
-            save(self.best, {"model": payload["model"], "step": state.step})
+            origin = {"key": state.key, "settings": state.settings}
+            save(self.best, {"model": payload["model"], "step": state.step, NOTE: origin})
         save(self.last, payload)
 
     def load(self) -> tuple[dict[str, Any], State]:
@@ -229,6 +274,7 @@ class Checkpoints:
         """
         with self._saying_what_to_do():
             payload = load_checkpoint(self.best)
+            check_origin(payload, self.best, state.key, state.settings)
             found = step_of(payload, self.best)
             # Weights of a later step were written just before the run was killed.
             if found != state.best_step and found <= state.step:

@@ -21,6 +21,7 @@ from rgbt.engine.checkpoint import (
     ADVICE,
     Checkpoints,
     State,
+    check_origin,
     check_weights,
     restore_optimizer,
     restore_weights,
@@ -122,6 +123,7 @@ class Trainer:
         if not agreed(source.exists()):
             return False
         payload, stored = self.checkpoints.load()
+        check_origin(payload, source, state.key, state.settings)
         others, optimizers = payload.get("others", {}), payload.get("optimizers", {})
         if others.keys() != self.others.keys() or optimizers.keys() != self.optimizers.keys():
             raise InputError(

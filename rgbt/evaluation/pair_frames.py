@@ -17,7 +17,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rgbt.assembly.contracts import check_requirements
 from rgbt.checks import InputError
 from rgbt.data.loaders import eval_batches
 from rgbt.data.next_frames import NextFrames
@@ -29,6 +28,7 @@ from rgbt.geometry.optical_flow import FlowSource, FrameFlow, frame_flow, gray_o
 from rgbt.geometry.warp import Warp
 from rgbt.metrics.pair_list import Frames, second_name
 from rgbt.metrics.pairs import Protocol
+from rgbt.requirements import check_requirements
 from rgbt.types import IGNORE, Batch
 
 USUAL_FLOW: FlowSource = "both"

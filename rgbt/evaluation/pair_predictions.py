@@ -40,7 +40,7 @@ from rgbt.metrics import pair_list
 from rgbt.metrics.metric import Regions
 from rgbt.metrics.pair_list import PAIR_LIST, Frames, ListedPair, PairList, second_name
 from rgbt.terminal import info
-from rgbt.transforms.view_sets import ViewSets
+from rgbt.transforms.views import ViewSets
 from rgbt.types import Batch
 
 CPU = torch.device("cpu")

@@ -32,8 +32,7 @@ from rgbt.engine.progress import progress
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.metrics.counts import Counts
 from rgbt.requirements import record_of
-from rgbt.transforms.joint import View as ImageView
-from rgbt.transforms.joint import whole_view
+from rgbt.transforms.maps import bilinear, mixed, nearest
 from rgbt.types import Batch, View
 
 if TYPE_CHECKING:  # it imports this module
@@ -60,11 +59,8 @@ class Predictor:
         """A batch from the loader, with labels of the size at which classes are counted."""
         if self._settings.counted == "label":
             return batch
-        from rgbt.transforms.thesis import mixed  # few recipes count at the size of the images
-
-        resize = mixed if self._settings.label_resize == "bilinear" else ImageView.nearest
-        view = whole_view(_hw(batch.label), _hw(batch.rgb))
-        labels = [resize(view, label) for label in batch.label.numpy()]
+        resize = mixed if self._settings.label_resize == "bilinear" else nearest
+        labels = [resize(label, _hw(batch.rgb)) for label in batch.label.numpy()]
         return replace(batch, label=torch.from_numpy(np.stack(labels)))
 
     def classes(self, batch: Batch) -> Tensor:
@@ -74,8 +70,7 @@ class Predictor:
         # Predicted at the size of the images; class numbers are enlarged like brightness.
         small = replace(batch, label=batch.label.new_zeros(len(batch.label), *_hw(batch.rgb)))
         found = class_maps(self.model, small, *self._how(batch))
-        view = whole_view(_hw(batch.rgb), _hw(batch.label))
-        maps = [view.bilinear(each, np.uint8) for each in found.cpu().numpy()]
+        maps = [bilinear(each, _hw(batch.label)) for each in found.cpu().numpy()]
         return torch.from_numpy(np.stack(maps)).to(found.device)
 
     def confident_classes(self, batch: Batch) -> tuple[Tensor, Tensor]:
@@ -142,6 +137,7 @@ def counts_of(
         split=split,
         unscored=dataset.unscored,
         absent=data.regions.absent,
+        run=data.run if isinstance(data, Session) else "",
     )
 
 

@@ -25,7 +25,7 @@ from rgbt.config.component import build, constructor, setting_types
 from rgbt.config.compose import conf_dir
 from rgbt.config.stored_config import load_config, parse_trust
 from rgbt.config.values import check_value
-from rgbt.corruptions.corruption import Corruption, OfTime
+from rgbt.corruptions.kinds import Corruption, OfTime
 from rgbt.data.domains import TestedHead
 from rgbt.dataset import DatasetWrapper, LabelledDataset
 from rgbt.files.yaml_files import parse_yaml
@@ -289,7 +289,7 @@ def choose_corruption(
         check_choice(NODE, stem, corruption_files())
     path = Path(name).expanduser() if is_file else corruption_files()[stem]
     typed = [*([f"image={image}"] if image else []), *(w.removeprefix(f"{NODE}.") for w in words)]
-    config = OmegaConf.create({NODE: load_config(path, trust)})
+    config = OmegaConf.create({NODE: load_config(path, trust, NODE)})
     for key, _, value in (word.partition("=") for word in typed):
         OmegaConf.update(config, f"{NODE}.{key}", parse_yaml(value, f"{NODE}.{key}"))
     node = config[NODE]

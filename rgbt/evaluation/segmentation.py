@@ -24,8 +24,7 @@ from rgbt.evaluation import prediction
 from rgbt.evaluation.prediction import Predictor, counts_of
 from rgbt.evaluation.request import EvaluationRequest, NetworkRequest
 from rgbt.metrics import scores
-from rgbt.metrics.absent import absent_notes
-from rgbt.metrics.confusion import RegionCounter
+from rgbt.metrics.counting import DetailCounter, RegionCounter
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.details import OF_SCENES, DetailKind
 from rgbt.metrics.metric import Regions
@@ -33,7 +32,7 @@ from rgbt.processes import collected, num_processes
 from rgbt.tables import ClassTable, RegionTable, ResultTables, TextTable, number
 from rgbt.terminal import result_view, rich_table
 from rgbt.tracking.pictures import Legend, PanelExample
-from rgbt.transforms.joint import whole_view
+from rgbt.transforms.maps import nearest
 from rgbt.types import View
 
 NUM_PANELS = 6
@@ -114,7 +113,7 @@ def _count(
     predictor: Predictor,
     request: EvaluationRequest,
     names: tuple[str, ...],
-    counters: Mapping[DetailKind, Any],
+    counters: Mapping[DetailKind, DetailCounter],
 ) -> Counted:
     """Predict the images `names` of the split, or the part of this process, and count."""
     dataset = Subset(session.dataset, names)
@@ -145,31 +144,19 @@ def _count(
     return found._replace(skipped=tuple(batches.skipped))
 
 
-def _detail_counters(session: Session, request: EvaluationRequest) -> dict[DetailKind, Any]:
+def _detail_counters(
+    session: Session, request: EvaluationRequest
+) -> dict[DetailKind, DetailCounter]:
     """A counter of each requested kind; InputError for scenes that the data set does not know."""
     dataset, regions, num_classes = session.dataset, session.regions, len(session.dataset.classes)
-    counters: dict[DetailKind, Any] = {}
-    if not request.details:
-        return counters
-    from rgbt.metrics.boundary import BoundaryCounter
-    from rgbt.metrics.calibration import CalibrationCounter
-    from rgbt.metrics.scene_counts import SceneCounter
-
     for each in request.details:
-        if each.kind == "boundary":
-            width, border = each.setting[0], each.with_border
-            counters[each.kind] = BoundaryCounter(num_classes, regions, width, border=border)
-        elif each.kind == "calibration":
-            counters[each.kind] = CalibrationCounter(num_classes, regions, each.groups)
-        elif isinstance(reader_of(dataset), KnownScenes):
-            counters[each.kind] = SceneCounter(num_classes, regions, each)
-        else:
+        if each.kind in OF_SCENES and not isinstance(reader_of(dataset), KnownScenes):
             raise InputError(f"details={each.kind}: {dataset.name} has no maps of its scenes.")
-    return counters
+    return {each.kind: DetailCounter(num_classes, regions, each) for each in request.details}
 
 
 def _details_of(
-    counters: Mapping[DetailKind, Any],
+    counters: Mapping[DetailKind, DetailCounter],
     dataset: LabelledDataset,
     name: str,
     maps: tuple[Tensor, Tensor, Tensor | None],
@@ -204,8 +191,8 @@ def _example(session: Session, name: str, classes: NDArray[np.uint8]) -> PanelEx
     sample = session.dataset.read(name)
     label = sample.label if sample.label is not None else np.full_like(sample.thermal, 255)
     # Classes may be counted at another size than that of the label file.
-    shown = whole_view((classes.shape[0], classes.shape[1]), (label.shape[0], label.shape[1]))
-    return PanelExample(name, sample.rgb, sample.thermal, label, shown.nearest(classes))
+    shown = nearest(classes, (label.shape[0], label.shape[1]))
+    return PanelExample(name, sample.rgb, sample.thermal, label, shown)
 
 
 def result_tables(counts: Counts, regions: Regions, label: str, step: int) -> ResultTables:
@@ -231,7 +218,7 @@ def result_tables(counts: Counts, regions: Regions, label: str, step: int) -> Re
             region_ious=tuple(tuple(map(float, row)) for row in scores.iou(by_region, absent).T),
             subset_mious={part: float(value) for part, value in parts.items()},
             unscored=counts.unscored,
-            notes=absent_notes(by_region, counts.classes, scored, counts.split, absent),
+            notes=scores.absent_notes(by_region, counts.classes, scored, counts.split, absent),
         ),
     )
 

@@ -20,11 +20,12 @@ from rgbt.engine.progress import progress
 from rgbt.evaluation.pair_frames import Compared, FlowRecord, Pairing, Predict, Scenes, scenes
 from rgbt.evaluation.prediction import EvaluationData, Predictor, counts_of, decode_ahead
 from rgbt.evaluation.request import EvaluationRequest
+from rgbt.metrics.counting import pair_counts
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.named import CHANGES, SCORES_OF, pair_scores, value
 from rgbt.metrics.names import CA, TC, consistency
-from rgbt.metrics.pairs import HEADLINES, Protocol, pair_counts, partition_name
+from rgbt.metrics.pairs import HEADLINES, Protocol, partition_name
 from rgbt.metrics.scores import class_mean
 from rgbt.tables import ConsistencyTable, TextTable
 from rgbt.tracking.pair_pictures import PairExample

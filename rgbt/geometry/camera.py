@@ -19,17 +19,9 @@ Coordinate = Annotated[float, Interval(ge=-0.5, le=8192)]
 class Camera:
     """Intrinsics of a pinhole camera for images of `height` x `width` pixels.
 
-    Attributes:
-        fx: focal length along a row, pixels, above 0.
-        fy: focal length along a column, pixels, above 0.
-        cx: column of the principal point, pixels; centres of pixels lie at whole numbers.
-        cy: row of the principal point.
-        height: rows of the images that the four numbers hold for.
-        width: their columns.
-
-    Raises:
-        InputError: a principal point outside the image: then these are the intrinsics of images of
-            another size.
+    Focal lengths along a row and a column, column and row of the principal point, in pixels, whose
+    centres lie at whole numbers. InputError for a principal point outside the image: then these are
+    the intrinsics of images of another size.
     """
 
     fx: Positive
@@ -44,8 +36,7 @@ class Camera:
         if not inside:
             raise InputError(
                 f"camera: the principal point (cx={self.cx:g}, cy={self.cy:g}) lies outside an "
-                f"image of {self.height}x{self.width}, so these are intrinsics for another image "
-                "size. Set height and width to the size of the calibration."
+                f"image of {self.height}x{self.width}; set height and width of the calibration."
             )
 
     def matrix(self, image_hw: tuple[int, int]) -> Tensor:
@@ -64,8 +55,7 @@ class Camera:
         if abs(sy * self.width - width) >= 1:
             raise InputError(
                 f"camera: expected images of {self.height}x{self.width} or of that aspect ratio, "
-                f"got {height}x{width}. These are intrinsics for another image size; set those of "
-                "your camera (fx, fy, cx, cy, height, width)."
+                f"got {height}x{width}; set the intrinsics of your camera."
             )
         cx, cy = (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5
         rows = [[self.fx * sx, 0.0, cx], [0.0, self.fy * sy, cy], [0.0, 0.0, 1.0]]

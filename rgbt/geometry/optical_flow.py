@@ -32,10 +32,8 @@ Flow = NDArray[np.float32]
 class FrameFlow(NamedTuple):
     """The estimated motion between two frames, for every pixel of the second one.
 
-    Attributes:
-        flow: (H, W, 2) float32, (rows, columns) from there to the position in the first frame.
-        used: (H, W) bool, whether the flows of both directions agree and the point is inside the
-            first frame.
+    `flow` leads to the first frame; `used` (H, W) is whether the flows of both directions agree and
+    the point is inside the first frame.
     """
 
     flow: Flow
@@ -59,24 +57,20 @@ def gray_of(rgb: NDArray[np.uint8]) -> Gray:
 def frame_flow(
     first: dict[str, Gray], second: dict[str, Gray], source: FlowSource = "both"
 ) -> FrameFlow:
-    """The motion between two frames.
+    """The motion between two frames; InputError where sizes differ or are below `SMALLEST`.
 
-    Args:
-        first: grey levels (H, W) of the first frame by the name of the image, "rgb" and "thermal".
-        second: the same of the second frame, of equal size.
-        source: images that it is estimated from.
-
-    Raises:
-        InputError: sizes differ, or are below `SMALLEST`.
+    `first` and `second` are grey levels (H, W) by the name of the image, "rgb" and "thermal".
     """
     names = ("rgb", "thermal") if source == "both" else (source,)
-    found = [_one(first[name], second[name]) for name in names]
-    flow, error, used = found[0]
-    for other, other_error, other_used in found[1:]:
+    found = []
+    for name in names:
+        flow = estimate(second[name], first[name])
+        found.append((flow, disagreement(flow, estimate(first[name], second[name]))[0]))
+    flow, error = found[0]
+    for other, other_error in found[1:]:
         better = other_error < error
-        flow = np.where(better[..., None], other, flow)
-        used = np.where(better, other_used, used)
-    return FrameFlow(flow, used)
+        flow, error = np.where(better[..., None], other, flow), np.where(better, other_error, error)
+    return FrameFlow(flow, error <= 1)
 
 
 def estimate(start: Gray, end: Gray) -> Flow:
@@ -90,10 +84,7 @@ def estimate(start: Gray, end: Gray) -> Flow:
     """
     if start.shape != end.shape or min(start.shape) < SMALLEST:
         sizes = [" x ".join(map(str, each.shape)) for each in (start, end)]
-        raise InputError(
-            f"the flow between two frames needs one size of {SMALLEST} x {SMALLEST} pixels or "
-            f"more, got {sizes[0]} and {sizes[1]}."
-        )
+        raise InputError(f"flow: expected one size of at least {SMALLEST} pixels, got {sizes}.")
     columns_rows = _search().calc(start, end, None)
     return np.ascontiguousarray(columns_rows[..., ::-1], dtype=np.float32)
 
@@ -117,12 +108,6 @@ def disagreement(flow: Flow, back: Flow) -> tuple[NDArray[np.float32], NDArray[n
     missed = np.square(flow + there).sum(-1)
     limit = RELATIVE * (np.square(flow).sum(-1) + np.square(there).sum(-1)) + ABSOLUTE
     return np.where(inside, missed / limit, np.inf).astype(np.float32), inside
-
-
-def _one(first: Gray, second: Gray) -> tuple[Flow, NDArray[np.float32], NDArray[np.bool_]]:
-    flow = estimate(second, first)
-    error, _ = disagreement(flow, estimate(first, second))
-    return flow, error, error <= 1
 
 
 @cache

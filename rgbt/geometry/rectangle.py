@@ -35,9 +35,8 @@ def inner_rectangle(homography: Tensor, image_hw: tuple[int, int], rule: Rule) -
     """A rectangle of the view inside the picture of the first frame and inside the frame.
 
     `homography` (B, 3, 3) float64: pixels of the first frame to pixels of the view, w > 0 in front
-    of the camera; `image_hw` of both frames. "corners", as released, may hold a few pixels that
-    the first frame does not show (up to 0.3 % in the published views). (B, 4) float64: (left, top,
-    right, bottom) in pixel edges; NaN where there is none (see `check_rectangle`).
+    of the camera. "corners", as released, may hold a few pixels that the first frame does not show
+    (up to 0.3 % in the published views). (B, 4) float64; NaN where there is none.
     """
     check_shape("homography", homography, "B M N", M=3, N=3)
     find = _largest if rule == "largest" else _by_corners
@@ -49,10 +48,7 @@ def check_rectangle(rectangle: Tensor, angles: Tensor) -> None:
     empty = rectangle.isnan().any(dim=1)
     if bool(empty.any()):
         yaw, pitch, roll = angles[empty][0].tolist()
-        raise InputError(
-            f"the angles yaw {yaw:g}, pitch {pitch:g}, roll {roll:g} degrees leave no rectangle "
-            "of the view without empty pixels; choose smaller ranges of angles."
-        )
+        raise InputError(f"yaw {yaw:g}, pitch {pitch:g}, roll {roll:g} leave no rectangle.")
 
 
 def _half_planes(homography: Tensor, image_hw: tuple[int, int]) -> tuple[Tensor, Tensor]:

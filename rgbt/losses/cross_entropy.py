@@ -1,7 +1,8 @@
-"""Pixel-wise cross-entropy for networks that return dense class scores."""
+"""Pixel-wise cross-entropy for networks that return dense class scores, and auxiliary ones."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import torch
@@ -12,8 +13,8 @@ from torch.nn import functional as F
 from rgbt.checks import InputError, check_shape
 from rgbt.processes import mean_count
 from rgbt.ranges import NonNegative
-from rgbt.requirements import Record, Requirement
-from rgbt.types import IGNORE, Batch, Output
+from rgbt.requirements import Record, Requirement, record_of
+from rgbt.types import IGNORE, Batch, Loss, Output
 
 ClassWeights = Annotated[tuple[NonNegative, ...], Len(1, 255)]
 
@@ -87,3 +88,42 @@ def _sum_of_weights(label: Tensor, weights: Tensor | None) -> Tensor:
     if weights is None:  # without a wait for the number of pixels, as a selection has
         return labelled.sum().float()
     return weights[label[labelled]].sum()
+
+
+@dataclass(frozen=True, kw_only=True)
+class WithAuxiliary:
+    """A loss of the class scores plus ``weight`` times the same loss of the auxiliary ones.
+
+    Source: PSPNet (0.4); AdaptSegNet, Eq. 5, and MaxSquareLoss (0.1); thesis (J. Sun), code (0.1
+    with maximum squares).
+
+    Attributes:
+        loss: of class scores.
+        weight: finite, >= 0.
+    """
+
+    loss: Loss
+    weight: NonNegative
+
+    @property
+    def record(self) -> Record:
+        """That of `loss`, and a network with an auxiliary head."""
+        record = record_of(self.loss)
+        auxiliary = Requirement("model", "auxiliary", True)
+        return replace(record, requires=(*record.requires, auxiliary), reads_auxiliary=True)
+
+    def __call__(
+        self, output: Output, batch: Batch, generator: torch.Generator
+    ) -> dict[str, Tensor]:
+        """The weighted parts of `loss`, and those of `aux["aux_logits"]` as <part>_aux.
+
+        `generator` is drawn from for the scores first; shapes as those of `loss`.
+        """
+        parts = self.loss(output, batch, generator)
+        auxiliary = self.loss(Output(output.aux["aux_logits"], {}), batch, generator)
+        return {**parts, **{f"{name}_aux": self.weight * part for name, part in auxiliary.items()}}
+
+
+def single(values: Tensor) -> Tensor:
+    """At least float32: sums over millions of pixels are kept in it under autocast too."""
+    return values.to(torch.promote_types(values.dtype, torch.float32))

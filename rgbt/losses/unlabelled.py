@@ -1,17 +1,24 @@
-"""Losses without labels, which reward confident predictions, and labels made of predictions."""
+"""Losses without labels, and labels that are made of predictions.
+
+Losses that reward confident predictions, those of a discriminator's verdicts with the maps that it
+judges, and the labels that a teacher or two heads predict in the step.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from rgbt.checks import check_shape
-from rgbt.class_scores import classes_of
-from rgbt.losses.overlap import single
+from rgbt.class_scores import best_of, classes_of
+from rgbt.losses.cross_entropy import single
+from rgbt.processes import mean_count
 from rgbt.ranges import NonNegative, Share
 from rgbt.types import IGNORE
 
@@ -112,3 +119,102 @@ def guidance(probabilities: Tensor, aux_probabilities: Tensor, threshold: float)
     p, q = probabilities.detach(), aux_probabilities.detach()
     sure = (p.amax(1) > threshold) | (q.amax(1) > threshold)
     return classes_of(p + q).where(sure, IGNORE)
+
+
+WeightedBy = Literal["batch", "image"]
+"""The images whose share of confident pixels weighs a pixel: all of the batch, or its own."""
+
+
+class PseudoLabels(NamedTuple):
+    """Labels of a batch.
+
+    Attributes:
+        label: (B, H, W) int64, every pixel has a class.
+        weight: (B, H, W) float32 in [0, 1].
+        confident: () float32, share of the confident pixels of the batch, in [0, 1].
+        confidence: () float32, mean of the highest probabilities of the batch, in [0, 1].
+    """
+
+    label: Tensor
+    weight: Tensor
+    confident: Tensor
+    confidence: Tensor
+
+
+def pseudo_labels(
+    scores: Tensor, threshold: float, weighted_by: WeightedBy, ignored: tuple[float, float]
+) -> PseudoLabels:
+    """The class of every pixel, weighted by the share of confident pixels.
+
+        y = argmax_k p_k,   q = mean over pixels of [max_k p_k >= threshold]
+
+    q weighs every pixel, confident or not. It is a number of the batch, or of each image. Rows at
+    the top and bottom of the image have weight 0.
+
+    Source: DACS; DAFormer, Sec. 3.1 (of each image).   Released: of the batch.
+
+    Args:
+        scores: (B, K, H, W), any float dtype; no gradient passes.
+        threshold: in [0, 1]; 0.968 in the releases of DACS, DAFormer, HRDA and MIC.
+        weighted_by: see above.
+        ignored: shares of the rows at the top and at the bottom, in [0, 1], rounded to rows.
+    """
+    height = check_shape("scores", scores, "B K H W")["H"]
+    confidence, label = best_of(single(scores.detach()).softmax(1))
+    of_image = (confidence >= threshold).float().mean((1, 2))
+    of_batch = mean_count(of_image.mean())
+    weight = of_image if weighted_by == "image" else of_batch.expand_as(of_image)
+    rows = torch.arange(height, device=scores.device)
+    top, bottom = (round(share * height) for share in ignored)
+    counted = (rows >= top) & (rows < height - bottom)
+    weights = (weight[:, None, None] * counted[:, None]).expand(label.shape)
+    return PseudoLabels(label, weights.contiguous(), of_batch, mean_count(confidence.mean()))
+
+
+Judged = Literal["probabilities", "logits", "self_information"]
+"""Input of a discriminator, derived from a prediction."""
+
+
+def least_squares(verdicts: Tensor, value: float) -> Tensor:
+    """Mean of ``(value - D)^2`` over verdicts D of any shape and float dtype; () float32.
+
+    Source: LSGAN; thesis (J. Sun), Eqs. 5 and 6 (source 0, target 1); HeatNet (day 1, night 0).
+    """
+    return (value - single(verdicts)).square().mean()
+
+
+def logistic(verdicts: Tensor, value: float) -> Tensor:
+    """Mean of ``-value log s(D) - (1 - value) log (1 - s(D))`` with the logistic function s.
+
+    Source: AdaptSegNet, Eqs. 2 and 4; ADVENT (releases of both: source 0, target 1).
+
+    As `least_squares`, verdicts not squashed and `value` in [0, 1]; finite for finite verdicts.
+    """
+    verdicts = single(verdicts)
+    return F.binary_cross_entropy_with_logits(verdicts, torch.full_like(verdicts, value))
+
+
+VERDICT_LOSSES: dict[str, Callable[[Tensor, float], Tensor]] = {
+    "least_squares": least_squares,
+    "cross_entropy": logistic,
+}
+"""By their names in the configuration."""
+
+
+def judged(logits: Tensor, how: Judged) -> Tensor:
+    """The input map of a discriminator.
+
+        probabilities       p = softmax of the class scores    AdaptSegNet, thesis (J. Sun)
+        logits              the class scores                   HeatNet
+        self_information    -p log p / log K                   ADVENT, Sec. 3.2
+
+    (B, K, H, W) class scores, any float dtype -> the same shape, float32 for half precision too.
+    """
+    sizes = check_shape("logits", logits, "B K H W")
+    logits = single(logits)
+    if how == "logits":
+        return logits
+    if how == "probabilities":
+        return logits.softmax(1)
+    log_p = logits.log_softmax(1)  # finite where p is too small to differ from 0
+    return -log_p.exp() * log_p / math.log(max(sizes["K"], 2))  # of one class: 0

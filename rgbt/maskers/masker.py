@@ -1,4 +1,8 @@
-"""The masker class, which every file of conf/masker/ configures."""
+"""Maskers: which cells of RGB and of thermal are hidden. Every file of conf/masker/ configures one.
+
+A mask is (B, h, w) bool, True = taken. Functions draw a whole batch on the device of their
+arguments.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +14,8 @@ import torch
 from annotated_types import Interval, MultipleOf, doc
 from torch import Tensor
 
-from rgbt.checks import InputError, check_shape
+from rgbt.checks import InputError, check_members, check_shape, described
 from rgbt.geometry.padding import STRIDE, padded_hw
-from rgbt.maskers import pattern
 from rgbt.ranges import Pixels, Share
 from rgbt.requirements import Record
 from rgbt.types import MaskPair
@@ -30,9 +33,7 @@ CELLS = {"patch_size", "pairing"}
 GAUSSIAN = {"sigma_div", "anchor", "cell_position"}
 NEEDED: dict[str, set[str]] = {
     "none": set(),
-    "uniform": CELLS | {"ratio"},
-    "bernoulli": CELLS | {"ratio"},
-    "square": CELLS | {"ratio"},
+    **dict.fromkeys(("uniform", "bernoulli", "square"), CELLS | {"ratio"}),
     "gaussian_count": CELLS | GAUSSIAN | {"ratio"},
     "gaussian_bernoulli": CELLS | GAUSSIAN,
 }
@@ -75,8 +76,7 @@ class Masker:
             1/3 each.
 
     Raises:
-        InputError: a setting without effect is not None, a required one is None, or the settings
-            do not fit each other.
+        InputError: a required setting is None, or one without effect is not.
     """
 
     sampler: Sampler
@@ -93,6 +93,25 @@ class Masker:
     def record(self) -> Record:
         """Cells are hidden, but by the sampler "none"; a scheme then omits the masked pass."""
         return Record(hides_cells=self.sampler != "none")
+
+    def __post_init__(self) -> None:
+        needed = NEEDED[self.sampler]
+        optional = {"sigma_height"} if "sigma_div" in needed else set()
+        if self.pairing == "rand_comp":
+            optional.add("pattern_probabilities")
+        for name, value in vars(self).items():
+            if name == "sampler" or name in optional or (name in needed) == (value is not None):
+                continue
+            effect = " requires a value" if name in needed else f"={value} has no effect"
+            raise InputError(
+                f"masker.{name}{effect} with masker.sampler={self.sampler} and masker.pairing="
+                f"{self.pairing}."
+            )
+        if self.sigma_height is not None and self.sigma_height < (self.patch_size or 1):
+            raise InputError(f"masker.sigma_height={self.sigma_height} is less than one cell.")
+        shares = self.pattern_probabilities
+        if shares is not None and abs(sum(shares) - 1) > 1e-6:
+            raise InputError(f"masker.pattern_probabilities must sum to 1, got {list(shares)}.")
 
     def __call__(
         self, image_hw: tuple[int, int], centre_yx: Tensor, generator: torch.Generator
@@ -118,24 +137,17 @@ class Masker:
         if self.pairing == "same":
             return MaskPair(taken, taken.clone())
         if self.pairing == "comp":
-            return pattern.complementary(taken)
-        shares = self.pattern_probabilities or THIRDS
-        return pattern.random_complementary(taken, shares, generator)
+            return complementary(taken)
+        return random_complementary(taken, self.pattern_probabilities or THIRDS, generator)
 
     def grid_hw(self, image_hw: tuple[int, int]) -> tuple[int, int]:
-        """(h, w) cells of a crop of `image_hw` pixels; cheap enough for a check before training.
-
-        Raises:
-            InputError: the patch size does not divide the padded crop.
-        """
+        """(h, w) cells of a crop of `image_hw` pixels; InputError if they are no whole cells."""
         height, width = padded_hw(image_hw)
         size = self.patch_size or STRIDE
         if height % size or width % size:
-            common = math.gcd(height, width)
-            fitting = [str(n) for n in range(TOKEN, common + 1, TOKEN) if common % n == 0]
             raise InputError(
                 f"masker.patch_size={size} does not divide the padded crop of {height}x{width} "
-                f"pixels; sizes that do: {', '.join(fitting)}."
+                f"pixels; it must divide {math.gcd(height, width)}."
             )
         return height // size, width // size
 
@@ -143,18 +155,16 @@ class Masker:
         self, grid_hw: tuple[int, int], centre_yx: Tensor, generator: torch.Generator
     ) -> Tensor:
         """(B, h, w) bool, the cells that one mask takes."""
+        batch = len(centre_yx)
         if self.ratio is None:
-            return pattern.bernoulli(self._log_weight(grid_hw, centre_yx), generator)
+            return bernoulli(self._log_weight(grid_hw, centre_yx), generator)
         if self.sampler == "square":
-            return pattern.square(len(centre_yx), grid_hw, self.ratio, generator)
+            return square(batch, grid_hw, self.ratio, generator)
+        same = centre_yx.new_zeros((batch, *grid_hw), dtype=torch.float32)
         if self.sampler == "bernoulli":
-            every = centre_yx.new_full((len(centre_yx), *grid_hw), self.ratio, dtype=torch.float32)
-            return pattern.bernoulli(every.log(), generator)
-        if self.sampler == "uniform":
-            log_weight = centre_yx.new_zeros((len(centre_yx), *grid_hw), dtype=torch.float32)
-        else:
-            log_weight = self._log_weight(grid_hw, centre_yx)
-        return pattern.fixed_count(log_weight, pattern.num_taken(grid_hw, self.ratio), generator)
+            return bernoulli((same + self.ratio).log(), generator)
+        weight = same if self.sampler == "uniform" else self._log_weight(grid_hw, centre_yx)
+        return fixed_count(weight, num_taken(grid_hw, self.ratio), generator)
 
     def _log_weight(self, grid_hw: tuple[int, int], centre_yx: Tensor) -> Tensor:
         assert self.patch_size, "the constructor requires it"
@@ -169,31 +179,128 @@ class Masker:
         else:
             centre = (centre_yx + 0.5) / self.patch_size
         offset = 0.0 if by_index else 0.5
-        return pattern.gaussian_log_weight(grid_hw, centre, rows / self.sigma_div, offset)
+        return gaussian_log_weight(grid_hw, centre, rows / self.sigma_div, offset)
 
-    def __post_init__(self) -> None:
-        needed = NEEDED[self.sampler]
-        optional = {"sigma_height"} if "sigma_div" in needed else set()
-        if self.pairing == "rand_comp":
-            optional.add("pattern_probabilities")
-        variant = f"masker.sampler={self.sampler} and masker.pairing={self.pairing}"
-        for name, value in vars(self).items():
-            if name == "sampler" or name in optional:
-                continue
-            if name in needed and value is None:
-                raise InputError(f"masker.{name} requires a value with {variant}, but it is null.")
-            if name not in needed and value is not None:
-                raise InputError(
-                    f"masker.{name}={value} has no effect with {variant}; set masker.{name}=null."
-                )
-        if self.sigma_height is not None and self.sigma_height < (self.patch_size or 1):
+
+def num_taken(grid_hw: tuple[int, int], ratio: float) -> int:
+    """How many cells a mask takes: ``ceil(h w ratio)`` (CRM release, mask generator)."""
+    # 20 * 0.55 is 11.000000000000002 in binary; that excess must not cost a cell.
+    return math.ceil(grid_hw[0] * grid_hw[1] * ratio - 1e-9)
+
+
+def gaussian_log_weight(
+    grid_hw: tuple[int, int], centre_yx: Tensor, sigma_cells: float, cell_offset: float
+) -> Tensor:
+    """Logarithm of a Gaussian of the distance between each cell and a centre.
+
+        log W(y, x) = -((y + o - c_y)^2 + (x + o - c_x)^2) / (2 sigma^2)
+
+    Source: SpatialSeg, Sec. IV-B, Eq. 8 (o = 0).
+
+    Centres (B, 2) float and sigma > 0 are in cells; `cell_offset` o says where in a cell its
+    position is measured: 0 its index, 0.5 its middle. (B, h, w) float32, 0 at the centre, negative
+    elsewhere.
+    """
+    y, x = (torch.arange(side, device=centre_yx.device) + cell_offset for side in grid_hw)
+    squared_y = (y - centre_yx[:, :1]) ** 2
+    squared_x = (x - centre_yx[:, 1:]) ** 2
+    return -(squared_y[:, :, None] + squared_x[:, None, :]) / (2 * sigma_cells**2)
+
+
+def fixed_count(log_weight: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """Exactly `count` cells per mask, drawn one after the other without replacement.
+
+    Each draw takes a cell with probability proportional to its weight among the cells still there.
+    The same distribution in one step (Efraimidis and Spirakis, Information Processing Letters 97,
+    2006): take the `count` largest of ``log w - log e`` with independent exponential e.
+
+    (B, h, w) float, all zero to draw uniformly -> (B, h, w) bool.
+    """
+    waiting = torch.empty_like(log_weight).exponential_(generator=generator)
+    keys = (log_weight - waiting.log()).flatten(1)
+    taken = torch.zeros_like(keys, dtype=torch.bool)
+    taken.scatter_(1, keys.topk(count, dim=1).indices, value=True)
+    return taken.view_as(log_weight)
+
+
+def bernoulli(log_probability: Tensor, generator: torch.Generator) -> Tensor:
+    """Every cell of (B, h, w), <= 0, independently with its own probability; their number varies.
+
+    Source: SpatialSeg, Sec. IV-B, Eq. 9.
+    """
+    uniform = torch.rand(log_probability.shape, generator=generator, device=log_probability.device)
+    return uniform < log_probability.exp()
+
+
+def square(
+    batch: int, grid_hw: tuple[int, int], ratio: float, generator: torch.Generator
+) -> Tensor:
+    """One rectangle per mask at a uniformly drawn position, `ratio` of the height and of the width.
+
+    Paper: CRM, Fig. 5 (half the height and half the width, so a quarter of the area).
+    Released: rows and columns of the slice are exchanged and the mask is in pixels where tokens are
+    expected, so the released square mask stops with a size mismatch.
+
+    Sides are rounded to whole cells; (B, h, w) bool on the device of `generator`.
+    """
+    inside = [_interval(batch, length, round(length * ratio), generator) for length in grid_hw]
+    return inside[0][:, :, None] & inside[1][:, None, :]
+
+
+def _interval(batch: int, length: int, extent: int, generator: torch.Generator) -> Tensor:
+    """(B, length) bool: `extent` neighbours, every position equally likely."""
+    device = generator.device
+    start = torch.randint(length - extent + 1, size=[batch, 1], generator=generator, device=device)
+    position = torch.arange(length, device=device)
+    return (position >= start) & (position < start + extent)
+
+
+def complementary(taken: Tensor) -> MaskPair:
+    """RGB hides the taken cells (B, h, w), thermal all others.
+
+    Source: CRM, Sec. 3.2 (there 1 keeps a cell; here True hides it); SpatialSeg, Eqs 6 and 10.
+    """
+    return MaskPair(rgb=taken, thermal=~taken)
+
+
+def random_complementary(
+    taken: Tensor, probabilities: tuple[float, float, float], generator: torch.Generator
+) -> MaskPair:
+    """One of three patterns per sample: only thermal hidden, only RGB hidden, both complementary.
+
+        (M_rgb, M_th) = (0, 1 - m), (m, 0) or (m, 1 - m)
+
+    Source: SpatialSeg, Eq. 11, and the default of both releases (`rand_comp`), each pattern with
+    probability 1/3. The CRM paper describes the third alone (`complementary`).
+
+    `taken` m is (B, h, w) bool; the probabilities, in this order, sum to 1.
+    """
+    batch = len(taken)
+    weights = torch.tensor(probabilities, device=taken.device)
+    pattern = torch.multinomial(weights, batch, replacement=True, generator=generator)
+    pattern = pattern[:, None, None]
+    return MaskPair(rgb=taken & (pattern != 0), thermal=~taken & (pattern != 1))
+
+
+def check_masker(masker: object, image_hw: tuple[int, int], generator: torch.Generator) -> None:
+    """Draw one mask of a user's own masker, and refuse one that does not fit the crop.
+
+    The networks would read other cells than were meant.
+
+    Raises:
+        InputError: naming its class, what it returned and what was expected.
+    """
+    check_members("masker", masker, (), {"__call__": ("image_hw", "centre_yx", "generator")})
+    found = masker(image_hw, torch.zeros(1, 2, dtype=torch.int64), generator)  # type: ignore[operator]
+    height, width = padded_hw(image_hw)
+    masks = tuple(found) if isinstance(found, MaskPair) else (found,)
+    for mask in masks:
+        shape = tuple(getattr(mask, "shape", ()))
+        fits = len(masks) == 2 and len(shape) == 3 and shape[0] == 1 and 0 not in shape
+        fits = fits and shape == masks[0].shape and not (height % shape[1] or width % shape[2])
+        if not fits or mask.dtype != torch.bool:
             raise InputError(
-                f"masker.sigma_height must be at least masker.patch_size={self.patch_size}, got "
-                f"{self.sigma_height}."
-            )
-        shares = self.pattern_probabilities
-        if shares is not None and abs(sum(shares) - 1) > 1e-6:
-            raise InputError(
-                "masker.pattern_probabilities must be three numbers >= 0 with sum 1 (only thermal, "
-                f"only RGB, both), got {list(shares)}."
+                f"masker: {type(masker).__name__} returned {described(mask)}; expected "
+                f"MaskPair(rgb, thermal), each bool (B, h, w), h and w dividing {height} and "
+                f"{width}, the padded size of the crop."
             )

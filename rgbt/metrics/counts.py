@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import cast, get_args
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,17 +16,7 @@ from rgbt.metrics.details import details_of
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.names import DAY, NIGHT
 
-ARCHIVE = Archive(
-    "rgbt counts 1",
-    "counts",
-    "evaluate the run to write it",
-    {
-        **{"counts": "iu N R J K", "names": "U N", "night": "b M", "classes": "U K"},
-        **{"partition": "U", "dataset": "U", "split": "U", "unscored": "U L"},
-        "absent": "U",
-    },
-    optional=("unscored", "absent"),
-)
+ARCHIVE = Archive("rgbt counts 2", "counts", "evaluate the run to write it")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,9 +39,10 @@ class Counts:
             positive of that class, and the other way round a miss.
         absent: convention for absent classes (`rgbt.metrics.scores`) of the evaluation that counted
             them; scores that are derived later follow it unless another one is requested.
+        run: key of the run whose network predicted; "" for others.
 
     Raises:
-        ValueError: the lengths do not agree, `unscored` names no class or all of them, or there is
+        ValueError: the sizes do not agree, `unscored` names no class or all of them, or there is
             no such convention.
     """
 
@@ -64,6 +55,7 @@ class Counts:
     split: str
     unscored: tuple[str, ...] = ()
     absent: Absent = "released"
+    run: str = ""
 
     def __post_init__(self) -> None:
         shape = self.counts.shape
@@ -71,19 +63,14 @@ class Counts:
         details = details_of(self.partition)
         rows = classes if details is None else details.measures(classes)
         groups = 1 if details is None else details.groups
-        if len(shape) != 4 or shape[0] != len(self.names) or shape[2:] != (rows, classes):
+        expected = (len(self.names), *shape[1:2], rows, classes)
+        if shape != expected or shape[1] % groups or self.counts.dtype.kind not in "iu":
             raise ValueError(
-                f"counts: expected shape N={len(self.names)} x R x K={rows} x K={classes}, "
-                f"got {shape}."
-            )
-        if shape[1] % groups:
-            raise ValueError(
-                f"counts: expected a multiple of {groups} rows by {self.partition}, got {shape[1]}."
+                f"counts: expected integers, N={len(self.names)} x R (a multiple of {groups}) x "
+                f"{rows} x K={classes}, got {shape} {self.counts.dtype}."
             )
         if self.night is not None and len(self.night) != len(self.names):
-            raise ValueError(
-                f"night: expected {len(self.names)} values, one per image, got {len(self.night)}."
-            )
+            raise ValueError(f"night: expected {len(self.names)} values, got {len(self.night)}.")
         scored_classes(self.classes, self.unscored)
         if self.absent not in get_args(Absent):
             raise ValueError(f"absent: expected released or exclude, got '{self.absent}'.")
@@ -111,12 +98,11 @@ class Counts:
         """
         index_of = {name: index for index, name in enumerate(self.names)}
         wanted = tuple(names)
-        for name in wanted:
-            if name not in index_of:
-                raise InputError(
-                    f"image '{name}' is not among the {len(self.names)} counted images of split "
-                    f"'{self.split}'; {nearest(name, self.names[:20])}."
-                )
+        if missing := [name for name in wanted if name not in index_of]:
+            raise InputError(
+                f"image '{missing[0]}' is not among the {len(self.names)} counted images of split "
+                f"'{self.split}'; {nearest(missing[0], self.names[:20])}."
+            )
         return self._take([index_of[name] for name in wanted])
 
     def parts(self) -> dict[str, Counts]:
@@ -139,25 +125,20 @@ class Counts:
     def load(cls, path: Path) -> Counts:
         """Read what `save` wrote.
 
-        Files from before `unscored` was stored score every class; files from before `absent` was
-        stored score absent classes as "released", as every data set did then.
-
         Raises:
             InputError: no such file, or not a file of counts.
         """
-        values = ARCHIVE.load(path)
-        with ARCHIVE.refusing(path):
-            return cls(
-                counts=values["counts"],
-                names=tuple(values["names"].tolist()),
-                night=tuple(values["night"].tolist()) or None,
-                classes=tuple(values["classes"].tolist()),
-                partition=str(values["partition"]),
-                dataset=str(values["dataset"]),
-                split=str(values["split"]),
-                unscored=tuple(values["unscored"].tolist()) if "unscored" in values else (),
-                absent=cast(Absent, str(values.get("absent", "released"))),
-            )
+        return ARCHIVE.load(path, cls._of_arrays)
+
+    @classmethod
+    def _of_arrays(cls, arrays: dict[str, NDArray[Any]]) -> Counts:
+        lists = {key: tuple(arrays[key].tolist()) for key in ("names", "classes", "unscored")}
+        texts = {
+            key: str(arrays[key]) for key in ("partition", "dataset", "split", "absent", "run")
+        }
+        night = tuple(arrays["night"].astype(bool).tolist()) or None
+        given: dict[str, Any] = {**lists, **texts}
+        return cls(counts=arrays["counts"], night=night, **given)
 
     def _take(self, indices: list[int]) -> Counts:
         night = None if self.night is None else tuple(self.night[index] for index in indices)

@@ -1,24 +1,29 @@
-"""The partition of the image and the rule for absent classes, configured by conf/metric/."""
+"""Partitions of an image into regions of equal area, and the rule for absent classes.
+
+`Regions` is the choice of conf/metric/. Index r of its map is region r + 1 of the tables.
+"""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Annotated, Literal
 
+import numpy as np
 from annotated_types import Interval
+from numpy.typing import NDArray
 
 from rgbt.checks import InputError
-from rgbt.metrics.regions import (
-    MAX_REGIONS,
-    Aspect,
-    Partition,
-    RegionMap,
-    ring_map,
-    strip_map,
-)
 
 Absent = Literal["released", "exclude"]
+Partition = Literal["ring", "vertical", "horizontal"]
+Aspect = Literal["image", "released_3_4"]
+RegionMap = NDArray[np.uint8]
+"""(H, W): region index 0..R-1 of every pixel."""
+
+MAX_REGIONS = 255
+"""What the bytes of a `RegionMap` can number."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,13 +34,13 @@ class Regions:
         partition: "ring" nested rectangles, region 1 innermost; "vertical" strips from left to
             right; "horizontal" strips from top to bottom.
         regions: number of regions of equal area, 1..255.
-        aspect: of the rings: "image" or "released_3_4" (see `rgbt.metrics.regions.ring_map`);
-            None for strips, which have none.
+        aspect: of the rings: "image" or "released_3_4" (see `ring_map`); None for strips, which
+            have none.
         absent: score of a class without a pixel to count: "released" 0, "exclude" left out of
             the mean (see `rgbt.metrics.scores`).
 
     Raises:
-        InputError: a number out of range, or an aspect where it cannot take effect.
+        InputError: an aspect where it cannot take effect.
     """
 
     partition: Partition
@@ -45,10 +50,8 @@ class Regions:
 
     def __post_init__(self) -> None:
         if (self.partition == "ring") != (self.aspect is not None):
-            wanted = "image or released_3_4" if self.partition == "ring" else "null"
             raise InputError(
-                f"metric.aspect must be {wanted} with metric.partition={self.partition}, "
-                f"got {self.aspect or 'null'}."
+                f"metric.aspect={self.aspect or 'null'}: a ring has an aspect, a strip has null."
             )
 
     @property
@@ -71,5 +74,72 @@ def _region_map(
     partition: Partition, regions: int, aspect: Aspect | None, image_hw: tuple[int, int]
 ) -> RegionMap:
     if aspect is not None:
-        return ring_map(image_hw, regions, aspect)
-    return strip_map(image_hw, regions, vertical=partition == "vertical")
+        found = ring_map(image_hw, regions, aspect)
+    else:
+        found = strip_map(image_hw, regions, vertical=partition == "vertical")
+    if np.bincount(found.ravel(), minlength=regions).min() == 0:
+        size = "{}x{}".format(*image_hw)
+        raise InputError(f"metric.regions={regions} is too many for an image of {size} pixels.")
+    found.flags.writeable = False
+    return found
+
+
+def strip_map(image_hw: tuple[int, int], regions: int, *, vertical: bool) -> RegionMap:
+    """Strips of equal width (``vertical``, left to right) or height (top to bottom).
+
+    Pixel n of a side of length N lies in region ``floor(n R / N)``, so that widths differ by at
+    most one pixel; R is `regions`. Source: SpatialSeg, Fig. 2; the release has no strips.
+    """
+    length = image_hw[1] if vertical else image_hw[0]
+    strip = (np.arange(length) * regions // length).astype(np.uint8)
+    return np.broadcast_to(strip if vertical else strip[:, None], image_hw).copy()
+
+
+def ring_map(image_hw: tuple[int, int], regions: int, aspect: Aspect) -> RegionMap:
+    """Nested centred rectangles of equal area steps; index 0 is the innermost.
+
+    The rectangle around regions 0..r-1 has the area ``r H W / R``; R is `regions`.
+    Paper: SpatialSeg, Sec. IV-D and Fig. 2(c); region 1 is the centre; `aspect` "image" gives the
+    rectangles the image's own. Released: sides in the ratio 3:4 for every image, numbered from the
+    outside ("released_3_4" is the same map with our numbers). For images of 3:4 both are equal.
+
+    Raises:
+        InputError: the released rectangles do not fit into the image.
+    """
+    height, width = image_hw
+    region_map = np.full(image_hw, regions - 1, np.uint8)
+    for inner in range(regions - 1, 0, -1):
+        rows, columns = ring_rectangle(image_hw, regions, inner, aspect)
+        if rows.start < 0 or columns.start < 0:
+            raise InputError(
+                f"metric.aspect=released_3_4: the rectangle around region {inner} of {regions} "
+                f"does not fit into {height}x{width} pixels; use metric.aspect=image."
+            )
+        region_map[rows, columns] = inner - 1
+    return region_map
+
+
+def ring_rectangle(
+    image_hw: tuple[int, int], regions: int, inner: int, aspect: Aspect
+) -> tuple[slice, slice]:
+    """Rows and columns, half open, of the rectangle around the `inner` innermost regions.
+
+    Its sides are ``H sqrt(r / R)`` and ``W sqrt(r / R)`` ("image"), or ``3 s`` and ``4 s`` with
+    ``12 s^2 = r H W / R`` ("released_3_4"); bounds are cut to integers as in the SpatialSeg
+    release. Squares are kept as whole fractions: no rounding decides where an edge falls.
+    """
+    height, width = image_hw
+    if aspect == "image":
+        squares = (height * height * inner, regions), (width * width * inner, regions)
+    else:
+        area = inner * height * width
+        squares = (3 * area, 4 * regions), (4 * area, 3 * regions)
+    return _centred(height, *squares[0]), _centred(width, *squares[1])
+
+
+def _centred(length: int, numerator: int, denominator: int) -> slice:
+    """``floor((length -+ sqrt(numerator / denominator)) / 2)``, exactly."""
+    floor_side = math.isqrt(numerator // denominator)
+    exact = floor_side * floor_side * denominator == numerator
+    ceil_side = floor_side if exact else floor_side + 1
+    return slice((length - ceil_side) // 2, (length + floor_side) // 2)

@@ -1,17 +1,14 @@
 """Compute scores from counts by the names that tables and comparisons use.
 
-``[day/ or night/]`` and then one of ``mIoU Var mAcc mPrecision mF1 pixel_accuracy``, ``region/<n>``
-(mIoU of region n), ``class/<name>`` (IoU), ``class/<name>/acc``, ``class/<name>/region/<n>``; of
-counts of pairs of frames (`rgbt.metrics.pairs`) ``TC CA CA_released`` and ``class/<name>/TC`` etc.;
-``warping_error`` and ``class/<name>/warping_error``, of three frames ``flicker``;
-of details (`rgbt.metrics.details`) ``boundary_mIoU ECE distance/<bin> size/<bin>``, each also after
-``region/<n>/`` and ``class/<name>/`` (there ``boundary_IoU``), as in
-``class/car/region/1/size/64-256``.
-Means are over the scored classes (`Counts.scored`); every single class is available by name.
+A name is ``[day/ or night/][class/<name>/][region/<n>/][score]``, where the score is one of
+`SCOPES`; distance and size are followed by a bin: ``class/car/region/1/size/64-256``. Without a
+score, ``region/<n>`` is the mIoU of region n, and ``class/<name>`` the IoU of a class. Means are
+over the scored classes (`Counts.scored`); every single class is available by name.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -20,13 +17,22 @@ from numpy.typing import NDArray
 
 from rgbt.checks import InputError, nearest
 from rgbt.metrics import names, pairs
-from rgbt.metrics.boundary import boundary_iou
-from rgbt.metrics.calibration import ece
 from rgbt.metrics.counts import Counts
-from rgbt.metrics.details import DetailKind, Details, details_of, parse_detail
+from rgbt.metrics.details import DetailKind, details_of
 from rgbt.metrics.metric import Absent
-from rgbt.metrics.scene_counts import object_recall
-from rgbt.metrics.scores import MEANS, Matrices, Scores, class_mean, iou, miou, recall, variance
+from rgbt.metrics.scores import (
+    MEANS,
+    Matrices,
+    Scores,
+    boundary_iou,
+    class_mean,
+    ece,
+    iou,
+    miou,
+    object_recall,
+    recall,
+    variance,
+)
 
 OF_PAIRS: dict[str, Callable[[Matrices, Absent], Scores]] = {
     names.TC: pairs.tc,
@@ -50,11 +56,33 @@ SCORES_OF: dict[pairs.Protocol, tuple[str, ...]] = {
 }
 """Protocol of pairs of frames -> the scores of its counts."""
 
-FORMS = (
-    *("region/<n>", "class/<name>", "class/<name>/acc", "class/<name>/region/<n>"),
-    *(names.of_class("<name>", score) for score in (*OF_PAIRS, *CHANGES)),
-    *(names.BOUNDARY_MIOU, names.ECE, f"class/<name>/{names.BOUNDARY_IOU}"),
-    *(names.in_bin(kind, "<low>-<high>") for kind in (names.DISTANCE, names.SIZE)),
+KIND_OF: dict[str, DetailKind] = {
+    **dict.fromkeys((names.BOUNDARY_MIOU, names.BOUNDARY_IOU), "boundary"),
+    **{names.ECE: "calibration", names.DISTANCE: "distance", names.SIZE: "size"},
+}
+"""Score of details -> the kind of counts that has it."""
+
+BY_CLASS: dict[str, Callable[[Matrices, Absent], Scores]] = {
+    **{"IoU": iou, "acc": recall, names.DISTANCE: iou},
+    **dict.fromkeys((names.BOUNDARY_MIOU, names.BOUNDARY_IOU), boundary_iou),
+    names.SIZE: lambda counts, _: object_recall(counts),
+}
+"""Scores of one region and bin by class as fractions (..., K)."""
+
+SCOPES: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys((*MEANS, names.VAR), ("",)),
+    **dict.fromkeys((*OF_PAIRS, *CHANGES), ("", "class")),
+    **{"acc": ("class",), names.BOUNDARY_MIOU: ("", "region")},
+    names.BOUNDARY_IOU: ("class", "class region"),
+    **dict.fromkeys(
+        (names.ECE, names.DISTANCE, names.SIZE), ("", "region", "class", "class region")
+    ),
+}
+"""Score -> what may be named before it."""
+
+NAME = re.compile(
+    r"((?P<part>day|night)/)?(class/(?P<name>[^/]+)(/|$))?(region/(?P<region>[1-9]\d*)(/|$))?"
+    r"(?P<score>[A-Za-z]\w*)?(/(?P<bin>\d+(\.\d+)?-(\d+(\.\d+)?|inf)))?"
 )
 
 
@@ -64,12 +92,10 @@ class ParsedMetric:
 
     Attributes:
         part: "day", "night", or None for all images.
-        score: a mean over classes, "Var", "IoU", "acc", one of `OF_PAIRS` or `CHANGES`, or the
-            kind of details.
+        score: one of `SCOPES`, or "IoU" of a class.
         class_name: of one class alone, or None.
         region: number from 1, or None for the whole image.
-        details: kind of details that have the score; None: other counts.
-        bin: of distance and size, e.g. "10-20".
+        bin: of distance and size, e.g. "10-20"; "" for others.
     """
 
     metric: str
@@ -77,8 +103,18 @@ class ParsedMetric:
     score: str
     class_name: str | None = None
     region: int | None = None
-    details: DetailKind | None = None
     bin: str = ""
+
+    @property
+    def details(self) -> DetailKind | None:
+        """Kind of details that have the score; None: other counts."""
+        return KIND_OF.get(self.score)
+
+    @property
+    def needs(self) -> str:
+        """The counts that have the score, in words."""
+        of_pairs = self.score in OF_PAIRS or self.score in CHANGES
+        return self.details or ("pairs of frames" if of_pairs else "single frames")
 
 
 def parse(metric: str) -> ParsedMetric:
@@ -87,26 +123,18 @@ def parse(metric: str) -> ParsedMetric:
     Raises:
         InputError: it is not a metric name; the message contains the nearest one.
     """
-    words = metric.split("/")
-    part = words.pop(0) if words[0] in (names.DAY, names.NIGHT) else None
-    detail = parse_detail(words)
-    if detail is not None:
-        kind = detail.kind
-        return ParsedMetric(metric, part, kind, detail.class_name, detail.region, kind, detail.bin)
-    match words:
-        case [score] if score in {*MEANS, *OF_PAIRS, *CHANGES, names.VAR}:
-            return ParsedMetric(metric, part, score)
-        case ["region", number] if _is_number(number):
-            return ParsedMetric(metric, part, names.MIOU, region=int(number))
-        case ["class", name] if name:
-            return ParsedMetric(metric, part, "IoU", name)
-        case ["class", name, "acc"] if name:
-            return ParsedMetric(metric, part, "acc", name)
-        case ["class", name, score] if name and score in {*OF_PAIRS, *CHANGES}:
-            return ParsedMetric(metric, part, score, name)
-        case ["class", name, "region", number] if name and _is_number(number):
-            return ParsedMetric(metric, part, "IoU", name, int(number))
-    known = nearest("/".join(words), [*MEANS, names.VAR, *OF_PAIRS, *CHANGES, *FORMS])
+    if (found := NAME.fullmatch(metric)) and not metric.endswith("/"):
+        scope = " ".join(
+            key for key, group in (("class", "name"), ("region", "region")) if found[group]
+        )
+        score, which = found["score"], found["bin"] or ""
+        is_binned = score in (names.DISTANCE, names.SIZE)
+        is_known = scope in SCOPES.get(score, ()) if score else bool(scope)
+        if is_known and bool(which) == is_binned:
+            region = int(found["region"]) if found["region"] else None
+            score = score or ("IoU" if found["name"] else names.MIOU)
+            return ParsedMetric(metric, found["part"], score, found["name"], region, which)
+    known = nearest(re.sub("^(day|night)/", "", metric), [*SCOPES, "region/<n>", "class/<name>"])
     raise InputError(
         f"'{metric}' is not a metric; {known}; each may have the prefix day/ or night/."
     )
@@ -144,26 +172,32 @@ def values(
         InputError: no such class or region, or a metric that such counts do not have.
     """
     check_kind(parsed, like.partition)
-    details = details_of(like.partition)
-    if details is not None:
-        return _of_details(parsed, details, by_region, like, absent)
+    name, details = parsed.class_name, details_of(like.partition)
+    index = None if name is None else _class_index(parsed, like.classes)
+
+    def mean_or_class(by_class: Scores) -> Scores:
+        found = class_mean(by_class, like.scored) if index is None else by_class[..., index]
+        return np.asarray(found)
+
     if parsed.score in CHANGES:
-        return 100.0 * _share(parsed, *CHANGES[parsed.score](by_region), like.classes)
+        part, every = (
+            each.sum(-1) if index is None else each[..., index]
+            for each in CHANGES[parsed.score](by_region)
+        )
+        return 100.0 * np.divide(part, every, out=np.full_like(every, np.nan), where=every > 0)
     if parsed.score in OF_PAIRS:
-        by_class = 100.0 * pair_scores(parsed.score, by_region, like.partition, absent)
-        if parsed.class_name is None:
-            return class_mean(by_class, like.scored)
-        return _of_class(parsed, by_class, like.classes)
+        return mean_or_class(100.0 * pair_scores(parsed.score, by_region, like.partition, absent))
     if parsed.score == names.VAR:
         return variance(miou(by_region, absent, like.scored))
-    if parsed.region is None:
-        matrices = by_region.sum(-3)
-    else:
-        matrices = by_region[..., _row(parsed, by_region.shape[-3]), :, :]
-    if parsed.class_name is None:
-        return 100.0 * MEANS[parsed.score](matrices, absent, like.scored)
-    score = recall if parsed.score == "acc" else iou
-    return _of_class(parsed, 100.0 * score(matrices, absent), like.classes)
+    groups = 1 if details is None else details.groups
+    *leading, _, measures, classes = by_region.shape
+    chosen = _of_region(parsed, by_region.reshape(*leading, -1, groups, measures, classes))
+    if parsed.score == names.ECE:
+        return 100.0 * ece(chosen if index is None else chosen[..., index : index + 1])
+    group = chosen[..., details.bins.index(parsed.bin) if details and parsed.bin else 0, :, :]
+    if parsed.score in MEANS:
+        return 100.0 * MEANS[parsed.score](group, absent, like.scored)
+    return 100.0 * mean_or_class(BY_CLASS[parsed.score](group, absent))
 
 
 def pair_scores(score: str, by_region: Matrices, partition: str, absent: Absent) -> Scores:
@@ -178,61 +212,24 @@ def pair_scores(score: str, by_region: Matrices, partition: str, absent: Absent)
     return OF_PAIRS[score](by_region, absent)
 
 
-def _share(
-    parsed: ParsedMetric, part: Scores, every: Scores, classes: tuple[str, ...]
-) -> NDArray[np.float64]:
-    """Share (...) of pixels (..., K), of all classes or of one; NaN without pixels."""
-    if parsed.class_name is None:
-        part, every = part.sum(-1), every.sum(-1)
-    else:
-        part, every = (_of_class(parsed, each, classes) for each in (part, every))
-    return np.divide(part, every, out=np.full_like(every, np.nan), where=every > 0)
-
-
 def check_kind(parsed: ParsedMetric, partition: str) -> None:
-    """Refuse a score of pairs of frames or of details from other counts, and the other way round.
-
-    Raises:
-        InputError: such counts do not have it.
-    """
-    details = details_of(partition)
-    kind = None if details is None else details.kind
-    if parsed.details != kind:
-        counted = f"these counts ({partition})"
-        if parsed.details is not None:
-            raise InputError(
-                f"'{parsed.metric}' is a score of {parsed.details}, which {counted} do not have. "
-                f"Count it with rgbt evaluate run=... details={parsed.details}"
-            )
+    """Refuse a score of other counts; InputError says how counts that have it are made."""
+    details, protocol = details_of(partition), pairs.protocol_of(partition)
+    has = details.kind if details else "pairs of frames" if protocol else "single frames"
+    these = f"these counts ({partition})"
+    if has != parsed.needs:
+        command = "consistency" if parsed.needs == "pairs of frames" else "evaluate"
+        option = f" details={parsed.details}" if parsed.details else ""
         raise InputError(
-            f"'{parsed.metric}' is no score of {counted}. Use scores of {kind}, or name counts "
-            "without details."
+            f"'{parsed.metric}' is a score of {parsed.needs}, but {these} are of {has}; use counts "
+            f"of rgbt {command} run=...{option}"
         )
-    if details is not None:
-        if parsed.bin and parsed.bin not in details.bins:
-            raise InputError(
-                f"'{parsed.metric}': the counts have the bins {', '.join(details.bins)}; use one "
-                "of these, or count again with other edges (rgbt evaluate)."
-            )
-        return
-    protocol = pairs.protocol_of(partition)
-    is_of_pairs = parsed.score in OF_PAIRS or parsed.score in CHANGES
-    if protocol and is_of_pairs and parsed.score not in SCORES_OF[protocol]:
-        raise InputError(
-            f"'{parsed.metric}' is no score of counts by {partition}; use "
-            f"{', '.join(SCORES_OF[protocol])}."
-        )
-    if protocol and not is_of_pairs:
-        raise InputError(
-            f"'{parsed.metric}' is a score of single frames, but these counts ({partition}, of "
-            "rgbt consistency run=...) are of pairs of frames. Use "
-            f"{', '.join(SCORES_OF[protocol])}, or name counts of single frames."
-        )
-    if not protocol and is_of_pairs:
-        raise InputError(
-            f"'{parsed.metric}' is a score of pairs of frames, but these counts ({partition}) are "
-            "of single frames. Count pairs with rgbt consistency run=..."
-        )
+    if protocol and parsed.score not in SCORES_OF[protocol]:
+        known = ", ".join(SCORES_OF[protocol])
+        raise InputError(f"'{parsed.metric}' is no score of {these}; use {known}.")
+    if details and parsed.bin and parsed.bin not in details.bins:
+        bins = ", ".join(details.bins)
+        raise InputError(f"'{parsed.metric}': {these} have the bins {bins}; use one of these.")
 
 
 def images_of(parsed: ParsedMetric, counts: Counts) -> Counts:
@@ -254,53 +251,23 @@ def images_of(parsed: ParsedMetric, counts: Counts) -> Counts:
     return parts[parsed.part]
 
 
-def _of_details(
-    parsed: ParsedMetric, details: Details, by_row: Matrices, like: Counts, absent: Absent
-) -> NDArray[np.float64]:
-    """Percent of counts of details (..., R G, M, K)."""
-    *leading, rows, measures, classes = by_row.shape
-    groups = details.groups
-    by_region = by_row.reshape(*leading, rows // groups, groups, measures, classes)
+def details_of_metric(metric: str) -> DetailKind | None:
+    """The kind of details that a metric name needs; None: other counts, or no metric."""
+    found = NAME.fullmatch(metric)
+    return KIND_OF.get(found["score"] or "") if found else None
+
+
+def _of_region(parsed: ParsedMetric, by_region: Matrices) -> Matrices:
+    """(..., R, G, M, K) -> (..., G, M, K): of the region of a metric, or of all."""
+    regions = by_region.shape[-4]
     if parsed.region is None:
-        chosen = by_region.sum(-4)
-    else:
-        chosen = by_region[..., _row(parsed, rows // groups), :, :, :]
-    if details.kind == "calibration":
-        if parsed.class_name is not None:
-            at = _class_index(parsed, like.classes)
-            chosen = chosen[..., at : at + 1]
-        return 100.0 * ece(chosen)
-    group = chosen[..., details.bins.index(parsed.bin) if parsed.bin else 0, :, :]
-    if details.kind == "boundary":
-        by_class = boundary_iou(group, absent)
-    elif details.kind == "distance":
-        by_class = iou(group, absent)
-    else:
-        by_class = object_recall(group)
-    if parsed.class_name is None:
-        return 100.0 * class_mean(by_class, like.scored)
-    return _of_class(parsed, 100.0 * by_class, like.classes)
-
-
-def _row(parsed: ParsedMetric, regions: int) -> int:
-    """Index of the region of a metric."""
-    if parsed.region is not None and 1 <= parsed.region <= regions:
-        return parsed.region - 1
-    raise InputError(
-        f"'{parsed.metric}': the counts have the regions 1 to {regions}; use counts of more "
-        "regions (another file of conf/metric)."
-    )
-
-
-def _is_number(text: str) -> bool:
-    return text.isdecimal() and int(text) >= 1
-
-
-def _of_class(
-    parsed: ParsedMetric, by_class: NDArray[np.float64], classes: tuple[str, ...]
-) -> NDArray[np.float64]:
-    """(..., K) -> (...)."""
-    return np.asarray(by_class[..., _class_index(parsed, classes)])
+        return np.asarray(by_region.sum(-4))
+    if parsed.region > regions:
+        raise InputError(
+            f"'{parsed.metric}': the counts have the regions 1 to {regions}; use counts of more "
+            "regions (another file of conf/metric)."
+        )
+    return by_region[..., parsed.region - 1, :, :, :]
 
 
 def _class_index(parsed: ParsedMetric, classes: tuple[str, ...]) -> int:

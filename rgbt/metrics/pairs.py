@@ -18,17 +18,13 @@ partition, e.g. "aligned3", is the protocol and S:
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
+from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rgbt.metrics import names
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.scores import Matrices, Scores, iou, known_mean, ratio
-
-if TYPE_CHECKING:
-    from torch import Tensor
 
 Protocol = Literal["aligned", "released", "next", "flow", "triples"]
 PROTOCOLS: tuple[Protocol, ...] = get_args(Protocol)
@@ -41,8 +37,6 @@ HEADLINES: dict[Protocol, tuple[str, ...]] = {
     "triples": (names.FLICKER,),
 }
 """The main scores of a protocol, TC and CA first: CA of the paper, or that of its release."""
-
-Map: TypeAlias = "NDArray[np.integer] | Tensor"
 
 
 def partition_name(protocol: Protocol, sets: int, views: str = "") -> str:
@@ -66,59 +60,6 @@ def file_name(protocol: Protocol, split: str, views: str = "") -> str:
 
 def _dashed(views: str) -> str:
     return f"-{views}" if views else ""
-
-
-def pair_counts(
-    first: Map, second: Map, label: Map, num_classes: int, valid: Map | None = None
-) -> NDArray[np.int64]:
-    """Counts of one pair of frames; several sets of second frames are put one after the other.
-
-    One histogram over ``(min(label, K) K + first) K + second``, in numbers as narrow as they fit;
-    pixels that do not count have a row K + 1, which is dropped.
-
-    (H, W) integer predictions 0..K-1 of the first frame, as the protocol compares it (anything
-    0..255 where not `valid`), and of the second; its label 0..255, K and above is no class; `valid`
-    (H, W) bool, pixels that count, None: all. (K + 1, K, K): label (row K: no class), first,
-    second; those of several images add. K is 1..255.
-
-    Raises:
-        ValueError: shapes differ, or a prediction that counts is no class.
-    """
-    # Code that only derives scores, such as tables, does not need PyTorch.
-    import torch
-
-    from rgbt.metrics.confusion import LANES
-
-    classes = num_classes
-    if not 1 <= classes <= 255:
-        raise ValueError(f"num_classes must be between 1 and 255, got {classes}.")
-    first_HW, second_HW, label_HW = (
-        torch.as_tensor(each).to(torch.uint8) for each in (first, second, label)
-    )
-    valid_HW = None if valid is None else torch.as_tensor(valid).bool().to(torch.uint8)
-    maps = (first_HW, second_HW, label_HW, valid_HW)
-    shapes = [tuple(each.shape) for each in maps if each is not None]
-    if len(shapes[0]) != 2 or len(set(shapes)) > 1:
-        raise ValueError(
-            "first, second, label and valid: expected maps H x W of one shape, got "
-            f"{', '.join(map(str, shapes))}."
-        )
-    if valid_HW is not None:
-        first_HW = first_HW * valid_HW
-    for name, each in (("first", first_HW), ("second", second_HW)):
-        if int(each.max()) >= classes:
-            raise ValueError(f"{name}: expected classes 0..{classes - 1}, got {int(each.max())}.")
-    size = (classes + 2) * classes**2
-    row_HW = label_HW.clamp(max=classes).to(torch.int16 if LANES * size <= 2**15 else torch.int32)
-    if valid_HW is not None:
-        row_HW = torch.maximum(row_HW, (1 - valid_HW).to(row_HW.dtype) * (classes + 1))
-    joint = row_HW.mul_(classes).add_(first_HW).mul_(classes).add_(second_HW)
-    # Neighbours fall into the same bin: two copies of the histogram take turns, see `confusion`.
-    lane = torch.arange(joint.shape[1], device=joint.device) % LANES * size
-    counted = torch.bincount((joint + lane.to(joint.dtype)).view(-1), minlength=LANES * size)
-    shape = (LANES, classes + 2, classes, classes)
-    found: NDArray[np.int64] = counted.view(shape).sum(0)[: classes + 1].cpu().numpy()
-    return found
 
 
 def tc(pairs: Matrices, absent: Absent) -> Scores:

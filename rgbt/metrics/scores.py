@@ -20,13 +20,14 @@ out counts in none of them, whether it has pixels or not and whatever `absent` s
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rgbt.metrics import names
 from rgbt.metrics.counts import Counts
+from rgbt.metrics.details import UNITS
 from rgbt.metrics.metric import Absent
 
 Scores = NDArray[np.float64]
@@ -114,6 +115,40 @@ def pixel_accuracy(counts: Matrices) -> Scores:
     return _divide(right.sum(-1), labelled.sum(-1), np.nan)
 
 
+def boundary_iou(counts: Matrices, absent: Absent) -> Scores:
+    """``|G_d and P_d| / |G_d or P_d|`` of each class, of counts of boundaries.
+
+    Source: Cheng et al.: "Boundary IoU", CVPR 2021, Sec. 4.
+    Shapes: (..., 3, K), summed over images -> (..., K) fractions 0..1.
+    """
+    both, label, predicted = (counts[..., row, :].astype(np.float64) for row in range(3))
+    return ratio(both, label + predicted - both, absent)
+
+
+def ece(counts: Matrices) -> Scores:
+    """``sum_b |correct_b - confidence_b| / sum_b number_b``, a fraction 0..1.
+
+    That is the mean over pixels of ``|acc(B_m) - conf(B_m)|``. All pixels of all images are pooled,
+    those of unscored classes included.
+
+    Source: Guo et al.: "On Calibration of Modern Neural Networks", ICML 2017, Eq. 3, with M equal
+    bins (0, 1/M], (1/M, 2/M], ... of the highest probability of each pixel.
+    Shapes: (..., M, 3, K), summed over images -> (...); NaN without pixels.
+    """
+    number, correct, confidence = np.moveaxis(counts.sum(-1, dtype=np.float64), -1, 0)
+    gaps = np.abs(correct - confidence / UNITS).sum(-1)
+    return _divide(gaps, number.sum(-1), np.nan)
+
+
+def object_recall(counts: Matrices) -> Scores:
+    """Recall of each class among the pixels of objects: ``TP / (TP + FN)``. Shapes as in `iou`.
+
+    NaN where no object of that size has a pixel of the class, whatever the convention for absent
+    classes: most classes have no objects of most sizes, and no published table counts them as 0.
+    """
+    return recall(counts, "exclude")
+
+
 MEANS: dict[str, Callable[[Matrices, Absent, Scored], Scores]] = {
     names.MIOU: miou,
     names.MACC: lambda counts, absent, scored: class_mean(recall(counts, absent), scored),
@@ -153,6 +188,39 @@ def _mean_and_variance(counts: Counts, absent: Absent) -> dict[str, float]:
         names.MIOU: float(miou(counts.whole(), absent, counts.scored)),
         names.VAR: float(variance(miou(counts.by_region(), absent, counts.scored))),
     }
+
+
+def absent_notes(
+    by_region: NDArray[np.integer],
+    classes: Sequence[str],
+    scored: NDArray[np.bool_],
+    split: str,
+    absent: Absent,
+) -> tuple[str, ...]:
+    """Footnotes of a class table, about absent classes that change the means over classes.
+
+    A class is absent where it is neither labelled nor predicted.
+
+    Of the (R, K, K) counts of all images, K names and the scored ones (K,), the others not being
+    mentioned: at most three sentences without a full stop, about absent classes, classes that are
+    predicted only, and classes that some regions lack.
+    """
+    counted = {"released": "counted as 0", "exclude": "left out of the mean"}[absent]
+    labelled = by_region.sum(-1) > 0
+    there = labelled | (by_region.sum(-2) > 0)
+    gone, unlabelled = ~there.any(0), there.any(0) & ~labelled.any(0)
+    lacks = []
+    for each in np.flatnonzero(scored & there.any(0) & ~there.all(0)).tolist():
+        regions = [str(number) for number in (np.flatnonzero(~there[:, each]) + 1)]
+        lacks.append(f"{classes[each]} (region{'s' * (len(regions) > 1)} {', '.join(regions)})")
+    named = {
+        f"absent from the {split} split: {{}} ({counted})": np.array(classes)[scored & gone],
+        f"predicted, but not labelled in the {split} split: {{}} (IoU 0)": np.array(classes)[
+            scored & unlabelled
+        ],
+        f"absent from some regions: {{}}; {counted} there": lacks,
+    }
+    return tuple(note.format(", ".join(each)) for note, each in named.items() if len(each))
 
 
 def _sums(counts: Matrices) -> tuple[Scores, Scores, Scores]:

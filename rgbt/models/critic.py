@@ -37,10 +37,7 @@ class Critic(nn.Module):
     ) -> None:
         super().__init__()
         if align_corners and not upsample:
-            raise InputError(
-                "critic.align_corners=true has no effect with critic.upsample=false; "
-                "set it to false."
-            )
+            raise InputError("critic.align_corners has no effect with critic.upsample=false.")
         self.in_channels = in_channels
         self.upsample = upsample
         self.align_corners = align_corners
@@ -61,16 +58,12 @@ class Critic(nn.Module):
         (N, in_channels, H, W), sides of at least 32 -> (N, 1, h, w) with h = H // 32, w = W // 32,
         or 32 times that with `upsample`: H and W, or a little less where 32 does not divide them.
 
-        Raises:
-            InputError: a map that is too small.
-            ValueError: another number of channels.
+        ValueError: another number of channels. InputError: a map that is too small.
         """
         sizes = check_shape("map", x, "N C H W", C=self.in_channels)
         if min(sizes["H"], sizes["W"]) < STRIDE:
-            raise InputError(
-                f"a discriminator requires maps of at least {STRIDE} x {STRIDE}, got {sizes['H']} "
-                f"x {sizes['W']}; use larger crops, or a discriminator on the class scores."
-            )
+            got = f"{sizes['H']} x {sizes['W']}"
+            raise InputError(f"a discriminator requires maps of at least 32 x 32, got {got}.")
         for conv in (self.conv1, self.conv2, self.conv3, self.conv4):
             x = F.leaky_relu(conv(x), 0.2)
         verdicts: Tensor = self.classifier(x)

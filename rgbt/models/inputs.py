@@ -62,23 +62,15 @@ class Inputs(nn.Module):
         thermal_scale: Literal["fixed", "image_max"],
     ) -> None:
         super().__init__()
-        if len(thermal_mean) not in (1, 3) or len(thermal_std) != len(thermal_mean):
-            raise InputError(
-                "model.inputs: thermal_mean and thermal_std must have one value, or three if "
-                f"thermal is repeated for three channels, got {len(thermal_mean)} and "
-                f"{len(thermal_std)}."
-            )
+        if len(thermal_mean) == 2 or len(thermal_std) != len(thermal_mean):
+            raise InputError("model.inputs: thermal_mean and thermal_std must both have 1 or 3.")
         self.rgb_order = rgb_order
         self.thermal_scale = thermal_scale
+        self.thermal_channels = len(thermal_mean)
         names = ("rgb_mean", "rgb_std", "thermal_mean", "thermal_std")
         for name, values in zip(names, (rgb_mean, rgb_std, thermal_mean, thermal_std), strict=True):
             scaled = torch.tensor(values).view(-1, 1, 1) / 255
             self.register_buffer(name, scaled, persistent=False)
-
-    @property
-    def thermal_channels(self) -> int:
-        """Channels of the thermal image that the network sees, 1 or 3."""
-        return len(self.thermal_mean)
 
     def forward(
         self, rgb: Tensor, thermal: Tensor, masks: MaskPair | None = None, *, multiple: int = 1
@@ -114,6 +106,11 @@ class Inputs(nn.Module):
         return Images(*(pad_to(image, whole_hw) for image in images))
 
 
+def as_rgb(thermal: Tensor) -> Tensor:
+    """A thermal image (N, 1 or 3, H, W) for a branch of three channels: (N, 3, H, W)."""
+    return thermal.expand(-1, 3, -1, -1)
+
+
 def expand_cells(masks: MaskPair, count: int, image_hw: tuple[int, int], unit: int = 1) -> MaskPair:
     """Cells (N, h, w) to squares of `unit` x `unit` pixels, (N, H/unit, W/unit) bool each.
 
@@ -132,26 +129,22 @@ def expand_cells(masks: MaskPair, count: int, image_hw: tuple[int, int], unit: i
         cell = height // h
         if cell % unit or (h * cell, w * cell) != image_hw:
             raise InputError(
-                f"masker: a grid of {h} x {w} cells does not divide the padded image of "
-                f"{height} x {width} pixels into squares of a multiple of {unit} pixels "
-                f"(patch size {height / h:g} x {width / w:g}); choose a "
-                "masker.patch_size that divides both sides."
+                f"masker.patch_size: {h} x {w} cells do not divide the padded image of "
+                f"{height} x {width} pixels into squares of a multiple of {unit} pixels."
             )
         found.append(mask.repeat_interleave(cell // unit, 1).repeat_interleave(cell // unit, 2))
     return MaskPair(*found)
 
 
 def only_view(views: tuple[View, ...], known: tuple[View, ...], network: str) -> View:
-    """The requested view of a network without stacked views.
+    """The requested view of a network without stacked views; InputError for another one.
 
     `views` as its `forward` got them (empty: the first of `known`), its views, and its name.
-    InputError: more than one view, or one that it does not have.
     """
     requested = views or known[:1]
     if len(requested) > 1 or requested[0] not in known:
         raise InputError(
-            f"{network} predicts from {' or '.join(known)}, one at a time, but got "
-            f"{', '.join(requested)}. Choose modality={known[0]}, or a network with several views "
-            "(model=mask2former_tiny)."
+            f"modality: {network} predicts from {' or '.join(known)}, one at a time, but got "
+            f"{', '.join(requested)}."
         )
     return requested[0]

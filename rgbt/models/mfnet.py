@@ -5,13 +5,15 @@ Parameter names are those of the authors' PyTorch release; "inf" (infrared) is t
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import torch
+from annotated_types import MultipleOf
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.checks import InputError
 from rgbt.models.inputs import Inputs, only_view
-from rgbt.ranges import Channels, NumClasses, Widths
+from rgbt.ranges import Channels, NumClasses
 from rgbt.requirements import Record
 from rgbt.types import MaskPair, Output, View
 
@@ -20,6 +22,8 @@ STRIDE = 16
 
 LEAKY_SLOPE = 0.2
 """Of every leaky ReLU, as released."""
+
+Widths = tuple[Channels, Channels, Channels, Annotated[Channels, MultipleOf(2)]]
 
 
 class ConvUnit(nn.Module):
@@ -65,19 +69,8 @@ class MFNet(nn.Module):
 
     Source: MFNet (Ha et al., IROS 2017).   Released: haqishen/MFNet-pytorch.
 
-    Args:
-        num_classes: K.
-        rgb_widths: channels of the RGB encoder at strides 1, 2, 4 and 8, the last even; stride 16
-            has those of stride 8, since the decoder adds the two.
-        thermal_widths: of the thermal encoder, likewise.
-        decoder_width: channels of the decoder's last features, at stride 2.
-        final_activation: whether the logits are the output of a leaky ReLU, as of every other
-            unit. Released: true. false: its input, with the same weights and the same class at
-            every pixel, for the leaky ReLU rises.
-        inputs: normalisation of the images.
-
-    Raises:
-        InputError: widths that are odd where a mini-inception halves them.
+    The arguments are the keys of ``conf/model/mfnet.yaml``. Stride 16 has the channels of stride 8,
+    since the decoder adds the two. `final_activation` does not change the class of any pixel.
     """
 
     record = Record(views=("rgbt",), recomputed=("conv*", "decode*"))
@@ -93,9 +86,6 @@ class MFNet(nn.Module):
         inputs: Inputs,
     ) -> None:
         super().__init__()
-        for name, widths in (("rgb_widths", rgb_widths), ("thermal_widths", thermal_widths)):
-            if widths[3] % 2:
-                raise InputError(f"model.{name}: the last must be even, got {list(widths)}.")
         self.num_classes = num_classes
         self._add_encoder("rgb", 3, rgb_widths)
         self._add_encoder("inf", inputs.thermal_channels, thermal_widths)
@@ -120,9 +110,8 @@ class MFNet(nn.Module):
         only_view(views, self.record.views, "MFNet")
         images = self.inputs(rgb, thermal, masks, multiple=STRIDE)
         encoded = (self._encode("rgb", images.rgb), self._encode("inf", images.thermal))
-        half, quarter, eighth, last = (torch.cat(pair, 1) for pair in zip(*encoded, strict=True))
-
-        x = self.decode4(doubled(last) + eighth)
+        half, quarter, eighth, x = (torch.cat(pair, 1) for pair in zip(*encoded, strict=True))
+        x = self.decode4(doubled(x) + eighth)
         x = self.decode3(doubled(x) + quarter)
         x = self.decode2(doubled(x) + half)
         x = self.decode1(doubled(x))
@@ -130,29 +119,23 @@ class MFNet(nn.Module):
 
     def _add_encoder(self, suffix: str, channels: int, widths: tuple[int, int, int, int]) -> None:
         full, half, quarter, eighth = widths
-        units: dict[str, nn.Module] = {
-            "conv1": ConvUnit(channels, full),
-            "conv2_1": ConvUnit(full, half),
-            "conv2_2": ConvUnit(half, half),
-            "conv3_1": ConvUnit(half, quarter),
-            "conv3_2": ConvUnit(quarter, quarter),
-            "conv4": MiniInception(quarter, eighth),
-            "conv5": MiniInception(eighth, eighth),
-        }
-        for name, unit in units.items():
-            self.add_module(f"{name}_{suffix}", unit)
+        self.add_module(f"conv1_{suffix}", ConvUnit(channels, full))
+        self.add_module(f"conv2_1_{suffix}", ConvUnit(full, half))
+        self.add_module(f"conv2_2_{suffix}", ConvUnit(half, half))
+        self.add_module(f"conv3_1_{suffix}", ConvUnit(half, quarter))
+        self.add_module(f"conv3_2_{suffix}", ConvUnit(quarter, quarter))
+        self.add_module(f"conv4_{suffix}", MiniInception(quarter, eighth))
+        self.add_module(f"conv5_{suffix}", MiniInception(eighth, eighth))
 
-    def _encode(self, suffix: str, image: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def _encode(self, suffix: str, x: Tensor) -> list[Tensor]:
         """Features at strides 2, 4, 8 (before they are pooled) and 16."""
-
-        def unit(name: str, x: Tensor) -> Tensor:
-            result: Tensor = self.get_submodule(f"{name}_{suffix}")(x)
-            return result
-
-        half = unit("conv2_2", unit("conv2_1", F.max_pool2d(unit("conv1", image), 2)))
-        quarter = unit("conv3_2", unit("conv3_1", F.max_pool2d(half, 2)))
-        eighth = unit("conv4", F.max_pool2d(quarter, 2))
-        return half, quarter, eighth, unit("conv5", F.max_pool2d(eighth, 2))
+        found: list[Tensor] = []
+        for level in (("1",), ("2_1", "2_2"), ("3_1", "3_2"), ("4",), ("5",)):
+            x = F.max_pool2d(x, 2) if found else x
+            for name in level:
+                x = self.get_submodule(f"conv{name}_{suffix}")(x)
+            found.append(x)
+        return found[1:]
 
 
 def doubled(x: Tensor) -> Tensor:

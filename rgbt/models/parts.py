@@ -1,11 +1,8 @@
-"""Parts that networks share: random drops from a given generator, the MLP, and up blocks.
-
-The up blocks are the decoder of HeatNet and of the modified DeepLab.
-"""
+"""Parts that networks share: random drops from a given generator, the MLP, and up blocks."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -18,6 +15,11 @@ from rgbt.ranges import ShareBelowOne
 DropRates = tuple[ShareBelowOne, ShareBelowOne]
 """Channel dropout before the first block, and after every block; each in [0, 1)."""
 
+Keep = Tensor | tuple[None, None]
+"""Factors of the two residuals of a block, (2, N, 1, 1, 1); None where nothing is dropped."""
+
+ALL_KEPT = (None, None)
+
 
 def keep_factors(
     rates: Tensor,
@@ -27,7 +29,7 @@ def keep_factors(
     *,
     dim: int = 0,
 ) -> Tensor:
-    """Factors of residuals that are dropped at random: 0, or 1 / (1 - rate) where kept.
+    """Factors of what is dropped at random: 0, or 1 / (1 - rate) where kept.
 
     Source: Deep Networks with Stochastic Depth, Eq. (4), rescaled while training.
 
@@ -46,6 +48,19 @@ def keep_factors(
     draw = torch.rand(len(rates), *sizes, generator=generator, device=generator.device)
     draw = own(draw, dim + 1)
     return ((draw < probability) / probability).to(device, non_blocking=True)
+
+
+def stochastic_depth(
+    rates: Tensor | None, depths: Sequence[int], x: Tensor, generator: torch.Generator | None
+) -> list[Sequence[Keep]]:
+    """A `Keep` for every block of stages with `depths` blocks, for a batch x (N, ...).
+
+    `rates` are those of all blocks in order; None: nothing is dropped, nothing drawn.
+    """
+    if rates is None:
+        return [[ALL_KEPT] * depth for depth in depths]
+    drawn = keep_factors(rates, (2, len(x), 1, 1, 1), generator, x.device, dim=1)
+    return [stage.unbind() for stage in torch.split(drawn, list(depths))]
 
 
 def add_residual(x: Tensor, residual: Tensor, factor: Tensor | None) -> Tensor:
@@ -79,6 +94,25 @@ class Mlp(nn.Module):
         return out
 
 
+class ResidualBlock(nn.Module):
+    """Attention and a feed-forward network, each normalised before and added to its input."""
+
+    def __init__(
+        self, dim: int, attn: nn.Module, mlp: nn.Module, *, norm_eps: float = 1e-5
+    ) -> None:
+        super().__init__()
+        self.norm1 = nn.LayerNorm(dim, eps=norm_eps)
+        self.attn = attn
+        self.norm2 = nn.LayerNorm(dim, eps=norm_eps)
+        self.mlp = mlp
+
+    def forward(self, x: Tensor, keep: Keep = ALL_KEPT) -> Tensor:
+        """(N, H, W, C) -> the same."""
+        first, second = keep
+        x = add_residual(x, self.attn(self.norm1(x)), first)
+        return add_residual(x, self.mlp(self.norm2(x)), second)
+
+
 class UpBlock(nn.Module):
     """Twice the size (bilinear), 3x3 convolution, normalisation, PReLU with one slope.
 
@@ -107,9 +141,6 @@ def enlarge(
     """`x` (N, C, H, W) through the blocks, with channels dropped before the first and after each.
 
     Rates (0, 0) drop nothing and need no generator, as in evaluation.
-
-    Raises:
-        ValueError: a rate above 0 without a generator.
     """
     first, later = rates
     x = drop_channels(x, first, generator)
@@ -118,29 +149,7 @@ def enlarge(
     return x
 
 
-def check_heads(widths: Iterable[int], heads: Iterable[int]) -> None:
-    """Refuse heads that do not divide the channels of their stage.
-
-    Raises:
-        InputError: naming the stage.
-    """
-    for stage, (width, number) in enumerate(zip(widths, heads, strict=True)):
-        if width % number:
-            raise InputError(
-                f"model.num_heads[{stage}] = {number} must divide the {width} channels of the "
-                "stage."
-            )
-
-
-def check_hidden(key: str, ratios: Iterable[float], widths: Iterable[int]) -> None:
-    """Refuse a ratio (`key` in the configuration) that leaves a feed-forward network no channel.
-
-    Raises:
-        InputError: naming both.
-    """
-    for ratio, width in zip(ratios, widths, strict=True):
-        if int(width * ratio) < 1:
-            raise InputError(
-                f"{key}={ratio:g} gives 0 channels in a stage of {width} channels "
-                "(model.embed_dims); choose a larger ratio, such as 4."
-            )
+def check_heads(key: str, heads: Sequence[int], widths: Sequence[int]) -> None:
+    """InputError unless the heads of every stage, settings of `key`, divide its channels."""
+    if any(width % number for width, number in zip(widths, heads, strict=True)):
+        raise InputError(f"{key}: {list(heads)} must divide the channels {list(widths)}.")

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.models.inputs import Images, Inputs, only_view
+from rgbt.models.inputs import Inputs, only_view
 from rgbt.models.parts import DropRates, UpBlock, enlarge
 from rgbt.models.resnet import bottleneck_stage
 from rgbt.ranges import BaseWidth, Channels, Depths, NumClasses
@@ -21,13 +21,10 @@ STRIDE = 8
 BINS = (1, 2, 3, 6)
 """Cells per side of the pooled maps (PSPNet, Sec. 3.2)."""
 
+Modalities = Literal["late_fusion", "early_fusion", "rgb", "thermal"]
+
 BRANCHES = ("", "_2")
 """What the released names of the first and second branch end with."""
-
-VIEW_OF: dict[str, View] = {
-    **{"late_fusion": "rgbt", "early_fusion": "rgbt"},
-    **{"rgb": "rgb", "thermal": "thermal"},
-}
 
 
 class PSPNet(nn.Module):
@@ -40,17 +37,7 @@ class PSPNet(nn.Module):
     Source: HeatNet, Sec. III; PSPNet.   Released: JohanVer/heatnet, jzuern/heatnet-pub
     (architecture "pspnet"; the names of the weights are theirs without "trgb_segnet.").
 
-    Args:
-        num_classes: K; 13 in the release, 14 in the thesis.
-        depths: bottlenecks per stage.
-        base_width: channels of the stem; the encoder's other widths are multiples of it.
-        decoder_width: channels of the last two up blocks; the first has four times as many.
-        modalities: "late_fusion", a stem and two stages for each image (HeatNet); "early_fusion",
-            one stem for all channels; "rgb" or "thermal", one image alone.
-        dropout: of channels, before the decoder and after each of its blocks.
-        align_corners: of all enlargements; false is the release on current PyTorch, true the
-            thesis' port of it.
-        inputs: normalisation of the images.
+    The arguments are the keys of ``conf/model/heatnet.yaml``.
     """
 
     def __init__(  # noqa: PLR0913 - each is a key of conf/model/*.yaml
@@ -60,7 +47,7 @@ class PSPNet(nn.Module):
         depths: Depths,
         base_width: BaseWidth,
         decoder_width: Channels,
-        modalities: Literal["late_fusion", "early_fusion", "rgb", "thermal"],
+        modalities: Modalities,
         dropout: DropRates,
         align_corners: bool,
         inputs: Inputs,
@@ -71,13 +58,8 @@ class PSPNet(nn.Module):
         self.modalities = modalities
         self.dropout = dropout
         thermal = inputs.thermal_channels
-        channels = {
-            "late_fusion": (3, thermal),
-            "early_fusion": (3 + thermal,),
-            "rgb": (3,),
-            "thermal": (thermal,),
-        }
-        self.feats = PSPNetEncoder(channels[modalities], depths, base_width)
+        channels = {"late_fusion": (3, thermal), "early_fusion": (3 + thermal,), "rgb": (3,)}
+        self.feats = PSPNetEncoder(channels.get(modalities, (thermal,)), depths, base_width)
         pooled, narrow = 16 * base_width, decoder_width
         self.psp = PyramidPooling(32 * base_width, pooled, align_corners=align_corners)
         self.up_1 = UpBlock(pooled, 4 * narrow, align_corners=align_corners)
@@ -93,10 +75,11 @@ class PSPNet(nn.Module):
         self.inputs = inputs
 
     @staticmethod
-    def record_from(*, modalities: str, **_: object) -> Record:
+    def record_from(*, modalities: Modalities, **_: object) -> Record:
         """Output and views."""
+        fused = modalities in ("late_fusion", "early_fusion")
         return Record(
-            views=(VIEW_OF[modalities],),
+            views=("rgbt",) if fused else ("rgb",) if modalities == "rgb" else ("thermal",),
             features=True,
             pretrained_parts=("feats.",),
             recomputed=("feats.layer*.*", "up_*"),
@@ -122,20 +105,17 @@ class PSPNet(nn.Module):
         """
         only_view(views, self.record.views, "PSPNet")
         images = self.inputs(rgb, thermal, masks, multiple=STRIDE)
-        features = self.feats(self._seen(images))
+        seen: tuple[Tensor, ...] = images
+        if self.modalities == "early_fusion":
+            seen = (torch.cat(images, 1),)
+        elif self.modalities != "late_fusion":
+            seen = (images.rgb if self.modalities == "rgb" else images.thermal,)
+        features = self.feats(seen)
         rates = self.dropout if self.training else (0.0, 0.0)
         x = self.psp(features["features"])
         x = enlarge(x, (self.up_1, self.up_2, self.up_3), rates, generator)
         logits = self.final(x)[..., : rgb.shape[2], : rgb.shape[3]]
         return Output(logits, features)
-
-    def _seen(self, images: Images) -> tuple[Tensor, ...]:
-        """One image per branch of the encoder."""
-        if self.modalities == "late_fusion":
-            return images
-        if self.modalities == "early_fusion":
-            return (torch.cat(images, 1),)
-        return (images.rgb if self.modalities == "rgb" else images.thermal,)
 
 
 class PSPNetEncoder(nn.Module):
@@ -164,22 +144,20 @@ class PSPNetEncoder(nn.Module):
 
     def forward(self, images: tuple[Tensor, ...]) -> dict[str, Tensor]:
         """Features by the name of their stage, see `PSPNet.forward`."""
-        found = [self._branch(*each) for each in zip(self.branches, images, strict=True)]
-        stem, layer1, layer2 = (
-            torch.cat(maps, 1) if len(maps) > 1 else maps[0] for maps in zip(*found, strict=True)
+        branches = []
+        for end, image in zip(self.branches, images, strict=True):
+            conv1, bn1, layer1, layer2 = (
+                self.get_submodule(f"{name}{end}") for name in ("conv1", "bn1", "layer1", "layer2")
+            )
+            stem = F.max_pool2d(F.relu(bn1(conv1(image))), 3, stride=2, padding=1)
+            first = layer1(stem)
+            branches.append((stem, first, layer2(first)))
+        stem, first, second = (
+            torch.cat(maps, 1) if len(maps) > 1 else maps[0] for maps in zip(*branches, strict=True)
         )
-        layer3 = self.layer3(layer2)
-        layer4 = self.layer4(layer3)
-        names = ("features", "layer3", "layer2", "layer1", "stem")
-        return dict(zip(names, (layer4, layer3, layer2, layer1, stem), strict=True))
-
-    def _branch(self, end: str, image: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        conv1, bn1, layer1, layer2 = (
-            self.get_submodule(f"{name}{end}") for name in ("conv1", "bn1", "layer1", "layer2")
-        )
-        stem = F.max_pool2d(F.relu(bn1(conv1(image))), 3, stride=2, padding=1)
-        first = layer1(stem)
-        return stem, first, layer2(first)
+        third = self.layer3(second)
+        maps = {"layer3": third, "layer2": second, "layer1": first, "stem": stem}
+        return {"features": self.layer4(third), **maps}
 
 
 class PyramidPooling(nn.Module):

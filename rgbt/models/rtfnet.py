@@ -35,13 +35,10 @@ BASIC = (18, 34)
 
 
 class Upception(nn.Module):
-    """1x1, 3x3 and a third convolution, added to a shortcut.
+    """1x1, 3x3 and a third convolution, added to a shortcut, then a ReLU unless `relu` is false.
 
     Source: RTFNet, Upception block A (3x3 convolution, identity) and block B (`up`: transposed
     convolution, transposed shortcut: twice the size).
-
-    Args:
-        relu: whether the sum passes a ReLU.
     """
 
     def __init__(self, in_channels: int, channels: int, *, up: bool, relu: bool = True) -> None:
@@ -51,18 +48,15 @@ class Upception(nn.Module):
         self.bn1 = nn.BatchNorm2d(channels)
         self.conv2 = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
         self.bn2 = nn.BatchNorm2d(channels)
-        self.conv3 = (
-            nn.ConvTranspose2d(channels, channels, 2, stride=2, bias=False)
-            if up
-            else nn.Conv2d(channels, channels, 3, padding=1, bias=False)
-        )
-        self.bn3 = nn.BatchNorm2d(channels)
-        self.upsample: nn.Module = nn.Identity()
         if up:
-            self.upsample = nn.Sequential(
-                nn.ConvTranspose2d(in_channels, channels, 2, stride=2, bias=False),
-                nn.BatchNorm2d(channels),
-            )
+            self.conv3: nn.Module = nn.ConvTranspose2d(channels, channels, 2, 2, bias=False)
+        else:
+            self.conv3 = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
+        self.bn3 = nn.BatchNorm2d(channels)
+        self.upsample = nn.Sequential()
+        if up:
+            self.upsample.append(nn.ConvTranspose2d(in_channels, channels, 2, 2, bias=False))
+            self.upsample.append(nn.BatchNorm2d(channels))
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, in, H, W) -> (N, out, H, W), with `up` (N, out, 2 H, 2 W)."""
@@ -80,17 +74,8 @@ class RTFNet(nn.Module):
 
     Source: RTFNet (Sun, Zuo, Liu, RA-L 2019).   Released: yuxiangsun/RTFNet.
 
-    Args:
-        num_classes: K.
-        depth: of both ResNets; the release edits a constant, 152 by default.
-        base_width: channels of the stem, a positive even number; everything scales with it. 64 is
-            ResNet's own.
-        final_relu: whether the logits are the output of the last block's ReLU, hence never
-            negative. Released: true. false: the sum before it, with the same weights.
-        thermal_stem: start of the thermal encoder's first convolution. "rgb_mean": the mean of the
-            RGB encoder's over its input channels (released), or a copy where `inputs` repeats
-            thermal three times; "xavier": drawn anew (paper). Holds for weights from ImageNet too.
-        inputs: normalisation of the images.
+    The arguments are the keys of ``conf/model/rtfnet_50.yaml``. A thermal stem of three channels
+    starts as a copy of RGB's instead of its mean; `thermal_stem` holds for ImageNet's weights too.
     """
 
     def __init__(
@@ -106,28 +91,37 @@ class RTFNet(nn.Module):
         super().__init__()
         self.num_classes = num_classes
         self.record = self.record_from(thermal_stem=thermal_stem)
-        self.thermal_stem = thermal_stem
+        stage, expansion = (basic_stage, 1) if depth in BASIC else (bottleneck_stage, 4)
         for part, image_channels in (("rgb", 3), ("thermal", inputs.thermal_channels)):
             stem = nn.Conv2d(image_channels, base_width, 7, stride=2, padding=3, bias=False)
             self.add_module(f"encoder_{part}_conv1", stem)
             self.add_module(f"encoder_{part}_bn1", nn.BatchNorm2d(base_width))
             self.add_module(f"encoder_{part}_maxpool", nn.MaxPool2d(3, stride=2, padding=1))
-            stage, expansion = (basic_stage, 1) if depth in BASIC else (bottleneck_stage, 4)
             channels = base_width
             for index, blocks in enumerate(BLOCKS[depth]):
                 width = base_width * 2**index
-                layer = stage(channels, width, blocks, stride=1 if index == 0 else 2)
+                layer = stage(channels, width, blocks, stride=min(index + 1, 2))
                 self.add_module(f"encoder_{part}_layer{index + 1}", layer)
                 channels = expansion * width
         for number in range(1, 6):
-            last = number == 5
-            after = num_classes if last else channels // 2
-            up = Upception(channels, after, up=True, relu=final_relu or not last)
-            block = nn.Sequential(Upception(channels, channels, up=False), up)
-            self.add_module(f"deconv{number}", block)
+            after, relu = (channels // 2, True) if number < 5 else (num_classes, final_relu)
+            block = Upception(channels, channels, up=False)
+            up = Upception(channels, after, up=True, relu=relu)
+            self.add_module(f"deconv{number}", nn.Sequential(block, up))
             channels = after
         self.inputs = inputs
-        self._start()
+        # Initial weights: torchvision's in the encoders, Xavier's (uniform) in the decoder.
+        for name, module in self.named_modules():
+            if isinstance(module, nn.Conv2d) and name.startswith("encoder_"):
+                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+            elif isinstance(module, nn.Conv2d | nn.ConvTranspose2d):
+                nn.init.xavier_uniform_(module.weight)
+        thermal = self.get_parameter("encoder_thermal_conv1.weight")
+        if thermal_stem == "xavier":
+            nn.init.xavier_uniform_(thermal)
+        else:
+            rgb = self.get_parameter("encoder_rgb_conv1.weight").detach()
+            thermal.data.copy_(rgb if rgb.shape == thermal.shape else rgb.mean(1, keepdim=True))
 
     @staticmethod
     def record_from(*, thermal_stem: str, **_: object) -> Record:
@@ -170,25 +164,7 @@ class RTFNet(nn.Module):
         for number in range(1, 5):
             y = unit(f"thermal_layer{number}", y)
             x = unit(f"rgb_layer{number}", x) + y
-
         features = x
         for number in range(1, 6):
             x = self.get_submodule(f"deconv{number}")(x)
         return Output(x[..., : rgb.shape[2], : rgb.shape[3]], {"features": features})
-
-    def _start(self) -> None:
-        """Initial weights: torchvision's in the encoders, Xavier's (uniform) in the decoder."""
-        for name, module in self.named_modules():
-            if not isinstance(module, nn.Conv2d | nn.ConvTranspose2d):
-                continue
-            if name.startswith("encoder_"):
-                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
-            else:
-                nn.init.xavier_uniform_(module.weight)
-        stem = self.get_parameter("encoder_thermal_conv1.weight")
-        if self.thermal_stem == "xavier":
-            nn.init.xavier_uniform_(stem)
-            return
-        with torch.no_grad():
-            rgb = self.get_parameter("encoder_rgb_conv1.weight")
-            stem.copy_(rgb if rgb.shape == stem.shape else rgb.mean(1, keepdim=True))

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.checks import InputError
-from rgbt.models.inputs import Inputs, only_view
+from rgbt.models.inputs import Inputs, as_rgb, only_view
 from rgbt.models.parts import drop_channels
 from rgbt.models.pspnet import BINS
 from rgbt.models.resnet import bottleneck_stage
@@ -29,16 +29,7 @@ class SemsegPSPNet(nn.Module):
     Source: PSPNet, Fig. 3; thesis (J. Sun), Sec. V-C.   Released: hszhao/semseg; the names of the
     weights are its own.
 
-    Args:
-        num_classes: K; 66 for Mapillary Vistas, 14 for Freiburg.
-        depths: bottlenecks per stage: (3, 4, 6, 3) for ResNet-50.
-        base_width: channels of the first two stem convolutions, 64; other widths are multiples.
-        modalities: "rgb" or "thermal".
-        dropout: share of channels dropped before the scores of both heads, 0.1.
-        inputs: normalisation of the images, with three thermal channels.
-
-    Raises:
-        InputError: one thermal channel.
+    The arguments are the keys of ``conf/model/semseg.yaml``.
     """
 
     def __init__(
@@ -52,11 +43,6 @@ class SemsegPSPNet(nn.Module):
         inputs: Inputs,
     ) -> None:
         super().__init__()
-        if inputs.thermal_channels != 3:
-            raise InputError(
-                "model.inputs must repeat thermal for three channels, because the stem takes "
-                "three; choose model/inputs=cmx."
-            )
         self.num_classes = num_classes
         self.record = self.record_from(modalities=modalities)
         self.modalities = modalities
@@ -108,24 +94,16 @@ class SemsegPSPNet(nn.Module):
         """
         only_view(views, self.record.views, "SemsegPSPNet")
         images = self.inputs(rgb, thermal, masks)
-        image = images.rgb if self.modalities == "rgb" else images.thermal
+        image = images.rgb if self.modalities == "rgb" else as_rgb(images.thermal)
         x = F.max_pool2d(self.layer0(image), 3, stride=2, padding=1)
         layer3 = self.layer3(self.layer2(self.layer1(x)))
         layer4 = self.layer4(layer3)
-        size = (rgb.shape[2], rgb.shape[3])
-        logits = self._scores(self.cls, self.ppm(layer4), size, generator)
-        auxiliary = self._scores(self.aux, layer3, size, generator)
-        return Output(logits, {"features": layer4, "aux_logits": auxiliary})
-
-    def _scores(
-        self, head: nn.Module, x: Tensor, size: tuple[int, int], generator: torch.Generator | None
-    ) -> Tensor:
-        """Scores of a head at the size of the image."""
-        *layers, last = head.children()
-        for layer in layers:
-            x = layer(x)
-        scores = last(drop_channels(x, self.drop_rate if self.training else 0.0, generator))
-        return F.interpolate(scores, size=size, mode="bilinear", align_corners=True)
+        rate = self.drop_rate if self.training else 0.0
+        found = []
+        for head, features in ((self.cls, self.ppm(layer4)), (self.aux, layer3)):
+            narrow = drop_channels(head[:-1](features), rate, generator)
+            found.append(_enlarged(head[-1](narrow), rgb.shape[2:]))
+        return Output(found[0], {"features": layer4, "aux_logits": found[1]})
 
 
 class SemsegPooling(nn.Module):
@@ -148,11 +126,11 @@ class SemsegPooling(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, C, h, w) -> (N, C + 4 narrow, h, w)."""
-        parts = [
-            F.interpolate(branch(x), size=x.shape[2:], mode="bilinear", align_corners=True)
-            for branch in self.features
-        ]
-        return torch.cat([x, *parts], 1)
+        return torch.cat([x, *(_enlarged(branch(x), x.shape[2:]) for branch in self.features)], 1)
+
+
+def _enlarged(x: Tensor, hw: Sequence[int]) -> Tensor:
+    return F.interpolate(x, size=tuple(hw), mode="bilinear", align_corners=True)
 
 
 def _conv_norm(before: int, after: int, *, stride: int = 1) -> tuple[nn.Module, ...]:
@@ -162,7 +140,7 @@ def _conv_norm(before: int, after: int, *, stride: int = 1) -> tuple[nn.Module, 
 
 
 def _head(channels: int, narrow: int, num_classes: int) -> nn.Sequential:
-    """As semseg numbers the layers: 3 is its dropout, which is drawn in `_scores`."""
+    """As semseg numbers the layers: 3 is its dropout, which `forward` draws."""
     return nn.Sequential(
         *_conv_norm(channels, narrow), nn.Identity(), nn.Conv2d(narrow, num_classes, 1)
     )

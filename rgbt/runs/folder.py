@@ -12,7 +12,7 @@ import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -66,11 +66,12 @@ class MetricLine:
 
 @dataclass(frozen=True)
 class Description:
-    """``run.json``: how a tracker shows the run."""
+    """``run.json``: how a tracker shows the run, and the overrides of its command."""
 
     name: str
     tags: dict[str, str]
     params: dict[str, str]
+    overrides: list[str] = field(default_factory=list)
 
 
 class MarkerForm(TypedDict):

@@ -29,6 +29,9 @@ SILENT = (
     *("experiment", "search", "runs_dir", "tracking", "dataset.root", "model.checkout", "name"),
     *("seed", "fresh"),
 )
+OF_MACHINE = ("runs_dir=", "tracking", "dataset.root=", "out=", "fresh=", "hydra")
+"""Beginnings of overrides that are of no use on another machine."""
+
 BESIDE = ("tracking.", "consistency")
 """Extra measurements and trackers are not part of the run."""
 
@@ -69,7 +72,8 @@ def describe(spec: RunSpec, extra_tags: Mapping[str, str] | None = None) -> Desc
     name = f"{' '.join([*first, seed])} · {' '.join([spec.name, *rest])}"
     if "experiment" in varied:
         name = " · ".join(filter(None, (" ".join([spec.name, *first, seed]), " ".join(rest))))
-    return Description(name, tags, params)
+    command = [word for word in spec.overrides if not word.lstrip("+").startswith(OF_MACHINE)]
+    return Description(name, tags, params, command)
 
 
 def row_name(corruption: str) -> str:

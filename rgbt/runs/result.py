@@ -114,7 +114,13 @@ class RunResult:
         """
         path = self.folder / (split if split.endswith(".npz") else counts_name(split))
         if path.is_file() or split.endswith(".npz"):
-            return Counts.load(path)
+            counts = Counts.load(path)
+            if counts.run not in ("", self.key) and not self.run_id:
+                raise InputError(
+                    f"{path} has counts of the run {counts.run}, not of {self.key}; restore the "
+                    "file of this run, or give its folder the name of the run."
+                )
+            return counts
         how = "rerun the command of the run to finish it"
         if self.is_finished:
             how = f"write them with: rgbt evaluate run={self.folder} split={split} out={path}"

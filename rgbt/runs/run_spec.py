@@ -374,6 +374,26 @@ class RunSpec:
         return str(found["digest"])
 
 
+def settings_digest(plain: Mapping[str, Any]) -> str:
+    """12 hexadecimal digits of the settings in the run key as they are written, without content.
+
+    A checkpoint holds them, so that a ``config.yaml`` that was changed since is noticed without the
+    files and upstream runs that the key depends on.
+    """
+    places = {"model": ("weights", "checkout"), "domains": ("source", "target")}
+    settings = {
+        name: {
+            k: v
+            for k, v in plain.get(name, {}).items()
+            if k not in (*node.outside_key, *places.get(name, ()))
+        }
+        for name, node in NODES.items()
+        if node.in_key
+    }
+    text = json.dumps(_plain_numbers({**settings, "seed": plain.get("seed")}), sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
 def file_digest(path: Path) -> str:
     """SHA-256 of a file, in hexadecimal."""
     with path.open("rb") as file:

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from rgbt.config.stored_config import EXTERNAL, targets
+from rgbt.files.adapters import adapter_of
 
 RELEASED = ("rgbt", "torch")
 """Packages whose targets do not count: their versions are in ``provenance.json``."""
@@ -31,6 +32,9 @@ INSTALLED = {"site-packages", "dist-packages"}
 
 PREFIX = "checkout/"
 """Before the names of the modules of a checkout, which may be those of the user's own."""
+
+ADAPTER = "adapter"
+"""Name of the adapter of a recipe among them."""
 
 Used = tuple[str, str]
 """Name of a module and SHA-256 of its code, or name and version of an installed distribution."""
@@ -70,26 +74,32 @@ def user_code(named: Iterable[str]) -> tuple[Used, ...]:
 def checkout_code(model: Mapping[str, Any]) -> tuple[Used, ...]:
     """Modules of the checkout that a network executes, with the digest of their code, by name.
 
+    An adapter of the recipe is one of them, and what it imports is followed.
+
     Args:
         model: plain values of the node.
 
     Returns:
-        () where the network is no other author's, or the checkout does not have its module.
+        () where the network is no other author's, or there is no such module.
     """
     if model.get("_target_") != EXTERNAL:
         return ()
     root = Path(str(model.get("checkout"))).expanduser() / str(model.get("root"))
-    empty = set(model.get("empty_packages", ()))
+    constructor = str(model.get("constructor"))
+    try:
+        adapter = adapter_of(constructor)
+    except FileNotFoundError:
+        return ()
 
     def file_of(name: str) -> Path | None:
         place = root.joinpath(*name.split("."))
         files = (place / "__init__.py", place.with_name(f"{place.name}.py"))
-        return None if name in empty else next((each for each in files if each.is_file()), None)
+        found = next((each for each in files if each.is_file()), None)
+        return adapter if name == ADAPTER else found
 
-    module = str(model.get("constructor")).partition(":")[0]
-    if file_of(module) is None:
-        return ()
-    return tuple(sorted((PREFIX + name, code) for name, code in _modules_from(module, file_of)))
+    first = constructor.partition(":")[0] if adapter is None else ADAPTER
+    found = {PREFIX + name: code for name, code in _modules_from(first, file_of)}
+    return tuple(sorted(found.items())) if found.keys() - {PREFIX + ADAPTER} else ()
 
 
 def code_of(plain: Mapping[str, Any]) -> dict[str, str]:

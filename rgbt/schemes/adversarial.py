@@ -11,8 +11,8 @@ from annotated_types import Interval
 from torch import Tensor, nn
 
 from rgbt.checks import InputError
-from rgbt.losses.adversarial import VERDICT_LOSSES, Judged
-from rgbt.losses.adversarial import judged as judged_map
+from rgbt.losses.unlabelled import VERDICT_LOSSES, Judged
+from rgbt.losses.unlabelled import judged as judged_map
 from rgbt.processes import mean_count
 from rgbt.ranges import NonNegative
 from rgbt.requirements import Record, Requirement, record_of
@@ -20,7 +20,7 @@ from rgbt.schemes.domains import Gradients, Passes, SourceAndTarget, scores
 from rgbt.types import GeneratorOf, Loss, Phase, TwoDomains
 
 DomainValue = Annotated[float, Interval(ge=-10, le=10)]
-"""Verdicts and the number they should be -> scalar (see `rgbt.losses.adversarial`)."""
+"""Verdicts and the number they should be -> scalar (see `rgbt.losses.unlabelled`)."""
 
 CRITIC = "critic"
 
@@ -69,8 +69,7 @@ class Adversarial:
             gradient every step is sqrt(1 + alpha) = 1.41 times as long.
 
     Raises:
-        InputError: equal numbers for both domains, or one that its verdict loss does not take;
-            idle steps where the steps do not alternate.
+        InputError: numbers that the verdict loss does not take, idle steps without alternation.
     """
 
     model: nn.Module
@@ -92,30 +91,21 @@ class Adversarial:
     idle_steps: Literal["none", "released"] = "none"
 
     def __post_init__(self) -> None:
-        source_value, target_value = self.source_value, self.target_value
-        outside = min(source_value, target_value) < 0 or max(source_value, target_value) > 1
-        if self.verdict_loss == "cross_entropy" and outside:
-            raise InputError(
-                "scheme.source_value and scheme.target_value must be between 0 and 1 with "
-                f"scheme.verdict_loss=cross_entropy, got {source_value:g} and {target_value:g}."
-            )
-        if source_value == target_value:
-            raise InputError(
-                f"scheme.source_value and scheme.target_value are both {source_value:g}, but the "
-                "discriminator requires two different numbers, such as 0 and 1."
-            )
+        values = {"source": self.source_value, "target": self.target_value}
+        setting = f"scheme.source_value={self.source_value:g}, target_value={self.target_value:g}"
+        if self.source_value == self.target_value:
+            raise InputError(f"{setting}: the discriminator requires two different numbers.")
+        if self.verdict_loss == "cross_entropy" and not all(0 <= v <= 1 for v in values.values()):
+            raise InputError(f"{setting}: cross_entropy requires numbers between 0 and 1.")
         if self.idle_steps == "released" and not self.alternates:
-            raise InputError(
-                "scheme.idle_steps=released requires scheme.alternates=true, because otherwise "
-                "both optimizers step with their gradients in every step. Set it to none."
-            )
+            raise InputError("scheme.idle_steps=released requires scheme.alternates=true.")
         self.passes = Passes(
             model=self.model, loss=self.loss, domains=self.domains, gradients=self.gradients
         )
         # Fabric's wrapper takes the place of the network here.
         self.others: dict[str, nn.Module] = {CRITIC: self.critic}
         self.cost_of = VERDICT_LOSSES[self.verdict_loss]
-        self.values = {"source": source_value, "target": target_value}
+        self.values = values
 
     @property
     def record(self) -> Record:
@@ -136,12 +126,13 @@ class Adversarial:
     def phases(self, batch: TwoDomains, generator_of: GeneratorOf) -> Iterator[Phase]:
         """The segmentation's phases, then the discriminator's; or one of both kinds."""
         seen: dict[str, Tensor] = {}
+        released = self.idle_steps == "released"
         if self.alternates and batch.step % 2 == 0:
             with torch.no_grad():
                 for name, each in (("source", batch.source), ("target", batch.target)):
                     output = self.passes.output(name, each, generator_of)
                     seen[name] = judged_map(scores(output), self.judged)
-            idle = tuple(self.passes.optimizers) if self.idle_steps == "released" else ()
+            idle = tuple(self.passes.optimizers) if released else ()
             yield self._discriminator_phase(seen)._replace(idle=idle)
             return
         self.others[CRITIC].requires_grad_(False)
@@ -149,7 +140,7 @@ class Adversarial:
             lambda: self._domain("source", batch, generator_of, seen),
             lambda: self._domain("target", batch, generator_of, seen),
         )
-        idle = (CRITIC,) if self.idle_steps == "released" else ()
+        idle = (CRITIC,) if released else ()
         for number, phase in enumerate(phases):  # one step of the discriminator's optimiser
             yield phase._replace(idle=() if number else idle)
         self.others[CRITIC].requires_grad_(True)
@@ -169,9 +160,8 @@ class Adversarial:
             output = self.passes.output(name, own, generator_of)
         seen[name] = judged_map(scores(output), self.judged)
         if self.both_ways or not is_source:
-            cost = self.cost_of(
-                self.others[CRITIC](seen[name]), self.values["target" if is_source else "source"]
-            )
+            verdicts = self.others[CRITIC](seen[name])
+            cost = self.cost_of(verdicts, self.values["target" if is_source else "source"])
             if self.weighed_by_confidence:
                 confidence = batch.target.confidence
                 assert confidence is not None, "the record requires it"
@@ -183,10 +173,5 @@ class Adversarial:
     def _discriminator_phase(self, seen: Mapping[str, Tensor]) -> Phase:
         share = 0.5 if self.halved else 1.0
         critic = self.others[CRITIC]
-        return Phase(
-            (CRITIC,),
-            {
-                f"{CRITIC}/{name}": share * self.cost_of(critic(each), self.values[name])
-                for name, each in seen.items()
-            },
-        )
+        costs = {name: self.cost_of(critic(each), self.values[name]) for name, each in seen.items()}
+        return Phase((CRITIC,), {f"{CRITIC}/{name}": share * cost for name, cost in costs.items()})

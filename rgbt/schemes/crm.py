@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from rgbt.losses.distillation import sdc, sdn
+from rgbt.losses.distances import sdc, sdn
 from rgbt.ranges import NonNegative
 from rgbt.requirements import Record, Requirement, record_of
-from rgbt.schemes.masks import draw_masks
+from rgbt.schemes.domains import draw_masks
 from rgbt.types import VIEWS, AnyMasker, Batch, GeneratorOf, Loss, MaskPair, Output, Phase
 
 

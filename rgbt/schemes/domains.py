@@ -1,14 +1,16 @@
-"""Code shared by the schemes of domain adaptation: the pass of a domain and its loss."""
+"""What schemes share: the masks of a batch, and the pass of a domain and its loss."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from typing import Any, Literal, Protocol
 
+import torch
 from torch import Tensor, nn
 
+from rgbt.processes import own, whole
 from rgbt.requirements import Record, Requirement
-from rgbt.types import Batch, GeneratorOf, Loss, MaskPair, Output, Phase, View
+from rgbt.types import AnyMasker, Batch, GeneratorOf, Loss, MaskPair, Output, Phase, View
 
 Gradients = Literal["apart", "kept", "together"]
 """The gradients with which the optimizers of two heads step their shared parameters.
@@ -25,17 +27,22 @@ source's was clipped to.
 
 
 class ViewAndHead(Protocol):
-    """View and head of a domain (see `rgbt.data.domains.Domain`)."""
+    """View and head of a domain (see `rgbt.data.domains.Domain`); None: the network's own."""
 
     @property
-    def view(self) -> View | None:
-        """Input images; None leaves the choice to the network."""
-        ...
-
+    def view(self) -> View | None: ...  # noqa: D102
     @property
-    def head(self) -> str | None:
-        """The head; None where there is one for all."""
-        ...
+    def head(self) -> str | None: ...  # noqa: D102
+
+
+def draw_masks(masker: AnyMasker, batch: Batch, generator: torch.Generator) -> MaskPair:
+    """Hidden cells of the samples of this process, (B, h, w) bool each.
+
+    The masker draws for the samples of all processes, so that it needs to know nothing of them.
+    """
+    height, width = batch.rgb.shape[-2:]
+    masks = masker((height, width), whole(batch.centre_yx), generator)
+    return MaskPair(*(own(mask) for mask in masks))
 
 
 def options_of(domain: ViewAndHead) -> dict[str, Any]:
@@ -45,17 +52,12 @@ def options_of(domain: ViewAndHead) -> dict[str, Any]:
 
 
 class SourceAndTarget(Protocol):
-    """The domains of a run (see `rgbt.data.domains.Domains`)."""
+    """The domains of a run (see `rgbt.data.domains.Domains`): labelled, and to adapt to."""
 
     @property
-    def source(self) -> ViewAndHead:
-        """Labelled."""
-        ...
-
+    def source(self) -> ViewAndHead: ...  # noqa: D102
     @property
-    def target(self) -> ViewAndHead | None:
-        """To adapt to."""
-        ...
+    def target(self) -> ViewAndHead | None: ...  # noqa: D102
 
 
 WHOLE_IMAGES = Requirement("masker", "hides_cells", False)
@@ -118,16 +120,22 @@ class Passes:
         )
 
     def output(
-        self, name: str, batch: Batch, generator_of: GeneratorOf, masks: MaskPair | None = None
+        self,
+        name: str,
+        batch: Batch,
+        generator_of: GeneratorOf,
+        masks: MaskPair | None = None,
+        network: nn.Module | None = None,
     ) -> Output:
-        """The output of the network for a batch of the domain "source" or "target".
+        """The output for a batch of the domain "source" or "target", of `network` or of the own.
 
         A pass with `masks` has draws of its own.
         """
         domain = self.source if name == "source" else self.target
         assert domain is not None, "a scheme of two domains has a target"
         generator = generator_of(f"{name} network" + (" masked" if masks else ""))
-        output: Output = self.model(
+        network = self.model if network is None else network
+        output: Output = network(
             batch.rgb, batch.thermal, masks, generator=generator, **options_of(domain)
         )
         return output

@@ -1,11 +1,12 @@
 """Self-training: a teacher, which is an average of the network, labels the target in every step.
 
-No run of a teacher is needed before (`domains.target.labels=experiment:...` has one).
+No run of a teacher is needed before (`domains.target.labels=experiment:...` has one). Class mixing
+pastes the pixels of some classes of a source image on a target image.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
@@ -13,21 +14,25 @@ import torch
 from torch import Tensor, nn
 
 from rgbt.checks import InputError
-from rgbt.losses.feature_distance import FeatureDistance
-from rgbt.losses.pseudo_labels import PseudoLabels, WeightedBy, pseudo_labels
+from rgbt.losses.distances import FeatureDistance
+from rgbt.losses.unlabelled import PseudoLabels, WeightedBy, pseudo_labels
+from rgbt.processes import mean_count, own_draw
 from rgbt.ranges import NonNegative, Share
 from rgbt.requirements import Record, Requirement
-from rgbt.schemes.class_mix import mixed, pasted_pixels, seen_as
-from rgbt.schemes.domains import Passes, SourceAndTarget, scores
-from rgbt.schemes.masks import draw_masks
-from rgbt.schemes.network_copy import NetworkCopy, Normalisation
-from rgbt.schemes.teacher import Teacher
-from rgbt.types import AnyMasker, Batch, GeneratorOf, Loss, Phase, TwoDomains
+from rgbt.schemes.domains import Passes, SourceAndTarget, draw_masks, scores
+from rgbt.schemes.teacher import Normalisation, Teacher, frozen_copy
+from rgbt.types import AnyMasker, Batch, GeneratorOf, Loss, Phase, TwoDomains, View
 
 TEACHER = "teacher"
 CONFIDENT_SHARE, CONFIDENCE = "teacher/confident_share", "teacher/confidence"
 """Names in the log: share of the target's pixels whose highest probability reaches the threshold,
 and the mean of the highest probabilities."""
+
+NUM_VALUES = 256
+"""Values of a label: the classes and 255, which is pasted like a class."""
+
+LUMA = (0.299, 0.587, 0.114)
+"""Of red, green and blue (ITU-R BT.601)."""
 
 
 class DatasetClasses(Protocol):
@@ -36,14 +41,8 @@ class DatasetClasses(Protocol):
     classes: tuple[str, ...]
 
 
-class Augmentation(Protocol):
-    """The interface of an augmentation on the device (`rgbt.transforms.strong`)."""
-
-    def __call__(
-        self, rgb: Tensor, thermal: Tensor, generator: torch.Generator
-    ) -> tuple[Tensor, Tensor]:
-        """Images of the same shapes."""
-        ...
+Augmentation = Callable[[Tensor, Tensor, torch.Generator], tuple[Tensor, Tensor]]
+"""RGB and thermal -> images of the same shapes (`rgbt.transforms.strong`)."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -55,14 +54,14 @@ class SelfTraining:
     The teacher predicts labels of the unchanged target. The mix is the target, with half of the
     classes of the source pasted on it, after strong augmentation. Its labels are those of the
     source where it is pasted, with weight 1, and those of the teacher elsewhere, with the weight q
-    of `rgbt.losses.pseudo_labels`. The masked images hide cells of the target, and are trained with
+    of `rgbt.losses.unlabelled`. The masked images hide cells of the target, and are trained with
     the labels of the teacher.
 
     Of an RGB-thermal pair, both images are pasted with the same pixels, and masked with the cells
     that `masker.pairing` gives each. A domain that sees one image pastes what it sees
-    (`rgbt.schemes.class_mix.seen_as`).
+    (`seen_as`).
 
-    The feature distance (`rgbt.losses.feature_distance`) compares the last stage of the encoder, of
+    The feature distance (`rgbt.losses.distances`) compares the last stage of the encoder, of
     the unchanged source, with that of the network as it was when training started: with the weights
     and running statistics of `model.weights`, in evaluation mode.
 
@@ -78,7 +77,7 @@ class SelfTraining:
         decay: of the teacher (`rgbt.schemes.teacher.Teacher`).
         teacher_norm: see there.
         threshold: probability from which a pixel of the teacher is confident.
-        weighted_by: see `rgbt.losses.pseudo_labels`.
+        weighted_by: see `rgbt.losses.unlabelled`.
         ignored_top: share of the rows at the top without a pseudo-label.
         ignored_bottom: the same at the bottom.
         mixing: "classes", or "none": the target alone, augmented.
@@ -112,20 +111,16 @@ class SelfTraining:
 
     def __post_init__(self) -> None:
         if self.ignored_top + self.ignored_bottom >= 1:
-            raise InputError(
-                f"scheme.ignored_top={self.ignored_top:g} and scheme.ignored_bottom="
-                f"{self.ignored_bottom:g} leave no row for pseudo-labels; their sum must be below "
-                "1."
-            )
+            raise InputError("scheme.ignored_top + scheme.ignored_bottom must be below 1.")
         self.passes = Passes(
             model=self.model, loss=self.loss, domains=self.domains, gradients="apart"
         )
         self.teacher = Teacher(self.model, decay=self.decay, normalisation=self.teacher_norm)
-        self.initial: NetworkCopy | None = None
+        self.initial: nn.Module | None = None
         if self.feature_distance is not None:
             assert self.dataset is not None, "a run has a data set"
             self.feature_distance.indices(self.dataset.classes)
-            self.initial = NetworkCopy(self.model, normalisation="running", buffers=True)
+            self.initial = frozen_copy(self.model)
 
     @property
     def record(self) -> Record:
@@ -154,30 +149,28 @@ class SelfTraining:
             yield phase._replace(logged={} if number else logged)
 
     def _labels(self, target: Batch, generator_of: GeneratorOf) -> PseudoLabels:
-        with self.teacher.in_network():
-            output = self.passes.output("target", target, generator_of)
+        with torch.no_grad():
+            network = self.teacher.network()
+            output = self.passes.output("target", target, generator_of, network=network)
         ignored = (self.ignored_top, self.ignored_bottom)
         return pseudo_labels(scores(output), self.threshold, self.weighted_by, ignored)
 
     def _source(self, source: Batch, generator_of: GeneratorOf) -> dict[str, Tensor]:
-        initial = self._initial_features(source, generator_of)
         output, parts = self.passes.supervised("source", source, generator_of)
         if self.masked_weight and self.masked_images == "both":
             parts |= self._masked("source", source, generator_of)
-        if initial is not None:
+        if self.initial is not None:
             assert self.feature_distance is not None
             assert self.dataset is not None
+            with torch.no_grad():
+                initial = self.passes.output("source", source, generator_of, network=self.initial)
             parts["source/feature_distance"] = self.feature_distance(
-                output.aux["features"], initial, source.label, self.dataset.classes
+                output.aux["features"],
+                initial.aux["features"],
+                source.label,
+                self.dataset.classes,
             )
         return parts
-
-    def _initial_features(self, source: Batch, generator_of: GeneratorOf) -> Tensor | None:
-        """(B, C, h, w) of the initial network; None without feature distance."""
-        if self.initial is None:
-            return None
-        with self.initial.in_network():
-            return self.passes.output("source", source, generator_of).aux["features"]
 
     def _target(self, source: Batch, target: Batch, generator_of: GeneratorOf) -> dict[str, Tensor]:
         mix = target
@@ -204,3 +197,60 @@ class SelfTraining:
     def _augmented(self, batch: Batch, generator: torch.Generator) -> Batch:
         rgb, thermal = self.augmentation(batch.rgb, batch.thermal, generator)
         return replace(batch, rgb=rgb, thermal=thermal)
+
+
+def pasted_pixels(label: Tensor, generator: torch.Generator) -> Tensor:
+    """(B, H, W) bool: the pixels of half of the classes, drawn for every image.
+
+    With n values in the labels of the batch, ceil(n / 2) of them are drawn for each image, without
+    replacement. A drawn value that the image does not have pastes nothing.
+
+    Source: ClassMix; DACS.   Released: DACS, DAFormer, HRDA and MIC, whose values are those of the
+    batch and include 255.
+
+    Args:
+        label: (B, H, W) int64, 0..255.
+        generator: on the device of `label`.
+    """
+    present = torch.zeros(NUM_VALUES, device=label.device)
+    present = mean_count(present.index_fill(0, label.flatten(), 1.0)) > 0
+
+    def draw(count: int) -> Tensor:
+        return torch.rand(count, NUM_VALUES, generator=generator, device=label.device)
+
+    # The present values come first, in random order; the number of draws does not depend on them.
+    order = (own_draw(draw, len(label)) + ~present).argsort(1)
+    place = torch.arange(NUM_VALUES, device=label.device).expand_as(order)
+    rank = torch.empty_like(order).scatter_(1, order, place)
+    drawn = rank < (present.sum() + 1) // 2
+    return drawn.gather(1, label.flatten(1)).view_as(label)
+
+
+def mixed(source: Batch, target: Batch, pasted: Tensor) -> Batch:
+    """The target with the pixels `pasted` (B, H, W) of the source in both images and the label.
+
+    Pasted pixels have weight 1; the others keep the confidence of the target, which it must have.
+    """
+    assert target.confidence is not None, "pseudo-labels have a weight"
+    return replace(
+        target,
+        rgb=source.rgb.where(pasted[:, None], target.rgb),
+        thermal=source.thermal.where(pasted[:, None], target.thermal),
+        label=source.label.where(pasted, target.label),
+        confidence=torch.ones_like(target.confidence).where(pasted, target.confidence),
+    )
+
+
+def seen_as(batch: Batch, own: View | None, other: View | None) -> Batch:
+    """The batch with what its domain sees, in the channels that another domain sees.
+
+    RGB becomes thermal as its luma; thermal becomes RGB as grey. A domain that sees RGB alone has
+    no thermal images to paste. Domains with the same view, or with both images, paste what they
+    have.
+    """
+    if {own, other} != {"rgb", "thermal"}:
+        return batch
+    if other == "rgb":
+        return replace(batch, rgb=batch.thermal.expand_as(batch.rgb))
+    luma = batch.rgb.new_tensor(LUMA).view(1, 3, 1, 1)
+    return replace(batch, thermal=(batch.rgb * luma).sum(1, keepdim=True))

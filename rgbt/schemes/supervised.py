@@ -7,8 +7,7 @@ from collections.abc import Iterator
 from torch import nn
 
 from rgbt.requirements import Record, record_of
-from rgbt.schemes.domains import SourceAndTarget, options_of
-from rgbt.schemes.masks import draw_masks
+from rgbt.schemes.domains import SourceAndTarget, draw_masks, options_of
 from rgbt.types import AnyMasker, Batch, GeneratorOf, Loss, Phase
 
 

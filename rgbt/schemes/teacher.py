@@ -1,13 +1,22 @@
-"""A teacher: the network with the moving average of its own parameters."""
+"""Copies of a network that predict beside it: the teacher, which is its moving average."""
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager
+import copy
+from typing import Literal
 
-import torch
 from torch import nn
+from torch.nn.modules.batchnorm import _BatchNorm
 
-from rgbt.schemes.network_copy import NetworkCopy, Normalisation
+from rgbt.averaging import AveragedNetwork
+
+Normalisation = Literal["batch", "running"]
+"""What batch normalisations use: the statistics of their own batch, or the running statistics."""
+
+
+def frozen_copy(network: nn.Module) -> nn.Module:
+    """The network as it is now, in evaluation mode and without gradients."""
+    return copy.deepcopy(network).eval().requires_grad_(False)
 
 
 class Teacher:
@@ -23,27 +32,33 @@ class Teacher:
     Args:
         network: the student.
         decay: 0.99 in DACS, 0.999 in DAFormer, HRDA and MIC.
-        normalisation: see `NetworkCopy`; released: "batch".
+        normalisation: "batch": the teacher is in training mode without dropout, stochastic depth
+            and changes of statistics; "running": in evaluation mode. Released: "batch".
 
     Attributes:
         average: w', which a checkpoint has.
     """
 
     def __init__(self, network: nn.Module, *, decay: float, normalisation: Normalisation) -> None:
-        self.average = NetworkCopy(network, normalisation=normalisation)
+        self.average = AveragedNetwork(network, buffers=False)
+        self._student = (network,)  # of which it is no part
         self._decay = decay
+        self._normalisation = normalisation
         self._step: int | None = None
 
     def update(self, step: int) -> None:
         """Average the parameters before `step`; a second call in the same step does nothing."""
-        if step == self._step:
-            return
-        self._step = step
-        share = max(1 / (step + 1), 1 - self._decay)
-        averages, own = self.average.pairs()
-        with torch.no_grad():
-            torch._foreach_lerp_(averages, own, share)
+        if step != self._step:
+            self._step = step
+            self.average.update(self._student[0], max(1 / (step + 1), 1 - self._decay))
 
-    def in_network(self) -> AbstractContextManager[None]:
-        """Within it, the network predicts as the teacher (`NetworkCopy.in_network`)."""
-        return self.average.in_network()
+    def network(self) -> nn.Module:
+        """The teacher, ready to predict; normalisations that the student froze stay frozen."""
+        teacher: nn.Module = self.average.module.eval()
+        if self._normalisation == "batch":
+            both = zip(teacher.modules(), self._student[0].modules(), strict=True)
+            for norm, own in both:
+                if isinstance(norm, _BatchNorm) and own.training:
+                    norm.train()
+                    norm.track_running_stats = False
+        return teacher

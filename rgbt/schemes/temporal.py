@@ -6,7 +6,7 @@ Understanding", Fig. 2 and Eq. 4, and its release.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol, cast
 
@@ -20,28 +20,14 @@ from rgbt.processes import own_draw
 from rgbt.requirements import Record, Requirement, record_of
 from rgbt.types import Batch, Frame, GeneratorOf, Output, Phase
 
-DenseLogits = Callable[[Output, tuple[int, int]], Tensor]
-"""(output, image_hw) -> (B, K, H, W) scores of a network that predicts masks of queries."""
-
 
 class VirtualViews(Protocol):
-    """The interface of a view, which draws the second frame (`rgbt.transforms.virtual_view`)."""
+    """What is called of a view, which draws the second frame (`rgbt.transforms.views`)."""
 
-    def draw(self, count: int, generator: torch.Generator) -> Tensor:
-        """(count, 3) angles."""
-        ...
-
-    def warp(self, angles: Tensor, image_hw: tuple[int, int]) -> Warp:
-        """Where the pixels of the second frame come from."""
-        ...
-
-    def batch(self, batch: Batch, warp: Warp) -> Batch:
-        """The second frames with their labels."""
-        ...
-
-    def valid(self, warp: Warp) -> Tensor:
-        """(B, H, W) bool: pixels that losses count."""
-        ...
+    def draw(self, count: int, generator: torch.Generator) -> Tensor: ...  # noqa: D102
+    def warp(self, angles: Tensor, image_hw: tuple[int, int]) -> Warp: ...  # noqa: D102
+    def batch(self, batch: Batch, warp: Warp) -> Batch: ...  # noqa: D102
+    def valid(self, warp: Warp) -> Tensor: ...  # noqa: D102
 
 
 @dataclass(kw_only=True, eq=False)
@@ -131,20 +117,20 @@ class Temporal:
         thermal = torch.cat([first.thermal, second.thermal])
         passes = {"passes": 2} if self.stacks else {}
         output = self.model(rgb, thermal, generator=generator, **passes)
-        if self.stacks:  # (L, P = 2, B, ...)
-            aux = [{k: v[:, p : p + 1] for k, v in output.aux.items()} for p in range(2)]
-            one, two = (Output(None, each) for each in aux)
-        else:  # scores, and what networks return beside, have the batch first
-            halves = slice(len(first.name)), slice(len(first.name), None)
-            one, two = (
-                Output(output.logits[half], {k: v[half] for k, v in output.aux.items()})
-                for half in halves
-            )
-        return self._frame(one, first), self._frame(two, second)
+        frames = []
+        for number, batch in enumerate((first, second)):
+            if self.stacks:  # (L, P = 2, B, ...)
+                one_pass = slice(number, number + 1)
+                own = Output(None, {k: v[:, one_pass] for k, v in output.aux.items()})
+            else:  # scores, and what networks return beside, have the batch first
+                part = slice(number * len(batch.name), (number + 1) * len(batch.name))
+                own = Output(output.logits[part], {k: v[part] for k, v in output.aux.items()})
+            frames.append(self._frame(own, batch))
+        return frames[0], frames[1]
 
     def _frame(self, output: Output, batch: Batch) -> Frame:
         logits = output.logits
-        if logits is None:
-            image_hw = (batch.rgb.shape[2], batch.rgb.shape[3])
-            logits = cast(DenseLogits, self.model.dense_logits)(output, image_hw)
+        if logits is None:  # masks of queries
+            hw = (batch.rgb.shape[2], batch.rgb.shape[3])
+            logits = cast(Tensor, cast(Any, self.model).dense_logits(output, hw))
         return Frame(output, batch, logits)

@@ -19,22 +19,26 @@ UnlabelledLoss = Callable[[Tensor], dict[str, Tensor]]
 """(B, K, H, W) probabilities -> named, weighted scalars (see `rgbt.losses.unlabelled`)."""
 
 
+@dataclass(kw_only=True, eq=False)
 class LabelledDomains:
     """Segmentation of both domains with the labels of each.
 
     Source: thesis (J. Sun), Sec. III-B, first stage; also HeatNet's students and first stage.
 
-    Args:
+    Attributes:
         model: the network.
         loss: of one domain.
         domains: source and target, both with labels.
         gradients: see `rgbt.schemes.domains.Gradients`. Released (thesis): "kept".
     """
 
-    def __init__(
-        self, *, model: nn.Module, loss: Loss, domains: SourceAndTarget, gradients: Gradients
-    ) -> None:
-        self.passes = Passes(model=model, loss=loss, domains=domains, gradients=gradients)
+    model: nn.Module
+    loss: Loss
+    domains: SourceAndTarget
+    gradients: Gradients
+
+    def __post_init__(self) -> None:
+        self.passes = Passes(**vars(self))
 
     @property
     def record(self) -> Record:
@@ -42,7 +46,7 @@ class LabelledDomains:
         return self.passes.record_with(Requirement("domains", "target_labels", True))
 
     def phases(self, batch: TwoDomains, generator_of: GeneratorOf) -> Iterator[Phase]:
-        """One phase, or one per optimiser, of images in [0, 1]."""
+        """One phase, or one per optimiser."""
         yield from self.passes.phases(
             lambda: self.passes.supervised("source", batch.source, generator_of)[1],
             lambda: self.passes.supervised("target", batch.target, generator_of)[1],

@@ -7,16 +7,13 @@ others do as it found (`agreed`).
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
-from rgbt.assembly.load_run import open_run
+from rgbt.assembly.load_run import with_weights
 from rgbt.assembly.training_setup import validate
 from rgbt.checks import InputError
-from rgbt.config.compose import flatten
-from rgbt.config.stored_config import checkouts, targets
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.files.atomic import is_held
 from rgbt.files.plain_files import check_links
@@ -129,19 +126,9 @@ def _predict_labels(spec: RunSpec, teacher: Dependency) -> None:
     assert folder is not None, "the domain takes labels of an upstream run"
     if folder.is_dir():
         return
-    # The upstream run may be a copy from another machine, where the data have another path.
-    local = ("trainer.accelerator", "trainer.threads", "dataset.root", "dataset.cache_dir")
-    overrides = [
-        f"{key}={json.dumps(value)}"
-        for key, value in flatten(spec.plain).items()
-        if key in local or (key.startswith("data.") and key != "data._target_")
-    ]
     checkpoint = teacher.checkpoint.removesuffix(".pt")
-    # Its configuration was composed by this command, so that its targets are the user's own.
-    trust = list(targets(teacher.run.plain).values())
-    own = checkouts(teacher.run.plain).items()
-    overrides += [f"{key}={json.dumps(checkout)}" for key, checkout in own]
-    session = open_run(teacher.run.folder, overrides, checkpoint, trust=trust)
+    # Its configuration is the one that this command composed; its folder may be a copy.
+    session = with_weights(teacher.run, teacher.run.folder, checkpoint, teacher.run.plain)
     from rgbt.evaluation.images import write_pseudo_labels  # few runs have a teacher
 
     write_pseudo_labels(

@@ -45,7 +45,7 @@ from rgbt.runs.folder import (
 )
 from rgbt.runs.naming import describe
 from rgbt.runs.provenance import provenance, warn_of_steps, without_passwords
-from rgbt.runs.run_spec import RunSpec
+from rgbt.runs.run_spec import RunSpec, settings_digest
 from rgbt.runtime.signals import deferred
 from rgbt.tables import ConsistencyTable, without_nan
 from rgbt.terminal import info, warn
@@ -145,7 +145,9 @@ class Run:
         tags = {**self.description.tags, "rgbt.key": self.folder.path.name}
         with self._tracked():
             self.tracking.start(self.folder, replace(self.description, tags=tags))
-            state = State(seed=session.spec.drawn.masks)
+            settings = settings_digest(session.spec.plain)
+            key = self.folder.path.name
+            state = State(seed=session.spec.drawn.masks, key=key, settings=settings)
             trainer = self._trainer(state)
             self._resume(trainer, state)
             accumulate = session.trainer.accumulate

@@ -70,9 +70,9 @@ def word(line: EffectLine) -> str:
     estimate = line.estimate
     if line.effect == MEAN and not line.against:
         return ABSENT
-    if estimate.interval is None:
+    if estimate.both is None:
         return "2 seeds needed" if estimate.seeds < 2 else "too few images"
-    if not estimate.is_shown():
+    if not line.is_shown:
         return "no"
     return "higher" if estimate.value > 0 else "lower"
 
@@ -82,18 +82,16 @@ def effects_csv(lines: Sequence[EffectLine]) -> str:
     rows: list[tuple[object, ...]] = [CSV_HEADER]
     for line in lines:
         found = line.estimate
-        low, high = (
-            (math.nan, math.nan)
-            if found.interval is None
-            else (found.interval.low, found.interval.high)
-        )
-        numbers = (found.value, low, high, found.p, found.corrected)
+        around = found.both
+        low, high = (math.nan, math.nan) if around is None else (around.low, around.high)
+        p = math.nan if around is None else found.p
+        numbers = (found.value, low, high, p, line.corrected)
         rows.append(
             (
                 *(line.part, line.outcome, line.method, line.against, line.effect),
                 *(_plain(each) for each in numbers),
                 word(line),
-                *(_plain(each) for each in (found.of_seeds, found.of_images)),
+                *(_plain(each) for each in _errors(line)),
                 *(found.seeds, line.cells),
             )
         )
@@ -102,11 +100,9 @@ def effects_csv(lines: Sequence[EffectLine]) -> str:
 
 def _row(line: EffectLine) -> tuple[str, ...]:
     found = line.estimate
-    interval = found.interval
+    interval = found.both
     around = ABSENT if interval is None else f"[{interval.low:+.2f}, {interval.high:+.2f}]"
-    errors = (
-        ABSENT if math.isnan(each) else f"{each:.2f}" for each in (found.of_seeds, found.of_images)
-    )
+    errors = (ABSENT if math.isnan(each) else f"{each:.2f}" for each in _errors(line))
     return (
         who(line),
         line.effect,
@@ -116,6 +112,12 @@ def _row(line: EffectLine) -> tuple[str, ...]:
         *errors,
         str(found.seeds),
     )
+
+
+def _errors(line: EffectLine) -> tuple[float, float]:
+    """Standard errors over seeds and over images; NaN where there is none."""
+    evidence = line.estimate.evidence
+    return math.nan if evidence.trainings is None else evidence.trainings.error, evidence.error
 
 
 def _plain(value: float) -> str:

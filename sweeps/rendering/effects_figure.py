@@ -31,7 +31,7 @@ def shown_lines(effects: DesignEffects) -> list[EffectLine]:
     return [
         line
         for line in effects.lines
-        if not line.against and line.effect != MEAN and line.estimate.interval is not None
+        if not line.against and line.effect != MEAN and line.estimate.both is not None
     ]
 
 
@@ -76,7 +76,7 @@ def _panel(axes: Axes, lines: Sequence[EffectLine], methods: Sequence[str]) -> N
         shift = SPAN * ((place + 0.5) / len(methods) - 0.5)
         at = [effects.index(line.effect) + shift for line in own]
         colour = COLOURS[place % len(COLOURS)]
-        halves = [line.estimate.interval.half for line in own if line.estimate.interval]
+        halves = [line.estimate.both.half for line in own if line.estimate.both]
         values = [line.estimate.value for line in own]
         faces = [colour if word(line) in ("higher", "lower") else "white" for line in own]
         axes.errorbar(

@@ -6,17 +6,41 @@ import shlex
 from collections import Counter
 from collections.abc import Sequence
 from statistics import median
+from typing import TYPE_CHECKING
 
 from rgbt.tables import ABSENT, TextTable
+from rgbt.terminal import print_rich, rich_table
 from sweeps.point import Outcome, State
+from sweeps.rendering.times import print_lines, time_lines
 from sweeps.table.efficiency import SCALE
 from sweeps.table.request import TableRequest
 from sweeps.table.table import MEASURED
 from sweeps.worker.point_list import estimated_seconds, other_code_line
 from sweeps.worker.progress import duration
 
+if TYPE_CHECKING:
+    from sweeps.table_plan import TablePlan
+
 STATES: tuple[State, ...] = ("finished", "running", "failed", "waiting")
 TRAINED = "trained, not evaluated for all columns"
+
+
+def print_previews(
+    previews: Sequence[tuple[TablePlan, Sequence[Outcome]]], workers: int, *, is_all: bool
+) -> None:
+    """Print the preview of one table, or one line for each of all."""
+    if is_all:
+        requests = [(plan.request, outcomes) for plan, outcomes in previews]
+        print_rich(rich_table(tables_grid(requests, workers)))
+        return
+    ((plan, outcomes),) = previews
+    if outcomes:
+        print_rich(rich_table(cells_grid(plan.request, outcomes)))
+    lines = summary(plan.request, outcomes, workers)
+    if plan.until_decided is not None:
+        lines.append(most_line(len(plan.until_decided.most_runs()), outcomes, workers))
+    lines += time_lines((), (each.point.overrides for each in outcomes), plan.planner)
+    print_lines(lines)
 
 
 def cells_grid(request: TableRequest, outcomes: Sequence[Outcome]) -> TextTable:

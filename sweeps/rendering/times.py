@@ -2,17 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from statistics import median
+
+from rich.text import Text
 
 from rgbt.checks import InputError
 from rgbt.runs.folder import read_result
 from rgbt.runs.result import RunResult
 from rgbt.runs.run_spec import RunSpec
+from rgbt.terminal import print_rich
 from sweeps.worker.planner import Planner
 from sweeps.worker.progress import duration
+
+
+def time_lines(
+    results: Iterable[RunResult], overrides: Iterable[tuple[str, ...]], planner: Planner
+) -> list[str]:
+    """Both lines, where there is something to say; see `time_line` and `upstream_line`."""
+    return list(filter(None, (time_line(results), upstream_line(overrides, planner))))
+
+
+def print_lines(lines: Sequence[str]) -> None:
+    """Print sentences; nothing without any."""
+    if lines:
+        print_rich(Text("\n".join(lines)))
 
 
 def time_line(results: Iterable[RunResult]) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -14,6 +14,7 @@ import numpy as np
 
 from rgbt.config.compose import PIXELS, with_pixels
 from sweeps import attributes
+from sweeps.point import short_names
 from sweeps.worker.trial_store import counted_trials
 
 if TYPE_CHECKING:
@@ -160,17 +161,6 @@ def read(study: optuna.Study) -> StudyData:
         trials=tuple(counted_trials(study)),
         command=str(notes.get(attributes.COMMAND, "")),
     )
-
-
-def short_names(names: Collection[str]) -> dict[str, str]:
-    """Dotted keys cut to their last part where that is unique: "masker.sigma_div": "sigma_div".
-
-    Example:
-        >>> short_names(["optimizer.lr", "head.lr", "masker.alpha"])["masker.alpha"]
-        'alpha'
-    """
-    ends = Counter(name.rpartition(".")[2] for name in names)
-    return {name: end if ends[end := name.rpartition(".")[2]] == 1 else name for name in names}
 
 
 def shown(value: object, pixel_factor: float | None = None) -> str:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 from rgbt.metrics import names as metric_names
 from rgbt.tables import ABSENT, TextTable, csv_text, number
 from sweeps import attributes
-from sweeps.report.study_data import Importances, StudyData, pruning_savings, short_names
+from sweeps.point import short_names
+from sweeps.report.study_data import Importances, StudyData, pruning_savings
 
 if TYPE_CHECKING:
     from optuna.trial import FrozenTrial

@@ -12,8 +12,7 @@ from typing import Any
 from rgbt.checks import InputError
 from rgbt.metrics import names
 from rgbt.metrics.counts import Counts
-from rgbt.metrics.details import details_of_metric
-from rgbt.metrics.named import value
+from rgbt.metrics.named import details_of_metric, value
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Outcome
 from sweeps.table.table import COUNTED, MEASURED, Column, Form, Row, Table
@@ -61,10 +60,9 @@ def evaluation_of(column: Column, table: Table) -> ExtraEvaluation | None:
     """The evaluation that the column needs; None: the one that every run makes itself."""
     if column.frames is not None:
         return ExtraEvaluation(frames=column.frames)
-    details = details_of_metric(str(column.metric))
+    kind = details_of_metric(str(column.metric))
     keys = ("modality", "head", "corruption", "severity", "batch_norm", "batch_norm_splits")
     same: dict[str, Any] = {key: getattr(column, key) for key in keys}
-    kind = None if details is None else details.kind
     needed = ExtraEvaluation(regions=table.regions, details=kind, **same)
     return None if needed == ExtraEvaluation() else needed
 

@@ -20,10 +20,8 @@ from sweeps.table.cells import NO_VALUE, CellId, TableCell
 from sweeps.table.request import TableRequest
 from sweeps.table.table import COUNTED, MEASURED
 
-SCALE = "paper"  # Scale of all networks
-
+SCALE = "paper"  # of all networks
 IMAGE_HW = (480, 640)  # of MFNet, for rows without settings.image_hw
-
 NOT_NETWORK = ("model.weights=", "tracking", "runs_dir=")  # overrides that begin so
 
 KEYS = {

@@ -35,10 +35,8 @@ from sweeps.table.request import TableRequest
 from sweeps.table.table import Row, Table
 from sweeps.worker.processes import run_command
 
-FOLDER = "external"  # Folder inside the folder of runs
-
+FOLDER = "external"  # inside the folder of runs
 NODE_FILE = "of_the_table"  # of conf/dataset and conf/metric, written for the commands
-
 MACHINE = ("data.", "trainer.accelerator=", "trainer.precision=", "trainer.threads=")
 """Overrides of the user that reach a row with a network of its own; others are for trainings."""
 
@@ -69,10 +67,7 @@ def row_named(word: str, table: Table) -> Row:
 
 
 def external_rows(words: Sequence[str], table: Table) -> tuple[list[ExternalRow], list[str]]:
-    """The external rows in the order of the table, and all words that are not about them.
-
-    InputError: no such row, one without a network for weights, or a path that does not exist.
-    """
+    """The external rows in the order of the table, and all words that are not about them."""
     found: dict[str, ExternalRow] = {}
     others = []
     for word in words:
@@ -110,7 +105,7 @@ class ExternalRun:
         cls, given: ExternalRow, request: TableRequest, base: Sequence[str], runs_dir: Path
     ) -> ExternalRun:
         """Weights are loaded into the network of `Row.network` at scale=paper, otherwise into that
-        of the row's experiment at the scale of the table. InputError: a wrong data set or row.
+        of the row's experiment at the scale of the table.
         """
         row = row_named(given.label, request.table)
         trained = row if row.experiment else next(iter(request.table.runnable_rows), row)

@@ -13,8 +13,6 @@ from typing import Annotated, Any
 from rgbt.checks import InputError
 from rgbt.config.options import Help
 
-RINGS = 5
-
 HEAD = """\
 # Run:     rgbt reproduce table={name} seeds=3 workers=2
 # Preview: rgbt reproduce table={name} seeds=3 dry_run=true
@@ -50,13 +48,13 @@ def new(options: NewOptions, overrides: list[str]) -> int:
 def write_new(name: str, experiment: str, overrides: Sequence[str], folder: Path) -> Path:
     """Write the file of a new table into `folder`; every row is composed and checked before.
 
-    Comma lists of `overrides` are varied, all with all. InputError: the file exists already,
-    nothing is varied, or a row does not fit.
+    Comma lists of `overrides` are varied, all with all.
     """
     import yaml
 
     from rgbt.config.compose import PIXELS
     from rgbt.files.atomic import write_atomic
+    from sweeps.point import short_names
     from sweeps.table.load_table import PUBLISHED
     from sweeps.worker.planner import specify_run
 
@@ -71,11 +69,7 @@ def write_new(name: str, experiment: str, overrides: Sequence[str], folder: Path
     varied = {key: each for key, each in values.items() if len(each) > 1}
     if not varied:
         raise InputError("no key is varied; give a comma list, such as masker.sigma_div=1,2,4.")
-    lasts = [key.lstrip("+").rpartition(".")[2] for key in varied]
-    short = {  # the last part of a key where that is unique
-        key: last if lasts.count(last) == 1 else key.lstrip("+")
-        for key, last in zip(varied, lasts, strict=True)
-    }
+    short = {key: name.lstrip("+") for key, name in short_names(varied).items()}
     rows: list[dict[str, Any]] = []
     for point in itertools.product(*values.values()):
         chosen = dict(zip(values, point, strict=True))
@@ -91,7 +85,7 @@ def write_new(name: str, experiment: str, overrides: Sequence[str], folder: Path
         "caption": f"{experiment} with {' and '.join(short.values())} varied.",
         "data": "the data set of each row",
         "columns": [
-            *({"name": f"IoU{n}", "metric": f"region/{n}"} for n in range(1, RINGS + 1)),
+            *({"name": f"IoU{n}", "metric": f"region/{n}"} for n in range(1, 6)),
             {"name": "mIoU", "metric": "mIoU"},
             {"name": "Var", "metric": "Var", "best": "lowest"},
         ],

@@ -33,7 +33,7 @@ class TableRequest:
     """A table to compute.
 
     Attributes:
-        table: with the rows that are shown; see `sweeps.table.make_request.select_rows`.
+        table: with the rows that are shown; see `sweeps.table_plan.select_rows`.
         extra: overrides that win over those of the rows.
         pretrained: files of initial weights by the name of the network.
         evaluated: labels of rows that are evaluated and not trained (`sweeps.table.external`).

@@ -25,9 +25,9 @@ Form = Literal["paper", "released"]  # what a row is run as
 Efficiency = Literal["parameters", "gflops", "peak_memory", "latency", "images_per_second"]
 """Millions of parameters, GFLOPs, MiB, milliseconds for one image, images per second."""
 
-COUNTED: tuple[Efficiency, ...] = ("parameters", "gflops")
+COUNTED: tuple[Efficiency, ...] = ("parameters", "gflops")  # the same on every machine
 MEASURED: tuple[Efficiency, ...] = ("peak_memory", "latency", "images_per_second")
-"""The same on every machine; of one device, shown with the ratio to the first row."""
+"""Of one device, shown with the ratio to the first row."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -203,9 +203,9 @@ class Table(Strict):
 
     @model_validator(mode="after")
     def _add_rows_of_design(self) -> Table:
+        of_design = () if self.design is None else self.design.rows()
         if not self.rows and self.design is None:
             raise ValueError("'rows' has no value.")
-        of_design = () if self.design is None else self.design.rows()
         return replace(self, rows=(*self.rows, *(Row(**each) for each in of_design)))
 
     @model_validator(mode="after")

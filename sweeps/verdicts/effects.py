@@ -9,14 +9,9 @@ from itertools import product
 import numpy as np
 
 from analysis.uncertainty import Resampling
-from analysis.uncertainty.factorial import (
-    CellScorer,
-    CellScores,
-    EffectEstimate,
-    Noise,
-    estimate_effects,
-    estimate_mean,
-)
+from analysis.uncertainty.contrasts import Evidence, Resampler, Term, combine
+from analysis.uncertainty.effects import Noise, estimate_effects
+from analysis.uncertainty.estimates import Estimate
 from rgbt.checks import InputError
 from rgbt.metrics import names
 from rgbt.metrics.counts import Counts
@@ -38,11 +33,13 @@ from sweeps.verdicts.contrasts import base_scores
 from sweeps.verdicts.judge import RESAMPLES, CellRunId, finished_runs_of
 from sweeps.verdicts.loaded_counts import LoadedCounts
 
-MEAN = "mean of all cells"
-"""Name of the line that is no effect: the outcome itself."""
+LEVEL = 0.95
 
 Cell = Mapping[int, tuple[str, Counts]]
 """Seed -> (identity of the counts, counts)."""
+
+MEAN = "mean of all cells"
+"""Name of the line that is no effect: the outcome itself."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +53,8 @@ class EffectLine:
         outcome: name of a column.
         effect: name of the effect, with its aliases; or `MEAN`.
         main: whether it is the effect of a single factor.
-        estimate: value, interval and p-values.
+        estimate: over images and seeds where it has an interval `both`.
+        corrected: its p-value, corrected for its family of effects (Holm).
         cells: number of cells.
     """
 
@@ -66,8 +64,14 @@ class EffectLine:
     outcome: str
     effect: str
     main: bool
-    estimate: EffectEstimate
+    estimate: Estimate
+    corrected: float
     cells: int
+
+    @property
+    def is_shown(self) -> bool:
+        """Whether the effect differs from 0, corrected for the number of effects."""
+        return self.corrected < 1 - LEVEL
 
 
 @dataclass(frozen=True)
@@ -99,7 +103,7 @@ class DesignJudge:
     def __post_init__(self) -> None:
         # Scenes of the generator are independent: no neighbouring frames.
         settings = Resampling(resamples=self.resamples, absent=self.table.absent, blocks="none")
-        self._scorer = CellScorer(settings)
+        self._engine = Resampler(settings, "names")
         self._rows = {row.label: row for row in self.table.rows}
 
     def effects(self, runs: Mapping[CellRunId, Outcome]) -> DesignEffects:
@@ -141,15 +145,39 @@ class DesignJudge:
         own, other = found.get(method.name), found.get(method.against or "")
         if own is None:
             return []
-        cells = self._scores(outcome, own, _common([own]))
+        cells = self._evidence(outcome, own, _common([own]))
         lines = part.lines(method.name, "", outcome, cells)
         if other is not None and method.against is not None:
             seeds = _common([own, other])
-            cells = self._scores(outcome, own, seeds).less(self._scores(outcome, other, seeds))
-            lines += part.lines(method.name, method.against, outcome, cells)
+            pairs = zip(
+                *(self._evidence(outcome, each, seeds) for each in (own, other)), strict=True
+            )
+            differences = [combine((1.0, -1.0), pair) for pair in pairs]
+            lines += part.lines(method.name, method.against, outcome, differences)
         return lines
 
-    def _scores(self, outcome: str, cells: Sequence[Cell], seeds: Sequence[int]) -> CellScores:
+    def _evidence(
+        self, outcome: str, cells: Sequence[Cell], seeds: Sequence[int]
+    ) -> list[Evidence]:
+        """The outcome in every cell."""
+        weights = self._weights(outcome)
+        return [
+            self._engine.evidence(
+                [
+                    Term(
+                        weight=weight,
+                        metric=metric,
+                        counts={seed: cell[seed][1] for seed in seeds},
+                        keys={seed: cell[seed][0] for seed in seeds},
+                    )
+                    for metric, weight in weights.items()
+                ]
+            )
+            for cell in cells
+        ]
+
+    def _weights(self, outcome: str) -> dict[str, float]:
+        """Metric -> weight of an outcome."""
         row = next(row for row in self.table.rows if row.group)
         weights: dict[str, float] = {}
         for weight, column in base_scores(self.table, row, outcome):
@@ -157,7 +185,7 @@ class DesignJudge:
                 raise InputError(f"'{column.name}' is no score of the plain test images.")
             metric = metric_of(column, row)
             weights[metric] = weights.get(metric, 0.0) + weight
-        return self._scorer.cells(weights, cells, seeds)
+        return weights
 
     @property
     def _plain_path(self) -> str:
@@ -201,16 +229,18 @@ class _Part:
             return [(tested_label(method), cell_name(cell)) for cell in cells]
         return [(trained_label(method, cell), "") for cell in cells]
 
-    def lines(self, method: str, against: str, outcome: str, cells: CellScores) -> list[EffectLine]:
+    def lines(
+        self, method: str, against: str, outcome: str, cells: Sequence[Evidence]
+    ) -> list[EffectLine]:
         """The mean of all cells, then every effect."""
         groups = self.design.effects(self.part)
         levels = self.design.cells(self.part)
         firsts = [next(iter(effects)) for effects in groups.values()]
         mains = [first for first in firsts if len(first) == 1]
-        found = [estimate_mean(cells)]
+        found = estimate_effects(cells, np.ones((1, len(levels))), self.noise, LEVEL)
         for family in (mains, firsts[len(mains) :]):  # p-values are corrected within each
             signs = np.array([[sign_of(cell, first) for cell in levels] for first in family], float)
-            found += estimate_effects(cells, signs, self.noise) if family else []
+            found += estimate_effects(cells, signs, self.noise, LEVEL) if family else []
         shown = [(MEAN, False), *((name, place < len(mains)) for place, name in enumerate(groups))]
         return [
             EffectLine(
@@ -220,10 +250,11 @@ class _Part:
                 outcome=outcome,
                 effect=effect,
                 main=main,
-                estimate=estimate,
+                estimate=each.estimate,
+                corrected=each.corrected,
                 cells=len(levels),
             )
-            for (effect, main), estimate in zip(shown, found, strict=True)
+            for (effect, main), each in zip(shown, found, strict=True)
         ]
 
 

@@ -118,11 +118,9 @@ class Driver:
         if claimed is None:
             return False
         slot = min(set(range(self.settings.workers)) - set(self.running))
-        minutes, trust = self.settings.timeout_minutes, self.settings.trust
-        limit = None if minutes is None else 60 * minutes
         start = partial(self._start, slot, claimed.plan.point.tags)
-        plan, number, report = claimed.plan, claimed.number, claimed.report
-        trial = RunningTrial(plan, number, self.runs, start, limit, report, trust)
+        limit_s = 60 * (self.settings.timeout_minutes or math.inf)
+        trial = RunningTrial(claimed, self.runs, start, limit_s, self.settings.trust)
         self.view.began(trial)
         self.running[slot] = trial
         # A point that was finished elsewhere needs no process: its slot is free at once.
@@ -134,8 +132,8 @@ class Driver:
     def _is_over(self) -> bool:
         """Whether the budget of this call is spent."""
         most, hours = self.settings.max_failures, self.settings.hours
-        spent = hours is not None and time.monotonic() - self._began > 3600 * hours
-        return spent or (most is not None and self.failures + self.source.rejected >= most)
+        spent = time.monotonic() - self._began > 3600 * (hours or math.inf)
+        return spent or self.failures + self.source.rejected >= (most or math.inf)
 
     def _start(self, slot: int, tags: Mapping[str, str], command: Sequence[str], log: Path) -> Job:
         environment = {TAGS: json.dumps(dict(tags))}

@@ -40,14 +40,10 @@ def specify_run(overrides: Sequence[str]) -> RunSpec:
 
 
 class Planner:
-    """Plans points; equal runs are specified once, and each data set is read once.
-
-    Args:
-        base: overrides that all runs have, e.g. the folders of runs and data.
-    """
+    """Plans points; equal runs are specified once, and each data set is read once."""
 
     def __init__(self, base: Sequence[str] = ()) -> None:
-        self.base = tuple(base)
+        self.base = tuple(base)  # overrides that all runs have, e.g. the folder of runs
         self._fingerprints: dict[str, str] = {}
         self._specified: dict[tuple[str, ...], RunSpec] = {}
 

@@ -11,15 +11,17 @@ from rgbt.checks import InputError, RunError
 from rgbt.config.stored_config import check_targets, parse_trust
 from rgbt.runs.naming import VARIED
 from rgbt.runs.result import RunResult
+from rgbt.terminal import info
 from sweeps import attributes as names
-from sweeps.point import COLOUR, UNFINISHED, Outcome, Point, State, colour, varied_keys
+from sweeps.point import UNFINISHED, Outcome, Point, State, varied_keys
 from sweeps.settings import SweepSettings
 from sweeps.worker.driver import drive
 from sweeps.worker.planner import PlannedPoint, Planner
 from sweeps.worker.progress import ProgressView, bars
 from sweeps.worker.run_store import RunStore
+from sweeps.worker.running_trial import ClaimedTrial
 from sweeps.worker.storage import find_study, open_storage, open_study
-from sweeps.worker.trial_sources import ClaimedTrial, trial_attributes
+from sweeps.worker.trial_sources import trial_attributes
 from sweeps.worker.trial_store import TrialStore, counted_trials, trials_by_key
 
 if TYPE_CHECKING:
@@ -75,6 +77,7 @@ class ListSource:
         """Indices of equal points, by key; the first one is run."""
         self._forgiven: set[int] | None = None
         self._finished: dict[str, tuple[RunResult, ...]] = {}
+        self._seen: set[int] = set()  # failed trials whose runs were looked for
         self._add(points.points)
 
     def _add(self, points: Sequence[Point]) -> bool:
@@ -90,13 +93,13 @@ class ListSource:
             index, reason = next(iter(self._errors.items()))
             raise InputError(f"{self._points[index].label}: {reason}" if self._plans else reason)
         varied = " ".join(varied_keys(self._points))
-        for number, indices in enumerate(self._same.values()):
+        for indices in self._same.values():
             # Points of the same run in other words (1 and 1.0) get the tags of all of them.
             tags: dict[str, dict[str, None]] = {}
             for name, value in (pair for i in indices for pair in self._points[i].tags.items()):
                 tags.setdefault(name, {})[value] = None
             merged = {name: " | ".join(values) for name, values in tags.items()}
-            merged |= {VARIED: varied, COLOUR: colour(self._list.study, number)}
+            merged |= {VARIED: varied}
             for index in indices:
                 plan = self._plans[index]
                 self._plans[index] = replace(plan, point=replace(plan.point, tags=merged))
@@ -123,14 +126,13 @@ class ListSource:
 
     def _claim(self) -> ClaimedTrial | None:
         by_key = self.store.by_key()
-        known = self._list.distributions or {}
         for plan in self._different():
             if self.status(plan, by_key).state != "waiting":
                 continue
-            params = {k: v for k, v in plan.point.params.items() if k in known}
+            params, known = plan.point.params, self._list.distributions or {}
+            own = {name: known[name] for name in params if name in known}
             # Failed trials of the point, and those whose runs were deleted.
             replaced = [trial.number for trial in by_key.get(plan.key, ())]
-            own = {name: known[name] for name in params}
             number = self.store.claim(trial_attributes(plan), params, own, replaced)
             if number is not None:
                 return ClaimedTrial(plan, number)
@@ -157,6 +159,10 @@ class ListSource:
             for index, point in enumerate(self._points)
         ]
 
+    def errors(self) -> list[tuple[str, str]]:
+        """Label of each point that cannot be run, and why."""
+        return [(self._points[index].label, reason) for index, reason in self._errors.items()]
+
     def _different(self) -> Iterator[PlannedPoint]:
         return (self._plans[indices[0]] for indices in self._same.values())
 
@@ -167,11 +173,14 @@ class ListSource:
             self._forgiven = {trial.number for trial in before if trial.state.name == "FAIL"}
         trials = by_key.get(plan.key, ())
         states = {trial.state.name for trial in trials}
-        if "COMPLETE" in states and plan.key not in self._finished:
+        failed = [trial for trial in trials if trial.state.name == "FAIL"]
+        # The runs of a failed point may have been finished by hand since.
+        unseen = {trial.number for trial in failed} - self._seen
+        self._seen |= unseen
+        if ("COMPLETE" in states or unseen) and plan.key not in self._finished:
             results = finished_runs(plan, self._list.runs)
             if is_evaluated(plan, results):
                 self._finished[plan.key] = results
-        failed = [trial for trial in trials if trial.state.name == "FAIL"]
         counted = [trial for trial in failed if trial.number not in self._forgiven]
         outcome = Outcome(plan.point, "waiting", keys=tuple(run.key for run in plan.runs))
         if plan.key in self._finished:
@@ -238,6 +247,8 @@ def run_points(
     def num_done() -> int:
         return sum(state in ("finished", "failed") for state in source.states())
 
+    for label, reason in source.errors():  # before hours of training
+        info(f"{label}: {reason.removeprefix(f'{label}: ')}")
     total = lambda: len(source.states())  # noqa: E731
     view = ProgressView(points.title, total, settings.workers, num_done)
     drive(view, source, source.store, points.runs, settings)

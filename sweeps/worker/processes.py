@@ -14,6 +14,7 @@ import signal
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Protocol
 
@@ -40,10 +41,7 @@ class Executor(Protocol):
     """Starts commands; it does not wait for them."""
 
     def start(self, command: Sequence[str], environment: Mapping[str, str], log: Path) -> Job:
-        """Start ``python -m <command>``, with variables beside those of this process.
-
-        `log` takes stdout and stderr, appended to.
-        """
+        """Start ``python -m <command>`` with more variables; its output is appended to `log`."""
 
 
 class LocalExecutor:
@@ -87,11 +85,9 @@ class LocalJob:
 
     def _signal(self, number: signal.Signals) -> None:
         assert self._process.pid is not None, "a started process has a number"
-        try:
-            os.killpg(self._process.pid, number)
-        except ProcessLookupError:  # not yet the leader of its group, or gone already
-            if self._process.exitcode is None:
-                os.kill(self._process.pid, number)
+        with suppress(ProcessLookupError):  # gone already
+            is_leader = os.getpgid(self._process.pid) == self._process.pid
+            (os.killpg if is_leader else os.kill)(self._process.pid, number)
 
 
 def _run_module(words: Sequence[str], variables: Mapping[str, str], log: str, folder: str) -> None:

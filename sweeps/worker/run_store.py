@@ -20,8 +20,7 @@ from rgbt.tracking.tracker import Tracking
 from sweeps.evaluation import ExtraEvaluation
 
 FETCHED_FILES = ("result.json", "provenance.json", "evaluations")
-FETCHED = ".fetched"
-"""Folder inside the folder of runs: copies of runs that other machines made, from MLflow."""
+FETCHED = ".fetched"  # in the folder of runs: copies of runs that other machines made
 
 Answer = TypeVar("Answer")
 
@@ -30,9 +29,8 @@ Answer = TypeVar("Answer")
 class RunStore:
     """All finished runs that this machine can reach.
 
-    Attributes:
-        tracking: as the configuration builds it; MLflow is searched for runs without a result here.
-        fresh: ignore finished runs that other code made, so that they are trained again.
+    MLflow of `tracking` is searched for runs without a result here. With `fresh`, finished runs
+    that other code made are ignored, so that they are trained again.
     """
 
     runs_dir: Path
@@ -43,8 +41,7 @@ class RunStore:
     def find(self, key: str, dataset: str) -> RunResult | None:
         """The finished run `key` on the data set with that fingerprint; None if there is none.
 
-        Raises:
-            RunError: the run folder is finished, but on other files of the data set.
+        RunError: the run folder is finished, but on other files of the data set.
         """
         result: RunResult | None = RunResult(self.runs_dir / key)
         if not is_finished(self.runs_dir / key):

@@ -10,6 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import fmean
+from typing import NamedTuple
 
 from rgbt.checks import RunError
 from rgbt.files.atomic import is_held
@@ -21,14 +22,21 @@ from sweeps.worker.planner import PlannedPoint
 from sweeps.worker.processes import Job, failure_reason
 from sweeps.worker.run_store import RunStore
 
-LOGS = ".logs"
-"""Folder inside the folder of runs: output of the processes, one file per run."""
+LOGS = ".logs"  # Folder inside the folder of runs: output of the processes, one file per run
 
 PruningCallback = Callable[[MetricLine], str]
 """Gets a line of the selection split; returns why the trial is pruned, or ""."""
 
 Start = Callable[[Sequence[str], Path], Job]
 """Starts ``python -m <command>`` with its output in a file."""
+
+
+class ClaimedTrial(NamedTuple):
+    """A trial that this driver executes; `report` gets every validation of the first run."""
+
+    plan: PlannedPoint
+    number: int
+    report: PruningCallback | None = None
 
 
 class TrialError(Exception):
@@ -40,13 +48,11 @@ class TrialPruned(Exception):  # noqa: N818 - not an error, Optuna's name for it
 
 
 class MetricsReader:
-    """Reads ``metrics.jsonl`` of a run as it grows; the run folder need not exist yet."""
+    """Reads ``metrics.jsonl`` of a run as it grows, up to `step`; the folder need not exist yet."""
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / "metrics.jsonl"
-        self._inode, self._offset = -1, 0
-        self.step = 0
-        """Last step seen."""
+        self._inode, self._offset, self.step = -1, 0, 0
 
     def new_lines(self) -> list[MetricLine]:
         """Whole lines since the last call; all of them again where the run has resumed."""
@@ -72,26 +78,24 @@ class RunningTrial:
     """Executes one trial; never blocks.
 
     Attributes:
-        timeout_s: of a run; None for no limit.
-        report: called with every validation of the first run, or None.
+        timeout_s: of a run.
         trust: as ``trust=`` of the commands that open a finished run.
         status: its present activity, in a few words.
         score: last mIoU on the selection split, a fraction.
         log: output of its last process.
     """
 
-    plan: PlannedPoint
-    number: int
+    claimed: ClaimedTrial
     runs: RunStore
     start: Start
-    timeout_s: float | None = None
-    report: PruningCallback | None = None
+    timeout_s: float = math.inf
     trust: str = ""
     status: str = field(default="starting", init=False)
     score: float = field(default=math.nan, init=False)
     log: Path | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
+        self.plan, self.number, self._report = self.claimed
         self._began = time.monotonic()
         self._job: Job | None = None
         self._metrics = MetricsReader(Path())
@@ -136,8 +140,8 @@ class RunningTrial:
 
     def _report_lines(self) -> None:
         """Report new lines; not in the generator, which an error of the storage would end."""
-        while self._unreported and not self._prune_reason and self.report is not None:
-            self._prune_reason = self.report(self._unreported[0])
+        while self._unreported and not self._prune_reason and self._report is not None:
+            self._prune_reason = self._report(self._unreported[0])
             del self._unreported[0]
 
     def stop(self) -> None:
@@ -224,13 +228,13 @@ class RunningTrial:
 
     def _wait(self, poll: Callable[[], int | None]) -> Generator[None, None, int]:
         """Wait for an exit code, and read the metrics of the run meanwhile."""
-        until = math.inf if self.timeout_s is None else time.monotonic() + self.timeout_s
+        until = time.monotonic() + self.timeout_s
         while True:
             code = poll()
             lines = [line for line in self._metrics.new_lines() if line.kind == "val"]
             if lines:
                 self.score = lines[-1].values.get("mIoU", math.nan)
-            if self.report is not None and not self._results:
+            if self._report is not None and not self._results:
                 self._unreported += lines
             if code is not None:
                 return code

@@ -31,7 +31,8 @@ FINAL = ("refused", "could not translate", "authentication", "unable to open", "
 """Words of errors that no later attempt cures."""
 
 
-def _url(storage: str | None, runs_dir: Path) -> str:
+def storage_url(storage: str | None, runs_dir: Path) -> str:
+    """The address of a storage for SQLAlchemy; "" and None: the file in the folder of runs."""
     url = storage or f"sqlite:///{runs_dir / 'studies.db'}"
     # SQLAlchemy before 2.1 takes a bare postgresql:// for psycopg2, which we do not install.
     return re.sub(r"^postgres(ql)?://", "postgresql+psycopg://", url)
@@ -44,20 +45,18 @@ def storage_file(url: str) -> Path | None:
 
 
 def open_storage(storage: str | None, runs_dir: Path) -> optuna.storages.RDBStorage:
-    """Open the storage; create it if it does not exist.
+    """Open a storage, and create it if it does not exist.
 
-    Args:
-        storage: None for the file ``<runs_dir>/studies.db``; or sqlite:///FILE, or
-            postgresql://USER@HOST/NAME (psycopg 3; the password belongs in ~/.pgpass).
-        runs_dir: the folder of runs.
+    `storage` is None for the file ``<runs_dir>/studies.db``, or sqlite:///FILE, or
+    postgresql://USER@HOST/NAME (psycopg 3; the password belongs in ~/.pgpass).
     """
     import optuna
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     warnings.filterwarnings("ignore", category=optuna.exceptions.ExperimentalWarning)
     warnings.filterwarnings("ignore", message="Heartbeat of storage")  # for optimize(), it says
-    url = _url(storage, runs_dir)
-    if storage is None:
+    url = storage_url(storage, runs_dir)
+    if not storage:
         runs_dir.mkdir(parents=True, exist_ok=True)
     # A firewall may cut a connection that is idle while a run trains for hours.
     options: dict[str, Any] = {"pool_pre_ping": True}
@@ -98,13 +97,6 @@ def _retry(opening: Callable[[], Opened], what: str) -> Opened:
     raise AssertionError("the last attempt returns or raises")
 
 
-def study_names(storage: optuna.storages.BaseStorage) -> list[str]:
-    """Names of all studies of a storage."""
-    import optuna
-
-    return sorted(optuna.get_all_study_names(storage))
-
-
 def open_study(
     name: str,
     storage: optuna.storages.BaseStorage,
@@ -115,8 +107,7 @@ def open_study(
 ) -> optuna.Study:
     """The study called `name`, created if it does not exist.
 
-    Raises:
-        InputError: there is one with other objectives, points of another kind or another space.
+    InputError: there is one with other objectives, points of another kind or another space.
     """
     import optuna
 
@@ -138,7 +129,7 @@ def open_study(
     for fixed in (names.METRICS, names.KIND, names.SIGNATURE):
         if fixed in known and known[fixed] != wanted.get(fixed):
             what = fixed.removeprefix("rgbt.")
-            raise InputError(f"study={name}: a study '{name}' with another {what} exists.")
+            raise InputError(f"study={name}: one with other {what} exists; choose another name.")
     for key, value in wanted.items():
         if known.get(key) != value:
             study.set_user_attr(key, value)
@@ -148,19 +139,19 @@ def open_study(
 
 def find_study(name: str, storage: str | None, runs_dir: Path) -> optuna.Study | None:
     """The study called `name`; None where it does not exist."""
-    file = storage_file(_url(storage, runs_dir))
+    file = storage_file(storage_url(storage, runs_dir))
     if file is not None and not file.exists():
         return None
     found = open_storage(storage, runs_dir)
-    return load_study(name, found) if name in study_names(found) else None
+    is_known = name in {study.study_name for study in found.get_all_studies()}
+    return load_study(name, found) if is_known else None
 
 
 def load_study(name: str, storage: optuna.storages.BaseStorage) -> optuna.Study:
     """The study called `name`; InputError, which names the nearest one, if there is none."""
     import optuna
 
-    known = study_names(storage)
+    known = [study.study_name for study in storage.get_all_studies()]
     if name not in known:
-        hint = nearest(name, known) if known else "the storage has none"
-        raise InputError(f"there is no study '{name}'; {hint}.")
+        raise InputError(f"name={name}: there is no such study; {nearest(name, known)}.")
     return optuna.load_study(study_name=name, storage=storage)

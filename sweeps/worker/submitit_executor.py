@@ -25,14 +25,10 @@ from sweeps.worker.processes import GPUS, Job
 
 QUIET = 'trap "" USR2; exec "$0" "$@"'
 """SLURM sends submitit's signal to all processes of a job: it is for submitit's alone."""
-YEAR_MIN = 365 * 24 * 60
-"""Time limit of a local job: submitit's own is two minutes."""
-KILL_S = 600.0
-"""How long a preempted job waits for SLURM to end it."""
-ASK_S = 5.0
-"""Seconds between two queries of a job that has to stop."""
-FAILED = 1
-"""Exit code of a job that ended without one; its log holds the reason."""
+YEAR_MIN = 365 * 24 * 60  # Time limit of a local job: submitit's own is two minutes
+KILL_S = 600.0  # How long a preempted job waits for SLURM to end it
+ASK_S = 5.0  # Seconds between two queries of a job that has to stop
+FAILED = 1  # Exit code of a job that ended without one; its log holds the reason
 
 
 @dataclass(frozen=True)
@@ -88,9 +84,9 @@ class SubmititExecutor:
             key if key in shared or key.startswith(prefix) else prefix + key: value
             for key, value in values.items()
         }
-        limit = {key: named.pop(key) for key in list(named) if key == f"{prefix}max_num_timeout"}
+        limit = {key: named.pop(key) for key in (f"{prefix}max_num_timeout",) if key in named}
+        place = folder.resolve() / "%j"
         try:
-            place = folder.resolve() / "%j"
             self._executor = submitit.AutoExecutor(place, cluster=self._cluster, **limit)
             self._executor.update_parameters(**named)
         except (AssertionError, NameError, RuntimeError, TypeError, ValueError) as error:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from rgbt.checks import InputError
 from rgbt.metrics.names import in_percent
@@ -13,33 +13,23 @@ from rgbt.runs.folder import MetricLine
 from rgbt.runs.naming import VARIED
 from rgbt.runs.provenance import without_passwords
 from sweeps import attributes as names
-from sweeps.point import COLOUR, Point, colour
+from sweeps.point import Point
 from sweeps.settings import SweepSettings
 from sweeps.worker.planner import PlannedPoint, Planner
-from sweeps.worker.running_trial import PruningCallback
+from sweeps.worker.running_trial import ClaimedTrial, PruningCallback
 from sweeps.worker.trial_store import TrialStore
 
 if TYPE_CHECKING:
     from optuna.trial import Trial
 
-    from sweeps.space.space import Space
-
-
-class ClaimedTrial(NamedTuple):
-    """A trial that this driver executes; for `report` see `running_trial.RunningTrial`."""
-
-    plan: PlannedPoint
-    number: int
-    report: PruningCallback | None = None
+    from sweeps.space import Space
 
 
 class TrialSource(Protocol):
     """Gives a driver its trials."""
 
-    requeues: bool
-    """Whether the study gives a point that failed to a driver again."""
-    rejected: int
-    """Points whose configuration is wrong."""
+    requeues: bool  # whether the study gives a point that failed to a driver again
+    rejected: int  # points whose configuration is wrong
 
     def next(self) -> ClaimedTrial | None:
         """The next trial, claimed for this driver; None when there is none at the moment."""
@@ -79,20 +69,19 @@ class SamplerSource:
 
     def next(self) -> ClaimedTrial | None:
         """See `TrialSource.next`."""
-        from sweeps.space.space import as_overrides, suggest
+        from sweeps.space import as_overrides
 
-        trial = self.store.ask(self.settings.trials)
+        trial = self.store.ask(self.settings.trials, self.space)
         if trial is None:
             return None
-        params = suggest(trial, self.space)
-        chosen, number = as_overrides(params), trial.number
+        chosen, number = as_overrides(trial.params), trial.number
         study, replicates = self.store.study.study_name, self.settings.replicates
-        tags = {f"rgbt.study/{study}": str(number), VARIED: " ".join(params)}
+        tags = {f"rgbt.study/{study}": str(number), VARIED: " ".join(trial.params)}
         point = Point(
             label=f"#{number} " + " ".join(map(_short, chosen)),
             overrides=(*self.fixed, *chosen),
             params=dict(trial.params),
-            tags={**tags, COLOUR: colour(study, number)},
+            tags=tags,
             seeds=tuple(range(replicates)) if replicates > 1 else (),
         )
         try:

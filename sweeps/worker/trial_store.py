@@ -59,8 +59,7 @@ class TrialStore:
     ) -> int | None:
         """The number of a new running trial of ours; None if an earlier trial has the point.
 
-        `replaced` are numbers of earlier trials of the point that the new one replaces: failed
-        ones, and those whose runs were deleted.
+        `replaced` are numbers of earlier trials that do not count: of failed or deleted runs.
         """
         from optuna.trial import TrialState, create_trial
 
@@ -87,15 +86,18 @@ class TrialStore:
                 return None
         return number
 
-    def ask(self, total: int | None) -> Trial | None:
-        """A trial of a search: an enqueued one, or a new one while there are fewer than `total`."""
+    def ask(self, total: int | None, space: Mapping[str, Any] | None = None) -> Trial | None:
+        """A trial of a search, with parameters of `space`.
+
+        It is an enqueued one, or a new one while there are fewer than `total`.
+        """
         from optuna.storages import RetryHeartbeatStaleTrialCallback
 
         trials = self.trials()
         is_waiting = any(trial.state.name == "WAITING" for trial in trials)
         if total is not None and len(trials) >= total and not is_waiting:
             return None
-        trial = self.study.ask()
+        trial = self.study.ask(dict(space or {}))
         self._storage.record_heartbeat(trial._trial_id)
         before = [other for other in self.trials() if other.number < trial.number]
         # Two drivers may ask for the last one at the same time: the lower number wins.

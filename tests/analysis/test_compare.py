@@ -53,14 +53,15 @@ def test_table_and_sentence_hold_the_numbers_of_the_comparison(call: Call, files
     }
     assert list(rows) == ["mIoU", "Var", "region/1", "region/2"]
     (found,) = compare(*([each] for each in pair()), ["mIoU"], SETTINGS).differences
-    assert found.images is not None
+    assert found.interval is not None
     words = rows["mIoU"].split()
     assert words[1:4] == [f"{found.a.value:.2f}", f"{found.b.value:.2f}", f"{found.value:+.2f}"]
-    assert words[4:7] == [f"{found.images.low:+.2f}", "to", f"{found.images.high:+.2f}"]
-    assert words[7] == f"{found.p_images:.3f}"
+    assert words[4:7] == [f"{found.interval.low:+.2f}", "to", f"{found.interval.high:+.2f}"]
+    assert found.difference.p < 0.00025
+    assert words[7] == "<0.001"
     said = next(line for line in lines if line.startswith("As trained here, the mIoU of grbm is "))
-    assert said.endswith(f"all 4 scores compared, p = {4 * found.p_images:.3f}.")
-    assert any("percentile, 200 resamples" in line for line in lines)
+    assert said.endswith("all 4 scores compared, p < 0.001.")
+    assert any("Student, 200 resamples" in line for line in lines)
 
 
 def test_seeds_have_their_columns(call: Call, tmp_path: Path):
@@ -116,14 +117,14 @@ def test_files_hold_all_digits(call: Call, files: tuple[str, str], tmp_path: Pat
     expected = compare(*([each] for each in pair()), metrics, SETTINGS).differences
     assert [row["metric"] for row in rows] == list(metrics)
     for row, each in zip(rows, expected, strict=True):
-        assert each.images is not None
+        assert each.interval is not None
         numbers = {
             **{"a": each.a.value, "b": each.b.value, "difference": each.value},
-            **{"images_low": each.images.low, "images_high": each.images.high},
-            **{"p_images": each.p_images, "p_holm": each.p_corrected, "seeds_a": 1, "seeds_b": 1},
+            **{"images_low": each.interval.low, "images_high": each.interval.high},
+            **{"p": each.difference.p, "p_holm": each.p_corrected, "seeds_a": 1, "seeds_b": 1},
         }
         assert {key: float(row[key]) for key in numbers} == numbers
-        assert row["both_low"] == row["both_high"] == row["p_both"] == ""
+        assert row["both_low"] == row["both_high"] == ""
         assert f"{each.value:+.2f}" in text
 
 
@@ -139,7 +140,7 @@ def test_nothing_to_score_is_empty(call: Call, tmp_path: Path):
     assert (code, err) == (0, "")
     assert "class/cone of crm and grbm cannot be compared: nothing to score." in out
     row = (tmp_path / "comparison.csv").read_text().splitlines()[1]
-    assert row == "class/cone,,,1,1,,,,,,,,"
+    assert row == "class/cone,,,1,1,,,,,,,"
 
 
 @pytest.mark.parametrize(("at_night", "parts"), [(0, ""), (9, "day"), (10, "day night")])
@@ -153,7 +154,7 @@ def test_auto_takes_parts_of_ten_images(call: Call, tmp_path: Path, at_night: in
     if at_night == 9:
         code, _, err = call(entry, *words, "metrics=night/mIoU")
         assert code == 2
-        assert_one_sentence(err, "9 single images are too few")
+        assert_one_sentence(err, "9 of 40 single images are too few")
 
 
 def test_missing_images_are_refused_or_excluded(call: Call, tmp_path: Path):

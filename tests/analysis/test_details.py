@@ -14,12 +14,12 @@ from analysis.compare import metrics_of
 from analysis.details import entry
 from analysis.uncertainty import Resampling, compare, estimate
 from analysis.uncertainty.contrasts import Resampler, Term
-from analysis.uncertainty.same_images import aligned, aligned_images
+from analysis.uncertainty.same_images import in_order
 from rgbt.checks import InputError
-from rgbt.metrics.calibration import ece
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.details import Details
 from rgbt.metrics.named import value
+from rgbt.metrics.scores import ece
 from tests.analysis.test_results import make_run
 from tests.commands import Call, assert_one_sentence
 
@@ -104,25 +104,25 @@ def test_difference_between_two_methods_has_an_interval_and_a_p_value() -> None:
     assert metrics == ["boundary_mIoU", "region/1/boundary_mIoU", "region/2/boundary_mIoU"]
     found = compare([boundaries(1)], [better], metrics, SETTINGS).differences[0]
     assert found.value > 0
-    assert found.images is not None
-    assert found.images.low > 0
-    assert found.p_images < 0.01
+    assert found.interval is not None
+    assert found.interval.low > 0
+    assert found.difference.p < 0.01
 
 
 def test_other_labels_are_refused() -> None:
     array = boundaries().counts.copy()
     array[3, 0, 1, 0] += 1  # one more boundary pixel of the label
     with pytest.raises(InputError, match="'00003' has different labels"):
-        aligned(boundaries(), replace(boundaries(), counts=array))
+        in_order(boundaries(), replace(boundaries(), counts=array), "pixels")
     array = calibrated().counts.copy()
     array[3, 0, 0, 1] += 1  # one more pixel
     with pytest.raises(InputError, match="'00003' has different labels"):
-        aligned(calibrated(), replace(calibrated(), counts=array))
+        in_order(calibrated(), replace(calibrated(), counts=array), "pixels")
     moved = calibrated().counts.copy()
     moved[:, 0] = moved[:, 1]
     moved[:, 1] = 0  # another bin, the same pixels
-    aligned(calibrated(), replace(calibrated(), counts=moved))
-    aligned_images(calibrated(), boundaries())  # nothing to compare
+    in_order(calibrated(), replace(calibrated(), counts=moved), "pixels")
+    in_order(calibrated(), boundaries(), "labels")  # nothing to compare
 
 
 @pytest.mark.parametrize("blocks", ["none", "auto"])

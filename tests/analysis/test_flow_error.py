@@ -62,8 +62,8 @@ def test_differences_by_hand(measured: Path) -> None:
     assert error.a.value == pytest.approx(5)
     assert error.b.value == pytest.approx(100 * 7 / 80)
     assert error.value == pytest.approx(100 * 7 / 80 - 5)
-    assert error.images is not None
-    assert error.images.low < error.value < error.images.high
+    assert error.interval is not None
+    assert error.interval.low < error.value < error.interval.high
     assert {"day/TC", "night/warning"} - set(found) == {"night/warning"}
     assert found["TC"].value < 0
 

@@ -196,7 +196,10 @@ def test_a_part_that_is_too_small_stops_nothing_else() -> None:
     counts = counts_of(array, names=names, night=night)
     (table,) = score_tables([("m", counts)], Resampling(resamples=100, blocks=5))
     assert "of 20 blocks of up to 5" in table.intervals
-    assert "night has none (night: blocks=5: 30 images make 6 blocks" in table.intervals
+    assert (
+        "night has none (6 of 20 blocks of up to 5 neighbouring frames are too few)"
+        in table.intervals
+    )
     assert {cell.images for cell, each in table.scores.items() if each.low == each.low} == {
         "all",
         "day",

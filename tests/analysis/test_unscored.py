@@ -84,13 +84,13 @@ def test_difference_in_unscored_classes_only_is_none() -> None:
     metrics = ["mIoU", "Var", "mAcc", "mPrecision", "mF1", "region/1"]
     for difference in compare([a], [b], metrics, FEW).differences:
         assert difference.value == 0, difference.metric
-        assert difference.images is not None
-        assert (difference.images.low, difference.images.high) == (0, 0)
-        assert difference.p_images == 1
+        assert difference.interval is not None
+        assert (difference.interval.low, difference.interval.high) == (0, 0)
+        assert difference.difference.p == 1
     both = [replace(each, unscored=()) for each in (a, b)]
     (scored,) = compare([both[0]], [both[1]], ["mIoU"], FEW).differences
     assert scored.value < -1
-    assert scored.p_images < 0.05
+    assert scored.difference.p < 0.05
 
 
 REFUSED = (

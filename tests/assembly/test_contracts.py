@@ -15,7 +15,7 @@ from torch import nn
 from rgbt.assembly import contracts
 from rgbt.checks import InputError
 from rgbt.data.mfnet import MFNet
-from rgbt.maskers.contract import check_masker
+from rgbt.maskers.masker import check_masker
 from rgbt.requirements import Record, record_of
 from rgbt.types import MaskPair, Output, Sample
 from tests.conftest import WriteMFNet
@@ -110,11 +110,11 @@ REFUSED: list[tuple[Callable[[], Any], str]] = [
     (lambda: sample(thermal=SAMPLE.rgb), "thermal ndarray (4, 6, 3) uint8; expected (4, 6) uint8"),
     (lambda: sample(label=SAMPLE.label[:3]), "label ndarray (3, 6) uint8; expected (4, 6)"),
     (lambda: sample(label=np.full(HW, 2, np.uint8)), "the label value 2 (24 pixels); expected 0"),
-    (lambda: drawn(None), "Halves.__call__ returned None; expected MaskPair(rgb, thermal)"),
-    (lambda: drawn(MaskPair(1, 2)), "returned MaskPair; expected MaskPair"),
-    (lambda: drawn(MaskPair(1.0 * CELLS, 1.0 * CELLS)), "rgb is Tensor (1, 4, 5) float32"),
+    (lambda: drawn(None), "masker: Halves returned None; expected MaskPair(rgb, thermal)"),
+    (lambda: drawn(MaskPair(1, 2)), "returned int 1; expected MaskPair"),
+    (lambda: drawn(MaskPair(1.0 * CELLS, 1.0 * CELLS)), "returned Tensor (1, 4, 5) float32; expected MaskPair"),
     (lambda: drawn(MaskPair(*[torch.zeros(1, 15, 20).bool()] * 2)), "dividing 128 and 160"),
-    (lambda: drawn(MaskPair(CELLS, CELLS.repeat(1, 2, 2))), "rgb and thermal differ in size"),
+    (lambda: drawn(MaskPair(CELLS, CELLS.repeat(1, 2, 2))), "returned Tensor (1, 8, 10) bool; expected MaskPair"),
     (lambda: passed(RGB), "Net.forward returned Tensor (2, 3, 4, 6) float32; expected Output."),
     (lambda: passed(Output(RGB, {})), "(2, 3, 4, 6) float32; expected (2, 5, 4, 6)."),
     (lambda: passed(Output(torch.zeros(2, 5, 2, 3), {})), "logits Tensor (2, 5, 2, 3) float32"),

@@ -13,9 +13,8 @@ import numpy as np
 import torch
 from sklearn.metrics import confusion_matrix
 
-from rgbt.metrics.confusion import RegionCounter
-from rgbt.metrics.metric import Regions
-from rgbt.metrics.regions import ring_rectangle
+from rgbt.metrics.counting import RegionCounter
+from rgbt.metrics.metric import Regions, ring_rectangle
 from tests.benchmarks.timing import medians
 
 HW = (480, 640)

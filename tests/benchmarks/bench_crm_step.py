@@ -35,7 +35,7 @@ from rgbt.config.component import build
 from rgbt.config.compose import compose
 from rgbt.engine.device import keep_memory
 from rgbt.geometry.padding import STRIDE, padded_hw
-from rgbt.losses.distillation import sdc, sdn
+from rgbt.losses.distances import sdc, sdn
 from rgbt.losses.set_criterion import SetCriterion
 from rgbt.models.inputs import expand_cells
 from rgbt.models.mask2former.model import Mask2Former

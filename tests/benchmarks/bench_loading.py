@@ -28,8 +28,8 @@ from rgbt.config.compose import compose
 from rgbt.data.cache.dataset import CachedDataset
 from rgbt.data.loaders import LoaderSettings, train_batches
 from rgbt.data.mfnet import MFNet
-from rgbt.data.synth.dataset import synth
 from rgbt.dataset import LabelledDataset
+from rgbt.synth.datasets import synth
 from rgbt.transforms.crm import CrmTransform
 from tests.benchmarks.released_loading import ReleasedSamples
 from tests.benchmarks.timing import seconds
@@ -48,11 +48,11 @@ def transform(name: str) -> CrmTransform:
     return made
 
 
-def ours(dataset: LabelledDataset, augment: Any) -> Way:
+def ours(dataset: LabelledDataset) -> Way:
     chain = transform("crm")
 
     def batches(workers: int) -> Iterator[Any]:
-        settings = LoaderSettings(BATCH, 1, workers, augment=augment)
+        settings = LoaderSettings(BATCH, 1, workers)
         return train_batches(dataset, "train", chain, settings, 0, range(10**6))
 
     return batches
@@ -83,10 +83,8 @@ def speeds(dataset: MFNet, cache: Path) -> None:
     _, built = seconds(lambda: mapped.ensure(dataset.names("train")))
     ways: dict[str, Way] = {
         "release": released(dataset),
-        "files, loader": ours(dataset, "loader"),
-        "files, device": ours(dataset, "device"),
-        "cache, loader": ours(mapped, "loader"),
-        "cache, device": ours(mapped, "device"),
+        "files": ours(dataset),
+        "cache": ours(mapped),
     }
     found = np.full((2, len(ways), ROUNDS), math.nan)
     for turn in range(ROUNDS):
@@ -125,8 +123,8 @@ def compare(dataset: MFNet, cache: Path, draws: int) -> None:
             made = samples[int(index)]
             yield made["image"].numpy(), made["label"].numpy()
 
-    def mine(chain: CrmTransform, augment: Any) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        settings = LoaderSettings(10, 1, 0, augment=augment)
+    def mine(chain: CrmTransform) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        settings = LoaderSettings(10, 1, 0)
         for batch in train_batches(mapped, "train", chain, settings, 0, range(draws // 10)):
             moved = batch.to("cpu")
             images = torch.cat([moved.rgb, moved.thermal], 1).numpy() * 255
@@ -134,9 +132,8 @@ def compare(dataset: MFNet, cache: Path, draws: int) -> None:
 
     found = {
         "release": moments(theirs()),
-        "crm_released": moments(mine(transform("crm_released"), "loader")),
-        "crm": moments(mine(transform("crm"), "loader")),
-        "crm, batch": moments(mine(transform("crm"), "device")),
+        "crm_released": moments(mine(transform("crm_released"))),
+        "crm": moments(mine(transform("crm"))),
     }
     titles = [f"{what} {c}" for what in ("mean", "std") for c in "RGBT"]
     titles += [f"class {k} %" for k in range(NUM_CLASSES)]

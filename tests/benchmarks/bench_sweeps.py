@@ -25,8 +25,10 @@ from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
+from optuna import get_all_study_names
+
 from sweeps import attributes as names
-from sweeps.worker.storage import load_study, open_storage, study_names
+from sweeps.worker.storage import load_study, open_storage
 from sweeps.worker.trial_store import counted_trials
 from tests.benchmarks.process_cost import cpu_seconds
 from tests.benchmarks.timing import seconds
@@ -53,7 +55,7 @@ def inside(run: Path) -> float:
 
 def trials_of(runs: Path) -> list:
     storage = open_storage(None, runs)
-    (name,) = study_names(storage)
+    (name,) = get_all_study_names(storage)
     return counted_trials(load_study(name, storage))
 
 

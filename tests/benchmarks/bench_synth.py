@@ -14,10 +14,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from rgbt.data.synth.dataset import LAYOUT
-from rgbt.data.synth.factors import SceneFactors
-from rgbt.data.synth.scene import render_scene
-from rgbt.data.synth.writer import Plan, write_shot
+from rgbt.synth.datasets import MFNET_LAYOUT
+from rgbt.synth.export import Plan, write_shot
+from rgbt.synth.factors import SceneFactors
+from rgbt.synth.scene import render_scene
 from tests.benchmarks.timing import in_turns
 
 WANTED = 100.0
@@ -38,14 +38,14 @@ def main(num_scenes: int) -> None:
     factors = SceneFactors()
     for index in range(20):
         render_scene(0, index, factors)
-    plan = Plan(seed=0, numbers={"num_train": num_scenes}, factors=factors)
-    shots = LAYOUT.shots(plan)
+    plan = Plan(name="x", seed=0, numbers={"train": num_scenes}, factors=factors)
+    shots = MFNET_LAYOUT.shots(plan)
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         rows = {
             "render": rate(lambda index: render_scene(0, index, factors), num_scenes),
             "render + PNG": rate(
-                lambda index: write_shot(LAYOUT, plan, folder, shots[index]), num_scenes
+                lambda index: write_shot(MFNET_LAYOUT, plan, folder, shots[index]), num_scenes
             ),
         }
     print(f"{factors.height} x {factors.width}, one thread, {num_scenes} scenes, CPU time")

@@ -39,8 +39,7 @@ from rgbt.geometry.halving import halved_mean
 from rgbt.geometry.homography import homography
 from rgbt.geometry.padding import pad_to
 from rgbt.geometry.rectangle import Rule, inner_rectangle
-from rgbt.geometry.sampling import powers_of_two
-from rgbt.geometry.warp import Resampling, Warp
+from rgbt.geometry.warp import Resampling, Warp, powers_of_two
 
 HW = (480, 640)
 BATCH = 8

@@ -20,7 +20,7 @@ from torch.nn import functional as F
 from torch.utils.data import Dataset
 
 from rgbt.geometry.padding import STRIDE
-from rgbt.transforms.photometric import ColourJitter
+from rgbt.transforms.crm import ColourJitter
 
 SIZES = tuple(range(240, 961, 48))
 CROP_HW = (240, 320)
@@ -28,7 +28,7 @@ FAR = 400.0
 """What the release pads its map of distances with."""
 
 JITTER = ColourJitter(
-    probability=0.5,
+    colour_probability=0.5,
     brightness_delta=32.0,
     contrast_range=(0.5, 1.5),
     saturation_range=(0.5, 1.5),
@@ -97,7 +97,7 @@ class ReleasedSamples(Dataset[dict[str, Any]]):
         return tuple(each[top : top + height, left : left + width] for each in arrays)
 
     def _coloured(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
-        colours = JITTER.draw(self.rng)
+        colours = JITTER.draw_colours(self.rng)
         rgb = colours.rgb(np.ascontiguousarray(image[..., :3]))
         thermal = colours.thermal(np.ascontiguousarray(image[..., 3]))
         return np.concatenate([rgb, thermal[..., None]], axis=-1).astype(np.float32)

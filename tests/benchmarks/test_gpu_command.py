@@ -167,7 +167,6 @@ def test_arithmetic_is_restored() -> None:
 def test_the_marked_tests_are_found() -> None:
     found = files_with_mark()
     assert "tests/on_device/test_draws.py" in found
-    assert "tests/transforms/test_on_batch.py" in found
 
 
 @pytest.mark.slow

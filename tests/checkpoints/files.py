@@ -13,11 +13,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import pytest
 import torch
 from torch import Tensor, nn
 
-from rgbt.checks import InputError
 from tests.models import golden
 
 PROTOTYPES: dict[str, nn.Module] = {}
@@ -75,12 +73,3 @@ def saved(folder: Path, content: Any, *, name: str = "file.pth", legacy: bool = 
 def holds(value: Tensor, name: str) -> bool:
     """Whether an entry holds the number of `name`, everywhere."""
     return bool((value == number(name)).all())
-
-
-def sentence(error: pytest.ExceptionInfo[InputError]) -> str:
-    """The text of a refusal, which must be one clear sentence: one line, ending in a full stop."""
-    text = str(error.value)
-    assert "\n" not in text
-    assert text.endswith(".")
-    assert len(text) < 600
-    return text

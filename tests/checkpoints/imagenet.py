@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -82,7 +83,12 @@ def mit_file(dims: tuple[int, ...], depths: tuple[int, ...]) -> OrderedDict[str,
 
 
 def resnet_file(
-    layers: int, *, counters: bool = True, prefix: str = "", width: int = 64
+    layers: int,
+    *,
+    counters: bool = True,
+    prefix: str = "",
+    width: int = 64,
+    more: Sequence[str] = (),
 ) -> OrderedDict[str, Tensor]:
     """torchvision's ResNets."""
     bottleneck = layers >= 50
@@ -111,10 +117,22 @@ def resnet_file(
     ends = ("weight", "bias", "running_mean", "running_var")
     shapes |= {f"{norm}.{end}": (size,) for norm, size in norms for end in ends}
     tensors = named({f"{prefix}{name}": shape for name, shape in shapes.items()})
+    tensors |= named(dict.fromkeys(more, (21, 2048, 3, 3)))
     if counters:
         for norm, _ in norms:
-            name = f"{norm}.num_batches_tracked"
+            name = f"{prefix}{norm}.num_batches_tracked"
             tensors[name] = tensor(name, (), torch.int64)
     if not prefix:
         tensors |= named(linear("fc", before, 1000))
     return tensors
+
+
+def deep_resnet_file(width: int) -> OrderedDict[str, Tensor]:
+    """The ResNet-50 of semseg, with three stem convolutions of width, width and 2 width."""
+    sizes = {"conv1": (width, 3), "conv2": (width, width), "conv3": (2 * width, width)}
+    deep: dict[str, Any] = {f"{name}.weight": (*size, 3, 3) for name, size in sizes.items()}
+    ends = ("weight", "bias", "running_mean", "running_var")
+    deep |= {f"bn{n}.{end}": (width * (1 + n // 3),) for n in (1, 2, 3) for end in ends}
+    deep["layer1.0.conv1.weight"] = (width, 2 * width, 1, 1)
+    deep["layer1.0.downsample.0.weight"] = (4 * width, 2 * width, 1, 1)
+    return resnet_file(50, width=width) | named(deep)

@@ -1,103 +1,97 @@
-"""``rgbt weights``: inspect and export, as they are called."""
+"""``rgbt weights``: inspect and export, as they are called, and the table of published files."""
 
 from __future__ import annotations
 
+import hashlib
 import json
+import re
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 import pytest
 import torch
 import yaml
 
+from rgbt.checkpoints.kinds import family_named
+from rgbt.checkpoints.load import plan_for
+from rgbt.checkpoints.read import read
+from rgbt.checkpoints.starts import RECIPES, STARTS
+from rgbt.config.component import build
+from rgbt.config.compose import available, compose
+from rgbt.requirements import record_of
 from rgbt.weights import entry
 from tests.checkpoints.files import like, network, saved
-from tests.checkpoints.imagenet import resnet_file
+from tests.checkpoints.imagenet import mit_file, resnet_file, swin_file
 from tests.commands import Call
-from tests.models.golden import SHARED
+from tests.models import golden
 
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
     """The folder of a run of MFNet, as far as it matters here."""
-    import hydra
-    from omegaconf import OmegaConf
-
-    from rgbt.config.compose import conf_dir
-
     folder = tmp_path / "runs" / "0123456789ab"
     folder.mkdir(parents=True)
-    with hydra.initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        config = hydra.compose("config", ["model=mfnet_tiny", "model.num_classes=9"])
-    resolved = OmegaConf.to_container(config.model, resolve=True)
-    (folder / "config.yaml").write_text(yaml.safe_dump({"model": resolved}))
-    state = network("mfnet_tiny").state_dict()
-    torch.save({"model": state, "step": 240}, folder / "best.pt")
+    model = golden.alone("model/mfnet_tiny", "model.num_classes=9").model
+    from omegaconf import OmegaConf
+
+    plain = {"model": OmegaConf.to_container(model, resolve=True)}
+    (folder / "config.yaml").write_text(yaml.safe_dump(plain))
+    torch.save({"model": network("mfnet_tiny").state_dict(), "step": 240}, folder / "best.pt")
     return folder
 
 
 def test_inspect_a_released_file(call: Call) -> None:
-    path = SHARED / "realdata/mfnet_weights/final.pth"
+    path = golden.SHARED / "realdata/mfnet_weights/final.pth"
     if not path.exists():
         pytest.skip("reference material is not here")
-    code, out, err = call(entry, "inspect", str(path))
+    code, out, err = call(entry, "inspect", str(path), "model=mfnet", "model.num_classes=9")
     assert (code, err) == (0, "")
-    lines = {line.split("  ")[0]: line for line in out.splitlines() if line[:1].isalpha()}
-    assert lines["what"].endswith("MFNet checkpoint (9 classes)")
-    assert lines["container"].endswith("torch.save")
-    assert lines["tensors"].endswith("228 (float32)")
-    assert lines["parameters"].endswith("736,275 (0.74 M)")
-    assert lines["fits"].endswith("model=mfnet")
-    assert "into model=mfnet model.num_classes=9" in out
-    rows = [line.split() for line in out.splitlines()]
-    assert ["set", "228"] in rows
-    assert any(row[:4] == ["begin", "at", "0", "38"] for row in rows)
+    lines = dict(line.split(None, 1) for line in out.splitlines())
+    assert lines["what"] == "MFNet checkpoint"
+    assert lines["tensors"] == "228 (float32)"
+    assert "228 of 266 entries set; 38 counters begin at 0" in out
+    assert "model.final_activation=true" in lines["trained"]
 
 
-def test_inspect_a_backbone(tmp_path: Path, call: Call) -> None:
+def test_inspect_for_networks_that_fit_and_that_do_not(tmp_path: Path, call: Call) -> None:
     path = saved(tmp_path, resnet_file(18))
     code, out, _ = call(entry, "inspect", str(path))
     assert code == 0
-    assert "ImageNet ResNet (ResNet-18)" in out
-    assert "into model=rtfnet_18" in out
-    assert "unused" in out
-    assert "ImageNet's classifier" in out
-    assert "keep initial values" in out
-
-
-def test_inspect_for_a_network_that_does_not_fit(tmp_path: Path, call: Call) -> None:
-    path = saved(tmp_path, resnet_file(18))
+    assert "ImageNet ResNet" in out
+    code, out, _ = call(entry, "inspect", str(path), "model=rtfnet_18")
+    assert code == 0
+    assert "initial values (deconv1.0.conv1.weight" in out
+    assert "unused in the file (fc.bias, fc.weight)" in out
     code, out, _ = call(entry, "inspect", str(path), "model=rtfnet_tiny")
     assert code == 1
-    assert "DIFFERENT" in out
+    assert "does not fit this network" in out
     code, _, err = call(entry, "inspect", str(path), "model=mfnet_tiny")
     assert code == 2
-    assert "cannot be loaded into MFNet" in err
+    assert "(ImageNet ResNet) is no file of weights for MFNet" in err
 
 
 def test_inspect_a_part_that_is_named_fresh(tmp_path: Path, call: Call) -> None:
     path = saved(tmp_path, like(network("mfnet_tiny", 9).state_dict()))
     words = ("model=mfnet_tiny", "model.num_classes=5")
-    code, out, _ = call(entry, "inspect", str(path), *words)
-    assert (code, "DIFFERENT" in out) == (1, True)
-    fresh = "model.fresh=[decode1]"
-    code, out, _ = call(entry, "inspect", str(path), *words, fresh)
+    assert call(entry, "inspect", str(path), *words)[0] == 1
+    code, out, _ = call(entry, "inspect", str(path), *words, "model.fresh=[decode1]")
     assert code == 0
-    assert "named in model.fresh" in out
+    assert "initial values (decode1." in out
 
 
 def test_inspect_an_unknown_file(tmp_path: Path, call: Call) -> None:
     path = saved(tmp_path, {"layer.weight": torch.zeros(2, 3), "[bold]\x1b[2J": torch.zeros(1)})
     code, out, _ = call(entry, "inspect", str(path))
     assert code == 0
-    assert "in an unknown layout" in out
+    assert "unknown" in out
     assert "layer.weight, [bold]?[2J" in out
 
 
 def test_inspect_the_checkpoint_of_a_run(run: Path, call: Call) -> None:
     code, out, _ = call(entry, "inspect", str(run / "best.pt"))
     assert code == 0
-    assert "checkpoint of a run, MFNet (9 classes)" in out
-    assert f"into {run / 'config.yaml'}" in out
+    assert re.search(r"what +file of rgbt", out)
+    assert re.search(r"weights of .*best.pt .*: (\d+) of \1 entries set", out)
 
 
 def test_a_configuration_beside_a_file_runs_nothing(run: Path, call: Call) -> None:
@@ -107,43 +101,47 @@ def test_a_configuration_beside_a_file_runs_nothing(run: Path, call: Call) -> No
     part = {"_target_": "rgbt.models.mfnet.MFNet"}
     for model in (evil, imported, {**part, "inputs": evil}, {**part, "inputs": imported}, 3):
         (run / "config.yaml").write_text(json.dumps({"model": model}))
-        code, out, err = call(entry, "inspect", str(run / "best.pt"))
+        code, _, err = call(entry, "inspect", str(run / "best.pt"))
         assert code == 2
-        assert "checkpoint of a run, MFNet" in out
         assert "'model" in err
         assert not marker.exists()
+    for text in ("[1, 2]", "model: [", "model: {a: '${b}'}"):
+        (run / "config.yaml").write_text(text)
+        code, _, err = call(entry, "inspect", str(run / "best.pt"))
+        assert code == 2
+        assert f"rgbt: {run / 'config.yaml'}" in err
 
 
 def test_export_and_inspect(run: Path, tmp_path: Path, call: Call) -> None:
     for layout, name in (("safetensors", "a.safetensors"), ("released", "final.pth")):
         words = (f"run={run.name}", f"runs_dir={run.parent}", f"format={layout}")
         out_file = tmp_path / name
-        code, out, _ = call(entry, "export", *words, f"out={out_file}")
+        code, out, err = call(entry, "export", *words, f"out={out_file}")
         assert (code, out) == (0, f"{out_file}\n")
+        assert "authors' code" not in err
         code, _, err = call(entry, "export", *words, f"out={out_file}")
         assert code == 2
         assert "already exists" in err
-        code, out, _ = call(entry, "inspect", str(out_file), "model=mfnet_tiny")
-        assert code == 0
-        assert "MFNet" in out
+        assert call(entry, "inspect", str(out_file), "model=mfnet_tiny")[0] == 0
     out = call(entry, "inspect", str(tmp_path / "a.safetensors"))[1]
-    lines = dict(line.rsplit("  ", 1) for line in out.splitlines() if line.startswith("note "))
-    said = {name.strip(): value for name, value in lines.items()}
-    assert said["note step"] == "240"
-    assert said["note run"] == run.name
-    assert '"rgb_order": "rgb"' in said["note inputs"]
+    assert re.search(r"note step +240\n", out)
+    assert re.search(rf"note run +{run.name}\n", out)
+    assert '"rgb_order": "rgb"' in out
+    # The authors' code feeds or evaluates the network otherwise.
+    stored = (run / "config.yaml").read_text()
+    changed = stored.replace("final_activation: true", "final_activation: false")
+    (run / "config.yaml").write_text(changed)
+    words = (f"run={run}", "format=released", f"out={tmp_path / 'b.pth'}")
+    assert "which uses model.final_activation=true" in call(entry, "export", *words)[2]
 
 
 @pytest.mark.parametrize(
     ("words", "said"),
     [
         ((), "known: export, inspect"),
-        (("inspct",), "did you mean 'inspect'?"),
         (("inspect",), "'file' has no value"),
         (("inspect", "missing.pth"), "missing.pth: no such file"),
-        (("export", "run=x"), "'format' has no value"),
         (("export", "run=x", "format=released", "out=y"), "run=x"),
-        (("export", "run=x", "format=released", "out=y", "modl=z"), "'modl' has no effect here"),
         (("export", "run=x", "format=released", "out=y", "checkpoint=first"), "checkpoint"),
     ],
 )
@@ -154,23 +152,56 @@ def test_usage_errors(words: tuple[str, ...], said: str, call: Call) -> None:
     assert err.count("\n") == 1
 
 
-def test_a_broken_configuration_beside_a_file_is_named(run: Path, call: Call) -> None:
-    for text in ("[1, 2]", "model: [", "model: {a: '${b}'}"):
-        (run / "config.yaml").write_text(text)
-        code, _, err = call(entry, "inspect", str(run / "best.pt"))
-        assert code == 2
-        assert f"rgbt: {run / 'config.yaml'}" in err
+def test_published_files_fit_the_networks_of_the_table(tmp_path: Path) -> None:
+    """Digests are those in the names; files made without our networks fit all named ones."""
+    for start in STARTS:
+        in_name = re.search(r"-([0-9a-f]{8})\.pth$", start.file)
+        assert in_name is None or in_name[1] == start.digest
+        assert re.fullmatch(r"([0-9a-f]{8})?", start.digest)
+    starts = {start.file: start for start in STARTS}
+    assert len(starts) == len(STARTS)
+    for file, tensors in {
+        "swin_tiny_patch4_window7_224.pth": swin_file(96, (2, 2, 6, 2), (3, 6, 12, 24), 7),
+        "mit_b2.pth": mit_file((64, 128, 320, 512), (3, 4, 6, 3)),
+        "resnet18-f37072fd.pth": resnet_file(18),
+    }.items():
+        contents = read(saved(tmp_path, tensors))
+        for model in starts[file].models:
+            with torch.device("meta"):
+                assert plan_for(golden.network(model), contents).problems == []
 
 
-def test_an_export_that_the_authors_code_feeds_otherwise_is_said(
-    run: Path, tmp_path: Path, call: Call
-) -> None:
-    words = (f"run={run}", "format=released")
-    _, _, err = call(entry, "export", *words, f"out={tmp_path / 'a.pth'}")
-    assert "authors' code" not in err
-    stored = (run / "config.yaml").read_text()
-    (run / "config.yaml").write_text(
-        stored.replace("final_activation: true", "final_activation: false")
-    )
-    _, _, err = call(entry, "export", *words, f"out={tmp_path / 'b.pth'}")
-    assert "authors' code, which uses model.final_activation=true" in err
+@pytest.mark.slow
+def test_every_experiment_has_one_recipe() -> None:
+    """Its network at scale=paper is one that the files of the recipe fit, if it takes a file."""
+    starts = {start.file: start for start in STARTS}
+    for name in available("experiment"):
+        if name.startswith("start_"):  # of scale=bench alone
+            continue
+        (recipe,) = (r for r in RECIPES if any(fnmatchcase(name, each) for each in r.experiments))
+        config = compose([f"+experiment={name}", "scale=paper"])
+        family = family_named(config.model._target_)
+        with torch.device("meta"):
+            takes = config.scale.pretrained and record_of(build(config.model)).pretrained_parts
+        assert bool(recipe.files) == bool(takes), name
+        models = {model for file in recipe.files for model in starts[file].models}
+        found = [compose([f"model={model}", "scale=paper"]).model for model in sorted(models)]
+        sizes = ("depths", "embed_dim", "layers", "dims")
+        assert not found or any(
+            family_named(each._target_) == family
+            and all(each.get(key) == config.model.get(key) for key in sizes)
+            for each in found
+        ), name
+
+
+def test_inspect_names_recipes_and_compares_the_digest(tmp_path: Path, call: Call) -> None:
+    path = tmp_path / "swin_tiny_patch4_window7_224.pth"
+    torch.save({"w": torch.zeros(1)}, path)
+    code, out, _ = call(entry, "inspect", str(path))
+    assert code == 0
+    lines = dict(line.split(None, 1) for line in out.splitlines())
+    assert lines["recipes"].startswith("baseline, crm, crm_kp, ")
+    assert lines["fits"] == "model=mask2former_swin_t"
+    assert lines["sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
+    # Same name, other content.
+    assert lines["remark"].startswith("not the published swin_tiny_patch4_window7_224.pth, whose")

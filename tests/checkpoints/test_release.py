@@ -11,17 +11,21 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from rgbt.checkpoints.layout import family_of
+from rgbt.checkpoints.kinds import family_of
 from rgbt.checkpoints.load import load_weights
-from rgbt.checkpoints.networks import position_index
-from rgbt.checkpoints.read import read
-from rgbt.checkpoints.release import save
+from rgbt.checkpoints.release import convention_of, position_index, save
 from rgbt.checks import InputError
-from tests.checkpoints.files import network, released, sentence
+from tests.checkpoints.files import network, released
 from tests.models import golden
 from tests.models.golden import requires_golden
 
-NOTE = {"family": "cmx", "inputs": "rgb", "run": "0123", "checkpoint": "best", "step": "240"}
+NOTE = {
+    "family": "cmx",
+    "inputs": '{"rgb_order": "rgb"}',
+    "run": "0123",
+    "checkpoint": "best",
+    "step": "240",
+}
 
 
 def family(model: nn.Module) -> str:
@@ -77,13 +81,6 @@ def test_round_trip_of_shared_stages(tmp_path: Path) -> None:
         save(tmp_path / layout, layout, "mask2former", model.state_dict(), {})
         load_weights(other, tmp_path / layout)
         check_equal(model, other)
-
-
-def test_round_trip_of_a_network_from_elsewhere(tmp_path: Path) -> None:
-    model, other = nn.Linear(2, 3), nn.Linear(2, 3)
-    save(tmp_path / "a.safetensors", "safetensors", family(model), model.state_dict(), NOTE)
-    load_weights(other, tmp_path / "a.safetensors")
-    check_equal(model, other)
 
 
 def unwrapped(path: Path) -> dict[str, Tensor]:
@@ -167,9 +164,7 @@ def test_positions_in_a_window_of_two() -> None:
 
 def test_unused_convolution_of_the_temporal_release(tmp_path: Path) -> None:
     model = network("cmx_tiny", 5)
-    remark = save(tmp_path / "0.pth", "released_temporal", "cmx", model.state_dict(), {})
-    assert remark is not None
-    assert "voting.weight and voting.bias are zeros" in remark
+    save(tmp_path / "0.pth", "released_temporal", "cmx", model.state_dict(), {})
     state = torch.load(tmp_path / "0.pth", weights_only=True)
     assert state["voting.weight"].shape == (5, 10, 3, 3)
     assert state["voting.bias"].shape == (5,)
@@ -180,29 +175,30 @@ def test_an_export_says_what_it_is(tmp_path: Path) -> None:
     model = network("cmx_tiny")
     for layout in ("safetensors", "released"):
         save(tmp_path / layout, layout, "cmx", model.state_dict(), NOTE)
-        assert read(tmp_path / layout).note == NOTE
-        report = load_weights(model, tmp_path / layout)
-        assert report.facts.remarks == ("exported from 0123 best, with the inputs of its note",)
+        plan = load_weights(model, tmp_path / layout)
+        assert (plan.contents.note, plan.convention) == (NOTE, ())
+        assert plan.inputs == {"rgb_order": "rgb"}
+
+
+def test_conventions_of_the_authors_code() -> None:
+    crm = ("model/inputs=crm", "model.fusion=max")
+    assert convention_of("released", "mask2former") == crm
+    assert convention_of("released", "cmx")[0] == "model/inputs=cmx_released"
+    assert convention_of("released_temporal", "cmx") == ("model/inputs=temporal",)
+    assert convention_of("released", "external") == convention_of("safetensors", "cmx") == ()
 
 
 def test_what_cannot_be_written(tmp_path: Path) -> None:
     state = {"a": torch.zeros(1)}
     cases = {
-        ("released", "deeplabv2"): "no released format exists for DeepLab v2",
-        ("released", ""): "no released format exists for this network",
-        (
-            "released_temporal",
-            "mfnet",
-        ): "for CMX of the temporal release, but this network is MFNet",
-        (
-            "onnx",
-            "cmx",
-        ): "'onnx' is not a valid choice; known: released, released_temporal, safetensors",
+        ("released", "deeplabv2"): "format=released does not exist for deeplabv2",
+        ("released", ""): "does not exist for this network",
+        ("released_temporal", "mfnet"): "format=released_temporal",
+        ("onnx", "cmx"): "format: 'onnx'",
     }
     for (layout, of), said in cases.items():
-        with pytest.raises(InputError) as error:
+        with pytest.raises(InputError, match=said):
             save(tmp_path / "file", layout, of, state, {})
-        assert said in sentence(error)
     (tmp_path / "file").write_text("dear")
     with pytest.raises(InputError, match="already exists"):
         save(tmp_path / "file", "safetensors", "cmx", state, {})

@@ -86,18 +86,6 @@ def test_same_batches_whatever_the_workers(dataset: MFNet) -> None:
             assert_equal(one, other)
 
 
-def test_same_batches_on_the_device(dataset: MFNet) -> None:
-    """Augmented as they are moved: whatever the workers, and what the loader makes."""
-    expected = list(train_batches(dataset, "train", crm(), settings(), 7, range(5)))
-    for workers in (0, 2):
-        changed = settings(num_workers=workers, augment="device")
-        found = train_batches(dataset, "train", crm(), changed, 7, range(5))
-        for one, other in zip(expected, found, strict=True):
-            assert not isinstance(other, Batch)
-            assert one.name == other.name
-            assert_equal(one.to("cpu"), other.to("cpu"))
-
-
 def test_starting_later_gives_the_same_batches(dataset: MFNet) -> None:
     """Steps 3 and 4 lie in another epoch (two whole batches per epoch), with workers or without."""
     whole = list(train_batches(dataset, "train", crm(), settings(), 7, range(6)))
@@ -270,11 +258,8 @@ def test_arguments_of_the_loader(
     assert requested["pin_memory"] is gpu
 
 
-@pytest.mark.parametrize("augment", ["loader", "device"])
-def test_all_of_a_batch_is_pinned(
-    dataset: MFNet, monkeypatch: pytest.MonkeyPatch, augment: str
-) -> None:
-    """What waits for its augmentation as well; pages are locked on machines with a GPU alone."""
+def test_all_of_a_batch_is_pinned(dataset: MFNet, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pages are locked on machines with a GPU alone."""
     locked: dict[int, torch.Tensor] = {}
 
     def lock(tensor: torch.Tensor) -> torch.Tensor:
@@ -283,7 +268,7 @@ def test_all_of_a_batch_is_pinned(
         return copy
 
     monkeypatch.setattr(torch.Tensor, "pin_memory", lock)
-    batch = next(train_batches(dataset, "train", crm(), settings(augment=augment), 0, range(1)))
+    batch = next(train_batches(dataset, "train", crm(), settings(), 0, range(1)))
     pinned = LoadedBatch(batch, {"x": "why"}).pin_memory()
     assert pinned.skipped == {"x": "why"}
     assert isinstance(pinned.batch, type(batch))

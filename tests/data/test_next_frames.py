@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +12,7 @@ import pytest
 from rgbt.checks import InputError
 from rgbt.data.mfnet import MFNet
 from rgbt.data.next_frames import NextFrames
-from rgbt.data.synth.dataset import LAYOUT
-from rgbt.data.synth.factors import EgoMotion, SceneFactors
-from rgbt.data.synth.writer import Plan
+from rgbt.synth.datasets import synth
 from tests.conftest import write_data
 
 HW = (6, 8)
@@ -87,11 +84,8 @@ def test_flow_is_rows_columns_to_nearest_pixel(root: Path) -> None:
 
 
 def test_flow_of_synth_leads_to_same_class(tmp_path: Path) -> None:
-    factors = replace(SceneFactors(), height=48, width=64)
-    numbers = {"num_train": 1, "num_val": 1, "num_test": 3}
-    plan = Plan(seed=0, numbers=numbers, factors=factors, motion=EgoMotion(0.5, 2.0))
-    LAYOUT.write(plan, tmp_path / "synth")
-    first = reader(tmp_path / "synth")
+    sizes = {"num_train": 1, "num_val": 1, "num_test": 3, "height": 48, "width": 64}
+    first = synth(cache_dir=str(tmp_path), **sizes, ego_forward_m=0.5, ego_yaw_deg=2.0)
     after = NextFrames(first)
     same = seen = 0
     for name in first.names("test"):

@@ -12,7 +12,7 @@ from rgbt.checks import InputError
 from rgbt.data.loaders import LoaderSettings, train_batches
 from rgbt.data.mfnet import MFNet
 from rgbt.data.pairs import LoadedPair, PairedBatches
-from rgbt.transforms.thesis import ThesisTransform
+from rgbt.transforms.fixed_size import ThesisTransform
 from rgbt.types import Batch
 
 DAY = [f"{number:05d}D" for number in range(1, 8)]

@@ -143,7 +143,7 @@ def more():
 export GREETING=$PWD/hello
 mkdir out
 echo "$GREETING" > out/greeting.txt
-rgbt scenes out=out/sheet.png
+rgbt masks +experiment=grbm +debug=smoke out=out/sheet.png
 ~~~
 
 ~~~python
@@ -167,11 +167,11 @@ assert written
 ~~~
 
 ~~~bash
-rgbt scenes out=nowhere/sheet.png
+rgbt masks +experiment=nowhere
 ~~~
 
 ~~~text
-rgbt: out=nowhere/sheet.png cannot be written; name a PNG in an existing folder.
+rgbt: there is no experiment 'nowhere'
 ~~~
 """
 
@@ -183,7 +183,7 @@ def test_page_is_followed_in_order(follow: Callable[..., int]) -> None:
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        (bash("rgbt scenes out=nowhere/sheet.png"), "page.md:4: rgbt scenes out=nowhere/sheet.png"),
+        (bash("rgbt masks +experiment=nowhere"), "page.md:4: rgbt masks +experiment=nowhere"),
         (bash("cat nothing.txt"), "page.md:4: exit code 1: cat: nothing.txt"),
         ("~~~python\nassert 1 == 2\n~~~\n", "page.md:3: Traceback"),
         (
@@ -192,8 +192,8 @@ def test_page_is_followed_in_order(follow: Callable[..., int]) -> None:
         ),
         (bash("for n in 1 2; do rgbt run seed=$n; done"), "page.md:3: a training in a loop"),
         (
-            bash("rgbt scenes out=nowhere/x.png") + "\n~~~text\nrgbt: another mistake\n~~~\n",
-            "page.md:4: rgbt scenes out=nowhere/x.png: exit code 2, expected the sentence 'another",
+            bash("rgbt masks +experiment=nowhere") + "\n~~~text\nrgbt: another mistake\n~~~\n",
+            "page.md:4: rgbt masks +experiment=nowhere: exit code 2, expected the sentence 'a",
         ),
     ],
 )

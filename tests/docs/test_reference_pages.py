@@ -49,6 +49,12 @@ def test_the_page_of_a_group_has_keys_types_defaults_and_meanings(pages: dict[st
         if line.startswith("| `momentum` |")
     )
     assert "(sgd" in row  # set by a file that is not the default
+    (row,) = (
+        line
+        for line in pages["reference/configuration/model.md"].splitlines()
+        if line.startswith("| `pool_windows` |")
+    )
+    assert "sides of the windows" in row  # a comment of the file, not the docstring
 
 
 def test_an_experiment_shows_its_command_and_what_it_expects(pages: dict[str, str]) -> None:

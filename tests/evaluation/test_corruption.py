@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -133,6 +134,8 @@ def test_file_stem_names_what_is_changed(
         ("occluded", ["corruption.blok=1"], "0.5", "corruption.blok.*block"),
         ("occluded", ["corruption.block=big"], "0.5", "corruption.block"),
         ("noise", ["corruption.severities=[4,2]"], "3", "corruption.severities"),
+        ("noise", ["corruption.severities=[]"], "3", "corruption.severities"),
+        ("noise", ["corruption.severities=[0,2]"], "3", "corruption.severities"),
         ("none", ["corruption.block=8"], "", "corruption.block=8 has no effect"),
         ("none", [], "3", "severity has no effect"),
     ],
@@ -140,6 +143,24 @@ def test_file_stem_names_what_is_changed(
 def test_bad_request_is_refused(name: str, words: list[str], severity: str, key: str) -> None:
     with pytest.raises(InputError, match=key):
         requested_corruption(name, severity, words, ())
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "_target_: rgbt.synth.datasets.synth\ncache_dir: written",
+        "_target_: rgbt.corruptions.kinds.Noise\nimage: {_target_: rgbt.synth.datasets.synth}",
+        "_target_: rgbt.transforms.crm.CrmTransform",
+    ],
+)
+def test_file_may_name_corruptions_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("mine.yaml").write_text(text)
+    with pytest.raises(InputError, match="_target_.* no file of conf/corruption names"):
+        choose_corruption("mine.yaml")
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.yaml"]
 
 
 def test_choose_corruptions() -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from math import cos, radians, sin
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,13 +19,13 @@ from rgbt.assembly.session import Session, open_session
 from rgbt.checks import InputError
 from rgbt.config.compose import compose
 from rgbt.data.next_frames import NextFrames
-from rgbt.evaluation.pair_frames import Pairing
+from rgbt.evaluation.pair_frames import FlowRecord, Pairing, _record
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.evaluation.temporal_consistency import consistency_table, consistency_values, count_pairs
 from rgbt.metrics.pairs import ca, tc
 from rgbt.requirements import Record
 from rgbt.runs.specify import specify
-from rgbt.transforms.view_sets import read_angles
+from rgbt.transforms.views import read_angles
 from rgbt.types import Output
 from tests.commands import SPLITS, words_of
 from tests.conftest import write_png
@@ -182,6 +184,15 @@ def test_the_estimated_flow_is_counted_beside_the_exact_one(tmp_path: Path) -> N
         assert record.displacement_px == pytest.approx(length, rel=0.5)
         assert 0 < record.end_point_error_px < length
         assert 0 <= record.hidden < 0.2
+
+
+def test_reliability_of_an_estimated_flow_by_hand() -> None:
+    """Four pixels: right, 1 pixel short, hidden in the first frame, and one that is not used."""
+    flow = np.array([[[0, 0], [0, 3], [5, 0], [0, 9]]], np.float32)
+    exact = np.array([[[0, 0], [0, 4], [np.nan, np.nan], [0, 0]]], np.float32)
+    found: Any = SimpleNamespace(flow=flow, used=np.array([[True, True, True, False]]))
+    assert _record("a", found, exact) == FlowRecord("a", 0.75, 3.0, 0.5, pytest.approx(1 / 3))
+    assert _record("a", found)[:3] == ("a", 0.75, 3.0)
 
 
 def test_an_oracle_scores_on_true_frames_what_its_labels_do(tmp_path: Path) -> None:

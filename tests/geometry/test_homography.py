@@ -48,8 +48,3 @@ def test_a_published_homography() -> None:
     ]
     close = torch.tensor(expected, dtype=torch.float64)
     torch.testing.assert_close(found, close, atol=6e-6, rtol=2e-5)
-
-
-def test_angles_of_another_shape_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"angles: expected shape B x 3=3, got \(3,\)"):
-        rotation(torch.zeros(3), "zyx")

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.autograd.graph import saved_tensors_hooks
 from torch.nn import functional as F
 
-from rgbt.geometry.sampling import NOWHERE, normalised, powers_of_two, sample
+from rgbt.geometry.warp import NOWHERE, normalised, powers_of_two, sample
 
 HW = (11, 13)
 
@@ -51,13 +51,6 @@ def test_sample_values_and_gradients_are_those_of_torch(
     assert bool(ours.grad.any())
 
 
-def test_sample_gradient_is_the_numerical_one_also_of_a_part_of_the_grid() -> None:
-    values = random(2, 2, *HW, dtype=torch.float64).requires_grad_()
-    grid = points((8, 9))
-    for part in (grid, grid[:, ::2, ::2]):
-        assert torch.autograd.gradcheck(lambda v, part=part: sample(v, part), (values,))
-
-
 def test_sample_keeps_the_grid_alone() -> None:
     kept: list[tuple[int, ...]] = []
 
@@ -69,15 +62,6 @@ def test_sample_keeps_the_grid_alone() -> None:
     with saved_tensors_hooks(note, lambda tensor: tensor):
         sample(values, grid)
     assert kept == [(2, *HW, 2)]
-
-
-def test_sample_second_derivative_is_refused() -> None:
-    values = random(2, 3, *HW).requires_grad_()
-    (gradient,) = torch.autograd.grad(
-        sample(values, points(HW)).square().sum(), values, create_graph=True
-    )
-    with pytest.raises(RuntimeError, match="once_differentiable"):
-        gradient.sum().backward()
 
 
 def test_normalised_edges_and_centres_by_hand() -> None:

@@ -122,53 +122,12 @@ def test_the_gradient_is_the_numerical_one(resampling: Resampling) -> None:
     assert torch.autograd.gradcheck(warp.bilinear, (values,))
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_bilinear_of_random_homographies_is_grid_sample_with_repeated_borders(seed: int) -> None:
-    """Views that are not cut show borders and what is outside; torch repeats the former."""
-    height, width = HW
-    views = random_views(2, seed)
-    warp = Warp(views, whole(HW, 2), HW, "once")
-    rows, columns = torch.meshgrid(*(torch.arange(side).double() for side in HW), indexing="ij")
-    x, y, w = (
-        torch.linalg.inv(views) @ torch.stack([columns, rows, torch.ones_like(rows)]).flatten(1)
-    ).unbind(1)
-    grid = torch.stack([(2 * x / w + 1) / width - 1, (2 * y / w + 1) / height - 1], -1)
-    values, upstream = (random_values(2, 3, *HW, dtype=torch.float64) + offset for offset in (0, 1))
-    expected = torch.nn.functional.grid_sample(
-        values.requires_grad_(),
-        grid.view(2, height, width, 2),
-        padding_mode="border",
-        align_corners=False,
-    )
-    inside = grid.abs().amax(-1).view(2, 1, height, width) <= 1
-    assert torch.equal(inside[:, 0], warp.inside())
-    assert 0.5 < float(inside.double().mean()) < 0.99
-    found = warp.bilinear(values)
-    torch.testing.assert_close(found, expected * inside, atol=2e-3, rtol=0)
-    gradients = [
-        torch.autograd.grad(each, values, upstream * inside)[0] for each in (found, expected)
-    ]
-    torch.testing.assert_close(*gradients, atol=2e-3, rtol=0)
-
-
 def test_once_repeats_the_border_up_to_the_outline_and_twice_fades_it_out() -> None:
     ones, right = torch.ones(1, 1, 4, 6), shift(0.5, 0)
     once, twice = (Warp(right, whole((4, 6)), (4, 6), each) for each in RESAMPLINGS)
     # x = -0.5 in the first column: the outline itself, half a pixel from the first centre
     assert once.bilinear(ones)[0, 0, 0].tolist() == [1, 1, 1, 1, 1, 1]
     assert twice.bilinear(ones)[0, 0, 0].tolist() == [0.5, 1, 1, 1, 1, 1]
-
-
-@pytest.mark.parametrize("resampling", RESAMPLINGS)
-def test_labels_keep_their_values_and_mark_the_outside(resampling: Resampling) -> None:
-    label = torch.randint(0, 9, (1, *HW), generator=torch.Generator().manual_seed(0))
-    view = homography(torch.tensor([[9.0, -4.0, 5.0]]), RELEASED.matrix(HW), "zyx")
-    warp = Warp(view, whole(HW), HW, resampling)
-    warped, inside = warp.nearest(label, 255), warp.inside()
-    assert warped.dtype == torch.int64
-    assert 0.5 < float(inside.float().mean()) < 0.95
-    assert bool((warped[~inside] == 255).all())
-    assert bool((warped[inside] < 9).all())
 
 
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.int64, torch.float64, torch.bool])
@@ -179,13 +138,6 @@ def test_nearest_takes_any_dtype_with_and_without_channels(dtype: torch.dtype) -
     assert warped.dtype == dtype
     assert warped.shape == values.shape
     assert torch.equal(warp.nearest(values[:, 1], 1), warped[:, 1])
-
-
-def test_half_precision_is_sampled_in_single() -> None:
-    warp, values = small_warp("once"), random_values(2, 3, 10, 12).bfloat16()
-    warped = warp.bilinear(values)
-    assert warped.dtype == torch.bfloat16
-    torch.testing.assert_close(warped, warp.bilinear(values.float()).bfloat16())
 
 
 def test_a_view_without_a_rectangle_shows_nothing() -> None:
@@ -273,13 +225,3 @@ def test_twice_is_what_opencv_does() -> None:
     label = torch.randint(0, 9, (6, 1, *HW), generator=torch.Generator().manual_seed(1)).float()
     differs = warp.nearest(label, 0) != opencv(warp, label, cv2.INTER_NEAREST)
     assert float(differs.float().mean()) < 2e-3  # every pixel its own label: points on a boundary
-
-
-def test_other_shapes_are_refused() -> None:
-    warp = small_warp("once")
-    with pytest.raises(ValueError, match="values: expected shape B=2 x C x H=10 x W=12"):
-        warp.bilinear(torch.zeros(2, 3, 12, 10))
-    with pytest.raises(ValueError, match="values: expected shape"):
-        warp.nearest(torch.zeros(1, 10, 12), 0)
-    with pytest.raises(ValueError, match="rectangle: expected shape"):
-        Warp(shift(0, 0), whole((4, 4), 2), (4, 4), "once")

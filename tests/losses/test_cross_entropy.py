@@ -1,16 +1,18 @@
 from __future__ import annotations
 
+import math
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
 from torch.nn import functional as F
 
 from rgbt.checks import InputError
-from rgbt.losses.cross_entropy import CrossEntropy
+from rgbt.config.component import build
+from rgbt.losses.cross_entropy import CrossEntropy, WithAuxiliary
 from rgbt.types import Output
 from tests.losses.problems import NOTHING, batch_of, seeded
+from tests.models.golden import compose
 
 
 def test_value_by_hand() -> None:
@@ -70,17 +72,6 @@ def test_confidences_by_hand() -> None:
     assert torch.allclose(part, (2 * 1 + 0.5 * 0.5 + 0.5 * 0.25 * 2) * log2 / (2 + 0.5 + 0.5))
 
 
-@pytest.mark.parametrize("weights", [None, (1.0, 2.0, 0.5)])
-def test_full_confidence_changes_nothing(weights: Any) -> None:
-    generator = seeded(3)
-    label = torch.randint(0, 4, (2, 4, 5), generator=generator)
-    batch = batch_of(torch.where(label == 3, 255, label))
-    output = Output(torch.randn(2, 3, 4, 5, generator=generator), {})
-    loss = CrossEntropy(class_weights=weights)
-    sure = loss(output, replace(batch, confidence=torch.ones(2, 4, 5)), NOTHING)
-    assert torch.allclose(sure["cross_entropy"], loss(output, batch, NOTHING)["cross_entropy"])
-
-
 def test_gradient_is_weighted_by_the_confidence() -> None:
     logits = torch.zeros(1, 3, 1, 2, dtype=torch.float64, requires_grad=True)
     confidence = torch.tensor([[[0.25, 0.0]]])
@@ -91,7 +82,32 @@ def test_gradient_is_weighted_by_the_confidence() -> None:
     assert logits.grad[0, :, 0, 0].tolist() == pytest.approx([-0.25 / 3, 0.125 / 3, 0.125 / 3])
 
 
-def test_confidences_of_another_size_are_refused() -> None:
-    batch = replace(batch_of(torch.zeros(1, 2, 2, dtype=torch.long)), confidence=torch.ones(1, 2))
-    with pytest.raises(ValueError, match="confidence: expected shape B=1 x H=2 x W=2"):
-        CrossEntropy(class_weights=None)(Output(torch.zeros(1, 3, 2, 2), {}), batch, NOTHING)
+def with_auxiliary(weight: float = 0.1) -> WithAuxiliary:
+    return WithAuxiliary(loss=CrossEntropy(class_weights=None), weight=weight)
+
+
+def test_auxiliary_value_by_hand() -> None:
+    """Scores for class 1 of (0, 0) and (0, log 3): log 2, and a tenth of log 4/3."""
+    output = Output(
+        torch.zeros(1, 2, 1, 1),
+        {"aux_logits": torch.tensor([0.0, math.log(3)]).view(1, 2, 1, 1), "other": torch.ones(1)},
+    )
+    batch = batch_of(torch.ones(1, 1, 1, dtype=torch.long))
+    parts = with_auxiliary()(output, batch, NOTHING)
+    assert list(parts) == ["cross_entropy", "cross_entropy_aux"]
+    assert parts["cross_entropy"].item() == pytest.approx(math.log(2))
+    assert parts["cross_entropy_aux"].item() == pytest.approx(0.1 * math.log(4 / 3))
+    assert all(part.shape == (1,) for part in parts.values())
+
+
+def test_record_weighs_confidence_where_its_loss_does() -> None:
+    assert with_auxiliary().record.weighs_confidence is True
+    assert WithAuxiliary(loss=lambda *_: {}, weight=0.1).record.weighs_confidence is False
+    assert build(compose("loss=cross_entropy_auxiliary").loss).record.weighs_confidence is True
+    # And weighs by it, in both: a half of log 2.
+    label = torch.zeros(1, 1, 1, dtype=torch.long)
+    batch = replace(batch_of(label), confidence=torch.full((1, 1, 1), 0.5))
+    scores = torch.zeros(1, 2, 1, 1)
+    parts = with_auxiliary()(Output(scores, {"aux_logits": scores}), batch, NOTHING)
+    assert parts["cross_entropy"].item() == pytest.approx(math.log(2) / 2)
+    assert parts["cross_entropy_aux"].item() == pytest.approx(0.1 * math.log(2) / 2)

@@ -9,14 +9,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from rgbt.losses.adversarial import VERDICT_LOSSES, judged
-from rgbt.losses.auxiliary import WithAuxiliary
-from rgbt.losses.cross_entropy import CrossEntropy
-from rgbt.losses.distillation import sdc, sdn
-from rgbt.losses.overlap import con, con_acc, dice
+from rgbt.losses.cross_entropy import CrossEntropy, WithAuxiliary
+from rgbt.losses.distances import sdc, sdn
 from rgbt.losses.spatial import SpatialWeight
-from rgbt.losses.temporal import TemporalLoss
-from rgbt.losses.unlabelled import Entropy, MaxSquares
+from rgbt.losses.temporal import TemporalLoss, con, con_acc, dice
+from rgbt.losses.unlabelled import VERDICT_LOSSES, Entropy, MaxSquares, judged
 from rgbt.types import Frame, Output
 from tests.losses.problems import batch_of, criterion_of, seeded, whole_image
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from rgbt.losses.overlap import SIGMA, Form, con, con_acc, dice
+from rgbt.losses.temporal import SIGMA, Form, con, con_acc, dice
 from tests.losses.problems import seeded
 
 FORMS: tuple[Form, ...] = ("paper", "released")
@@ -152,32 +152,6 @@ def test_perfect_predictions() -> None:
     assert dice(wrong, label, "paper") == 1
 
 
-def test_con_acc_as_printed_never_lies_below_a_third() -> None:
-    for seed in range(10):
-        first, second, label = random_problem(1, 3, 4, 4, seed=seed)
-        for sharpness in (0, 1, 100):
-            near = 10 * sharpness * one_hot(label, 3)
-            p, q = (sharpness * first + near).softmax(1), (sharpness * second + near).softmax(1)
-            assert con_acc(p, q, label, "paper") > 1 / 3
-
-
-def test_agreement_in_doubt_costs_more_than_agreement_without() -> None:
-    valid = torch.ones(1, 2, 2, dtype=torch.bool)
-    sure, unsure = two_classes(0, 1, 0, 1), two_classes(0.25, 0.75, 0.25, 0.75)
-    # 1 - sum p^2 / sum p.
-    assert con(unsure, unsure, valid, "released").item() == pytest.approx(1 - 5 / 8)
-    assert con(sure, sure, valid, "released") == 0
-
-
-def test_class_without_a_pixel_moves_nothing() -> None:
-    label = torch.tensor([[[1, 1]]])
-    p = torch.tensor([[0.0, 0.0], [0.5, 0.5], [0.5, 0.5]]).view(1, 3, 1, 2).requires_grad_()
-    dice(p, label, "paper").backward()
-    assert p.grad is not None
-    assert not p.grad[:, [0, 2]].any()
-    assert (p.grad[:, 1] < 0).all()
-
-
 @pytest.mark.parametrize(
     ("name", "form", "label", "expected"),
     [
@@ -195,43 +169,3 @@ def test_nothing_to_compare_has_no_gradient(
     assert found == expected
     gradients = torch.autograd.grad(found, (first, second), allow_unused=True)
     assert not any(each is not None and each.any() for each in gradients)
-
-
-def test_background_is_a_class_as_printed() -> None:
-    label = torch.zeros(1, 2, 2, dtype=torch.long)
-    thirds = torch.full((1, 3, 2, 2), 1 / 3)
-    # (1 - 2/3 / (1/9 + 1)) for background, 1 for the others.
-    assert dice(thirds, label, "paper").item() == pytest.approx((1 - 0.6 + 2) / 3)
-    # Products with y 7/4 / 2, sums 7/4 + 2 + 4.
-    paper = con_acc(P, torch.full_like(P, 0.5), label, "paper").item()
-    assert paper == pytest.approx(1 - 2 * 0.875 / 7.75 / 2)
-
-
-@BY_FORM
-@BY_LOSS
-def test_half_precision_is_summed_in_float32(loss: Any, form: Form) -> None:
-    first, second, label = random_problem(1, 3, 64, 64)
-    p, q = first.bfloat16().softmax(1), second.bfloat16().softmax(1)
-    with torch.autocast("cpu", torch.bfloat16):
-        found = loss(p, q, label, form)
-    assert found.dtype == torch.float32
-    assert found == loss(p.float(), q.float(), label, form)
-
-
-LABEL = torch.zeros(1, 2, 2, dtype=torch.long)
-
-
-@pytest.mark.parametrize(
-    ("call", "word"),
-    [
-        (lambda: dice(P[0], LABEL, "paper"), "probabilities"),
-        (lambda: dice(P, LABEL[:, :1], "paper"), "label"),
-        (lambda: con(P, Q[0], LABEL == 0, "paper"), "second"),
-        (lambda: con_acc(P[:, :1], Q, LABEL, "paper"), "warped"),
-        (lambda: con(P, Q, LABEL[:, :1] == 0, "paper"), "valid"),
-        (lambda: con_acc(P, Q, LABEL[:, :1], "paper"), "label"),
-    ],
-)
-def test_shapes_that_do_not_fit_are_named(call: Any, word: str) -> None:
-    with pytest.raises(ValueError, match=word):
-        call()

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -8,9 +9,10 @@ import torch
 from torch import Tensor
 
 from rgbt.checks import InputError, RunError
-from rgbt.losses.masks import Sampling
+from rgbt.losses import matcher
 from rgbt.losses.points import Points
-from rgbt.losses.spatial import PLAIN, SpatialWeight
+from rgbt.losses.set_criterion import Sampling, mask_and_dice
+from rgbt.losses.spatial import PLAIN, PointWeights, SpatialWeight
 from rgbt.types import Output
 from tests.benchmarks.reference_criterion import Replayed, reference_criterion
 from tests.losses.problems import criterion_of, problem_of, seeded
@@ -110,25 +112,12 @@ def test_a_batch_without_targets() -> None:
     assert not masks.any()
 
 
-def test_sums_stay_in_float32_under_autocast() -> None:
-    output, batch = problem_of(2, 2, 2)
-    half = Output(None, {name: tensor.bfloat16() for name, tensor in output.aux.items()})
-    rounded = Output(None, {name: tensor.float() for name, tensor in half.aux.items()})
-    expected = criterion_of()(rounded, batch, seeded())
-    with torch.autocast("cpu", torch.bfloat16):
-        parts = criterion_of()(half, batch, seeded())
-    for name, part in parts.items():
-        assert part.dtype == torch.float32
-        assert torch.equal(part, expected[name])
-
-
 def test_predictions_and_labels_that_do_not_fit_are_refused() -> None:
     output, batch = problem_of(1, 2, 2)
     criterion, label, aux = criterion_of(), batch.label, output.aux
     nan = {**aux, "class_logits": aux["class_logits"] * float("nan")}
     cut = {**aux, "mask_logits": aux["mask_logits"][:, :1]}
     for loss, given, changed, error, word in (
-        (criterion, Output(torch.zeros(2, 5, 22, 32), {}), batch, InputError, "mask_logits"),
         (criterion_of(num_classes=4), output, batch, ValueError, "class_logits"),
         (criterion, Output(None, cut), batch, ValueError, "mask_logits"),
         (criterion, output, replace(batch, label=label[:1]), ValueError, "label"),
@@ -139,3 +128,53 @@ def test_predictions_and_labels_that_do_not_fit_are_refused() -> None:
     ):
         with pytest.raises(error, match=word):
             loss(given, changed, seeded())
+
+
+def test_plain_losses_by_hand() -> None:
+    # s = 1/2 and 3/4 against t = 1 and 0: BCE = (log 2 + log 4) / 2,
+    # dice = 1 - (2 * 1/2 + 1) / (5/4 + 1 + 1) = 1 - 8/13.
+    x, t = torch.tensor([[0.0, math.log(3)]]), torch.tensor([[1.0, 0.0]])
+    bce, dice = mask_and_dice(x, t, None)
+    assert torch.allclose(bce, torch.tensor([1.5 * math.log(2)]))
+    assert torch.allclose(dice, torch.tensor([5 / 13]))
+
+
+def test_weighted_losses_by_hand() -> None:
+    # The same with weights 1 and 3, divided by two points: BCE = (log 2 + 3 log 4) / 2;
+    # dice without smoothing = 1 - (2 * 1/2) / (1/2 + 9/4 + 1) = 1 - 4/15.
+    x, t = torch.tensor([[0.0, math.log(3)]]), torch.tensor([[1.0, 0.0]])
+    w = PointWeights(torch.tensor([[1.0, 3.0]]), torch.tensor([2.0]), torch.tensor([0.0]))
+    bce, dice = mask_and_dice(x, t, w)
+    assert torch.allclose(bce, torch.tensor([3.5 * math.log(2)]))
+    assert torch.allclose(dice, torch.tensor([11 / 15]))
+
+
+def test_large_logits_stay_finite() -> None:
+    x = torch.tensor([[200.0, -200.0]], requires_grad=True)
+    bce, dice = mask_and_dice(x, torch.tensor([[0.0, 1.0]]), None)
+    assert bce.item() == 200.0
+    (bce + dice).sum().backward()
+    assert x.grad is not None
+    assert x.grad.isfinite().all()
+
+
+def test_gradients() -> None:
+    generator = seeded(0)
+    x = torch.randn(3, 6, dtype=torch.float64, generator=generator, requires_grad=True)
+    t = torch.rand(3, 6, dtype=torch.float64, generator=generator)
+    w = PointWeights(1 + t, (1 + t).sum(-1), torch.zeros(3, dtype=torch.float64))
+    assert torch.autograd.gradcheck(lambda x: mask_and_dice(x, t, None), x)
+    assert torch.autograd.gradcheck(lambda x: mask_and_dice(x, t, w), x)
+
+
+def test_losses_do_not_depend_on_the_chunks(monkeypatch: Any) -> None:
+    output, batch = problem_of(3, 4, 2)
+    criterion = criterion_of()
+
+    def losses() -> torch.Tensor:
+        points = Points(seeded(0), device=torch.device("cpu"))
+        return torch.stack(list(criterion.compare(output, batch, points).values()))
+
+    whole = losses()
+    monkeypatch.setattr(matcher, "CHUNK_BYTES", 1)
+    assert torch.allclose(whole, losses(), rtol=1e-6)

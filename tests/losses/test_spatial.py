@@ -89,12 +89,6 @@ def test_weights_at_points() -> None:
     assert weights.smoothing.tolist() == [[1.0]]
 
 
-def test_what_counts_as_active() -> None:
-    assert EDGE.active
-    assert not replace(EDGE, alpha=0.0).active
-    assert not replace(EDGE, focus="none").active
-
-
 def test_boundaries_are_labelled_pixels_beside_another_class() -> None:
     # One pixel of class 1 at (1, 1), class 2 in the last column, no label at (3, 0) and (4, 1).
     label = torch.tensor(
@@ -129,8 +123,3 @@ def test_edge_weighted_loss_weights_boundaries_without_a_position() -> None:
     assert torch.equal(weight_map(batch, (2, 5), settings)[0, 0], expected)
     with pytest.raises(InputError, match="does not track"):
         weight_map(batch, (2, 5), EDGE)
-
-
-def test_boundaries_of_one_class_or_of_no_label_are_nowhere() -> None:
-    for value in (0, 4, 255):
-        assert not boundaries(torch.full((2, 3, 5), value)).any()

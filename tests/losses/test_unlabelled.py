@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Any
+import math
+from typing import Any, get_args
 
 import pytest
 import torch
 from torch import Tensor
 
-from rgbt.losses.unlabelled import Entropy, MaxSquares, guidance
+from rgbt.losses.unlabelled import (
+    Entropy,
+    Judged,
+    MaxSquares,
+    guidance,
+    judged,
+    least_squares,
+    logistic,
+    pseudo_labels,
+)
 from tests.losses.problems import seeded
 
 
@@ -110,15 +120,6 @@ def test_large_scores_give_finite_values_and_gradients(dtype: torch.dtype) -> No
         assert leaf.grad.isfinite().all()
 
 
-def test_of_one_class_there_is_nothing_to_be_unsure_of() -> None:
-    p = torch.ones(2, 1, 3, 5, requires_grad=True)
-    assert entropy(p).item() == 0
-    assert squares(p).item() == squares(p, "entries").item() == -0.5
-    entropy(p).backward()
-    assert p.grad is not None
-    assert p.grad.isfinite().all()
-
-
 def maps(*pixels: tuple[float, ...]) -> Tensor:
     """(1, K, 1, pixels)."""
     return torch.tensor(pixels).T[None, :, None]
@@ -133,18 +134,90 @@ def test_guidance_by_hand() -> None:
     assert found.dtype == torch.int64
 
 
-def test_guidance_at_the_ends_of_the_threshold() -> None:
-    p, q = maps((1.0, 0.0), (0.4, 0.6)), maps((0.2, 0.8), (0.5, 0.5))
-    assert guidance(p, q, 0.0).tolist() == [[[0, 1]]]
-    assert guidance(p, q, 1.0).tolist() == [[[255, 255]]]
+def test_least_squares_by_hand() -> None:
+    verdicts = torch.tensor([[[[2.0, -1.0], [0.0, 1.0]]]])
+    assert least_squares(verdicts, 1).item() == (1 + 4 + 1 + 0) / 4
+    assert least_squares(verdicts, 0).item() == (4 + 1 + 0 + 1) / 4
+    assert least_squares(verdicts, 1).shape == ()
 
 
-def test_guidance_has_no_gradient() -> None:
-    p = maps((0.96, 0.04)).requires_grad_()
-    assert not guidance(p, p, 0.5).requires_grad
+def test_cross_entropy_by_hand() -> None:
+    verdicts = torch.tensor([[[[0.0, math.log(3)]]]])  # logistic function: 1/2 and 3/4
+    assert logistic(verdicts, 1).item() == pytest.approx((math.log(2) + math.log(4 / 3)) / 2)
+    assert logistic(verdicts, 0).item() == pytest.approx((math.log(2) + math.log(4)) / 2)
+    assert logistic(verdicts, 0.5).item() == pytest.approx(
+        (math.log(2) + math.log(4) / 2 + math.log(4 / 3) / 2) / 2
+    )
 
 
-def test_guidance_refuses_what_does_not_fit() -> None:
-    p = torch.full((1, 2, 3, 4), 0.5)
-    with pytest.raises(ValueError, match="aux_probabilities: expected shape"):
-        guidance(p, p[..., 1:], 0.95)
+@pytest.mark.parametrize("loss", [least_squares, logistic])
+@pytest.mark.parametrize("value", [0.0, 1.0])
+def test_gradients_of_verdicts(loss, value: float) -> None:  # noqa: ANN001
+    generator = seeded(0)
+    verdicts = torch.randn(2, 1, 3, 2, generator=generator, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda d: loss(d, value), (verdicts,))
+
+
+def test_what_is_judged_by_hand() -> None:
+    logits = torch.tensor([0.7, 0.2, 0.1]).log().view(1, 3, 1, 1) + 5
+    assert torch.equal(judged(logits, "logits"), logits)
+    assert judged(logits, "probabilities").flatten().tolist() == pytest.approx([0.7, 0.2, 0.1])
+    found = judged(logits, "self_information").flatten().tolist()
+    expected = [-p * math.log2(p) / math.log2(3) for p in (0.7, 0.2, 0.1)]
+    assert found == pytest.approx(expected, rel=1e-5)
+    assert sum(found) == pytest.approx(0.729847, abs=1e-6)
+
+
+@pytest.mark.parametrize("how", get_args(Judged))
+def test_gradients_of_what_is_judged(how: Judged) -> None:
+    generator = seeded(2)
+    logits = torch.randn(2, 3, 2, 2, generator=generator, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda s: judged(s, how), (logits,))
+
+
+def test_one_class_is_judged_without_dividing_by_nothing() -> None:
+    logits = torch.randn(2, 1, 3, 5, generator=seeded(0))
+    assert torch.equal(judged(logits, "self_information"), torch.zeros(2, 1, 3, 5))
+    assert torch.equal(judged(logits, "probabilities"), torch.ones(2, 1, 3, 5))
+
+
+def scores() -> Tensor:
+    """(2, 2, 2, 2): highest probabilities of the first image 0.9, 0.8, 0.6, 0.6; then 0.9 once."""
+    first = torch.tensor([[[0.9, 0.2], [0.4, 0.6]], [[0.9, 0.5], [0.5, 0.5]]], dtype=torch.float64)
+    return torch.stack([first, 1 - first], dim=1).log()
+
+
+def test_classes_and_share_of_confident_pixels() -> None:
+    found = pseudo_labels(scores(), 0.8, "batch", (0.0, 0.0))
+    assert found.label.tolist() == [[[0, 1], [1, 0]], [[0, 0], [0, 0]]]
+    assert found.label.dtype == torch.int64
+    # 0.9 and 0.8 of the first image, 0.9 of the second: 3 of 8 pixels.
+    assert found.confident.item() == 3 / 8
+    torch.testing.assert_close(found.weight, torch.full((2, 2, 2), 3 / 8))
+    means = (0.9 + 0.8 + 0.6 + 0.6 + 0.9 + 0.5 + 0.5 + 0.5) / 8
+    assert found.confidence.item() == pytest.approx(means)
+
+
+def test_share_of_each_image() -> None:
+    found = pseudo_labels(scores(), 0.8, "image", (0.0, 0.0))
+    assert found.weight[0].unique().tolist() == [0.5]
+    assert found.weight[1].unique().tolist() == [0.25]
+    assert found.confident.item() == 3 / 8
+
+
+@pytest.mark.parametrize("weighted_by", ["batch", "image"])
+def test_rows_at_the_borders_have_no_weight(weighted_by: str) -> None:
+    tall = scores().repeat(1, 1, 5, 1)  # ten rows
+    plain = pseudo_labels(tall, 0.8, weighted_by, (0.0, 0.0))  # type: ignore[arg-type]
+    found = pseudo_labels(tall, 0.8, weighted_by, (0.1, 0.3))  # type: ignore[arg-type]
+    assert not found.weight[:, :1].any()
+    assert not found.weight[:, 7:].any()
+    assert torch.equal(found.weight[:, 1:7], plain.weight[:, 1:7])
+    # The share is that of all rows, as released.
+    assert torch.equal(found.confident, plain.confident)
+
+
+def test_no_gradient_passes() -> None:
+    leaf = scores().requires_grad_()
+    found = pseudo_labels(leaf, 0.8, "batch", (0.0, 0.0))
+    assert not any(each.requires_grad for each in found)

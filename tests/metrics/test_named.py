@@ -1,120 +1,174 @@
+"""Scores by their names: values by hand, what counts do not have, and many sums at once."""
+
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
-from rgbt.metrics.named import CHANGES, OF_PAIRS, images_of, parse, value, values
+from rgbt.metrics.details import Details, default, details_of, regions_of, requested
+from rgbt.metrics.named import CHANGES, OF_PAIRS, details_of_metric, images_of, parse, value, values
+from rgbt.metrics.names import in_percent
+from rgbt.metrics.score_grid import headlines, score_grid
 from tests.sweeps.tabled import DAY, counts_of
 
-
-@pytest.mark.parametrize(
-    ("metric", "expected"),
-    [
-        # whole image [[7, 1], [2, 6]]: IoU 7/10 and 6/9
-        ("mIoU", 100 * (7 / 10 + 6 / 9) / 2),
-        ("mAcc", 100 * (7 / 8 + 6 / 8) / 2),
-        ("mPrecision", 100 * (7 / 9 + 6 / 7) / 2),
-        ("mF1", 100 * (14 / 17 + 12 / 15) / 2),
-        ("pixel_accuracy", 100 * 13 / 16),
-        ("class/car", 100 * 6 / 9),
-        ("class/car/acc", 75.0),
-        # rings [[4, 0], [2, 2]]: 4/6 and 2/4; [[3, 1], [0, 4]]: 3/4 and 4/5
-        ("region/1", 100 * (4 / 6 + 2 / 4) / 2),
-        ("region/2", 77.5),
-        ("class/road/region/1", 100 * 4 / 6),
-        ("Var", ((77.5 - 175 / 3) / 2) ** 2),
-        ("day/mIoU", 77.5),  # [[3, 1], [0, 4]]
-        ("night/class/car/acc", 50.0),  # [[4, 0], [2, 2]]
-    ],
-)
-def test_values_by_hand(metric: str, expected: float) -> None:
-    assert value(metric, counts_of(), "released") == pytest.approx(expected)
-
-
-# Pairs of frames.
+# Pairs of frames, by label, first, second.
 
 ONE = [[[3, 1], [0, 0]], [[1, 0], [1, 2]], [[0, 0], [0, 0]]]
-"""By label, first, second. Road: alike in 4 of 6, all three in 3 of 6 (coded: 8). Car: in 2 of 4,
-all three in 2 of 5 (coded: 6)."""
+"""Road: alike in 4 of 6, all three in 3 of 6 (coded: 8). Car: in 2 of 4, all three in 2 of 5
+(coded: 6)."""
 
 OTHER = [[[0, 0], [0, 4]], [[0, 0], [0, 4]], [[0, 0], [0, 0]]]
 """Road: in no frame, all three in 0 of 4; car: alike in 8 of 8, all three in 4 of 8 (coded: 12)."""
 
 
-def pairs_of(night: tuple[bool, ...] | None = (False, True)) -> Counts:
+def pairs_of(night: tuple[bool, ...] | None = (False, True), partition: str = "aligned2") -> Counts:
     """Two sets: by day each once, by night the first one twice."""
-    return replace(
-        counts_of([*ONE, *OTHER], [*ONE, *ONE], night=night), partition="aligned2", names=("a", "b")
+    counts = counts_of([*ONE, *OTHER], [*ONE, *ONE], night=night)
+    return replace(counts, partition=partition, names=("a", "b"))
+
+
+# Details, of an image by day and one by night.
+
+SUNNY, DARK, NONE = [[2, 0], [2, 0]], [[2, 1], [0, 1]], [[0, 0], [0, 0]]
+
+
+def of_details(kind: Any, setting: tuple[float, ...], *images: object) -> Counts:
+    return Counts(
+        counts=np.array(images, np.int64),
+        names=tuple(map(str, range(len(images)))),
+        night=tuple(index % 2 == 1 for index in range(len(images))),
+        classes=("road", "car"),
+        partition=Details(kind, setting).partition("ring2"),
+        dataset="d",
+        split="test",
     )
 
 
+FIRST = [SUNNY, NONE, NONE, NONE, DARK, NONE, NONE, SUNNY]
+BY_DISTANCE = of_details("distance", (10.0, 40.0), FIRST, [DARK, NONE, NONE, SUNNY] * 2)
+BY_SIZE = of_details("size", (64.0,), [NONE, SUNNY, NONE, DARK, DARK, SUNNY], [NONE] * 6)
+OUTER = [[1, 0], [2, 0], [1, 0]]
+BOUNDARIES = of_details(
+    "boundary", (0.02,), [[[2, 1], [4, 2], [3, 2]], OUTER], [OUTER, OUTER]
+)  # by region: both, label and prediction of road and car
+LOW, HIGH = [[4, 0], [1, 0], [12000, 0]], [[2, 4], [2, 2], [18000, 38000]]
+CALIBRATED = of_details("calibration", (2.0,), [LOW, HIGH, [[0, 0]] * 3, HIGH])
+"""Two regions of two bins: number, correct and units of confidence by predicted class."""
+
+
 @pytest.mark.parametrize(
-    ("metric", "absent", "expected"),
+    ("counts", "metric", "absent", "expected"),
     [
-        ("night/TC", "released", (4 / 6 + 2 / 4) / 2),
-        ("night/CA", "released", (3 / 6 + 2 / 5) / 2),
-        ("night/CA_released", "released", (3 / 8 + 2 / 6) / 2),
+        # whole image [[7, 1], [2, 6]]: IoU 7/10 and 6/9
+        (counts_of(), "mIoU", "released", (7 / 10 + 6 / 9) / 2),
+        (counts_of(), "mAcc", "released", (7 / 8 + 6 / 8) / 2),
+        (counts_of(), "mPrecision", "released", (7 / 9 + 6 / 7) / 2),
+        (counts_of(), "mF1", "released", (14 / 17 + 12 / 15) / 2),
+        (counts_of(), "pixel_accuracy", "released", 13 / 16),
+        (counts_of(), "class/car", "released", 6 / 9),
+        (counts_of(), "class/car/acc", "released", 0.75),
+        # rings [[4, 0], [2, 2]]: 4/6 and 2/4; [[3, 1], [0, 4]]: 3/4 and 4/5
+        (counts_of(), "region/1", "released", (4 / 6 + 2 / 4) / 2),
+        (counts_of(), "region/2", "released", 0.775),
+        (counts_of(), "class/road/region/1", "released", 4 / 6),
+        (counts_of(), "Var", "released", 100 * ((0.775 - 1.75 / 3) / 2) ** 2),
+        (counts_of(), "day/mIoU", "released", 0.775),  # [[3, 1], [0, 4]]
+        (counts_of(), "night/class/car/acc", "released", 0.5),  # [[4, 0], [2, 2]]
+        (pairs_of(), "night/TC", "released", (4 / 6 + 2 / 4) / 2),
+        (pairs_of(), "night/CA", "released", (3 / 6 + 2 / 5) / 2),
+        (pairs_of(), "night/CA_released", "released", (3 / 8 + 2 / 6) / 2),
         # By day the sets differ; their shares are averaged.
-        ("day/class/car/TC", "released", (2 / 4 + 8 / 8) / 2),
-        ("day/class/car/CA", "exclude", (2 / 5 + 4 / 8) / 2),
-        ("day/class/car/CA_released", "exclude", (2 / 6 + 4 / 12) / 2),
-        ("day/class/road/TC", "released", (4 / 6 + 0) / 2),
-        ("day/class/road/TC", "exclude", 4 / 6),
-        ("day/TC", "exclude", (4 / 6 + 3 / 4) / 2),
+        (pairs_of(), "day/class/car/TC", "released", (2 / 4 + 8 / 8) / 2),
+        (pairs_of(), "day/class/car/CA", "exclude", (2 / 5 + 4 / 8) / 2),
+        (pairs_of(), "day/class/car/CA_released", "exclude", (2 / 6 + 4 / 12) / 2),
+        (pairs_of(), "day/class/road/TC", "released", (4 / 6 + 0) / 2),
+        (pairs_of(), "day/TC", "exclude", (4 / 6 + 3 / 4) / 2),
         # Day and night: images are pooled inside a set.
-        ("class/car/TC", "released", (2 / 4 + 10 / 12) / 2),
-        ("class/car/CA", "released", (2 / 5 + 6 / 13) / 2),
-        ("class/road/CA", "released", (3 / 6 + 3 / 10) / 2),
-        ("TC", "released", (4 / 6 + (2 / 4 + 10 / 12) / 2) / 2),
+        (pairs_of(), "class/car/CA", "released", (2 / 5 + 6 / 13) / 2),
+        (pairs_of(), "TC", "released", (4 / 6 + (2 / 4 + 10 / 12) / 2) / 2),
+        # 0-10 m: [[2,0],[2,0]] + 2 [[2,1],[0,1]] + [[2,1],[0,1]] = [[8,3],[2,3]]: 8/13 and 3/8.
+        (BY_DISTANCE, "distance/0-10", "released", (8 / 13 + 3 / 8) / 2),
+        (BY_DISTANCE, "class/car/distance/0-10", "released", 3 / 8),
+        # Region 2: [[2,1],[0,1]] twice: 4/6 and 2/4.
+        (BY_DISTANCE, "class/car/region/2/distance/0-10", "released", 2 / 4),
+        (BY_DISTANCE, "night/distance/0-10", "released", (4 / 6 + 2 / 4) / 2),
+        (BY_DISTANCE, "distance/10-40", "released", 0.0),  # no pixel, which counts as 0
+        (BY_DISTANCE, "distance/10-40", "exclude", np.nan),
+        # 0-64: [[2,1],[0,1]] of region 2. From 64 on [[2,0],[2,0]] + [[2,1],[0,1]].
+        (BY_SIZE, "size/0-64", "released", (2 / 3 + 1) / 2),
+        (BY_SIZE, "region/1/size/0-64", "released", np.nan),  # no object there
+        (BY_SIZE, "region/1/size/64-inf", "released", (1 + 0) / 2),
+        (BY_SIZE, "class/road/size/64-inf", "released", 4 / 5),
+        # Road 2 + 1 + 1 + 1 of 4 + 2 + 2 + 2 and 3 + 1 + 1 + 1; car 1 of 2 and 2.
+        (BOUNDARIES, "boundary_mIoU", "released", (5 / (10 + 6 - 5) + 1 / 3) / 2),
+        (BOUNDARIES, "region/1/boundary_mIoU", "released", (3 / (6 + 4 - 3) + 1 / 3) / 2),
+        (BOUNDARIES, "class/car/region/1/boundary_IoU", "released", 1 / 3),
+        (replace(BOUNDARIES, unscored=("car",)), "boundary_mIoU", "released", 5 / 11),
+        # |1 - 1.2| + |8 - 11.2| over 16; region 2: |4 - 5.6| over 6; road: 0.2 + |4 - 3.6| over 8.
+        (CALIBRATED, "ECE", "released", (0.2 + 3.2) / 16),
+        (CALIBRATED, "region/2/ECE", "released", 1.6 / 6),
+        (CALIBRATED, "class/road/ECE", "released", (0.2 + 0.4) / 8),
     ],
 )
-def test_values_of_pairs_by_hand(metric: str, absent, expected: float) -> None:
-    assert value(metric, pairs_of(), absent) == pytest.approx(100 * expected)
+def test_values_by_hand(counts: Counts, metric: str, absent: Any, expected: float) -> None:
+    assert value(metric, counts, absent) == pytest.approx(100 * expected, nan_ok=True)
 
 
 @pytest.mark.parametrize(
-    ("metric", "of_pairs", "night", "word"),
+    ("counts", "metric", "word"),
     [
-        ("class/carr", False, True, "no class 'carr'; did you mean 'car'"),
-        ("region/3", False, True, "the counts have the regions 1 to 2"),
-        ("night/mIoU", False, False, "marked as day"),
-        ("class/carr/TC", True, True, "no class 'carr'; did you mean 'car'"),
-        ("night/TC", True, False, "marked as day"),
-        *((each, True, True, "score of single frames.*aligned2, of rgbt consistency")
-          for each in ("mIoU", "Var", "class/car/acc", "class/car/region/2", "night/mIoU")),
-        *((each, False, True, "score of pairs.*ring2.*rgbt consistency run=")
-          for each in ("TC", "CA", "night/CA_released", "class/car/TC")),
+        (counts_of(), "class/carr", "no class 'carr'; did you mean 'car'"),
+        (counts_of(), "region/3", "the counts have the regions 1 to 2"),
+        (counts_of(DAY, night=None), "night/mIoU", "marked as day"),
+        (pairs_of(), "class/carr/TC", "no class 'carr'"),
+        (pairs_of(None), "night/TC", "marked as day"),
+        (pairs_of(), "night/mIoU", "score of single frames.*aligned2.*of pairs"),
+        (pairs_of(), "class/car/acc", "score of single frames"),
+        (counts_of(), "night/CA_released", "score of pairs.*ring2.*rgbt consistency run="),
+        (counts_of(), "ECE", "details=calibration"),
+        (BOUNDARIES, "mIoU", "score of single frames.*of boundary"),
+        (BOUNDARIES, "distance/0-10", "score of distance"),
+        (BY_DISTANCE, "distance/0-20", "the bins 0-10, 10-40, 40-inf"),
+        (BY_DISTANCE, "region/3/distance/0-10", "the regions 1 to 2"),
+        (CALIBRATED, "class/cat/ECE", "no class 'cat'"),
+        (pairs_of(partition="triples1"), "TC", "use flicker"),
+        (pairs_of(partition="flow1"), "flicker", "use TC, CA, CA_released, warping_error"),
+        (pairs_of(partition="released1"), "warping_error", "use TC, CA, CA_released"),
     ],
-)  # fmt: skip
-def test_scores_that_counts_do_not_have_are_refused(
-    metric: str, of_pairs: bool, night: bool, word: str
-) -> None:
-    given = {} if night else {"night": None}
-    counts = pairs_of(**given) if of_pairs else counts_of(DAY, **given) if given else counts_of()
+)
+def test_scores_that_counts_do_not_have_are_refused(counts, metric: str, word: str) -> None:
     with pytest.raises(InputError, match=word):
         value(metric, counts, "released")
 
 
 @pytest.mark.parametrize(
     "metric",
-    ["mIou", "region/0", "region/x", "class/", "class/car/prec", "region/1/TC", "class//CA", ""],
+    ["mIou", "region/0", "region/x", "class/", "class/car/", "class/car/prec", "region/1/TC"]
+    + ["class//CA", "", "day", "class/car/boundary_mIoU", "boundary_IoU", "distance", "size/10"]
+    + ["size/a-b", "ece", "mIoU/0-10", "region/1/mIoU"],
 )
-def test_unknown_metrics_are_refused(metric: str) -> None:
+def test_names_that_are_no_metric_are_refused(metric: str) -> None:
     with pytest.raises(InputError, match=f"'{metric}' is not a metric"):
         parse(metric)
     with pytest.raises(InputError, match="did you mean 'mIoU'"):
         parse("day/mIou")
 
 
+def test_kind_of_details_that_a_metric_needs() -> None:
+    kinds = {"day/class/car/ECE": "calibration", "size/0-64": "size", "class/size": None}
+    assert {each: details_of_metric(each) for each in kinds} == kinds
+    assert parse("class/size").class_name == "size"
+
+
 @pytest.mark.parametrize(
     "metric",
-    ["mIoU", "Var", "mAcc", "pixel_accuracy", "region/2", "class/car", "day/class/car/acc"]
-    + ["TC", "CA", "CA_released", "class/car/CA", "night/TC"]
-    + ["warping_error", "class/car/warping_error"],
+    ["mIoU", "Var", "pixel_accuracy", "region/2", "class/car", "day/class/car/acc"]
+    + ["TC", "class/car/CA", "night/TC", "warping_error", "class/car/warping_error"],
 )
 def test_many_sums_at_once_are_each_alone(metric: str) -> None:
     requested = parse(metric)
@@ -128,29 +182,71 @@ def test_many_sums_at_once_are_each_alone(metric: str) -> None:
     np.testing.assert_allclose(found[0], value(metric, counts, "released"))
 
 
-def test_scores_of_a_protocol_alone() -> None:
-    for protocol, metric, word in (
-        ("triples1", "TC", "'TC' is no score of counts by triples1; use flicker"),
-        ("flow1", "flicker", "use TC, CA, CA_released, warping_error"),
-        ("released1", "warping_error", "use TC, CA, CA_released"),
-    ):
-        with pytest.raises(InputError, match=word):
-            value(metric, replace(pairs_of(), partition=protocol), "released")
-
-
 def test_ca_along_an_estimated_flow_is_of_labelled_pixels() -> None:
     """What has no label cannot be wrong, and counts for TC and the warping error alone."""
-    labelled = pairs_of()
-    counts = labelled.counts.copy()
-    counts[:, -1] += 7
-    more = replace(labelled, counts=counts, partition="flow1")
-    counts = labelled.counts.copy()
-    counts[:, -1] = 0
-    less = replace(labelled, counts=counts, partition="next1")
+    counts = pairs_of().counts
+    unlabelled = np.zeros_like(counts)
+    unlabelled[:, -1] = 7
+    more = replace(pairs_of(partition="flow1"), counts=counts + unlabelled)
+    less = pairs_of(partition="next1")
     assert value("CA", more, "released") == value("CA", less, "released") > 0
     assert value("TC", more, "released") < value("TC", less, "released")
-    none = counts.copy()
-    none[:, :-1] = 0
-    none[:, -1] = 1
     for absent in ("released", "exclude"):
-        assert np.isnan(value("CA", replace(more, counts=none), absent))
+        assert np.isnan(value("CA", replace(more, counts=unlabelled), absent))
+
+
+def test_every_score_of_a_table_has_a_value() -> None:
+    for counts in (BY_DISTANCE, BY_SIZE, BOUNDARIES, CALIBRATED, counts_of(), pairs_of()):
+        grid = score_grid(counts)
+        assert {len(row) for _, row in grid.rows} == {len(grid.columns)}
+        for metric in grid.metrics:
+            value(metric, counts, "released")
+    assert score_grid(BY_DISTANCE).columns == ("0-10", "10-40", "40-inf")
+    assert headlines(BY_DISTANCE) == ("distance/0-10", "distance/10-40", "distance/40-inf")
+    assert headlines(CALIBRATED) == ("ECE", "region/1/ECE", "region/2/ECE")
+
+
+@pytest.mark.parametrize("name", ["ring5", "ring9_released_3_4"])
+@pytest.mark.parametrize(
+    "details",
+    [
+        *map(default, ("boundary", "calibration", "distance", "size")),
+        *(Details("boundary", (0.0012,)), Details("boundary", (0.02, 1.0))),
+        *(Details("size", (0.5, 123456.0, 1e7)), Details("distance", (1e-05,))),
+    ],
+)
+def test_partition_names_the_kind_and_its_setting(name: str, details: Details) -> None:
+    partition = details.partition(name)
+    assert details_of(partition) == details
+    assert regions_of(partition) == regions_of(name) == name
+    assert details_of(name) is details_of("aligned3-1c0ffe") is None
+
+
+def test_requested_details() -> None:
+    assert requested("none", (0.02, False), "10", "64") == ()
+    found = requested("[size,boundary,size]", (0.1, False), "10", "64")
+    assert [each.kind for each in found] == ["size", "boundary"]
+    every = requested("all", (0.1, False), "5,7.5", "64,128")
+    assert [each.setting for each in every] == [(0.1,), (15.0,), (5.0, 7.5), (64.0, 128.0)]
+    assert requested("boundary", (0.1, True), "1", "1") == (Details("boundary", (0.1, 1.0)),)
+    assert every[2].bins == ("0-5", "5-7.5", "7.5-inf")
+
+
+@pytest.mark.parametrize(
+    ("kinds", "width", "edges", "words"),
+    [
+        ("boundry", 0.02, "1", "did you mean 'boundary'"),
+        ("size,all", 0.02, "1", "'all'"),
+        ("boundary", 0.5, "1", "boundary_width"),
+        *(("size", 0.02, each, f"sizes={each}: ") for each in ("10,5", "near", "0,5", "inf")),
+    ],
+)
+def test_wrong_settings_are_refused(kinds: str, width: float, edges: str, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        requested(kinds, (width, False), "1", edges)
+
+
+def test_fractions_are_shown_in_percent() -> None:
+    for name in ("ECE", "boundary_mIoU", "region/1/ECE", "distance/0-10", "size/0-64"):
+        assert in_percent(name, 0.5) == 50.0
+    assert (in_percent("Var", 0.5), in_percent("loss", 0.5)) == (0.5, 0.5)

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
+from rgbt.metrics.counting import pair_counts
 from rgbt.metrics.pairs import (
     HEADLINES,
     PROTOCOLS,
@@ -17,14 +17,13 @@ from rgbt.metrics.pairs import (
     file_name,
     flickered,
     only_labelled,
-    pair_counts,
     partition_name,
     protocol_of,
     tc,
 )
 from rgbt.metrics.scores import class_mean
+from tests.metrics.test_counting import maps
 from tests.models.golden import FOLDER
-from tests.on_device.places import device, on_device
 
 GOLDEN = FOLDER / "losses.npz"
 BOTH = ["released", "exclude"]
@@ -32,16 +31,6 @@ BOTH = ["released", "exclude"]
 FIRST = np.array([[0, 1, 1, 2], [2, 2, 0, 0]], np.uint8)
 SECOND = np.array([[0, 1, 2, 2], [2, 1, 0, 1]], np.uint8)
 LABEL = np.array([[0, 1, 2, 2], [1, 2, 0, 1]], np.uint8)
-
-
-def maps(seed: int, classes: int = 5, hw: tuple[int, int] = (23, 31)) -> tuple[Any, Any, Any, Any]:
-    """Two predictions that often agree with each other and the label, which has gaps; a mask."""
-    rng = np.random.default_rng(seed)
-    label = rng.integers(0, classes, hw).astype(np.uint8)
-    first = np.where(rng.random(hw) < 0.7, label, rng.integers(0, classes, hw)).astype(np.uint8)
-    second = np.where(rng.random(hw) < 0.7, first, rng.integers(0, classes, hw)).astype(np.uint8)
-    label[rng.random(hw) < 0.1] = 255
-    return first, second, label, rng.random(hw) < 0.8
 
 
 def by_sets_of_pixels(first, second, label, valid, classes: int) -> dict[str, list[float]]:
@@ -60,76 +49,6 @@ def by_sets_of_pixels(first, second, label, valid, classes: int) -> dict[str, li
         ):
             found[name].append(part / whole if whole else np.nan)
     return found
-
-
-# Counting.
-
-
-def test_counts_by_hand() -> None:
-    first = np.array([[0, 1], [1, 1]], np.uint8)
-    second = np.array([[0, 0], [1, 1]], np.uint8)
-    label = np.array([[0, 1], [1, 255]], np.uint8)
-    counts = pair_counts(first, second, label, 2)
-    # [label, first, second]: (0, 0, 0), (1, 1, 0), (1, 1, 1) and, without a label, (2, 1, 1).
-    expected = [[[1, 0], [0, 0]], [[0, 0], [1, 1]], [[0, 0], [0, 1]]]
-    assert counts.tolist() == expected
-    assert counts.dtype == np.int64
-    dropped = np.array([[True, False], [True, False]])
-    assert pair_counts(first, second, label, 2, dropped).tolist() == [
-        [[1, 0], [0, 0]],
-        [[0, 0], [0, 1]],
-        [[0, 0], [0, 0]],
-    ]
-
-
-@pytest.mark.parametrize("masked", [False, True])
-@pytest.mark.parametrize("classes", [1, 2, 9, 24, 25, 40, 150])
-def test_equal_to_a_loop_over_pixels(classes: int, masked: bool) -> None:
-    # 24 and 25 classes: the numbers of the histogram grow from 16 to 32 bits.
-    first, second, label, valid = maps(classes, classes)
-    chosen = valid if masked else np.ones_like(valid)
-    expected = np.zeros((classes + 1, classes, classes), int)
-    np.add.at(expected, (np.minimum(label, classes)[chosen], first[chosen], second[chosen]), 1)
-    found = pair_counts(first, second, label, classes, valid if masked else None)
-    assert np.array_equal(found, expected)
-
-
-def test_the_most_classes_fit() -> None:
-    last = np.full((2, 3), 254, np.uint8)
-    found = pair_counts(last, last, np.array([[254, 255, 0]] * 2), 255, last > 0)
-    assert found[254, 254, 254] == found[255, 254, 254] == found[0, 254, 254] == 2
-    assert found.sum() == 6
-
-
-def test_what_does_not_count_need_be_no_class() -> None:
-    """The first prediction brought into the second frame is nothing where that shows more."""
-    first = np.array([[255, 1]], np.uint8)
-    second = label = np.array([[0, 1]], np.uint8)
-    assert pair_counts(first, second, label, 2, first < 2).sum() == 1
-    with pytest.raises(ValueError, match=r"first: expected classes 0\.\.1, got 255"):
-        pair_counts(first, second, label, 2)
-
-
-def test_refuses_what_cannot_be_counted() -> None:
-    zeros = np.zeros((4, 4), np.uint8)
-    with pytest.raises(ValueError, match=r"one shape, got \(4, 4\), \(4, 5\), \(4, 4\)"):
-        pair_counts(zeros, np.zeros((4, 5), np.uint8), zeros, 3)
-    with pytest.raises(ValueError, match=r"\(4, 4\), \(4,\)"):
-        pair_counts(zeros, zeros, zeros, 3, np.ones(4, bool))
-    with pytest.raises(ValueError, match="maps H x W"):
-        pair_counts(zeros[None], zeros[None], zeros[None], 3)
-    with pytest.raises(ValueError, match=r"second: expected classes 0\.\.2, got 3"):
-        pair_counts(zeros, zeros + 3, zeros, 3)
-    with pytest.raises(ValueError, match="num_classes"):
-        pair_counts(zeros, zeros, zeros, 256)
-
-
-@on_device
-def test_counts_on_the_gpu() -> None:
-    given = maps(2)
-    there = [torch.from_numpy(each).to(device()) for each in given]
-    expected = pair_counts(*given[:3], 5, given[3])
-    assert np.array_equal(pair_counts(there[0], there[1], there[2], 5, there[3]), expected)
 
 
 # Scores.

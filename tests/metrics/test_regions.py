@@ -12,8 +12,7 @@ from omegaconf import OmegaConf
 from rgbt.checks import InputError
 from rgbt.config.component import build
 from rgbt.config.compose import conf_dir
-from rgbt.metrics.metric import Regions
-from rgbt.metrics.regions import ring_map, ring_rectangle, strip_map
+from rgbt.metrics.metric import Regions, ring_map, ring_rectangle, strip_map
 from tests.models.golden import FOLDER
 
 GOLDEN = FOLDER

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
-from pathlib import Path
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from sklearn.metrics import f1_score, jaccard_score, precision_score, recall_score
 
-from rgbt.checks import InputError
 from rgbt.metrics import scores
-from rgbt.metrics.absent import absent_notes
-from rgbt.metrics.counts import ARCHIVE, Counts, check_same_means, convention
+from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
 from tests.models.golden import FOLDER
 
@@ -202,82 +199,17 @@ def test_day_and_night_and_chosen_images_leave_it_out_too() -> None:
     assert value("mIoU", chosen[0], "released") == pytest.approx(night)
 
 
-def test_pairs_of_frames_by_hand() -> None:
-    """By label (the last: no class), first, second."""
-    pairs = np.zeros((5, 4, 4), int)
-    pairs[0, 0, 0] = 3  # road, twice seen as such
-    pairs[0, 0, 1] = 1
-    pairs[1, 1, 1] = 2
-    pairs[2, 3, 3] = 4  # a person, twice void
-    pairs[3, 3, 0] = 2  # void, then road
-    counts = counts_of(pairs, partition="aligned1")
-    # TC: road 3 of 6, car 2 of 3, person in no frame; void 4 of 6.
-    # CA: road 3 of 6, car 2 of 3, person 0 of 4 (label alone); void 0 of 6.
-    assert value("class/void/TC", counts, "released") == pytest.approx(100 * 4 / 6)
-    assert value("TC", counts, "released") == pytest.approx(100 * (3 / 6 + 2 / 3 + 0) / 3)
-    assert value("TC", counts, "exclude") == pytest.approx(100 * (3 / 6 + 2 / 3) / 2)
-    for absent in ("released", "exclude"):
-        assert value("CA", counts, absent) == pytest.approx(100 * (3 / 6 + 2 / 3 + 0) / 3)
-    # As released: the three sizes less twice what all three share.
-    road, car = 3 / (4 + 5 + 4 - 2 * 3), 2 / (2 + 3 + 2 - 2 * 2)
-    assert value("CA_released", counts, "released") == pytest.approx(100 * (road + car + 0) / 3)
-
-
-def test_files_from_before_score_every_class(tmp_path: Path) -> None:
-    counts = counts_of()
-    stored = {each.name: getattr(counts, each.name) for each in fields(counts)}
-    del stored["unscored"]
-    ARCHIVE.save(tmp_path / "old.npz", {**stored, "night": np.array((), bool)})
-    loaded = Counts.load(tmp_path / "old.npz")
-    assert loaded.unscored == ()
-    assert loaded.scored.tolist() == [True] * 4
-    assert counts.scored.tolist() == [True, True, True, False]
-
-
-@pytest.mark.parametrize("unscored", [("sky",), ("void", "Void"), CLASSES])
-def test_unscored_are_some_of_the_classes(unscored) -> None:
-    with pytest.raises(
-        ValueError, match="some, but not all, of the classes road, car, person, void"
-    ):
-        counts_of(unscored=unscored)
-
-
-def test_means_over_different_classes_are_not_compared() -> None:
-    check_same_means(counts_of(unscored=("void", "car")), counts_of(unscored=("car", "void")))
-    with pytest.raises(
-        InputError, match=r"leave out void .* leave out no class\. .*dataset\.unscored"
-    ):
-        check_same_means(counts_of(), counts_of(unscored=()))
-
-
 def test_absent_notes_by_hand() -> None:
     """Two regions: person nowhere, void predicted on 5 road pixels of region 2 only."""
     regions = np.zeros((2, 4, 4), int)
     regions[:, 0, 0], regions[0, 1, 1], regions[1, 0, 3] = (90, 95), 10, 5
     every = np.ones(4, bool)
     for absent, counted in (("released", "counted as 0"), ("exclude", "left out of the mean")):
-        assert absent_notes(regions, CLASSES, every, "test", absent) == (
+        assert scores.absent_notes(regions, CLASSES, every, "test", absent) == (
             f"absent from the test split: person ({counted})",
             "predicted, but not labelled in the test split: void (IoU 0)",
             f"absent from some regions: car (region 2), void (region 1); {counted} there",
         )
     scored = np.array([True, False, False, False])
-    assert absent_notes(regions, CLASSES, scored, "test", "released") == ()
-    assert absent_notes(np.ones_like(regions), CLASSES, every, "test", "exclude") == ()
-
-
-def test_counts_keep_their_convention_and_are_not_mixed(tmp_path: Path) -> None:
-    path = tmp_path / "counts.npz"
-    both = [counts_of(absent=absent) for absent in ("released", "exclude")]
-    for counts in both:
-        counts.save(path)
-        assert Counts.load(path).absent == Counts.load(path).parts().get("day", counts).absent
-        assert Counts.load(path).absent == counts.absent
-    values = ARCHIVE.load(path)
-    ARCHIVE.save(path, {key: value for key, value in values.items() if key != "absent"})
-    assert Counts.load(path).absent == "released"
-    assert convention(both[1:]) == "exclude"
-    with pytest.raises(InputError, match="Choose absent=released or absent=exclude"):
-        convention(both)
-    with pytest.raises(ValueError, match="expected released or exclude, got 'zero'"):
-        counts_of(absent="zero")
+    assert scores.absent_notes(regions, CLASSES, scored, "test", "released") == ()
+    assert scores.absent_notes(np.ones_like(regions), CLASSES, every, "test", "exclude") == ()

@@ -100,8 +100,9 @@ def alone(name: str, *overrides: str) -> DictConfig:
 
 
 def network(yaml: str, num_classes: int = 9, **changed: Any) -> Any:
-    """The network of conf/model/<yaml>.yaml."""
-    changes = [f"model.{key}={value}" for key, value in changed.items()]
+    """The network of conf/model/<yaml>.yaml; `inputs` is a file of conf/model/inputs."""
+    files = {"inputs": "model/inputs"}
+    changes = [f"{files.get(key, f'model.{key}')}={value}" for key, value in changed.items()]
     changes.append(f"model.num_classes={num_classes}")
     return build(alone(f"model/{yaml}", *changes).model)
 

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.models.cmnext.model import CMNeXt
+from rgbt.models.cmnext import CMNeXt
 from rgbt.models.cmx.model import CMX
 from rgbt.models.critic import Critic
-from rgbt.models.deeplabv2.model import DeepLabV2
+from rgbt.models.deeplabv2 import DeepLabV2
 from rgbt.models.dinov2.model import DinoMask2Former
 from rgbt.models.inputs import Inputs
 from rgbt.models.mask2former.model import Mask2Former
@@ -20,6 +20,7 @@ from rgbt.models.mfnet import MFNet
 from rgbt.models.pspnet import PSPNet
 from rgbt.models.rtfnet import RTFNet
 from rgbt.models.semseg import SemsegPSPNet
+from rgbt.types import MaskPair
 
 NANO: dict[str, tuple[Any, dict[str, Any]]] = {
     "mfnet": (MFNet, {"num_classes": 3, "rgb_widths": (2, 3, 4, 6), "thermal_widths": (3, 2, 3, 4),
@@ -94,6 +95,12 @@ def images(count: int, height: int = 64, width: int = 96, seed: int = 0) -> tupl
     g = generator(seed)
     rgb = torch.rand(count, 3, height, width, generator=g)
     return rgb, torch.rand(count, 1, height, width, generator=g)
+
+
+def cells(count: int, h: int = 2, w: int = 3, seed: int = 1) -> MaskPair:
+    """About half of the cells are hidden."""
+    g = generator(seed)
+    return MaskPair(*(torch.rand(count, h, w, generator=g) < 0.5 for _ in range(2)))
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -176,11 +183,6 @@ class Plain:
             x = (x + y).clamp(min=0)
             block += 1
         return x
-
-    def doubled(self, conv: str, norm: str, x: Tensor) -> Tensor:
-        """Transposed 2x2 convolution with stride 2: every pixel becomes its own 2x2 square."""
-        squares = torch.einsum("nihw,iokl->nohkwl", x, self.state[f"{conv}.weight"])
-        return self.norm(norm, squares.flatten(4, 5).flatten(2, 3))
 
     def up(self, name: str, x: Tensor, *, align_corners: bool) -> Tensor:
         """Twice the size, convolution, normalisation, one slope for what is negative."""

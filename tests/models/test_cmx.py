@@ -1,9 +1,8 @@
-"""CMX: values by second computations, where maps go, random drops, starting weights."""
+"""CMX and CMNeXt: values by second computations, where maps go, random drops, starting weights."""
 
 from __future__ import annotations
 
 import math
-from functools import partial
 from typing import Any
 
 import pytest
@@ -12,27 +11,27 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.checks import InputError
-from rgbt.models.cmx.decoder import MlpDecoder
-from rgbt.models.cmx.mit import MitAttention, MitBlock, MixFfn, drop_rates
-from rgbt.models.cmx.model import CMX
-from tests.models import plain
+from rgbt.models.cmnext import PoolingGate, PpxBlock, window_mean
+from rgbt.models.cmx.fusion import CrossAttention, Rectification
+from rgbt.models.cmx.mit import mit_blocks
+from rgbt.models.cmx.model import drop_rates
 from tests.models.golden import network
-from tests.models.plain import generator as seeded
-from tests.models.plain import images, normal
+from tests.models.plain import generator, images, nano, normal, randomise
 
-nano = partial(plain.nano, "cmx")
-B2, B4 = (3, 4, 6, 3), (3, 8, 27, 3)
+BOTH = pytest.mark.parametrize("name", ["cmx", "cmnext"])
 
 
-def randomise(module: nn.Module, seed: int = 5) -> Any:
-    g = seeded(seed)
+def drawn(module: nn.Module) -> Any:
+    """Every parameter far from its start."""
+    g = generator(5)
     for parameter in module.parameters():
         nn.init.normal_(parameter, std=0.5, generator=g)
     return module
 
 
-def test_rectified_maps_go_on_and_fused_maps_to_the_decoder() -> None:
-    net = nano().eval()
+@BOTH
+def test_rectified_maps_go_on_and_fused_maps_to_the_decoder(name: str) -> None:
+    net = nano(name).eval()
     rectified, fused, fed = [], [], []
     for rectify, fuse in zip(net.backbone.FRMs, net.backbone.FFMs, strict=True):
         rectify.register_forward_hook(lambda _m, _i, out: rectified.append(out))
@@ -49,120 +48,185 @@ def test_rectified_maps_go_on_and_fused_maps_to_the_decoder() -> None:
     assert all(a is b for a, b in zip(fed, expected))
 
 
-def test_images_that_are_too_small_raise() -> None:
+@BOTH
+def test_images_that_are_too_small_raise(name: str) -> None:
     """Stage 1 has maps of a quarter of the image and a kernel of 8: 29 pixels give 8 places."""
-    with pytest.raises(InputError, match=r"29 pixels.*28 x 64"):
-        nano().eval()(*images(1, 28, 64))
-    assert nano(sr_ratios=[2, 1, 1, 1]).eval()(*images(1, 5, 5)).logits is not None
+    with pytest.raises(InputError, match=r"model.sr_ratios.*29.*28 x 64"):
+        nano(name).eval()(*images(1, 28, 64))
+    assert nano(name, sr_ratios=[2, 1, 1, 1]).eval()(*images(1, 5, 5)).logits is not None
 
 
 def test_eps_of_every_normalisation() -> None:
-    """Blocks and stages have 1e-6, everything else torch's 1e-5 but the decoder."""
-    fine = ("norm1", "norm2", "norm3", "norm4")
-    for name, module in nano().named_modules():
-        if isinstance(module, nn.BatchNorm2d):
-            assert module.eps == (1e-3 if name.startswith("decode_head") else 1e-5), name
-        if isinstance(module, nn.LayerNorm):
-            inside = "block" in name or "extra_norm" in name or name.startswith("backbone.norm")
-            expected = 1e-6 if inside and name.endswith(fine) else 1e-5
-            assert module.eps == expected, name
+    """CMX: 1e-6 in blocks and after stages; CMNeXt: in the layers of the thermal stream."""
+    for name in ("cmx", "cmnext"):
+        for path, module in nano(name).named_modules():
+            expected = 1e-5
+            if isinstance(module, nn.LayerNorm):
+                inside = "block" in path or "norm" in path.split(".")[1]
+                own = inside and path.endswith(("norm1", "norm2", "norm3", "norm4"))
+                is_fine = own if name == "cmx" else "extra_" in path
+                expected = 1e-6 if is_fine else 1e-5
+            elif isinstance(module, nn.BatchNorm2d) and name == "cmx":
+                expected = 1e-3 if path.startswith("decode_head") else 1e-5
+            assert getattr(module, "eps", expected) == expected, path
 
 
-@pytest.mark.parametrize("reduction", [1, 2])
-def test_attention_by_loops(reduction: int) -> None:
-    """Three heads of two channels; a map of 5 x 4 is attended to as 2 x 2 where it is reduced."""
-    layer: MitAttention = randomise(MitAttention(6, 3, reduction))
-    x = normal(2, 5, 4, 6)
-    expected = torch.empty(2, 20, 6)
-    for n in range(2):
-        seen = x[n].flatten(0, 1)
-        if reduction > 1:
-            weight = layer.sr.weight
-            patches = [x[n, 2 * r : 2 * r + 2, 2 * c : 2 * c + 2] for r in (0, 1) for c in (0, 1)]
-            seen = torch.stack([torch.einsum("hwi,oihw->o", p, weight) for p in patches])
-            seen = layer.norm(seen + layer.sr.bias)
-        q, kv = layer.q(x[n].flatten(0, 1)), layer.kv(seen)
-        for head in range(3):
+def test_rectification_by_hand() -> None:
+    """Weights from biases alone: 1/4 by channel and 1/2 by place of x1, 3/4 and 9/10 of x2."""
+    layer = Rectification(1)
+    for parameter in layer.parameters():
+        nn.init.zeros_(parameter)
+    biases = (layer.channel_weights.mlp[-1].bias, layer.spatial_weights.mlp[-1].bias)
+    for bias, shares in zip(biases, ((0.25, 0.75), (0.5, 0.9)), strict=True):
+        bias.data = torch.tensor(shares).logit()
+    x1, x2 = torch.tensor(2.0).view(1, 1, 1, 1), torch.tensor(10.0).view(1, 1, 1, 1)
+    first, second = layer(x1, x2)
+    assert first.item() == pytest.approx(2 + 0.5 * (0.75 + 0.9) * 10)
+    assert second.item() == pytest.approx(10 + 0.5 * (0.25 + 0.5) * 2)
+
+
+def test_cross_attention_by_loops() -> None:
+    """Each stream reads the other's context; every column of a context sums to 1."""
+    layer: CrossAttention = drawn(CrossAttention(4, 2))
+    u = normal(1, 5, 4), normal(1, 5, 4, seed=1)
+    expected = [torch.empty(1, 5, 4) for _ in u]
+    for own, (other, kv) in enumerate(((u[1], layer.kv2), (u[0], layer.kv1))):
+        k, v = kv(other)[0].chunk(2, -1)
+        for head in range(2):
             part = slice(2 * head, 2 * head + 2)
-            k, v = kv[:, :6][:, part], kv[:, 6:][:, part]
-            for token in range(20):
-                scores = torch.stack([q[token, part] @ key for key in k]) / math.sqrt(2)
-                shares = scores.exp() / scores.exp().sum()
-                expected[n, token, part] = shares @ v
-    expected = layer.proj(expected).view(2, 5, 4, 6)
-    torch.testing.assert_close(layer(x), expected, rtol=1e-4, atol=1e-5)
-
-
-def test_feed_forward_sees_its_neighbours_only() -> None:
-    """Values by loops over places, zero outside the map; GELU by its definition."""
-    layer: MixFfn = randomise(MixFfn(2, 3))
-    x = normal(1, 3, 4, 2)
-    wide = layer.fc1(x)[0]
-    kernel = layer.dwconv.dwconv.weight[:, 0]
-    for r in range(3):
-        for c in range(4):
-            total = layer.dwconv.dwconv.bias.clone()
-            for y in range(max(r - 1, 0), min(r + 2, 3)):
-                for z in range(max(c - 1, 0), min(c + 2, 4)):
-                    total = total + wide[y, z] * kernel[:, y - r + 1, z - c + 1]
-            gelu = 0.5 * total * (1 + torch.erf(total / math.sqrt(2)))
-            torch.testing.assert_close(layer(x)[0, r, c], layer.fc2(gelu), rtol=1e-4, atol=1e-5)
-
-
-IMAGE = (36, 50)
-
-
-def decoder() -> tuple[MlpDecoder, list[Tensor]]:
-    net = MlpDecoder((3, 4, 5, 6), 2, dim=7, dropout=0.0, norm_eps=(1e-3, 1e-3))
-    sizes = ((9, 13), (5, 7), (3, 4), (2, 2))
-    maps = [normal(2, *hw, 3 + i, seed=i).double() for i, hw in enumerate(sizes)]
-    return randomise(net).double(), maps
-
-
-def in_released_order(net: MlpDecoder, maps: list[Tensor]) -> Tensor:
-    """Projected, enlarged, joined from the smallest to the largest, then convolved."""
-    joined = []
-    for number in (4, 3, 2, 1):
-        small = net.get_submodule(f"linear_c{number}.proj")(maps[number - 1]).permute(0, 3, 1, 2)
-        joined.append(F.interpolate(small, size=(9, 13), mode="bilinear", align_corners=False))
-    scores = net.linear_pred(net.linear_fuse(torch.cat(joined, 1)))
-    return F.interpolate(scores.float(), size=IMAGE, mode="bilinear", align_corners=False)
-
-
-@pytest.mark.parametrize("training", [False, True])
-def test_decoder_equals_the_released_order(training: bool) -> None:
-    (ours, maps), (theirs, _) = decoder(), decoder()
-    found = ours.train(training)(maps, IMAGE)
-    expected = in_released_order(theirs.train(training), maps)
-    torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-10)
-
-    g = normal(*found.shape, seed=9).double()
-    (found * g).sum().backward()
-    (expected * g).sum().backward()
-    for (name, mine), theirs_too in zip(ours.named_parameters(), theirs.parameters()):
-        torch.testing.assert_close(mine.grad, theirs_too.grad, msg=name, rtol=1e-9, atol=1e-9)
+            context = (k[:, part].T @ v[:, part] / math.sqrt(2)).exp()
+            expected[own][0, :, part] = u[own][0, :, part] @ (context / context.sum(0))
+    torch.testing.assert_close(layer(*u), tuple(expected))
 
 
 @pytest.mark.parametrize(("eps", "evaluated"), [(None, 1e-3), (1e-5, 1e-5)])
 def test_decoder_eps_in_evaluation(eps: float | None, evaluated: float) -> None:
     """A constant map c, statistics mean 0 and variance v: c / sqrt(v + eps)."""
-    decoder = nano(decoder_norm_eps_eval=eps).decode_head
+    decoder = nano("cmx", decoder_norm_eps_eval=eps).decode_head
     norm = decoder.linear_fuse[1]
     x, variance = torch.full((1, 16, 2, 2), 3.0), 1e-3
     norm.running_var.fill_(variance)
     for mode, expected in ((False, evaluated), (True, 1e-3), (False, evaluated)):
         assert decoder.train(mode).linear_fuse[1].eps == expected
-    found = norm(x)
-    torch.testing.assert_close(found, torch.full_like(x, 3 / math.sqrt(variance + evaluated)))
+    torch.testing.assert_close(norm(x), torch.full_like(x, 3 / math.sqrt(variance + evaluated)))
 
 
-def test_starting_weights() -> None:
-    """Linear maps of the backbone 0.02, convolutions sqrt(2 / outputs reached), biases 0."""
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        net: CMX = network("cmx_b0")
-    spread = {name: float(p.detach().std()) for name, p in net.named_parameters() if p.dim() > 1}
-    expected = {
+# ---- stochastic depth ----------------------------------------------------------------------------
+
+
+def test_drop_rates() -> None:
+    ramp = drop_rates((3, 4, 6, 3), 0.1, "ramp")
+    expected = torch.tensor([0.1 * i / 15 for i in range(16)])
+    torch.testing.assert_close(ramp, expected.expand(2, 16))
+    released = drop_rates((3, 4, 6, 3), 0.1, "released")
+    torch.testing.assert_close(released[0, 3:7], torch.full((4,), 0.02))
+    torch.testing.assert_close(released[1, 3:7], torch.full((4,), 0.4 / 15))
+    assert torch.equal(released[:, :3], ramp[:, :3])
+    assert torch.equal(released[:, 7:], ramp[:, 7:])
+
+
+RAMP = ([1.0], [0.8, 0.6], [0.4], [0.2])
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "keeps"),
+    [
+        (
+            "cmx",
+            {"drop_path_stage2": "released"},
+            {
+                "block": ([1.0], [0.8, 0.8], [0.4], [0.2]),
+                "extra_block": ([1.0], [0.6, 0.6], [0.4], [0.2]),
+            },
+        ),
+        ("cmnext", {}, {"block": RAMP, "extra_block": RAMP}),
+        ("mask2former", {"depths": (1, 2, 1, 1)}, dict.fromkeys(("RGB", "THR"), RAMP)),
+    ],
+)
+def test_rates_reach_the_blocks_of_each_stream(
+    name: str, changes: dict[str, Any], keeps: dict[str, tuple[list[float], ...]]
+) -> None:
+    """Five blocks at 0.8: keep 1, .8, .6, .4, .2; released stage 2 keeps .8 of RGB, .6 of thermal.
+
+    The factor of a residual is 0 or 1 / keep; samples, residuals and streams have their own draws.
+    """
+    net = nano(name, drop_path_rate=0.8, **changes).train()
+    seen: dict[str, Tensor] = {}
+    for path, module in net.backbone.named_modules():
+        if hasattr(module, "norm1") and hasattr(module, "mlp"):
+            module.register_forward_pre_hook(lambda _m, args, n=path: seen.update({n: args[1]}))
+    net(*images(400, 32, 32), generator=generator())
+    path = "{}{}.{}" if name != "mask2former" else "{}_branch.layers.{}.blocks.{}"
+    for prefix, stages in keeps.items():
+        for stage, blocks in enumerate(stages, int(name != "mask2former")):
+            for number, keep in enumerate(blocks):
+                factors = seen[path.format(prefix, stage, number)]
+                assert factors.shape == (2, 400, 1, 1, 1)
+                kept = factors > 0
+                torch.testing.assert_close(factors[kept], torch.full((int(kept.sum()),), 1 / keep))
+                assert abs(float(kept.float().mean()) - keep) < 0.06
+    first, second = (seen[path.format(prefix, 3, 0)] for prefix in keeps)
+    assert not torch.equal(first, second)
+    assert not torch.equal(first[0], first[1])
+
+
+def test_a_dropped_residual_leaves_the_sample_alone() -> None:
+    block = drawn(mit_blocks((4,) * 4, (2,) * 4, (1,) * 4, 2.0, norm_eps=1e-6)(0))
+    x = normal(3, 2, 2, 4)
+    out = block(x, torch.tensor([[0.0, 1, 0], [0, 1, 2]]).view(2, 3, 1, 1, 1))
+    torch.testing.assert_close(out[0], x[0])
+    torch.testing.assert_close(out[1], block(x)[1])
+    torch.testing.assert_close(out[2:], x[2:] + 2 * block.mlp(block.norm2(x[2:])))
+
+
+# ---- thermal blocks of CMNeXt --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("window", [1, 3, 7, 11])
+@pytest.mark.parametrize("size", [(2, 3), (5, 4), (9, 14)])
+def test_means_count_positions_inside_the_map_alone(window: int, size: tuple[int, int]) -> None:
+    x, reach = normal(2, 3, *size), window // 2
+    found = window_mean(x, window)
+    for row in range(size[0]):
+        for column in range(size[1]):
+            rows = slice(max(row - reach, 0), row + reach + 1)
+            inside = x[:, :, rows, max(column - reach, 0) : column + reach + 1]
+            torch.testing.assert_close(
+                found[:, :, row, column], inside.mean((2, 3)), rtol=1e-5, atol=1e-6
+            )
+
+
+def test_gate_multiplies_its_input_and_adds_it() -> None:
+    """With weights that leave the map as it is: x sigmoid(x + means of x) + x."""
+    gate = PoolingGate(3, (3, 7))
+    for name, value in gate.named_parameters():
+        value.data = torch.eye(3)[..., None, None] if name == "conv4.weight" else 0 * value.data
+    gate.conv0.weight.data[:, 0, 3, 3] = 1
+    x = normal(2, 3, 6, 5)
+    mixed = x + window_mean(x, 3) + window_mean(x, 7)
+    torch.testing.assert_close(gate(x), x * mixed.sigmoid() + x)
+
+
+def test_thermal_block_by_its_equations() -> None:
+    """y = x + l1 gate(norm(x)); a convolution of 3 channel means weighs y; + l2 ffn(norm(y))."""
+    layer, x = PpxBlock(6, 12, windows=(3, 7, 11), layer_scale=0.3).eval(), normal(3, 6, 5, 4)
+    randomise(layer)
+    first, second = (s.view(-1, 1, 1) for s in (layer.layer_scale_1, layer.layer_scale_2))
+    keep = torch.tensor([[1.0, 0, 0], [1, 0, 2]]).view(2, 3, 1, 1, 1)
+    found = layer(x.permute(0, 2, 3, 1), keep).permute(0, 3, 1, 2)
+    y = x + keep[0] * first * layer.attn(layer.norm1(x))
+    means = F.pad(y.mean((2, 3)), (1, 1))
+    kernel = layer.c_nets[0].weight.flatten()
+    total = sum(kernel[step] * means[:, step : step + 6] for step in range(3))
+    weighted = y / (1 + (-total).exp())[..., None, None]
+    expected = weighted + keep[1] * second * layer.mlp(layer.norm2(y))
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
+
+
+# ---- starting weights ----------------------------------------------------------------------------
+
+SPREAD = {
+    "cmx_b0": {
         "backbone.extra_block4.0.mlp.fc1.weight": 0.02,
         "backbone.FRMs.3.channel_weights.mlp.0.weight": 0.02,
         "backbone.FFMs.2.cross.cross_attn.kv1.weight": 0.02,
@@ -173,88 +237,32 @@ def test_starting_weights() -> None:
         "decode_head.linear_fuse.0.weight": math.sqrt(2 / 2048),
         "decode_head.linear_pred.weight": math.sqrt(2 / 512),
         "decode_head.linear_c4.proj.weight": math.sqrt(1 / (3 * 256)),
-    }
-    assert {name: spread[name] for name in expected} == pytest.approx(expected, rel=0.05)
-    for name, p in net.named_parameters():
-        if name.startswith("backbone.") and p.dim() == 1:
-            constant = torch.zeros_like(p) if name.endswith("bias") else torch.ones_like(p)
-            assert torch.equal(p, constant), name
-    assert net.decode_head.linear_fuse[0].bias.any()
+    },
+    # Groups are not divided out, also between the streams and in the decoder.
+    "cmnext_b0": {
+        "decode_head.linear_c4.proj.weight": 0.02,
+        "backbone.block3.0.mlp.dwconv.dwconv.weight": math.sqrt(2 / (9 * 640)),
+        "backbone.extra_block4.0.attn.conv0.weight": math.sqrt(2 / (49 * 256)),
+        "backbone.extra_block2.0.mlp.fc1.weight": math.sqrt(2 / 512),
+        "backbone.FFMs.3.channel_emb.channel_embed.1.weight": math.sqrt(2 / (9 * 256)),
+        "decode_head.linear_fuse.0.weight": math.sqrt(2 / 256),
+        "decode_head.linear_pred.weight": math.sqrt(2 / 9),
+    },
+}
 
 
-def test_drop_rates() -> None:
-    ramp = drop_rates(B2, 0.1, "ramp")
-    expected = torch.tensor([0.1 * i / 15 for i in range(16)])
-    torch.testing.assert_close(ramp, expected.expand(2, 16))
-
-    released = drop_rates(B2, 0.1, "released")
-    torch.testing.assert_close(released[0, 3:7], torch.full((4,), 0.02))
-    torch.testing.assert_close(released[1, 3:7], torch.full((4,), 0.4 / 15))
-    assert torch.equal(released[:, :3], ramp[:, :3])
-    assert torch.equal(released[:, 7:], ramp[:, 7:])
-
-    deep = drop_rates(B4, 0.1, "released")
-    torch.testing.assert_close(deep[0, 3:11], torch.full((8,), 0.0075))
-    torch.testing.assert_close(deep[1, 3:11], torch.full((8,), 0.01))
-
-
-def test_rates_reach_the_blocks_of_each_stream() -> None:
-    """Five blocks at 0.8: keep 1, .8, .6, .4, .2; released stage 2 keeps .8 of RGB, .6 of thermal.
-
-    The factor of a residual is 0 or 1 / keep; samples, residuals and streams have their own draws.
-    """
-    count = 400
-    net = nano(drop_path_rate=0.8, drop_path_stage2="released").train().backbone
-    seen: dict[str, Tensor] = {}
-    for name, module in net.named_modules():
-        if isinstance(module, MitBlock):
-            module.register_forward_pre_hook(lambda _m, args, n=name: seen.update({n: args[1]}))
-    net(nano().inputs(*images(count, 29, 29)), seeded(0))
-    keeps = {
-        "block": ([1.0], [0.8, 0.8], [0.4], [0.2]),
-        "extra_block": ([1.0], [0.6, 0.6], [0.4], [0.2]),
-    }
-    for prefix, stages in keeps.items():
-        for stage, blocks in enumerate(stages, 1):
-            for number, keep in enumerate(blocks):
-                factors = seen[f"{prefix}{stage}.{number}"]
-                assert factors.shape == (2, count, 1, 1, 1)
-                kept = factors > 0
-                torch.testing.assert_close(factors[kept], torch.full((int(kept.sum()),), 1 / keep))
-                assert abs(float(kept.float().mean()) - keep) < 0.06
-    assert not torch.equal(seen["block3.0"], seen["extra_block3.0"])
-    assert not torch.equal(seen["block3.0"][0], seen["block3.0"][1])
-
-
-def test_a_dropped_residual_leaves_the_sample_alone() -> None:
-    block: MitBlock = randomise(MitBlock(4, 2, 1, 8, norm_eps=1e-6))
-    x = normal(3, 2, 2, 4)
-    keep = torch.tensor([[0.0, 1.0, 0.0], [0.0, 1.0, 2.0]]).view(2, 3, 1, 1, 1)
-    out = block(x, keep)
-    torch.testing.assert_close(out[0], x[0])
-    torch.testing.assert_close(out[1], block(x)[1])
-    torch.testing.assert_close(out[2:], x[2:] + 2 * block.mlp(block.norm2(x[2:])))
-
-
-def test_decoder_drops_whole_channels() -> None:
-    head = nano(decoder_dropout=0.5).decode_head.train()
-    seen = []
-    head.linear_pred.register_forward_pre_hook(lambda _m, args: seen.append(args[0]))
-    maps = [normal(2, 8 // s, 8 // s, d) for s, d in ((1, 8), (2, 8), (4, 12), (8, 16))]
-    wholes: list[Tensor] = []
-    head.linear_fuse[2].register_forward_hook(lambda _m, _i, out: wholes.append(out))
-    head(maps, (32, 32), seeded(0))
-    (whole,) = wholes
-    dropped = ~seen[0].flatten(2).any(-1) & whole.flatten(2).any(-1)
-    assert 0 < int(dropped.sum()) < dropped.numel()
-    expected = whole * 2 * ~dropped[..., None, None]
-    torch.testing.assert_close(seen[0], expected)
-
-
-def test_bfloat16_autocast_trains() -> None:
-    net = nano(drop_path_rate=0.1, decoder_dropout=0.1).train()
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        logits = net(*images(2), generator=seeded(0)).logits
-    assert logits.dtype == torch.float32
-    logits.square().mean().backward()
-    assert all(p.grad.isfinite().all() for p in net.parameters())
+@pytest.mark.parametrize("yaml", SPREAD)
+def test_starting_weights(yaml: str) -> None:
+    """Linear maps 0.02, convolutions sqrt(2 / outputs reached), biases 0; not CMX's decoder."""
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        found = {name: p.detach() for name, p in network(yaml).named_parameters()}
+    spread = {name: float(found[name].std()) for name in SPREAD[yaml]}
+    assert spread == pytest.approx(SPREAD[yaml], rel=0.05)
+    for name, p in found.items():
+        if p.dim() == 1 and (yaml == "cmnext_b0" or name.startswith("backbone.")):
+            scale = 0.01 if "layer_scale" in name else 1.0
+            assert torch.equal(p, torch.full_like(p, 0.0 if name.endswith("bias") else scale)), name
+    # The convolution of the channel weights keeps torch's uniform start, at most 1 / sqrt(3).
+    kernels = [p.flatten() for name, p in found.items() if "c_nets" in name]
+    assert not kernels or 0.4 < float(torch.cat(kernels).abs().max()) <= 1 / math.sqrt(3)

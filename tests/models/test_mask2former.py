@@ -1,84 +1,77 @@
-"""Mask2Former as a whole: sizes, views, passes, masks, stochastic depth, parameter counts."""
+"""Networks with Mask2Former's head: views, passes, masks, precision, shared stages, parts."""
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from rgbt.checks import InputError
-from rgbt.models.mask2former.head import semantic_logits
-from rgbt.types import MaskPair
+from rgbt.models.mask2former.decoder import QueryAttention
+from rgbt.models.mask2former.network import Fusion, Request, semantic_logits
+from rgbt.models.mask2former.pixel_decoder import (
+    DeformableAttention,
+    centre_grid,
+    shrink,
+    sine_code,
+)
+from rgbt.models.mask2former.swin import PatchMerging, relative_index, shift_mask
+from rgbt.types import VIEWS, MaskPair
 from tests.models import plain
 from tests.models.golden import network
-from tests.models.plain import count, generator, images
+from tests.models.plain import cells, count, images, normal, randomise
 
 nano = partial(plain.nano, "mask2former")
-ALL_VIEWS = ("rgbt", "rgb", "thermal")
+BOTH = pytest.mark.parametrize("name", ["mask2former", "dinov2"])
 
 
-def cells(count: int, h: int = 2, w: int = 3, seed: int = 1) -> MaskPair:
-    g = generator(seed)
-    return MaskPair(*(torch.rand(count, h, w, generator=g) < 0.5 for _ in range(2)))
-
-
-@pytest.mark.parametrize("size", [(64, 96), (60, 84)])
-def test_shapes(size: tuple[int, int]) -> None:
-    out = nano().eval()(*images(2, *size))
-    assert out.logits is not None
-    assert out.logits.shape == (2, 4, *size)
-    assert out.aux["class_logits"].shape == (4, 1, 2, 5, 5)
-    assert out.aux["mask_logits"].shape == (4, 1, 2, 5, 16, 24)
-
-
-def test_logits_only_for_one_prediction_in_evaluation() -> None:
-    net = nano()
-    assert net.train()(*images(2)).logits is None
-    assert net.eval()(*images(2), views=("rgb", "thermal")).logits is None
+def test_logits_only_for_one_prediction() -> None:
+    net = nano().eval()
+    assert net(*images(2)).logits is not None
+    assert net(*images(2), views=("rgb", "thermal")).logits is None
     assert net(*images(2), passes=2).logits is None
 
 
-def test_padding_is_the_mean_colour() -> None:
-    """60 x 84 equals 64 x 96 with the missing pixels set to the mean, 1/2."""
-    net, pair = nano().eval(), images(1, 60, 84)
-    full = net(*(nn.functional.pad(image, (0, 12, 0, 4), value=0.5) for image in pair))
-    small = net(*pair)
-    torch.testing.assert_close(small.aux["mask_logits"], full.aux["mask_logits"])
-    torch.testing.assert_close(small.logits, full.logits[..., :60, :84])
-
-
 @pytest.mark.parametrize("training", [False, True])
-def test_batched_views_and_passes_equal_single_calls(training: bool) -> None:
+@BOTH
+@torch.no_grad()
+def test_batched_views_and_passes_equal_single_calls(name: str, training: bool) -> None:
     rgb, thermal = images(2)
-    hidden = cells(2)
-    nothing = MaskPair(torch.zeros(2, 2, 3).bool(), torch.zeros(2, 2, 3).bool())
-    together, apart = nano().train(training), nano().train(training)
-    both = MaskPair(
-        torch.cat([nothing.rgb, hidden.rgb]), torch.cat([nothing.thermal, hidden.thermal])
-    )
-    out = together(
-        rgb.repeat(2, 1, 1, 1), thermal.repeat(2, 1, 1, 1), both, passes=2, views=ALL_VIEWS
-    )
+    hidden, nothing = cells(2), MaskPair(*(torch.zeros(2, 2, 3).bool() for _ in range(2)))
+    both = MaskPair(*(torch.cat(pair) for pair in zip(nothing, hidden, strict=True)))
+    together, apart = plain.nano(name).train(training), plain.nano(name).train(training)
+    pair = rgb.repeat(2, 1, 1, 1), thermal.repeat(2, 1, 1, 1)
+    out = together(*pair, both, passes=2, views=VIEWS)
     assert out.aux["class_logits"].shape[:3] == (4, 6, 2)
 
     # Pass by pass, within it view by view. The clean call comes first: batch statistics add up.
     for number, masks in enumerate((None, hidden)):
-        for offset, view in enumerate(ALL_VIEWS):
-            net = apart if view == "rgbt" else nano().train(training)
+        for offset, view in enumerate(VIEWS):
+            net = apart if view == "rgbt" else plain.nano(name).train(training)
             single = net(rgb, thermal, masks, views=(view,))
-            for name in ("class_logits", "mask_logits"):
-                torch.testing.assert_close(
-                    out.aux[name][:, 3 * number + offset],
-                    single.aux[name][:, 0],
-                    rtol=1e-4,
-                    atol=1e-4,
-                )
+            for key in ("class_logits", "mask_logits"):
+                found, expected = out.aux[key][:, 3 * number + offset], single.aux[key][:, 0]
+                torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
     for mine, theirs in zip(together.buffers(), apart.buffers(), strict=True):
         torch.testing.assert_close(mine, theirs)
     assert together.backbone.norm_layers["res2"].num_batches_tracked == (2 if training else 0)
+
+
+@pytest.mark.parametrize(("fusion", "order"), [("max", (-1, 0, 1)), ("add", (-1, 1, 0))])
+def test_fusion_by_hand(fusion: Any, order: tuple[int, ...]) -> None:
+    """Maxima 2, 3, 4 and sums 3, 5, 4: a deviation of sqrt(2 / 3) around the mean."""
+    layer = Fusion((1, 1, 1, 1), fusion).train()
+    rgb, thermal = torch.tensor([1.0, 3.0, 0.0]), torch.tensor([2.0, 2.0, 4.0])
+    maps = {"rgb": [rgb.view(1, 1, 1, 3)] * 4, "thermal": [thermal.view(1, 1, 1, 3)] * 4}
+    fused = torch.tensor(order) * 1.5**0.5
+    for level in layer(maps, Request(VIEWS, 1, 3)):
+        expected = torch.stack([fused, rgb, thermal]).view(3, 1, 1, 3)
+        torch.testing.assert_close(level, expected, rtol=0, atol=1e-4)
 
 
 def gradients(net: nn.Module, loss: Tensor) -> dict[str, Tensor]:
@@ -90,40 +83,35 @@ def gradients(net: nn.Module, loss: Tensor) -> dict[str, Tensor]:
 @pytest.mark.parametrize(("predictions", "with_masks"), [(6, 4), (4, 4), (5, 1)])
 def test_fewer_predictions_equal_the_first_of_all(predictions: int, with_masks: int) -> None:
     """The loss reads the masks of some, and the final class logits of the others, as CRM does."""
-    net = nano().train()
-    pair, hidden = images(4), cells(4)
-    g = generator(4)
+    net, pair, hidden = nano().train(), images(4), cells(4)
     weights = {
-        "class_logits": torch.randn(4, predictions, 2, 5, 5, generator=g),
-        "mask_logits": torch.randn(4, with_masks, 2, 5, 16, 24, generator=g),
+        "class_logits": normal(4, predictions, 2, 5, 5, seed=4),
+        "mask_logits": normal(4, with_masks, 2, 5, 16, 24, seed=5),
     }
 
     def loss(aux: dict[str, Tensor]) -> Tensor:
-        supervised = sum(
-            (aux[name][:, :with_masks] * w[:, :with_masks]).sum() for name, w in weights.items()
-        )
-        others = slice(with_masks, predictions)
+        first, others = slice(with_masks), slice(with_masks, predictions)
+        supervised = sum((aux[name][:, first] * w[:, first]).sum() for name, w in weights.items())
         final = aux["class_logits"][-1, others] * weights["class_logits"][-1, others]
         return supervised + final.sum()
 
-    every = net(*pair, hidden, passes=2, views=ALL_VIEWS).aux
+    every = net(*pair, hidden, passes=2, views=VIEWS).aux
     wanted = {"num_predictions": predictions, "num_masks": with_masks}
-    fewer = net(*pair, hidden, passes=2, views=ALL_VIEWS, **wanted).aux
+    fewer = net(*pair, hidden, passes=2, views=VIEWS, **wanted).aux
     for name, number in (("class_logits", predictions), ("mask_logits", with_masks)):
         assert fewer[name].shape[1] == number
         assert torch.equal(fewer[name], every[name][:, :number])
     expected = gradients(net, loss(every))
-    found = gradients(net, loss(fewer))
-    for name, gradient in found.items():  # sums of other rows are rounded in another order
+    for name, gradient in gradients(net, loss(fewer)).items():  # other rounding of the sums
         tolerance = 1e-5 * float(expected[name].abs().max()) + 1e-5
         torch.testing.assert_close(gradient, expected[name], rtol=1e-5, atol=tolerance)
 
 
 def test_the_finest_features_of_predictions_without_masks_need_no_gradient() -> None:
     net = nano().train()
-    aux = net(*images(2), views=ALL_VIEWS, num_masks=1).aux
+    aux = net(*images(2), views=VIEWS, num_masks=1).aux
     aux["class_logits"][-1, 1:].sum().backward()
-    pixel_decoder = net.sem_seg_head.pixel_decoder
+    pixel_decoder = net.sem_seg_head["pixel_decoder"]
     for parameter in (pixel_decoder.layer_1.weight, pixel_decoder.adapter_1.weight):
         assert parameter.grad is None
     assert pixel_decoder.input_proj[0][0].weight.grad.any()
@@ -143,12 +131,10 @@ def test_mask_token_replaces_exactly_the_hidden_tokens() -> None:
     masks = cells(2, 4, 6)
     net(*images(2), masks)
     for name, mask in zip(("RGB_branch", "THR_branch"), masks, strict=True):
+        hidden = mask.repeat_interleave(4, 1).repeat_interleave(4, 2)
         token = net.backbone.get_submodule(name).mask_token.flatten()
-        for row in range(16):
-            for column in range(24):
-                hidden = mask[:, row // 4, column // 4, None]
-                expected = torch.where(hidden, token, seen[f"{name}.embed"][:, row, column])
-                assert torch.equal(seen[name][:, row, column], expected)
+        expected = torch.where(hidden[..., None], token, seen[f"{name}.embed"])
+        assert torch.equal(seen[name], expected)
 
 
 def test_shared_mask_token_is_one_parameter_with_the_gradient_of_both() -> None:
@@ -158,19 +144,23 @@ def test_shared_mask_token_is_one_parameter_with_the_gradient_of_both() -> None:
     assert branches[0].mask_token is branches[1].mask_token
     # With the same values in both branches of the other network, its two gradients add up.
     apart.load_state_dict(shared.state_dict())
-    masks = cells(2, 4, 6)
     for net in (apart, shared):
-        net(*images(2), masks).aux["mask_logits"].square().sum().backward()
-    separate = [
+        net(*images(2), cells(2, 4, 6)).aux["mask_logits"].square().sum().backward()
+    first, second = (
         branch.mask_token.grad for branch in (apart.backbone.RGB_branch, apart.backbone.THR_branch)
-    ]
-    assert all(each.any() for each in separate)
-    torch.testing.assert_close(branches[0].mask_token.grad, separate[0] + separate[1])
+    )
+    assert first.any()
+    assert second.any()
+    torch.testing.assert_close(branches[0].mask_token.grad, first + second)
 
 
-@pytest.mark.parametrize(("view", "idle"), [("rgb", "THR_branch"), ("thermal", "RGB_branch")])
-def test_single_modality_does_not_run_the_other_branch(view: str, idle: str) -> None:
-    net = nano().eval()
+@pytest.mark.parametrize(("view", "idle"), [("rgb", "thermal"), ("thermal", "rgb")])
+@pytest.mark.parametrize(
+    ("name", "part"), [("mask2former", "{}_branch"), ("dinov2", "pyramids.{}")]
+)
+def test_single_modality_does_not_run_the_other(name: str, part: str, view: str, idle: str) -> None:
+    net = plain.nano(name).eval()
+    idle = part.format(idle if name == "dinov2" else {"rgb": "RGB", "thermal": "THR"}[idle])
 
     def fail(*_: object) -> None:
         raise AssertionError(f"{idle} ran")
@@ -181,83 +171,39 @@ def test_single_modality_does_not_run_the_other_branch(view: str, idle: str) -> 
         net(*images(1))
 
 
-def test_gradient_reaches_every_parameter() -> None:
-    net = nano().train()
-    # At initialisation the sampling offsets ignore their input, hence the position code too.
-    attention = net.sem_seg_head.pixel_decoder.transformer.encoder["layers"][0].self_attn
-    nn.init.normal_(attention.sampling_offsets.weight, generator=generator(3))
-    rgb, thermal = images(4)
-    aux = net(rgb, thermal, cells(4), passes=2, views=ALL_VIEWS).aux
-    g = generator(2)
-    sum((x * torch.randn(x.shape, generator=g)).sum() for x in aux.values()).backward()
-    idle = [n for n, p in net.named_parameters() if p.grad is None or not p.grad.any()]
-    assert idle == []
-    assert all(p.grad.isfinite().all() for p in net.parameters())
-
-
-def test_stochastic_depth_follows_the_generator_only() -> None:
-    net = nano(drop_path_rate=0.6).train()
-    state = torch.get_rng_state()
-
-    def run(seed: int) -> Tensor:
-        return net(*images(4), generator=generator(seed)).aux["class_logits"]
-
-    first = run(0)
-    assert torch.equal(first, run(0))
-    assert not torch.equal(first, run(1))
-    assert torch.equal(state, torch.get_rng_state())
-    with pytest.raises(ValueError, match="generator"):
-        net(*images(1))
-
-
-def test_stochastic_depth_factors() -> None:
-    """Five blocks at rate 0.4: keep probabilities 1, .9, .8, .7, .6; factors 0 or 1/p; mean 1."""
-    net = nano(drop_path_rate=0.4).train()
-    seen: list[Tensor] = []
-    for stage in net.backbone.RGB_branch.layers:
-        stage.register_forward_pre_hook(lambda _m, args: seen.append(args[1]))
-    net.backbone.RGB_branch(torch.zeros(2000, 3, 32, 32), None, generator())
-    factor = torch.cat(seen)
-    assert factor.shape == (5, 2, 2000, 1, 1, 1)
-    for block, keep in enumerate((1.0, 0.9, 0.8, 0.7, 0.6)):
-        values = factor[block].flatten()
-        assert torch.allclose(values[values > 0], torch.tensor(1 / keep))
-        assert abs(float((values > 0).float().mean()) - keep) < 0.03
-
-
 @pytest.mark.parametrize(
     "call",
     [
         {"passes": 2},
         {"views": ("rgb", "rgb")},
-        {"views": ("infrared",)},
         {"num_predictions": 2},
         {"num_masks": 2},
         {"num_masks": 0},
-        {"views": ALL_VIEWS, "num_predictions": 2, "num_masks": 3},
+        {"views": VIEWS, "num_predictions": 2, "num_masks": 3},
         {"masks": cells(2)},
     ],
 )
-def test_inputs_that_do_not_fit_raise(call: dict[str, Any]) -> None:
+def test_calls_that_do_not_fit_raise(call: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=r".+"):
         nano().eval()(*images(3), **call)
 
 
 @pytest.mark.parametrize("grid", [(3, 3), (2, 2), (32, 48), (5, 7)])
-def test_cells_that_do_not_divide_are_named(grid: tuple[int, int]) -> None:
-    with pytest.raises(InputError, match=r"patch size .*64 x 96|64 x 96.*patch size"):
-        nano().eval()(*images(1), cells(1, *grid))
+@BOTH
+def test_cells_that_do_not_divide_the_image_are_refused(name: str, grid: tuple[int, int]) -> None:
+    with pytest.raises(InputError, match=r"masker.patch_size"):
+        plain.nano(name).eval()(*images(1), cells(1, *grid))
 
 
 @pytest.mark.parametrize("fp32", [True, False])
 def test_autocast_keeps_the_pixel_decoder_in_single_precision_on_request(fp32: bool) -> None:
     net = nano(pixel_decoder_fp32=fp32).train()
     seen: list[torch.dtype] = []
-    net.sem_seg_head.pixel_decoder.layer_1.register_forward_hook(
+    net.sem_seg_head["pixel_decoder"].layer_1.register_forward_hook(
         lambda _m, _i, out: seen.append(out.dtype)
     )
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        aux = net(*images(2), cells(2), views=ALL_VIEWS).aux
+        aux = net(*images(2), cells(2), views=VIEWS).aux
     assert (seen[0] == torch.float32) == fp32
     sum(x.float().square().mean() for x in aux.values()).backward()
     assert all(p.grad.isfinite().all() for p in net.parameters())
@@ -269,9 +215,7 @@ def test_weights_survive_evaluation_in_inference_mode() -> None:
     with torch.inference_mode():
         net.eval()(*images(1, 96, 64))
     net.train()(*images(2, 96, 64)).aux["mask_logits"].sum().backward()
-    trained = net.sem_seg_head.pixel_decoder.mask_features.weight.grad
-    assert trained is not None
-    assert trained.abs().sum() > 0
+    assert net.sem_seg_head["pixel_decoder"].mask_features.weight.grad.any()
 
 
 def test_semantic_logits_by_hand() -> None:
@@ -294,19 +238,86 @@ def test_shared_stages(name: str, start: int, millions: float) -> None:
     assert round(count(net.backbone) / 1e6, 2) == millions
 
 
-def test_optimiser_groups_follow_from_types_and_names() -> None:
-    """Sizes of the released groups for Swin-T: (learning rate, weight decay) -> numbers."""
-    with torch.device("meta"):
-        net = network("mask2former_swin_t")
-    undecayed = (nn.LayerNorm, nn.BatchNorm2d, nn.GroupNorm, nn.Embedding)
-    groups: dict[tuple[float, float], list[int]] = {}
-    for module_name, module in net.named_modules():
-        for name, parameter in module.named_parameters(recurse=False):
-            rate = 1e-5 if module_name.startswith("backbone") else 1e-4
-            free = isinstance(module, undecayed) or name == "relative_position_bias_table"
-            groups.setdefault((rate, 0.0 if free else 0.05), []).append(parameter.numel())
-    found = {key: (round(sum(sizes) / 1e6, 3), len(sizes)) for key, sizes in groups.items()}
-    assert found[1e-5, 0.05] == (pytest.approx(54.94, abs=0.005), 204)
-    assert found[1e-5, 0.0] == (pytest.approx(0.102, abs=0.0005), 160)
-    assert found[1e-4, 0.05] == (pytest.approx(19.81, abs=0.005), 199)
-    assert found[1e-4, 0.0] == (pytest.approx(0.075, abs=0.0005), 93)
+# ---- parts ---------------------------------------------------------------------------------------
+
+CPU = torch.device("cpu")
+
+
+def test_relative_index_by_hand() -> None:
+    # Tokens (0,0) (0,1) (1,0) (1,1); (dy + 1) * 3 + (dx + 1).
+    expected = [[4, 3, 1, 0], [5, 4, 2, 1], [7, 6, 4, 3], [8, 7, 5, 4]]
+    assert relative_index(2).tolist() == expected
+
+
+def test_shift_mask_by_hand() -> None:
+    """4 x 4 tokens, windows of 2, rolled by 1: the last row and column came from the front."""
+    mask = shift_mask((4, 4), 2, 1, CPU)
+    assert mask.shape == (4, 1, 4, 4)
+    blocked = mask[:, 0] < 0
+    assert not blocked[0].any()
+    columns_apart = torch.tensor([[0, 1, 0, 1], [1, 0, 1, 0], [0, 1, 0, 1], [1, 0, 1, 0]]).bool()
+    rows_apart = torch.tensor([[0, 0, 1, 1], [0, 0, 1, 1], [1, 1, 0, 0], [1, 1, 0, 0]]).bool()
+    assert torch.equal(blocked[1], columns_apart)
+    assert torch.equal(blocked[2], rows_apart)
+    assert torch.equal(blocked[3], columns_apart | rows_apart)
+
+
+def test_patch_merging_order() -> None:
+    """Four neighbours in the order (0,0) (1,0) (0,1) (1,1); an odd side is padded with zeros."""
+    merge = PatchMerging(1)
+    merge.norm = nn.Identity()
+    merge.reduction = nn.Identity()
+    x = torch.tensor([[1.0, 2, 3], [4, 5, 6]]).view(1, 2, 3, 1)
+    assert merge(x).view(2, 4).tolist() == [[1, 4, 2, 5], [3, 6, 0, 0]]
+
+
+def test_sine_code_equals_its_formula() -> None:
+    code = sine_code((2, 3), 8, CPU).view(2, 3, 8)
+    for y in range(2):
+        for x in range(3):
+            expected = []
+            for position, size in ((y, 2), (x, 3)):
+                angle = 2 * math.pi * (position + 1) / (size + 1e-6)
+                for slower in (angle, angle / 10000 ** (2 / 4)):
+                    expected += [math.sin(slower), math.cos(slower)]
+            torch.testing.assert_close(code[y, x], torch.tensor(expected), rtol=1e-5, atol=1e-5)
+
+
+def test_centre_grid_by_hand() -> None:
+    centre, scale = centre_grid(((1, 2),), CPU)
+    assert centre.tolist() == [[-0.5, 0.5], [0.0, 0.0]]
+    assert scale.flatten().tolist() == [1.0, 2.0]
+
+
+def test_deformable_attention_starts_by_looking_around() -> None:
+    """Four heads look right, down, left, up, at 1..4 pixels."""
+    layer = DeformableAttention(8, heads=4, num_levels=1)
+    bias = layer.sampling_offsets.bias.view(4, 4, 2)
+    for head, direction in enumerate([(1, 0), (0, 1), (-1, 0), (0, -1)]):
+        for point in range(4):
+            expected = torch.tensor(direction) * (point + 1.0)
+            torch.testing.assert_close(bias[head, point], expected, rtol=0, atol=1e-6)
+    assert not layer.sampling_offsets.weight.any()
+
+
+def test_attention_equals_torch_module() -> None:
+    ours, theirs = QueryAttention(8, 2), nn.MultiheadAttention(8, 2, batch_first=True)
+    theirs.load_state_dict(randomise(ours))
+    query, key, value = normal(2, 3, 8, seed=1), normal(2, 5, 8, seed=2), normal(2, 5, 8, seed=3)
+    allowed = normal(2, 3, 5, seed=4) < 0.3
+    allowed |= ~allowed.any(-1, keepdim=True)
+    blocked = ~allowed.repeat_interleave(2, dim=0)
+    found = ours(query, key, value, allowed)
+    torch.testing.assert_close(found, theirs(query, key, value, attn_mask=blocked)[0])
+    torch.testing.assert_close(ours(query, key, value, None), theirs(query, key, value)[0])
+    with torch.autocast("cpu", torch.bfloat16):
+        rounded = ours(query, key, value, allowed)
+    assert rounded.dtype == torch.bfloat16
+    torch.testing.assert_close(rounded.float(), found, rtol=0.05, atol=0.05)
+
+
+@pytest.mark.parametrize("factor", [2, 4, 8])
+def test_shrink_equals_bilinear_interpolation(factor: int) -> None:
+    x, size = normal(2, 3, 16, 24), (16 // factor, 24 // factor)
+    expected = F.interpolate(x, size=size, mode="bilinear", align_corners=False)
+    torch.testing.assert_close(shrink(x, factor), expected)

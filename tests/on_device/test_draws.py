@@ -9,7 +9,7 @@ from rgbt.geometry.camera import Camera
 from rgbt.losses.points import Points
 from rgbt.models.parts import keep_factors
 from rgbt.randomness import torch_generator
-from rgbt.transforms.virtual_view import VirtualView
+from rgbt.transforms.views import VirtualView
 from rgbt.types import MaskPair
 from tests.maskers.test_masker import VARIANTS, configured
 from tests.on_device.places import ON_DEVICE, device

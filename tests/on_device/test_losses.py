@@ -11,14 +11,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from rgbt.losses.adversarial import VERDICT_LOSSES, judged
 from rgbt.losses.cross_entropy import CrossEntropy
-from rgbt.losses.distillation import sdc
+from rgbt.losses.distances import sdc
 from rgbt.losses.matcher import Matcher, targets_of
-from rgbt.losses.overlap import con, con_acc, dice
 from rgbt.losses.points import Points
 from rgbt.losses.spatial import PLAIN
-from rgbt.losses.unlabelled import Entropy, MaxSquares, guidance
+from rgbt.losses.temporal import con, con_acc, dice
+from rgbt.losses.unlabelled import VERDICT_LOSSES, Entropy, MaxSquares, guidance, judged
 from rgbt.types import Batch, Output
 from tests.losses.problems import batch_of, criterion_of, problem_of, seeded
 from tests.on_device.places import ON_DEVICE, device, exact

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from rgbt.checks import InputError
 from rgbt.config.compose import compose
 from rgbt.runs import source_code
 from rgbt.runs.source_code import checkout_code, counted_modules, user_code
@@ -137,8 +138,6 @@ def test_code_covers_what_the_constructor_imports(tmp_path: Path) -> None:
         *("checkout/model", "checkout/model.deep.part", "checkout/model.net"),
         "checkout/model.util",
     ]
-    empty = specify(compose([*WORDS, f"model.checkout={tmp_path}", "model.empty_packages=[model]"]))
-    assert "checkout/model" not in empty.own_code()
 
 
 @pytest.mark.parametrize(
@@ -157,3 +156,20 @@ def test_key_changes_with_the_code_that_is_imported(
     (tmp_path / file).write_text(text)
     assert (key_of_checkout(tmp_path) != before) == counts
     assert key_of_checkout(write_checkout(tmp_path / "elsewhere", FILES)) == before
+
+
+def test_key_changes_with_an_adapter_and_what_it_imports(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RGBT_CONF", str(tmp_path / "conf"))
+    text = "def network():\n    from model import net\n    return net.Net(3)\n"
+    adapter = tmp_path / "conf" / "model" / "external" / "odd.py"
+    write_checkout(adapter.parent, {"odd.py": text})
+    folder, named = write_checkout(tmp_path / "x", FILES), ("model.constructor=odd.py:network",)
+    first = key_of_checkout(folder, *named)
+    (folder / "code/model/deep/part.py").write_text("VALUE = 2\n")
+    second = key_of_checkout(folder, *named)
+    adapter.write_text(text.replace("3", "4"))
+    assert len({first, second, key_of_checkout(folder, *named)}) == 3
+    with pytest.raises(InputError, match=r"^model\.checkout="):
+        key_of_checkout(tmp_path, *named, "model.root=.")  # has no module that the adapter imports

@@ -21,7 +21,7 @@ from rgbt.engine.checkpoint import State, load_checkpoint
 from rgbt.engine.trainer import Trainer
 from rgbt.runtime.signals import Stopped, answered, deferred
 from rgbt.types import Batch
-from tests.checkpoints.test_torch_files import same
+from tests.checkpoints.test_damage import same
 from tests.commands import Call, NoOptions, assert_one_sentence
 from tests.engine.test_trainer import batches, make
 

@@ -12,8 +12,7 @@ from torch import Tensor, nn
 from rgbt.data.domains import Domain, Domains
 from rgbt.engine.batch_norm import synchronise_batch_norm
 from rgbt.geometry.camera import Camera
-from rgbt.losses.auxiliary import WithAuxiliary
-from rgbt.losses.cross_entropy import CrossEntropy
+from rgbt.losses.cross_entropy import CrossEntropy, WithAuxiliary
 from rgbt.losses.spatial import PLAIN
 from rgbt.losses.temporal import TemporalLoss
 from rgbt.losses.unlabelled import Entropy, MaxSquares
@@ -29,7 +28,7 @@ from rgbt.schemes.supervised import Supervised
 from rgbt.schemes.temporal import Temporal
 from rgbt.schemes.two_domains import LabelledDomains, UnlabelledTarget
 from rgbt.transforms.strong import StrongAugmentation
-from rgbt.transforms.virtual_view import VirtualView
+from rgbt.transforms.views import VirtualView
 from rgbt.types import IGNORE, Batch, TwoDomains
 from tests.losses.problems import batch_of, criterion_of, whole_image
 from tests.models.plain import nano
@@ -218,8 +217,8 @@ def self_training(*, heads: bool = False, **changes: Any) -> Case:
         **{"heads": heads, "loss": weighted, "masker": INDEPENDENT},
         **{"augmentation": augmentation, **settings},
     )
-    for each in () if case.scheme.initial is None else case.scheme.initial.buffers():
-        each.mul_(0.5)  # as if the network had been trained since
+    for each in () if case.scheme.initial is None else case.scheme.initial.parameters():
+        each.data.mul_(0.5)  # as if the network had been trained since
     return case
 
 
@@ -251,17 +250,6 @@ CASES: dict[str, Callable[[], Case]] = {
 }
 """Every scheme and every loss."""
 
-SLOW: dict[str, Callable[[], Case]] = {
-    "crm plain": crm,
-    "rtfnet": lambda: supervised("rtfnet", CrossEntropy(class_weights=None)),
-    "pspnet": lambda: supervised("pspnet", WEIGHTED),
-    "deeplab": lambda: supervised("deeplabv2", WithAuxiliary(loss=WEIGHTED, weight=0.4)),
-    "cmx": lambda: supervised("cmx", WEIGHTED, drop_path_rate=0.5, decoder_dropout=0.5),
-    "temporal batch norm": lambda: temporal("mfnet", "con", "released"),
-}
-"""The other networks, whose normalisations wait for each other hundreds of times."""
-
-
 # ---- steps ----------------------------------------------------------------------------------
 
 
@@ -282,7 +270,7 @@ def averaged_gradients(network: nn.Module) -> list[Tensor]:
 
 def run_case(name: str) -> Values:
     """Loss parts and gradients of every phase, and the buffers afterwards, by name."""
-    case = (CASES | SLOW)[name]()
+    case = CASES[name]()
     for net in case.networks.values():
         assert synchronise_batch_norm(net.train()) is net
     found: Values = {}
@@ -309,7 +297,7 @@ def run_cases(names: tuple[str, ...]) -> dict[str, Values]:
 
 def ten_steps(name: str) -> list[float]:
     """The losses of ten steps with AdamW, on a new batch each."""
-    case = (CASES | SLOW)[name]()
+    case = CASES[name]()
     net = case.networks["model"]
     synchronise_batch_norm(net.train())
     optimizer = torch.optim.AdamW(net.parameters(), lr=1e-4)  # as in the paper

@@ -8,9 +8,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from rgbt.checks import InputError
 from rgbt.randomness import torch_generator
-from rgbt.schemes.class_mix import mixed, pasted_pixels, seen_as
+from rgbt.schemes.self_training import mixed, pasted_pixels, seen_as
 from rgbt.types import Batch
 from tests.losses.problems import batch_of
 
@@ -39,27 +38,6 @@ def test_half_of_the_values_of_the_batch_are_pasted(values: list[int], pasted: i
     assert len(values) == 1 or not all(torch.equal(masks[0], each) for each in masks)
 
 
-def test_every_class_is_pasted_in_half_of_the_images() -> None:
-    label = torch.tensor([1, 4, 6, 255]).expand(2000, 1, -1).contiguous()
-    shares = drawn(label).double().mean((0, 1))
-    torch.testing.assert_close(shares, torch.full((4,), 0.5).double(), atol=0.05, rtol=0)
-
-
-def test_a_drawn_class_may_be_of_another_image() -> None:
-    label = torch.tensor([[[1, 1, 1]], [[2, 2, 2]]])
-    found = [drawn(label, number)[0] for number in range(40)]
-    assert all(each.all() or not each.any() for each in found)
-    assert {bool(each.any()) for each in found} == {True, False}
-
-
-def test_the_generator_alone_decides() -> None:
-    label = torch.arange(12).view(1, 3, 4).expand(4, 3, 4).contiguous()
-    before = torch.get_rng_state()
-    assert torch.equal(drawn(label), drawn(label))
-    assert not torch.equal(drawn(label), drawn(label, 1))
-    assert torch.equal(before, torch.get_rng_state())
-
-
 def test_both_images_label_and_weight_are_pasted_with_one_mask() -> None:
     source, target = images(0.01, label=3), images(0.02, label=5)
     pasted = torch.tensor([[[True, False, False], [False, True, False]]])
@@ -83,9 +61,3 @@ def test_views_that_differ_paste_what_the_source_sees() -> None:
     assert torch.equal(rgb, torch.ones_like(rgb))
     for views in (("rgb", "rgb"), ("thermal", "thermal"), (None, None), ("rgbt", "rgb")):
         assert seen_as(batch, *views) is batch  # type: ignore[arg-type]
-
-
-def test_images_of_another_size_are_refused() -> None:
-    source, target = images(0.5, 1), images(0.5, 1, height=4)
-    with pytest.raises(InputError, match="got 2 x 3 and 4 x 3 pixels; choose a transform"):
-        mixed(source, target, torch.ones(1, 4, 3, dtype=torch.bool))

@@ -13,12 +13,11 @@ import torch
 from torch import Tensor
 
 from rgbt.engine.checkpoint import State
-from rgbt.losses.unlabelled import Entropy, MaxSquares
+from rgbt.losses.unlabelled import MaxSquares
 from rgbt.schemes.supervised import Supervised
 from rgbt.schemes.two_domains import LabelledDomains, UnlabelledTarget
 from rgbt.types import IGNORE
 from tests.schemes.linear import (
-    K,
     Linear,
     Momentum,
     Nothing,
@@ -129,40 +128,6 @@ def test_view_and_head_are_passed_to_the_network() -> None:
     assert model.calls == [(("rgb",), "day", True), (("thermal",), "dark", True)]
 
 
-def test_null_view_is_not_passed_to_the_network() -> None:
-    model = network(False)
-    scheme = labelled(model, False, "apart", view=None)
-    list(scheme.phases(next(pairs()).to("cpu"), generator_of))
-    assert model.calls == [(("rgb",), None, True), ((), None, True)]
-
-
-def test_the_network_draws_from_the_generator_of_its_pass() -> None:
-    """What is dropped of the target does not follow from what is dropped of the source."""
-    drawn: dict[str, Tensor] = {}
-
-    class Drawing(Linear):
-        def forward(self, *images: Tensor, **requested: Any) -> Any:
-            drawn[f"{requested['head']} network"] = torch.rand(4, generator=requested["generator"])
-            return super().forward(*images, **requested)
-
-    def loss(output: Any, batch: Any, generator: torch.Generator) -> dict[str, Tensor]:
-        drawn[f"{batch.name[0]} loss"] = torch.rand(4, generator=generator)
-        return cross_entropy(output, batch, torch.Generator())
-
-    model = Drawing(("day", "dark"))
-    scheme = LabelledDomains(model=model, loss=loss, domains=domains(True), gradients="apart")
-    pair = next(pairs()).to("cpu")
-    pair = replace(pair, target=replace(pair.target, name=("t", "u")))
-    list(scheme.phases(pair, generator_of))
-    names = {
-        **{"day network": "source network", "dark network": "target network"},
-        **{"a loss": "source loss", "t loss": "target loss"},
-    }
-    assert drawn.keys() == names.keys()
-    for name, purpose in names.items():
-        assert torch.equal(drawn[name], torch.rand(4, generator=generator_of(purpose))), name
-
-
 # ---- without labels of the target -----------------------------------------------------------
 
 
@@ -193,22 +158,6 @@ def test_labels_of_an_unlabelled_target_are_not_read(tmp_path: Path) -> None:
         made.fit(iter([pair]), State(seed=0))
         found.append(values_of(model))
     assert all(torch.equal(found[0][name], found[1][name]) for name in found[0])
-
-
-def test_entropy_of_two_heads_trains_the_targets(tmp_path: Path) -> None:
-    model = network(True)
-    values = values_of(model)
-    day, dark = Momentum((SHARED, DAY)), Momentum((SHARED, DARK))
-    pair = next(pairs())
-
-    def entropy(v: Values) -> Tensor:
-        p = scores(v, pixels(pair.target, "thermal")[0], DARK).softmax(1)
-        return -0.3 * (p * p.log()).sum(1).mean() / torch.tensor(float(K)).log()
-
-    written_out(values, "apart", day, dark, supervised_costs(pair, True)[0], entropy)
-    scheme = unlabelled(model, heads=True, unlabelled=Entropy(weight=0.3))
-    trained(scheme, model, tmp_path, 1)
-    assert_same(model, values)
 
 
 def test_guidance_trains_the_auxiliary_head_alone_and_what_is_below(tmp_path: Path) -> None:

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import islice
-from math import sqrt
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from lightning_fabric import Fabric
-from torch import Tensor, nn
+from torch import nn
 
-from rgbt.checks import InputError
 from rgbt.engine.checkpoint import State
 from rgbt.engine.optimizers import RMSprop, step_without_gradient
 from rgbt.types import Phase
@@ -81,46 +77,6 @@ def test_seven_alternating_steps_are_those_written_out(
     assert_same(judge, expected.judge)
 
 
-def test_released_steps_differ_from_those_of_two_optimizers(tmp_path: Path) -> None:
-    """Otherwise the test above could not tell one form from the other."""
-    both = [after(tmp_path / each, 7, each)[0] for each in ("none", "released")]
-    one, other = map(values_of, both)
-    assert max(float((one[name] - other[name]).abs().max()) for name in one) > 1e-3
-
-
-def mean_step(decays: bool, gradients: Iterator[float]) -> float:
-    """Mean length of a step in plain floats, alpha 0.99 and rate 1e-4 as released."""
-    squares, total, count = 0.0, 0.0, 0
-    for gradient in gradients:
-        squares = 0.99 * squares + 0.01 * gradient**2
-        total, count = total + 1e-4 * abs(gradient) / (sqrt(squares) + 1e-8), count + 1
-        squares *= 0.99 if decays else 1.0
-    return total / count
-
-
-@pytest.mark.parametrize(("decays", "length"), [(False, 7.97e-5), (True, 1.123e-4)])
-def test_mean_step_of_the_released_optimizer_is_longer(decays: bool, length: float) -> None:
-    """Of normally distributed gradients: sqrt(2 / pi) * 1e-4, and 1.41 times that."""
-    draw = torch.Generator().manual_seed(0)
-    gradients = torch.randn(50_000, generator=draw).tolist()
-    expected = mean_step(decays, iter(gradients))
-    assert expected == pytest.approx(length, rel=0.01)
-
-    weight = nn.Parameter(torch.zeros(()))
-    holder = nn.Module()
-    holder.register_parameter("weight", weight)
-    optimizer = RMSprop(lr=1e-4, alpha=0.99, eps=1e-8)(holder)
-    total = 0.0
-    for gradient in gradients[:2000]:
-        before = weight.item()
-        weight.grad = torch.tensor(gradient)
-        optimizer.step()
-        total += abs(weight.item() - before)
-        if decays:
-            step_without_gradient(optimizer)
-    assert total / 2000 == pytest.approx(mean_step(decays, iter(gradients[:2000])), rel=2e-3)
-
-
 def test_step_without_gradient_acts_on_momentum_and_decay_of_stepped_parameters() -> None:
     """Momentum 0.5 and decay 0.1: d = 0.1 p, b = 0.5 b + d, p -= b. New parameters stay."""
     old, new = (nn.Parameter(torch.tensor(value)) for value in (2.0, 3.0))
@@ -151,11 +107,6 @@ def test_phases_name_the_idle_optimizers_of_the_released_form() -> None:
     assert idle(1, idle_steps="released") == [("critic",)]
 
 
-def test_idle_steps_without_alternation_are_refused() -> None:
-    with pytest.raises(InputError, match="idle_steps=released requires scheme.alternates=true"):
-        scheme_of(network(False), **{**HEATNET, "alternates": False, "idle_steps": "released"})
-
-
 def test_only_the_released_form_changes_the_key() -> None:
     plain = specified(("+experiment=heatnet",))
     assert plain.scheme.values["idle_steps"] == "none"
@@ -164,18 +115,3 @@ def test_only_the_released_form_changes_the_key() -> None:
         for name in ("heatnet_released",):
             scheme = specified((f"+experiment={name}", *scale)).scheme
             assert scheme.values["idle_steps"] == "released"
-
-
-def test_a_fabric_optimizer_steps_without_gradient() -> None:
-    model = nn.Linear(1, 1, bias=False)
-    start: Tensor = model.weight.detach().clone()
-    fabric = Fabric(accelerator="cpu", devices=1)
-    optimizer: Any = fabric.setup_optimizers(RMSprop(lr=RATE, alpha=ALPHA, eps=EPS)(model))
-    model.weight.grad = torch.ones(1, 1)
-    optimizer.step()
-    moved = model.weight.detach().clone()
-    assert not torch.equal(moved, start)
-    step_without_gradient(optimizer)
-    torch.testing.assert_close(model.weight.detach(), moved)
-    (state,) = optimizer.state.values()
-    torch.testing.assert_close(state["square_avg"], torch.full((1, 1), (1 - ALPHA) * ALPHA))

@@ -15,10 +15,15 @@ from torch import Tensor
 from rgbt.checks import InputError
 from rgbt.engine.checkpoint import State
 from rgbt.losses.cross_entropy import CrossEntropy
-from rgbt.losses.feature_distance import FeatureDistance
+from rgbt.losses.distances import FeatureDistance
 from rgbt.requirements import Record, record_of
-from rgbt.schemes.class_mix import LUMA, pasted_pixels
-from rgbt.schemes.self_training import CONFIDENCE, CONFIDENT_SHARE, SelfTraining
+from rgbt.schemes.self_training import (
+    CONFIDENCE,
+    CONFIDENT_SHARE,
+    LUMA,
+    SelfTraining,
+    pasted_pixels,
+)
 from rgbt.transforms.strong import StrongAugmentation
 from rgbt.types import Batch, MaskPair, Phase, TwoDomains
 from tests.schemes.linear import (
@@ -150,6 +155,20 @@ def test_masked_images_of_both_domains_have_half_of_the_weight_each() -> None:
     torch.testing.assert_close(phase.parts["target/masked_cross_entropy"], 0.25 * target)
 
 
+def test_masks_of_source_and_target_are_drawn_apart() -> None:
+    seen: list[Tensor] = []
+
+    class Drawn(Halves):
+        def __call__(self, image_hw: Any, centre_yx: Tensor, generator: Any) -> MaskPair:
+            hidden = torch.rand(len(centre_yx), 2, 2, generator=generator) < 0.5
+            seen.append(hidden)
+            return MaskPair(hidden, ~hidden)
+
+    phase_of(scheme_of(network(False), masker=Drawn(), masked_images="both"), batches())
+    source, target = seen
+    assert not torch.equal(source, target)
+
+
 def test_mix_and_masked_target_are_augmented_and_pseudo_labels_are_not() -> None:
     model, data = network(False), batches()
     plain = phase_of(scheme_of(model), data)
@@ -164,8 +183,7 @@ def test_without_masked_images_nothing_is_masked() -> None:
     model, data = network(False), batches()
     phase = phase_of(scheme_of(model, masked_weight=0.0), data)
     assert list(phase.parts) == ["source/cross_entropy", "target/cross_entropy"]
-    assert len(model.calls) == 3  # the teacher, the source and the mix
-    assert [trains for _, _, trains in model.calls] == [False, True, True]
+    assert len(model.calls) == 2  # the source and the mix
 
 
 def test_feature_distance_is_that_to_the_start_on_things_of_the_source() -> None:
@@ -190,20 +208,24 @@ def test_initial_network_sees_the_source_with_its_own_statistics() -> None:
     model.norm = torch.nn.BatchNorm2d(1)
     scheme = scheme_of(model, domains=domains(False, labels="none"), **DISTANCE)
     model.norm.running_mean.fill_(3.0)
-    seen: list[tuple[bool, float]] = []
-    model.register_forward_hook(
-        lambda *_: seen.append((model.norm.training, model.norm.running_mean.item()))
-    )
     phase_of(scheme, batches())
-    calls = [(views, *norm) for (views, *_), norm in zip(model.calls, seen, strict=True)]
+    seen = [
+        (each.calls, each.norm.training, each.norm.running_mean.item())
+        for each in (scheme.teacher.network(), scheme.initial)
+    ]
     # The teacher has the statistics of its batch, the initial network those of the start.
-    assert calls[:2] == [(("thermal",), True, 3.0), (("rgb",), False, 0.0)]
-    assert set(seen[2:]) == {(True, 3.0)}
+    assert seen[0] == ([(("thermal",), None, False)], True, 3.0)
+    assert seen[1] == ([(("rgb",), None, False)], False, 0.0)
 
 
 def test_ignored_rows_leave_rows_for_pseudo_labels() -> None:
-    scheme_of(network(False), ignored_top=0.5, ignored_bottom=0.4)
-    with pytest.raises(InputError, match="their sum must be below 1"):
+    model, data = network(False), batches()
+    scheme = scheme_of(model, ignored_top=0.5, ignored_bottom=0.25, mixing="none")
+    label, share = teacher_labels(model, data.target)
+    third_row = torch.tensor([0.0, 0.0, 1.0, 0.0])[:, None].expand(2, 4, 4)
+    expected = cost(logits(model, data.target.rgb), label, share.float() * third_row)
+    torch.testing.assert_close(phase_of(scheme, data).parts["target/cross_entropy"], expected)
+    with pytest.raises(InputError, match="must be below 1"):
         scheme_of(network(False), ignored_top=0.5, ignored_bottom=0.5)
 
 
@@ -249,8 +271,10 @@ def test_two_heads_train_each_domain_with_its_own() -> None:
     assert set(source.parts) == {"source/cross_entropy"}
     assert set(target.parts) == {"target/cross_entropy", "target/masked_cross_entropy"}
     assert (set(source.logged), set(target.logged)) == ({CONFIDENT_SHARE, CONFIDENCE}, set())
-    heads = [head for _, head, _ in model.calls]
-    assert heads == ["dark", "day", "dark", "dark"]
+    assert [head for _, head, _ in model.calls] == ["day", "dark", "dark"]
+    teacher = scheme.teacher.network()
+    assert [head for _, head, _ in teacher.calls] == ["dark"]
+    assert record_of(scheme).networks == {"teacher": scheme.teacher.average}
 
 
 @pytest.mark.parametrize("changes", [{}, DISTANCE])
@@ -286,11 +310,3 @@ def test_resumed_run_ends_with_the_same_bits(tmp_path: Path, changes: dict[str, 
     ]
     assert logged[0] == logged[1]
     assert len({line[CONFIDENCE] for line in logged[0]}) == 6
-
-
-def test_record_has_the_teacher_and_no_optimizer_of_it() -> None:
-    scheme = scheme_of(network(False))
-    record = record_of(scheme)
-    assert record.networks == {"teacher": scheme.teacher.average}
-    assert not record.builders
-    assert set(record.optimizers) == {"main"}

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from tests.processes import run_in_processes
-from tests.schemes.several import CASES, SLOW, Values, run_cases, ten_steps
+from tests.schemes.several import CASES, Values, run_cases, ten_steps
 
 NUMBERS = pytest.mark.parametrize("num_processes", [2, pytest.param(4, marks=pytest.mark.slow)])
 TOLERANCE = 1e-5
@@ -60,13 +60,6 @@ def test_processes_compute_the_step_of_one(name: str, num_processes: int) -> Non
     assert all(value.isfinite().all() for value in expected.values())
     assert all(value != 0 for value in losses)
     assert any(value.any() for value in gradients)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", SLOW)
-def test_processes_compute_the_step_of_one_with_other_networks(name: str) -> None:
-    for found in run_in_processes(run_cases, 2, (name,)):
-        assert_same(found[name], run_cases((name,))[name])
 
 
 @NUMBERS

@@ -14,13 +14,11 @@ from torch.nn import functional as F
 from rgbt.geometry.camera import Camera
 from rgbt.geometry.halving import halved_all, halved_label, halved_mean
 from rgbt.geometry.warp import Warp
-from rgbt.losses.cross_entropy import CrossEntropy
-from rgbt.losses.temporal import TemporalLoss
-from rgbt.models.mask2former.head import semantic_logits
 from rgbt.models.mask2former.model import Mask2Former
-from rgbt.requirements import Record, Requirement
+from rgbt.models.mask2former.network import semantic_logits
+from rgbt.requirements import Record
 from rgbt.schemes.temporal import Temporal
-from rgbt.transforms.virtual_view import VirtualView
+from rgbt.transforms.views import VirtualView
 from rgbt.types import Batch, Frame, Output
 from tests.losses.problems import batch_of
 from tests.models.plain import images
@@ -166,19 +164,6 @@ def test_second_frame_is_the_view_of_the_first() -> None:
     assert len(set(drawn[:, 0].tolist())) == B
 
 
-@pytest.mark.parametrize("norm", [nn.BatchNorm2d(6), nn.Identity()], ids=["apart", "joint"])
-def test_every_part_of_a_step_asks_for_its_own_generator_once(norm: nn.Module) -> None:
-    requested: list[str] = []
-
-    def noting(purpose: str) -> torch.Generator:
-        requested.append(purpose)
-        return generator_of(purpose)
-
-    (_,) = scheme(Net(norm)).phases(batch(), noting)
-    # The same words for every run: they decide the numbers that are drawn.
-    assert sorted(requested) == ["loss", "stochastic depth", "virtual view"]
-
-
 class Half:
     """A view that lies half a pixel to the right: each pixel is the mean of two."""
 
@@ -269,54 +254,24 @@ def test_half_resolution_warps_the_scores_averaged_over_two_by_two_pixels(
     assert torch.equal(half.second.logits, full.second.logits)
 
 
-@pytest.mark.parametrize("warps", ["probabilities", "logits"])
-def test_half_resolution_of_frames_that_agree_is_agreement(warps: Any) -> None:
-    """A view of no turn: both frames are averaged in the same way."""
-    still = view(mode="rotation", yaw=(0.0, 0.0), pitch=(0.0, 0.0), roll=(0.0, 0.0))
-    net = Net(nn.Identity())
-    loss = step(scheme(net, loss=Halved(), view=still, warps=warps, resolution="half"))
-    assert bool(loss.valid.all())
-    torch.testing.assert_close(loss.warped, halved_mean(loss.second.logits).softmax(1))
+class Smaller(Half):
+    """A view in which a step of one pixel is one of three pixels of the first frame."""
+
+    def warp(self, angles: Tensor, image_hw: tuple[int, int]) -> Warp:
+        still = super().warp(angles, image_hw)
+        shrink = torch.eye(3, dtype=torch.float64).repeat(len(angles), 1, 1)
+        shrink[:, 0, 0], shrink[:, 0, 2] = 1 / 3, 4 - 4.4 / 3  # the last pixel shows column 4.4
+        return replace(still, homography=shrink)
 
 
-@pytest.mark.parametrize("second", ["con", "con_acc"])
-def test_half_resolution_changes_the_part_of_agreement_alone(second: Any) -> None:
-    parts = {}
-    for resolution in ("full", "half"):
-        net = Net(nn.Identity())
-        loss = TemporalLoss(
-            segmentation=CrossEntropy(class_weights=None),
-            **{"alpha": 1.0, "beta": 1.0, "second": second, "form": "paper"},
-        )
-        (phase,) = scheme(net, loss=loss, resolution=resolution).phases(batch(), generator_of)
-        parts[resolution] = phase.parts
-        phase.parts[second].backward()
-        assert all(bool(each.any()) for each in gradients(net))
-    full, half = ({k: v.detach() for k, v in each.items()} for each in parts.values())
-    assert list(full) == list(half)
-    for name in full.keys() - {second}:
-        assert torch.equal(full[name], half[name])
-    assert float(full[second]) != float(half[second])
-    assert float(half[second]) == pytest.approx(float(full[second]), rel=0.05)
-
-
-def test_half_resolution_requires_a_loss_of_agreement() -> None:
-    loss = TemporalLoss(
-        segmentation=CrossEntropy(class_weights=None),
-        **{"alpha": 1.0, "beta": 1.0, "second": "dice", "form": "paper"},
-    )
-    for resolution in ("full", "half"):
-        record = scheme(Net(nn.Identity()), loss=loss, resolution=resolution).record
-        unmet = [each for each in record.requires if each.node == "loss"]
-        unmet = [each for each in unmet if not each.is_met_by(loss.record)]
-        wanted = Requirement("loss", "compares_half", True, "scheme.resolution=half")
-        assert unmet == ([wanted] if resolution == "half" else [])
-
-
-def test_background_views_count_every_pixel() -> None:
-    loss = step(scheme(Net(nn.Identity()), view=view(mode="rotation", outside="background")))
-    assert loss.valid.all()
-    assert (loss.second.batch.label < K).all()
+def test_half_pixel_beyond_the_first_frame_does_not_count() -> None:
+    """The last of five columns shows 4.4, and half a pixel further is 5.9, beyond 5.5."""
+    shown = scheme(Net(nn.Identity()), view=Smaller(), loss=Halved(), resolution="half")
+    loss = step(shown, batch(1, (2, 5)))
+    full = Smaller().warp(torch.zeros(1, 3), (2, 5))
+    assert full.inside()[0, 0].tolist() == [False, False, False, True, True]
+    assert halved_all(full.inside()).tolist() == [[[False, False, True]]]
+    assert not loss.valid.any()
 
 
 def test_mask2former_passes_equal_two_calls() -> None:

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-import subprocess
-import sys
 import time
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
@@ -24,8 +21,7 @@ from rgbt.tracking.mlflow_store import NoTracking
 from sweeps import attributes as names
 from sweeps.point import Point
 from sweeps.settings import Objective, SweepSettings
-from sweeps.space.samplers import build_sampler
-from sweeps.space.space import parse_space
+from sweeps.space import build_sampler, parse_space
 from sweeps.worker import driver as drivers
 from sweeps.worker.driver import Driver
 from sweeps.worker.planner import PlannedPoint
@@ -146,10 +142,6 @@ class Call:
         (found,) = [word.partition("=")[2] for word in self.words if word.startswith(f"{name}=")]
         return found
 
-    def say(self, text: str) -> None:
-        with self.log.open("a") as file:
-            file.write(text + "\n")
-
 
 Process = Generator[None, None, int]
 Behaviour = Callable[[Call], Process]
@@ -177,23 +169,19 @@ succeed = scored(0.2, 0.4)
 """A run of two validations."""
 
 
-def say(text: str, code: int) -> Behaviour:
+def leave(code: int, text: str = "") -> Behaviour:
     """Says this and ends."""
 
     def process(call: Call) -> Process:
         yield
-        call.say(text) if text else None
+        with call.log.open("a") as file:
+            file.write(text)
         return code
 
     return process
 
 
-def leave(code: int) -> Behaviour:
-    """Ends at once, says and writes nothing."""
-    return say("", code)
-
-
-fail = say("Traceback (most recent call last):\n  File x\nValueError: a bad day", 1)
+fail = leave(1, "Traceback (most recent call last):\n  File x\nValueError: a bad day\n")
 
 
 def hang(call: Call) -> Generator[None, None, NoReturn]:
@@ -411,30 +399,3 @@ def is_alive(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
     except OSError:
         return False
-
-
-HOLDER = """
-import sys, time
-from pathlib import Path
-from rgbt.files.atomic import holding
-with holding(Path(sys.argv[1])) as holder:
-    assert holder is None, holder
-    print("held", flush=True)
-    sys.stdin.readline()
-"""
-
-
-@contextmanager
-def held_by_another(folder: Path) -> Iterator[subprocess.Popen[str]]:
-    """A process of its own that trains in `folder`, as far as its lock tells; a line ends it."""
-    folder.mkdir(parents=True, exist_ok=True)
-    command = [sys.executable, "-c", HOLDER, str(folder / "lock")]
-    pipe = subprocess.PIPE
-    process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True)
-    try:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "held\n"
-        yield process
-    finally:
-        process.kill()
-        process.communicate()

@@ -48,8 +48,8 @@ def test_read_settings_converts_and_resolves() -> None:
     assert settings.params == {"a": "${px:8},2"}
 
 
-def objective(metric: str, direction: str = "maximize") -> dict[str, Any]:
-    return {"objectives": [{"metric": metric, "direction": direction}]}
+def objective(metric: str) -> dict[str, Any]:
+    return {"objectives": [{"metric": metric, "direction": "maximize"}]}
 
 
 @pytest.mark.parametrize(
@@ -57,13 +57,10 @@ def objective(metric: str, direction: str = "maximize") -> dict[str, Any]:
     [
         ({"worker": 2}, "hydra.sweeper.worker'"),
         ({"workers": 0}, "hydra.sweeper.workers'"),
-        ({"gpus": [[]]}, "hydra.sweeper.gpus"),
         ({"submitit": {"cluster": "slurm"}}, "executor=submitit"),
         ({"executor": "submitit", "timeout_minutes": 3}, "timeout_minutes"),
         (objective("mIoU"), "objective 'mIoU'"),
         (objective("val/TC/align"), "did you mean 'TC/aligned'"),
-        (objective("val/mIoU", direction="up"), r"hydra.sweeper.objectives\[0\].direction"),
-        ({"space": {"a": "0..1"}}, "hydra.sweeper.space.a'"),
         ({"points": ["a=1"]}, r"hydra.sweeper.points\[0\]"),
     ],
 )
@@ -73,6 +70,6 @@ def test_read_settings_names_wrong_setting(values: dict[str, Any], said: str) ->
 
 
 def test_objectives_reported_during_training() -> None:
-    metrics = ("val/mIoU", "val/night/mIoU", "val/TC/aligned", "test/CA/released", "test/Var")
+    metrics = ("val/night/mIoU", "val/region/2", "val/TC/aligned", "test/Var")
     followed = [Objective(metric, "maximize").is_reported for metric in metrics]
-    assert followed == [True, True, False, False, False]
+    assert followed == [True, True, False, False]

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import optuna
@@ -13,7 +11,9 @@ from optuna.trial import TrialState
 
 from rgbt.tracking.mlflow_store import MlflowTracking
 from sweeps import attributes
-from sweeps.study import entry, study_folder
+from sweeps.report import publish
+from sweeps.report.publish import study_folder
+from sweeps.study import entry
 from tests.commands import Call, assert_one_sentence
 
 LINK = "http://127.0.0.1:5000/#/run"
@@ -29,7 +29,7 @@ def recorded(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
         calls.append({"tracking": tracking, **told})
         return [("this run", LINK)]
 
-    monkeypatch.setitem(sys.modules, "sweeps.report.records", SimpleNamespace(record=record))
+    monkeypatch.setattr(publish, "record", record)
     return calls
 
 
@@ -80,18 +80,6 @@ def test_study_of_search_is_shown_and_recorded(
     assert "![" not in told["note"]
 
 
-def test_study_of_table_has_points_and_no_figures(
-    call: Call, tmp_path: Path, recorded: list[dict[str, Any]]
-) -> None:
-    make_study(tmp_path, "spatialseg/table3", "list")
-    place = (f"runs_dir={tmp_path}", f"out={tmp_path / 'out'}")
-    code, out, _ = call(entry, "name=spatialseg/table3", *place, "tracking=none")
-    assert code == 0
-    assert out.index("alpha=0.25") < out.index("alpha=0.75") < out.index("alpha=0.5")
-    assert "No figure" not in out
-    assert {path.name for path in (tmp_path / "out").iterdir()} == set(FILES[:2])
-
-
 def test_study_unknown_or_missing_name_lists_studies(call: Call, tmp_path: Path) -> None:
     code, _, err = call(entry, "name=x", f"runs_dir={tmp_path}")
     assert code == 2
@@ -105,9 +93,8 @@ def test_study_unknown_or_missing_name_lists_studies(call: Call, tmp_path: Path)
 
 
 def test_study_folders_are_safe_and_differ() -> None:
-    runs = Path("runs")
     names = ["a/b", "a_b", "../../etc", "..", "a b", "x" * 300, "x" * 301]
-    folders = {study_folder(runs, name) for name in names}
+    folders = {study_folder(Path("runs"), name) for name in names}
     assert len(folders) == len(names)
     assert all(folder.parent == Path("runs/studies") for folder in folders)
     assert all(folder.name.strip(".") and len(folder.name) < 100 for folder in folders)

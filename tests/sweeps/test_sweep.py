@@ -21,8 +21,8 @@ from rgbt.metrics.counts import Counts
 from sweeps import attributes as names
 from sweeps.point import Outcome, Point
 from sweeps.settings import Objective, SweepSettings
-from sweeps.space.space import parse_space
-from sweeps.sweep import Search, probe, search, study_command, sweep
+from sweeps.space import parse_space
+from sweeps.sweep import Search, probe, search, sweep
 from sweeps.worker import point_list
 from sweeps.worker.point_list import PointList
 from sweeps.worker.run_store import open_run_store
@@ -126,7 +126,7 @@ def test_search_file_runs_are_single(calls: RecordedCalls, tmp_path: Path) -> No
     assert {"hydra.mode=RUN", "masker.sigma_div=4"} <= set(wanted.fixed)
 
 
-@pytest.mark.parametrize(("key", "value"), [("trials", 3), ("replicates", 2), ("pruner", MEDIAN)])
+@pytest.mark.parametrize(("key", "value"), [("trials", 3), ("replicates", 2)])
 def test_search_settings_of_grid_are_refused(tmp_path: Path, key: str, value: Any) -> None:
     with pytest.raises(InputError, match=f"hydra.sweeper.{key}"):
         call(tmp_path, *GRID, **{key: value})
@@ -145,12 +145,6 @@ def test_preview_of_grid_runs_nothing(tmp_path: Path, capsys: pytest.CaptureFixt
     call(tmp_path, *GRID, dry_run=True)
     assert list(tmp_path.iterdir()) == []
     assert "4 of 4 points" in capsys.readouterr().err
-
-
-def test_study_command_hides_passwords() -> None:
-    found = study_command("a", Path("/my runs"), "postgresql://me:Secret@host/db")
-    place = "'runs_dir=/my runs' 'storage=postgresql://me:***@host/db'"
-    assert found == f"rgbt study name=a {place}"
 
 
 def sigma(low: float, high: float) -> Any:
@@ -181,7 +175,7 @@ def ends(monkeypatch: pytest.MonkeyPatch) -> list[str]:
                 store.fail(trial.number, "no memory", {})
 
     monkeypatch.setattr(sweeping, "drive", drive)
-    monkeypatch.setattr(sweeping, "report", lambda *_: None)
+    monkeypatch.setattr(sweeping, "publish_study", lambda *_: None)
     return states
 
 
@@ -226,7 +220,6 @@ TC, UP = (Objective(metric, "maximize") for metric in ("val/TC/aligned", "val/mI
     [
         ({"trials": None}, "hydra.sweeper.trials"),
         ({"sampler": {"_target_": "optuna.samplers.TPE"}}, "hydra.sweeper.sampler"),
-        ({"objectives": (TC,), "pruner": MEDIAN}, "hydra.sweeper.pruner"),
         ({"objectives": (UP, UP), "pruner": MEDIAN}, "hydra.sweeper.pruner"),
         ({"objectives": (TC,)}, "val/TC/aligned'.*consistency.splits"),
     ],

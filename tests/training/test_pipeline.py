@@ -179,10 +179,10 @@ def test_pipeline_predicts_and_validates_for_unfinished_labels(
     assert len(run("multi_head_night_stage1").validated) == 1
     monkeypatch.undo()
 
-    def opened(*given: Any, trust: Any) -> None:
-        raise KeyError(given[0])
+    def opened(run: RunSpec, folder: Path, checkpoint: str, trained_with: object) -> None:
+        raise KeyError(run.key, folder, checkpoint)
 
-    monkeypatch.setattr(pipeline, "open_run", opened)
+    monkeypatch.setattr(pipeline, "with_weights", opened)
     monkeypatch.setattr(pipeline, "validate", lambda spec: None)
     monkeypatch.setattr(pipeline, "train", lambda spec, tags: None)
     with pytest.raises(KeyError, match=teacher.key):

@@ -18,6 +18,7 @@ import hashlib
 import json
 import logging
 import math
+import os
 import re
 import shutil
 from collections import deque
@@ -41,7 +42,6 @@ from rgbt.data.cache.sample_map import (
     state_of,
     write_map,
 )
-from rgbt.data.synth.cache import default_cache
 from rgbt.dataset import DatasetWrapper, LabelledDataset, layers
 from rgbt.files.atomic import holder_of, holding, remove_left_behind
 from rgbt.files.plain_files import read_json, write_json
@@ -66,7 +66,8 @@ def _silent(what: str, done: int, total: int) -> None:
 
 def default_folder() -> Path:
     """$XDG_CACHE_HOME/rgbt/decoded, or ~/.cache/rgbt/decoded if that is not set."""
-    return default_cache() / "decoded"
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "rgbt" / "decoded"
 
 
 def check_cache(key: str, cache: object) -> None:

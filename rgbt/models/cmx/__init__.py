@@ -1,5 +1,1 @@
-"""CMX: two Mix Transformer streams that rectify each other, their fusion and an MLP decoder.
-
-Parameter names are those of the CMX release, which the temporal release's files share except for
-an unused layer (`voting`). Not here: losses (`rgbt.losses`), weight files.
-"""
+"""CMX: `model.CMX`; what it shares with CMNeXt: `network.CmxNetwork`."""

@@ -1,4 +1,4 @@
-"""Mix Transformer (MiT): patch embedding, attention with fewer keys, feed-forward, stages.
+"""Mix Transformer (MiT): patch embedding, attention with fewer keys, feed-forward.
 
 Maps are (N, H, W, C) throughout, which is a sequence of tokens and an image that convolutions
 take as it is (channels last), so that nothing is copied between the two.
@@ -7,30 +7,16 @@ take as it is (channels last), so that nothing is copied between the two.
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Callable
 
-import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.models.parts import add_residual
+from rgbt.models.parts import ResidualBlock
+from rgbt.ranges import Widths
 
 NORM_EPS = 1e-5
 """Of the normalisations in patch embeddings and of keys, and of all of CMNeXt's RGB stream."""
-
-Stage2 = Literal["ramp", "released"]
-
-
-@dataclass(frozen=True)
-class MitShape:
-    """Sizes of one stream; see `CMX` for their meaning."""
-
-    embed_dims: tuple[int, int, int, int]
-    depths: tuple[int, int, int, int]
-    num_heads: tuple[int, int, int, int]
-    sr_ratios: tuple[int, int, int, int]
-    mlp_ratio: float
 
 
 def convolve(convolution: nn.Module, x: Tensor) -> Tensor:
@@ -43,7 +29,7 @@ class MitPatchEmbed(nn.Module):
     """One token per patch; neighbouring patches overlap."""
 
     def __init__(
-        self, in_channels: int, dim: int, *, kernel: int, stride: int, norm_eps: float
+        self, in_channels: int, dim: int, kernel: int, stride: int, *, norm_eps: float
     ) -> None:
         super().__init__()
         self.proj = nn.Conv2d(in_channels, dim, kernel, stride=stride, padding=kernel // 2)
@@ -104,68 +90,17 @@ class MixFfn(nn.Module):
         return out
 
 
-class MitBlock(nn.Module):
-    """Attention and feed-forward, each normalised before and added to its input."""
+def mit_blocks(
+    dims: Widths, heads: Widths, reductions: Widths, ratio: float, *, norm_eps: float
+) -> Callable[[int], ResidualBlock]:
+    """What makes a block of stage 0..3; arguments as in `CMX`."""
 
-    def __init__(
-        self, dim: int, heads: int, reduction: int, hidden: int, *, norm_eps: float
-    ) -> None:
-        super().__init__()
-        self.norm1 = nn.LayerNorm(dim, eps=norm_eps)
-        self.attn = MitAttention(dim, heads, reduction)
-        self.norm2 = nn.LayerNorm(dim, eps=norm_eps)
-        self.mlp = MixFfn(dim, hidden)
+    def block(stage: int) -> ResidualBlock:
+        attention = MitAttention(dims[stage], heads[stage], reductions[stage])
+        mlp = MixFfn(dims[stage], int(dims[stage] * ratio))
+        return ResidualBlock(dims[stage], attention, mlp, norm_eps=norm_eps)
 
-    def forward(self, x: Tensor, keep: Tensor | None = None) -> Tensor:
-        """(N, H, W, C) -> the same; `keep`: (2, N, 1, 1, 1) factors of both residuals, or None."""
-        first, second = (None, None) if keep is None else keep.unbind()
-        x = add_residual(x, self.attn(self.norm1(x)), first)
-        return add_residual(x, self.mlp(self.norm2(x)), second)
-
-
-def patch_embed(
-    shape: MitShape, stage: int, in_channels: int, *, norm_eps: float = NORM_EPS
-) -> MitPatchEmbed:
-    """Patch embedding of stage 0..3; `in_channels` are those of the image, for stage 0."""
-    before = shape.embed_dims[stage - 1] if stage else in_channels
-    kernel, stride = (3, 2) if stage else (7, 4)
-    dim = shape.embed_dims[stage]
-    return MitPatchEmbed(before, dim, kernel=kernel, stride=stride, norm_eps=norm_eps)
-
-
-def stage_modules(
-    shape: MitShape, stage: int, *, in_channels: int, norm_eps: float
-) -> dict[str, nn.Module]:
-    """Patch embedding, blocks and normalisation of stage 0..3, by their released names.
-
-    The release keeps them side by side (`block1`, `extra_block1`), not in one module per stage.
-    `in_channels` are those of the image, for stage 0; `norm_eps` is that of the normalisations in
-    front of attention and feed-forward and after the stage.
-    """
-    dim = shape.embed_dims[stage]
-    hidden = int(dim * shape.mlp_ratio)
-    heads, reduction = shape.num_heads[stage], shape.sr_ratios[stage]
-    return {
-        "patch_embed": patch_embed(shape, stage, in_channels),
-        "block": nn.ModuleList(
-            MitBlock(dim, heads, reduction, hidden, norm_eps=norm_eps)
-            for _ in range(shape.depths[stage])
-        ),
-        "norm": nn.LayerNorm(dim, eps=norm_eps),
-    }
-
-
-def drop_rates(depths: tuple[int, int, int, int], last: float, stage2: Stage2) -> Tensor:
-    """Stochastic depth of every block of the two streams, (2, blocks): RGB's, thermal's.
-
-    Rates rise evenly from 0 to `last`. `stage2` "released": stage 2 has one rate per stream, that
-    of its first block for RGB and the next one on the ramp for thermal; "ramp": no exception.
-    """
-    rates = torch.linspace(0, last, sum(depths)).repeat(2, 1)
-    if stage2 == "released":
-        start = depths[0]
-        rates[:, start : start + depths[1]] = rates[0, start : start + 2, None].clone()
-    return rates
+    return block
 
 
 def initialise(module: nn.Module, *, divide_groups: bool = True) -> None:

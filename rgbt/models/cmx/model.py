@@ -2,60 +2,37 @@
 
 from __future__ import annotations
 
-from functools import partial
-from typing import Annotated
+from typing import Annotated, Literal
 
 import torch
 from annotated_types import Interval
-from torch import Tensor, nn
+from torch import Tensor
 
-from rgbt.models.cmx.decoder import MlpDecoder
-from rgbt.models.cmx.encoder import CmxEncoder
-from rgbt.models.cmx.mit import MitShape, Stage2, drop_rates, initialise, stage_modules
-from rgbt.models.inputs import Inputs, only_view
-from rgbt.models.parts import check_heads, check_hidden
+from rgbt.models.cmx.mit import NORM_EPS, initialise, mit_blocks
+from rgbt.models.cmx.network import CmxEncoder, CmxNetwork, MlpDecoder, Stream
+from rgbt.models.inputs import Inputs
 from rgbt.ranges import Channels, Depths, Epsilon, MlpRatio, NumClasses, ShareBelowOne, Widths
-from rgbt.requirements import Record
-from rgbt.types import MaskPair, Output, View
 
 BLOCK_NORM_EPS = 1e-6
 """Of the normalisations in front of attention and feed-forward and after a stage."""
 
 Reduction = Annotated[int, Interval(ge=1, le=64)]
+Reductions = tuple[Reduction, Reduction, Reduction, Reduction]
+Stage2 = Literal["ramp", "released"]
 
 
-class CMX(nn.Module):
+class CMX(CmxNetwork):
     """CMX with MiT streams for RGB and thermal.
 
     Source: J. Zhang et al., CMX: Cross-Modal Fusion for RGB-X Semantic Segmentation With
     Transformers, T-ITS 2023; the network of the temporal paper, too.   Released:
     huaaaliu/RGBX_Semantic_Segmentation; lab-sun/Temporal-Consistent-RGBT-Segmentation (the same
-    network, other inputs).
+    network, other inputs, and an unused layer `voting`).
 
-    Args:
-        num_classes: K.
-        embed_dims: channels per stage.
-        depths: blocks per stage.
-        num_heads: heads per stage, of attention and of fusion.
-        sr_ratios: how many times smaller per side the map is that a stage attends to.
-        mlp_ratio: width of a block's feed-forward network divided by the width of the block.
-        decoder_dim: E, channels of the decoder.
-        drop_path_rate: stochastic depth of the last block, 0 at the first, in [0, 1).
-        drop_path_stage2: "ramp": rates rise from block to block, as in MiT.   Released:
-            "released": all RGB blocks of stage 2 have the rate of its first block, all thermal
-            ones that of its second.
-        decoder_dropout: share of channels dropped in front of the classifier, in [0, 1).
-        decoder_norm_eps: of the decoder's batch normalisation, > 0.
-        decoder_norm_eps_eval: of the same in evaluation; None: the same.   Released: CMX trains
-            with 1e-3 and, as its evaluation skips the set-up of weights, evaluates with 1e-5.
-        inputs: normalisation of the images.
+    The arguments are the keys of ``conf/model/cmx_b2.yaml``. The release trains with a
+    `decoder_norm_eps` of 1e-3 and, as its evaluation skips the set-up of weights, evaluates with
+    1e-5.
     """
-
-    record = Record(
-        views=("rgbt",),
-        pretrained_parts=("backbone.",),
-        recomputed=("backbone.*block*.*", "backbone.FRMs.*", "backbone.FFMs.*"),
-    )
 
     def __init__(  # noqa: PLR0913 - each is a key of conf/model/*.yaml
         self,
@@ -64,7 +41,7 @@ class CMX(nn.Module):
         embed_dims: Widths,
         depths: Depths,
         num_heads: Widths,
-        sr_ratios: tuple[Reduction, Reduction, Reduction, Reduction],
+        sr_ratios: Reductions,
         mlp_ratio: MlpRatio,
         decoder_dim: Channels,
         drop_path_rate: ShareBelowOne,
@@ -74,47 +51,32 @@ class CMX(nn.Module):
         decoder_norm_eps_eval: Epsilon | None,
         inputs: Inputs,
     ) -> None:
-        super().__init__()
-        shape = MitShape(embed_dims, depths, num_heads, sr_ratios, mlp_ratio)
-        check_hidden("model.mlp_ratio", [mlp_ratio] * 4, embed_dims)
-        check_heads(embed_dims, num_heads)
-        self.num_classes = num_classes
-        rates = drop_rates(depths, drop_path_rate, drop_path_stage2)
-        rgb, thermal = (
-            partial(stage_modules, shape, in_channels=channels, norm_eps=BLOCK_NORM_EPS)
-            for channels in (3, inputs.thermal_channels)
+        block = mit_blocks(embed_dims, num_heads, sr_ratios, mlp_ratio, norm_eps=BLOCK_NORM_EPS)
+        streams = (
+            Stream(3, block, NORM_EPS, BLOCK_NORM_EPS),
+            Stream(inputs.thermal_channels, block, NORM_EPS, BLOCK_NORM_EPS),
         )
-        self.backbone = CmxEncoder(
-            shape, (rgb, thermal), drop_rates=rates if drop_path_rate > 0 else None
-        )
-        self.backbone.apply(initialise)
-        self.decode_head = MlpDecoder(
+        rates = drop_rates(depths, drop_path_rate, drop_path_stage2) if drop_path_rate else None
+        backbone = CmxEncoder(streams, embed_dims, depths, num_heads, drop_rates=rates)
+        backbone.apply(initialise)
+        decode_head = MlpDecoder(
             embed_dims,
             num_classes,
             dim=decoder_dim,
             dropout=decoder_dropout,
             norm_eps=(decoder_norm_eps, decoder_norm_eps_eval or decoder_norm_eps),
         )
-        self.inputs = inputs
+        super().__init__(backbone, decode_head, inputs, sr_ratios)
 
-    def forward(
-        self,
-        rgb: Tensor,
-        thermal: Tensor,
-        masks: MaskPair | None = None,
-        *,
-        views: tuple[View, ...] = (),
-        generator: torch.Generator | None = None,
-    ) -> Output:
-        """Class scores of every pixel, as `rgbt.models` says; float32, `aux` is empty.
 
-        Sides may have any length from 29 (with the released `sr_ratios`). Stochastic depth is drawn
-        per sample, block and stream, then the decoder's dropped channels.
+def drop_rates(depths: Depths, last: float, stage2: Stage2 = "ramp") -> Tensor:
+    """Stochastic depth of every block of the two streams, (2, blocks): RGB's, thermal's.
 
-        Raises:
-            InputError: images smaller than the deepest reduction of attention takes.
-        """
-        images = self.inputs(rgb, thermal, masks, multiple=1)
-        only_view(views, self.record.views, "CMX")
-        maps = self.backbone(images, generator)
-        return Output(self.decode_head(maps, rgb.shape[2:], generator), {})
+    Rates rise evenly from 0 to `last`. `stage2` "released": stage 2 has one rate per stream, that
+    of its first block for RGB and the next one on the ramp for thermal; "ramp": no exception.
+    """
+    rates = torch.linspace(0, last, sum(depths)).repeat(2, 1)
+    if stage2 == "released":
+        start = depths[0]
+        rates[:, start : start + depths[1]] = rates[0, start : start + 2, None].clone()
+    return rates

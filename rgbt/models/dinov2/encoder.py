@@ -1,4 +1,4 @@
-"""The plain vision transformers of DINOv2 and DINOv3.
+"""The plain vision transformers of DINOv2 and DINOv3, with rotary positions and low-rank updates.
 
 Entries have the names and shapes of the published files, except `register_tokens`, which DINOv3
 names `storage_tokens`, and the mask of its bias, which has no entry here.
@@ -9,7 +9,7 @@ registers, then patches row by row.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
 from typing import Literal
 
 import torch
@@ -17,60 +17,167 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.checks import InputError
-from rgbt.models.dinov2.layers import Attention, GatedMlp, LayerScale
-from rgbt.models.dinov2.lora import LoraBlocks, LoraProjection
-from rgbt.models.dinov2.rotary import RotaryPositions, Rotation
-from rgbt.models.parts import Mlp
+from rgbt.models.parts import Mlp, check_heads
 
 OFFSET = 0.1
 """Patches added to the size when positions are enlarged by a factor (DINOv2 release)."""
 
-TOKEN_STD = {"learned": 1e-6, "rotary": 0.02}
-"""Deviation of the initial class token and registers (DINOv2 and DINOv3 releases)."""
-
-PositionResize = Literal["factor", "size"]
+Resize = Literal["factor", "size"]
 MlpForm = Literal["gelu", "swiglu"]
+Part = Literal["q", "k", "v"]
+PARTS: tuple[Part, ...] = ("q", "k", "v")
+"""In the order of the rows of a joint projection."""
+
+Rotation = tuple[Tensor, Tensor]
+"""Cosine and sine, (T, D) each, D channels of a head."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ViTShape:
-    """Sizes of the encoder; see `rgbt.models.dinov2.model.DinoMask2Former`.
+class LoraProjection(nn.Module):
+    """What is added to the joint projection of queries, keys and values of one block.
 
-    Raises:
-        InputError: heads that do not divide the width, or positions that are both learned and
-            rotary, or neither.
+        alpha / rank * B A x,  for each of `parts`, 0 for the others
+
+    Source: LoRA (Hu et al., ICLR 2022), Sec. 4.1, Eq. (3): A is drawn, B is 0, so that the network
+    is unchanged at first. A is drawn as its release does, uniformly with a deviation of
+    1 / sqrt(3 d). The paper updates "q" and "v" (Sec. 7.1).
     """
 
-    patch: int
-    embed_dim: int
-    depth: int
-    num_heads: int
-    mlp_ratio: float
-    num_registers: int
-    position_grid: int | None
-    position_resize: PositionResize | None
-    rope_base: float | None
-    norm_eps: float
-    key_bias: bool
-    mlp: MlpForm
+    def __init__(self, dim: int, *, rank: int, alpha: float, parts: tuple[Part, ...]) -> None:
+        super().__init__()
+        self.scale = alpha / rank
+        self.parts = parts
+        self.down = nn.ParameterDict({part: torch.empty(rank, dim) for part in parts})
+        self.up = nn.ParameterDict({part: torch.zeros(dim, rank) for part in parts})
+        for part in parts:
+            nn.init.kaiming_uniform_(self.down[part], a=5**0.5)
 
-    def __post_init__(self) -> None:
-        if self.embed_dim % self.num_heads:
-            raise InputError(
-                f"model.num_heads = {self.num_heads} must divide model.embed_dim = "
-                f"{self.embed_dim}."
-            )
-        is_learned = {self.position_grid is not None, self.position_resize is not None}
-        if is_learned != {self.rope_base is None}:
-            raise InputError(
-                "model: positions are either learned, with model.position_grid and "
-                "model.position_resize, or rotary, with model.rope_base; set the others to null."
-            )
-        if self.rope_base is not None and self.embed_dim % (4 * self.num_heads):
-            raise InputError(
-                f"model.embed_dim = {self.embed_dim} must be a multiple of 4 channels for each of "
-                f"model.num_heads = {self.num_heads}, because positions are rotary."
-            )
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, T, d) -> (N, T, 3 d)."""
+        updates = {
+            part: self.scale * F.linear(F.linear(x, self.down[part]), self.up[part])
+            for part in self.parts
+        }
+        nothing = torch.zeros_like(next(iter(updates.values())))
+        return torch.cat([updates.get(part, nothing) for part in PARTS], dim=-1)
+
+
+class RotaryPositions(nn.Module):
+    """Angles of the channels of a head for every token.
+
+        2 pi y / period and 2 pi x / period,  period = base ** (j / (D / 4)),  j = 0 .. D / 4 - 1
+
+    y and x are the centre of a patch in [-1, 1], each divided by its own side of the image. The
+    first half of the channels has the angles of y, then those of x; the second half repeats them.
+
+    Source: DINOv3 release, `layers/rope_position_encoding.py`, normalize_coords "separate". Its
+    random rescaling of the coordinates while training is left out. The published files hold the
+    periods rounded to bfloat16, so the periods are an entry of the network.
+    """
+
+    periods: Tensor
+
+    def __init__(self, head_dim: int, base: float) -> None:
+        super().__init__()
+        exponents = 2 * torch.arange(head_dim // 4, dtype=torch.float32) / (head_dim // 2)
+        self.register_buffer("periods", base**exponents)
+
+    def forward(self, hw: tuple[int, int], num_first: int) -> Rotation:
+        """The rotation of `num_first` tokens without a position, which is none, and of h x w."""
+        rows, columns = (self._angles(side) for side in hw)
+        rows, columns = rows[:, None].expand(-1, hw[1], -1), columns.expand(hw[0], -1, -1)
+        angles = torch.cat([rows, columns], dim=-1).flatten(0, 1).tile(2)
+        angles = torch.cat([angles.new_zeros(num_first, angles.shape[1]), angles])
+        return angles.cos(), angles.sin()
+
+    def _angles(self, side: int) -> Tensor:
+        """(side, D / 4) of the patches along one side of the image."""
+        centres = torch.arange(0.5, side, dtype=torch.float32, device=self.periods.device)
+        return 2 * math.pi * (2 * (centres / side) - 1)[:, None] / self.periods
+
+
+def rotated(x: Tensor, rotation: Rotation) -> Tensor:
+    """Channels j and j + D / 2 of (N, heads, T, D) rotated as a pair, in single precision."""
+    cos, sin = rotation
+    first, second = x.chunk(2, dim=-1)
+    turned = torch.cat([-second, first], dim=-1)
+    return (x * cos + turned * sin).to(x.dtype)
+
+
+class KeylessLinear(nn.Linear):
+    """Joint projection of queries, keys and values with a bias whose third for keys counts as 0.
+
+    Source: DINOv3 release, `layers/attention.py`, mask_k_bias. The published files have the third.
+    """
+
+    def forward(self, input: Tensor) -> Tensor:
+        """(..., d) -> (..., 3 d)."""
+        query, key, value = self.bias.chunk(3)
+        bias = torch.cat([query, torch.zeros_like(key), value])
+        return F.linear(input, self.weight, bias)
+
+
+class Attention(nn.Module):
+    """Multi-head attention among all tokens.
+
+        softmax(q k' / sqrt(d / heads)) v
+
+    Source: Vision Transformer (Dosovitskiy et al., ICLR 2021), App. A; rotation of q and k:
+    RoFormer (Su et al., 2021), Sec. 3.2.2.
+    """
+
+    def __init__(self, dim: int, heads: int, *, key_bias: bool) -> None:
+        super().__init__()
+        self.heads = heads
+        self.qkv = (nn.Linear if key_bias else KeylessLinear)(dim, 3 * dim)
+        self.proj = nn.Linear(dim, dim)
+
+    def forward(self, x: Tensor, lora: LoraProjection | None, rotation: Rotation | None) -> Tensor:
+        """(N, T, d) -> (N, T, d); `lora` is added to the projections."""
+        qkv = self.qkv(x)
+        if lora is not None:
+            qkv = qkv + lora(x)
+        q, k, v = qkv.unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4).unbind(0)
+        if rotation is not None:
+            q, k = rotated(q, rotation), rotated(k, rotation)
+        out = F.scaled_dot_product_attention(q, k, v)
+        projected: Tensor = self.proj(out.transpose(1, 2).flatten(2))
+        return projected
+
+
+class LayerScale(nn.Module):
+    """One factor per channel.
+
+    It is 1 at first (DINOv2 release, `hub/backbones.py`, init_values). DINOv3's own training begins
+    with 1e-5, which matters only without a file of weights.
+    """
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        self.gamma = nn.Parameter(torch.ones(dim))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(..., d) -> (..., d)."""
+        return x * self.gamma
+
+
+class GatedMlp(nn.Module):
+    """The MLP of DINOv3's larger forms.
+
+        w3(silu(w1 x) * w2 x)
+
+    Source: Shazeer, GLU Variants Improve Transformer (2020), Eq. (6); biases: DINOv3 release.
+    """
+
+    def __init__(self, dim: int, hidden: int) -> None:
+        super().__init__()
+        self.w1 = nn.Linear(dim, hidden)
+        self.w2 = nn.Linear(dim, hidden)
+        self.w3 = nn.Linear(hidden, dim)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(..., d) -> (..., d)."""
+        out: Tensor = self.w3(F.silu(self.w1(x)) * self.w2(x))
+        return out
 
 
 class Block(nn.Module):
@@ -81,15 +188,15 @@ class Block(nn.Module):
     Source: Vision Transformer, Eqs. (2) and (3); LayerScale: CaiT (Touvron et al., ICCV 2021).
     """
 
-    def __init__(self, shape: ViTShape) -> None:
+    def __init__(
+        self, dim: int, heads: int, hidden: int, *, norm_eps: float, key_bias: bool, mlp: MlpForm
+    ) -> None:
         super().__init__()
-        dim = shape.embed_dim
-        self.norm1 = nn.LayerNorm(dim, eps=shape.norm_eps)
-        self.attn = Attention(dim, shape.num_heads, key_bias=shape.key_bias)
+        self.norm1 = nn.LayerNorm(dim, eps=norm_eps)
+        self.attn = Attention(dim, heads, key_bias=key_bias)
         self.ls1 = LayerScale(dim)
-        self.norm2 = nn.LayerNorm(dim, eps=shape.norm_eps)
-        mlp = GatedMlp if shape.mlp == "swiglu" else Mlp
-        self.mlp = mlp(dim, int(dim * shape.mlp_ratio))
+        self.norm2 = nn.LayerNorm(dim, eps=norm_eps)
+        self.mlp = (GatedMlp if mlp == "swiglu" else Mlp)(dim, hidden)
         self.ls2 = LayerScale(dim)
 
     def forward(
@@ -101,9 +208,7 @@ class Block(nn.Module):
         return out
 
 
-def resized_positions(
-    positions: Tensor, hw: tuple[int, int], position_resize: PositionResize
-) -> Tensor:
+def resized_positions(positions: Tensor, hw: tuple[int, int], position_resize: Resize) -> Tensor:
     """Positions of the class token and of h x w patches.
 
     Source: DINOv2 release, `interpolate_pos_encoding`: both forms are bicubic. The files without
@@ -135,36 +240,60 @@ class Encoder(nn.Module):
 
     Source: DINOv2 (Oquab et al., TMLR 2024); registers: Darcet et al., "Vision Transformers Need
     Registers" (ICLR 2024), Sec. 2.2; rotary positions, bias and MLP: DINOv3 (Siméoni et al., 2025),
-    Sec. 3.2, and its release. Hidden patches get the mask token before the positions.
+    Sec. 3.2, and its release. Hidden patches get the mask token before the positions. Weights are
+    drawn as in the releases.
+
+    Raises:
+        InputError: heads that do not divide the width, or positions that are both learned and
+            rotary, or neither.
     """
 
-    def __init__(self, shape: ViTShape) -> None:
+    def __init__(  # noqa: PLR0913 - see `rgbt.models.dinov2.model.DinoMask2Former`
+        self,
+        *,
+        patch: int,
+        embed_dim: int,
+        depth: int,
+        num_heads: int,
+        mlp_ratio: float,
+        num_registers: int,
+        position_grid: int | None,
+        position_resize: Resize | None,
+        rope_base: float | None,
+        norm_eps: float,
+        key_bias: bool,
+        mlp: MlpForm,
+    ) -> None:
         super().__init__()
-        dim = shape.embed_dim
-        self.shape = shape
-        self.patch_embed = nn.ModuleDict(
-            {"proj": nn.Conv2d(3, dim, shape.patch, stride=shape.patch)}
+        check_heads("model.num_heads", (num_heads,), (embed_dim,))
+        is_rotary = {position_grid is None, position_resize is None, rope_base is not None}
+        if len(is_rotary) > 1:
+            raise InputError(
+                "model.rope_base is for rotary positions, model.position_grid and "
+                "model.position_resize are for learned ones; set those of the other kind to null."
+            )
+        self.patch, self.position_resize, self.num_registers = patch, position_resize, num_registers
+        self.patch_embed = nn.ModuleDict({"proj": nn.Conv2d(3, embed_dim, patch, stride=patch)})
+        self.cls_token = nn.Parameter(torch.empty(1, 1, embed_dim))
+        if position_grid is not None:
+            self.pos_embed = nn.Parameter(torch.empty(1, 1 + position_grid**2, embed_dim))
+        if rope_base is not None:
+            check_heads("model.rope_base: 4 * num_heads", (4 * num_heads,), (embed_dim,))
+            self.rope_embed = RotaryPositions(embed_dim // num_heads, rope_base)
+        if num_registers:
+            self.register_tokens = nn.Parameter(torch.empty(1, num_registers, embed_dim))
+        self.mask_token = nn.Parameter(torch.zeros(1, embed_dim))
+        hidden = int(embed_dim * mlp_ratio)
+        self.blocks = nn.ModuleList(
+            Block(embed_dim, num_heads, hidden, norm_eps=norm_eps, key_bias=key_bias, mlp=mlp)
+            for _ in range(depth)
         )
-        self.cls_token = nn.Parameter(torch.empty(1, 1, dim))
-        if shape.position_grid is not None:
-            self.pos_embed = nn.Parameter(torch.empty(1, 1 + shape.position_grid**2, dim))
-        if shape.rope_base is not None:
-            self.rope_embed = RotaryPositions(dim // shape.num_heads, shape.rope_base)
-        if shape.num_registers:
-            self.register_tokens = nn.Parameter(torch.empty(1, shape.num_registers, dim))
-        self.mask_token = nn.Parameter(torch.zeros(1, dim))
-        self.blocks = nn.ModuleList(Block(shape) for _ in range(shape.depth))
-        self.norm = nn.LayerNorm(dim, eps=shape.norm_eps)
-        self._initialise()
-
-    def _initialise(self) -> None:
-        """Draw the initial weights as the releases do."""
-        std = TOKEN_STD["rotary"]
-        if self.shape.position_grid is not None:
-            std = TOKEN_STD["learned"]
+        self.norm = nn.LayerNorm(embed_dim, eps=norm_eps)
+        if position_grid is not None:
             nn.init.trunc_normal_(self.pos_embed, std=0.02)
+        std = 0.02 if position_grid is None else 1e-6
         nn.init.normal_(self.cls_token, std=std)
-        if self.shape.num_registers:
+        if num_registers:
             nn.init.normal_(self.register_tokens, std=std)
         for module in self.modules():
             if isinstance(module, nn.Linear):
@@ -178,7 +307,7 @@ class Encoder(nn.Module):
         *,
         layers: tuple[int, ...],
         added: Tensor | None = None,
-        lora: LoraBlocks | None = None,
+        lora: nn.ModuleList | None = None,
     ) -> list[Tensor]:
         """Normalised patch tokens after some of the blocks, as maps.
 
@@ -199,25 +328,21 @@ class Encoder(nn.Module):
             x = torch.where(hidden.flatten(1)[..., None], self.mask_token.to(x.dtype), x)
         if added is not None:
             x = x + added
-        x, rotation = self._positioned(x, hw)
+        first: list[Tensor] = [self.cls_token]
+        rotation = None
+        if self.position_resize is None:
+            rotation = self.rope_embed(hw, 1 + self.num_registers)
+        else:
+            positions = resized_positions(self.pos_embed, hw, self.position_resize)
+            first, x = [self.cls_token + positions[:, :1]], x + positions[:, 1:]
+        if self.num_registers:  # registers have no position
+            first.append(self.register_tokens)
+        x = torch.cat([*(each.expand(x.shape[0], -1, -1) for each in first), x], 1)
 
-        maps, skipped = [], 1 + self.shape.num_registers
+        maps = []
         for number, block in enumerate(self.blocks[: layers[-1]], 1):
             x = block(x, None if lora is None else lora[number - 1], rotation)
             if number in layers:
-                tokens = self.norm(x[:, skipped:])
+                tokens = self.norm(x[:, 1 + self.num_registers :])
                 maps.append(tokens.transpose(1, 2).unflatten(2, hw))
         return maps
-
-    def _positioned(self, x: Tensor, hw: tuple[int, int]) -> tuple[Tensor, Rotation | None]:
-        """All tokens (N, T, d) with learned positions, or with the rotation of rotary ones."""
-        first: list[Tensor] = [self.cls_token]
-        rotation = None
-        if self.shape.position_resize is None:
-            rotation = self.rope_embed(hw, 1 + self.shape.num_registers)
-        else:
-            positions = resized_positions(self.pos_embed, hw, self.shape.position_resize)
-            first, x = [self.cls_token + positions[:, :1]], x + positions[:, 1:]
-        if self.shape.num_registers:  # registers have no position
-            first.append(self.register_tokens)
-        return torch.cat([*(each.expand(x.shape[0], -1, -1) for each in first), x], 1), rotation

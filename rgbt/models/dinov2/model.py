@@ -2,69 +2,149 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated, Literal
 
 import torch
-from annotated_types import Interval, Len
+from annotated_types import Interval, Len, MultipleOf
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from rgbt.checks import InputError
-from rgbt.geometry.padding import STRIDE, padded_hw
-from rgbt.models.dinov2.backbone import STRIDES, DinoBackbone, Tuning, TuningSettings
-from rgbt.models.dinov2.encoder import MlpForm, PositionResize, ViTShape
-from rgbt.models.dinov2.lora import Part
-from rgbt.models.inputs import Inputs, expand_cells
-from rgbt.models.mask2former.head import HeadShape, MaskHead, dense_logits, requested
+from rgbt.models.dinov2.encoder import Encoder, LoraProjection, MlpForm, Part, Resize
+from rgbt.models.inputs import Inputs, as_rgb
+from rgbt.models.mask2former.network import (
+    MODALITIES,
+    RECORD,
+    Fusion,
+    FusionKind,
+    HiddenDim,
+    Maps,
+    MaskNetwork,
+    NumQueries,
+)
+from rgbt.models.mask2former.pixel_decoder import HeadShape
 from rgbt.ranges import Blocks, Channels, Epsilon, MlpRatio, NumClasses, Positive
-from rgbt.requirements import Record
-from rgbt.types import VIEWS, MaskPair, Output, View
+
+STRIDES = (4, 8, 16, 32)
+Tuning = Literal["frozen", "lora", "full"]
 
 
-class DinoMask2Former(nn.Module):
+class ChannelNorm(nn.LayerNorm):
+    """Layer normalisation over the channels of maps."""
+
+    def forward(self, input: Tensor) -> Tensor:
+        """(N, C, h, w) -> (N, C, h, w)."""
+        return super().forward(input.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
+
+
+class Level(nn.Sequential):
+    """A map of one stride from a map with one token per `token_px` pixels.
+
+    Each doubling of the size halves the channels. `width` is their number.
+    """
+
+    def __init__(self, dim: int, *, token_px: int, stride: int) -> None:
+        layers: list[nn.Module] = []
+        width, size = dim, token_px
+        while size > stride:
+            layers += [ChannelNorm(width), nn.GELU()] if layers else []
+            layers.append(nn.ConvTranspose2d(width, width // 2, 2, stride=2))
+            width, size = width // 2, size // 2
+        if size < stride:
+            layers.append(nn.MaxPool2d(stride // size))
+        super().__init__(*layers, ChannelNorm(width))
+        self.width = width
+
+
+class Pyramid(nn.ModuleList):
+    """Maps at strides 4, 8, 16 and 32 from maps of one size.
+
+    Source: ViTDet (Li et al., ECCV 2022), Sec. 3, "simple feature pyramid"; layers as in detectron2
+    (`modeling/backbone/vit.py`, SimpleFeaturePyramid). Its last 1x1 and 3x3 convolutions of each
+    level are left out, because Mask2Former's pixel decoder begins with convolutions of its own.
+
+    `widths` are the channels of the four maps.
+    """
+
+    def __init__(self, dim: int, token_px: int) -> None:
+        levels = [Level(dim, token_px=token_px, stride=stride) for stride in STRIDES]
+        super().__init__(levels)
+        first, second, third, last = (level.width for level in levels)
+        self.widths = first, second, third, last
+
+    def forward(self, maps: Maps) -> Maps:
+        """One (N, d, h, w), or one for each level, to four (N, C_s, H/s, W/s)."""
+        sources = maps if len(maps) > 1 else maps * len(self)
+        return [level(source) for level, source in zip(self, sources, strict=True)]
+
+
+class DinoBackbone(nn.Module):
+    """RGB and thermal through the same encoder, a pyramid each, and their fusion.
+
+    Sources: fusion: CRM, Sec. III-B. Ours: the shared encoder, with a vector that is added to the
+    patch tokens of thermal images (0 at first) and low-rank updates for both or for each modality.
+
+    `lora` are the updates of the blocks of both modalities, by "rgb" and "thermal", or by "both";
+    the other arguments: see `DinoMask2Former`.
+    """
+
+    def __init__(
+        self,
+        encoder: Encoder,
+        lora: dict[str, nn.ModuleList],
+        *,
+        token_px: int,
+        layers: tuple[int, ...],
+        fusion: FusionKind,
+        thermal_embedding: bool,
+    ) -> None:
+        super().__init__()
+        self.token_px, self.layers = token_px, layers
+        self.encoder = encoder
+        (dim,) = encoder.norm.normalized_shape
+        self.thermal_embedding = nn.Parameter(torch.zeros(dim)) if thermal_embedding else None
+        self.lora = nn.ModuleDict(dict(lora))
+        first, second = (Pyramid(dim, token_px) for _ in MODALITIES)
+        self.pyramids = nn.ModuleDict({"rgb": first, "thermal": second})
+        self.norm_layers = Fusion(first.widths, fusion)
+
+    def maps(
+        self,
+        modality: str,
+        image: Tensor,
+        hidden: Tensor | None,
+        generator: torch.Generator | None,  # noqa: ARG002 - nothing is dropped at random
+    ) -> Maps:
+        """(N, c, H, W) and (N, h, w); images are resized so that a patch has `token_px` pixels."""
+        image, patch = as_rgb(image), self.encoder.patch
+        if patch != self.token_px:
+            height, width = (side // self.token_px * patch for side in image.shape[-2:])
+            image = F.interpolate(image, (height, width), mode="bilinear", antialias=True)
+        owner = modality if modality in self.lora else "both"
+        tokens = self.encoder(
+            image,
+            hidden,
+            layers=self.layers,
+            added=self.thermal_embedding if modality == "thermal" else None,
+            lora=self.lora[owner] if len(self.lora) else None,
+        )
+        maps: Maps = self.pyramids[modality](tokens)
+        return maps
+
+
+class DinoMask2Former(MaskNetwork):
     """RGB and thermal through one vision transformer, fused as in CRM, with Mask2Former's head.
 
     Sources: encoder: DINOv2 (Oquab et al., TMLR 2024) or DINOv3 (Siméoni et al., 2025); pyramid:
     ViTDet, Sec. 3; fusion: CRM, Sec. III-B; head: Mask2Former, Sec. 3.2. The combination is ours.
     With the weights of a published file, the patch tokens of an RGB image are those of its network.
 
-    The settings with a default are those of DINOv3. Configurations of DINOv2 are older and do not
-    name them, so that the keys of their runs are unchanged.
+    The arguments are the keys of ``conf/model/dinov2_vits14.yaml``, and those of DINOv3. With
+    `thermal_embedding`, a frozen encoder keeps the activations of thermal images for its gradient.
 
     Args:
-        num_classes: K, without the no-object class.
-        patch: side of a patch in the resized image, pixels.
-        embed_dim: d, width of the encoder, a multiple of 4.
-        depth: its blocks.
-        num_heads: its attention heads.
-        mlp_ratio: width of a block's MLP divided by the width of the block.
-        num_registers: its register tokens; 4 in the files with registers, else 0.
-        position_grid: side of the grid of its position embedding, 37 in the files of DINOv2; None:
-            positions are rotary.
-        position_resize: how positions are resized: "factor" without and "size" with registers
-            (`rgbt.models.dinov2.encoder.resized_positions`); None: positions are rotary.
-        token_px: pixels of the image per token and side. Images, padded to multiples of 32, are
-            resized by patch / token_px, so that the tokens fit the strides 4 to 32 of the head.
-        layers: numbers of the blocks whose tokens are used, rising: one for all levels, or four.
-        tuning: "full": the encoder is trained; "frozen": it is not; "lora": low-rank updates of its
-            attention are.
-        lora_rank: rank of an update; this and the other settings of LoRA are read for "lora" only.
-        lora_alpha: factor of an update, divided by the rank.
-        lora_parts: updated projections, of "q", "k" and "v".
-        lora_per_modality: whether RGB and thermal have updates of their own.
-        thermal_embedding: whether a learned vector is added to the patch tokens of thermal images.
-            A frozen encoder then keeps the activations of thermal images for its gradient.
-        fusion: "max" or "add" of the two modalities.
-        hidden_dim: channels of both decoders, a multiple of 32.
-        num_queries: Q.
-        encoder_layers: deformable layers of the pixel decoder.
-        encoder_ffn_dim: width of their feed-forward networks.
-        decoder_layers: layers of the query decoder, without the initial prediction.
-        decoder_ffn_dim: width of theirs.
-        attention_heads: heads of both decoders.
-        pixel_decoder_fp32: keep the pixel decoder in single precision under autocast.
-        inputs: normalisation of the images, with three thermal channels.
-        rope_base: base of the periods of rotary positions
-            (`rgbt.models.dinov2.rotary.RotaryPositions`), 100 in DINOv3; None: positions are
+        rope_base: base of the periods of rotary positions, 100 in DINOv3; None: positions are
             learned.
         norm_eps: epsilon of the layer normalisations of the encoder; 1e-6 in DINOv2, 1e-5 in
             DINOv3.
@@ -75,17 +155,10 @@ class DinoMask2Former(nn.Module):
         InputError: settings that do not fit each other.
     """
 
-    record = Record(
-        outputs="masks",
-        views=VIEWS,
-        stacks_passes=True,
-        dense_logits=True,
+    record = replace(
+        RECORD,
         pretrained_parts=("backbone.encoder.",),
-        recomputed=(
-            "backbone.encoder.blocks.*",
-            "sem_seg_head.pixel_decoder.transformer.encoder.layers.*",
-            "sem_seg_head.predictor.transformer_*_layers.*",
-        ),
+        recomputed=("backbone.encoder.blocks.*", *RECORD.recomputed),
     )
 
     def __init__(  # noqa: PLR0913 - each is a key of conf/model/*.yaml
@@ -93,13 +166,13 @@ class DinoMask2Former(nn.Module):
         *,
         num_classes: NumClasses,
         patch: Annotated[int, Interval(ge=1, le=64)],
-        embed_dim: Channels,
+        embed_dim: Annotated[Channels, MultipleOf(4)],
         depth: Blocks,
         num_heads: Channels,
         mlp_ratio: MlpRatio,
         num_registers: Annotated[int, Interval(ge=0, le=1024)],
         position_grid: Annotated[int, Interval(ge=1, le=1024)] | None,
-        position_resize: PositionResize | None,
+        position_resize: Resize | None,
         token_px: Literal[8, 16],
         layers: Annotated[tuple[Blocks, ...], Len(1, 4)],
         tuning: Tuning,
@@ -108,9 +181,9 @@ class DinoMask2Former(nn.Module):
         lora_parts: Annotated[tuple[Part, ...], Len(1, 3)],
         lora_per_modality: bool,
         thermal_embedding: bool,
-        fusion: Literal["max", "add"],
-        hidden_dim: Channels,
-        num_queries: Annotated[int, Interval(ge=1, le=10_000)],
+        fusion: FusionKind,
+        hidden_dim: HiddenDim,
+        num_queries: NumQueries,
         encoder_layers: Blocks,
         encoder_ffn_dim: Channels,
         decoder_layers: Blocks,
@@ -123,8 +196,12 @@ class DinoMask2Former(nn.Module):
         key_bias: bool = True,
         mlp: MlpForm = "gelu",
     ) -> None:
-        super().__init__()
-        shape = ViTShape(
+        rising = all(a < b for a, b in zip(layers, layers[1:], strict=False))
+        if len(layers) not in (1, len(STRIDES)) or not rising or layers[-1] > depth:
+            raise InputError(
+                f"model.layers must be one block or four rising ones of {depth}, got {layers}."
+            )
+        encoder = Encoder(
             patch=patch,
             embed_dim=embed_dim,
             depth=depth,
@@ -138,12 +215,21 @@ class DinoMask2Former(nn.Module):
             key_bias=key_bias,
             mlp=mlp,
         )
-        settings = TuningSettings(
-            tuning=tuning,
-            rank=lora_rank,
-            alpha=lora_alpha,
-            parts=lora_parts,
-            per_modality=lora_per_modality,
+        encoder.requires_grad_(tuning == "full")
+        owners: tuple[str, ...] = MODALITIES if lora_per_modality else ("both",)
+        lora = {
+            owner: nn.ModuleList(
+                LoraProjection(embed_dim, rank=lora_rank, alpha=lora_alpha, parts=lora_parts)
+                for _ in range(layers[-1])
+            )
+            for owner in (owners if tuning == "lora" else ())
+        }
+        backbone = DinoBackbone(
+            encoder,
+            lora,
+            token_px=token_px,
+            layers=layers,
+            fusion=fusion,
             thermal_embedding=thermal_embedding,
         )
         head = HeadShape(
@@ -157,71 +243,4 @@ class DinoMask2Former(nn.Module):
             attention_heads=attention_heads,
             pixel_decoder_fp32=pixel_decoder_fp32,
         )
-        _check(shape, layers, lora_parts, inputs)
-        self.num_classes = num_classes
-        self.token_px = token_px
-        self.backbone = DinoBackbone(
-            shape, settings, token_px=token_px, layers=layers, fusion=fusion
-        )
-        self.sem_seg_head = MaskHead(head, self.backbone.widths)
-        self.inputs = inputs
-
-    def forward(  # noqa: PLR0913 - what every network takes, and what is stacked
-        self,
-        rgb: Tensor,
-        thermal: Tensor,
-        masks: MaskPair | None = None,
-        *,
-        passes: int = 1,
-        views: tuple[View, ...] = (),
-        num_predictions: int | None = None,
-        num_masks: int | None = None,
-        generator: torch.Generator | None = None,  # noqa: ARG002 - nothing is dropped at random
-    ) -> Output:
-        """Predictions of every view and pass, as one batch through the head.
-
-        Arguments, results and errors as `rgbt.models.mask2former.model.Mask2Former.forward` states
-        them. A cell of `masks` is a square of a multiple of `token_px` pixels: its pixels are 0,
-        and the mask token of the encoder takes the place of its tokens. Nothing is drawn from
-        `generator`.
-        """
-        wanted = requested(rgb.shape[0], passes, views, num_predictions, num_masks)
-        image_hw = rgb.shape[2], rgb.shape[3]
-        images = self.inputs(rgb, thermal, masks, multiple=STRIDE)
-        hidden = None
-        if masks is not None:
-            hidden = expand_cells(masks, rgb.shape[0], padded_hw(image_hw), self.token_px)
-        features = self.backbone(
-            images,
-            hidden,
-            passes=passes,
-            views=wanted.views,
-            num_predictions=wanted.predictions,
-        )
-        output: Output = self.sem_seg_head(features, wanted, image_hw)
-        return output
-
-    def dense_logits(self, output: Output, image_hw: tuple[int, int]) -> Tensor:
-        """As `rgbt.models.mask2former.head.dense_logits`."""
-        return dense_logits(output, image_hw)
-
-
-def _check(
-    shape: ViTShape, layers: tuple[int, ...], lora_parts: tuple[Part, ...], inputs: Inputs
-) -> None:
-    """Refuse settings that do not fit each other."""
-    if shape.embed_dim % 4:
-        raise InputError(f"model.embed_dim must be a multiple of 4, got {shape.embed_dim}.")
-    rising = all(a < b for a, b in zip(layers, layers[1:], strict=False))
-    if len(layers) not in (1, len(STRIDES)) or not rising or layers[-1] > shape.depth:
-        raise InputError(
-            f"model.layers must be one number of a block, or four rising ones, from 1 to "
-            f"model.depth = {shape.depth}, got {list(layers)}."
-        )
-    if len(set(lora_parts)) < len(lora_parts):
-        raise InputError(f"model.lora_parts must name each part once, got {list(lora_parts)}.")
-    if inputs.thermal_channels != 3:
-        raise InputError(
-            "model.inputs: the encoder takes thermal images of three channels, got "
-            f"{inputs.thermal_channels}; choose model/inputs=cmx."
-        )
+        super().__init__(backbone, head, inputs)

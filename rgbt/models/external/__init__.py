@@ -1,6 +1,6 @@
 """Networks of other authors, built and called from their own checkouts; nothing is copied.
 
-`checkout` imports them apart from everything else, `guard` keeps their constructors from loading
-weights, `calling` feeds them and finds the class scores, `network` is the network of this project.
-The code of the checkout is executed.
+`building` imports and builds them, `calling` feeds them and finds the class scores, `network` is
+the network of this project, `adapting` has tools for the adapters of odd repositories. The code of
+the checkout is executed. A process can hold one checkout.
 """

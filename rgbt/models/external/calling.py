@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any, Literal
 
 import torch
@@ -18,8 +18,10 @@ Feed = Literal["stacked", "pair", "pair_and_edges", "list", "dicts", "thermal"]
 """How a network takes its images; see `FEEDS`."""
 
 Index = Annotated[int, Interval(ge=-1000, le=1000)]
-Path = Annotated[tuple[Index | Text, ...], Len(0, 16)]
+ScorePath = Annotated[tuple[Index | Text, ...], Len(0, 16)]
 """Indices, keys and attributes that lead to scores; "*" stacks what follows of every element."""
+
+ScorePaths = Annotated[tuple[ScorePath, ...], Len(1, 16)]
 
 FEEDS: Mapping[Feed, Callable[[Images, Tensor], tuple[Any, ...]]] = {
     "stacked": lambda images, _: (torch.cat(images, 1),),
@@ -46,36 +48,30 @@ def edge_map(rgb: Tensor, thermal: Tensor) -> Tensor:
         thermal: see there.
 
     Returns:
-        (N, H, W), whole numbers in 0..255.
+        (N, 1, H, W), whole numbers in 0..255.
     """
     luma = (rgb * rgb.new_tensor([0.299, 0.587, 0.114]).view(1, 3, 1, 1)).sum(1, keepdim=True)
     grey = (255 * torch.cat([luma, thermal])).round()
     across = grey.new_tensor([[-1.0, 0.0, 1.0], [-2.0, 0.0, 2.0], [-1.0, 0.0, 1.0]])
     kernels = torch.stack([across, across.T])[:, None]
     slopes = F.conv2d(F.pad(grey, (1, 1, 1, 1), mode="reflect"), kernels).abs().clamp(max=255)
-    of_rgb, of_thermal = slopes.mean(1).round().chunk(2)
+    of_rgb, of_thermal = slopes.mean(1, keepdim=True).round().chunk(2)
     return (of_rgb + of_thermal) % 256
 
 
-def picked(output: Any, path: Path) -> Any:
-    """What a path leads to.
-
-    Raises:
-        LookupError: it leads nowhere.
-    """
+def picked(output: Any, path: ScorePath) -> Any:
+    """What a path leads to; None where it leads nowhere."""
     for number, step in enumerate(path):
         if step == "*":
             return torch.stack([picked(each, path[number + 1 :]) for each in output])
         try:
             output = output[step]
         except (TypeError, IndexError, KeyError):
-            if not isinstance(step, str) or not hasattr(output, step):
-                raise LookupError(step) from None
-            output = getattr(output, step)
+            output = getattr(output, str(step), None)
     return output
 
 
-def scores_at(output: Any, paths: Sequence[Path], setting: str, shape: tuple[int, int]) -> Tensor:
+def scores_at(output: Any, paths: ScorePaths, setting: str, shape: tuple[int, int]) -> Tensor:
     """The sum of the scores at some paths, (N, K, h, w).
 
     Args:
@@ -87,48 +83,26 @@ def scores_at(output: Any, paths: Sequence[Path], setting: str, shape: tuple[int
     Raises:
         InputError: a path leads nowhere or to something else than scores of K classes.
     """
-    found = []
-    for path in paths:
-        try:
-            value = picked(output, path)
-        except (LookupError, TypeError) as error:
+    found = [picked(output, path) for path in paths]
+    for path, value in zip(paths, found, strict=True):
+        is_map = isinstance(value, Tensor) and value.dim() == 4 and value.is_floating_point()
+        if not is_map or value.shape[:2] != shape:
             raise InputError(
-                f"{setting}: the network returns {structure(output)}, which has nothing at "
-                f"{list(path)}; name the position of the class scores."
-            ) from error
-        if not _is_scores(value) or len(value) != shape[0]:
-            raise InputError(
-                f"{setting}: expected class scores ({shape[0]}, {shape[1]}, h, w) float at "
-                f"{list(path)} of {structure(output)}, got {described(value)}."
+                f"{setting}: expected scores ({shape[0]}, {shape[1]}, h, w) with model.num_classes="
+                f"{shape[1]} at {list(path)}, got {described(value)}; the network returns "
+                f"{structure(output)}."
             )
-        if value.shape[1] != shape[1]:
-            raise InputError(
-                f"{setting}: the network returns scores of {value.shape[1]} classes, but "
-                f"model.num_classes is {shape[1]}; set the argument of its constructor, or choose "
-                "a data set with as many classes."
-            )
-        found.append(value)
-    if len({each.shape for each in found}) > 1:
-        raise InputError(
-            f"{setting}: scores of {' and '.join(described(each) for each in found)} cannot be "
-            "added; choose paths to scores of one size."
-        )
     return torch.stack(found).sum(0) if len(found) > 1 else found[0]
-
-
-def _is_scores(value: object) -> bool:
-    return isinstance(value, Tensor) and value.dim() == 4 and value.is_floating_point()
 
 
 def structure(value: object) -> str:
     """What a network returned, in words: "tuple (Tensor (2, 9, 4, 6) float32, list of 3)"."""
-    if isinstance(value, tuple | list):
-        inner = [
-            f"{type(each).__name__} of {len(each)}"
-            if isinstance(each, tuple | list)
-            else described(each)
-            for each in value[:4]
-        ]
-        more = ["..."] if len(value) > 4 else []
-        return f"{type(value).__name__} ({', '.join([*inner, *more])})"
-    return described(value)
+    if not isinstance(value, tuple | list):
+        return described(value)
+    inner = [
+        f"{type(each).__name__} of {len(each)}"
+        if isinstance(each, tuple | list)
+        else described(each)
+        for each in value[:4]
+    ]
+    return f"{type(value).__name__} ({', '.join([*inner, *['...'] * (len(value) > 4)])})"

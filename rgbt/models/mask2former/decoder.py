@@ -2,26 +2,11 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.models.mask2former.pixel_decoder import NUM_LEVELS, PixelPyramid, sine_code
-
-
-class Predictions(NamedTuple):
-    """Predictions of the initial queries and after each layer.
-
-    Attributes:
-        class_logits: (L, B, Q, K + 1), last column = no object.
-        mask_logits: (L, M, Q, H/4, W/4) of the first M samples, those of `PixelPyramid.fine`; a
-            view of memory ordered M, L, Q, H/4, W/4.
-    """
-
-    class_logits: Tensor
-    mask_logits: Tensor
+from rgbt.models.mask2former.pixel_decoder import NUM_LEVELS, HeadShape, PixelPyramid, sine_code
 
 
 class QueryAttention(nn.Module):
@@ -51,18 +36,14 @@ class QueryAttention(nn.Module):
             for x, w, b in zip((query, key, value), weights, biases, strict=True)
         )
         mask = None if allowed is None else allowed[:, None]
-        out = _attend(q, k, v, mask)
+        if q.device.type == "cpu" and q.dtype in (torch.bfloat16, torch.float16):
+            # The gradient takes up to three times as long in bfloat16 as in single precision.
+            with torch.autocast("cpu", enabled=False):
+                out = F.scaled_dot_product_attention(q.float(), k.float(), v.float(), mask)
+        else:
+            out = F.scaled_dot_product_attention(q, k, v, mask)
         projected: Tensor = self.out_proj(out.transpose(1, 2).flatten(2))
         return projected
-
-
-def _attend(q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None) -> Tensor:
-    """Scaled dot-product attention of (B, heads, Q, D) to (B, heads, S, D)."""
-    if q.device.type != "cpu" or q.dtype not in (torch.bfloat16, torch.float16):
-        return F.scaled_dot_product_attention(q, k, v, attn_mask=mask)
-    # On CPU the gradient takes up to three times as long in bfloat16 as in single precision.
-    with torch.autocast("cpu", enabled=False):
-        return F.scaled_dot_product_attention(q.float(), k.float(), v.float(), attn_mask=mask)
 
 
 class AttentionLayer(nn.Module):
@@ -121,37 +102,36 @@ class Predictor(nn.Module):
 
     Source: Mask2Former, Sec. 3.2, Eq. (1)-(2).
 
-    Layer i reads level i mod 3 (strides 32, 16, 8). Sizes: see `Mask2Former`.
+    Layer i reads level i mod 3 (strides 32, 16, 8).
     """
 
-    def __init__(
-        self,
-        num_classes: int,
-        *,
-        hidden_dim: int,
-        num_queries: int,
-        num_layers: int,
-        heads: int,
-        ffn_dim: int,
-    ) -> None:
+    def __init__(self, shape: HeadShape) -> None:
         super().__init__()
-        dim, count = hidden_dim, range(num_layers)
+        dim, heads, count = shape.hidden_dim, shape.attention_heads, range(shape.decoder_layers)
         self.transformer_self_attention_layers = nn.ModuleList(
             AttentionLayer("self_attn", dim, heads) for _ in count
         )
         self.transformer_cross_attention_layers = nn.ModuleList(
             AttentionLayer("multihead_attn", dim, heads) for _ in count
         )
-        self.transformer_ffn_layers = nn.ModuleList(FfnLayer(dim, ffn_dim) for _ in count)
+        self.transformer_ffn_layers = nn.ModuleList(
+            FfnLayer(dim, shape.decoder_ffn_dim) for _ in count
+        )
         self.decoder_norm = nn.LayerNorm(dim)
-        self.query_feat = nn.Embedding(num_queries, dim)
-        self.query_embed = nn.Embedding(num_queries, dim)
+        self.query_feat = nn.Embedding(shape.num_queries, dim)
+        self.query_embed = nn.Embedding(shape.num_queries, dim)
         self.level_embed = nn.Embedding(NUM_LEVELS, dim)
-        self.class_embed = nn.Linear(dim, num_classes + 1)
+        self.class_embed = nn.Linear(dim, shape.num_classes + 1)
         self.mask_embed = MaskEmbed(dim)
 
-    def forward(self, pyramid: PixelPyramid) -> Predictions:
-        """L = number of layers + 1 predictions, the last one final."""
+    def forward(self, pyramid: PixelPyramid) -> tuple[Tensor, Tensor]:
+        """Predictions of the initial queries and after each layer, L in all, the last one final.
+
+        Returns:
+            class_logits: (L, B, Q, K + 1), last column = no object.
+            mask_logits: (L, M, Q, H/4, W/4) of the first M samples, those of `PixelPyramid.fine`;
+                a view of memory ordered M, L, Q, H/4, W/4.
+        """
         memories = []  # keys and values of the three levels, each (B, S_l, C)
         every_level = zip(pyramid.tokens, pyramid.levels, self.level_embed.weight, strict=True)
         for tokens, hw, embed in every_level:
@@ -186,7 +166,7 @@ class Predictor(nn.Module):
         embed = torch.cat(embeds, dim=1)[: pyramid.fine.shape[0]]
         masks = _mask_logits(embed, pyramid, pyramid.fine.flatten(2))
         masks = masks.view(masks.shape[0], len(embeds), -1, *pyramid.fine.shape[-2:])
-        return Predictions(class_logits, masks.transpose(0, 1))
+        return class_logits, masks.transpose(0, 1)
 
 
 def _mask_logits(embed: Tensor, pyramid: PixelPyramid, fine: Tensor) -> Tensor:

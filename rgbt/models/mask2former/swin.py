@@ -7,6 +7,7 @@ of Swin and in the CRM and SpatialSeg releases, and unlike the ImageNet classifi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -14,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.models.parts import Mlp, add_residual, keep_factors
+from rgbt.models.parts import Keep, Mlp, ResidualBlock, stochastic_depth
 
 PATCH = 4
 
@@ -99,14 +100,14 @@ class WindowAttention(nn.Module):
 
         softmax(q k' / sqrt(d) + bias + shift mask) v
 
-    Source: Swin Transformer, Eq. (4).
+    Source: Swin Transformer, Eq. (4). Maps are rolled by -`shift`.
     """
 
     relative_position_index: Tensor
 
-    def __init__(self, dim: int, heads: int, window: int) -> None:
+    def __init__(self, dim: int, heads: int, window: int, shift: int) -> None:
         super().__init__()
-        self.heads, self.window = heads, window
+        self.heads, self.window, self.shift = heads, window, shift
         self.scale = (dim // heads) ** -0.5
         self.qkv = nn.Linear(dim, 3 * dim)
         self.proj = nn.Linear(dim, dim)
@@ -115,13 +116,16 @@ class WindowAttention(nn.Module):
         index = relative_index(window)
         self.register_buffer("relative_position_index", index, persistent=False)
 
-    def forward(self, x: Tensor, shift: int) -> Tensor:
-        """Attention in every window of (N, H, W, C), before the output projection.
-
-        H and W are multiples of the window; the map has been rolled by -`shift` already.
-        """
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, H, W, C) of any size -> the same."""
+        hw, side, shift = x.shape[1:3], self.window, self.shift
+        below, right = ((-length) % side for length in hw)
+        if below or right:
+            x = F.pad(x, (0, 0, 0, right, 0, below))
+        if shift:
+            x = x.roll((-shift, -shift), (1, 2))
         n, height, width, dim = x.shape
-        side, rows, columns = self.window, height // self.window, width // self.window
+        rows, columns = height // side, width // side
         # Windows and heads are cut out of the projected map in one copy.
         qkv = self.qkv(x).view(n, rows, side, columns, side, 3, self.heads, -1)
         qkv = qkv.permute(5, 0, 1, 3, 6, 2, 4, 7).reshape(
@@ -138,40 +142,11 @@ class WindowAttention(nn.Module):
         out = (scores + bias).softmax(-1) @ v
 
         out = out.view(n, rows, columns, self.heads, side, side, -1)
-        merged: Tensor = out.permute(0, 1, 4, 2, 5, 3, 6).reshape(n, height, width, dim)
-        return merged
-
-
-class SwinBlock(nn.Module):
-    """Window attention and MLP, each normalised before and added to its input."""
-
-    def __init__(self, dim: int, heads: int, shape: SwinShape, *, shift: int) -> None:
-        super().__init__()
-        self.shift = shift
-        self.norm1 = nn.LayerNorm(dim)
-        self.attn = WindowAttention(dim, heads, shape.window_size)
-        self.norm2 = nn.LayerNorm(dim)
-        self.mlp = Mlp(dim, int(dim * shape.mlp_ratio))
-
-    def forward(self, x: Tensor, keep: Tensor | None) -> Tensor:
-        """(N, H, W, C) -> the same; `keep`: (2, N, 1, 1, 1) factors of both residuals, or None."""
-        first, second = (None, None) if keep is None else keep.unbind()
-        x = add_residual(x, self._attend(self.norm1(x)), first)
-        return add_residual(x, self.mlp(self.norm2(x)), second)
-
-    def _attend(self, x: Tensor) -> Tensor:
-        """Window attention on a map of any size."""
-        height, width = x.shape[1:3]
-        below, right = (-height) % self.attn.window, (-width) % self.attn.window
-        if below or right:
-            x = F.pad(x, (0, 0, 0, right, 0, below))
-        if self.shift:
-            x = x.roll((-self.shift, -self.shift), (1, 2))
-        x = self.attn(x, self.shift)
-        if self.shift:
-            x = x.roll((self.shift, self.shift), (1, 2))
-        out: Tensor = self.attn.proj(x[:, :height, :width])
-        return out
+        out = out.permute(0, 1, 4, 2, 5, 3, 6).reshape(n, height, width, dim)
+        if shift:
+            out = out.roll((shift, shift), (1, 2))
+        projected: Tensor = self.proj(out[:, : hw[0], : hw[1]])
+        return projected
 
 
 class PatchMerging(nn.Module):
@@ -199,18 +174,18 @@ class Stage(nn.Module):
 
     def __init__(self, shape: SwinShape, index: int) -> None:
         super().__init__()
-        dim, heads = shape.widths[index], shape.num_heads[index]
-        shifts = (0, shape.window_size // 2)
-        self.blocks = nn.ModuleList(
-            SwinBlock(dim, heads, shape, shift=shifts[block % 2])
-            for block in range(shape.depths[index])
-        )
+        dim, heads, window = shape.widths[index], shape.num_heads[index], shape.window_size
+        self.blocks = nn.ModuleList()
+        for block in range(shape.depths[index]):
+            attention = WindowAttention(dim, heads, window, shift=block % 2 * (window // 2))
+            mlp = Mlp(dim, int(dim * shape.mlp_ratio))
+            self.blocks.append(ResidualBlock(dim, attention, mlp))
         self.downsample = PatchMerging(dim) if index < 3 else nn.Identity()
 
-    def forward(self, x: Tensor, keep: Tensor | None) -> Tensor:
-        """(N, H, W, C) -> (N, H, W, C), before merging; `keep` is (blocks, 2, N, 1, 1, 1)."""
-        for number, block in enumerate(self.blocks):
-            x = block(x, None if keep is None else keep[number])
+    def forward(self, x: Tensor, keeps: Sequence[Keep]) -> Tensor:
+        """(N, H, W, C) -> (N, H, W, C), before merging; `keeps` has one for every block."""
+        for block, keep in zip(self.blocks, keeps, strict=True):
+            x = block(x, keep)
         return x
 
 
@@ -245,12 +220,10 @@ class Swin(nn.Module):
         x = self.patch_embed(image)
         if hidden is not None:
             x = torch.where(hidden[..., None], self.mask_token.view(-1), x)
-        keeps: list[Tensor | None] = [None] * 4
-        if self.training and self.shape.drop_path_rate > 0:
-            # Factors of every residual of every sample; rates rise from 0.
+        rates = None
+        if self.training and self.shape.drop_path_rate > 0:  # rates rise from 0
             rates = torch.linspace(0, self.shape.drop_path_rate, sum(self.shape.depths))
-            drawn = keep_factors(rates, (2, len(x), 1, 1, 1), generator, x.device, dim=1)
-            keeps = list(torch.split(drawn, list(self.shape.depths)))
+        keeps = stochastic_depth(rates, self.shape.depths, x, generator)
         maps = []
         for index, (stage, keep) in enumerate(zip(self.layers, keeps, strict=True)):
             x = stage(x, keep)

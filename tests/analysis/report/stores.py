@@ -21,10 +21,10 @@ from sweeps import attributes
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.rendering.claims import claims_markdown
 from sweeps.rendering.file_formats import tidy_csv
+from sweeps.report.publish import markdown
 from sweeps.report.records import record
 from sweeps.report.study_data import read
 from sweeps.report.tables import trials_csv
-from sweeps.study import markdown
 from sweeps.table.cells import score
 from sweeps.table.load_table import load_table
 from sweeps.verdicts.judge import TableJudge
@@ -73,7 +73,7 @@ MASKER = {
     "pattern_probabilities": None,
 }
 DATASET = {
-    "_target_": "rgbt.data.synth.dataset.synth",
+    "_target_": "rgbt.synth.datasets.synth",
     **{"num_train": 1, "num_val": 1, "num_test": 1, "height": 64, "width": 96},
 }
 

@@ -203,10 +203,12 @@ def test_differences_of_columns_are_paired_over_images_and_seeds(data: ReportDat
     rgb = [counts_of(seed, 0.8 - 0.2) for seed in range(3)]
     settings = Resampling(resamples=RESAMPLES)
     compared = compare(full, rgb, ["mIoU"], settings, paired=True).differences[0]
-    assert compared.both is not None
+    assert compared.difference.both is not None
     assert cell.mean == pytest.approx(compared.value)
     assert cell.mean < 0
-    assert (cell.low, cell.high) == pytest.approx((compared.both.low, compared.both.high))
+    assert (cell.low, cell.high) == pytest.approx(
+        (compared.difference.both.low, compared.difference.both.high)
+    )
     assert cell.covers == "images and seeds"
 
 
@@ -243,8 +245,9 @@ def test_claims_of_the_table_are_judged_by_its_runs(data: ReportData) -> None:
     assert better.estimate == pytest.approx(statistics.fmean(differences))
     settings = Resampling(resamples=RESAMPLES)
     (wanted,) = compare(a, b, ["mIoU"], settings, paired=True).differences
-    assert wanted.both is not None
-    assert (better.low, better.high) == pytest.approx((wanted.both.low, wanted.both.high), rel=0.1)
+    both = wanted.difference.both
+    assert both is not None
+    assert (better.low, better.high) == pytest.approx((both.low, both.high), rel=0.1)
     assert (better.seeds, better.covers) == (3, "images and seeds")
     assert better.runs == (*keys_of("grbm scale=paper"), *keys_of("crm scale=paper"))
     # Printed: 60 for B and 61 for A.

@@ -95,7 +95,7 @@ def test_index_without_paper_gpu_and_real_data_says_so_first() -> None:
 
 
 def test_index_runs_on_gpu_and_real_data_are_counted() -> None:
-    synth = {"dataset._target_": "rgbt.data.synth.dataset.synth"}
+    synth = {"dataset._target_": "rgbt.synth.datasets.synth"}
     runs = (
         replace(run_entry(0, 0), hardware="NVIDIA H100", scale="paper", config={}),
         replace(run_entry(0, 1), hardware="EPYC, 2 cores", config=synth),
@@ -272,9 +272,10 @@ def test_contrast_entries_two_groups_are_compared_over_images_and_seeds() -> Non
     sides = [[counts_of(seed, right) for seed in (0, 1, 2)] for right in (0.6, 0.8)]
     settings = Resampling(resamples=RESAMPLES, absent="released")
     (wanted,) = compare(*sides, ["mIoU"], settings, paired=True).differences
-    assert wanted.both is not None
+    both = wanted.difference.both
+    assert both is not None
     assert (found.difference, found.low, found.high, found.p) == (
-        *(wanted.value, wanted.both.low, wanted.both.high, wanted.p_both),
+        *(wanted.value, both.low, both.high, wanted.difference.p),
     )
     assert (found.seeds, found.covers) == ((3, 3), "images and seeds")
     assert found.verdict == "Holds."
@@ -320,10 +321,11 @@ def test_verdict_says_what_the_interval_shows() -> None:
     assert verdict(alone, "higher", 0.95) == "Undecided: both methods need two seeds or more."
     again = [counts_of(seed, 0.6) for seed in range(3, 6)]
     (same,) = compare(low, again, ["mIoU"], settings, paired=True).differences
-    assert same.both is not None
+    both = same.difference.both
+    assert both is not None
     said = verdict(same, "higher", 0.95)
     assert said.startswith(
-        f"Undecided: with these seeds and images, a difference below {same.both.half:.2f} points "
+        f"Undecided: with these seeds and images, a difference below {both.half:.2f} points "
         "cannot be shown. "
     )
     assert said.endswith((" seeds would show the present difference.", "any number of seeds."))
@@ -366,7 +368,7 @@ def test_network_entries_parameters_are_those_of_the_built_network(
     text = page_texts(replace(report(0), tables=()), (found,))["networks.md"]
     assert "| MFNet | `model=mfnet` | 0.74 |" in text
     assert "| MFNet | MFNet (final.pth) | <https://github.com/haqishen/MFNet-pytorch> |" in text
-    assert "| MFNet | `tests/models/test_rtfnet_mfnet_golden.py` |" in text
+    assert "| MFNet | `tests/models/test_golden.py` |" in text
 
 
 def test_command_markdown_writes_the_pages_and_leaves_others(

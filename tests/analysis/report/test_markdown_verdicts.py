@@ -126,7 +126,7 @@ def test_chosen_data_are_overrides_of_the_images_without_folders(extra: str, dat
 
 
 def test_claims_page_says_what_cannot_be_said() -> None:
-    synthetic = {"dataset._target_": "rgbt.data.synth.dataset.synth"}
+    synthetic = {"dataset._target_": "rgbt.synth.datasets.synth"}
     runs = tuple(replace(run, config=synthetic) for run in RUNS)
     stuck = table_of("bench", ("b0", "b1"), seeds_needed=float("inf"))
     text = page_of(runs, stuck, table_of("demo", ("d0",)), table_entry("temporal/table2", {}))

@@ -1,4 +1,4 @@
-"""Evidence about contrasts: against `compare`, and against a bootstrap written as a loop."""
+"""Evidence about contrasts, against a bootstrap written as a loop."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 from analysis.uncertainty import Resampling, compare
 from analysis.uncertainty.contrasts import FIXED, Evidence, Resampler, Term
-from analysis.uncertainty.images import CommonImages
+from analysis.uncertainty.scores import RunScores
 from analysis.uncertainty.verdicts import FixedSeeds, decide
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
@@ -97,17 +97,14 @@ def test_evidence_gives_the_interval_of_paired_comparisons(blocks, metric: str) 
         *(list(row.values()) for row in rows), [metric], settings, paired=True
     ).differences
     found = Resampler(settings).evidence(difference(rows, metric))
-    assert wanted.evidence is not None
-    assert wanted.both is not None
-    assert found.values == pytest.approx(wanted.evidence.values)
-    assert found.error == pytest.approx(wanted.evidence.error)
-    assert (found.blocks, found.said) == (wanted.evidence.blocks, wanted.evidence.said)
+    both = wanted.difference.both
+    assert both is not None
     if blocks == "auto":
         assert "neighbouring frames" in found.said
     verdict = decide([found], (0.0, math.inf), FixedSeeds(), "all")
     assert verdict.interval is not None
-    assert verdict.interval.low == pytest.approx(wanted.both.low)
-    assert verdict.interval.high == pytest.approx(wanted.both.high)
+    assert verdict.interval.low == pytest.approx(both.low)
+    assert verdict.interval.high == pytest.approx(both.high)
     assert verdict.estimate == pytest.approx(wanted.value)
 
 
@@ -120,7 +117,7 @@ def test_evidence_of_the_night_gives_other_images_no_weight() -> None:
     values, error = by_loop(terms, (0, 1, 2))
     assert found.values == pytest.approx(values)
     assert found.error == pytest.approx(error * math.sqrt(18 / 17))
-    assert found.blocks == 18
+    assert (found.blocks, found.said) == (18, "18 of 30 single images")
     both = [*terms, *difference(rows_of(night=night), "mIoU")]
     values, error = by_loop(both, (0, 1, 2))
     found = resampler.evidence(both)
@@ -201,20 +198,19 @@ def test_evidence_does_not_depend_on_the_order_of_images_or_on_other_contrasts()
 
 def test_evidence_again_draws_no_images(monkeypatch: pytest.MonkeyPatch) -> None:
     rows, resampler, calls = rows_of(), Resampler(SETTINGS), []
-    drawn = CommonImages.resampled
+    draw = RunScores._weights
 
-    def counted(self: CommonImages, parsed: Sequence) -> list:
-        calls.append(len(self.methods))
-        return drawn(self, parsed)
+    def counted(self: RunScores, blocks: int) -> object:
+        calls.append(blocks)
+        return draw(self, blocks)
 
-    monkeypatch.setattr(CommonImages, "resampled", counted)
+    monkeypatch.setattr(RunScores, "_weights", counted)
     less = [{seed: row[seed] for seed in (0, 1)} for row in rows]
     first = resampler.evidence(difference(less))
-    assert calls == [2, 2]
     more = resampler.evidence(difference(rows))
-    assert calls == [2, 2, 1, 1]  # the third seed of each row alone
+    assert calls == [30] * 4
     assert resampler.evidence(difference(rows)) == more
-    assert calls == [2, 2, 1, 1]
+    assert calls == [30] * 4
     assert more.values[:2] == first.values
 
 
@@ -258,7 +254,9 @@ def test_evidence_refuses_what_cannot_be_compared() -> None:
     with pytest.raises(InputError, match="the counts have the regions 1 to 2"):
         resampler.evidence(difference([row, other], "region/3"))
     emptied = {seed: replace(each, counts=each.counts * 0) for seed, each in row.items()}
-    with pytest.raises(InputError, match="'pixel_accuracy' of a/0 has nothing to score"):
+    with pytest.raises(
+        InputError, match="'pixel_accuracy' of one of a/0, a/1, a/2 has nothing to score"
+    ):
         Resampler(SETTINGS).evidence([term(1.0, emptied, "a", "pixel_accuracy")])
     with pytest.raises(ValueError, match="expected one term or more"):
         resampler.evidence([])

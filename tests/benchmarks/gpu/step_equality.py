@@ -68,8 +68,7 @@ def experiments() -> list[str]:
 
 def compare(name: str, device: torch.device) -> dict[str, Any]:
     """One step and one evaluation of an experiment on the CPU and on `device`."""
-    words = [*smoke_words(name), "data.augment=loader"]
-    setups = [setup_of(words, each) for each in (CPU, device)]
+    setups = [setup_of(smoke_words(name), each) for each in (CPU, device)]
     # Step 1: where steps alternate, step 0 trains the discriminator alone.
     loaded = next(setups[0].batches(range(1, 2)))
     losses, norms, maps = [], [], []

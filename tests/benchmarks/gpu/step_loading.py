@@ -1,4 +1,4 @@
-"""The input path: cache and augmentation on the device, alone and in front of a CRM step."""
+"""The input path: cache and augmentation, alone and in front of a CRM step."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def measure(task: Task) -> None:
         shares[number] = row.get(WAIT_SHARE, float("nan"))
     cores = len(os.sched_getaffinity(0))
     where = "synthetic images" if task.data is None else str(task.data)
-    task.note(f"Batch {size}, {where}, cache and augmentation on the device, {cores} CPU cores.")
+    task.note(f"Batch {size}, {where}, cache, {cores} CPU cores.")
     task.headline("wait_share: " + ", ".join(f"{n} workers {s:.2g}" for n, s in shares.items()))
 
 
@@ -52,12 +52,12 @@ def _words(task: Task, root: Path, size: int, workers: str) -> list[str]:
     if task.smoke:
         words += ["dataset=mfnet", f"dataset.root={root}"]
     cache = task.folder / "cache"
-    words += [f"data.num_workers={workers}", f"data.cache={cache}", "data.augment=device"]
+    words += [f"data.num_workers={workers}", f"data.cache={cache}"]
     return [*words, "trainer.precision=bf16-mixed"]
 
 
 def _loader_alone(setup: TrainingSetup, size: int, steps: int) -> float:
-    """Images per second that are read, moved and augmented."""
+    """Images per second that are read, augmented and moved."""
     device = setup.session.device
     batches = setup.batches(range(steps + 2))
     for _ in range(2):  # processes start, memory is allocated

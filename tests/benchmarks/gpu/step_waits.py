@@ -68,7 +68,7 @@ def _measure_on_gpu(task: Task, device: torch.device) -> None:
     for line in lines:
         ms = 1e3 * clock.seconds[line] / STEPS
         task.row(line=line, **{"per step": seen[line] / STEPS, "ms per step": ms})
-    task.note(f"Swin-S, batch {size}, bf16-mixed, augmentation on the device; {step_ms:.0f} ms.")
+    task.note(f"Swin-S, batch {size}, bf16-mixed; {step_ms:.0f} ms.")
     waiting = [each[WAIT_SHARE] for each in training.recorded[WARM:]]
     task.note(f"wait_share of these steps: {max(waiting):.2g} at most.")
     number = sum(seen.values()) / STEPS
@@ -80,7 +80,7 @@ def _measure_on_gpu(task: Task, device: torch.device) -> None:
 def _warm(task: Task, root: Any, size: int, device: torch.device) -> tuple[Training, Iterator[Any]]:
     """A training after its first steps, and the batches that follow."""
     words = crm_words("mask2former_swin_s", size, root, smoke=task.smoke)
-    words += [f"data.cache={task.folder / 'cache'}", "data.augment=device", "data.num_workers=0"]
+    words += [f"data.cache={task.folder / 'cache'}", "data.num_workers=0"]
     setup = setup_of([*words, "trainer.precision=bf16-mixed"], device)
     batches = setup.batches(range(WARM + 3 * STEPS))
     training = Training(setup, task.folder)

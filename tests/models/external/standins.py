@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import sys
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import pytest
 import torch
 
 from rgbt.config.compose import compose
+from rgbt.models.external import building
 from rgbt.models.external.network import ExternalNetwork
 from rgbt.models.inputs import Inputs
 
@@ -36,8 +39,26 @@ class Net(Base):
 """
 
 
+def forget() -> None:
+    """Leave the checkout of this process, as another process would."""
+    building._held.clear()
+    for name in list(sys.modules):
+        if name.split(".")[0] in ("model", "toolbox", "absent"):
+            del sys.modules[name]
+
+
+@pytest.fixture(autouse=True)
+def own_process() -> Iterator[None]:
+    """A test may use a checkout whatever other tests used."""
+    path = list(sys.path)
+    forget()
+    yield
+    forget()
+    sys.path[:] = path
+
+
 def write_checkout(folder: Path, files: Mapping[str, str]) -> Path:
-    """A checkout with these files; a name without an ending is a package's folder."""
+    """A checkout with these files."""
     for name, text in files.items():
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -45,23 +66,18 @@ def write_checkout(folder: Path, files: Mapping[str, str]) -> Path:
     return folder
 
 
-def settings(checkout: Path, **changes: Any) -> dict[str, Any]:
-    """Arguments of an `ExternalNetwork` of three classes, with the defaults of the file."""
+def external(checkout: Path, *, inputs: str = "unit", **changes: Any) -> ExternalNetwork:
+    """The network of a checkout of three classes, with the defaults of the file."""
+    node = compose([f"model/inputs={inputs}", "model=mfnet_tiny"]).model.inputs
+    kinds = {key: value for key, value in node.items() if key != "_target_"}
     plain = {
         **{"num_classes": 3, "checkout": str(checkout), "root": "."},
         **{"constructor": "model.net:Net", "arguments": {"n_class": 3}, "namespaces": {}},
         **{"feed": "stacked", "multiple": 1, "size_hw": None, "scores": ((),)},
         **{"train_scores": None, "auxiliary": None, "resize": False, "one_by_one": False},
-        **{"empty_packages": (), "stubs": {}, "moves_cuda": False, "weights_prefix": ""},
+        **{"weights_prefix": ""},
     }
-    return {**plain, **changes}
-
-
-def external(checkout: Path, *, inputs: str = "unit", **changes: Any) -> ExternalNetwork:
-    """The network of a checkout, with the inputs of a file of ``conf/model/inputs``."""
-    node = compose([f"model/inputs={inputs}", "model=mfnet_tiny"]).model.inputs
-    kinds = {key: value for key, value in node.items() if key != "_target_"}
-    return ExternalNetwork(**settings(checkout, **changes), inputs=Inputs(**kinds))
+    return ExternalNetwork(**{**plain, **changes}, inputs=Inputs(**kinds))
 
 
 def images(count: int = 2, height: int = 8, width: int = 12) -> tuple[torch.Tensor, torch.Tensor]:
@@ -69,8 +85,3 @@ def images(count: int = 2, height: int = 8, width: int = 12) -> tuple[torch.Tens
     generator = torch.Generator().manual_seed(0)
     both = torch.rand(count, 4, height, width, generator=generator)
     return both[:, :3], both[:, 3:]
-
-
-def generator(seed: int = 0) -> torch.Generator:
-    """A generator of a step."""
-    return torch.Generator().manual_seed(seed)

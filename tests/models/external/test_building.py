@@ -1,23 +1,31 @@
-"""Classes of checkouts are found and called; every mistake is one sentence."""
+"""Networks of checkouts are built, directly or by adapters; each mistake names its setting."""
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 import torch
 
 from rgbt.checks import InputError
-from rgbt.models.external.building import namespace
-from tests.models.external.standins import HEAD, STACKED, external, images, write_checkout
+from rgbt.files.adapters import adapter_of
+from rgbt.models.external.adapting import Untrained, replaced
+from tests.models.external.standins import (
+    HEAD,
+    STACKED,
+    external,
+    images,
+    own_process,  # noqa: F401 - used by every test
+    write_checkout,
+)
 
 NAMESPACE = f"""{HEAD}
 class Net(Base):
     def __init__(self, cfg=None, norm_layer=nn.BatchNorm2d):
         super().__init__(cfg.num_classes if "num_classes" in cfg else cfg["k"])
         self.names = [each for each in cfg.modals], cfg.deep.eps
-    def forward(self, x):
-        return self.conv(x)
 """
 
 
@@ -29,72 +37,60 @@ def test_namespaces_have_attributes_and_keys(tmp_path: Path) -> None:
     del cfg["deep"]
     with pytest.raises(InputError, match="the namespace has no value 'deep'"):
         external(folder, arguments={}, namespaces={"cfg": cfg})
-    assert not hasattr(namespace({"a": 1}), "b")
-
-
-HOLLOW = """
-def hollow(n_class):
-    return Net(n_class).to("meta")
-"""
 
 
 @pytest.mark.parametrize(
-    ("changes", "reason"),
+    ("changes", "key"),
     [
+        ({"constructor": "model.nets:Net"}, r"constructor=model.nets:Net: ModuleNotFoundError"),
+        ({"constructor": "model.net:Nett"}, "constructor=model.net:Nett: AttributeError"),
+        ({"constructor": "os:system"}, "constructor=os:system: os is not a module of"),
+        ({"constructor": "none.py:network"}, "constructor=none.py:network: FileNotFoundError"),
         (
-            {"constructor": "model.nets:Net"},
-            r"the module model\.nets is not in the checkout .*root",
+            {"constructor": "model.net:build", "arguments": {}},
+            "constructor=model.net:build returned int 3",
         ),
-        ({"constructor": "model.net:Nett"}, r"has no class or function 'Nett'; .*'Net'\?"),
-        ({"constructor": "os:system"}, "the module os is not in the checkout"),
-        ({"constructor": "model.net:build", "arguments": {}}, "returned int 3; expected a torch"),
-        ({"arguments": {"classes": 3}}, r"takes \(n_class, channels=4\), but got classes"),
-        ({"arguments": {}}, "missing a required argument: 'n_class'"),
-        ({"arguments": {"n_class": "x"}}, r"cannot be built: TypeError: .*model/net.py, line 8"),
-        ({"constructor": "model.stops:Net"}, "cannot be imported: SystemExit: 2"),
-        ({"constructor": "model.net:hollow"}, r"builds parameters without values \(device meta"),
-        ({"constructor": "model.wrong:Net"}, r"cannot be imported: SyntaxError: .*"),
-        ({"constructor": "model.scans:Net"}, r"'scan_cuda'.* compiled for CUDA: .* its sources"),
+        ({"arguments": {"classes": 3}}, "constructor=.*unexpected keyword argument 'classes'"),
+        ({"constructor": "model.stops:Net"}, "constructor=model.stops:Net: SystemExit: 2"),
+        ({"root": "nowhere"}, "checkout: no such folder: .*nowhere"),
+        ({"root": "../evil"}, "root=../evil leads out of model.checkout="),
+        ({"root": "link"}, "root=link leads out of model.checkout="),
     ],
 )
-def test_mistakes_are_one_sentence(tmp_path: Path, changes: dict[str, object], reason: str) -> None:
-    folder = write_checkout(
-        tmp_path,
-        {
-            "model/__init__.py": "",
-            "model/net.py": f"{STACKED}\ndef build():\n    return 3\n{HOLLOW}",
-            "model/stops.py": "raise SystemExit(2)",
-            "model/wrong.py": "def",
-            "model/scans.py": "import scan_cuda",
-        },
-    )
-    with pytest.raises(InputError, match=reason) as info:
+def test_mistake_names_its_setting(tmp_path: Path, changes: dict[str, object], key: str) -> None:
+    files = {"model/net.py": f"{STACKED}\ndef build():\n    return 3\n"}
+    folder = write_checkout(tmp_path / "code", {**files, "model/stops.py": "raise SystemExit(2)"})
+    evil = write_checkout(tmp_path / "evil", {"model/net.py": "raise KeyboardInterrupt"})
+    (folder / "link").symlink_to(evil)
+    with pytest.raises(InputError, match=rf"^model\.{key}"):
         external(folder, **changes)
-    assert "\n" not in str(info.value)
 
 
-CUDA = STACKED.replace(
-    "super().__init__()", "super().__init__()\n        self.index = torch.tensor([1.5]).cuda()"
-).replace("return self.conv(x)", "return self.conv(x) + torch.ones(1).cuda() * self.index")
+def test_second_checkout_of_a_process_is_refused(tmp_path: Path) -> None:
+    first = external(write_checkout(tmp_path / "a", {"model/net.py": STACKED}))
+    again = external(tmp_path / "a")
+    assert type(again.network) is type(first.network)
+    other = write_checkout(tmp_path / "b", {"model/net.py": STACKED})
+    with pytest.raises(InputError, match="use another process"):
+        external(other)
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="there the calls are no mistake")
-def test_cuda_calls_need_a_gpu_or_are_moved(tmp_path: Path) -> None:
-    folder = write_checkout(tmp_path, {"model/net.py": CUDA})
-    with pytest.raises(InputError, match=r"requires CUDA: .* model\.moves_cuda=true"):
-        external(folder)
-    net = external(folder, moves_cuda=True).eval()
-    with torch.no_grad():
-        for parameter in net.parameters():
-            parameter.zero_()
-    assert torch.equal(net(*images()).logits, torch.full((2, 3, 8, 12), 1.5))
-    with pytest.raises((AssertionError, RuntimeError), match="CUDA|NVIDIA"):
-        torch.ones(1).cuda()
+def test_module_of_another_folder_is_not_taken_for_the_checkouts(tmp_path: Path) -> None:
+    mine = ModuleType("model.net")
+    mine.Net = torch.nn.Identity  # type: ignore[attr-defined]
+    sys.modules["model.net"] = mine
+    with pytest.raises(InputError, match=r"model\.net is not a module of"):
+        external(write_checkout(tmp_path, {"model/net.py": STACKED}))
 
 
-def test_plain_tensors_of_modules_move_with_the_network(tmp_path: Path) -> None:
-    net = external(write_checkout(tmp_path, {"model/net.py": CUDA}), moves_cuda=True)
-    assert net.double().network.index.dtype == torch.float64
+def test_network_may_import_when_it_is_called(tmp_path: Path) -> None:
+    lazy = STACKED.replace("return", "from model.late import TWO\n        return TWO *")
+    files = {"model/net.py": lazy, "model/late.py": "TWO = 2", "json.py": "raise SystemExit"}
+    net = external(write_checkout(tmp_path, files)).eval()
+    rgb, thermal = images()
+    expected = 2 * net.network.conv(torch.cat([rgb, thermal], 1))
+    torch.testing.assert_close(net(rgb, thermal).logits, expected)
+    assert sys.path[-1] == str(tmp_path)  # nothing of ours is looked for there first
 
 
 def test_weights_follow_the_generator_also_of_numpy(tmp_path: Path) -> None:
@@ -113,3 +109,76 @@ def test_weights_follow_the_generator_also_of_numpy(tmp_path: Path) -> None:
     (first, weight), (again, same), (other, _) = built(0), built(0), built(1)
     assert first == again != other
     assert torch.equal(weight, same)
+
+
+# ---- adapters -------------------------------------------------------------------------------
+
+ODD = f"""
+import absent.tools as tools
+from absent.registry import ARCH, twice
+{HEAD}
+@ARCH.register()
+class Unused(nn.Module):
+    pass
+
+class Net(Base):
+    def __init__(self, n_class):
+        super().__init__(n_class)
+        self.two = twice(1)
+        self.load_state_dict(torch.load("/home/author/pretrained.pth"), strict=False)
+        self.index = torch.tensor([1.5]).cuda()
+
+    def forward(self, x):
+        return self.conv(x) + self.index
+"""
+ADAPTER = """
+import torch
+from rgbt.models.external.adapting import allow_cpu, replace_in, replaced, skip_init, stand_in
+
+
+def network(n_class):
+    skip_init("toolbox")
+    stand_in("absent.tools")
+    stand_in("absent.registry", twice=lambda value: 2 * value)
+    allow_cpu()
+    from toolbox.net import Net
+
+    replace_in(Net, torch=replaced(torch, load=lambda _: {}))
+    return Net(n_class)
+"""
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="`.cuda()` is no mistake there")
+def test_adapter_builds_an_odd_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for kind in (torch.Tensor, torch.nn.Module):
+        monkeypatch.setattr(kind, "cuda", kind.cuda)  # restored after the test
+    monkeypatch.setenv("RGBT_CONF", f"{tmp_path / 'none'},{tmp_path / 'conf'}")
+    write_checkout(tmp_path / "conf/model/external", {"odd.py": ADAPTER})
+    files = {"toolbox/__init__.py": "raise SystemExit", "toolbox/net.py": ODD}
+    folder = write_checkout(tmp_path / "code", files)
+    load = torch.load
+    for _ in range(2):
+        net = external(folder, constructor="odd.py:network").eval()
+    rgb, thermal = images()
+    expected = net.network.conv(torch.cat([rgb, thermal], 1)) + 1.5
+    torch.testing.assert_close(net(rgb, thermal).logits, expected)
+    assert net.network.two == 2
+    assert torch.load is load
+
+
+def test_untrained_functions_ignore_pretrained() -> None:
+    module = ModuleType("zoo")
+    module.build = lambda depth, pretrained=False: (depth, pretrained)  # type: ignore[attr-defined]
+    assert Untrained(module).build(18, pretrained=True) == (18, False)
+    changed = replaced(module, build=1)
+    assert (changed.build, module.build(2)) == (1, (2, False))  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("name", ["../external/gmnet.py", "/tmp/gmnet.py", "none.py"])  # noqa: S108
+def test_adapter_lies_beside_a_recipe(name: str) -> None:
+    assert adapter_of("model.net:Net") is None
+    found = adapter_of("gmnet.py:network")
+    assert found is not None
+    assert found.with_suffix(".yaml").is_file()
+    with pytest.raises(FileNotFoundError):
+        adapter_of(f"{name}:network")

@@ -9,18 +9,12 @@ from typing import Any
 from rgbt.checks import InputError
 from rgbt.runs.folder import RunFolder
 from rgbt.runs.result import RunResult
-from sweeps.rendering.times import time_line, upstream_line
+from sweeps.rendering.times import time_lines
 
 
 def took(folder: Path, seconds: float) -> RunResult:
     RunFolder(folder).finish({"key": folder.name, "seconds_of_last_process": seconds})
     return RunResult(folder)
-
-
-def test_time_line_counts_each_run_once(tmp_path: Path) -> None:
-    """60 + 80 + 1,000 s are 19 minutes, and the middle one is 80 s."""
-    runs = [took(tmp_path / str(seconds), seconds) for seconds in (60, 80, 1000)]
-    assert time_line([*runs, runs[0]]) == "Time: 3 runs, 19 min in total, 80 s for a run (median)."
 
 
 @dataclass(frozen=True)
@@ -40,30 +34,32 @@ class Spec:
         return (self.folder / "result.json").exists()
 
 
-def planner_of(specs: dict[str, Spec]) -> Any:
+def test_time_lines_count_each_run_once(tmp_path: Path) -> None:
+    """Two rows share a start, which has a teacher; one row has a start of its own."""
+    runs = [took(tmp_path / str(seconds), seconds) for seconds in (60, 80, 1000)]
+    teacher = Spec("teacher", took(tmp_path / "t", 40).folder)
+    shared = Spec("start", took(tmp_path / "s", 200).folder, (teacher,))
+    rows = {
+        "a": Spec("crm", tmp_path / "a", (shared,)),
+        "b": Spec("baseline", tmp_path / "b", (shared,)),
+        "c": Spec("grbm", tmp_path / "c", (Spec("start", tmp_path / "o"),)),
+    }
+
     class Planner:
         base = ("runs_dir=x",)
 
         def specify(self, words: tuple[str, ...]) -> Spec:
             assert words[:1] == self.base
-            if words[1] not in specs:
+            if words[1] not in rows:
                 raise InputError("no such row")
-            return specs[words[1]]
+            return rows[words[1]]
 
-    return Planner()
-
-
-def test_upstream_line_counts_shared_and_indirect_runs_once(tmp_path: Path) -> None:
-    """Two rows share a start, which has a teacher; one row has a start of its own."""
-    teacher = Spec("teacher", took(tmp_path / "t", 40).folder)
-    shared = Spec("start", took(tmp_path / "s", 200).folder, (teacher,))
-    own = Spec("start", tmp_path / "o")
-    rows = {
-        "a": Spec("crm", tmp_path / "a", (shared,)),
-        "b": Spec("baseline", tmp_path / "b", (shared,)),
-        "c": Spec("grbm", tmp_path / "c", (own,)),
-    }
-    line = upstream_line([("a",), ("b",), ("c",), ("wrong",)], planner_of(rows))
-    assert line == (
-        "Upstream of these: 3 runs (start: 1 of 2 finished, 3 min; teacher: 1 of 1 finished, 40 s)."
-    )
+    planner: Any = Planner()
+    words = [("a",), ("b",), ("c",), ("wrong",)]
+    assert time_lines([*runs, runs[0]], words, planner) == [
+        # 60 + 80 + 1,000 s are 19 minutes, and the middle one is 80 s.
+        "Time: 3 runs, 19 min in total, 80 s for a run (median).",
+        "Upstream of these: 3 runs (start: 1 of 2 finished, 3 min; "
+        "teacher: 1 of 1 finished, 40 s).",
+    ]
+    assert time_lines([], [("wrong",)], planner) == []

@@ -9,8 +9,7 @@ from omegaconf import DictConfig
 from rgbt.config.compose import conf_dir, flatten, register_resolvers
 from rgbt.runs.specify import specify
 from sweeps.settings import read_settings
-from sweeps.space.samplers import build_pruner, build_sampler
-from sweeps.space.space import Space, ends, parse_space
+from sweeps.space import Space, build_pruner, build_sampler, ends, parse_space
 from tests.models.golden import compose
 
 FILES = sorted(path.stem for path in (conf_dir() / "search").glob("*.yaml"))
@@ -56,7 +55,3 @@ def test_search_ranges_hold_the_published_values() -> None:
     assert discrete["loss.spatial.alpha"].choices == (0, 1, 1.5, 2, 2.5, 3)  # type: ignore[union-attr]
     # Temporal, Table III: 0.5, 1 and 2 for both.
     assert ends(space_of("temporal"))[1] == ("loss.alpha=2.0", "loss.beta=2.0")
-    released = flatten(compose("+experiment=crm"))
-    for low_word, high_word in zip(*ends(space_of("loss")), strict=True):
-        key, low_text = low_word.split("=")
-        assert float(low_text) < released[key] < float(high_word.split("=")[1])

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pandas as pd
 import pytest
 
-from rgbt.checks import InputError
 from rgbt.evaluation import profile
-from sweeps.table.efficiency import efficiency_cells, million_parameters
+from sweeps.table.efficiency import efficiency_cells
 from sweeps.table.request import TableRequest
 from sweeps.table.table import Column, Row
 from tests.sweeps.tabled import table
@@ -22,42 +23,28 @@ MFNET = 736_275
 """As its authors count it, at nine classes."""
 
 
-def unit(channels_in: int, channels_out: int) -> int:
-    """A 3 x 3 convolution with bias and the batch normalisation behind it."""
-    return 9 * channels_in * channels_out + channels_out + 2 * channels_out
+FOURTEEN = MFNET + 5 * (9 * 32 + 1 + 2)
+"""With fourteen classes: convolutions of 3 x 3 with bias, and the batch normalisation behind."""
 
 
 def wanted(*rows: Row, columns: tuple[Column, ...] = (SIZE,), **others: Any) -> TableRequest:
     return TableRequest("own/t", table(rows, columns, **others), "demo", (0, 1))
 
 
-def test_parameters_by_hand() -> None:
-    nine = million_parameters(["scale=paper", "model=mfnet"])
-    assert nine * 1e6 == pytest.approx(MFNET)
-    fourteen = million_parameters(["scale=paper", "model=mfnet", "dataset.num_classes=14"])
-    assert fourteen * 1e6 == pytest.approx(MFNET - unit(32, 9) + unit(32, 14))
-
-
 def test_parameter_cells_use_paper_scale() -> None:
     row = Row(label="a", experiment="crm", at={"paper": ("model=mfnet",)})
-    cells = efficiency_cells(wanted(row))
-    cell = cells["a", "size"]
+    cell = efficiency_cells(wanted(row))["a", "size"]
     assert cell.mean * 1e6 == pytest.approx(MFNET)
     assert (cell.seeds, cell.keys, cell.reason, math.isnan(cell.sd)) == (0, (), "", True)
 
 
 def test_parameter_cells_follow_overrides_and_report_errors() -> None:
-    rows = (
-        Row(label="a", experiment="crm", overrides=("model=mfnet",)),
-        Row(label="b", experiment="crm", overrides=("model=mfnte",)),
-    )
+    rows = (ROWS[0], replace(ROWS[3], label="b"))
     asked = TableRequest("own/t", table(rows, (SIZE,)), "demo", (0,), ("model.num_classes=14",))
     cells = efficiency_cells(asked)
-    assert cells["a", "size"].mean * 1e6 == pytest.approx(MFNET - unit(32, 9) + unit(32, 14))
+    assert cells["a", "size"].mean * 1e6 == pytest.approx(FOURTEEN)
     assert cells["b", "size"].mark == "no value"
     assert "there is no model 'mfnte'; did you mean 'mfnet" in cells["b", "size"].reason
-    with pytest.raises(InputError, match=r"model\.width"):
-        million_parameters(["model=mfnet", "+model.width=3"])
 
 
 ALL = (
@@ -81,20 +68,12 @@ ROWS = (
 )
 
 
-@dataclass(frozen=True)
-class FakeProfile:
-    """Stands for `rgbt.evaluation.profile.Profile`."""
-
-    setup: Mapping[str, Any]
-    networks: pd.DataFrame
-
-
 @pytest.fixture
 def calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, Any]]:
     """The calls of the profile; the second network is slower and larger."""
     called: list[tuple[Any, Any]] = []
 
-    def fake(networks: Sequence[Any], settings: Any) -> FakeProfile:
+    def fake(networks: Sequence[Any], settings: Any) -> SimpleNamespace:
         called.append((networks, settings))
         rows = []
         for number, network in enumerate(networks, start=1):
@@ -102,7 +81,8 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, Any]]:
             values = {"peak_memory": 2**20 * number, "ratio": 1 + 1.1 * (number - 1), **times}
             values = values if settings.measure else dict.fromkeys(values)
             rows.append({"name": network.name, "flops": number * 10**9, **values})
-        return FakeProfile({"device": "cpu", "threads": 2, "torch": "2"}, pd.DataFrame(rows))
+        setup = {"device": "cpu", "threads": 2, "torch": "2"}
+        return SimpleNamespace(setup=setup, networks=pd.DataFrame(rows))
 
     monkeypatch.setattr(profile, "profile", fake)
     return called
@@ -140,10 +120,7 @@ def test_counted_columns_measure_nothing(calls: list[tuple[Any, Any]]) -> None:
 
 
 def test_failed_profile_is_the_reason_of_a_cell(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: object) -> None:
-        raise RuntimeError("no memory")
-
-    monkeypatch.setattr(profile, "profile", fail)
+    monkeypatch.setattr(profile, "profile", Mock(side_effect=RuntimeError("no memory")))
     cells = efficiency_cells(wanted(*ROWS[:1], columns=ALL))
     assert (cells["a", "fps"].reason, cells["a", "fps"].mark) == ("no memory", "no value")
     assert cells["a", "size"].mean * 1e6 == pytest.approx(MFNET)

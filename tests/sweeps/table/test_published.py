@@ -121,14 +121,3 @@ def test_claims_agree_with_printed_numbers_or_are_listed() -> None:
     listed = {each.strip(): False for each in CONTRADICTED.split(",")}
     listed |= {each.strip(): None for each in NOT_PRINTED.split(",")}
     assert {key: word for key, word in found.items() if word is not True} == listed
-
-
-@pytest.mark.parametrize("name", OURS)
-def test_texts_of_a_table_are_short_sentences(name: str) -> None:
-    table = OURS[name]
-    assert set(table.forms) in ({"paper", "released"}, set())
-    texts = [*table.forms.values(), *(claim.says for claim in table.claims)]
-    texts += [remark for claim in table.claims for remark in claim.remarks]
-    texts += [text for row in table.rows if row.released for text in row.released.remarks]
-    for sentence in (each for text in texts for each in re.split(r"(?<=\.) ", text)):
-        assert len(sentence.split()) <= 25, sentence

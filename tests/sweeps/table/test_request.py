@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -10,16 +9,15 @@ from rgbt.checks import InputError
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Outcome
 from sweeps.table.claim import Claim
-from sweeps.table.load_table import load_table
-from sweeps.table.make_request import (
+from sweeps.table.request import TableRequest, seeds_of
+from sweeps.table.table import Column, Row
+from sweeps.table_plan import (
     TableWords,
     check_equal_runs,
     make_request,
     read_named,
     select_rows,
 )
-from sweeps.table.request import TableRequest, seeds_of
-from sweeps.table.table import Column, Row
 from sweeps.worker.planner import Planner
 from tests.sweeps.tabled import table
 
@@ -59,9 +57,7 @@ def test_points_share_runs_of_equal_rows() -> None:
 
 def test_frames_are_evaluated_whatever_the_regions_of_the_table() -> None:
     columns = (
-        Column(name="mIoU", metric="mIoU"),
-        Column(name="TC", metric="TC", frames="released"),
-        Column(name="CA", metric="CA_released", frames="released"),
+        *(Column(name="mIoU", metric="mIoU"), Column(name="TC", metric="TC", frames="released")),
         Column(name="TC aligned", metric="TC", frames="aligned", printed=False),
     )
     for regions, others in (("as trained", ()), ("ring9", (ExtraEvaluation(regions="ring9"),))):
@@ -76,29 +72,18 @@ def test_frames_are_evaluated_whatever_the_regions_of_the_table() -> None:
 def test_outcomes_go_back_to_their_cells() -> None:
     asked = wanted()
     outcomes = [Outcome(point, "failed", point.label) for point in asked.points()]
-    runs = asked.runs(outcomes)
-    assert {place: run.reason for place, run in runs.items()} == {
-        ("small", 0): "small (and 1 more) seed=0",
-        ("large", 0): "small (and 1 more) seed=0",
-        ("other", 0): "other seed=0",
-        ("small", 2): "small (and 1 more) seed=2",
-        ("large", 2): "small (and 1 more) seed=2",
-        ("other", 2): "other seed=2",
+    first = {"small": "small (and 1 more)", "large": "small (and 1 more)", "other": "other"}
+    assert {place: run.reason for place, run in asked.runs(outcomes).items()} == {
+        (row, seed): f"{label} seed={seed}" for seed in (0, 2) for row, label in first.items()
     }
 
 
-@pytest.mark.parametrize(
-    ("text", "seeds"),
-    [("3", (0, 1, 2)), ("1", (0,)), ("4,7", (4, 7)), ("[5,0]", (5, 0)), ("[7]", (7,))],
-)
-def test_seeds(text: str, seeds: tuple[int, ...]) -> None:
-    assert seeds_of(text) == seeds
-
-
-@pytest.mark.parametrize("text", ["0", "", "a", "1,1", "-2", "1.5", "1,"])
-def test_no_seeds(text: str) -> None:
-    with pytest.raises(InputError, match="^seeds="):
-        seeds_of(text)
+def test_seeds_are_a_number_or_a_list() -> None:
+    for text, seeds in {"3": (0, 1, 2), "1": (0,), "4,7": (4, 7), "[5,0]": (5, 0)}.items():
+        assert seeds_of(text) == seeds
+    for text in ("0", "", "a", "1,1", "-2", "1.5", "1,"):
+        with pytest.raises(InputError, match="^seeds="):
+            seeds_of(text)
 
 
 def test_rows_of_different_networks_start_from_separate_files() -> None:
@@ -178,19 +163,3 @@ def test_rows_that_are_one_run_are_refused_unless_the_table_says_so() -> None:
         check_equal_runs(TableRequest("own/t", table((first, third)), "demo", (0,)), Planner())
     third = replace(third, same_as="b")
     check_equal_runs(TableRequest("own/t", table((first, same, third)), "demo", (0,)), Planner())
-
-
-@pytest.mark.parametrize(
-    ("words", "is_refused"),
-    [
-        (("masker=grbm_released", "masker.sigma_div=4"), True),
-        (("recipe.batch_size=1", "dataset.root=/data", "model.queries=8"), False),
-    ],
-)
-def test_overrides_that_make_rows_equal_are_refused(
-    words: tuple[str, ...], is_refused: bool
-) -> None:
-    made = select_rows(load_table("spatialseg/table3"), "Ny,Ny/4")
-    request = TableRequest("t", made, "demo", (0,), words)
-    with pytest.raises(InputError, match="'Ny' and 'Ny/4'") if is_refused else nullcontext():
-        check_equal_runs(request, Planner())

@@ -107,26 +107,18 @@ def test_score_details_have_own_counts() -> None:
 
 def test_score_sizes_have_marks_without_seeds() -> None:
     size = Column(name="size", efficiency="parameters", best="lowest")
-    rows = tuple(
-        Row(label=label, experiment="crm", values={"size": printed})
-        for label, printed in (("a", 54.4), ("b", 44.6), ("c", 50.0))
-    )
-    sizes = {
-        (label, "size"): TableCell(millions, math.nan, 0)
-        for label, millions in (("a", 54.36), ("b", 44.56), ("c", 51.0))
-    }
-    found = score("t", table(rows, (ACC, size)), BOTH, scale="demo", sizes=sizes)
-    assert found.cells["a", "acc"].seeds == 2
-    assert found.cells["b", "size"].mean == 44.56
-    assert size_marks(found.table, sizes) == {("b", "size"): 1, ("c", "size"): 2}
-    shared = sizes | {("c", "size"): TableCell(44.56, math.nan, 0)}
-    assert size_marks(found.table, shared) == {
-        **{("b", "size"): 1, ("c", "size"): 1, ("a", "size"): 2}
-    }
-    equal = {each: TableCell(1.0, math.nan, 0) for each in sizes}
-    assert size_marks(found.table, equal) == {}
-    assert found.difference(rows[0], size) == pytest.approx(-0.04)
-    assert scored((size,), {}, rows).cells == {}
+    rows = tuple(Row(label=label, experiment="crm") for label in "abc")
+
+    def marks(*millions: float) -> dict[str, int]:
+        pairs = zip("abc", millions, strict=True)
+        cells = {(label, "size"): TableCell(each, math.nan, 0) for label, each in pairs}
+        found = score("t", table(rows, (ACC, size)), BOTH, scale="demo", sizes=cells)
+        assert found.cells["b", "size"].mean == millions[1]
+        return {label: rank for (label, _), rank in size_marks(found.table, cells).items()}
+
+    assert marks(54.36, 44.56, 51.0) == {"b": 1, "c": 2}
+    assert marks(54.36, 44.56, 44.56) == {"b": 1, "c": 1, "a": 2}
+    assert marks(1.0, 1.0, 1.0) == {}
 
 
 def test_score_failed_seed_keeps_reason() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from sweeps.table.load_table import load_table
-from sweeps.table.make_request import TableWords, make_request
+from sweeps.table_plan import TableWords, make_request
 from sweeps.worker.planner import Planner
 
 MISSING = "missing_image"

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import pytest
 
 from rgbt.metrics.counts import Counts
@@ -18,30 +16,20 @@ from tests.sweeps.tabled import counts_of, failed, outcome, table
 WHOLE = Part()
 """All combinations of the levels."""
 
+NT = ("noise", "texture")
 CELLS = ("N-T-", "N-T+", "N+T-", "N+T+")
 
 
 def design_table(trained: Part | None = WHOLE, tested: Part | None = None) -> Table:
-    factors = tuple(
-        DesignFactor(
-            letter=letter,
-            name=name,
-            low=(f"dataset.{name}=0",),
-            high=(f"dataset.{name}=1",),
-            low_means="little",
-            high_means="much",
-        )
-        for letter, name in (("N", "noise"), ("T", "texture"))
-    )
+    levels = {name: {"low": (f"dataset.{name}=0",), "high": (f"dataset.{name}=1",)} for name in NT}
+    means = {"low_means": "little", "high_means": "much"}
+    baseline = DesignMethod(name="baseline", experiment="baseline")
     design = Design(
-        factors=factors,
-        methods=(
-            DesignMethod(name="baseline", experiment="baseline"),
-            DesignMethod(name="crm", experiment="crm", against="baseline"),
+        factors=tuple(
+            DesignFactor(letter=name[0].upper(), name=name, **levels[name], **means) for name in NT
         ),
-        outcomes=("contrast",),
-        trained=trained,
-        tested=tested,
+        methods=(baseline, DesignMethod(name="crm", experiment="crm", against="baseline")),
+        **{"outcomes": ("contrast",), "trained": trained, "tested": tested},  # type: ignore[arg-type]
     )
     columns = (
         Column(name="one", metric="region/1"),
@@ -131,13 +119,3 @@ def test_networks_tested_in_worlds_use_the_counts_of_each_world() -> None:
     found = estimates(table, runs)
     assert found["baseline", "", "noise"].value == pytest.approx(EFFECT)
     assert ("crm", "", "noise") not in found
-
-
-def test_scenes_are_paired_although_labels_differ() -> None:
-    """A factor that adds objects changes labels, which comparisons of rows refuse."""
-    runs = trained()
-    more = with_rates(0.8, 0.9)
-    doubled = replace(more, counts=np.asarray(more.counts * 2))
-    runs["baseline N+T+", 0] = outcome("other labels", doubled)
-    found = estimates(design_table(), runs)
-    assert found["baseline", "", "noise"].value == pytest.approx(EFFECT, abs=0.5)

@@ -11,7 +11,7 @@ from analysis.uncertainty.contrasts import FIXED
 from sweeps.point import Outcome
 from sweeps.table.claim import Claim
 from sweeps.table.table import Column, Row, Table
-from sweeps.verdicts.judge import CellRunId, JudgedClaim, TableJudge
+from sweeps.verdicts.judge import CellRunId, JudgedClaim, TableJudge, as_claimed
 from tests.sweeps.tabled import failed, outcome, table
 from tests.sweeps.verdicts.accuracies import accuracy, planted
 
@@ -109,6 +109,11 @@ def test_predictions_without_seeds_are_compared_with_every_seed() -> None:
     assert found.word == "holds"
     assert found.verdict is not None
     assert found.verdict.seeds == 3
+
+
+def test_most_are_more_than_half() -> None:
+    most = claim(rows=("high",), combine="most")
+    assert [as_claimed(most, values) for values in ((1.0, -1.0), (1.0, -1.0, 2.0))] == [False, True]
 
 
 def test_mean_and_any_combine_contrasts() -> None:

@@ -16,11 +16,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from optuna import get_all_study_names
 
 from sweeps import attributes as names
 from sweeps.worker import driver as drivers
 from sweeps.worker import storage as stores
-from sweeps.worker.storage import load_study, open_storage, study_names
+from sweeps.worker.storage import load_study, open_storage
 from tests.sweeps.fakes import list_desk, points, scored, search_desk, until
 
 
@@ -49,7 +50,7 @@ def end(process: BaseProcess) -> int | None:
 
 def trials_of(runs: Path, url: str) -> list[Any]:
     storage = open_storage(url, runs)
-    return load_study("study", storage).trials if "study" in study_names(storage) else []
+    return load_study("study", storage).trials if "study" in get_all_study_names(storage) else []
 
 
 def until_running(runs: Path, url: str) -> None:

@@ -34,11 +34,8 @@ def test_plan_uses_run_key_of_command(planner: Planner, base: tuple[str, ...]) -
     (run,) = plan.runs
     assert run.key == plan.key == specify(compose([*base, *plan.point.overrides])).key
     assert run.overrides == (*base, *plan.point.overrides)
-    assert (run.trainer.max_steps, run.scale.pixel_factor, plan.point.label) == (
-        6,
-        0.5,
-        "patch_size=32",
-    )
+    shown = (run.trainer.max_steps, run.scale.pixel_factor, plan.point.label)
+    assert shown == (6, 0.5, "patch_size=32")
     assert planner.plan(Point("p", plan.point.overrides[1:], seeds=(3,))).key == plan.key
 
 
@@ -77,17 +74,11 @@ def test_the_data_set_is_named_by_its_files(planner: Planner, data: Path) -> Non
     ("override", "said"),
     [
         ("masker.sigma=1", "'masker.sigma' is not a key of the configuration"),
-        ("masker=grid", "there is no masker 'grid'"),
-        ("trainer.max_steps=many", "trainer.max_steps"),
-        ("+masker.sigma=1", "'masker.sigma' is not a setting"),
-        ("masker", "'masker'"),
         ("dataset.root=/nowhere/to/be/found", "/nowhere/to/be/found"),
     ],
 )
-def test_conflicting_settings_are_reported_in_one_sentence(
+def test_wrong_settings_are_reported_in_one_line(
     planner: Planner, override: str, said: str
 ) -> None:
-    with pytest.raises(InputError) as error:
+    with pytest.raises(InputError, match=rf"^[^\n]*{said}[^\n]*$"):
         planner.plan(Point("p", (override,)))
-    assert said in str(error.value)
-    assert "\n" not in str(error.value)

@@ -19,7 +19,7 @@ from rgbt.runs.result import RunResult
 from rgbt.tracking.mlflow_store import NoTracking
 from sweeps import attributes as names
 from sweeps.evaluation import ExtraEvaluation
-from sweeps.point import COLOUR, Outcome, Point, colour
+from sweeps.point import Outcome, Point
 from sweeps.worker import driver as drivers
 from sweeps.worker import point_list
 from sweeps.worker.planner import PlannedPoint
@@ -34,16 +34,14 @@ from sweeps.worker.point_list import (
     run_points,
 )
 from sweeps.worker.run_store import RunStore
-from sweeps.worker.trial_sources import ClaimedTrial
+from sweeps.worker.running_trial import ClaimedTrial
 from tests.sweeps.fakes import (
     Desk,
     FakeExecutor,
     FakePlanner,
-    fail,
     finish,
     list_desk,
     memory,
-    only,
     plan_of,
     points,
     quick,
@@ -77,22 +75,15 @@ def test_run_points_strict_with_wrong_point_starts_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_run_points_without_strict_runs_the_other_points(
-    tmp_path: Path, executor: FakeExecutor
-) -> None:
-    outcomes = run_points(a_list(tmp_path, "x=0", "wrong", "x=1"), settings())
-    assert [each.state for each in outcomes] == ["finished", "failed", "finished"]
-    assert len(executor.calls) == 2
-
-
-def test_all_points_wrong_is_an_error_of_the_command(
-    tmp_path: Path, executor: FakeExecutor
-) -> None:
+def test_wrong_points_fail_unless_all_are_wrong(tmp_path: Path, executor: FakeExecutor) -> None:
     with pytest.raises(InputError, match=r"^wrong=1 is no key"):
         preview_points(a_list(tmp_path, "wrong", "wrong"), settings())
     previews = preview_points(a_list(tmp_path, "wrong", "x=1"), settings())
     assert [outcome.state for outcome in previews] == ["failed", "waiting"]
     assert list(tmp_path.iterdir()) == []
+    outcomes = run_points(a_list(tmp_path, "x=0", "wrong", "x=1"), settings())
+    assert [each.state for each in outcomes] == ["finished", "failed", "finished"]
+    assert len(executor.calls) == 2
 
 
 @pytest.mark.parametrize(("trust", "is_refused"), [("", True), ("my_lab", False)])
@@ -128,7 +119,7 @@ def test_equal_points_are_one_run_and_share_their_tags(tmp_path: Path) -> None:
     source = ListSource(replace(a_list(tmp_path), points=rows), settings(), SameRun())  # type: ignore[arg-type]
     found: list[PlannedPoint] = []
     source.outcomes(lambda plan: found.append(plan) or Outcome(plan.point, "waiting"))
-    tags = {"table": "1 | 1.0", VARIED: "x", COLOUR: colour("s", 0)}
+    tags = {"table": "1 | 1.0", VARIED: "x"}
     assert [plan.point.tags for plan in found] == [tags, tags]
 
 
@@ -178,6 +169,15 @@ def test_a_point_whose_run_was_deleted_is_run_again(tmp_path: Path) -> None:
     assert taken(desk).number == 1
 
 
+def test_failed_point_that_was_run_by_hand_is_finished(tmp_path: Path) -> None:
+    storage = memory()
+    before = list_desk(tmp_path, points(1), storage=storage)
+    before.store.fail(taken(before).number, "a bad day", {})
+    assert before.source.states() == ["failed"]
+    finish(tmp_path / before.plans[0].key)
+    assert list_desk(tmp_path, points(1), storage=storage).source.states() == ["finished"]
+
+
 def test_finished_runs_require_all_runs_and_evaluations(tmp_path: Path) -> None:
     ring = ExtraEvaluation(regions="ring9")
     plan = plan_of(Point("p", (), seeds=(0, 1), evaluations=(ring,)))
@@ -217,37 +217,22 @@ def test_run_points_resumed_continues_behind_the_added_points(
     assert executor.started() == [(f"x={x}",) for x in range(5)], "nothing is run twice"
 
 
-def test_run_points_failed_added_point_ends_the_list(
-    tmp_path: Path, executor: FakeExecutor
-) -> None:
-    executor.behaviour = only("x=1", fail)
-    outcomes = run_points(a_list(tmp_path, "x=0", more=growing(3)), settings())
-    assert [outcome.state for outcome in outcomes] == ["finished", "failed"]
-    assert outcomes[1].reason == "ValueError: a bad day"
-
-
-def made(folder: Path, seconds: float) -> Outcome:
-    run = finish(folder)
-    (folder / "result.json").write_text(f'{{"seconds_of_last_process": {seconds}}}')
-    return Outcome(Point("p", ()), "finished", results=(RunResult(run.path),))
-
-
 def test_estimated_seconds_is_median_of_untrained_over_workers(tmp_path: Path) -> None:
-    known = [made(tmp_path / str(seconds), seconds) for seconds in (10, 20, 90)]
-    left = [Outcome(Point("q", ()), state) for state in ("waiting", "failed", "running")]
-    assert estimated_seconds([*known, *left], 1) == 40.0  # type: ignore[list-item]
-    assert estimated_seconds([*known, *left], 2) == 20.0  # type: ignore[list-item]
+    known = []
+    for seconds in (10, 20, 90):
+        folder = finish(tmp_path / str(seconds)).path
+        (folder / "result.json").write_text(f'{{"seconds_of_last_process": {seconds}}}')
+        known.append(Outcome(Point("p", ()), "finished", results=(RunResult(folder),)))
+    left: list[Any] = [Outcome(Point("q", ()), state) for state in ("waiting", "failed", "running")]
+    assert [estimated_seconds([*known, *left], workers) for workers in (1, 2)] == [40.0, 20.0]
     assert estimated_seconds(left, 1) is None
-    trained = replace(known[0], state="waiting")
-    assert estimated_seconds([trained], 1) == 0.0
+    assert estimated_seconds([replace(known[0], state="waiting")], 1) == 0.0
 
 
 def test_runs_of_other_code_are_counted_in_one_line(tmp_path: Path) -> None:
-    found = []
-    for name, digest in (("a", "0" * 64), ("b", code()["code"]), ("c", "1" * 64)):
-        run = finish(tmp_path / name)
-        run.add_provenance({"code": digest, "diff": ""})
-        found.append(RunResult(run.path))
-    assert other_code_line([Outcome(Point("p", ()), "finished", results=(found[1],))]) == ""
-    outcomes = [Outcome(Point("p", ()), "finished", results=tuple(found))] * 2
-    assert other_code_line(outcomes).startswith("2 of 3 runs")
+    for name, digest in (("a", "0" * 64), ("b", code()["code"])):
+        finish(tmp_path / name).add_provenance({"code": digest, "diff": ""})
+    old, new = (RunResult(tmp_path / name) for name in "ab")
+    assert other_code_line([Outcome(Point("p", ()), "finished", results=(new,))]) == ""
+    outcomes = [Outcome(Point("p", ()), "finished", results=(old, new))] * 2
+    assert other_code_line(outcomes).startswith("1 of 2 runs")

@@ -132,26 +132,19 @@ def test_local_executor_passes_arguments_and_environment(start: Start, tmp_path:
 
 @pytest.mark.parametrize(
     ("words", "expected"),
-    [
-        (("leave", "x", "0"), 0),
-        (("leave", "x", "3"), 3),
-        (("raise", "x"), 1),
-        (("kill", "x", str(int(signal.SIGKILL))), -9),
-        (("kill", "x", str(int(signal.SIGSEGV))), -11),
-    ],
-    ids=["in order", "exit code", "exception", "killed", "crash"],
+    [("leave x 0", 0), ("leave x 3", 3), ("raise x", 1), ("kill x 9", -9), ("kill x 11", -11)],
 )
 def test_local_job_returns_exit_code_and_logs(
-    start: Start, tmp_path: Path, words: tuple[str, ...], expected: int
+    start: Start, tmp_path: Path, words: str, expected: int
 ) -> None:
-    job = start(*words)
+    job = start(*words.split())
     assert code(job) == expected
     job.stop()  # too late, and no harm
     assert job.poll() == expected
     said = (tmp_path / "logs" / "log").read_text()
-    assert said.startswith(f"said {words[0]}\n")
+    assert said.startswith(f"said {words.split()[0]}\n")
     assert "complained\n" in said
-    assert ("ValueError: a bad day" in said) == (words[0] == "raise")
+    assert ("ValueError: a bad day" in said) == (words == "raise x")
 
 
 def test_stop_ends_process_with_its_children(start: Start, tmp_path: Path) -> None:
@@ -238,12 +231,9 @@ def test_run_continues_when_driver_is_killed(driver: subprocess.Popen[str], tmp_
     until(lambda: not is_alive(pid), "its end")
 
 
-def test_run_command_returns_the_reason_of_a_failure(
-    executor: LocalExecutor, tmp_path: Path
-) -> None:
-    log = tmp_path / "logs" / "log"
-    assert run_command(("tiny_run", "leave", "x", "0"), log) == ""
-    assert run_command(("tiny_run", "raise", "x"), log) == "ValueError: a bad day"
+def test_run_command_has_reason_of_failure(executor: LocalExecutor, tmp_path: Path) -> None:
+    assert run_command(("tiny_run", "leave", "x", "0"), tmp_path / "log") == ""
+    assert run_command(("tiny_run", "raise", "x"), tmp_path / "log") == "ValueError: a bad day"
 
 
 SERVER = """
@@ -280,12 +270,10 @@ See the documentation.
         (1, "warning\nrgbt: masker.sigma_div must be positive.\n", "masker.sigma_div must be"),
         (1, TRACEBACK, "torch.cuda.OutOfMemoryError: CUDA out of memory. Tried to allocate 2 GiB"),
         (1, f"{TRACEBACK}rgbt: the loss is not finite.\n", "the loss is not finite."),
-        (1, "step 1\rstep 2\rfull disk\n", "full disk"),
-        (1, "\udcff\udcfe broken\n", "\ufffd\ufffd broken"),
+        (1, "step 1\rfull \udcff disk\n", "full \ufffd disk"),
         (1, "ValueError: " + "x" * 5000, "ValueError: " + "x" * 288),
         (3, "", "it ended with exit code 3 and no output; see"),
         (-9, "rgbt: x", "stopped by SIGKILL"),
-        (-99, "rgbt: x", "stopped by signal 99"),
     ],
 )
 def test_failure_reason_is_last_message_or_signal(
@@ -299,29 +287,13 @@ def test_failure_reason_is_last_message_or_signal(
     assert len(reason) <= max(300, len(f"{said} {log}"))
 
 
-@pytest.mark.parametrize(
-    ("shown", "gpus", "named"),
-    [
-        ("2,3", (3, 5), "gpus: no GPU 5;"),
-        ("", (0,), "gpus: no GPU 0;"),
-        (None, (0, 99), "gpus: no GPU "),
-        ("2,3", (3, 2), None),
-        ("2,3", ((3, 2),), None),
-        ("2,3", ((2, 3), (4,)), "gpus: no GPU 4;"),
-        ("2,3", None, None),
-    ],
-)
-def test_check_gpus_refuses_hidden_ones(
-    monkeypatch: pytest.MonkeyPatch,
-    shown: str | None,
-    gpus: tuple[int | tuple[int, ...], ...] | None,
-    named: str | None,
-) -> None:
-    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
-    if shown is not None:
-        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", shown)
-    if named is None:
+def test_check_gpus_refuses_hidden_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2, 3")
+    for gpus in ((3, 2), ((3, 2),), None):
         check_gpus(gpus)
-        return
-    with pytest.raises(InputError, match=named):
-        check_gpus(gpus)
+    for gpus, named in (((3, 5), 5), (((2, 3), (4,)), 4), ((0,), 0)):
+        with pytest.raises(InputError, match=f"gpus: no GPU {named};"):
+            check_gpus(gpus)
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
+    with pytest.raises(InputError, match="gpus: no GPU "):
+        check_gpus((0, 99))

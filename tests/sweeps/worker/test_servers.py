@@ -12,12 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mlflow import MlflowClient
+from optuna import get_all_study_names
 
 from rgbt.runs.folder import read_result
 from rgbt.tracking.mlflow_store import MlflowTracking
 from sweeps.attributes import LABEL, RUNS
 from sweeps.worker.run_store import RunStore
-from sweeps.worker.storage import load_study, open_storage, study_names
+from sweeps.worker.storage import load_study, open_storage
 from sweeps.worker.trial_store import counted_trials
 from tests.commands import SMALL, short
 from tests.sweeps.fakes import counts, finish, until
@@ -107,15 +108,15 @@ def test_search_on_four_drivers_survives_killed_driver(
     victim = drivers[2]
 
     def is_noted() -> bool:
-        found = "shared-search" in study_names(storage)
+        found = "shared-search" in get_all_study_names(storage)
         trials = load_study("shared-search", storage).trials if found else ()
         return sum(t.state.name == "RUNNING" and LABEL in t.user_attrs for t in trials) >= 4
 
     until(is_noted, "a trial of each driver")
     victim.kill()
-    for driver in drivers:
-        code = driver.wait(timeout=300)
-        assert code == (-9 if driver is victim else 0), log_of(tmp_path)
+    for number, driver in enumerate(drivers):
+        code, log = driver.wait(timeout=300), tmp_path / f"driver{number}.log"
+        assert code == (-9 if driver is victim else 0), log.read_text()[-3000:]
 
     trials = load_study("shared-search", storage).trials
     counted = counted_trials(load_study("shared-search", storage))
@@ -137,7 +138,3 @@ def test_search_on_four_drivers_survives_killed_driver(
     # The addresses that the runs and the reports keep hold no password.
     for path in runs.rglob("*"):
         assert path.is_dir() or servers.password.encode() not in path.read_bytes(), path
-
-
-def log_of(folder: Path) -> str:
-    return "\n".join(path.read_text()[-3000:] for path in sorted(folder.glob("driver*.log")))

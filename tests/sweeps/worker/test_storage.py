@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -12,12 +10,7 @@ from rgbt.checks import InputError
 from sweeps import attributes as names
 from sweeps.settings import Objective
 from sweeps.worker import storage as stores
-from sweeps.worker.storage import (
-    find_study,
-    load_study,
-    open_storage,
-    open_study,
-)
+from sweeps.worker.storage import find_study, open_storage, open_study
 
 UP = (Objective("test/mIoU", "maximize"),)
 BOTH = (*UP, Objective("test/Var", "minimize"))
@@ -62,39 +55,6 @@ def test_open_storage_retries_while_tables_are_created(monkeypatch: pytest.Monke
 
     assert stores._retry(opening, "sqlite:///x") == "open"
     assert len(tries) == 3
-
-
-OPEN = """
-import sys
-from pathlib import Path
-import optuna, sqlalchemy  # loaded before the start, so that all open at the same time
-from sweeps.settings import Objective
-from sweeps.worker.storage import open_study, open_storage
-print("ready", flush=True)
-sys.stdin.readline()
-storage = open_storage(sys.argv[1], Path("."))
-study = open_study("study", storage, (Objective("test/mIoU", "maximize"),), {"rgbt.kind": "list"})
-study.add_trial(optuna.trial.create_trial(value=1.0))
-"""
-
-
-def test_open_storage_by_several_processes_at_once(tmp_path: Path) -> None:
-    where = f"sqlite:///{tmp_path}/fresh.db"
-    command = [sys.executable, "-c", OPEN, where]
-    pipe = subprocess.PIPE
-    every = [subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) for _ in range(3)]
-    for process in every:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "ready\n"
-    for process in every:
-        assert process.stdin is not None
-        process.stdin.write("\n")
-        process.stdin.flush()
-    for process in every:
-        process.communicate()
-        assert process.returncode == 0
-    study = load_study("study", open_storage(where, tmp_path))
-    assert [trial.number for trial in study.trials] == [0, 1, 2]
 
 
 def test_open_study_with_other_attributes_raises(tmp_path: Path) -> None:

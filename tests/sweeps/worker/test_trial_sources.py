@@ -10,9 +10,8 @@ import pytest
 from rgbt.runs.folder import MetricLine
 from rgbt.runs.naming import VARIED
 from sweeps import attributes as names
-from sweeps.point import COLOUR, colour
 from sweeps.settings import Objective
-from sweeps.worker.trial_sources import ClaimedTrial
+from sweeps.worker.running_trial import ClaimedTrial
 from tests.sweeps.fakes import Desk, PickyPlanner, search_desk
 
 
@@ -37,7 +36,7 @@ def test_a_search_asks_the_sampler_and_notes_the_point(tmp_path: Path) -> None:
         names.LABEL: f"#0 x={x:.4g}",
         names.PIXELS: 1.0,
     }
-    tags = {"rgbt.study/study": "0", VARIED: "x", COLOUR: colour("study", 0)}
+    tags = {"rgbt.study/study": "0", VARIED: "x"}
     assert task.plan.point.tags == tags
     assert (task.plan.point.label, task.plan.point.seeds) == (f"#0 x={x:.4g}", ())
 

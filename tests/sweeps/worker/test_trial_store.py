@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
 from optuna.distributions import CategoricalDistribution
 
 from sweeps import attributes as names
-from sweeps.space.samplers import build_sampler
-from sweeps.worker.storage import open_storage
+from sweeps.space import build_sampler
 from sweeps.worker.trial_store import TrialStore
 from tests.sweeps.fakes import memory, silence, store_on
 
@@ -49,14 +45,6 @@ def taken(store: TrialStore, total: int | None = None) -> tuple[int, float]:
     return asked.number, x
 
 
-def at_once(works: list[Callable[[], None]]) -> None:
-    threads = [threading.Thread(target=work) for work in works]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-
-
 def test_claim_with_other_choices_of_a_grid_loses_only_the_parameter(store: TrialStore) -> None:
     for number, choices in enumerate([(1, 2), (1, 2, 3)]):
         known = {"x": CategoricalDistribution(choices)}
@@ -71,30 +59,11 @@ def test_claim_of_running_point_is_dropped(store: TrialStore) -> None:
     assert [each.number for each in store.trials()] == [0, 2]
 
 
-@pytest.mark.parametrize("how", ["complete", "prune"])
-def test_claim_of_finished_point_requires_replaced(store: TrialStore, how: str) -> None:
+def test_claim_of_finished_point_requires_replaced(store: TrialStore) -> None:
     claim(store)
-    if how == "complete":
-        store.complete(0, [1.0], {})
-    else:
-        store.fail(0, "hopeless", {}, "PRUNED")
+    store.complete(0, [1.0], {})
     assert claim(store) is None
     assert claim(store, replaced=[0]) == 2
-
-
-def test_claim_by_two_drivers_succeeds_once_per_point(tmp_path: Path) -> None:
-    stores = [store_on(open_storage(None, tmp_path)) for _ in range(2)]
-    got: list[str] = []
-    barrier = threading.Barrier(2)
-
-    def work(store: TrialStore) -> None:
-        for key in "abcdef":
-            barrier.wait()
-            got.extend(key for _ in "k" if claim(store, key) is not None)
-
-    at_once([lambda store=store: work(store) for store in stores])  # type: ignore[misc]
-    assert sorted(got) == list("abcdef")
-    assert states(stores[0]) == ["RUNNING"] * 6
 
 
 def test_ask_last_trial_goes_to_lower_number(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -102,9 +71,9 @@ def test_ask_last_trial_goes_to_lower_number(monkeypatch: pytest.MonkeyPatch) ->
     mine, theirs = searching(storage), searching(storage)
     ask = mine.study.ask
 
-    def both_saw_room() -> Any:
+    def both_saw_room(space: Any) -> Any:
         theirs.ask(1)
-        return ask()
+        return ask(space)
 
     monkeypatch.setattr(mine.study, "ask", both_saw_room)
     assert mine.ask(1) is None
@@ -206,8 +175,8 @@ def test_ask_at_once_for_a_point_enqueued_twice_keeps_one() -> None:
     waiting = [each.number for each in a.trials()]
     pop, answers = a.study.ask, []
 
-    def both_pop() -> Any:
-        mine = pop()
+    def both_pop(space: Any) -> Any:
+        mine = pop(space)
         answers.append(b.ask(1))
         return mine
 

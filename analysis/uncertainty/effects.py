@@ -1,0 +1,85 @@
+"""Effects of a two-level factorial design, with intervals over seeds and images.
+
+An effect is the mean of the cells at the high level less the mean of those at the low level. An
+interaction is half of the difference between the effects of one factor at the two levels of the
+other. Every effect is a contrast of all cells, so that few seeds per cell suffice.
+
+Source: Box, Hunter and Hunter, Statistics for Experimenters (2nd ed., 2005), chapters 5 and 6.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from analysis.uncertainty.contrasts import Evidence, combine
+from analysis.uncertainty.estimates import Estimate, estimate_of
+from analysis.uncertainty.intervals import Spread, Values, holm
+
+Noise = Literal["cells", "effects"]
+"""Whose spread over seeds is the error: "cells", what is left of all cells after their means and
+those of the seeds (every cell is a training of its own, so all cells tell of the same noise);
+"effects", that of the effect itself over seeds (all cells are tests of one network)."""
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One effect: its estimate, and its p-value corrected for its family (Holm)."""
+
+    estimate: Estimate
+    corrected: float
+
+    def is_shown(self, level: float = 0.95) -> bool:
+        """Whether the effect differs from 0, corrected for the number of effects."""
+        return self.corrected < 1 - level
+
+
+def estimate_effects(
+    cells: Sequence[Evidence], contrasts: Values, noise: Noise, level: float = 0.95
+) -> list[Effect]:
+    """Effects with intervals over seeds and images.
+
+    Args:
+        cells: evidence of an outcome in C cells, with the same seeds and draws of images.
+        contrasts: (E, C) signs, -1 or 1, each row with as many of one as of the other; a row of
+            ones is the mean over all cells.
+        noise: see `Noise`; a mean has that of its own.
+        level: of the intervals.
+
+    Returns:
+        E effects, whose p-values are corrected for E.
+
+    Raises:
+        ValueError: contrasts of another number of cells, or unbalanced ones.
+    """
+    count = len(cells)
+    if contrasts.shape[1:] != (count,) or not set(contrasts.sum(1)) <= {0, count}:
+        raise ValueError(f"contrasts: expected balanced rows of {count} signs.")
+    values = np.array([cell.values for cell in cells]).T
+    found = []
+    for signs in contrasts:
+        is_mean = bool((signs > 0).all())
+        weights = signs / count if is_mean else 2.0 * signs / count
+        evidence = combine(weights.tolist(), cells)
+        if noise == "cells" and not is_mean and len(values) > 1:
+            left = _left_over(values)
+            scale = math.sqrt(float((weights**2).sum()) / len(values))
+            evidence = replace(evidence, trainings=Spread(left.error * scale, left.freedom))
+        found.append(estimate_of(evidence, level))
+    ps = holm([math.nan if each.both is None else each.p for each in found])
+    return [Effect(each, p) for each, p in zip(found, ps, strict=True)]
+
+
+def _left_over(values: Values) -> Spread:
+    """Standard deviation of (S, C) values around the means of their cells and seeds.
+
+    Each seed is a block: initial weights and the order of the data are the same in all its cells.
+    """
+    seeds, cells = values.shape
+    left = values - values.mean(0) - values.mean(1, keepdims=True) + values.mean()
+    freedom = (seeds - 1) * (cells - 1)
+    return Spread(math.sqrt(float((left**2).sum()) / freedom), freedom)

@@ -1,0 +1,247 @@
+"""Scores of one method with intervals, and the differences between two methods."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from analysis.uncertainty.blocks import FEWEST, Resampling
+from analysis.uncertainty.contrasts import Evidence, Resampler, Term
+from analysis.uncertainty.intervals import (
+    Interval,
+    corrected,
+    holm,
+    images_and_seeds,
+    of_gaps,
+    student,
+    student_p,
+)
+from rgbt.checks import InputError
+from rgbt.metrics import names
+from rgbt.metrics.counts import Counts
+from rgbt.metrics.named import images_of, parse
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """A contrast with its uncertainty; percent points, the variance in squared percent points.
+
+    Attributes:
+        value: mean over seeds; NaN where there is nothing to score.
+        sd: standard deviation over seeds (n - 1); NaN for one.
+        seeds: their number S.
+        images: interval over the draw of the images, trainings as they are; None with too few
+            images or nothing to score.
+        trainings: interval over seeds, images as they are; None for one seed.
+        both: interval over images and seeds; None where one of the two is.
+        p: two-sided p-value of `interval` against 0; NaN without one.
+        evidence: the numbers that the intervals follow from.
+    """
+
+    value: float
+    sd: float
+    seeds: int
+    images: Interval | None
+    trainings: Interval | None
+    both: Interval | None
+    p: float
+    evidence: Evidence
+
+    @property
+    def interval(self) -> Interval | None:
+        """The interval to go by: over images and seeds, else over images."""
+        return self.both or self.images
+
+    @property
+    def said(self) -> str:
+        """What was drawn, e.g. "40 blocks of up to 10 neighbouring frames"."""
+        return self.evidence.said
+
+    @property
+    def reason(self) -> str:
+        """Why so, see `analysis.uncertainty.blocks.ImageBlocks.reason`."""
+        return self.evidence.reason
+
+
+def estimate_of(evidence: Evidence, level: float, metric: str = "") -> Estimate:
+    """Student's intervals of a contrast.
+
+    Args:
+        evidence: of the contrast.
+        level: of the intervals.
+        metric: of a score that is no difference; variances over regions and calibration errors
+            are never negative, and chance alone raises them and raises each resample again.
+    """
+    value, images, trainings = float(np.mean(evidence.values)), evidence.images, evidence.trainings
+    parsed = parse(metric) if metric else None
+    around = over_seeds = both = None
+    if images is not None and not math.isnan(value):
+        around = student(value, images, level)
+        if parsed is not None and parsed.score == names.VAR:
+            bias = float(np.nanmean(evidence.drawn)) - value
+            around = corrected(value, bias, images, level)
+        elif parsed is not None and parsed.details == "calibration":
+            around = of_gaps(value, evidence.drawn, images, level)
+    used = images
+    if trainings is not None:
+        over_seeds = student(value, trainings, level)
+        if around is not None and images is not None:
+            used = images_and_seeds(images, trainings, level)
+            both = student(value, used, level)
+    intervals = [around, over_seeds, both]
+    if metric:  # no score is negative
+        intervals = [each and Interval(max(0.0, each.low), each.high) for each in intervals]
+    return Estimate(
+        value=value,
+        sd=float(np.std(evidence.values, ddof=1)) if len(evidence.values) > 1 else math.nan,
+        seeds=len(evidence.values),
+        images=intervals[0],
+        trainings=intervals[1],
+        both=intervals[2],
+        p=math.nan if around is None or used is None else student_p(value, used),
+        evidence=evidence,
+    )
+
+
+def estimate(
+    seeds: Sequence[Counts], metrics: Sequence[str], settings: Resampling
+) -> dict[str, Estimate]:
+    """Scores of one method.
+
+    Args:
+        seeds: counts of its trainings on the same images, one or more.
+        metrics: names, see `rgbt.metrics.named`.
+        settings: of the resampling.
+
+    Returns:
+        metric -> estimate, in the requested order.
+
+    Raises:
+        InputError: no such metric, class or region; seeds on different images; blocks that cannot
+            be made.
+    """
+    engine, runs = Resampler(settings, "pixels"), _runs(seeds, "a")
+    return {
+        metric: estimate_of(engine.contrast([_term(1.0, metric, runs)]), settings.level, metric)
+        for metric in metrics
+    }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Difference:
+    """Method b less method a in one score.
+
+    Attributes:
+        difference: the estimate of ``b - a``.
+        p_corrected: its p-value, corrected for the number of scores compared (Holm).
+    """
+
+    metric: str
+    a: Estimate
+    b: Estimate
+    difference: Estimate
+    p_corrected: float = math.nan
+
+    @property
+    def value(self) -> float:
+        """``b - a``, means over seeds."""
+        return self.difference.value
+
+    @property
+    def interval(self) -> Interval | None:
+        """Of the difference, see `Estimate.interval`."""
+        return self.difference.interval
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """Two methods compared.
+
+    Attributes:
+        differences: in the order of the requested metrics.
+        images: number of images of the first metric.
+        partition: of the regions, e.g. "ring5".
+    """
+
+    differences: tuple[Difference, ...]
+    images: int
+    partition: str
+    level: float
+
+    @property
+    def said(self) -> str:
+        """How the images of the first metric were drawn, e.g. "393 single images"."""
+        return self.differences[0].difference.said
+
+    @property
+    def reason(self) -> str:
+        """Why so, see `analysis.uncertainty.blocks.ImageBlocks.reason`."""
+        return self.differences[0].difference.reason
+
+
+def compare(
+    a: Sequence[Counts],
+    b: Sequence[Counts],
+    metrics: Sequence[str],
+    settings: Resampling,
+    *,
+    paired: bool = False,
+    same_pixels: bool = True,
+) -> Comparison:
+    """Compare two methods on the same images.
+
+    Args:
+        a: counts of the trainings of the first method, one or more.
+        b: of the second, on the same images.
+        metrics: names, see `rgbt.metrics.named`.
+        settings: of the resampling.
+        paired: counts i of `a` and of `b` are of the same training, evaluated in two ways. Seeds of
+            two methods are not paired (Welch).
+        same_pixels: whether both must count the same pixels of every image, by the same partition.
+
+    Raises:
+        InputError: other images, classes, scored classes, regions or labels; fewer than `FEWEST`
+            blocks of images of every metric; no such metric.
+        ValueError: paired, but not as many.
+    """
+    if paired and len(a) != len(b):
+        raise ValueError(f"paired: expected as many counts in a and b, got {len(a)} and {len(b)}.")
+    engine = Resampler(settings, "pixels" if same_pixels else "labels")
+    runs, found = (_runs(a, "a"), _runs(b, "b")), []
+    for metric in dict.fromkeys(metrics):
+        terms = [
+            _term(weight, metric, each) for weight, each in zip((-1.0, 1.0), runs, strict=True)
+        ]
+        evidence = engine.contrast(terms, paired=paired)
+        sides = [
+            estimate_of(engine.contrast([replace(term, weight=1.0)]), settings.level, metric)
+            for term in terms
+        ]
+        difference = estimate_of(evidence, settings.level)
+        found.append(Difference(metric=metric, a=sides[0], b=sides[1], difference=difference))
+    if all(each.difference.evidence.blocks < FEWEST for each in found):
+        said = found[0].difference.said
+        raise InputError(f"{said} are too few to compare two methods; {FEWEST} are the least.")
+    ps = holm([each.difference.p for each in found])
+    return Comparison(
+        differences=tuple(replace(each, p_corrected=p) for each, p in zip(found, ps, strict=True)),
+        images=len(images_of(parse(metrics[0]), a[0]).names),
+        partition=a[0].partition,
+        level=settings.level,
+    )
+
+
+def _runs(seeds: Sequence[Counts], side: str) -> dict[int, tuple[str, Counts]]:
+    return {seed: (f"{side}{seed}", counts) for seed, counts in enumerate(seeds)}
+
+
+def _term(weight: float, metric: str, runs: Mapping[int, tuple[str, Counts]]) -> Term:
+    return Term(
+        weight=weight,
+        metric=metric,
+        counts={seed: counts for seed, (_, counts) in runs.items()},
+        keys={seed: key for seed, (key, _) in runs.items()},
+    )

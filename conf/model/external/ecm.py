@@ -1,0 +1,13 @@
+"""ECM with random weights, and without the data sets that its package imports."""
+
+from rgbt.models.external.adapting import Untrained, replace_in, skip_init
+
+
+def network(n_classes):
+    """Build the network."""
+    skip_init("toolbox")
+    import resnet
+    from toolbox.models.ECM import ECM
+
+    replace_in(ECM, Backbone_ResNet152_in3=Untrained(resnet).Backbone_ResNet152_in3)
+    return ECM(n_classes)

@@ -1,0 +1,179 @@
+"""Keep the results of runs in the repository: ``rgbt archive add run=all``, ``rgbt archive check``.
+
+See `rgbt.runs.archive` for the files. Exit code 1 of ``check``: a run is damaged, or its command
+now has another key.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from rgbt.checks import InputError
+from rgbt.config.common_options import RunsDir
+from rgbt.config.options import Help
+from rgbt.config.plain_command import CommandGroup, PlainCommand
+
+if TYPE_CHECKING:
+    from rgbt.runs.archive import ArchivedRun
+
+Archive = Annotated[Path, Help("folder of the archive")]
+
+
+@dataclass(frozen=True)
+class AddOptions:
+    """Options of `add_runs`."""
+
+    run: Annotated[str, Help("run folder or config key; all: every finished run of runs_dir")]
+    runs_dir: RunsDir = Path("runs")
+    archive: Archive = Path("results")
+
+
+@dataclass(frozen=True)
+class ArchiveOptions:
+    """Options of `check` and `rekey`."""
+
+    archive: Archive = Path("results")
+
+
+def add_runs(options: AddOptions, overrides: list[str]) -> int:
+    """Add finished runs to the archive; a run that is in it already is left as it is."""
+    from rgbt.runs.archive import add
+    from rgbt.runs.folder import find_run, is_finished, runs_in
+    from rgbt.runs.result import RunResult
+    from rgbt.terminal import plain_text, print_rich, warn
+
+    del overrides  # none is heeded
+    folders = [run.path for run in runs_in(options.runs_dir) if is_finished(run.path)]
+    if options.run != "all":
+        folders = [find_run(options.run, options.runs_dir)]
+    for folder in folders:
+        added = add(RunResult(folder), options.archive)
+        print_rich(plain_text(f"{added.path}  {added.path.stat().st_size} bytes"))
+        if added.path.stem != added.key:
+            warn(f"{options.archive / added.key}.zip has other results; both are kept.")
+    return 0
+
+
+def check(options: ArchiveOptions, overrides: list[str]) -> int:
+    """Compose the command of every archived run again, and report whose key has changed."""
+    from rgbt.tables import TextTable
+    from rgbt.terminal import print_rich, rich_table
+
+    del overrides  # none is heeded
+    found = list(_compared(options.archive))
+    rows = [(each.run.path.stem, each.state, each.reason) for each in found if each.state != "same"]
+    if rows:
+        print_rich(rich_table(TextTable("archive", ("run", "state", "reason"), tuple(rows))))
+    print_rich(f"{len(found)} runs, {len(found) - len(rows)} have the key of their command.")
+    return int(bool(rows))
+
+
+def rekey(options: ArchiveOptions, overrides: list[str]) -> int:
+    """Rename runs whose configuration differs from today's in added settings alone.
+
+    The default of an added setting has to keep the behaviour. Who adds it knows.
+    """
+    from rgbt.runs.archive import add
+    from rgbt.runs.result import RunResult
+    from rgbt.terminal import plain_text, print_rich
+
+    del overrides  # none is heeded
+    for each in list(_compared(options.archive)):
+        if each.settings is None or each.state != "added":
+            continue
+        with tempfile.TemporaryDirectory() as scratch:
+            folder = each.run.unpack(Path(scratch)).folder
+            _rewrite(folder, each.key, each.settings)
+            new = folder.rename(folder.with_name(each.key))
+            path = add(RunResult(new), options.archive).path
+        each.run.path.unlink()
+        print_rich(plain_text(f"{each.run.path}  ->  {path}"))
+    return 0
+
+
+@dataclass(frozen=True)
+class ComparedRun:
+    """An archived run beside the run that its command requests today.
+
+    Attributes:
+        state: "same" key; "added": other key, but only for settings that were added; "changed":
+            other settings; "damaged", or its command does not compose any more.
+        reason: what differs.
+        key: today's key.
+        settings: today's configuration.
+    """
+
+    run: ArchivedRun
+    state: Literal["same", "added", "changed", "damaged"]
+    reason: str = ""
+    key: str = ""
+    settings: Mapping[str, Any] | None = None
+
+
+def _compared(archive: Path) -> Iterator[ComparedRun]:
+    from rgbt.runs.archive import archived
+
+    with tempfile.TemporaryDirectory() as scratch:
+        for run in archived(archive):
+            try:
+                yield _compare(run, run.unpack(Path(scratch)).folder)
+            except InputError as error:
+                yield ComparedRun(run, "damaged", str(error))
+
+
+def _compare(run: ArchivedRun, folder: Path) -> ComparedRun:
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    from rgbt.config.compose import compose, flatten
+    from rgbt.config.stored_config import read_settings
+    from rgbt.runs.folder import read_description
+    from rgbt.runs.run_spec import NOT_IN_KEY
+    from rgbt.runs.specify import requested_run
+
+    description = read_description(folder)
+    words = description.overrides if description else []
+    try:
+        spec = requested_run(compose(words), words)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise InputError(f"its command does not compose: {error}") from error
+    if spec.key == run.key:
+        return ComparedRun(run, "same")
+    before, now = (flatten(each) for each in (read_settings(folder / "config.yaml"), spec.plain))
+    differing = [
+        key
+        for key in sorted(before.keys() | now.keys())
+        if (key not in before or key not in now or before[key] != now[key])
+        and not any(key == out or key.startswith(f"{out}.") for out in NOT_IN_KEY)
+    ]
+    is_added = all(key not in before for key in differing)
+    reason = ", ".join(differing) or "a run that it depends on"
+    return ComparedRun(run, "added" if is_added else "changed", reason, spec.key, spec.plain)
+
+
+def _rewrite(folder: Path, key: str, settings: Mapping[str, Any]) -> None:
+    """Give an unpacked run its new key and settings."""
+    from omegaconf import OmegaConf
+
+    from rgbt.files.plain_files import write_json
+    from rgbt.runs.folder import read_result
+
+    (folder / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(dict(settings))))
+    write_json(folder / "result.json", {**(read_result(folder) or {}), "key": key})
+
+
+entry = CommandGroup(
+    __doc__,
+    {
+        "add": PlainCommand(AddOptions, add_runs, heeds=(), name="rgbt archive add"),
+        "check": PlainCommand(ArchiveOptions, check, heeds=(), name="rgbt archive check"),
+        "rekey": PlainCommand(ArchiveOptions, rekey, heeds=(), name="rgbt archive rekey"),
+    },
+)
+
+if __name__ == "__main__":
+    entry()

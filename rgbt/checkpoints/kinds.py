@@ -1,0 +1,404 @@
+"""Kinds of files of weights: how each is recognised, and where its tensors go in a network.
+
+`KINDS` has a row for each kind of file that a family of networks takes: files of whole networks as
+their authors publish them, and of ImageNet backbones. The names here are those of the releases but
+for a prefix and a few words. How a file is read and loaded is in `read` and `load`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor, nn
+
+Tensors = Mapping[str, Tensor]
+Names = tuple[tuple[str, str], ...]
+"""(regular expression, replacement), applied one after the other."""
+
+NONE = r"(?!)"
+"""Regular expression that fits no name."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of file, and how a network of one family is filled from it.
+
+    Attributes:
+        title: what the file is.
+        has: beginnings of names, behind the prefix, that the file has.
+        prefix: before every name that belongs to the network.
+        needs: beginning of an entry that the network has; "": any network of the family.
+        source: entry of the network -> name in the file, behind the prefix.
+        unused: regular expression for names of the file that the network has no place for.
+        fresh: for entries that such a file does not hold; a backbone has some.
+        stems: for convolutions whose input channels may be others than in the file: for one channel
+            the mean over the file's, for further ones behind the file's the same mean.
+        converted: tensors of the file -> under the names that `source` gives; for files that split
+            tensors of the network.
+        convention: overrides for the inputs and the evaluation of the release, which its weights do
+            not show.
+    """
+
+    title: str
+    has: tuple[str, ...] = ()
+    prefix: str = ""
+    needs: str = ""
+    source: Callable[[str], str] = str
+    unused: str = NONE
+    fresh: str = NONE
+    stems: str = NONE
+    converted: Callable[[Tensors], Tensors] = dict
+    convention: tuple[str, ...] = ()
+
+    def recognises(self, names: Tensors) -> bool:
+        """Whether a file with these names is of this kind."""
+        return all(any(name.startswith(self.prefix + part) for name in names) for part in self.has)
+
+
+def renaming(*names: tuple[str, str]) -> Callable[[str], str]:
+    """A function that replaces regular expressions in a name."""
+
+    def renamed(name: str) -> str:
+        for pattern, replacement in names:
+            name = re.sub(pattern, replacement, name)
+        return name
+
+    return renamed
+
+
+# Mask2Former: CRM and SpatialSeg, and Swin Transformers for both branches.
+
+BRANCH = r"backbone\.(RGB|THR)_branch\."
+CRM = Kind(
+    "checkpoint of CRM or SpatialSeg",
+    has=("backbone.RGB_branch.", "sem_seg_head."),
+    prefix="network.",  # attribute of the LightningModule
+    unused=r".*\.relative_position_index$|criterion\.empty_weight$",
+    convention=("model/inputs=crm",),
+)
+# Released: CRM and SpatialSeg, DetectionCheckpointer with the thermal convolution averaged
+# (keepdim). The file's last normalisation is not norm3.
+SWIN = Kind(
+    "ImageNet Swin Transformer",
+    has=("patch_embed.proj.", "layers.0.blocks.0.attn.qkv.", "layers.0.downsample."),
+    source=renaming((f"^{BRANCH}", "")),
+    unused=r".*\.(relative_position_index|attn_mask)$|norm\.|head\.",
+    fresh=rf"{BRANCH}(mask_token$|norm[0-3]\.)|backbone\.norm_layers\.|sem_seg_head\.",
+    stems=r"backbone\.THR_branch\.patch_embed\.proj\.weight",
+)
+
+
+def _timm_swin(entry: str) -> str:
+    """The merging between two stages is saved with the second of them in timm 0.9 and later.
+
+    Source: timm/models/swin_transformer.py, `checkpoint_filter_fn`.
+    """
+    name = SWIN.source(entry)
+    later = re.fullmatch(r"layers\.(\d)\.(downsample\..*)", name)
+    return f"layers.{int(later[1]) + 1}.{later[2]}" if later else name
+
+
+# CMX and CMNeXt. Released: CMX and the temporal release feed thermal three times, so that the stem
+# is copied; one of one channel gets the mean.
+
+CMX = Kind(
+    "CMX checkpoint",
+    has=("backbone.patch_embed", "backbone.extra_patch_embed", "backbone.F"),
+    convention=("model/inputs=cmx_released", "model.decoder_norm_eps_eval=1e-5"),
+)
+TEMPORAL = replace(
+    CMX,
+    title="CMX checkpoint of the temporal release",
+    has=(*CMX.has, "voting."),
+    unused=r"voting\.",  # which it never uses
+    convention=("model/inputs=temporal",),
+)
+MIT = Kind(
+    "ImageNet MiT",
+    has=("patch_embed1.", "block1.0.attn."),
+    source=renaming((r"^backbone\.(extra_)?", "")),
+    unused=r"head\.",
+    fresh=r"backbone\.F[RF]Ms\.|decode_head\.",
+    stems=r"backbone\.extra_patch_embed1\.proj\.weight",
+)
+
+
+def _cmnext(entry: str) -> str:
+    """The released name of an entry of CMNeXt.
+
+    Source: DELIVER release, with two modalities. The thermal patch embeddings, numbered from 0
+    there, and the decoder have other names than here, where they are those of CMX.
+    """
+    if found := re.fullmatch(r"backbone\.extra_patch_embed(\d)\.(proj|norm)\.(.*)", entry):
+        layer = {"proj": "proj.module", "norm": "norm.ln_0"}[found[2]]
+        return f"backbone.extra_downsample_layers.{int(found[1]) - 1}.{layer}.{found[3]}"
+    fuse = "decode_head.linear_fuse"
+    return entry.replace(f"{fuse}.0.", f"{fuse}.conv.").replace(f"{fuse}.1.", f"{fuse}.bn.")
+
+
+CMNEXT = Kind(
+    "CMNeXt checkpoint",
+    has=("backbone.patch_embed", "backbone.extra_block1.0.c_nets.", "backbone.extra_downsample_"),
+    source=_cmnext,
+    convention=("model/inputs=imagenet_unit",),
+)
+
+# Networks with a ResNet.
+
+RESNET = Kind("ImageNet ResNet", has=("bn1.", "layer1.0.conv1.", "layer4.0.conv1."), unused=r"fc\.")
+# HeatNet itself starts from random weights.
+PSPNET_RESNET = replace(
+    RESNET,
+    source=renaming((r"^feats\.(\w+?)(_2)?\.", r"\1.")),
+    fresh=r"(psp|up_\d|final)\.",
+    stems=r"feats\.conv1(_2)?\.weight",
+)
+# The third stage of late fusion takes both images.
+LATE_RESNET = replace(
+    PSPNET_RESNET,
+    needs="feats.layer2_2.",
+    fresh=rf"{PSPNET_RESNET.fresh}|feats\.layer3\.0\.conv1\.",
+    unused=r"fc\.|layer3\.0\.(conv1|downsample)\.",
+)
+STEM = {"0": "conv1", "1": "bn1", "3": "conv2", "4": "bn2", "6": "conv3", "7": "bn3"}
+"""Number of a layer in the stem of semseg -> name in its ImageNet file, resnet50_v2.pth."""
+
+DEEPLAB_RESNET = replace(
+    RESNET,
+    title="ImageNet ResNet (its strides sit on the 3x3 convolutions, not on the first 1x1)",
+    source=renaming((r"^backbone\.", "")),
+    fresh=r"(heads|auxiliary)\.",
+)
+# Released: AdaptSegNet and ADVENT start from their own file and skip its classifier, layer5. It was
+# trained on B, G, R in 0..255 less the mean.
+CAFFE_RESNET = replace(
+    DEEPLAB_RESNET,
+    title="DeepLab v2 start of AdaptSegNet and ADVENT",
+    prefix="Scale.",
+    unused=r"(fc|layer5)\.",
+    convention=("model/inputs=caffe",),
+)
+
+# Vision transformers of DINOv2 and DINOv3, in the names of their authors and of other programs.
+
+ENCODER = "backbone.encoder."
+OUTSIDE = r"(?!backbone\.encoder\.)"
+BLOCK = ("patch_embed.proj.", "blocks.0.attn.qkv.")
+DINOV2 = Kind(
+    "DINOv2 vision transformer",
+    has=("cls_token", "pos_embed", "mask_token", "blocks.0.ls1.", *BLOCK),
+    source=renaming((rf"^{ENCODER}", "")),
+    fresh=OUTSIDE,
+    convention=("model/inputs=cmx", "model.position_resize=factor"),
+)
+SIZE = ("model/inputs=cmx", "model.position_resize=size")
+"""Convention of files with registers."""
+
+
+def _dinov2_of_timm(tensors: Tensors) -> Tensors:
+    """Names of DINOv2 for timm's, which drops the token of hidden patches.
+
+    With registers the position of the class is part of its token (timm/models/
+    vision_transformer.py, `_convert_dinov2`), so that this position becomes 0.
+    """
+    found = dict(tensors)
+    if "reg_token" in found:
+        found["register_tokens"] = found.pop("reg_token")
+        table = found["pos_embed"]
+        found["pos_embed"] = torch.cat([torch.zeros_like(table[:, :1]), table], 1)
+    return found
+
+
+DINOV2_TIMM = replace(
+    DINOV2,
+    title="DINOv2 vision transformer of timm",
+    has=("cls_token", "pos_embed", "blocks.0.ls1.", *BLOCK),
+    fresh=rf"{OUTSIDE}|{ENCODER}mask_token$",
+    converted=_dinov2_of_timm,
+)
+# The released files hold the periods of the positions rounded to bfloat16; the other forms lack
+# them, and both programs compute them, as the network does. The bias of keys is 0 here too.
+DINOV3 = Kind(
+    "DINOv3 vision transformer",
+    has=("storage_tokens", "rope_embed.periods", "blocks.0.ls1.", *BLOCK),
+    source=renaming((rf"^{ENCODER}", ""), ("^register_tokens$", "storage_tokens")),
+    unused=r"blocks\.\d+\.attn\.qkv\.bias_mask$",
+    fresh=OUTSIDE,
+    convention=("model/inputs=cmx", "model.norm_eps=1e-05", "model.rope_base=100.0"),
+)
+FROM_HUGGING_FACE: Names = (
+    (r"^embeddings\.patch_embeddings\.", "patch_embed.proj."),
+    (r"^embeddings\.register_tokens$", "storage_tokens"),
+    (r"^embeddings\.", ""),
+    (r"^layer\.", "blocks."),
+    (r"\.layer_scale(\d)\.lambda1$", r".ls\1.gamma"),
+    (r"\.attention\.o_proj\.", ".attn.proj."),
+    (r"\.attention\.([qkv])_proj\.", r".attn.\1."),
+    (r"\.mlp\.gate_proj\.", ".mlp.w1."),
+)
+GATED = ((r"\.mlp\.up_proj\.", ".mlp.w2."), (r"\.mlp\.down_proj\.", ".mlp.w3."))
+PLAIN = ((r"\.mlp\.up_proj\.", ".mlp.fc1."), (r"\.mlp\.down_proj\.", ".mlp.fc2."))
+FROM_TIMM: Names = (
+    (r"^reg_token$", "storage_tokens"),
+    (r"\.gamma_(\d)$", r".ls\1.gamma"),
+    (r"\.attn\.([qv])_bias$", r".attn.\1.bias"),
+)
+GATED_TIMM = (
+    *((r"\.mlp\.fc1_g\.", ".mlp.w1."), (r"\.mlp\.fc1_x\.", ".mlp.w2.")),
+    (r"\.mlp\.fc2\.", ".mlp.w3."),
+)
+
+
+def _dinov3_of_hugging_face(tensors: Tensors) -> Tensors:
+    """Released names; queries, keys and values as one projection, keys without a bias.
+
+    Source: transformers, models/dinov3_vit.
+    """
+    gated = any(".mlp.gate_proj." in name for name in tensors)
+    name_of = renaming(*FROM_HUGGING_FACE, *(GATED if gated else PLAIN))
+    found = {name_of(name): tensor for name, tensor in tensors.items()}
+    if "mask_token" in found:
+        found["mask_token"] = found["mask_token"].flatten(0, -2)
+    for start in [name[: -len("q.weight")] for name in found if name.endswith(".attn.q.weight")]:
+        parts = [f"{start}{part}.weight" for part in "qkv"]
+        if all(part in found for part in parts):
+            found[f"{start}qkv.weight"] = torch.cat([found.pop(part) for part in parts])
+        _join_biases(found, start)
+    return found
+
+
+def _dinov3_of_timm(tensors: Tensors) -> Tensors:
+    """Released names; a joint bias, which is 0 where the file has none (timm/models/eva.py)."""
+    gated = any(".mlp.fc1_g." in name for name in tensors)
+    name_of = renaming(*FROM_TIMM, *(GATED_TIMM if gated else ()))
+    found = {name_of(name): tensor for name, tensor in tensors.items()}
+    has_bias = any(name.endswith((".attn.q.bias", ".attn.v.bias")) for name in found)
+    for start in [name[: -len("weight")] for name in found if name.endswith(".attn.qkv.weight")]:
+        if has_bias:
+            _join_biases(found, start.removesuffix("qkv."))
+        else:
+            weight = found[f"{start}weight"]
+            found[f"{start}bias"] = weight.new_zeros(len(weight))
+    return found
+
+
+def _join_biases(tensors: dict[str, Tensor], start: str) -> None:
+    """Replace the biases of queries and values by the joint one; a lone one stays, and is named."""
+    first, last = f"{start}q.bias", f"{start}v.bias"
+    if first in tensors and last in tensors:
+        query, value = tensors.pop(first), tensors.pop(last)
+        tensors[f"{start}qkv.bias"] = torch.cat([query, torch.zeros_like(query), value])
+
+
+KINDS: Mapping[str, tuple[Kind, ...]] = {
+    "mask2former": (
+        CRM,
+        replace(CRM, prefix=""),
+        SWIN,
+        replace(
+            SWIN,
+            title="ImageNet Swin Transformer of timm",
+            has=(*SWIN.has[:2], "layers.3.downsample."),
+            source=_timm_swin,
+        ),
+    ),
+    "cmnext": (
+        CMNEXT,
+        replace(CMNEXT, has=CMNEXT.has[:2], source=str),  # with the names here
+        replace(
+            MIT,
+            source=renaming((r"^backbone\.", "")),
+            fresh=r"backbone\.(extra_|F[RF]Ms\.)|decode_head\.",
+            stems=NONE,
+        ),
+    ),
+    "cmx": (TEMPORAL, CMX, MIT),
+    "rtfnet": (
+        # Old files have no counters of batch normalisation.
+        Kind(
+            "RTFNet checkpoint",
+            has=("encoder_rgb_", "encoder_thermal_", "deconv"),
+            convention=("model/inputs=unit", "model.final_relu=true"),
+        ),
+        # Released: the thermal stem is the mean of the RGB stem. Paper
+        # (model.thermal_stem=xavier): it is drawn anew, like the decoder.
+        replace(
+            RESNET,
+            source=renaming((r"^encoder_(rgb|thermal)_", "")),
+            fresh=r"deconv\d\.",
+            stems=r"encoder_thermal_conv1\.weight",
+        ),
+    ),
+    "mfnet": (
+        Kind(
+            "MFNet checkpoint",
+            has=("conv1_rgb.conv.", "conv1_inf.conv.", "decode"),  # "inf" is thermal
+            convention=("model/inputs=unit", "model.final_activation=true"),
+        ),
+    ),
+    "pspnet": (
+        Kind(
+            "HeatNet checkpoint",
+            has=("feats.",),
+            prefix="trgb_segnet.",
+            unused=r"critics\.",  # discriminators, which are separate networks here
+            convention=("model/inputs=half", "model.align_corners=false"),
+        ),
+        LATE_RESNET,
+        PSPNET_RESNET,
+    ),
+    "semseg": (
+        Kind(
+            "PSPNet checkpoint of semseg",
+            has=("layer0.6.", "ppm.features.", "cls.4."),
+            convention=("model/inputs=cmx",),
+        ),
+        replace(
+            RESNET,
+            title="ImageNet ResNet of semseg, with three stem convolutions",
+            has=(*RESNET.has, "conv3.", "bn3."),
+            source=renaming(*((rf"^layer0\.{n}\.", f"{name}.") for n, name in STEM.items())),
+            fresh=r"(ppm|cls|aux)\.",
+        ),
+    ),
+    "deeplabv2": (CAFFE_RESNET, DEEPLAB_RESNET),
+    "dinov2": (
+        replace(DINOV2, has=(*DINOV2.has, "register_tokens"), convention=SIZE),
+        DINOV2,
+        replace(DINOV2_TIMM, has=(*DINOV2_TIMM.has, "reg_token"), convention=SIZE),
+        DINOV2_TIMM,
+        DINOV3,
+        replace(
+            DINOV3,
+            title="DINOv3 vision transformer of Hugging Face",
+            has=("embeddings.register_tokens", "layer.0.attention.k_proj.", "layer.0.layer_scale1"),
+            fresh=rf"{OUTSIDE}|{ENCODER}rope_embed\.periods$",
+            converted=_dinov3_of_hugging_face,
+        ),
+        replace(
+            DINOV3,
+            title="DINOv3 vision transformer of timm",
+            has=("reg_token", "blocks.0.gamma_1", *BLOCK),
+            fresh=rf"{OUTSIDE}|{ENCODER}(rope_embed\.periods|mask_token)$",
+            converted=_dinov3_of_timm,
+        ),
+    ),
+    "external": (),
+}
+"""Module of rgbt.models -> kinds of files for its networks, in the order they are tried."""
+
+OWN = Kind("file of rgbt")
+
+
+def family_of(network: type[nn.Module]) -> str:
+    """The module of rgbt.models that a class or a base of it is from, "" for all others."""
+    return next(filter(None, (family_named(each.__module__) for each in network.__mro__)), "")
+
+
+def family_named(path: str) -> str:
+    """The same for a dotted path: "cmx" for "rgbt.models.cmx.model.CMX"."""
+    words = path.split(".")
+    return words[2] if words[:2] == ["rgbt", "models"] and len(words) > 2 else ""

@@ -1,0 +1,248 @@
+"""The network DeepLab v2, which predicts class scores of one image with one of its heads."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Annotated, Literal
+
+import torch
+from annotated_types import Interval, Len
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from rgbt.checks import InputError, check_choice
+from rgbt.geometry.padding import padded_hw
+from rgbt.models.inputs import Inputs, as_rgb, only_view
+from rgbt.models.parts import DropRates, UpBlock, enlarge
+from rgbt.models.resnet import bottleneck_stage
+from rgbt.ranges import BaseWidth, Depths, Names, NumClasses
+from rgbt.requirements import Record, Requirement
+from rgbt.types import MaskPair, Output, View
+
+STRIDE = 8
+"""Of the backbone; the modified decoders double the size three times."""
+
+TrainNorm = Literal["all", "statistics"]
+Decoder = Literal["basic", "modified_heatnet", "modified_thesis"]
+Rates = Annotated[tuple[Annotated[int, Interval(ge=1, le=1024)], ...], Len(1, 64)]
+"""Dilations."""
+
+
+class Backbone(nn.Module):
+    """ResNet with the stride on the first 1x1 convolution and both last stages dilated throughout.
+
+    Parameters have torchvision's names, so that its ImageNet files fit, although there the stride
+    sits on the 3x3 convolution.
+
+    Source: DeepLab v2, Sec. 3.1.   Released: AdaptSegNet, ADVENT, MaxSquareLoss, thesis.
+
+    Arguments: see `DeepLabV2`; `width` is its base_width.
+    """
+
+    def __init__(
+        self, depths: tuple[int, int, int, int], width: int, *, ceil_mode: bool, train_norm: str
+    ) -> None:
+        super().__init__()
+        stage = partial(bottleneck_stage, stride_at="1x1")
+        self.pool = nn.MaxPool2d(3, stride=2, padding=1, ceil_mode=ceil_mode)
+        self.conv1 = nn.Conv2d(3, width, 7, stride=2, padding=3, bias=False)
+        self.bn1 = nn.BatchNorm2d(width)
+        self.layer1 = stage(width, width, depths[0])
+        self.layer2 = stage(4 * width, 2 * width, depths[1], stride=2)
+        self.layer3 = stage(8 * width, 4 * width, depths[2], dilations=(2, 2))
+        self.layer4 = stage(16 * width, 8 * width, depths[3], dilations=(4, 4))
+        for module in self.modules():
+            if isinstance(module, nn.BatchNorm2d):
+                module.requires_grad_(train_norm == "all")
+
+    def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """(N, 3, H, W) -> layer3 (N, 16 w, h, w) and layer4 (N, 32 w, h, w).
+
+        h = H / 8, one more where the pooling rounded up.
+        """
+        x = self.pool(F.relu(self.bn1(self.conv1(image))))
+        layer3 = self.layer3(self.layer2(self.layer1(x)))
+        return layer3, self.layer4(layer3)
+
+
+class AtrousPyramid(nn.Module):
+    """Sum of parallel dilated 3x3 convolutions, nothing else (ASPP).
+
+    Source: DeepLab v2, Sec. 3.2 and Fig. 7: all four count.   Released: AdaptSegNet,
+    MaxSquareLoss and the thesis leave their loop early, so that only the first two (`summed_rates`)
+    count, while the others still belong to the parameters; ADVENT sums all.
+    """
+
+    def __init__(
+        self, in_channels: int, out_channels: int, *, rates: Rates, summed_rates: Rates
+    ) -> None:
+        super().__init__()
+        self.conv2d_list = nn.ModuleList(
+            nn.Conv2d(in_channels, out_channels, 3, padding=rate, dilation=rate) for rate in rates
+        )
+        self.summed = [rates.index(rate) for rate in summed_rates]
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, in, h, w) -> (N, out, h, w)."""
+        first, *others = self.summed
+        result: Tensor = self.conv2d_list[first](x)
+        for index in others:
+            result = result + self.conv2d_list[index](x)
+        return result
+
+
+class DeepLabHead(nn.Module):
+    """A pyramid, and in the modified decoders three up blocks, between maps of `widths` channels.
+
+    Source: thesis, Sec. III-B and Fig. 5: a modified decoder keeps the number of channels.
+    Released: the training scripts import the network without up blocks. A file that no script
+    imports has a modified decoder of HeatNet's widths, which ends with a 1x1 convolution (`final`).
+    """
+
+    def __init__(
+        self,
+        aspp: AtrousPyramid,
+        widths: tuple[int, ...],
+        final: int | None,
+        *,
+        dropout: DropRates,
+        align_corners: bool,
+    ) -> None:
+        super().__init__()
+        self.dropout = dropout
+        self.aspp = aspp
+        self.ups = nn.ModuleList(
+            UpBlock(before, after, align_corners=align_corners)
+            for before, after in zip(widths, widths[1:], strict=False)
+        )
+        self.final = nn.Identity() if final is None else nn.Conv2d(widths[-1], final, 1)
+
+    def forward(self, x: Tensor, generator: torch.Generator | None) -> Tensor:
+        """(N, in, h, w) -> (N, K, h, w), or (N, K, 8 h, 8 w) from a modified decoder."""
+        rates = self.dropout if self.training else (0.0, 0.0)
+        result: Tensor = self.final(enlarge(self.aspp(x), self.ups, rates, generator))
+        return result
+
+
+class DeepLabV2(nn.Module):
+    """DeepLab v2 with a backbone that all domains share and one head, or one per domain.
+
+    Sees the RGB image or the thermal image, never both. Weights of convolutions are drawn from
+    N(0, 0.01), as released; biases and slopes keep torch's initialisation.
+
+    Source: DeepLab v2; thesis (J. Sun, Multi-head), Sec. III.   Released: AdaptSegNet, ADVENT and
+    MaxSquareLoss (one head, with or without the auxiliary one); the thesis' code (two heads).
+
+    The arguments are the keys of ``conf/model/deeplabv2.yaml``.
+
+    Raises:
+        InputError: `ceil_mode` with a modified decoder, or names that no module can have.
+    """
+
+    def __init__(  # noqa: PLR0913 - each is a key of conf/model/*.yaml
+        self,
+        *,
+        num_classes: NumClasses,
+        depths: Depths,
+        base_width: BaseWidth,
+        ceil_mode: bool,
+        train_norm: TrainNorm,
+        heads: Annotated[Names, Len(1, 100)],
+        auxiliary: bool,
+        decoder: Decoder,
+        rates: Rates,
+        summed_rates: Rates,
+        dropout: DropRates,
+        align_corners: bool,
+        inputs: Inputs,
+    ) -> None:
+        super().__init__()
+        if not set(summed_rates) <= set(rates):
+            raise InputError(f"model.summed_rates must be some of {rates}, got {summed_rates}.")
+        if not all(name.isidentifier() and not hasattr(nn.ModuleDict, name) for name in heads):
+            raise InputError(f"model.heads must be names such as source, got {list(heads)}.")
+        if ceil_mode and decoder != "basic":
+            raise InputError(f"model.ceil_mode must be false with model.decoder={decoder}.")
+        self.record = self.record_from(heads=heads, auxiliary=auxiliary)
+        self.num_classes = num_classes
+        self.align_corners = align_corners
+        # Scores that are interpolated fit images of any size.
+        self.multiple = 1 if decoder == "basic" else STRIDE
+        self.backbone = Backbone(depths, base_width, ceil_mode=ceil_mode, train_norm=train_norm)
+        channels = 32 * base_width
+        widths: dict[str, tuple[int, ...]] = {
+            "basic": (num_classes,),
+            "modified_heatnet": tuple(channels // each for each in (2, 8, 32, 32)),
+            "modified_thesis": (num_classes,) * 4,
+        }
+        pyramid = partial(AtrousPyramid, rates=rates, summed_rates=summed_rates)
+        self.heads = nn.ModuleDict(
+            {
+                name: DeepLabHead(
+                    pyramid(channels, widths[decoder][0]),
+                    widths[decoder],
+                    num_classes if decoder == "modified_heatnet" else None,
+                    dropout=dropout,
+                    align_corners=align_corners,
+                )
+                for name in heads
+            }
+        )
+        self.auxiliary = pyramid(16 * base_width, num_classes) if auxiliary else None
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.normal_(module.weight, 0.0, 0.01)
+        self.inputs = inputs
+
+    @staticmethod
+    def record_from(*, heads: tuple[str, ...], auxiliary: bool, **_: object) -> Record:
+        """Output, views and heads; of several heads, the domains train each."""
+        return Record(
+            requires=(Requirement("domains", "heads", heads),) if len(heads) > 1 else (),
+            views=("rgb", "thermal"),
+            heads=heads,
+            auxiliary=auxiliary,
+            features=True,
+            pretrained_parts=("backbone.",),
+            recomputed=("backbone.layer*.*",),
+        )
+
+    def forward(  # noqa: PLR0913 - what every network takes, and the head
+        self,
+        rgb: Tensor,
+        thermal: Tensor,
+        masks: MaskPair | None = None,
+        *,
+        views: tuple[View, ...] = (),
+        head: str | None = None,
+        generator: torch.Generator | None = None,
+    ) -> Output:
+        """Class scores from one image by one head, as `rgbt.models` says.
+
+        Of several heads, `head` names the one (InputError: there is none); None: the first.
+
+        Returns:
+            logits: (N, K, H, W).
+            aux: "features" (N, 32 w, h, w) of the fourth stage; "aux_logits" (N, K, H, W) of the
+                auxiliary head, where there is one.
+        """
+        view = only_view(views, self.record.views, "DeepLabV2")
+        name = next(iter(self.heads)) if head is None else head
+        check_choice("head", name, self.heads)
+        images = self.inputs(rgb, thermal, masks, multiple=self.multiple)
+        layer3, layer4 = self.backbone(images.rgb if view == "rgb" else as_rgb(images.thermal))
+        image_hw = rgb.shape[2], rgb.shape[3]
+        aux = {"features": layer4}
+        if self.auxiliary is not None:
+            aux["aux_logits"] = self._at_image(self.auxiliary(layer3), image_hw)
+        scores = self.heads[name](layer4, generator)
+        return Output(self._at_image(scores, image_hw), aux)
+
+    def _at_image(self, scores: Tensor, image_hw: tuple[int, int]) -> Tensor:
+        """Scores enlarged to the padded image where they are smaller, less the padding."""
+        full = padded_hw(image_hw, self.multiple)
+        if scores.shape[2:] != full:
+            scores = F.interpolate(
+                scores, size=full, mode="bilinear", align_corners=self.align_corners
+            )
+        return scores[..., : image_hw[0], : image_hw[1]]

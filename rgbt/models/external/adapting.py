@@ -1,0 +1,72 @@
+"""Tools for adapters, which build the networks of odd repositories.
+
+An adapter is a Python file beside a recipe, with a function that returns the network. Within it,
+modules of the checkout can be imported. It keeps constructors from reading weights of files, so
+that a run starts from the weights that its configuration names.
+"""
+
+from __future__ import annotations
+
+import sys
+from importlib.machinery import ModuleSpec
+from importlib.util import module_from_spec
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+from unittest.mock import MagicMock
+
+import torch
+from torch import nn
+
+
+def skip_init(*names: str) -> None:
+    """Let packages of the checkout be imported without executing their ``__init__.py``."""
+    for name in names:
+        spec = ModuleSpec(name, None, is_package=True)
+        spec.submodule_search_locations = [str(Path(sys.path[0], *name.split(".")))]
+        sys.modules.setdefault(name, module_from_spec(spec))
+
+
+def stand_in(name: str, **attributes: Any) -> None:
+    """Let a package be imported that is not installed and that the network does not use.
+
+    All that it is expected to have is a mock, but for `attributes`.
+    """
+    parts = name.split(".")
+    for length in range(1, len(parts) + 1):
+        sys.modules.setdefault(".".join(parts[:length]), MagicMock(__path__=[]))
+    for key, value in attributes.items():
+        setattr(sys.modules[name], key, value)
+
+
+def replace_in(owner: Any, **attributes: Any) -> None:
+    """Put other objects under some names of the module that defines a class or function."""
+    vars(sys.modules[owner.__module__]).update(attributes)
+
+
+def replaced(module: ModuleType, **attributes: Any) -> ModuleType:
+    """A module with other objects under some names; the module itself stays as it is.
+
+    ``replace_in(Net, torch=replaced(torch, load=lambda *_: {}))`` lets one module load nothing.
+    """
+    copy = ModuleType(module.__name__)
+    vars(copy).update(vars(module) | attributes)
+    return copy
+
+
+class Untrained:
+    """A module, such as ``torchvision.models``, whose functions ignore ``pretrained=True``."""
+
+    def __init__(self, module: ModuleType) -> None:
+        self._module = module
+
+    def __getattr__(self, name: str) -> Any:
+        function = getattr(self._module, name)
+        return lambda *given, **more: function(*given, **{**more, "pretrained": False})
+
+
+def allow_cpu() -> None:
+    """Without a GPU, ``.cuda()`` returns its tensor or module unchanged from now on."""
+    if not torch.cuda.is_available():
+        for kind in (torch.Tensor, nn.Module):
+            setattr(kind, "cuda", lambda self, *_, **__: self)  # noqa: B010 - not a type's method

@@ -1,0 +1,235 @@
+"""What the networks with Mask2Former's head share: fusion of two modalities, views and passes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal, NamedTuple
+
+import torch
+from annotated_types import Interval, MultipleOf
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from rgbt.checks import check_choice
+from rgbt.geometry.padding import STRIDE, padded_hw
+from rgbt.models.inputs import Inputs, expand_cells
+from rgbt.models.mask2former.decoder import Predictor
+from rgbt.models.mask2former.pixel_decoder import GROUPS, HeadShape, PixelDecoder
+from rgbt.models.parts import check_heads
+from rgbt.ranges import Channels
+from rgbt.requirements import Record
+from rgbt.types import VIEWS, MaskPair, Output, View
+
+FAINTEST = 1e-6
+"""Smallest semantic score whose logarithm is taken."""
+
+MODALITIES: tuple[Literal["rgb", "thermal"], ...] = ("rgb", "thermal")
+LEVELS = ("res2", "res3", "res4", "res5")
+
+FusionKind = Literal["max", "add"]
+HiddenDim = Annotated[Channels, MultipleOf(GROUPS)]
+NumQueries = Annotated[int, Interval(ge=1, le=10_000)]
+
+RECORD = Record(
+    outputs="masks",
+    views=VIEWS,
+    stacks_passes=True,
+    dense_logits=True,
+    recomputed=(
+        "sem_seg_head.pixel_decoder.transformer.encoder.layers.*",
+        "sem_seg_head.predictor.transformer_*_layers.*",
+    ),
+)
+"""Of every such network, without its backbone."""
+
+Widths = tuple[int, int, int, int]
+Maps = list[Tensor]
+"""(N, C_s, H/s, W/s), s = 4, 8, 16, 32."""
+
+
+class Request(NamedTuple):
+    """The first `predictions` of all `views` of all `passes`; see `MaskNetwork.forward`."""
+
+    views: tuple[View, ...]
+    passes: int
+    predictions: int
+
+
+class Fusion(nn.ModuleDict):
+    """The normalised maximum (or sum) of the maps of both modalities, level by level.
+
+    Source: CRM, Sec. III-B.   Released: batch normalisation of the fused maps only; the maps of
+    a single modality leave as their branch normalised them.
+
+    `widths` are the channels of the four levels, `fusion` is "max" or "add".
+    """
+
+    def __init__(self, widths: Widths, fusion: FusionKind) -> None:
+        super().__init__(
+            {level: nn.BatchNorm2d(width) for level, width in zip(LEVELS, widths, strict=True)}
+        )
+        self.widths = widths
+        self.fuse = torch.maximum if fusion == "max" else torch.add
+
+    def forward(self, maps: dict[str, Maps], request: Request) -> Maps:
+        """Maps of "rgb" and "thermal" to those of all predictions: pass by pass, view by view.
+
+        Maps of one that no view needs may be missing. Batch normalisation takes the passes one
+        after the other, so that each is normalised on its own.
+        """
+        predicted = []
+        for level, norm in enumerate(self.values()):
+            by_view: list[Sequence[Tensor]] = []
+            for view in request.views:
+                if view != "rgbt":
+                    by_view.append(_parts(maps[view][level], request.passes))
+                    continue
+                fused = self.fuse(maps["rgb"][level], maps["thermal"][level])
+                if self.training:
+                    by_view.append([norm(part) for part in _parts(fused, request.passes)])
+                else:  # without batch statistics all passes are one call
+                    by_view.append(_parts(norm(fused), request.passes))
+            parts = [part for one_pass in zip(*by_view, strict=True) for part in one_pass]
+            parts = parts[: request.predictions]
+            predicted.append(torch.cat(parts) if len(parts) > 1 else parts[0])
+        return predicted
+
+
+def _parts(stacked: Tensor, passes: int) -> Sequence[Tensor]:
+    """The passes of a stacked batch; one alone is not split, so that its size may be a symbol."""
+    return (stacked,) if passes == 1 else stacked.chunk(passes)
+
+
+class MaskNetwork(nn.Module):
+    """Two images through a backbone to classes and masks of queries.
+
+    Source: Mask2Former, Sec. 3.2.
+
+    A backbone has `maps(modality, image, hidden, generator)`, the maps of one normalised image with
+    tokens that are hidden, (N, h, w) bool or None; `token_px`, the side of a token; and a `Fusion`
+    under the name of the release, `norm_layers`.
+    """
+
+    backbone: Any
+
+    def __init__(self, backbone: nn.Module, shape: HeadShape, inputs: Inputs) -> None:
+        super().__init__()
+        check_heads("model.attention_heads", (shape.attention_heads,), (shape.hidden_dim,))
+        self.num_classes = shape.num_classes
+        self.backbone = backbone
+        pixel_decoder = PixelDecoder(self.backbone.norm_layers.widths, shape)
+        self.sem_seg_head = nn.ModuleDict(
+            {"pixel_decoder": pixel_decoder, "predictor": Predictor(shape)}
+        )
+        self.inputs = inputs
+
+    def forward(  # noqa: PLR0913 - what every network takes, and what is stacked
+        self,
+        rgb: Tensor,
+        thermal: Tensor,
+        masks: MaskPair | None = None,
+        *,
+        passes: int = 1,
+        views: tuple[View, ...] = (),
+        num_predictions: int | None = None,
+        num_masks: int | None = None,
+        generator: torch.Generator | None = None,
+    ) -> Output:
+        """Predictions of every view and pass, as one batch through the head.
+
+        Predictions are in the order F R T F' R' T': pass by pass, within it view by view.
+
+        Args:
+            rgb: as `rgbt.models` says, N = passes * B, pass by pass.
+            thermal: likewise.
+            masks: likewise; a cell is a square of a multiple of the backbone's `token_px` pixels.
+                Its pixels are 0, and the mask token takes the place of its tokens.
+            passes: stacked copies of one batch. The fusion's batch normalisation sees them one
+                after the other, as successive calls would show them.
+            views: which features are predicted from, each at most once: "rgbt" (fused), "rgb",
+                "thermal". () is "rgbt". A modality that no view needs is not computed.
+            num_predictions: P, how many of the len(views) * passes predictions are computed, from
+                the first one on. None: all.
+            num_masks: M, how many of the P have mask logits, from the first one on; the others have
+                class logits alone, which costs less, because the gradient of the finest features is
+                not needed. None: all.
+            generator: draws stochastic depth, per sample and branch.
+
+        Returns:
+            logits: (B, K, H, W) float32 semantic scores in evaluation mode when there is one view
+                and one pass, else None. They are sums over queries, not normalised.
+            aux: with L = decoder_layers + 1, the last one final:
+                "class_logits" (L, P, B, Q, K + 1), last column = no object;
+                "mask_logits" (L, M, B, Q, h, w) at 1/4 of the padded size; in memory the order
+                is M, B, L, Q, h, w.
+
+        Raises:
+            ValueError: passes, views or numbers of predictions that do not fit.
+        """
+        views = views or VIEWS[:1]
+        for view in views:
+            check_choice("view", view, VIEWS)
+        stacked = len(views) * passes
+        predictions = stacked if num_predictions is None else num_predictions
+        with_masks = predictions if num_masks is None else num_masks
+        if rgb.shape[0] % passes or len(set(views)) < len(views):
+            raise ValueError(f"{rgb.shape[0]} images in {passes} passes, views {views}: no batch.")
+        if not 1 <= with_masks <= predictions <= stacked:
+            raise ValueError(f"expected 1 <= {with_masks} masks <= {predictions} <= {stacked}.")
+
+        count = rgb.shape[0] // passes
+        image_hw = rgb.shape[2], rgb.shape[3]
+        hidden = None
+        if masks is not None:
+            padded = padded_hw(image_hw)
+            hidden = expand_cells(masks, rgb.shape[0], padded, self.backbone.token_px)
+        images = self.inputs(rgb, thermal, masks, multiple=STRIDE)
+        maps: dict[str, Maps] = {}
+        for index, modality in enumerate(MODALITIES):
+            if views != (MODALITIES[1 - index],):
+                mask = None if hidden is None else hidden[index]
+                maps[modality] = self.backbone.maps(modality, images[index], mask, generator)
+        features = self.backbone.norm_layers(maps, Request(views, passes, predictions))
+        pyramid = self.sem_seg_head["pixel_decoder"](features, with_masks * count)
+        class_logits, mask_logits = self.sem_seg_head["predictor"](pyramid)
+        logits = None
+        if not self.training and stacked == 1:
+            full_hw = padded_hw(image_hw)
+            logits = semantic_logits(class_logits[-1], mask_logits[-1], image_hw, full_hw)
+        aux = {
+            "class_logits": class_logits.unflatten(1, (predictions, count)),
+            "mask_logits": mask_logits.unflatten(1, (with_masks, count)),
+        }
+        return Output(logits, aux)
+
+    def dense_logits(self, output: Output, image_hw: tuple[int, int]) -> Tensor:
+        """Class scores of every pixel in training, for losses that compare dense predictions.
+
+        `output` is of one pass and view. (B, K, H, W) float32: logarithm of the semantic scores, so
+        that their softmax is the share of a class in the sum over classes.
+        """
+        classes, masks = (output.aux[name][-1, 0] for name in ("class_logits", "mask_logits"))
+        scores = semantic_logits(classes, masks, image_hw, padded_hw(image_hw))
+        return scores.clamp(min=FAINTEST).log()
+
+
+def semantic_logits(
+    class_logits: Tensor, mask_logits: Tensor, image_hw: tuple[int, int], padded: tuple[int, int]
+) -> Tensor:
+    """Score of every class at every pixel, at the size of the image.
+
+        score(k, pixel) = sum over queries of softmax(class)(k) * sigmoid(mask)(pixel)
+
+    Source: Mask2Former release, semantic inference; the no-object class is dropped.
+
+    (B, Q, K + 1) and (B, Q, h, w), which stands for an image of size `padded` whose top left part
+    is `image_hw`, -> (B, K, H, W) float32, >= 0.
+    """
+    with torch.autocast(class_logits.device.type, enabled=False):
+        masks = F.interpolate(
+            mask_logits.float(), size=padded, mode="bilinear", align_corners=False
+        )
+        masks = masks[..., : image_hw[0], : image_hw[1]].sigmoid()
+        classes = class_logits.float().softmax(-1)[..., :-1]
+        scores = classes.transpose(1, 2) @ masks.flatten(2)
+        return scores.view(*scores.shape[:2], *image_hw)

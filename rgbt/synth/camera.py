@@ -1,0 +1,138 @@
+"""Pinhole camera above the ground plane: projection, rays, and the motion between two frames.
+
+World: X right, Y up, Z ahead, metres, ground at Y = 0. SynthCamera: x right, y down, z ahead.
+Pixels: the centre of the top-left pixel is (0, 0).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rgbt.synth.factors import EgoMotion, SceneFactors
+
+Floats = NDArray[np.float32]
+Real = TypeVar("Real", np.float32, np.float64)
+
+
+def floats(values: Sequence[object] | NDArray[np.float64]) -> Floats:
+    """A float32 array of `values`."""
+    return np.array(values, np.float32)
+
+
+NEAR_M = 0.3
+"""Nothing nearer than this along the optical axis is drawn."""
+
+
+@dataclass(frozen=True)
+class SynthCamera:
+    """Size of the image and focal length in pixels, position in metres, angles in radians.
+
+    `pitch` tilts downward, `yaw` turns to the right.
+    """
+
+    height: int
+    width: int
+    focal: float
+    position: tuple[float, float, float]
+    pitch: float
+    yaw: float = 0.0
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """(column, row) of the optical axis: the middle of the image."""
+        return (self.width - 1) / 2, (self.height - 1) / 2
+
+    @property
+    def rotation(self) -> NDArray[np.float64]:
+        """(3, 3) float64: rows are the camera's x, y and z axes in world coordinates."""
+        sin_yaw, cos_yaw = np.sin(self.yaw), np.cos(self.yaw)
+        sin_pitch, cos_pitch = np.sin(self.pitch), np.cos(self.pitch)
+        return np.array(
+            [
+                [cos_yaw, 0.0, -sin_yaw],
+                [-sin_yaw * sin_pitch, -cos_pitch, -cos_yaw * sin_pitch],
+                [sin_yaw * cos_pitch, -sin_pitch, cos_yaw * cos_pitch],
+            ]
+        )
+
+    def to_camera(self, points: NDArray[Real]) -> NDArray[Real]:
+        """World points (..., 3) in camera coordinates, in the precision they come in."""
+        # As one list of points: a stack of small matrices would be multiplied one by one.
+        moved = points.reshape(-1, 3) - np.asarray(self.position, points.dtype)
+        return (moved @ self.rotation.T.astype(points.dtype)).reshape(points.shape)
+
+    def project(self, points_in_camera: Floats) -> Floats:
+        """Points (..., 3) in camera coordinates as (column, row); depth is held above `NEAR_M`."""
+        scale = np.reciprocal(np.maximum(points_in_camera[..., 2:], np.float32(NEAR_M)))
+        scale *= np.float32(self.focal)
+        return points_in_camera[..., :2] * scale + floats(self.centre)
+
+    def rays(self) -> Floats:
+        """(3, H, W) camera coordinates of the point at depth 1 that each pixel sees."""
+        column, row = self.centre
+        rays = np.ones((3, self.height, self.width), np.float32)
+        rays[0] = (np.arange(self.width, dtype=np.float32) - column) / self.focal
+        rays[1] = ((np.arange(self.height, dtype=np.float32) - row) / self.focal)[:, None]
+        return rays
+
+    def turned(self, vectors_3HW: Floats) -> Floats:
+        """(3, H, W) vectors in camera coordinates as vectors in world coordinates."""
+        flat = vectors_3HW.reshape(3, -1)
+        return (self.rotation.T.astype(np.float32) @ flat).reshape(vectors_3HW.shape)
+
+    def to_world(self, rays_3HW: Floats, inverse_depth_HW: Floats) -> Floats:
+        """(3, H, W) world points along `rays_3HW`; 10 km away where the inverse depth is 0."""
+        depth = np.reciprocal(np.maximum(inverse_depth_HW, np.float32(1e-4)))
+        return self.turned(rays_3HW) * depth + floats(self.position)[:, None, None]
+
+    def moved(self, motion: EgoMotion) -> SynthCamera:
+        """The camera after `motion`."""
+        yaw = self.yaw + float(np.deg2rad(motion.yaw_deg))
+        x, y, z = self.position
+        step = motion.forward_m
+        return replace(
+            self,
+            position=(x + step * float(np.sin(yaw)), y, z + step * float(np.cos(yaw))),
+            yaw=yaw,
+        )
+
+
+def camera_of(factors: SceneFactors) -> SynthCamera:
+    """The camera that the factors describe, above the origin, looking along Z."""
+    half_angle = np.deg2rad(factors.field_of_view_deg) / 2
+    return SynthCamera(
+        height=factors.height,
+        width=factors.width,
+        focal=float(factors.width / 2 / np.tan(half_angle)),
+        position=(0.0, factors.camera_height_m, 0.0),
+        pitch=float(np.deg2rad(factors.camera_pitch_deg)),
+    )
+
+
+def flow_between(depth_HW: Floats, source: SynthCamera, target: SynthCamera) -> Floats:
+    """Displacement of each pixel of `source` to its position in `target`, for a static scene.
+
+        p' = K (R' R^T K^-1 p z + R' (C - C')) / z',   flow = p' - p
+
+    with R, C rotation and position of `source`, R', C' those of `target`, z the depth.
+
+    `depth_HW` is that along the optical axis of `source` in metres, infinity for the sky. Returns
+    (H, W, 2) float32 (rows, columns) in pixels, NaN behind `target`; ValueError if the two cameras
+    differ in image size or focal length.
+    """
+    shift = target.rotation @ (np.asarray(source.position) - np.asarray(target.position))
+    rays = source.rays()
+    turned = np.tensordot((target.rotation @ source.rotation.T).astype(np.float32), rays, 1)
+    # Divided by the depth, so that the sky (inverse depth 0) needs no case of its own.
+    points = turned + (1.0 / depth_HW) * shift.astype(np.float32)[:, None, None]
+    ahead = np.where(points[2] > 0, points[2], np.nan)
+    focal = source.focal
+    if (target.focal, target.centre) != (focal, source.centre):
+        raise ValueError("flow_between: the two cameras must be the same but for where they stand.")
+    rows, columns = (points[axis] / ahead - rays[axis] for axis in (1, 0))
+    return np.asarray(np.stack([rows, columns], axis=2) * np.float32(focal), np.float32)

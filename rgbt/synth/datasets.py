@@ -1,0 +1,471 @@
+"""The embedded data sets: one world in the layouts of four real data sets.
+
+Each is written on first use and read by the ordinary reader of its layout. A further file of
+``conf/dataset/`` with other factors is a preset: ``synth_calibrated`` is one of `synth`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Literal
+
+import cv2
+import numpy as np
+from annotated_types import Interval
+from numpy.typing import NDArray
+
+from rgbt.checks import InputError
+from rgbt.data import freiburg, kp, pst900
+from rgbt.data.freiburg import CountRange, Crop, Freiburg
+from rgbt.data.kp import KP
+from rgbt.data.mfnet import MFNet
+from rgbt.data.pst900 import PST900, Bags
+from rgbt.ranges import Names, Seed, Text
+from rgbt.synth.camera import Floats
+from rgbt.synth.export import Images, Layout, Plan, Shot, exported
+from rgbt.synth.factors import (
+    EgoMotion,
+    ForwardMetres,
+    NumScenes,
+    SceneFactors,
+    YawDegrees,
+    with_factors,
+)
+from rgbt.synth.scene import Scene
+from rgbt.synth.shapes import (
+    BUMP,
+    CAR_STOP,
+    COLOR_CONE,
+    ELSEWHERE,
+    PERSON,
+    UNLABELED,
+    Table,
+    class_table,
+)
+from rgbt.types import SceneMaps
+
+
+def _bgr(scene: Scene) -> NDArray[np.uint8]:
+    """RGB in the order in which OpenCV stores channels."""
+    return np.ascontiguousarray(scene.rgb[..., ::-1])
+
+
+# ---- MFNet ----------------------------------------------------------------------------------
+
+SKY = 65535
+"""Depth of the sky in a file, and of anything farther than 655 m."""
+
+
+class SceneDataset(MFNet):
+    """Rendered scenes in MFNet's layout, with depth and objects of the test images."""
+
+    def scene_maps(self, name: str) -> SceneMaps:
+        """Depth and objects of an image of the test split; InputError without such a file."""
+        path = self.root / "scene" / f"{name}.png"
+        stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        if stored is None or stored.dtype != np.uint16 or stored.ndim != 3:
+            raise InputError(f"{path}: no depth and objects of a rendered scene (test split).")
+        # OpenCV reads the first channel of the file last.
+        centimetres, number = stored[..., 2], stored[..., 1]
+        depth = centimetres.astype(np.float32) / 100
+        depth[centimetres == SKY] = np.inf
+        return SceneMaps(depth, number.astype(np.int32))
+
+
+@with_factors()
+def synth(  # noqa: PLR0913 - each is a key of the configuration
+    *,
+    name: Text = "synth",
+    cache_dir: Text | None = None,
+    num_classes: Literal[9] = 9,
+    seed: Seed = 0,
+    num_train: NumScenes = 600,
+    num_val: NumScenes = 100,
+    num_test: NumScenes = 100,
+    factors: SceneFactors,
+    ego_forward_m: ForwardMetres | None = None,
+    ego_yaw_deg: YawDegrees = 0.0,
+) -> SceneDataset:
+    """Streets in MFNet's layout, generated on first use.
+
+    images/00012D.png   four channels R, G, B, thermal       labels/00012D.png   class ids
+    train.txt val.txt test.txt test_day.txt test_night.txt   one name per line
+    scene/00012D.png    of test images: 16 bits, channels depth in centimetres, number of the object
+    next/               the same names after the ego-motion, with flow/NAME.npy, if requested
+
+    Args:
+        name: of the data set.
+        cache_dir: folder that holds written data sets; None: $XDG_CACHE_HOME/rgbt or ~/.cache/rgbt.
+        num_classes: MFNet's nine; other nodes of the configuration interpolate it.
+        seed: of the data set; independent of the seed of a run.
+        num_train: scenes of the training split.
+        num_val: scenes of the validation split.
+        num_test: scenes of the test split; no scene is in two splits.
+        factors: given as keywords, from `height` to `whole_shadows`; see `SceneFactors`.
+        ego_forward_m: None: single frames. A number: every scene is also written as it looks after
+            this motion, in the sub-folder `next`, with the exact flow back to the first frame; see
+            `EgoMotion`.
+        ego_yaw_deg: turn of that motion.
+
+    Returns:
+        the reader of the written folder.
+
+    Raises:
+        InputError: a turn without a motion, a cache that cannot be written.
+    """
+    if ego_forward_m is None and ego_yaw_deg != 0:
+        raise InputError("dataset.ego_yaw_deg requires dataset.ego_forward_m (0: on the spot).")
+    motion = None if ego_forward_m is None else EgoMotion(ego_forward_m, ego_yaw_deg)
+    numbers = {"train": num_train, "val": num_val, "test": num_test}
+    plan = Plan(name=name, seed=seed, numbers=numbers, factors=factors, motion=motion)
+    folder = exported(MFNET_LAYOUT, plan, cache_dir)
+    return SceneDataset(str(folder), name=name, num_classes=num_classes)
+
+
+def _mfnet_shots(plan: Plan) -> list[Shot]:
+    """Names have five digits and D (day) or N (night), as in MFNet."""
+    return [
+        Shot(scene, split, night, f"{scene:05d}{'N' if night else 'D'}")
+        for split, scenes in plan.splits
+        for scene in scenes
+        for night in [plan.is_night(scene)]
+    ]
+
+
+def _mfnet_images(scene: Scene, shot: Shot) -> Images:
+    written: Images = {
+        # The fourth channel, alpha, is thermal.
+        f"images/{shot.name}.png": np.dstack([_bgr(scene), scene.thermal]),
+        f"labels/{shot.name}.png": scene.label,
+    }
+    if shot.split == "test":
+        centimetres = np.minimum(np.rint(scene.depth * 100), SKY).astype(np.uint16)
+        # Buildings and trees are objects of the drawing, but not of a class.
+        labelled = (scene.owner >= 0) & (scene.label != UNLABELED)
+        number = np.where(labelled, scene.owner + 1, 0).astype(np.uint16)
+        maps = np.dstack([np.zeros_like(number), number, centimetres])
+        written[f"scene/{shot.name}.png"] = maps
+    return written
+
+
+def _mfnet_lists(shots: Sequence[Shot]) -> dict[str, list[str]]:
+    """The names of each split, and those of the test split by day and at night."""
+    lists: dict[str, list[str]] = {}
+    for shot in shots:
+        lists.setdefault(f"{shot.split}.txt", []).append(shot.name)
+        if shot.split == "test":
+            time = "night" if shot.night else "day"
+            lists.setdefault(f"test_{time}.txt", []).append(shot.name)
+    return lists
+
+
+MFNET_LAYOUT = Layout(_mfnet_shots, _mfnet_images, _mfnet_lists)
+
+
+# ---- KP -------------------------------------------------------------------------------------
+
+_FRAMES_PER_VIDEO = 40
+_SETS = {
+    **{("train", False): (0, 1, 2), ("train", True): (3, 4, 5)},
+    **{("val", False): (6,), ("val", True): (10,)},
+    **{("test", False): (7, 8), ("test", True): (9, 11)},
+}
+"""(split, night) -> recordings that the CRM release gives to it."""
+
+VOID = "void"
+"""What has no class: the id after the last one, ignored in training and in every score."""
+
+_KP_LABELS = ("car", "person", "bicycle", "sidewalk", VOID, "fence", VOID, "road")
+"""Class of MFNet's labels 1 to 8; a person on a bicycle is a "rider"."""
+
+KP_TABLE = class_table([*kp.CLASSES, VOID], _KP_LABELS, "kp")
+
+
+@with_factors(night_share=0.48)
+def synth_kp(  # noqa: PLR0913 - each is a key of the configuration
+    *,
+    cache_dir: Text | None = None,
+    num_classes: Literal[19] = 19,
+    seed: Seed = 0,
+    num_train: NumScenes = 400,
+    num_val: NumScenes = 60,
+    num_test: NumScenes = 80,
+    factors: SceneFactors,
+) -> KP:
+    """Streets in the layout of KP in the CRM release; arguments and errors as of `synth`.
+
+    images/setXX/VYYY/{visible,lwir}/IZZZZZ.jpg   three channels each, those of lwir equal
+    labels/setXX_VYYY_IZZZZZ.png                  class ids, 19 for void
+    {train,val,test}{,_day,_night}.txt            one label file per line
+
+    Five of the 19 classes are in no scene (see `kp_ids`): where absent classes count as 0, as in
+    the published tables, no network scores more than 14 / 19 = 73.7 %.
+    """
+    numbers = {"train": num_train, "val": num_val, "test": num_test}
+    plan = Plan(name="synth_kp", seed=seed, numbers=numbers, factors=factors)
+    return KP(str(exported(KP_LAYOUT, plan, cache_dir)), name=plan.name, num_classes=num_classes)
+
+
+def _kp_shots(plan: Plan) -> list[Shot]:
+    shots = []
+    for split, scenes in plan.splits:
+        nights = [plan.is_night(scene) for scene in scenes]
+        for number, (scene, night) in enumerate(zip(scenes, nights, strict=True)):
+            # How many scenes of the same time of day come before this one.
+            before = nights[:number].count(night)
+            sets = _SETS[split, night]
+            recording = sets[before * len(sets) // nights.count(night)]
+            name = f"set{recording:02d}_V{before // _FRAMES_PER_VIDEO:03d}_I{scene:05d}"
+            shots.append(Shot(scene, split, night, name))
+    return shots
+
+
+def _kp_images(scene: Scene, shot: Shot) -> Images:
+    recording, video, frame = shot.name.split("_")
+    folder = f"images/{recording}/{video}"
+    return {
+        f"{folder}/visible/{frame}.jpg": _bgr(scene),
+        f"{folder}/lwir/{frame}.jpg": np.repeat(scene.thermal[..., None], 3, axis=2),
+        f"labels/{shot.name}.png": kp_ids(scene),
+    }
+
+
+def _kp_lists(shots: Sequence[Shot]) -> dict[str, list[str]]:
+    lists: dict[str, list[str]] = {}
+    for shot in sorted(shots, key=lambda shot: shot.name):
+        for suffix in ("", "_night" if shot.night else "_day"):
+            lists.setdefault(f"{shot.split}{suffix}.txt", []).append(f"{shot.name}.png")
+    return lists
+
+
+KP_LAYOUT = Layout(_kp_shots, _kp_images, _kp_lists)
+
+
+def _ids(table: Table, scene: Scene) -> NDArray[np.uint8]:
+    ids = table[scene.label, scene.material]
+    assert (ids != ELSEWHERE).all(), "every material of the scenery has a class"
+    return ids
+
+
+def kp_ids(scene: Scene) -> NDArray[np.uint8]:
+    """Class ids of KP, those of Cityscapes: (H, W) uint8, 0 to 19.
+
+    Of the 19 classes five are never there: traffic_light, truck, bus, train, motorcycle; vans are
+    cars as in Cityscapes. Guardrails are "fence" so that there is one; Cityscapes gives them no
+    class.
+    """
+    ids = _ids(KP_TABLE, scene)
+    ridden = [n for n, thing in enumerate(scene.placed) if thing.shape.name == "bike_ridden"]
+    on_bike = (scene.label == PERSON) & np.isin(scene.owner, ridden)
+    return np.where(on_bike, np.uint8(kp.CLASSES.index("rider")), ids)
+
+
+# ---- PST900 ---------------------------------------------------------------------------------
+
+VAL_BAG = 20
+"""The recording of the training part that scenes for validation lie in."""
+
+_BAGS = {"train": range(1, VAL_BAG), "val": (VAL_BAG,), "test": (21, 22, 23, 24, 25)}
+"""Recordings of each split; those for testing are the real ones."""
+
+_FRAME_STEP = 10
+_STANDS_FOR = {
+    **{COLOR_CONE: "fire_extinguisher", CAR_STOP: "backpack"},
+    **{BUMP: "hand_drill", PERSON: "survivor"},
+}
+"""Which object of a street stands for which of the four; everything else is background."""
+
+PST900_IDS = np.array(
+    [pst900.CLASSES.index(_STANDS_FOR.get(label, "background")) for label in range(9)], np.uint8
+)
+
+
+@with_factors(width=214, field_of_view_deg=80.0)
+def synth_pst900(  # noqa: PLR0913 - each is a key of the configuration
+    *,
+    cache_dir: Text | None = None,
+    num_classes: Literal[5] = 5,
+    val_bags: Bags = (VAL_BAG,),
+    seed: Seed = 0,
+    num_train: NumScenes = 400,
+    num_val: NumScenes = 50,
+    num_test: NumScenes = 80,
+    factors: SceneFactors,
+) -> PST900:
+    """Streets in the layout of the PST900 archive; arguments and errors as of `synth`.
+
+    {train,test}/{rgb,thermal,labels}/NAME.png, NAME as in 58_bag21_rect_rgb_frame0000000440
+
+    These are streets and not tunnels. They imitate the files and the rarity of the four objects
+    (about 1 % of the pixels each, as backpack and survivor in PST900; the other two are rarer
+    there): traffic cones for fire extinguishers, car stops for backpacks, bumps for hand drills,
+    persons for survivors. Results on them say nothing about PST900.
+
+    `val_bags` of `rgbt.data.pst900.PST900`; () makes "val" the test part, as in the releases, and
+    leaves the scenes for validation in training.
+    """
+    numbers = {"train": num_train, "val": num_val, "test": num_test}
+    plan = Plan(name="synth_pst900", seed=seed, numbers=numbers, factors=factors)
+    folder = str(exported(PST900_LAYOUT, plan, cache_dir))
+    return PST900(folder, name=plan.name, num_classes=num_classes, val_bags=val_bags)
+
+
+def _pst900_shots(plan: Plan) -> list[Shot]:
+    shots = []
+    for split, scenes in plan.splits:
+        bags, part = _BAGS[split], "test" if split == "test" else "train"
+        for number, scene in enumerate(scenes):
+            bag = bags[number * len(bags) // len(scenes)]
+            name = f"{scene}_bag{bag:02d}_rect_rgb_frame{scene * _FRAME_STEP:010d}"
+            shots.append(Shot(scene, split, plan.is_night(scene), name, part))
+    return shots
+
+
+def _pst900_images(scene: Scene, shot: Shot) -> Images:
+    return {
+        f"{shot.folder}/rgb/{shot.name}.png": _bgr(scene),
+        f"{shot.folder}/thermal/{shot.name}.png": scene.thermal,
+        f"{shot.folder}/labels/{shot.name}.png": PST900_IDS[scene.label],
+    }
+
+
+PST900_LAYOUT = Layout(_pst900_shots, _pst900_images)
+
+
+# ---- Freiburg Thermal -----------------------------------------------------------------------
+
+VAL_SEQUENCE = "seq_04_day"
+_SEQUENCES = {"train_day": 4, "train_night": 3}
+_PIECES = 2
+"""Of each sequence."""
+
+_LARGE_LABELS = "train/seq_01_day/"
+"""The sequence whose labels are twice the size of its frames."""
+
+BLACK, WHITE = 21800, 23700
+"""Counts of the grey levels 0 and 1, which some pixels lie beyond."""
+
+_MARGINS = ((0.151, 0.0), (0.172, 1.0), (0.826, 1.0), (0.845, 0.0))
+"""Corners (share of the width, of the height) of what the thermal camera sees, which leaves a few
+pixels of the crop without."""
+
+_FREIBURG_LABELS = (
+    *("car", "person", "bicycle", "curb"),
+    *("background", "fence", "background", "road"),
+)
+"""Class of MFNet's labels 1 to 8."""
+
+FREIBURG_TABLE = class_table(freiburg.CLASSES, _FREIBURG_LABELS, "freiburg")
+
+
+@with_factors("night_share", height=98, width=288, field_of_view_deg=96.0)
+def synth_freiburg(  # noqa: PLR0913 - each is a key of the configuration
+    *,
+    cache_dir: Text | None = None,
+    num_classes: Literal[14] = 14,
+    unscored: Names = ("background", "ignore"),
+    crop: Crop | None = (1, 97, 48, 240),
+    thermal_range: CountRange = freiburg.THERMAL_RANGE,
+    ignored_test: Names = ("ignore",),
+    seed: Seed = 0,
+    num_train_day: NumScenes = 300,
+    num_train_night: NumScenes = 300,
+    num_val: NumScenes = 40,
+    num_test: Annotated[int, Interval(ge=2, le=30_000)] = 60,
+    factors: SceneFactors,
+) -> Freiburg:
+    """Streets in the layout of Freiburg Thermal; arguments and errors as of `synth` and `Freiburg`.
+
+    train/SEQUENCE/PIECE/{fl_rgb,fl_ir_aligned,fl_rgb_labels}/..._STAMP.png, no labels at night
+    test/{day,night}/{ImagesRGB,ImagesIR}/STAMP_{rgb,ir}.png, SegmentationClass/STAMP_rgb.npy
+
+    The files have the irregularities of the archives: thermal images are counts of 16 bits that end
+    in slanted black margins, because the thermal camera sees less than the RGB camera; labels of
+    one sequence have another size than its frames; test folders are spelt in two ways, and stamps
+    there end in another 0 or not; test labels are arrays.
+
+    Labels are exact, those for training too, which in the real data set a network has predicted.
+    "ignore" is in test labels alone: what the thermal camera does not see. `num_train_day` scenes
+    are labelled, `num_train_night` others are not, `num_val` are labelled, by day and of a sequence
+    of their own, and `num_test` are labelled, half by day and half at night.
+    """
+    numbers = {"train_day": num_train_day, "train_night": num_train_night}
+    numbers |= {"val": num_val, "test": num_test}
+    plan = Plan(name="synth_freiburg", seed=seed, numbers=numbers, factors=factors)
+    return Freiburg(
+        str(exported(FREIBURG_LAYOUT, plan, cache_dir)),
+        name=plan.name,
+        num_classes=num_classes,
+        unscored=unscored,
+        crop=crop,
+        thermal_range=thermal_range,
+        ignored_test=ignored_test,
+        val_sequences=(VAL_SEQUENCE,),
+    )
+
+
+def _freiburg_shots(plan: Plan) -> list[Shot]:
+    shots = []
+    for split, scenes in plan.splits:
+        for number, scene in enumerate(scenes):
+            night = split == "train_night"
+            if split == "val":
+                folder = f"train/{VAL_SEQUENCE}/00"
+            elif split == "test":
+                night = number >= len(scenes) - len(scenes) // 2
+                folder = f"test/{'night' if night else 'day'}"
+            else:
+                pieces = _SEQUENCES[split] * _PIECES
+                sequence, piece = divmod(number * pieces // len(scenes), _PIECES)
+                folder = f"train/seq_{sequence:02d}_{split.removeprefix('train_')}/{piece:02d}"
+            # Seconds and nanoseconds, which end in the number of the frame in its burst: 0.
+            stamp = f"{1_570_000_000 + 3 * scene}_{scene * 618_033_989 % 10**9:09d}0"
+            shots.append(Shot(scene, split, night, stamp, folder))
+    return shots
+
+
+def _freiburg_images(scene: Scene, shot: Shot) -> Images:
+    folder, stamp = shot.folder, shot.name
+    ids = freiburg_ids(scene)
+    counts = np.where(seen_in_thermal(*ids.shape), counts_of(scene.grey), np.uint16(0))
+    if shot.split == "test":
+        rgb, thermal = ("ImagesRgb", "ImagesIr") if shot.night else ("ImagesRGB", "ImagesIR")
+        of_thermal = stamp if shot.night else stamp.removesuffix("0")
+        # By hand only that is labelled which both cameras see.
+        label = np.where(counts > 0, ids, np.uint8(freiburg.CLASSES.index("ignore")))
+        return {
+            f"{folder}/{rgb}/{stamp}_rgb.png": _bgr(scene),
+            f"{folder}/{thermal}/{of_thermal}_ir.png": counts,
+            f"{folder}/SegmentationClass/{stamp}_rgb.npy": label,
+        }
+    images: Images = {
+        f"{folder}/fl_rgb/fl_rgb_{stamp}.png": _bgr(scene),
+        f"{folder}/fl_ir_aligned/fl_ir_aligned_{stamp}.png": counts,
+    }
+    if not shot.night:
+        if folder.startswith(_LARGE_LABELS):
+            ids = ids.repeat(2, axis=0).repeat(2, axis=1)
+        images[f"{folder}/fl_rgb_labels/fl_rgb_labels_{stamp}.png"] = ids
+    return images
+
+
+FREIBURG_LAYOUT = Layout(_freiburg_shots, _freiburg_images)
+
+
+def freiburg_ids(scene: Scene) -> NDArray[np.uint8]:
+    """Class ids of Freiburg Thermal, (H, W) uint8, 0 to 12."""
+    return _ids(FREIBURG_TABLE, scene)
+
+
+def counts_of(grey: Floats) -> NDArray[np.uint16]:
+    """Counts (H, W) uint16 of grey levels: `BLACK` is 0 and `WHITE` is 1, in a straight line."""
+    return np.rint(BLACK + (WHITE - BLACK) * grey.astype(np.float64)).astype(np.uint16)
+
+
+def seen_in_thermal(height: int, width: int) -> NDArray[np.bool_]:
+    """(H, W): whether the thermal camera sees a pixel of the frame; it never moves on its mount."""
+    size = np.array([width - 1, height - 1])
+    corners = np.rint(np.array(_MARGINS) * size).astype(np.int32)
+    canvas = np.zeros((height, width), np.uint8)
+    cv2.fillConvexPoly(canvas, corners, 1)
+    return canvas > 0

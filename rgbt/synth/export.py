@@ -1,0 +1,184 @@
+"""Write scenes in the layout of a data set, once, with several processes if there are many.
+
+The layouts are defined in `rgbt.synth.datasets`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import multiprocessing
+import os
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import Progress
+
+from rgbt.checks import InputError
+from rgbt.synth.factors import EgoMotion, SceneFactors
+from rgbt.synth.light import is_night
+from rgbt.synth.scene import Scene, render_pair, render_scene
+
+VERSION = 3
+"""Of the files. Raise it with every change that changes a byte, so that no cache is stale."""
+
+_WORTH_A_POOL = 200
+"""Scenes; fewer are written before a pool has started."""
+
+_WORTH_A_BAR = 100
+"""Scenes; about a second's work."""
+
+_FAST_PNG = [cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
+"""A third of the time of the quickest ordinary compression, and smaller: the images are noisy."""
+
+Images = dict[str, NDArray[Any]]
+"""Path in the data set -> image in OpenCV's order of channels, or array if the path says .npy."""
+
+FRAMES = "next"
+"""Folder of the second frames, in the same layout, with flow/NAME.npy."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """The plan of a written data set; equal plans give equal files.
+
+    `numbers` are scenes by split; `motion` leads to a second frame of every scene.
+    """
+
+    name: str
+    seed: int
+    numbers: Mapping[str, int]
+    factors: SceneFactors
+    motion: EgoMotion | None = None
+
+    @property
+    def splits(self) -> Iterator[tuple[str, range]]:
+        """Every split and its scenes; none is in two of them."""
+        first = 0
+        for split, number in self.numbers.items():
+            yield split, range(first, first + number)
+            first += number
+
+    def is_night(self, scene: int) -> bool:
+        """Whether a scene is one at night, by the share of the factors."""
+        return is_night(self.seed, scene, self.factors.night_share)
+
+
+class Shot(NamedTuple):
+    """One scene to be written: its number, its split, whether it is night, its name and folder."""
+
+    scene: int
+    split: str
+    night: bool
+    name: str
+    folder: str = ""
+
+
+class Layout(NamedTuple):
+    """Which files of which scenes a data set has.
+
+    Attributes:
+        shots: every scene, in the order of their numbers.
+        images: the files of a scene.
+        lists: the split lists, by path, if there are any.
+    """
+
+    shots: Callable[[Plan], list[Shot]]
+    images: Callable[[Scene, Shot], Images]
+    lists: Callable[[Sequence[Shot]], dict[str, list[str]]] | None = None
+
+
+def exported(layout: Layout, plan: Plan, cache_dir: str | Path | None) -> Path:
+    """The folder of a data set, written now if it is not there yet.
+
+    It is written under another name and renamed when complete, so that an interrupted generation
+    leaves nothing that looks like a data set, and two at once cannot mix. The plan is stored in it.
+    `cache_dir` None: `default_cache`; InputError if it cannot be written.
+    """
+    text = json.dumps({"version": VERSION, **asdict(plan)}, sort_keys=True, indent=1)
+    cache = Path(cache_dir).expanduser() if cache_dir else default_cache()
+    folder = cache / f"{plan.name}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
+    if folder.is_dir():
+        return folder
+    try:
+        cache.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".synth-", dir=cache) as scratch:
+            made = Path(scratch) / "made"
+            made.mkdir()
+            write(layout, plan, made)
+            (made / "plan.json").write_text(text + "\n", encoding="utf-8")
+            made.rename(folder)
+    except OSError as error:
+        # Where another process was first, its folder is as good: equal plans give equal files.
+        if not folder.is_dir():
+            reason = error.strerror or error
+            raise InputError(f"dataset.cache_dir: cannot write {folder} ({reason}).") from error
+    return folder
+
+
+def default_cache() -> Path:
+    """$XDG_CACHE_HOME/rgbt, or ~/.cache/rgbt where that is not set."""
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "rgbt"
+
+
+def write(layout: Layout, plan: Plan, folder: Path) -> None:
+    """Write the whole data set into `folder`, which exists; OSError if that is impossible."""
+    shots = layout.shots(plan)
+    work = partial(write_shot, layout, plan, folder)
+    hidden = len(shots) < _WORTH_A_BAR
+    with Progress(console=Console(stderr=True), transient=True, disable=hidden) as progress:
+        task = progress.add_task("writing synthetic scenes", total=len(shots))
+        for _ in _for_each(work, shots):
+            progress.advance(task)
+    lists = layout.lists(shots) if layout.lists else {}
+    for root in [folder, folder / FRAMES] if plan.motion else [folder]:
+        for path, lines in lists.items():
+            text = "".join(f"{line}\n" for line in lines)
+            (root / path).write_text(text, encoding="utf-8")
+
+
+def write_shot(layout: Layout, plan: Plan, folder: Path, shot: Shot) -> None:
+    """Render and write one scene, with its second frame where the plan has a motion."""
+    factors = replace(plan.factors, night_share=float(shot.night))
+    if plan.motion is None:
+        _write(layout.images(render_scene(plan.seed, shot.scene, factors), shot), folder)
+        return
+    pair = render_pair(plan.seed, shot.scene, factors, plan.motion)
+    _write(layout.images(pair.first, shot), folder)
+    flow = np.where(pair.visible[..., None], pair.flow, np.float32(np.nan))
+    second = layout.images(pair.second, shot) | {f"flow/{shot.name}.npy": flow}
+    _write(second, folder / FRAMES)
+
+
+def _write(images: Images, folder: Path) -> None:
+    for name, image in images.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.suffix == ".npy":
+            np.save(path, image)
+            continue
+        _, encoded = cv2.imencode(path.suffix, image, _FAST_PNG if path.suffix == ".png" else ())
+        path.write_bytes(encoded.tobytes())
+
+
+def _for_each(work: partial[None], shots: Sequence[Shot]) -> Iterator[None]:
+    cores = len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+    if len(shots) < _WORTH_A_POOL or cores == 1:
+        cv2.setNumThreads(1)
+        yield from map(work, shots)
+        return
+    # Forked workers need not import the caller's main module again; only Linux forks safely.
+    context = multiprocessing.get_context("fork" if sys.platform == "linux" else "spawn")
+    with ProcessPoolExecutor(cores, context, cv2.setNumThreads, (1,)) as pool:
+        yield from pool.map(work, shots, chunksize=8)

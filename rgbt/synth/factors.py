@@ -1,0 +1,117 @@
+"""The factors of the scenes; no factor changes the random draws of another."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from functools import wraps
+from typing import Annotated, Any, Literal, TypeVar, get_type_hints
+
+from annotated_types import Interval, doc
+
+from rgbt.ranges import Share
+
+Made = TypeVar("Made")
+
+NumScenes = Annotated[int, Interval(ge=1, le=30_000)]
+"""Of a split; names have five digits."""
+
+Side = Annotated[int, Interval(ge=32, le=2048), doc("pixels")]
+Strength = Annotated[float, Interval(ge=0, le=4)]
+Gain = Annotated[float, Interval(ge=0, le=20)]
+RadiusGain = Annotated[float, Interval(ge=-0.95, le=20)]
+"""Corners have (1 + this) times the value of the centre; negative: the centre has more."""
+
+Metres = Annotated[float, Interval(ge=2, le=60)]
+Multiple = Annotated[float, Interval(ge=0.1, le=10)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneFactors:
+    """The factors of a scene; a study varies one of them and keeps the others fixed.
+
+    The comments of ``conf/dataset/synth.yaml`` say what each of them is. A gain by radius changes
+    with the squared radius, from 1 at the centre to (1 + gain) at the corners.
+    """
+
+    height: Side = 120
+    width: Side = 160
+    num_objects: Annotated[int, Interval(ge=0, le=24)] = 7
+    num_far_objects: Annotated[int, Interval(ge=0, le=64)] = 16
+    texture_strength: Strength = 1.0
+    rgb_noise: Share = 0.012
+    rgb_noise_radius_gain: RadiusGain = 0.5
+    rgb_noise_dark_gain: Gain = 1.5
+    thermal_noise: Share = 0.012
+    thermal_contrast: Strength = 1.0
+    thermal_drift: Share = 0.02
+    night_share: Share = 0.5
+    camera_height_m: Annotated[float, Interval(ge=0.9, le=4)] = 1.6
+    camera_pitch_deg: Annotated[float, Interval(ge=-10, le=20)] = 2.0
+    field_of_view_deg: Annotated[float, Interval(ge=20, le=110)] = 64.0
+    thermal_noise_radius_gain: RadiusGain = 0.0
+    texture_radius_gain: RadiusGain = 0.0
+    night_light: Strength = 1.0
+    glare: Strength = 0.0
+    passive_contrast: Strength = 1.0
+    far_object_scale: Multiple = 1.0
+    object_mix: Literal["demo", "mfnet"] = "demo"
+    rail_share: Share = 0.55
+    bump_share: Share = 0.6
+    bump_nearest_m: Metres = 4.2
+    bump_farthest_m: Metres = 11.7
+    kerb_share: Share = 1.0
+    kerb_scale: Multiple = 1.0
+    vignette: Share = 0.18
+    whole_shadows: bool = False
+
+
+ForwardMetres = Annotated[float, Interval(ge=-3, le=3)]
+YawDegrees = Annotated[float, Interval(ge=-15, le=15)]
+"""What a camera moves between two frames of a video."""
+
+
+@dataclass(frozen=True)
+class EgoMotion:
+    """Motion of the camera between two frames: it turns to the right, then it drives ahead."""
+
+    forward_m: ForwardMetres
+    yaw_deg: YawDegrees = 0.0
+
+
+def with_factors(
+    *left_out: str, **defaults: float
+) -> Callable[[Callable[..., Made]], Callable[..., Made]]:
+    """Lets a function of ``factors: SceneFactors`` take each factor as a keyword of its own.
+
+    The keys of a data set in the configuration are the arguments of the function that makes it.
+    `left_out` are factors that the data set decides itself; `defaults` are those that differ.
+    """
+
+    def with_keywords(function: Callable[..., Made]) -> Callable[..., Made]:
+        own = inspect.signature(function)
+        types = get_type_hints(SceneFactors, include_extras=True)
+        added = {
+            each.name: inspect.Parameter(
+                each.name,
+                inspect.Parameter.KEYWORD_ONLY,
+                default=defaults.get(each.name, each.default),
+                annotation=types[each.name],
+            )
+            for each in fields(SceneFactors)
+            if each.name not in left_out
+        }
+
+        @wraps(function)
+        def made(**settings: Any) -> Made:
+            chosen = {name: settings.pop(name, each.default) for name, each in added.items()}
+            return function(factors=SceneFactors(**chosen), **settings)
+
+        kept = [each for each in own.parameters.values() if each.name != "factors"]
+        parameters = [*kept, *added.values()]
+        made.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]
+        made.__annotations__ = {each.name: each.annotation for each in parameters}
+        return made
+
+    return with_keywords

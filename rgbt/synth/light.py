@@ -1,0 +1,238 @@
+"""Draw time of day, sun, sky, lamps and glare of one scene, for the RGB and the thermal image.
+
+Lamps light by night: the own headlights, street lamps, oncoming cars, vending machines. Strong
+lights in view lay a veil over RGB, because the lens scatters them: headlights that point at the
+camera by night, and a low sun by day.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+
+from rgbt.randomness import numpy_generator
+from rgbt.synth.camera import NEAR_M, Floats, SynthCamera, floats
+from rgbt.synth.street import Placed
+
+_GOLDEN = 0.6180339887
+_DARK = floats([0, 0, 0])
+
+
+class Light(NamedTuple):
+    """The light sources of a scene.
+
+    Attributes:
+        sun: (3,) unit vector towards the sun.
+        exposure: factor on all light.
+        tint: colour cast of the camera.
+        headlight: strength of the own headlights by night.
+        lamp: colour of the street lamps; zero where they are off.
+        lit_windows: share of windows with light by night.
+        visibility_m: distance at which 37 % of the light comes through.
+        direct: strength of the sun, 0 under clouds.
+        ambient: strength of the sky.
+        zenith: colour of the sky above.
+        horizon: colour of the sky at the horizon, and of the haze.
+        cloud: how much clouds show, 0..1.
+        clear: a day without a cover of clouds.
+        others: factor on the light that cars and vending machines cast.
+    """
+
+    is_night: bool
+    sun: Floats
+    exposure: float
+    tint: Floats
+    headlight: float
+    lamp: Floats
+    lit_windows: float
+    visibility_m: float
+    direct: float = 0.0
+    ambient: float = 0.0
+    zenith: Floats = _DARK
+    horizon: Floats = _DARK
+    cloud: float = 0.0
+    clear: bool = False
+    others: float = 1.0
+
+
+def is_night(seed: int, index: int, night_share: float) -> bool:
+    """Whether scene `index` is a night scene; consecutive scenes keep the share closely."""
+    return (_night_start(seed) + index * _GOLDEN) % 1.0 < night_share
+
+
+@lru_cache(maxsize=64)
+def _night_start(seed: int) -> float:
+    return float(numpy_generator(seed, "synth/night").random())
+
+
+def draw_light(seed: int, index: int, night_share: float, night_light: float = 1.0) -> Light:
+    """The light of one scene. Both day and night are drawn, so the share changes nothing else.
+
+    `night_light` is a factor on everything that lights the night.
+    """
+    u = numpy_generator(seed, "synth/light", index).random(16).tolist()
+    angle, height = 2 * math.pi * u[2], math.radians(22 + 43 * u[3])
+    flat = math.cos(height)
+    lamp = floats([1.0, 0.72, 0.38] if u[8] < 0.5 else [0.85, 1.0, 0.85])
+    common = Light(
+        is_night=is_night(seed, index, night_share),
+        sun=floats([math.sin(angle) * flat, math.sin(height), math.cos(angle) * flat]),
+        exposure=1.6 ** (u[12] - 0.5),
+        tint=floats([0.96 + 0.08 * u[0], 1.0, 0.96 + 0.08 * u[1]]),
+        headlight=0.5 + 0.8 * u[4],
+        # Street lamps are off in a quarter of the streets, and of any strength in the others.
+        lamp=lamp * (0.25 + 0.87 * u[7] if u[7] < 0.75 else 0.0),
+        lit_windows=0.06 + 0.4 * u[5] ** 2,
+        visibility_m=140 + 300 * u[6],
+    )
+    return _night(common, u, night_light) if common.is_night else _day(common, u)
+
+
+def _day(light: Light, u: list[float]) -> Light:
+    """Clear, or in a third of the scenes cloudy."""
+    brighter = light._replace(exposure=1.25 * light.exposure)
+    if u[9] < 0.35:
+        grey = floats([0.74, 0.77, 0.82]) * (0.85 + 0.3 * u[10])
+        sky: dict[str, Any] = {"zenith": grey * 0.9, "horizon": grey}
+        return brighter._replace(direct=0.15, ambient=0.72, cloud=0.25, **sky)
+    sky = {"zenith": floats([0.28, 0.50, 0.95]), "horizon": floats([0.80, 0.88, 0.98])}
+    return brighter._replace(clear=True, direct=0.95, ambient=0.42, cloud=0.9 * u[11], **sky)
+
+
+def _night(light: Light, u: list[float], factor: float) -> Light:
+    """A dark sky with some glow at the horizon; the camera sees a little green, as MFNet's does."""
+    single = np.float32(factor)
+    return light._replace(
+        ambient=(0.010 + 0.022 * u[10]) * factor,
+        zenith=floats([0.004, 0.005, 0.010]) * single,
+        horizon=floats([0.026, 0.022, 0.018]) * (0.6 + u[11]) * single,
+        cloud=0.3,
+        exposure=1.5 * light.exposure,
+        tint=light.tint * floats([0.93, 1.03, 0.92]),
+        headlight=light.headlight * factor,
+        lamp=light.lamp * single,
+        others=factor,
+    )
+
+
+_MAX_LAMPS = 6
+
+
+class Lamp(NamedTuple):
+    """A lamp that lights its surroundings: position, colour times strength, reach in metres."""
+
+    position: tuple[float, float, float]
+    colour: Floats
+    reach_m: float
+
+
+def lamplight(world_3HW: Floats, lamps: list[Lamp]) -> Floats:
+    """(3, H, W) light of all lamps at each world point; strength / (1 + (distance / reach)^2)^2."""
+    if not lamps:
+        return np.zeros_like(world_3HW)
+    points = world_3HW.reshape(3, -1)
+    positions = floats([lamp.position for lamp in lamps])
+    reach = floats([lamp.reach_m for lamp in lamps])
+    colours = np.stack([lamp.colour for lamp in lamps], axis=1)
+    # |p - q|^2 = |p|^2 - 2 p.q + |q|^2: one product of matrices for all lamps.
+    squared = (points * points).sum(0) + (positions**2).sum(1)[:, None] - 2 * positions @ points
+    nearness = 1.0 + np.maximum(squared, 0) / (reach**2)[:, None]
+    return np.asarray(colours @ (1.0 / (nearness * nearness)), np.float32).reshape(world_3HW.shape)
+
+
+def headlight(world_3HW: Floats, camera: SynthCamera) -> Floats:
+    """(H, W) light of the own low beams: a pool ahead, cut off at the waist."""
+    dx, dz = world_3HW[0] - camera.position[0], world_3HW[2] - camera.position[2]
+    sin, cos = np.float32(np.sin(camera.yaw)), np.float32(np.cos(camera.yaw))
+    ahead, aside = np.maximum(dx * sin + dz * cos, 0.1), dx * cos - dz * sin
+    spread = aside / (1.1 + 0.30 * ahead)
+    near = np.minimum(ahead / 4.0, 1.0)
+    above = np.maximum(world_3HW[1] - 0.75 - 0.012 * ahead, 0.0)
+    reach = near / (1.0 + (ahead / 11.0) ** 2)
+    return np.asarray(reach * cv2.exp(-spread * spread - 1.6 * above), np.float32)
+
+
+def lamps_of(placed: Sequence[Placed], light: Light) -> list[Lamp]:
+    """The nearest lamps that light their surroundings; `placed` is sorted far to near."""
+    lamps = [lamp for thing in placed if thing.lit for lamp in _lamps(thing, light)]
+    return lamps[-_MAX_LAMPS:]
+
+
+def is_oncoming(thing: Placed) -> bool:
+    """Whether it is a car whose headlights point at the camera."""
+    return thing.shape.name.startswith("car_") and math.cos(thing.yaw) < 0
+
+
+def _lamps(thing: Placed, light: Light) -> list[Lamp]:
+    if thing.shape.name == "street_lamp":
+        reach = 1.35 * math.cos(thing.yaw)
+        return [Lamp((thing.x + reach, 5.4, thing.z), light.lamp, 5.5)]
+    if thing.shape.name == "vending_machine":
+        colour = floats([0.30, 0.33, 0.36]) * np.float32(light.others)
+        return [Lamp((thing.x, 1.0, thing.z - 0.7), colour, 1.6)]
+    if is_oncoming(thing):
+        colour = floats([0.9, 0.85, 0.75]) * np.float32(light.others)
+        return [Lamp((thing.x, 0.4, thing.z - 4.0), colour, 1.8)]
+    return []
+
+
+_SUN_SHARE = 0.33
+_SUN = floats([1.0, 0.95, 0.85])
+_HEADLAMP = floats([1.0, 0.97, 0.90])
+_REACH = 0.16
+"""Distance at which a veil has half its strength, as a share of the image width."""
+
+
+def veil_of(
+    placed: Sequence[Placed],
+    camera: SynthCamera,
+    light: Light,
+    strength: float,
+    key: tuple[int, int],
+) -> Floats | None:
+    """(3, H, W) light that is added to the image; None where there is no source of glare.
+
+    A headlight pair 10 m ahead has the brightness `strength`, 1 = white of the day. `key`, (seed,
+    index) of the scene, draws whether and where there is a low sun.
+    """
+    if strength == 0:
+        return None
+    sources = list(_headlamps(placed, camera) if light.is_night else _low_sun(camera, light, key))
+    if not sources:
+        return None
+    rows, columns = np.mgrid[: camera.height, : camera.width].astype(np.float32)
+    reach = np.float32(_REACH * camera.width)
+    veil = np.zeros((camera.height, camera.width), np.float32)
+    for column, row, brightness in sources:
+        squared = (columns - np.float32(column)) ** 2 + (rows - np.float32(row)) ** 2
+        veil += np.float32(strength * brightness) / (1 + squared / reach**2)
+    colour = _HEADLAMP if light.is_night else _SUN
+    return np.asarray(colour[:, None, None] * veil, np.float32)
+
+
+def _headlamps(
+    placed: Sequence[Placed], camera: SynthCamera
+) -> Iterator[tuple[float, float, float]]:
+    """Column, row and brightness of each pair of headlights in view."""
+    oncoming = (thing for thing in placed if thing.lit and is_oncoming(thing))
+    points = (camera.to_camera(floats([thing.x, 0.7, thing.z])) for thing in oncoming)
+    for point in points:
+        column, row = camera.project(point).tolist()
+        inside = 0 <= column < camera.width and 0 <= row < camera.height
+        if inside and point[2] > NEAR_M:
+            yield column, row, 10 / max(float(point[2]), 10.0)
+
+
+def _low_sun(
+    camera: SynthCamera, light: Light, key: tuple[int, int]
+) -> Iterator[tuple[float, float, float]]:
+    """The sun just above the end of the road, in a share of the clear days."""
+    seed, index = key
+    u = numpy_generator(seed, "synth/glare", index).random(3).tolist()
+    if light.clear and u[0] < _SUN_SHARE:
+        yield camera.width * (0.3 + 0.4 * u[1]), camera.height * (0.2 + 0.25 * u[2]), 1.0

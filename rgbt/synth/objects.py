@@ -1,0 +1,462 @@
+"""Place what stands in a street: labelled objects, and the scenery, which has no label.
+
+Labelled are near groups, small far objects, guardrails and bumps (kerbs: `rgbt.synth.street`);
+scenery are buildings, walls, trees, lamps, poles, signs and the horizon.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect
+from collections.abc import Callable
+
+from rgbt.randomness import numpy_generator
+from rgbt.synth.factors import SceneFactors
+from rgbt.synth.shapes import shapes
+from rgbt.synth.street import (
+    BACKDROP,
+    COLOUR,
+    GROUND,
+    HEAT,
+    NO_SHADOW,
+    STANDING,
+    Paint,
+    Placed,
+    Road,
+    Row,
+    draw_rows,
+)
+
+_GOLDEN = 0.6180339887
+_MAX_GROUP = 5
+RAIL_STEP_M = 2.0
+"""Length of one guardrail segment."""
+
+_CAR_PAINTS = (
+    *((0.78, 0.78, 0.78), (0.62, 0.63, 0.65), (0.05, 0.05, 0.06), (0.25, 0.26, 0.28)),
+    *((0.04, 0.09, 0.28), (0.48, 0.04, 0.04), (0.80, 0.79, 0.74), (0.10, 0.22, 0.16)),
+)
+_CLOTHES = (
+    *((0.06, 0.06, 0.07), (0.10, 0.12, 0.20), (0.45, 0.08, 0.08), (0.55, 0.54, 0.50)),
+    *((0.14, 0.24, 0.40), (0.30, 0.28, 0.22), (0.70, 0.68, 0.66), (0.10, 0.22, 0.14)),
+)
+_FACADES: tuple[Paint, ...] = (
+    *((0.56, 0.53, 0.48), (0.62, 0.60, 0.58), (0.44, 0.30, 0.24), (0.38, 0.38, 0.40)),
+    *((0.66, 0.60, 0.48), (0.30, 0.34, 0.38), (0.50, 0.44, 0.38)),
+)
+_STOPS = ("stop_block", "stop_bollard", "stop_cube")
+
+_NEAR_SHARES = {"demo": (0.22, 0.45, 0.73, 0.87, 1.0), "mfnet": (0.30, 0.54, 0.78, 0.90, 1.0)}
+_FAR_SHARES = {"demo": (0.34, 0.72, 0.82, 0.88, 1.0), "mfnet": (0.15, 0.62, 0.80, 0.90, 1.0)}
+"""Object mix -> cumulative shares of the kinds, in the order of `_GROUPS`."""
+
+_FAR_Z = (26.0, 90.0)
+
+At = tuple[float, float]
+"""(Z, lateral position) in metres."""
+
+
+def place_objects(seed: int, index: int, road: Road, factors: SceneFactors) -> list[Placed]:
+    """All labelled objects of a scene except kerbs.
+
+    `factors` say how many near groups and far objects; the first of each are always the same.
+    """
+    u = numpy_generator(seed, "synth/structures", index).random(8).tolist()
+    near = draw_rows(seed, index, "near", factors.num_objects * _MAX_GROUP)
+    placed = _structures(road, u, factors)
+    for number in range(factors.num_objects):
+        # Low-discrepancy in number: distances are spread however many groups there are.
+        share = (u[7] + number * _GOLDEN) % 1.0
+        rows = near[number * _MAX_GROUP : (number + 1) * _MAX_GROUP]
+        # The first row chooses kind and side.
+        kind = bisect(_NEAR_SHARES[factors.object_mix], rows[0][0])
+        nearest, farthest, place = _GROUPS[kind]
+        z = nearest * (farthest / nearest) ** share
+        placed += place(road, rows, z, -1 if rows[0][1] < 0.5 else 1)
+    far = draw_rows(seed, index, "far", factors.num_far_objects)
+    return _without_collisions(placed + [_far_object(road, row, factors) for row in far])
+
+
+def _without_collisions(placed: list[Placed]) -> list[Placed]:
+    """Remove objects that overlap a car; of two objects the earlier one stays."""
+    kept: list[Placed] = []
+    taken: list[tuple[float, float, float, float, bool]] = []
+    for thing in placed:
+        if thing.layer == GROUND:
+            kept.append(thing)
+            continue
+        x, z, is_car = thing.x, thing.z, thing.shape.name.startswith("car_")
+        across, along = thing.shape.half_width, thing.shape.half_length
+        if all(
+            abs(x - other[0]) >= across + other[2] or abs(z - other[1]) >= along + other[3]
+            for other in taken
+            if is_car or other[4]
+        ):
+            kept.append(thing)
+            taken.append((x, z, across, along, is_car))
+    return kept
+
+
+def _far_object(road: Road, row: Row, factors: SceneFactors) -> Placed:
+    """One small object around the vanishing point."""
+    kind = bisect(_FAR_SHARES[factors.object_mix], row[0])
+    z = _FAR_Z[0] * (_FAR_Z[1] / _FAR_Z[0]) ** row[1]
+    lateral = (2 * row[2] - 1) * (road.half_width + 1.5)
+    if kind == 0:
+        moving = row[3] < 0.6
+        lane = math.copysign(road.half_width * (0.45 if moving else 0.8), lateral)
+        thing = _car(road, row, (z, lane), parked=not moving)
+    elif kind == 1:
+        thing = _person(road, row, (z, lateral))
+    elif kind == 2:
+        thing = _bike(road, row, (z, lateral), yaw=3.0 * row[6], ridden=row[3] < 0.6)
+    elif kind == 3:
+        thing = _stop(road, row, (z, lateral), int(row[5] * len(_STOPS)))
+    else:
+        thing = road.place("cone", z, lateral)
+    across, up, along = (factors.far_object_scale * each for each in thing.scale)
+    return thing._replace(scale=(across, up, along))
+
+
+def _structures(road: Road, u: list[float], factors: SceneFactors) -> list[Placed]:
+    """Guardrails along one side and a bump across the road, each in a share of the scenes."""
+    placed = []
+    if u[0] < factors.rail_share:
+        lateral = (-1 if u[1] < 0.5 else 1) * (road.half_width + 0.45)
+        for number in range(4 + int(u[3] * 7)):
+            z = 3.5 + 7 * u[2] + RAIL_STEP_M * number
+            placed.append(road.place("guardrail", z, lateral, yaw=road.heading(z)))
+    if u[4] < factors.bump_share:
+        depth = factors.bump_farthest_m - factors.bump_nearest_m
+        both_lanes, z = u[6] < 0.6, factors.bump_nearest_m + depth * u[5] ** 1.3
+        width = 2 * road.half_width - 0.3 if both_lanes else road.half_width - 0.2
+        bump = road.place(
+            "bump",
+            z,
+            0.0 if both_lanes else -road.half_width / 2,
+            yaw=road.heading(z),
+            scale=(width, 1.0, 1.0),
+            layer=GROUND,
+            shadow_from=NO_SHADOW,
+        )
+        placed.append(bump)
+    return placed
+
+
+# ---- one object -----------------------------------------------------------------------------
+
+
+def _paint(palette: tuple[Paint, ...], u: float, shade: float) -> Paint:
+    red, green, blue = palette[int(u * len(palette))]
+    return min(red * shade, 1.0), min(green * shade, 1.0), min(blue * shade, 1.0)
+
+
+def _car(road: Road, row: Row, at: At, parked: bool) -> Placed:
+    """A car: parked ones are cold and dark, moving ones warm and lit."""
+    z, lateral = at
+    away = lateral < 0 if row[4] < 0.85 else lateral >= 0
+    paint = _paint(_CAR_PAINTS, row[COLOUR], 0.75 + 0.4 * row[COLOUR + 1])
+    return road.place(
+        f"car_{int(row[5] * 4)}",
+        *at,
+        yaw=road.heading(z) + (0.0 if away else math.pi) + 0.12 * (row[6] - 0.5),
+        paints=(paint, paint),
+        warmth=0.15 * row[HEAT] if parked else 0.65 + 0.35 * row[HEAT],
+        lit=float(not parked),
+    )
+
+
+def _person(road: Road, row: Row, at: At) -> Placed:
+    """A person; one in eight is dressed so warmly that little of them shows in thermal."""
+    size = 0.90 + 0.16 * row[6]
+    wrapped = row[HEAT + 1] < 0.12
+    return road.place(
+        f"person_{int(row[5] * 6)}",
+        *at,
+        yaw=0.3 * (row[7] - 0.5),
+        scale=(size * 1.08, size, size),
+        paints=_outfit(row),
+        warmth=-0.5 + 0.3 * row[HEAT] if wrapped else 0.3 + 0.7 * row[HEAT],
+    )
+
+
+def _outfit(row: Row) -> tuple[Paint, Paint]:
+    top = _paint(_CLOTHES, row[COLOUR], 0.7 + 0.6 * row[COLOUR + 1])
+    return top, _paint(_CLOTHES, row[COLOUR + 2], 0.6)
+
+
+def _bike(road: Road, row: Row, at: At, yaw: float, ridden: bool) -> Placed:
+    """A bike, with its rider where it is ridden."""
+    frame = _paint(_CAR_PAINTS, row[COLOUR], 0.9)
+    return road.place(
+        "bike_ridden" if ridden else "bike_parked",
+        *at,
+        yaw=yaw,
+        paints=_outfit(row) if ridden else (frame, frame),
+        warmth=0.4 + 0.6 * row[HEAT] if ridden else 0.0,
+    )
+
+
+def _stop(road: Road, row: Row, at: At, kind: int) -> Placed:
+    """A car stop, roughly along the road."""
+    return road.place(_STOPS[kind], *at, yaw=road.heading(at[0]) + 0.2 * (row[4] - 0.5))
+
+
+# ---- near groups ----------------------------------------------------------------------------
+
+
+def _cars(road: Road, rows: list[Row], z: float, side: int) -> list[Placed]:
+    """One car: parked at the kerb or on the sidewalk, oncoming, or ahead in the own lane."""
+    u = rows[0]
+    parked = u[2] < 0.5
+    lateral = side * (road.half_width - 1.0 if parked else road.half_width * 0.45)
+    if parked and u[3] < 0.25:
+        lateral = side * (road.half_width + 1.3)
+    if side < 0 and not parked:
+        z = max(z, 9.0)
+    return [_car(road, u, (z, lateral), parked)]
+
+
+def _persons(road: Road, rows: list[Row], z: float, side: int) -> list[Placed]:
+    """One to three persons on a sidewalk or crossing the road."""
+    u = rows[0]
+    lateral = side * (road.half_width + 0.5 + u[2] * (road.sidewalk_of(side) - 0.7))
+    if u[3] < 0.3:
+        lateral, z = (u[2] - 0.3) * 1.6 * road.half_width, max(z, 7.0)
+    step = 0.62 if u[7] < 0.5 else -0.62
+    return [
+        _person(road, row, (z + 0.9 * (row[5] - 0.5), lateral + step * number))
+        for number, row in enumerate(rows[: 1 + int(u[4] * 2.6)])
+    ]
+
+
+def _bikes(road: Road, rows: list[Row], z: float, side: int) -> list[Placed]:
+    """A rack of parked bikes, or one ridden along the edge of the road."""
+    u = rows[0]
+    if u[2] < 0.3:
+        z = max(z, 6.0)
+        yaw = road.heading(z) + (0 if side < 0 else math.pi) + 0.9 * (u[3] - 0.5)
+        return [_bike(road, u, (z, side * (road.half_width - 0.6)), yaw, ridden=True)]
+    lateral = side * (road.half_width + 0.95)
+    yaw = (1.25 + 0.5 * (u[3] - 0.5)) * (1 if u[5] < 0.5 else -1)
+    places = [(z + 0.65 * number, lateral + side * 0.1 * number) for number in range(_MAX_GROUP)]
+    return [
+        _bike(road, row, place, yaw + 0.15 * row[6], ridden=False)
+        for place, row in zip(places, rows[: 2 + int(u[4] * 3)], strict=False)
+    ]
+
+
+def _stops(road: Road, rows: list[Row], z: float, side: int) -> list[Placed]:
+    """A row of two to four car stops: blocks beside the lane, or bollards along the sidewalk."""
+    u = rows[0]
+    kind = int(u[2] * len(_STOPS))
+    is_bollard = _STOPS[kind] == "stop_bollard"
+    lateral = side * (road.half_width + 0.55 if is_bollard else road.half_width - 0.55)
+    step = (2.4, 1.7, 1.9)[kind]
+    chosen = enumerate(rows[: 2 + int(u[3] * 3)])
+    return [_stop(road, row, (z + step * number, lateral), kind) for number, row in chosen]
+
+
+def _cones(road: Road, rows: list[Row], z: float, side: int) -> list[Placed]:
+    """A row of three to five cones that slants into the road."""
+    u = rows[0]
+    start, slant = side * (road.half_width - 0.35), -side * (0.1 + 0.25 * u[3])
+    step, size = 1.0 + 0.8 * u[2], 0.9 + 0.35 * u[4]
+    return [
+        road.place(
+            "cone",
+            z + step * number,
+            start + slant * number + 0.15 * (row[5] - 0.5),
+            scale=(size, size, size),
+        )
+        for number, row in enumerate(rows[: 3 + int(u[6] * 3)])
+    ]
+
+
+_GROUPS: tuple[tuple[float, float, Callable[[Road, list[Row], float, int], list[Placed]]], ...] = (
+    *((6.5, 26, _cars), (4.5, 18, _persons), (3.8, 13, _bikes)),
+    *((3.6, 11, _stops), (3.6, 12, _cones)),
+)
+"""Nearest and farthest Z, and what places it given road, rows, Z and side (-1 left)."""
+
+
+# ---- scenery --------------------------------------------------------------------------------
+
+_LAST_Z = 85.0
+_FAR_TREE_M = 22.0
+
+
+def place_scenery(seed: int, index: int, road: Road) -> list[Placed]:
+    """Everything unlabelled that stands in a scene."""
+    rows = draw_rows(seed, index, "scenery", 120)
+    placed = _horizon(rows[:12])
+    for side, own in ((-1, rows[20:60]), (1, rows[60:100])):
+        placed += _plots(road, own[:20], side)
+        placed += _street_trees(road, own[20:30], side)
+        placed += _signs(road, own[30:33], side)
+    return placed + _poles(road, rows[100])
+
+
+def _shaded(paint: Paint, shade: float) -> tuple[Paint, Paint]:
+    red, green, blue = paint
+    shaded = (red * shade, green * shade, blue * shade)
+    return shaded, shaded
+
+
+def _horizon(rows: list[Row]) -> list[Placed]:
+    """Blocks and tree lines far away."""
+    placed = []
+    for number, u in enumerate(rows):
+        x, z = (number + u[0] - 6) * 32, 190 + 60 * u[1]
+        size = (4 + 4 * u[2], 7 + 9 * u[3], 1.0)
+        if number % 2 == 0:
+            size = (12 + 26 * u[2], 9 + 34 * u[3] ** 2, 1.0)
+        shape = shapes()["tree_line" if number % 2 else "skyline"]
+        paints = _shaded((0.38, 0.40, 0.44), 0.8 + 0.4 * u[COLOUR])
+        placed.append(
+            Placed(shape, x, z, scale=size, paints=paints, layer=BACKDROP, shadow_from=NO_SHADOW)
+        )
+    return placed
+
+
+def _plots(road: Road, rows: list[Row], side: int) -> list[Placed]:
+    """Plots along one side: each a building, or a wall or hedge with trees behind."""
+    town = rows[0][1]
+    edge = side * (road.half_width + road.sidewalk_of(side) + 0.4)
+    placed: list[Placed] = []
+    z = -4.0 + 6 * rows[0][0]
+    for row in rows[1:]:
+        length = 8 + 12 * row[0]
+        built = row[1] < 0.25 + 0.6 * town
+        placed += (_building if built else _green)(road, row, (z + length / 2, length, edge))
+        z += length + 3 * row[2] + (4 * row[3] if built else 0)
+        if z > _LAST_Z:
+            break
+    return placed
+
+
+Plot = tuple[float, float, float]
+"""Middle (Z), length along the road, lateral position of the edge towards the road (signed)."""
+
+
+def _building(road: Road, row: Row, plot: Plot) -> list[Placed]:
+    """A house, in some cases with a warm outlet on its wall."""
+    z, length, edge = plot
+    side = math.copysign(1.0, edge)
+    depth, height = 9 + 6 * row[4], 4.5 + 13 * row[5] ** 1.5
+    front = edge + side * (0.3 + 2.5 * row[6])
+    house = road.place(
+        "building",
+        z,
+        front + side * depth / 2,
+        scale=(depth, height, length),
+        paints=_shaded(_FACADES[int(row[COLOUR] * len(_FACADES))], 0.75 + 0.5 * row[COLOUR + 1]),
+        lit=row[COLOUR + 2],
+        layer=BACKDROP,
+    )
+    if row[HEAT] > 0.6:
+        return [house]
+    outlet = Placed(
+        shapes()["vent"],
+        road.x(z, front) - side * 0.05,
+        z - length * (row[7] - 0.5) * 0.8,
+        y=0.5 + 2.5 * row[6],
+        shadow_from=NO_SHADOW,
+        layer=BACKDROP,
+    )
+    return [house, outlet]
+
+
+def _green(road: Road, row: Row, plot: Plot) -> list[Placed]:
+    """A wall or a hedge along the plot with two trees behind."""
+    z, length, edge = plot
+    side = math.copysign(1.0, edge)
+    lateral = edge + side * 0.4
+    low = row[4] < 0.4
+    border = road.place(
+        "wall" if low else "hedge",
+        z,
+        lateral,
+        yaw=road.heading(z),
+        scale=(0.3, 1.1 + 0.9 * row[5], length) if low else (0.8, 0.7 + 0.9 * row[5], length),
+        paints=_shaded((0.55, 0.53, 0.49), 0.6 + 0.5 * row[COLOUR]),
+        layer=BACKDROP,
+    )
+    behind = lateral + side * (2.2 + 2 * row[6])
+    sizes = (1.0 + 0.7 * row[COLOUR + 1], 1.0 + 0.7 * row[COLOUR + 2])
+    trees = [
+        _tree(road, (z + length * (0.45 * number - 0.2), behind), size, row[7 - number])
+        for number, size in enumerate(sizes)
+    ]
+    return [border, *trees]
+
+
+def _tree(road: Road, at: At, size: float, u: float, layer: int = BACKDROP) -> Placed:
+    """A tree; far ones have no branches, and three blobs of leaves rather than six."""
+    name = "tree" if at[0] < _FAR_TREE_M else "far_tree"
+    scale = (size * 1.1, size, size)
+    return road.place(f"{name}_{int(u * 5)}", *at, scale=scale, layer=layer, shadow_from=0.35)
+
+
+def _street_trees(road: Road, rows: list[Row], side: int) -> list[Placed]:
+    """Trees on the sidewalk in about half of the streets."""
+    u = rows[0]
+    if u[0] > 0.5:
+        return []
+    lateral = side * (road.half_width + road.sidewalk_of(side) * 0.75)
+    first, step = 7 + 9 * u[1], 8 + 7 * u[2]
+    return [
+        _tree(road, (first + step * number, lateral), 0.8 + 0.35 * row[0], row[1], STANDING)
+        for number, row in enumerate(rows[1:8])
+    ]
+
+
+def _signs(road: Road, rows: list[Row], side: int) -> list[Placed]:
+    """Up to two traffic signs, and in some streets a vending machine, on the sidewalk."""
+    placed = [
+        road.place(
+            f"sign_{int(u[2] * 3)}",
+            7 + 24 * u[1],
+            side * (road.half_width + 0.4),
+            shadow_from=NO_SHADOW,
+        )
+        for u in rows[:2]
+        if u[0] < 0.4
+    ]
+    u = rows[2]
+    if u[0] < 0.3:
+        lateral = side * (road.half_width + road.sidewalk_of(side) + 0.1)
+        placed.append(road.place("vending_machine", 7 + 16 * u[1], lateral, lit=1.0))
+    return placed
+
+
+def _poles(road: Road, u: Row) -> list[Placed]:
+    """Street lamps on one side; utility poles with cables on the other, in most streets."""
+    side = 1 if u[0] < 0.5 else -1
+    lateral = side * (road.half_width + 0.45)
+    yaw = 0.0 if side < 0 else math.pi
+    zs = [5 + 12 * u[2] + (17 + 8 * u[1]) * number for number in range(5)]
+    placed = [
+        road.place("street_lamp", z, lateral, yaw=yaw, lit=1.0, shadow_from=NO_SHADOW) for z in zs
+    ]
+    if u[3] >= 0.6:
+        return placed
+    lateral, first, step = -side * (road.half_width + 0.6), 8 + 10 * u[4], 20 + 8 * u[5]
+    for number in range(-1, 3):
+        z = first + step * number
+        x = road.x(z, lateral)
+        if number >= 0:
+            placed.append(road.place("utility_pole", z, lateral, shadow_from=NO_SHADOW))
+        turn = math.atan2(road.x(z + step, lateral) - x, step)
+        size = (1.0, 1.0, step / math.cos(turn))
+        placed += [
+            Placed(
+                *(shapes()["wire"], x + offset, z),
+                yaw=turn,
+                scale=size,
+                shadow_from=NO_SHADOW,
+                y=y,
+            )
+            for offset, y in ((-0.8, 8.3), (0.8, 8.3), (0.3, 7.3))
+        ]
+    return placed

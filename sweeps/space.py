@@ -1,0 +1,342 @@
+"""What a sweep varies: points of a grid or a list, ranges of a search, samplers and pruners.
+
+A space maps keys of the configuration to `optuna.distributions`, as in ``conf/search``::
+
+    masker.sigma_div: {type: float, low: 0.5, high: 32, log: true}
+    masker.patch_size: {type: categorical, choices: ["${px:8}", "${px:64}"]}
+
+Samplers and pruners are nodes such as ``{_target_: optuna.samplers.TPESampler, seed: 0}``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import product
+from typing import Any
+
+from hydra.core.config_loader import ConfigLoader
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import IntervalSweep, Override, Quote, QuotedString
+from hydra.errors import HydraException
+from optuna import distributions as kinds
+from optuna.pruners import BasePruner
+from optuna.samplers import BaseSampler
+from optuna.study import Study
+from optuna.trial import FrozenTrial, TrialState
+
+from rgbt.checks import InputError, check_choice, one_line
+from rgbt.config.component import Component
+from rgbt.config.values import check_value
+from sweeps.point import Point, Value
+
+Distribution = kinds.FloatDistribution | kinds.IntDistribution | kinds.CategoricalDistribution
+Space = Mapping[str, Distribution]
+"""Key of the configuration (dotted, or a group such as ``loss``) -> what Optuna samples."""
+
+
+def parse_space(entries: Mapping[str, Mapping[str, Any]]) -> Space:
+    """The distributions of a space, in the order of the file.
+
+    Args:
+        entries: key -> type (float, int, categorical) and arguments of the distribution.
+            Interpolations are kept as text: ``${px:64}`` is resolved by the run that gets it. A
+            list among the choices is text too, because Optuna's storages hold plain values.
+
+    Raises:
+        InputError: what the distribution refuses, or choices that Optuna takes for equal.
+    """
+    space: dict[str, Distribution] = {}
+    for key, entry in entries.items():
+        path = f"hydra.sweeper.space.{key}"
+        options = dict(entry)
+        kind = str(options.pop("type", None))
+        check_choice(f"{path}.type", kind, ("float", "int", "categorical"))
+        if "choices" in options:
+            choices = check_value(f"{path}.choices", options["choices"], list[Any])
+            choices = [_text(one) if isinstance(one, list) else one for one in choices]
+            # Optuna compares by ==, for which 1, 1.0 and true are equal: it would run another one.
+            twice = [one for place, one in enumerate(choices) if one in choices[:place]]
+            if twice:
+                raise InputError(f"'{path}.choices': {twice[0]!r} equals another choice.")
+            options["choices"] = choices
+        target = f"optuna.distributions.{kind.capitalize()}Distribution"
+        space[key] = build_optuna({"_target_": target, **options}, path)
+    return space
+
+
+def build_optuna(node: Mapping[str, Any], path: str, **collaborators: Any) -> Any:
+    """The object of a node of Optuna; what the constructor refuses is an InputError with `path`."""
+    try:
+        return Component.from_node(node, path).build(**collaborators)
+    except InputError:
+        raise
+    except ValueError as error:
+        raise InputError(f"'{path}': {one_line(error)}.") from error
+
+
+def ends(space: Space) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Overrides of the lowest and the highest point; of choices the first and the last."""
+    ranges = {
+        key: one.choices if isinstance(one, kinds.CategoricalDistribution) else (one.low, one.high)
+        for key, one in space.items()
+    }
+    first, last = ({key: each[place] for key, each in ranges.items()} for place in (0, -1))
+    return as_overrides(first), as_overrides(last)
+
+
+def as_overrides(params: Mapping[str, Any]) -> tuple[str, ...]:
+    """``key=value`` for every value, such that Hydra reads exactly that value.
+
+    Args:
+        params: None, booleans, numbers, texts or lists of these, by key. Text with an
+            interpolation, and text of a list ("[48,64]"), is passed on as it is.
+    """
+    return tuple(f"{key}={_text(value)}" for key, value in params.items())
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, int | float):
+        return repr(value)
+    if isinstance(value, list):
+        return "[" + ",".join(_text(item) for item in value) + "]"
+    if value.startswith("[") and value.endswith("]"):
+        return str(value)
+    try:  # whether the grammar takes the bare text as this very text, also inside a list
+        is_read_back = OverridesParser.create().parse_override(f"x=[{value}]").value() == [value]
+    except HydraException:
+        is_read_back = False
+    return value if is_read_back else QuotedString(text=value, quote=Quote.single).with_quotes()
+
+
+def signature(*parts: Any) -> str:
+    """Hash of what makes a study (12 hexadecimal digits)."""
+    return hashlib.sha256(repr(parts).encode()).hexdigest()[:12]
+
+
+SweptValues = dict[str, list[str]]  # Key -> values of an override, as they stand after ``=``
+
+
+def split(
+    overrides: Iterable[str], config_loader: ConfigLoader
+) -> tuple[tuple[str, ...], SweptValues, dict[str, dict[str, Any]]]:
+    """Split the overrides of ``-m`` into single values, lists of values, and ranges.
+
+    Like in Hydra's own sweeper, a repeated key keeps its first position and its last value.
+
+    Args:
+        overrides: as typed, e.g. ``["+experiment=grbm", "masker.sigma_div=1,2", "seed=0,1"]``.
+        config_loader: answers ``model=glob(*)``.
+
+    Returns:
+        fixed overrides as typed; swept: key (with its ``+``) -> values; intervals: key -> entry of
+        a search space, ``tag(log, interval(1, 8))`` on a logarithmic scale and
+        ``int(interval(1, 8))`` in whole numbers.
+
+    Raises:
+        InputError: a sweep without values, a tag that means nothing.
+    """
+    fixed: list[str] = []
+    swept: SweptValues = {}
+    intervals: dict[str, dict[str, Any]] = {}
+    parsed = OverridesParser.create(config_loader).parse_overrides(list(overrides))
+    for key, override in {one.get_key_element(): one for one in parsed}.items():
+        value = override.value()
+        if not override.is_sweep_override():
+            fixed.append(str(override.input_line))
+        elif isinstance(value, IntervalSweep):
+            if value.tags - {"log"}:
+                raise InputError(f"'{override.input_line}': the only tag of an interval is log.")
+            # Hydra's interval leaves out its end, which an entry of a space takes in.
+            whole = isinstance(value.start, int) and isinstance(value.end, int)
+            ends = {"low": value.start, "high": value.end}
+            kind = "int" if whole else "float"
+            intervals[key] = {"type": kind, **ends, "log": "log" in value.tags}
+        else:
+            swept[key] = list(override.sweep_string_iterator())
+            if not swept[key]:
+                raise InputError(f"'{override.input_line}' has no values; widen it.")
+    return tuple(fixed), swept, intervals
+
+
+def grid_points(fixed: Sequence[str], swept: SweptValues) -> list[Point]:
+    """All combinations of the `swept` values, in Hydra's order: the last key changes fastest."""
+    return [
+        _point(fixed, [f"{key}={value}" for key, value in zip(swept, values, strict=True)])
+        for values in product(*swept.values())
+    ]
+
+
+def list_points(points: Sequence[Sequence[str]], fixed: Sequence[str]) -> list[Point]:
+    """Points written out one by one, so that values vary together (Hydra's issue 3082).
+
+    A point's own override has priority over the `fixed` one of the same key.
+    """
+    taken = [{key_of(word) for word in own} for own in points]
+    return [
+        _point([word for word in fixed if key_of(word) not in keys], own)
+        for own, keys in zip(points, taken, strict=True)
+    ]
+
+
+def key_of(override: str) -> str:
+    """Key of an override as typed."""
+    return override.partition("=")[0].lstrip("+~")
+
+
+def distributions(points: Sequence[Point]) -> dict[str, kinds.BaseDistribution]:
+    """Distributions of the parameters of a grid or a list, for Optuna's figures.
+
+    Numbers are ranges, which may grow in a study; other choices may not.
+    """
+    found: dict[str, kinds.BaseDistribution] = {}
+    for key in dict.fromkeys(key for point in points for key in point.params):
+        seen: list[Any] = [point.params[key] for point in points if key in point.params]
+        types = {type(value) for value in seen}
+        if types <= {int, float}:
+            make = kinds.IntDistribution if types == {int} else kinds.FloatDistribution
+            found[key] = make(min(seen), max(seen))
+        else:
+            found[key] = kinds.CategoricalDistribution(tuple(dict.fromkeys(seen)))
+    return found
+
+
+def merge_space(
+    entries: Mapping[str, Mapping[str, Any]],
+    fixed: Sequence[str],
+    swept: SweptValues,
+    intervals: Mapping[str, Mapping[str, Any]],
+) -> Space:
+    """The space of a search; the command line has priority for every key.
+
+    Args:
+        entries: as in ``conf/search``.
+        fixed: overrides as typed; one for a key of `entries` takes it out of the search.
+        swept: key -> values; they are the choices of the key.
+        intervals: key -> entry of a space, in the place of the one in `entries`.
+    """
+    merged = dict(entries)
+    for key, texts in swept.items():
+        choices = [one.value() for one in _parsed(f"{key}={text}" for text in texts)]
+        merged[key] = {"type": "categorical", "choices": choices}
+    merged.update(intervals)
+    keys = {one.get_key_element() for one in _parsed(fixed)}
+    return parse_space({key: entry for key, entry in merged.items() if key not in keys})
+
+
+def _parsed(overrides: Iterable[str]) -> list[Override]:
+    return OverridesParser.create().parse_overrides(list(overrides))
+
+
+def _point(fixed: Sequence[str], own: Sequence[str]) -> Point:
+    params: dict[str, Value] = {}
+    for override in (one for one in _parsed(own) if not one.is_delete()):
+        value = override.value()
+        if override.is_sweep_override():
+            raise InputError(f"hydra.sweeper.points: '{override.input_line}' is not one value.")
+        if value is None or isinstance(value, str | int | float):
+            params[override.get_key_element()] = value
+        else:
+            params[override.get_key_element()] = override.get_value_element_as_str()
+    return Point("", (*fixed, *own), params)
+
+
+SAMPLERS = [f"optuna.samplers.{n}Sampler" for n in ("TPE", "Random", "GP", "NSGAII")]
+"""Samplers without state outside the storage: others (QMC, grid, brute force) keep a counter or
+stop the study, which neither several drivers nor a resumed search can share."""
+
+PRUNERS = [
+    f"optuna.pruners.{name}Pruner"
+    for name in ("Nop", "Median", "Percentile", "SuccessiveHalving", "Hyperband", "Patient")
+]
+
+
+class PerTrialSampler(BaseSampler):
+    """Draws of a trial follow from the seed and the number of the trial, and the trials before it.
+
+    Optuna's samplers draw from one generator for all trials: two drivers with one seed, or a search
+    that is resumed, would propose the same points again. Here every trial draws by its own number
+    in the storage. No two trials share draws, and one worker repeats a search exactly, even if it
+    was stopped and resumed.
+
+    Args:
+        make: the sampler that chooses, from a seed; it keeps nothing outside the storage.
+        seed: of the search.
+    """
+
+    def __init__(self, make: Callable[[int], BaseSampler], seed: int) -> None:
+        self.make = make
+        self.seed = seed
+        self._inner: dict[int, BaseSampler] = {}
+
+    def before_trial(self, study: Study, trial: FrozenTrial) -> None:
+        """Begin a trial, also one that another process began and this one resumes."""
+        self._inner[trial.number] = self.make(trial_seed(self.seed, trial.number))
+        self._inner[trial.number].before_trial(study, trial)
+
+    def infer_relative_search_space(
+        self, study: Study, trial: FrozenTrial
+    ) -> dict[str, kinds.BaseDistribution]:
+        """See `BaseSampler`."""
+        return self._of(trial).infer_relative_search_space(study, trial)
+
+    def sample_relative(
+        self, study: Study, trial: FrozenTrial, search_space: dict[str, kinds.BaseDistribution]
+    ) -> dict[str, Any]:
+        """See `BaseSampler`."""
+        return self._of(trial).sample_relative(study, trial, search_space)
+
+    def sample_independent(
+        self, study: Study, trial: FrozenTrial, param_name: str, param_distribution: Any
+    ) -> Any:
+        """See `BaseSampler`."""
+        return self._of(trial).sample_independent(study, trial, param_name, param_distribution)
+
+    def after_trial(
+        self, study: Study, trial: FrozenTrial, state: TrialState, values: Sequence[float] | None
+    ) -> None:
+        """End a trial; one that this process never began is ended all the same."""
+        self._of(trial).after_trial(study, trial, state, values)
+        self._inner.pop(trial.number, None)
+
+    def _of(self, trial: FrozenTrial) -> BaseSampler:
+        return self._inner.get(trial.number) or self.make(trial_seed(self.seed, trial.number))
+
+
+def trial_seed(seed: int, number: int) -> int:
+    """32-bit seed that depends on both arguments (SHA-256), the same on every machine."""
+    digest = hashlib.sha256(f"{seed}:trial:{number}".encode()).digest()
+    return int.from_bytes(digest[:4], "big")
+
+
+def build_sampler(node: Mapping[str, Any]) -> PerTrialSampler:
+    """The sampler of a search.
+
+    Args:
+        node: with `_target_`, one of `SAMPLERS`, and options of its constructor; one worker with
+            the same `seed` (0 if it has none) proposes the same points, see `PerTrialSampler`.
+    """
+    path = "hydra.sweeper.sampler"
+    check_choice(f"{path}._target_", str(node.get("_target_")), SAMPLERS)
+    build_optuna(node, path)
+    return PerTrialSampler(lambda seed: build_optuna(node, path, seed=seed), node.get("seed") or 0)
+
+
+def build_pruner(node: Mapping[str, Any] | None) -> BasePruner:
+    """The pruner of a search; trials report at their validation steps.
+
+    Args:
+        node: with `_target_`, one of `PRUNERS`, and options of its constructor; None: no pruner.
+            Those that count steps (``n_warmup_steps``, ``min_resource``) count steps of the
+            optimizer, not validations.
+    """
+    path, node = "hydra.sweeper.pruner", node or {"_target_": "optuna.pruners.NopPruner"}
+    check_choice(f"{path}._target_", str(node.get("_target_")), PRUNERS)
+    # A patient pruner may wrap another one, which the node then holds.
+    alone = {} if "wrapped_pruner" in node else {"wrapped_pruner": None}
+    pruner: BasePruner = build_optuna(node, path, **alone)
+    return pruner

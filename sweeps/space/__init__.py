@@ -1,1 +1,0 @@
-"""Selection of points: grids of comma lists, ranges of a search, samplers and pruners."""

@@ -1,0 +1,153 @@
+"""Archived runs: unpacked they are equal, and their command still asks for them."""
+
+from __future__ import annotations
+
+import zipfile
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+
+from rgbt.archive import entry
+from rgbt.checks import InputError
+from rgbt.metrics.counts import Counts
+from rgbt.runs.archive import add, archived
+from rgbt.runs.folder import RunFolder
+from rgbt.runs.naming import describe
+from rgbt.runs.result import RunResult
+from tests.analysis.counts import counts_of
+from tests.commands import Call
+from tests.composed import specified
+
+WORDS = ("+experiment=crm", "+debug=smoke")
+
+
+def some(seed: int, **changed: object) -> Counts:
+    return counts_of(np.random.default_rng(seed).integers(0, 900, (12, 5, 4, 4)), **changed)
+
+
+PAIRS = counts_of(np.random.default_rng(9).integers(0, 9, (12, 15, 4, 4)), partition="aligned3")
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> RunResult:
+    """A finished run folder without weights, as `rgbt.training.train` writes it."""
+    spec = specified((*WORDS, f"runs_dir={tmp_path}/runs"))
+    folder = RunFolder(spec.folder)
+    folder.write_config(OmegaConf.to_yaml(OmegaConf.create(dict(spec.plain))))
+    folder.describe(describe(spec))
+    folder.add_provenance({"git_commit": "a" * 40, "cwd": "/home/me", "packages": {"torch": "2"}})
+    some(0).save(folder.path / "counts_test.npz")
+    (folder.path / "evaluations").mkdir()
+    replace(some(1), night=(True, False) * 6).save(folder.path / "evaluations/test_rgb.npz")
+    PAIRS.save(folder.path / "evaluations/consistency_aligned_test.npz")
+    folder.finish({"key": spec.key, "dataset": "abc", "test": {"mIoU": 0.5}})
+    return RunResult(folder.path)
+
+
+def test_unpacked_run_has_equal_counts(run: RunResult, tmp_path: Path) -> None:
+    unpacked = add(run, tmp_path / "results").unpack(tmp_path / "unpacked")
+    for path in sorted(run.folder.rglob("*.npz")):
+        name = path.relative_to(run.folder).as_posix()
+        first, again = Counts.load(path), unpacked.counts(name)
+        assert np.array_equal(first.counts, again.counts)
+        assert first.counts.dtype == again.counts.dtype
+        others = [field.name for field in fields(Counts) if field.name != "counts"]
+        assert [getattr(first, each) for each in others] == [getattr(again, e) for e in others]
+    assert (unpacked.key, unpacked.commit) == (run.key, "a" * 10)
+    assert unpacked.recorded_scores() == run.recorded_scores()
+    assert "cwd" not in unpacked.provenance[0]
+
+
+def test_same_results_are_one_file_and_others_are_kept(run: RunResult, tmp_path: Path) -> None:
+    archive = tmp_path / "results"
+    assert add(run, archive) == add(run, archive)
+    some(2).save(run.folder / "counts_test.npz")
+    other = add(run, archive)
+    assert other.key == run.key
+    assert [each.path for each in archived(archive)] == [other.path, archive / f"{run.key}.zip"]
+
+
+def test_images_are_stored_once_for_all_runs(run: RunResult, tmp_path: Path) -> None:
+    wrong = some(0).counts.copy()
+    wrong[..., 0, 1] += 1  # another prediction of a pixel with the same label
+    wrong[..., 0, 0] -= 1
+    add(run, tmp_path / "results")
+    before = len(list((tmp_path / "results/shared").iterdir()))
+    replace(some(0), counts=wrong).save(run.folder / "counts_test.npz")
+    add(run, tmp_path / "results")
+    assert len(list((tmp_path / "results/shared").iterdir())) == before == 3
+
+
+def test_unfinished_run_is_refused(run: RunResult, tmp_path: Path) -> None:
+    (run.folder / "result.json").unlink()
+    with pytest.raises(InputError, match="is not finished"):
+        add(run, tmp_path / "results")
+
+
+@pytest.mark.parametrize("place", [0.3, 0.6])
+def test_damaged_archive_is_refused(run: RunResult, tmp_path: Path, place: float) -> None:
+    archived_run = add(run, tmp_path / "results")
+    content = bytearray(archived_run.path.read_bytes())
+    content[int(place * len(content))] ^= 0xFF
+    archived_run.path.write_bytes(content)
+    with pytest.raises(InputError, match="damaged"):
+        archived_run.unpack(tmp_path / "unpacked")
+    assert list((tmp_path / "unpacked").iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["../outside.txt", "/tmp/outside.txt"])
+def test_archive_writes_nothing_outside(run: RunResult, tmp_path: Path, name: str) -> None:
+    archived_run = add(run, tmp_path / "results")
+    with zipfile.ZipFile(archived_run.path, "a") as archive:
+        archive.writestr(name, "x")
+    with pytest.raises(InputError, match="leads out of the folder"):
+        archived_run.unpack(tmp_path / "unpacked")
+    assert not (tmp_path / "unpacked/outside.txt").exists()
+
+
+def test_archive_of_another_run_is_refused(run: RunResult, tmp_path: Path) -> None:
+    path = add(run, tmp_path / "results").path
+    path.rename(path.with_name("0123456789ab.zip"))
+    with pytest.raises(InputError, match=f"holds the run {run.key}"):
+        archived(tmp_path / "results")[0].unpack(tmp_path / "unpacked")
+
+
+def write_settings(run: RunResult, **changed: object) -> None:
+    """Give a run the settings of its command, with changes of its masker, and another key."""
+    plain = dict(specified(WORDS).plain)
+    plain["masker"] = {k: v for k, v in {**plain["masker"], **changed}.items() if v is not None}
+    (run.folder / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(plain)))
+
+
+@pytest.mark.parametrize(
+    ("changed", "state"), [({"sampler": None}, "added"), ({"sampler": "bernoulli"}, "changed")]
+)
+def test_check_reports_changed_keys(
+    call: Call, run: RunResult, tmp_path: Path, changed: dict[str, object], state: str
+) -> None:
+    archive = tmp_path / "results"
+    folder = run.folder.rename(run.folder.with_name("0123456789ab"))
+    write_settings(RunResult(folder), **changed)
+    (folder / "result.json").write_text('{"dataset": "abc"}')
+    add(RunResult(folder), archive)
+    code, out, _ = call(entry, "check", f"archive={archive}")
+    assert code == 1
+    assert state in out
+    assert "masker.sampler" in out
+    assert call(entry, "rekey", f"archive={archive}")[0] == 0
+    names = [each.path.stem for each in archived(archive)]
+    assert names == [run.key if state == "added" else "0123456789ab"]
+    assert call(entry, "check", f"archive={archive}")[0] == (0 if state == "added" else 1)
+
+
+def test_command_adds_all_finished_runs(call: Call, run: RunResult, tmp_path: Path) -> None:
+    archive = tmp_path / "results"
+    words = (f"runs_dir={run.folder.parent}", f"archive={archive}")
+    assert call(entry, "add", "run=all", *words)[0] == 0
+    assert [each.key for each in archived(archive)] == [run.key]
+    code, out, err = call(entry, "check", f"archive={archive}")
+    assert (code, err) == (0, "")
+    assert "1 runs, 1 have the key of their command" in out

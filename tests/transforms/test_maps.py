@@ -1,0 +1,153 @@
+"""What moves the maps of a sample, by hand and against torch and OpenCV."""
+
+from __future__ import annotations
+
+import itertools
+from collections import Counter
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from torch.nn import functional as F
+
+from rgbt.transforms.maps import (
+    Maps,
+    Window,
+    bilinear,
+    drawn_window,
+    mixed,
+    nearest,
+    nearest_source,
+    short_edge_hw,
+)
+from rgbt.types import Sample
+from tests.transforms.recipes import noise
+
+MFNET_SIZES = range(240, 961, 48)
+
+
+@pytest.mark.parametrize(
+    ("source_hw", "short_edge", "max_size", "expected"),
+    [
+        ((480, 640), 240, 1920, (240, 320)),
+        ((480, 640), 960, 1920, (960, 1280)),
+        ((640, 480), 240, 1920, (320, 240)),
+        ((512, 640), 307, 1920, (307, 384)),  # 640 * 307 / 512 = 383.75
+        ((720, 1280), 1152, 1920, (1080, 1920)),  # would be 2048 wide
+        ((720, 1280), 1152, None, (1152, 2048)),
+    ],
+)
+def test_short_edge_hw(source_hw, short_edge, max_size, expected) -> None:
+    assert short_edge_hw(source_hw, short_edge, max_size) == expected
+
+
+@pytest.mark.parametrize("source", [97, 480, 512, 720])
+def test_nearest_source_is_that_of_torch(source: int) -> None:
+    line = torch.arange(source, dtype=torch.float32)[None, None, :, None]
+    for resized in [*MFNET_SIZES, 97, 307, 320, 448, 1080, 1280]:
+        expected = F.interpolate(line, size=(resized, 1), mode="nearest").flatten()
+        np.testing.assert_array_equal(nearest_source(source, resized), expected.numpy())
+    assert nearest_source(5, 3).tolist() == [0, 1, 3]  # floor(0), floor(1.67), floor(3.33)
+    assert nearest(np.array([[4, 7]]), (2, 4)).tolist() == [[4, 4, 7, 7]] * 2
+
+
+def test_bilinear_by_hand() -> None:
+    """Doubling 0, 8: samples at -1/4 (clamped), 1/4, 3/4, 5/4 (clamped)."""
+    image = np.array([[0, 8]], np.uint8)
+    small = Sample(np.repeat(image[..., None], 3, 2), image, None, "x")
+    found = Maps.of(small).resize((1, 4), dtype=np.float32)
+    assert found.thermal.tolist() == bilinear(image, (1, 4)).tolist() == [[0, 2, 6, 8]]
+    assert found.rgb[..., 1].tolist() == [[0, 2, 6, 8]]
+    assert found.columns.tolist() == [0, 0, 1, 1]
+
+
+@pytest.mark.parametrize("short_edge", [24, 31, 57, 96])
+def test_bilinear_is_that_of_torch(short_edge: int) -> None:
+    sample, hw = noise(3), short_edge_hw((48, 64), short_edge, None)
+    planes = torch.from_numpy(sample.rgb).permute(2, 0, 1)[None].double()
+    expected = F.interpolate(planes, size=hw, mode="bilinear", align_corners=False)
+    found = Maps.of(sample).resize(hw, dtype=np.float32).rgb
+    np.testing.assert_allclose(found, expected[0].permute(1, 2, 0), rtol=0, atol=1e-3)
+    assert np.abs(Maps.of(sample).resize(hw).rgb - found).max() < 1.5
+
+
+@pytest.mark.parametrize("hw", [(48, 64), (37, 53), (72, 128), (480, 640)])
+def test_a_window_is_the_whole_cut(hw: tuple[int, int]) -> None:
+    """Bit for bit in uint8, whose pixels lie in a block that is resized alone."""
+    rng, maps = np.random.default_rng(1), Maps.of(noise(1, hw))
+    for short_edge in rng.integers(hw[0] // 3, 2 * hw[0] + 1, 12):
+        size = short_edge_hw(hw, int(short_edge), 1920)
+        window = drawn_window(size, (int(rng.integers(1, hw[0])), int(rng.integers(1, hw[1]))), rng)
+        top, left, height, width = window
+        whole = cv2.resize(maps.rgb, size[::-1], interpolation=cv2.INTER_LINEAR_EXACT)
+        found = maps.resize(size, window)
+        cut = whole[top : top + height, left : left + width]
+        np.testing.assert_array_equal(found.rgb, cut)
+        np.testing.assert_array_equal(found.label, maps.resize(size).crop(window).label)
+        np.testing.assert_array_equal(found.rows, nearest_source(hw[0], size[0])[top:][:height])
+
+
+def test_crops_are_uniform_and_clipped() -> None:
+    rng = np.random.default_rng(7)
+    counts = Counter(drawn_window((4, 6), (3, 4), rng) for _ in range(3000))
+    assert set(counts) == {Window(y, x, 3, 4) for y in range(2) for x in range(3)}
+    assert max(abs(count - 500) for count in counts.values()) < 100  # five standard deviations
+    assert drawn_window((4, 6), (100, 5), rng)[2:] == (4, 5)
+
+
+def test_padding_and_flip_by_hand() -> None:
+    small = Sample(
+        *(np.full((1, 2, 3), 9, np.uint8), np.array([[1, 2]], np.uint8)),
+        *(np.array([[3, 4]], np.uint8), "x", np.array([[0.25, 0.75]], np.float32)),
+    )
+    found = Maps.of(small).flip(True).pad((2, 5), (124, 116, 104), 114).example(True)
+    # One row more: below. Three columns more: one left, two right.
+    assert found.label.tolist() == [[255, 4, 3, 255, 255], [255] * 5]
+    assert found.thermal.tolist() == [[114, 2, 1, 114, 114], [114] * 5]
+    assert found.rgb[0, :, 0].tolist() == [124, 9, 9, 124, 124]
+    assert found.rgb[1, 4].tolist() == [124, 116, 104]
+    assert found.confidence is not None and found.confidence.tolist()[0] == [0, 0.75, 0.25, 0, 0]  # noqa: PT018
+    assert found.position is not None
+    assert found.position[1].tolist() == [[1, 1, 0, 0, 0]] * 2
+
+
+def test_centre_outside_a_crop_lies_on_its_border() -> None:
+    maps = Maps.of(noise())
+    for window, flipped, expected in (
+        (Window(0, 0, 10, 10), False, (9, 9)),
+        (Window(38, 54, 10, 10), False, (0, 0)),
+        (Window(38, 54, 10, 10), True, (0, 9)),
+        (Window(0, 0, 48, 64), True, (24, 31)),
+    ):
+        assert maps.crop(window).flip(flipped).example(False).centre_yx == expected
+    odd = Maps.of(noise(hw=(37, 53)))
+    assert odd.example(False).centre_yx == (18, 26)
+
+
+def test_an_area_is_the_mean_where_nothing_grows() -> None:
+    sample = noise(2, (8, 12))
+    found = Maps.of(sample).resize((4, 6), area=True)
+    for image, of in ((found.rgb, sample.rgb), (found.thermal, sample.thermal)):
+        total = sum(of[y::2, x::2].astype(int) for y, x in itertools.product((0, 1), repeat=2))
+        np.testing.assert_array_equal(image, (total + 2) // 4)
+    wider = Maps.of(sample).resize((4, 30), area=True)
+    np.testing.assert_array_equal(wider.thermal, bilinear(sample.thermal, (4, 30)))
+
+
+def test_mixed_labels_are_brightness_but_for_ignored_ones() -> None:
+    """Columns 1 and 2 hold road and background; a mix with an ignored pixel is ignored."""
+    label = np.array([[0, 0, 12, 12, 12, 12]], np.uint8)
+    assert mixed(np.roll(label, -1, 1)[:, :4], (1, 2)).tolist() == [[6, 12]]
+    label = np.full((2, 6), 3, np.uint8)
+    label[0, 0] = 255
+    assert mixed(label, (1, 3)).tolist() == [[255, 3, 3]]
+
+
+def test_examples_do_not_share_memory_with_views_of_the_file() -> None:
+    maps = replace(Maps.of(noise()), name="other")
+    cut = maps.crop(Window(3, 4, 10, 12)).flip(True).example(False)
+    assert cut.rgb.flags.c_contiguous
+    assert cut.label.flags.c_contiguous
+    assert (cut.name, cut.original_hw) == ("other", (48, 64))

@@ -1,0 +1,403 @@
+"""Virtual views: what is drawn, where pixels come from, what becomes of a batch, fixed angles."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+from math import cos, radians, sin
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from rgbt.checks import InputError
+from rgbt.geometry.camera import Camera
+from rgbt.geometry.warp import Warp
+from rgbt.requirements import Record
+from rgbt.transforms.views import ViewSets, VirtualView, read_angles
+from rgbt.types import IGNORE, Batch
+
+CAMERA = Camera(
+    fx=702.6030497884977, fy=703.4541726858521, cx=320.0, cy=240.0, height=480, width=640
+)
+PAPER: dict[str, Any] = {
+    "camera": CAMERA,
+    "order": "zyx",
+    "yaw": (-10.0, 10.0),
+    "pitch": (-10.0, 10.0),
+    "roll": (-5.0, 5.0),
+    "angles": "uniform",
+    "mode": "both",
+    "rectangle": "largest",
+    "resampling": "once",
+    "outside": "ignore",
+}
+RELEASED = {
+    **PAPER,
+    **{"order": "zxy", "angles": "integer", "rectangle": "corners"},
+    **{"resampling": "twice", "outside": "background"},
+}
+HW = (96, 128)
+
+
+def paper(**changes: Any) -> VirtualView:
+    return VirtualView(**{**PAPER, **changes})
+
+
+def released(**changes: Any) -> VirtualView:
+    return VirtualView(**{**RELEASED, **changes})
+
+
+def angles(*triples: tuple[float, float, float]) -> torch.Tensor:
+    return torch.tensor(triples, dtype=torch.float64)
+
+
+def drawn(view: VirtualView, count: int = 4000, seed: int = 0) -> torch.Tensor:
+    return view.draw(count, torch.Generator().manual_seed(seed))
+
+
+def scene(count: int = 1, hw: tuple[int, int] = HW, label_hw: tuple[int, int] = HW) -> Batch:
+    """Blurred noise, which has edges everywhere, and blobs of nine classes."""
+    rng = np.random.default_rng(3)
+    images = np.stack(
+        [cv2.GaussianBlur(rng.random((*hw, 4)), (0, 0), 3, dst=None) for _ in range(count)]
+    )
+    images = (images - images.min()) / (images.max() - images.min())
+    coarse = rng.integers(1, 9, (count, 6, 8))
+    label = np.stack(
+        [cv2.resize(each, label_hw[::-1], interpolation=cv2.INTER_NEAREST) for each in coarse]
+    )
+    image = torch.from_numpy(images).float().permute(0, 3, 1, 2)
+    rows, columns = torch.meshgrid(*map(torch.arange, hw), indexing="ij")
+    return Batch(
+        rgb=image[:, :3].contiguous(),
+        thermal=image[:, 3:].contiguous(),
+        label=torch.from_numpy(label).long(),
+        name=tuple(map(str, range(count))),
+        centre_yx=torch.zeros(count, 2, dtype=torch.int64),
+        position=torch.stack([rows, columns]).float().expand(count, 2, *hw),
+        original_hw=torch.tensor([hw]).expand(count, 2),
+    )
+
+
+# ---- what is drawn --------------------------------------------------------------------------
+
+
+def test_uniform_angles_fill_their_own_intervals() -> None:
+    found = drawn(paper(yaw=(-10.0, 2.0), pitch=(3.0, 4.0), roll=(-5.0, -5.0)))
+    assert found.shape == (4000, 3)
+    assert found.dtype == torch.float64
+    low, high = found.min(0).values, found.max(0).values
+    assert (low >= torch.tensor([-10.0, 3.0, -5.0])).all()
+    assert (high <= torch.tensor([2.0, 4.0, -5.0])).all()
+    # The ends of 4000 draws lie this near to those of the interval with probability 0.998 each.
+    assert (low[:2] - torch.tensor([-10.0, 3.0])).abs().max() < 0.02
+    assert (found[:, 0].mean() + 4).abs() < 0.3  # standard error 0.055
+    assert not torch.equal(found[:, 0], found[:, 0].floor())
+    assert np.corrcoef(found[:, 0], found[:, 1])[0, 1] == pytest.approx(0, abs=0.08)
+
+
+def test_integer_angles_are_whole_degrees_without_the_upper_end() -> None:
+    found = drawn(released())
+    for column, (low, high) in enumerate([(-10, 10), (-10, 10), (-5, 5)]):
+        assert sorted(set(found[:, column].tolist())) == list(range(low, high))
+    counts = np.unique(found[:, 2], return_counts=True)[1]
+    assert counts.min() > 330  # of 400 expected, standard deviation 19
+
+
+def test_draws_follow_from_the_generator_alone() -> None:
+    view = paper()
+    assert torch.equal(drawn(view, 5), drawn(view, 5))
+    assert not torch.equal(drawn(view, 5), drawn(view, 5, seed=1))
+    generator = torch.Generator().manual_seed(0)
+    assert not torch.equal(view.draw(5, generator), view.draw(5, generator))
+    state = torch.get_rng_state()
+    drawn(view)
+    assert torch.equal(state, torch.get_rng_state())
+
+
+# ---- where pixels come from -----------------------------------------------------------------
+
+
+def by_hand(yaw: float, pitch: float, roll: float, order: str) -> np.ndarray:
+    a, b, g = (radians(each) for each in (yaw, pitch, roll))
+    about_y = np.array([[cos(a), 0, sin(a)], [0, 1, 0], [-sin(a), 0, cos(a)]])
+    about_x = np.array([[1, 0, 0], [0, cos(b), -sin(b)], [0, sin(b), cos(b)]])
+    about_z = np.array([[cos(g), -sin(g), 0], [sin(g), cos(g), 0], [0, 0, 1]])
+    turn = about_z @ about_y @ about_x if order == "zyx" else about_z @ about_x @ about_y
+    matrix = np.array([[CAMERA.fx, 0, 320], [0, CAMERA.fy, 240], [0, 0, 1]])
+    found: np.ndarray = matrix @ turn @ np.linalg.inv(matrix)
+    return found
+
+
+@pytest.mark.parametrize("make", [paper, released])
+def test_the_homography_is_that_of_the_order(make: Any) -> None:
+    view, triple = make(), (4.0, 7.0, 1.0)
+    found = view.warp(angles(triple), (480, 640)).homography[0].numpy()
+    assert found == pytest.approx(by_hand(*triple, view.order), rel=1e-9)
+    other = by_hand(*triple, "zxy" if view.order == "zyx" else "zyx")
+    assert np.abs(found - other).max() > 0.1
+
+
+def test_rotation_does_not_cut_and_translation_does_nothing_else() -> None:
+    triple = angles((4, 7, 1))
+    both, rotation, translation = (
+        paper(mode=mode).warp(triple, HW) for mode in ("both", "rotation", "translation")
+    )
+    assert torch.equal(rotation.homography, both.homography)
+    assert rotation.rectangle.tolist() == [[-0.5, -0.5, 127.5, 95.5]]
+    assert torch.equal(translation.homography, torch.eye(3, dtype=torch.float64)[None])
+    assert torch.equal(translation.rectangle, both.rectangle)
+    assert translation.inside().all()
+    assert not rotation.inside().all()
+    assert both.inside().all()
+
+
+def test_positive_angles_move_what_is_seen_to_the_right_up_and_clockwise() -> None:
+    view = paper(mode="rotation")
+    centre = torch.zeros(3, 1, *HW)
+    centre[:, :, 44:52, 60:68] = 1
+    centre[2] = 0
+    centre[2, :, 44:52, 100:108] = 1  # right of the middle: clockwise is down
+    moved = view.warp(angles((5, 0, 0), (0, 5, 0), (0, 0, 5)), HW).bilinear(centre)
+    rows, columns = torch.meshgrid(*map(torch.arange, HW), indexing="ij")
+
+    def place(image: torch.Tensor) -> tuple[float, float]:
+        return tuple(float((image[0] * grid).sum() / image.sum()) for grid in (rows, columns))
+
+    assert place(moved[0])[1] > 63.5 + 8
+    assert place(moved[1])[0] < 47.5 - 8
+    assert place(moved[2])[0] > 47.5 + 2
+
+
+# ---- what becomes of a batch ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("make", [paper, released])
+def test_no_turn_changes_nothing(make: Any) -> None:
+    # The release's rule leaves out the last row and column: its cut is not the whole frame.
+    view = make(rectangle="largest")
+    batch = scene(2)
+    found = view.batch(batch, view.warp(angles((0, 0, 0), (0, 0, 0)), HW))
+    # The released views keep images in bytes.
+    of_bytes = view.resampling == "twice"
+    for ours, theirs in ((found.rgb, batch.rgb), (found.thermal, batch.thermal)):
+        expected = (255 * theirs).round() / 255 if of_bytes else theirs
+        # Where rounding in float32 decides, the next byte is right too.
+        assert ((ours - expected).abs() > 1e-5).float().mean() < (1e-3 if of_bytes else 1e-9)
+        assert (ours - expected).abs().max() < (1.001 / 255 if of_bytes else 1e-5)
+    assert torch.equal(found.label, batch.label)
+    assert torch.equal(found.position, batch.position)
+    assert found.name == batch.name
+    assert torch.equal(found.original_hw, batch.original_hw)
+
+
+@pytest.mark.parametrize(("outside", "label"), [("ignore", 255), ("background", 0)])
+def test_what_the_first_frame_does_not_show(outside: str, label: int) -> None:
+    view = paper(mode="rotation", outside=outside)
+    warp = view.warp(angles((10, 0, 0)), HW)
+    found, inside = view.batch(scene(), warp), warp.inside()
+    assert 0.05 < 1 - inside.float().mean() < 0.5
+    assert (found.label[~inside] == label).all()
+    assert (found.label[inside] > 0).all()
+    assert (found.label[inside] < 9).all()
+    assert not found.rgb.movedim(1, -1)[~inside].any()
+    assert not found.thermal.movedim(1, -1)[~inside].any()
+    assert torch.equal(view.valid(warp), inside if label == 255 else torch.ones_like(inside))
+
+
+@pytest.mark.parametrize("label_hw", [HW, (2 * HW[0], 2 * HW[1])])
+@pytest.mark.parametrize(("outside", "confidence"), [("ignore", 0.0), ("background", 1.0)])
+def test_confidences_move_with_their_labels(
+    outside: str, confidence: float, label_hw: tuple[int, int]
+) -> None:
+    view = paper(mode="rotation", outside=outside)
+    batch = scene(label_hw=label_hw)
+    batch = replace(batch, confidence=batch.label / 16)
+    found = view.batch(batch, view.warp(angles((10, 0, 0)), HW))
+    assert found.confidence is not None
+    inside = (found.label > 0) & (found.label < IGNORE)
+    assert torch.equal(found.confidence[inside], found.label[inside] / 16)
+    assert (found.confidence[~inside] == confidence).all()
+    assert not inside.all()
+
+
+def test_positions_say_where_a_pixel_was() -> None:
+    view, batch = paper(), scene()
+    found = view.batch(batch, view.warp(angles((4, 7, 1)), HW))
+    assert found.position is not None
+    rows, columns = found.position[0].long()
+    assert torch.equal(found.label[0], batch.label[0, rows, columns])
+
+
+def centres(warp: Warp, *points_yx: tuple[int, int]) -> list[list[int]]:
+    batch = replace(scene(), centre_yx=torch.tensor(points_yx), label=torch.zeros(1, *HW).long())
+    # One view, several points of it.
+    moved = [replace(batch, centre_yx=batch.centre_yx[n : n + 1]) for n in range(len(points_yx))]
+    found: list[list[int]] = [paper().batch(each, warp).centre_yx[0].tolist() for each in moved]
+    return found
+
+
+def by_shift(x: float, y: float, *edges: float) -> Warp:
+    turn = torch.tensor([[[1, 0, x], [0, 1, y], [0, 0, 1]]], dtype=torch.float64)
+    cut = torch.tensor([edges or (-0.5, -0.5, 127.5, 95.5)], dtype=torch.float64)
+    return Warp(turn, cut, HW, "once")
+
+
+@pytest.mark.parametrize("row", [40, 41])
+@pytest.mark.parametrize("column", [50, 51])
+def test_the_centre_moves_to_the_nearest_pixel(row: int, column: int) -> None:
+    assert centres(by_shift(0.3, 0.8), (row, column)) == [[row + 1, column]]
+    assert centres(by_shift(0.8, 0.3), (row, column)) == [[row, column + 1]]
+
+
+def test_the_centre_is_enlarged_with_the_cut_and_stays_in_the_view() -> None:
+    """The middle half is enlarged twofold: row 30 to (30 - 23.5) 2 - 0.5, less 0.2 of the shift."""
+    middle = by_shift(-0.1, -0.1, 31.5, 23.5, 95.5, 71.5)
+    assert centres(middle, (30, 40)) == [[12, 16]]
+    assert centres(middle, (0, 0), (95, 127), (30, 127)) == [[0, 0], [95, 127], [12, 127]]
+
+
+@pytest.mark.parametrize("make", [paper, released])
+def test_released_images_are_whole_bytes_and_those_of_the_paper_are_not(make: Any) -> None:
+    view = make()
+    found = view.batch(scene(), view.warp(angles((4, 7, 1)), HW))
+    for image in (255 * found.rgb, 255 * found.thermal):
+        off = (image - image.round()).abs().max()
+        assert off < 1e-3 if make is released else off > 0.4
+
+
+# ---- what is refused ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"angles": "integer", "yaw": (-0.5, 3.0)}, "view.yaw"),
+        ({"angles": "integer", "yaw": (3.0, 3.0)}, "view.yaw"),
+        ({"yaw": (-50.0, 50.0)}, "yaw -50, pitch -10, roll .* leave no rectangle"),
+        ({"yaw": (-50.0, 50.0), "mode": "rotation"}, "leave no rectangle"),
+        ({"yaw": (-44.0, 44.0)}, "a rectangle of [0-9.]+ % .* at least 10 % is required"),
+        ({"yaw": (0.0, 44.0), "rectangle": "corners"}, "a rectangle of [0-9.]+ %"),
+    ],
+)
+def test_ranges_that_cannot_be_are_refused(changes: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        paper(**changes)
+
+
+def test_the_least_that_is_left_is_that_of_the_widest_turn() -> None:
+    none = (0.0, 0.0)
+    with pytest.raises(InputError, match="yaw 47, pitch 0, roll 0 degrees leave") as raised:
+        paper(yaw=(0.0, 47.0), pitch=none, roll=none)
+    left, top, right, bottom = paper().warp(angles((47, 0, 0)), (480, 640)).rectangle[0].tolist()
+    share = 100 * (right - left) * (bottom - top) / (480 * 640)
+    assert f"a rectangle of {share:.2g} % of the frame" in str(raised.value)
+    paper(yaw=(-35.0, 35.0))
+
+
+# ---- fixed sets of angles -------------------------------------------------------------------
+
+# The first digits of the SHA-256 of each list as the release writes it, and its column means.
+PUBLISHED = {
+    "released_1": ("dfeb6588", (-0.043, -0.491, -0.341), 380),
+    "released_2": ("65f7993c", (-0.239, 0.140, -0.445), 374),
+    "released_3": ("65943e37", (-0.346, -0.165, -0.316), 373),
+}
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_published_sets_are_those_of_the_release(name: str) -> None:
+    digest, means, distinct = PUBLISHED[name]
+    found = read_angles(name)
+    assert (found.shape, found.dtype) == ((393, 3), torch.float64)
+    text = "\n".join(",".join(f"{value:.1f}" for value in row) for row in found.tolist())
+    assert hashlib.sha256(text.encode()).hexdigest().startswith(digest)
+    assert found.mean(0).tolist() == pytest.approx(means, abs=5e-4)
+    assert len({tuple(row) for row in found.tolist()}) == distinct
+
+
+def test_every_published_view_keeps_what_the_release_keeps() -> None:
+    triples = torch.cat([read_angles(name) for name in PUBLISHED])
+    left, top, right, bottom = released().warp(triples, (480, 640)).rectangle.unbind(1)
+    width, height = right - left, bottom - top
+    assert (width.min(), width.max(), height.min(), height.max()) == (482, 632, 320, 476)
+    assert float(width.mean()) == pytest.approx(556, abs=0.5)
+    assert float(height.mean()) == pytest.approx(398, abs=0.5)
+    assert float((width * height).mean()) / (480 * 640) == pytest.approx(0.72, abs=0.005)
+
+
+def sets(*names: str, view: VirtualView | None = None) -> ViewSets:
+    return ViewSets(view=view or released(), sets=names, splits=("test",))
+
+
+def test_the_kth_image_has_the_kth_triple_and_long_lists_begin_again() -> None:
+    views, triples = sets("released_1", "released_3"), read_angles("released_3")
+    assert torch.equal(views.angles(1, [5, 0, 392, 393, 398]), triples[[5, 0, 392, 0, 5]])
+    assert views.angles(0, [0]).tolist() == [[4, 7, 1]]
+
+
+@pytest.mark.parametrize(
+    "text", ["yaw,pitch,roll\r\n1.5,-2,3\r\n0,0,0", "\ufeffyaw, pitch, roll\n\n1.5,-2,3\n\n0,0,0"]
+)
+def test_a_file_of_ones_own(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "mine.csv"
+    path.write_bytes(text.encode())
+    assert sets(str(path)).angles(0, [2, 1]).tolist() == [[1.5, -2, 3], [0, 0, 0]]
+
+
+def test_the_mark_tells_views_apart_by_what_they_show(tmp_path: Path) -> None:
+    copies = [tmp_path / f"{name}.csv" for name in PUBLISHED]
+    for path in copies:
+        rows = [",".join(map(str, row)) for row in read_angles(path.stem).tolist()]
+        path.write_text("\n".join(["yaw,pitch,roll", *rows]))
+    narrow = released(yaw=(-9.0, 3.0))  # nothing is drawn
+    same = [sets(*PUBLISHED), sets(*map(str, copies)), sets(*PUBLISHED, view=narrow)]
+    assert [each.mark for each in same] == ["", "", ""]
+    changes: tuple[dict[str, Any], ...] = (
+        *({"order": "zyx"}, {"rectangle": "largest"}, {"resampling": "once"}),
+        *({"mode": "rotation"}, {"outside": "ignore"}, {"camera": replace(CAMERA, fx=500.0)}),
+    )
+    others = [sets(*PUBLISHED, view=released(**each)) for each in changes]
+    marks = {each.mark for each in (*others, sets("released_1"), sets(*reversed(PUBLISHED)))}
+    assert (len(marks), {len(mark) for mark in marks}) == (8, {6})
+
+
+BROKEN = {
+    **{"empty": b"", "no triple": b"yaw,pitch,roll\n", "no header": b"1,2,3\n"},
+    **{"order": b"roll,pitch,yaw\n1,2,3\n", "two values": b"yaw,pitch,roll\n1,2\n"},
+    **{"four values": b"yaw,pitch,roll\n1,2,3,4\n", "a word": b"yaw,pitch,roll\n1,2,x\n"},
+    **{"nan": b"yaw,pitch,roll\n1,2,nan\n", "endless": b"yaw,pitch,roll\n0,0,0\ninf,2,3\n"},
+    **{"too steep": b"yaw,pitch,roll\n0,0,0\n80,2,3\n", "bytes": b"\xff\xfe\x00\x01" * 9},
+    **{"ragged": b"yaw,pitch,roll\n1,2,3\n1,2\n", "utf-16": "1,2,3\n".encode("utf-16")},
+}
+
+
+@pytest.mark.parametrize("content", BROKEN.values(), ids=BROKEN)
+def test_broken_sets_are_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "mine.csv"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="consistency.sets: ") as raised:
+        sets(str(path))
+    assert str(path) in str(raised.value)
+
+
+def test_unknown_sets_and_sets_without_a_split_are_refused(tmp_path: Path) -> None:
+    for name in ("released_4", str(tmp_path)):
+        with pytest.raises(InputError, match="consistency.sets: .*released_1"):
+            sets(name)
+    with pytest.raises(InputError, match=r"consistency\.splits"):
+        ViewSets(view=released(), sets=("released_1",), splits=())
+    assert ViewSets(view=released(), sets=(), splits=()).sets == ()
+
+
+def test_views_that_paint_the_background_require_class_0_to_be_that() -> None:
+    (required,) = sets("released_1").record.requires
+    assert (required.node, required.setting) == ("dataset", "consistency.view.outside=background")
+    assert required.is_met_by(Record(first_class="background"))
+    assert not required.is_met_by(Record(first_class="object"))
+    assert not sets().record.requires
+    assert not sets("released_1", view=released(outside="ignore")).record.requires
