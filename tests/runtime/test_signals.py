@@ -12,7 +12,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from tests.checkpoints.test_damage import same
 from torch.utils.data import DataLoader
 
 from rgbt.config.plain_command import PlainCommand
@@ -21,6 +20,7 @@ from rgbt.engine.checkpoint import State, load_checkpoint
 from rgbt.engine.trainer import Trainer
 from rgbt.runtime.signals import Stopped, answered, deferred
 from rgbt.types import Batch
+from tests.checkpoints.test_torch_files import same
 from tests.commands import Call, NoOptions, assert_one_sentence
 from tests.engine.test_trainer import batches, make
 
