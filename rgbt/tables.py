@@ -49,7 +49,7 @@ class ClassTable:
     region_ious: tuple[tuple[Score, ...], ...]  # K rows of R
     subset_mious: Mapping[str, Score]  # of subsets of the images: {"day": 0.41, "night": 0.38}
     unscored: tuple[str, ...] = ()  # classes that are left out of every mean
-    notes: tuple[str, ...] = ()  # about absent classes (`rgbt.metrics.absent`)
+    notes: tuple[str, ...] = ()  # about absent classes (`rgbt.metrics.scores.absent_notes`)
 
 
 @dataclass(frozen=True)

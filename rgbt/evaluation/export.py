@@ -18,8 +18,14 @@ from rgbt.data.domains import TestedHead
 from rgbt.data.loaders import collate
 from rgbt.data.new_images import of_split
 from rgbt.evaluation.prediction import heads_of, view_of
-from rgbt.exported.description import Description, require_packages
-from rgbt.exported.graph import OPSET, ScoresOfImages, onnx_bytes, traced
+from rgbt.exported.graph import (
+    OPSET,
+    Description,
+    ScoresOfImages,
+    onnx_bytes,
+    require_packages,
+    traced,
+)
 from rgbt.exported.onnx_network import ExportedNetwork
 from rgbt.files.atomic import write_atomic
 from rgbt.requirements import record_of
