@@ -164,6 +164,14 @@ def test_damaged_files_of_others_raise_one_kind_of_error(tmp_path: Path, kind: s
     assert 10 < refused < 200
 
 
+def test_a_tensor_of_another_shape_or_type_than_its_place_is_refused(tmp_path: Path) -> None:
+    model, weights = trained()[0], payload()["model"]
+    name = "0.weight"
+    for wrong in (weights[name].double(), weights[name].mT[:, :3], weights[name].to_sparse(), "x"):
+        with pytest.raises(InputError, match=f"{name} is .* instead of 8x4x3x3 float32"):
+            restore_weights(model, {**weights, name: wrong}, tmp_path / "best.pt")
+
+
 WRONG: list[Any] = [
     *(None, True, -1, 1.5, "x", b"x", [], [1], {}, {"a": 1}, ("a", "b"), torch.zeros(7)),
     *(torch.zeros(8, 4, 3, 3, dtype=torch.int64), torch.zeros(8, 4, 3, 3).double()),
