@@ -35,7 +35,7 @@ def test_plan_uses_run_key_of_command(planner: Planner, base: tuple[str, ...]) -
     assert run.key == plan.key == specify(compose([*base, *plan.point.overrides])).key
     assert run.overrides == (*base, *plan.point.overrides)
     shown = (run.trainer.max_steps, run.scale.pixel_factor, plan.point.label)
-    assert shown == (6, 0.5, "patch_size=32")
+    assert shown == (6, 1.0, "patch_size=64")
     assert planner.plan(Point("p", plan.point.overrides[1:], seeds=(3,))).key == plan.key
 
 
