@@ -18,7 +18,7 @@ from rgbt.engine.checkpoint import load_checkpoint
 from rgbt.runs.folder import RunFolder
 from rgbt.runs.result import RunResult
 from sweeps.worker.processes import LocalExecutor, LocalJob
-from tests.checkpoints.test_damage import same
+from tests.checkpoints.test_torch_files import same
 from tests.commands import only_run
 from tests.conftest import write_data
 

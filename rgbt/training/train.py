@@ -21,7 +21,7 @@ from rgbt.checks import InputError
 from rgbt.data.domains import TestedHead
 from rgbt.engine.checkpoint import Checkpoints, State, restore_weights
 from rgbt.engine.trainer import WAIT_SHARE, Loaded, Trainer
-from rgbt.evaluation.prediction import decode_ahead, view_of
+from rgbt.evaluation.prediction import view_of
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.evaluation.segmentation import (
     EvaluationResult,
@@ -84,10 +84,6 @@ def train(
         announce_upstream(setup, description.name, upstream_of)
     else:
         announce_training(setup, description.name, spec.folder)
-    for turn in range(2):  # process 0 writes what is missing in the cache of images
-        if turn == min(rank(), 1):
-            decode_ahead(setup.session, *setup.names)
-        agreed(None)
     if rank() > 0:
         Run(setup, SilentFolder(spec.folder), Tracking(), description).complete()
         return

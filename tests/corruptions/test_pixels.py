@@ -97,16 +97,6 @@ def test_the_image_that_is_named_fails_alone(make: Callable[[str], OfPixels]) ->
     np.testing.assert_array_equal(found["both"].thermal, found["thermal"].thermal)
 
 
-def test_removed_is_black() -> None:
-    source = sample()
-    no_rgb, no_thermal = (
-        Removed(image=image)(source, 1.0, rng_of()) for image in ("rgb", "thermal")
-    )
-    assert (no_rgb.rgb.max(), no_thermal.thermal.max()) == (0, 0)
-    np.testing.assert_array_equal(no_rgb.thermal, source.thermal)
-    np.testing.assert_array_equal(no_thermal.rgb, source.rgb)
-
-
 @pytest.mark.parametrize(
     ("share", "blocks"), [(0.1, 30), (0.25, 75), (0.75, 225), (0.0984, 30), (0.098, 29), (1, 300)]
 )
@@ -158,13 +148,6 @@ def test_noise_is_cut_at_black_and_white_and_not_wrapped() -> None:
     assert 0.4 < (found.rgb == 0).mean() < 0.6
 
 
-def test_noise_of_a_higher_severity_is_the_same_noise_stronger() -> None:
-    grey = flat((60, 60), 128, 128)
-    kind = Noise(image="thermal", severities=(8.0, 16.0))
-    low, high = (kind(grey, each, rng_of()).thermal.astype(float) - 128 for each in (8.0, 16.0))
-    assert np.abs(high - 2 * low).max() <= 1.5
-
-
 def test_blur_of_a_step_is_the_normal_distribution_of_that_width() -> None:
     step = np.zeros((120, 160), np.uint8)
     step[:, 80:] = 255
@@ -174,11 +157,6 @@ def test_blur_of_a_step_is_the_normal_distribution_of_that_width() -> None:
     for column in range(74, 86):
         expected = 255 * 0.5 * (1 + math.erf((column + 0.5 - 80) / 2 / math.sqrt(2)))
         assert found[60, column] == pytest.approx(expected, abs=2)
-
-
-def test_blur_leaves_a_flat_image_as_it_is_up_to_its_edges() -> None:
-    found = Blur(image="both", severities=(16.0,))(flat((30, 40), 77, 33), 16.0, rng_of())
-    assert (np.unique(found.rgb).tolist(), np.unique(found.thermal).tolist()) == ([77], [33])
 
 
 def test_moved_by_hand() -> None:
@@ -216,16 +194,6 @@ def test_the_direction_is_the_same_at_every_severity() -> None:
     near, far = (kind(source, severity, rng_of()).thermal for severity in (4, 8))
     (direction,) = [d for d in DIRECTIONS if np.array_equal(near, moved(source.thermal, *d))]
     np.testing.assert_array_equal(far, moved(source.thermal, 2 * direction[0], 2 * direction[1]))
-
-
-@pytest.mark.parametrize("kind", [occluded("both"), EVERY["noise"], EVERY["misregistered"]])
-def test_what_is_drawn_follows_from_seed_and_name(kind: OfPixels) -> None:
-    images = [
-        kind(sample(), kind.severities[0], rng_of(seed, name)).thermal
-        for seed, name in ((0, "a"), (0, "a"), (1, "a"), (0, "b"), (0, "c"), (0, "d"))
-    ]
-    np.testing.assert_array_equal(images[0], images[1])
-    assert any(not np.array_equal(images[0], each) for each in images[2:])
 
 
 @pytest.mark.parametrize(

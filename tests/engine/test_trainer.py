@@ -20,7 +20,7 @@ from rgbt.engine.settings import TrainerSettings
 from rgbt.engine.trainer import Trainer
 from rgbt.randomness import torch_generator
 from rgbt.types import Batch, GeneratorOf, Phase
-from tests.checkpoints.test_damage import same
+from tests.checkpoints.test_torch_files import same
 
 SETTINGS = {
     "max_steps": 6,

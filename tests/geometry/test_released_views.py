@@ -33,16 +33,6 @@ def warp(recorded: Recorded, views: Tensor) -> Warp:
     return Warp(views, rectangle, recorded.hw, "twice")
 
 
-def test_homographies_in_both_orders(recorded: Recorded, views: Tensor) -> None:
-    paper = homography(recorded.angles, recorded.camera.matrix(recorded.hw), "zyx")
-    for ours, key in ((views, "release_order_float64"), (paper, "paper_order")):
-        torch.testing.assert_close(
-            ours, torch.from_numpy(recorded[f"homography.{key}"]), rtol=1e-9, atol=1e-9
-        )
-    released = torch.from_numpy(recorded["homography.release_order"]).double()
-    assert (views - released).abs().max() < 2e-4  # the release multiplies in float32
-
-
 def test_corners_and_crops(recorded: Recorded, views: Tensor, warp: Warp) -> None:
     height, width = recorded.hw
     frame = [[0, 0, 1], [width - 1, 0, 1], [0, height - 1, 1], [width - 1, height - 1, 1]]

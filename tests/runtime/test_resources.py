@@ -9,12 +9,15 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
+from PIL import PngImagePlugin
 
 from rgbt.checks import InputError
 from rgbt.config.plain_command import PlainCommand
+from rgbt.data.files import decode
 from rgbt.files.atomic import write_atomic
 from tests.commands import Call, NoOptions, assert_one_sentence, only_run, short, train
 
@@ -91,6 +94,20 @@ def test_other_errors_stay_errors(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_sentences_hold_no_codes_of_the_terminal(call: Call) -> None:
     code, _, err = call(raising(lambda: InputError("\x1b[31mfolder\x07/a: is missing.")))
     assert (code, err) == (2, "rgbt: ?[31mfolder?/a: is missing.\n")
+
+
+def test_an_image_that_does_not_fit_into_memory_is_not_called_damaged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.png"
+    cv2.imwrite(str(path), np.zeros((8, 8, 3), np.uint8))
+
+    def load(*_: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(PngImagePlugin.PngImageFile, "load", load)
+    with pytest.raises(MemoryError):
+        decode(path)
 
 
 @pytest.fixture

@@ -15,13 +15,12 @@ import pytest
 from torch.utils.data import DataLoader
 
 from rgbt.config.plain_command import PlainCommand
-from rgbt.data.loaders import _started
-from rgbt.data.reader import start_worker
+from rgbt.data.loaders import ENDING, start_worker
 from rgbt.engine.checkpoint import State, load_checkpoint
 from rgbt.engine.trainer import Trainer
 from rgbt.runtime.signals import Stopped, answered, deferred
 from rgbt.types import Batch
-from tests.checkpoints.test_damage import same
+from tests.checkpoints.test_torch_files import same
 from tests.commands import Call, NoOptions, assert_one_sentence
 from tests.engine.test_trainer import batches, make
 
@@ -215,24 +214,78 @@ def thread_after_fork() -> Iterator[None]:
     is_wanted.clear()
 
 
+def started(loader: DataLoader[int]) -> Iterator[int]:
+    """As `rgbt.data.loaders.Batches` does."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
+    try:
+        return iter(loader)
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 @pytest.mark.usefixtures("thread_after_fork")
 def test_workers_leave_signals_of_a_group_to_the_main_process() -> None:
     """Ctrl-C in a terminal and `killpg` reach them too; the step in progress needs them."""
     loader = DataLoader(
         range(40), batch_size=None, num_workers=1, worker_init_fn=start_worker, prefetch_factor=2
     )
-    found = _started(loader, 1)
+    found = started(loader)
     assert next(found) == 0
     (worker,) = found._workers  # type: ignore[attr-defined]
     for number in SIGNALS:
         subprocess.run(["kill", f"-{int(number)}", str(worker.pid)], check=True)
     assert list(found) == list(range(1, 40))
-    fresh = _started(loader, 1)
+    fresh = started(loader)
     assert next(fresh) == 0
     (worker,) = fresh._workers  # type: ignore[attr-defined]
     worker.terminate()
     worker.join(5)
     assert worker.exitcode == 0, "the main process ends them"
+
+
+SERVED = """
+import multiprocessing, os, sys
+from torch.utils.data import DataLoader
+from rgbt.data.loaders import start_worker
+
+if __name__ == "__main__":
+    loader = DataLoader(
+        range(9),
+        batch_size=None,
+        num_workers=1,
+        worker_init_fn=start_worker,
+        multiprocessing_context="forkserver",
+    )
+    found = iter(loader)
+    next(found)
+    (worker,) = found._workers
+    print(worker.pid, flush=True)
+    if sys.argv[1] == "die":
+        os.kill(os.getpid(), 9)
+    worker.terminate()
+    worker.join(10)
+    print(worker.exitcode, flush=True)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("end", ["die", "terminate"])
+def test_workers_of_a_fork_server_end_with_the_main_process(tmp_path: Path, end: str) -> None:
+    """As inside a sweep: the parent of such a worker is the server, which lives on."""
+    script = tmp_path / "served.py"
+    script.write_text(SERVED)
+    process = subprocess.Popen(
+        [sys.executable, str(script), end], stdout=subprocess.PIPE, text=True, cwd=Path.cwd()
+    )
+    assert process.stdout is not None
+    worker = int(process.stdout.readline())
+    if end == "terminate":
+        assert process.stdout.readline() == "0\n"
+    process.wait(60)
+    deadline = time.monotonic() + 20
+    while Path(f"/proc/{worker}").exists() and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not Path(f"/proc/{worker}").exists()
 
 
 def test_an_error_of_a_library_that_a_signal_left_halfway_is_its_consequence(call: Call) -> None:

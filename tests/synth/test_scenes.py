@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rgbt.randomness import numpy_generator
-from rgbt.synth import render, scene, surface
+from rgbt.synth import scene
 from rgbt.synth.camera import SynthCamera, camera_of, flow_between
 from rgbt.synth.factors import EgoMotion, SceneFactors
 from rgbt.synth.light import is_night
@@ -313,16 +313,6 @@ def inside(pair: ScenePair) -> Array:
     return pair.visible & (cv2.erode(number, square) == cv2.dilate(number, square))
 
 
-def apart(factors: SceneFactors, count: int = 16) -> float:
-    """Mean absolute difference of grey levels between the second frame and the warped first."""
-    found = []
-    for index in range(count):
-        pair = render_pair(0, index, factors, MOTION)
-        difference = pair.second.rgb - warped(pair.first.rgb, pair)
-        found.append(np.abs(difference.mean(2))[inside(pair)].mean())
-    return float(np.mean(found))
-
-
 @pytest.mark.parametrize("motion", [EgoMotion(0.6, 0.0), EgoMotion(0.5, 2.0), EgoMotion(-0.7, -3)])
 def test_flow_carries_labels_from_frame_to_frame(motion: EgoMotion) -> None:
     agree, labelled, visible, hidden = [], [], [], []
@@ -351,46 +341,6 @@ def test_first_frame_of_a_pair_is_the_scene() -> None:
     assert pair.visible.all()
 
 
-def without(patch: pytest.MonkeyPatch, **light: float) -> None:
-    """Take haze or headlights away from the world."""
-    world = scene._world
-    patch.setattr(
-        scene,
-        "_world",
-        lambda *given: (made := world(*given))._replace(light=made.light._replace(**light)),
-    )
-
-
-@pytest.mark.slow
-def test_by_day_vignette_shadows_and_haze_change_brightness(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The flow is exact, so that each cause, taken away, brings the frames nearer."""
-    even = replace(STILL, night_share=0.0, vignette=0.0)
-    found = [apart(replace(even, vignette=0.18)), apart(even)]
-    found.append(apart(replace(even, whole_shadows=True)))
-    without(monkeypatch, visibility_m=1e9)
-    found.append(apart(replace(even, whole_shadows=True)))
-    assert found == sorted(found, reverse=True)
-    assert found[0] > 2.0
-    assert found[3] < 0.6  # rounding to bytes of both frames, and interpolation
-
-
-@pytest.mark.slow
-def test_by_night_headlights_halos_and_vignette_change_brightness(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    night = replace(STILL, night_share=1.0)
-    found = [apart(night)]
-    without(monkeypatch, headlight=0.0)
-    found.append(apart(night))
-    monkeypatch.setattr(render, "_bloom", np.zeros_like)
-    found += [apart(night), apart(replace(night, vignette=0.0))]
-    assert found == sorted(found, reverse=True)
-    assert found[0] > 2.5
-    assert found[3] < 0.6
-
-
 def test_whole_shadows_stay_on_the_ground(monkeypatch: pytest.MonkeyPatch) -> None:
     """Scene 52 by day: a shadow with a corner behind the camera covered most of the street."""
     seen: list[Array] = []
@@ -409,21 +359,3 @@ def test_whole_shadows_stay_on_the_ground(monkeypatch: pytest.MonkeyPatch) -> No
         lost[whole] = float((warped(first, pair) - second > 0.5)[inside(pair)].mean())
     assert lost[False] > 0.2
     assert lost[True] == 0.0
-
-
-def test_clipped_shadow_is_that_of_the_part_in_front() -> None:
-    """A square of ground from 1 m behind the camera to 10 m ahead, seen from 1.6 m."""
-    camera = camera_of(replace(STILL, camera_pitch_deg=0.0))
-    canvas = np.zeros((camera.height, camera.width), np.uint8)
-    corners = [[-0.5, 0.0, -1.0], [-0.5, 0.0, 10.0], [0.5, 0.0, 10.0], [0.5, 0.0, -1.0]]
-    surface._fill_beyond(canvas, np.array(corners, np.float32), camera, 200)
-    rays = camera.rays()
-    with np.errstate(divide="ignore", invalid="ignore"):
-        depth = 1.6 / rays[1]
-        across = rays[0] * depth
-    expected = (rays[1] > 0) & (depth < 10.0) & (depth > 0.3) & (np.abs(across) < 0.5)
-    assert expected.sum() > 500
-    assert not (expected & (canvas == 0)).any()
-    # The outline is drawn as well.
-    around = cv2.dilate(expected.astype(np.uint8), np.ones((3, 3))) > 0
-    assert not ((canvas > 0) & ~around).any()

@@ -39,6 +39,7 @@ def test_a_training_says_what_it_works_with_and_nothing_that_reads_like_a_remark
     millions = sum(each.numel() for each in setup.session.model.parameters()) / 1e6
     assert shown["network"] == f"MFNet, {millions:.2f} M parameters"
     assert shown["images"] == "synth: 3 train, 2 val, 4 test"
+    assert shown["sizes"] == "stored 48x64, trained 120x160, predicted 120x160"
     # one batch of two of the three images is an epoch
     assert shown["steps"] == "6 of batch 2 (6 epochs), validated every 3"
     assert shown["folder"] == "/runs/abc"
