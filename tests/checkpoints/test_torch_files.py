@@ -243,12 +243,14 @@ def test_nothing_in_a_checkpoint_runs(tmp_path: Path) -> None:
 def test_checkpoints_and_counts_of_another_run_are_refused(
     trained: Trained, call: Call, tmp_path: Path
 ) -> None:
-    words = ("+experiment=mfnet", *short(1))
+    words = ("+experiment=mfnet", "masker.patch_size=null", *short(1))
     first, other = trained(*words, "seed=1"), trained(*words, "seed=2")
     folder = Path(shutil.copytree(first, tmp_path / "runs" / first.name))
     evaluated = (f"run={folder}", f"out={tmp_path / 'counts.npz'}")
-    assert call(evaluate.entry, *evaluated)[0] == 0
+    code, _, err = call(evaluate.entry, *evaluated)
+    assert code == 0, err
     assert Counts.load(tmp_path / "counts.npz").run == RunResult(folder).counts().run == first.name
+    (tmp_path / "counts.npz").unlink()
     config = folder / "config.yaml"
     stored = config.read_text()
     config.write_text(stored.replace("seed: 1\n", "seed: 3\n", 1))

@@ -7,11 +7,11 @@ import multiprocessing
 
 import pytest
 import torch
-from rgbt.transforms.thesis import ThesisTransform
 
 from rgbt.checks import InputError
 from rgbt.data.loaders import LoadedPair, LoaderSettings, PairedBatches, train_batches
 from rgbt.data.mfnet import MFNet
+from rgbt.transforms.fixed_size import ThesisTransform
 from rgbt.types import Batch
 
 DAY = [f"{number:05d}D" for number in range(1, 8)]
