@@ -112,9 +112,15 @@ REFUSED: list[tuple[Callable[[], Any], str]] = [
     (lambda: sample(label=np.full(HW, 2, np.uint8)), "the label value 2 (24 pixels); expected 0"),
     (lambda: drawn(None), "masker: Halves returned None; expected MaskPair(rgb, thermal)"),
     (lambda: drawn(MaskPair(1, 2)), "returned int 1; expected MaskPair"),
-    (lambda: drawn(MaskPair(1.0 * CELLS, 1.0 * CELLS)), "returned Tensor (1, 4, 5) float32; expected MaskPair"),
+    (
+        lambda: drawn(MaskPair(1.0 * CELLS, 1.0 * CELLS)),
+        "returned Tensor (1, 4, 5) float32; expected MaskPair",
+    ),
     (lambda: drawn(MaskPair(*[torch.zeros(1, 15, 20).bool()] * 2)), "dividing 128 and 160"),
-    (lambda: drawn(MaskPair(CELLS, CELLS.repeat(1, 2, 2))), "returned Tensor (1, 8, 10) bool; expected MaskPair"),
+    (
+        lambda: drawn(MaskPair(CELLS, CELLS.repeat(1, 2, 2))),
+        "returned Tensor (1, 8, 10) bool; expected MaskPair",
+    ),
     (lambda: passed(RGB), "Net.forward returned Tensor (2, 3, 4, 6) float32; expected Output."),
     (lambda: passed(Output(RGB, {})), "(2, 3, 4, 6) float32; expected (2, 5, 4, 6)."),
     (lambda: passed(Output(torch.zeros(2, 5, 2, 3), {})), "logits Tensor (2, 5, 2, 3) float32"),
