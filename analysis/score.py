@@ -52,9 +52,8 @@ class Options(PredictionFormatOptions):
     predictions: Annotated[
         str,
         Help(
-            "folder of predictions, or a ZIP file of one, with a PNG file for every image of the "
-            "split: class indices (8 bit, one channel), a palette PNG, or RGB in the colours of a "
-            "palette"
+            "folder of predictions, with a PNG file for every image of the split: class indices "
+            "(8 bit, one channel) or, with format=colour, the colours of a palette"
         ),
     ] = ""
     counts: Annotated[
@@ -238,8 +237,7 @@ def _show(tables: Sequence[ScoreTable], remarks: list[str], out: Path | None) ->
 
 def _scored(options: Options, overrides: list[str]) -> FolderScores:
     from analysis.predictions.scoring import PARTITIONS, ScoringOptions, score_folder
-    from rgbt.data.prediction_files import Affixes
-    from rgbt.data.prediction_format import FormatOptions
+    from rgbt.data.predictions import Affixes, FormatOptions
 
     dataset, absent = dataset_of(overrides), built("metric", overrides).absent
     counting = ScoringOptions(

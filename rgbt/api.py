@@ -16,7 +16,7 @@ from rgbt.assembly.session import Session
 from rgbt.checks import InputError, check_choice
 from rgbt.config.stored_config import parse_trust, read_settings
 from rgbt.data.domains import TestedHead
-from rgbt.data.to_predict import of_arrays, of_files
+from rgbt.data.new_images import of_arrays, of_files
 from rgbt.dataset import LabelledDataset
 from rgbt.evaluation.images import batch_of
 from rgbt.evaluation.prediction import Predictor

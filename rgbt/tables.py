@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, TypeAdapter
 
-from rgbt.checks import InputError
+from rgbt.checks import InputError, without_controls
 from rgbt.metrics.names import DAY, NIGHT
 
 ABSENT = "-"
@@ -49,7 +49,7 @@ class ClassTable:
     region_ious: tuple[tuple[Score, ...], ...]  # K rows of R
     subset_mious: Mapping[str, Score]  # of subsets of the images: {"day": 0.41, "night": 0.38}
     unscored: tuple[str, ...] = ()  # classes that are left out of every mean
-    notes: tuple[str, ...] = ()  # about absent classes (`rgbt.metrics.absent`)
+    notes: tuple[str, ...] = ()  # about absent classes (`rgbt.metrics.scores.absent_notes`)
 
 
 @dataclass(frozen=True)
@@ -98,11 +98,15 @@ class TextTable:
     notes: tuple[str, ...] = ()
 
     def to_markdown(self) -> str:
-        """The table in Markdown, with the title in bold above it and its footnotes below."""
+        """The table in Markdown, with the title in bold above it and its footnotes below.
+
+        Control characters and new lines of names become "?".
+        """
         rule = ["---", *["---:"] * (len(self.header) - 1)]
         lines = ["| " + " | ".join(row) + " |" for row in (self.header, rule, *self.rows)]
         notes = ["", *(f"- {note}" for note in self.notes)] if self.notes else []
-        return "\n".join([f"**{self.title}**", "", *lines, *notes]) + "\n"
+        every = [f"**{self.title}**", "", *lines, *notes]
+        return "\n".join(without_controls(line.replace("\n", "?")) for line in every) + "\n"
 
 
 def class_grid(tables: ResultTables) -> TextTable:

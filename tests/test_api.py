@@ -15,10 +15,14 @@ import pytest
 
 import rgbt
 from rgbt import predict
+from rgbt.checkpoints.read import NOTE
+from rgbt.checkpoints.torch_files import read_torch_file, save
 from rgbt.checks import InputError
+from rgbt.config.stored_config import read_settings
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
 from rgbt.runs.folder import Description, RunFolder, counts_name
+from rgbt.runs.run_spec import settings_digest
 from tests.commands import Call, Trained, short
 
 ONE = ("+experiment=crm", *short(1))
@@ -120,6 +124,9 @@ def test_own_classes_are_refused_until_their_module_is_trusted(
     config = folder / "config.yaml"
     loss = "rgbt.losses.set_criterion.SetCriterion"
     config.write_text(config.read_text().replace(loss, "api_lab.MyLoss"))
+    best = read_torch_file(folder / "best.pt")
+    best[NOTE] = {"key": folder.name, "settings": settings_digest(read_settings(config))}
+    save(folder / "best.pt", best)
     with pytest.raises(InputError, match=r"names api_lab\.MyLoss.* add trust=api_lab\."):
         rgbt.load_run(folder)
     (tmp_path / "api_lab.py").write_text(

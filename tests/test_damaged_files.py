@@ -18,10 +18,8 @@ import pytest
 from analysis.robustness import FORMAT as ROBUSTNESS
 from analysis.robustness import _level
 from rgbt.checks import InputError, RunError
-from rgbt.data.cache.sample_map import NewSample, SampleMap, write_map
-from rgbt.data.files import decode
-from rgbt.data.integrity import read_names
-from rgbt.data.labels import read_label
+from rgbt.data.files import decode, read_names
+from rgbt.data.labels import indices
 from rgbt.data.pseudo_labels import FORMAT, PseudoLabels
 from rgbt.files.plain_files import sealed
 from rgbt.metrics.counts import Counts
@@ -35,7 +33,6 @@ from rgbt.runs.folder import (
     read_tables,
 )
 from rgbt.tables import ClassTable, RegionTable, ResultTables
-from rgbt.types import Sample
 from tests.damage import damaged
 
 HEADROOM = 2**30
@@ -107,22 +104,6 @@ def read_pseudo(path: Path) -> Any:
     return labels.classes, labels.digest, *labels.read("a", 5)
 
 
-def cache(path: Path) -> None:
-    rgb = picture(3)
-    samples = (Sample(rgb // n, rgb[..., 0] // n, None, name=f"{n}") for n in (1, 2, 3))
-    write_map(path, (NewSample(each, ()) for each in samples))
-
-
-def read_cache(path: Path) -> Any:
-    try:
-        held = SampleMap(path)
-    except ValueError as error:  # what is damaged is decoded again
-        raise InputError(f"{error}.") from error
-    if not held.is_intact(1, lambda *_: None):
-        raise InputError("a sample is damaged.")
-    return [held.read(name) for name in held.records]
-
-
 def robustness(path: Path) -> None:
     counts(path.with_suffix(".npz"))
     made = {"format": ROBUSTNESS, "row": "noise", "title": "Noise", "unit": "", "severity": 0.5}
@@ -144,7 +125,7 @@ KINDS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any]]] = {
     "rgbt.png": (image(4), decode),
     "16_bits.png": (image(1, "uint16"), decode),
     "rgb.jpg": (image(3), decode),
-    "label.png": (label, lambda path: read_label(path, 5)),
+    "label.png": (label, indices(5).read),
     "metrics.jsonl": (run_file, lambda path: RunFolder(path.parent).lines()),
     "result.json": (run_file, lambda path: read_result(path.parent)),
     "run.json": (run_file, lambda path: read_description(path.parent)),
@@ -155,7 +136,6 @@ KINDS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], Any]]] = {
     "labels/a.png": (pseudo, read_pseudo),
     "confidence/a.png": (pseudo, read_pseudo),
     "train.txt": (names, lambda path: read_names(path, "dataset.splits")),
-    "cache.frames": (cache, read_cache),
     "noise.json": (robustness, read_robustness),
 }
 UNSEALED = {"rgb.jpg", "metrics.jsonl", "provenance.json", "train.txt"}

@@ -18,8 +18,8 @@ from tests.commands import Call, Trained, assert_one_sentence, short
 def test_details_of_every_input_are_stored_and_shown_again(
     call: Call, trained: Trained, tmp_path: Path
 ) -> None:
-    folder = tmp_path / "key"
-    shutil.copytree(trained("+experiment=crm", *short(1)), folder)
+    done = trained("+experiment=crm", *short(1))
+    folder = Path(shutil.copytree(done, tmp_path / done.name))
 
     code, _, err = call(details.entry, f"run={folder}")
     assert code == 2

@@ -18,6 +18,7 @@ from rgbt.engine.checkpoint import load_checkpoint
 from rgbt.runs.folder import RunFolder
 from rgbt.runs.result import RunResult
 from sweeps.worker.processes import LocalExecutor, LocalJob
+from tests.checkpoints.test_torch_files import same
 from tests.commands import only_run
 from tests.conftest import write_data
 
@@ -118,7 +119,7 @@ def check(bench: Bench, place: Path) -> None:
     assert result == expected
     assert lines(folder) == lines(straight)
     for name in ("best.pt", "last.pt"):
-        assert (folder / name).read_bytes() == (straight / name).read_bytes(), name
+        assert same(*(load_checkpoint(each / name) for each in (folder, straight))), name
     assert load_checkpoint(folder / "best.pt")["step"] == result["best_step"]
     for split in ("val", "test"):
         one, other = (RunResult(each).counts(split).counts for each in (folder, straight))

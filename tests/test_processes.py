@@ -18,9 +18,8 @@ from torch import nn
 
 from rgbt import processes
 from rgbt.checks import InputError
-from rgbt.data.loaders import LoaderSettings, eval_batches, train_batches
+from rgbt.data.loaders import LoaderSettings, PairedBatches, eval_batches, train_batches
 from rgbt.data.mfnet import MFNet
-from rgbt.data.pairs import PairedBatches
 from rgbt.engine.batch_norm import (
     SynchronisedBatchNorm,
     check_batch_norm_parts,

@@ -23,8 +23,8 @@ MARKS = ("clean", "features-rgb", "features-thermal", "noise_rgb-16", "noise_rgb
 def test_robustness_counts_are_those_of_evaluate(
     call: Call, trained: Trained, tmp_path: Path
 ) -> None:
-    folder = tmp_path / "runs" / "key"
-    shutil.copytree(trained("+experiment=crm", *short(1)), folder)
+    done = trained("+experiment=crm", *short(1))
+    folder = Path(shutil.copytree(done, tmp_path / "runs" / done.name))
     code, out, err = call(ENTRY, f"run={folder}", *NOISE)
     assert code == 0, err
     place = folder / "evaluations" / "robustness" / "test"

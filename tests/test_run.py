@@ -15,7 +15,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from tests.checkpoints.test_torch_files import same
 
 from rgbt import evaluate, predict
 from rgbt.checkpoints.torch_files import save
@@ -24,6 +23,7 @@ from rgbt.config.compose import compose
 from rgbt.engine.checkpoint import load_checkpoint
 from rgbt.metrics.counts import Counts
 from rgbt.run import main
+from tests.checkpoints.test_torch_files import same
 from tests.commands import (
     DAYS_AND_NIGHTS,
     ON_CPU,
@@ -331,7 +331,7 @@ def test_night_images_are_predicted_by_the_targets_head(
     trained: Trained, call: Call, tmp_path: Path
 ) -> None:
     folder = trained(*NIGHT)
-    broken = without_target_head(folder, tmp_path / "broken")
+    broken = without_target_head(folder, tmp_path / "broken" / folder.name)
     whole = Counts.load(folder / "counts_test.npz").counts
     night, day = slice(2, 4), slice(0, 2)
     target = evaluated(call, broken).counts

@@ -79,7 +79,7 @@ def test_other_inputs_are_reported(
 @pytest.mark.parametrize(
     ("words", "key"),
     [
-        (("model.weights={run}", "model.fresh=[decode1]"), "model.fresh"),
+        (("model.weights={run}", "model.fresh=[decode1]"), "initial values (decode1."),
         (("model.weights={run}", "checkpoint=last"), "checkpoint"),
         (("model.weights=nowhere.pth",), "nowhere.pth"),
         ((), "run"),

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from analysis.figures.inputs import FigureInput
 from rgbt.checks import InputError
 from rgbt.data.files import decode, read_rgb
-from rgbt.data.next_frames import NextFrames
-from rgbt.data.prediction_format import FormatOptions, recognise_format
+from rgbt.data.mfnet import NextFrames
+from rgbt.data.predictions import FormatOptions, PredictionReader
 from rgbt.metrics.pair_list import ListedPair, PairList, read_list
 from rgbt.types import IGNORE
 
@@ -99,7 +99,7 @@ class Pairs:
         named = given.named("methods", PREDICTIONS)
         self.methods = {label: Path(place).expanduser() for label, place in named.items()}
         self._format = FormatOptions(
-            form=given.get("format", "auto"), palette=given.get("palette", "auto")
+            form=given.get("format", "index"), palette=given.get("palette", "dataset")
         )
         number = given.get("view_set", 1)
         self.listed = {each.first: each for each in self._listed.pairs if each.set == number}
@@ -172,7 +172,7 @@ class Pairs:
                     f"out={folder}."
                 )
         dataset = self._dataset
-        reader, _ = recognise_format(paths, dataset.classes, dataset.palette, self._format)
+        reader = PredictionReader(dataset.classes, dataset.palette, self._format)
         found = [reader.read(path) for path in paths]
         for path, each in zip(paths, found, strict=True):
             if each.shape != label.shape:

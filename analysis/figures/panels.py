@@ -21,8 +21,7 @@ from analysis.figures.grid import Grid, Texts, draw_grid
 from analysis.figures.inputs import FigureInput
 from analysis.predictions.scoring import ScoringOptions, score_folder
 from rgbt.checks import InputError
-from rgbt.data.prediction_files import Affixes, find_affixes
-from rgbt.data.prediction_format import FormatOptions, recognise_format
+from rgbt.data.predictions import Affixes, FormatOptions, PredictionReader, prediction_paths
 from rgbt.metrics.counting import RegionCounter
 from rgbt.metrics.counts import Counts, scored_classes
 from rgbt.metrics.metric import Regions, ring_rectangle
@@ -118,17 +117,14 @@ def _reading(
     Raises:
         InputError: an image without a prediction, or an unknown format.
     """
-    stems = {path.stem for path in folder.glob("*.png")}
-    affixes = find_affixes(stems, names, described.affixes)
-    paths = {name: folder / f"{affixes.file_stem(name)}.png" for name in names}
+    paths = prediction_paths(folder, names, described.affixes)
     for path in paths.values():
         if not path.is_file():
             raise InputError(
-                f"methods: there is no prediction {path}; name a folder that holds "
-                f"{affixes.file_stem('NAME')}.png for every image shown, or other images with "
-                "names=..."
+                f"methods: there is no prediction {path}; name a folder with a file for every "
+                "image shown, or other images with names=..."
             )
-    reader, _ = recognise_format(paths.values(), dataset.classes, dataset.palette, described)
+    reader = PredictionReader(dataset.classes, dataset.palette, described)
     return lambda name: reader.read(paths[name])
 
 
@@ -137,8 +133,8 @@ def _read(given: FigureInput, named: Mapping[str, str], number: int) -> Qualitat
     folders = {label: Path(place).expanduser() for label, place in named.items()}
     dataset = given.dataset
     described = FormatOptions(
-        form=given.get("format", "auto"),
-        palette=given.get("palette", "auto"),
+        form=given.get("format", "index"),
+        palette=given.get("palette", "dataset"),
         affixes=Affixes(given.get("prefix", ""), given.get("suffix", "")),
     )
     if "names" in given.values and ("pick" in given.values or "rows" in given.values):

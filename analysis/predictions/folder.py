@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from rgbt.checks import InputError
-from rgbt.data.prediction_files import OVERLAY, Affixes, find_affixes
+from rgbt.data.predictions import OVERLAY, Affixes
 from rgbt.dataset import LabelledDataset
 
 Missing = Literal["refuse", "leave_out"]
@@ -23,13 +23,11 @@ class PredictionFiles:
 
     Attributes:
         paths: name of the image -> its prediction, in the order of the split.
-        affixes: how the files are named.
         missing: names of the split without a file.
         extra: names of PNG files that belong to no image of the split (overlays left out).
     """
 
     paths: dict[str, Path]
-    affixes: Affixes
     missing: tuple[str, ...]
     extra: tuple[str, ...]
 
@@ -43,7 +41,7 @@ def find(
         folder: holds the PNG files.
         dataset: its names are looked up.
         split: of the data set.
-        given: prefix and suffix, see `rgbt.data.prediction_files.find_affixes`.
+        given: prefix and suffix of the names of the files.
         missing: "refuse", or "leave_out" to go on without the images that have no file.
 
     Raises:
@@ -52,15 +50,14 @@ def find(
     """
     stems = _stems(folder)
     names = dataset.names(split)
-    affixes = find_affixes(stems, names, given)
-    own = {name: affixes.file_stem(name) for name in names}
+    own = {name: given.file_stem(name) for name in names}
     there = {name: folder / f"{stem}.png" for name, stem in own.items() if stem in stems}
     absent = tuple(name for name in names if name not in there)
     if not there:
         raise InputError(
             f"none of the {len(names)} images of split '{split}' has a file "
-            f"{affixes.file_stem('NAME')}.png in {folder}; it contains "
-            f"{listed(sorted(stems), '.png')}{_hint(stems, dataset, affixes)}."
+            f"{given.file_stem('NAME')}.png in {folder}; it contains "
+            f"{listed(sorted(stems), '.png')}{_hint(stems, dataset, given)}."
         )
     if absent and missing == "refuse":
         raise InputError(
@@ -69,7 +66,7 @@ def find(
             "others alone with missing=leave_out."
         )
     known = {*own.values(), *(f"{name}{OVERLAY}" for name in names)}
-    return PredictionFiles(there, affixes, absent, tuple(sorted(stems - known)))
+    return PredictionFiles(there, absent, tuple(sorted(stems - known)))
 
 
 def listed(names: Sequence[str], ending: str = "") -> str:

@@ -15,9 +15,7 @@ from analysis.bar import in_threads
 from analysis.predictions.folder import Missing, PredictionFiles, find
 from analysis.predictions.maps import MapSum, PixelMaps
 from rgbt.checks import InputError, check_choice
-from rgbt.data.prediction_files import opened_folder
-from rgbt.data.prediction_format import FormatOptions, RecognisedFormat, recognise_format
-from rgbt.data.prediction_images import Array
+from rgbt.data.predictions import Array, FormatOptions, PredictionReader
 from rgbt.dataset import LabelledDataset
 from rgbt.metrics.counting import RegionCounter
 from rgbt.metrics.counts import Counts
@@ -37,7 +35,7 @@ class ScoringOptions:
     Attributes:
         partitions: how the image is cut; all are counted in the same pass.
         regions: R of each partition.
-        format: see `rgbt.data.prediction_format.FormatOptions`.
+        format: see `rgbt.data.predictions.FormatOptions`.
         missing: "refuse", or "leave_out" to count only the images that have a prediction.
         resize: "refuse" predictions of another size than the label, or take for every pixel of the
             label the "nearest" one of the prediction (by pixel centres); "stretch" does so too
@@ -74,7 +72,6 @@ class FolderScores:
         found: which files were read, which are missing, which belong to no image.
         resized: name of an image whose prediction had another size -> both sizes, such as "480x640
             to 720x1280".
-        format: what the files were read as.
     """
 
     name: str
@@ -82,7 +79,6 @@ class FolderScores:
     maps: PixelMaps | None
     found: PredictionFiles
     resized: dict[str, str]
-    format: RecognisedFormat
 
 
 def score_folder(
@@ -98,8 +94,7 @@ def score_folder(
     pixel maps (10 K H W bytes) and one image per thread.
 
     Args:
-        folder: holds NAME.png for every image of the split; other files are not read. Or a ZIP file
-            of such a folder.
+        folder: holds NAME.png for every image of the split; other files are not read.
         dataset: names, labels, classes and colours.
         split: of the data set.
         options: see `ScoringOptions`.
@@ -109,20 +104,9 @@ def score_folder(
         InputError: files missing, unreadable, of another size, or with values that are no class;
             of several, the first in the order of the split.
     """
-    with opened_folder(folder) as opened:
-        return _score(opened, dataset, split, options, advance)
-
-
-def _score(
-    folder: Path,
-    dataset: LabelledDataset,
-    split: str,
-    options: ScoringOptions,
-    advance: Callable[[], None],
-) -> FolderScores:
     found = find(folder, dataset, split, options.format.affixes, options.missing)
     paths = found.paths.values()
-    form = recognise_format(paths, dataset.classes, dataset.palette, options.format)
+    reader = PredictionReader(dataset.classes, dataset.palette, options.format)
     names = tuple(found.paths)
     counters = [
         RegionCounter(dataset.num_classes, _regions(partition, options.regions))
@@ -138,7 +122,7 @@ def _score(
                 f"'{image}' of {dataset.name} has no label to count predictions against; "
                 "choose a labelled split."
             )
-        prediction, sizes = form.reader.read(path), ""
+        prediction, sizes = reader.read(path), ""
         if prediction.shape != label.shape:
             sizes = f"{_size(prediction)} to {_size(label)}"
             prediction = _resized(prediction, label, path, options.resize)
@@ -167,7 +151,7 @@ def _score(
         Counts(counts=by_image, partition=counter.regions.name, **shared)
         for by_image, counter in zip(counts, counters, strict=True)
     ]
-    return FolderScores(name, tuple(made), summed, found, resized, form)
+    return FolderScores(name, tuple(made), summed, found, resized)
 
 
 def _resized(prediction: Array, label: Array, path: Path, resize: Resize) -> Array:

@@ -10,6 +10,7 @@ from dataclasses import replace
 from analysis.predictions.folder import listed
 from analysis.predictions.scoring import FolderScores
 from analysis.predictions.table import ALL, Metric, Score, ScoreKey, ScoreTable
+from rgbt.checks import without_controls
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.names import MACC, MIOU
 from rgbt.tables import ABSENT, TextTable, class_labels, csv_text, number
@@ -95,7 +96,7 @@ def convention_line(table: ScoreTable) -> str:
 def remarks_on(scored: FolderScores) -> list[str]:
     """Remarks about the folder that a reader of the numbers needs, one sentence each."""
     found = scored.found
-    remarks = [" ".join(filter(None, (scored.format.sentence, found.affixes.sentence)))]
+    remarks = []
     if found.missing:
         number = len(found.missing) + len(found.paths)
         remarks.append(
@@ -118,7 +119,8 @@ def remarks_on(scored: FolderScores) -> list[str]:
 
 def markdown(title: str, tables: Sequence[ScoreTable], remarks: Sequence[str]) -> str:
     """One page: remarks, then the tables of each partition."""
-    lines = [f"# {title}", "", *(f"- {remark}" for remark in remarks)]
+    heading = [f"# {title}", "", *(f"- {remark}" for remark in remarks)]
+    lines = [without_controls(line.replace("\n", "?")) for line in heading]
     for table in tables:
         lines += ["", *filter(None, (convention_line(table), table.intervals))]
         lines += [f"\n{grid.to_markdown()}".rstrip("\n") for grid in grids(table)]

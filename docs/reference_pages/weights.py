@@ -20,8 +20,8 @@ def weights_page() -> str:
         table(["Recipes", "Networks", "Files", "Source"], [_recipe(each) for each in RECIPES]),
         "## Files",
         "A digest is the beginning of the SHA-256, where it is known. `rgbt weights inspect FILE` "
-        "prints the SHA-256 of your file, the recipes that it fits, and a remark where a file of "
-        "that name has another digest.",
+        "prints the SHA-256 of your file, the recipes of a published file, and a remark where a "
+        "file of that name has another digest.",
         table(
             ["File", "Architecture, pretraining", "Published at", "`model=`", "Digest"],
             [
@@ -35,7 +35,7 @@ def weights_page() -> str:
         "## No file is converted by hand",
         "- Swin Transformers load from the original files, from files that timm has saved "
         "(`model.safetensors` or `pytorch_model.bin` of `timm/swin_*_patch4_window7_224.ms_in1k`, "
-        "or `torch.save(model.state_dict(), ...)`), and from the pickles that detectron2 reads. "
+        "or `torch.save(model.state_dict(), ...)`). "
         "timm 0.9 and later names the patch merging after the stage behind it; this is "
         "recognised.\n"
         "- The thermal stem gets the mean of the RGB stem where it has one channel, as released.\n"

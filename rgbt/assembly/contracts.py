@@ -214,8 +214,11 @@ class CheckedLoss:
 
 def check_parts(
     session: Session, names: Lists, masker: AnyMasker, records: Mapping[str, Record]
-) -> None:
-    """Use a user's own parts, another author's network, the masker and the cameras once."""
+) -> dict[str, tuple[int, ...]]:
+    """Use a user's own parts, another author's network, the masker and the cameras once.
+
+    Returns the sizes of an image.
+    """
     transform, seed = session.transform, session.spec.seed
     check_dataset(reader_of(session.dataset), names)
     check_part("transform", transform)
@@ -226,8 +229,8 @@ def check_parts(
     tested = transform.test(shown)
     if session.spec.model.target == EXTERNAL:
         _probe_external(session, example_hw, tested.thermal.shape)
-    crop_hw = example_hw if is_own(masker) else records["transform"].crop_hw
-    if crop_hw is not None and records["masker"].hides_cells:
+    crop_hw = (not is_own(masker) and records["transform"].crop_hw) or example_hw
+    if records["masker"].hides_cells:
         check_masker(masker, crop_hw, torch_generator(seed, "probe"))
     cameras = [("scheme", records["scheme"].camera, example_hw)]
     if session.consistency.sets:
@@ -239,6 +242,8 @@ def check_parts(
                 camera.matrix(image_hw)
         except InputError as error:
             raise InputError(f"{node}.view.{error}") from error
+    predicted = tested.thermal.shape
+    return {"stored": shown.thermal.shape, "trained": example_hw, "predicted": predicted}
 
 
 def first_readable(session: Session, names: tuple[str, ...]) -> Sample:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Iterable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -19,7 +18,7 @@ from rgbt.assembly.contracts import check_dataset, watch_model
 from rgbt.checks import InputError
 from rgbt.config.compose import compose
 from rgbt.config.stored_config import read_settings
-from rgbt.data.cache.dataset import cached_dataset
+from rgbt.data.cache import CachedDataset
 from rgbt.data.domains import Domains
 from rgbt.data.loader_settings import LoaderSettings
 from rgbt.dataset import LabelledDataset
@@ -123,7 +122,7 @@ def open_session(
         model: nn.Module = spec.model.build() if network is None else network
     files: LabelledDataset = spec.dataset.build()
     check_dataset(files)
-    dataset = cached_dataset(files, spec.data.cache, num_threads=len(os.sched_getaffinity(0)))
+    dataset = files if spec.data.cache is None else CachedDataset(files, spec.data.cache)
     num_classes = spec.model.values.get("num_classes", dataset.num_classes)
     if label_map is not None:
         label_map.check(num_classes, tuple(dataset.classes), dataset.name)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +22,7 @@ from rgbt.assembly.contracts import (
 from rgbt.assembly.session import Session, open_session
 from rgbt.checks import InputError
 from rgbt.data.domains import GIVEN, NONE, Domain
-from rgbt.data.loaders import Batches, steps_per_epoch, train_batches
+from rgbt.data.loaders import Batches, PairedBatches, steps_per_epoch, train_batches
 from rgbt.dataset import LabelledDataset
 from rgbt.engine.fabric import open_fabric
 from rgbt.engine.network_settings import prepare_training
@@ -36,7 +37,6 @@ from rgbt.terminal import info
 from rgbt.types import AnyMasker, Loadable
 
 if TYPE_CHECKING:  # most runs have one domain, draw no classes, and train a network of this package
-    from rgbt.data.pairs import PairedBatches
     from rgbt.data.rare_classes import RareClasses
 
 
@@ -54,6 +54,7 @@ class TrainingSetup:
         rare: how images of the source are drawn by class; None: each once per epoch.
         scheme: yields the phases of a step.
         schedule: learning rate factor per step.
+        sizes: height and width of the first image: "stored", "trained" and "predicted".
     """
 
     session: Session
@@ -66,6 +67,7 @@ class TrainingSetup:
     rare: RareClasses | None
     scheme: Scheme
     schedule: Schedule
+    sizes: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
 
     def steps_per_epoch(self) -> int:
         """Batches of one epoch of the source."""
@@ -81,8 +83,6 @@ class TrainingSetup:
         target = session.domains.named.get("target")
         if target is None:
             return source
-        from rgbt.data.pairs import PairedBatches  # most runs have one domain
-
         transform = record_of(session.transform).for_target or session.transform
         seed = derive(seed, "target domain")  # shuffled and augmented by draws of its own
         data = self.datasets["target"]
@@ -143,7 +143,7 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
         steps_per_epoch(session.dataset, loading, domain.split)
         is_missing = labels_key(name) in missing
         datasets[name] = session.dataset if is_missing else _labelled(session, name, domain, names)
-    check_parts(session, names, masker, records)
+    sizes = check_parts(session, names, masker, records)
     if upstream_finished:
         _report_unpublished_settings(session, names)
     rare = None
@@ -154,7 +154,8 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
     others, optimizers = _networks_and_optimizers(session, fabric, records["scheme"])
     schedule: Schedule = spec.schedule.build()
     return TrainingSetup(
-        session, fabric, names, datasets, model, others, optimizers, rare, scheme, schedule
+        *(session, fabric, names, datasets, model, others, optimizers, rare, scheme, schedule),
+        sizes=sizes,
     )
 
 

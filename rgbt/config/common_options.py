@@ -49,15 +49,15 @@ class PredictionFormatOptions:
     """Options of files of predictions."""
 
     format: Annotated[
-        Literal["auto", "index", "colour"],
-        Help("index: the stored numbers; colour: the colours shown; auto: by the files"),
-    ] = "auto"
+        Literal["index", "colour"],
+        Help("what is a class: index: the stored numbers; colour: the colours shown"),
+    ] = "index"
     palette: Annotated[
         str,
-        Help("of coloured files: auto, dataset, voc or a YAML file; -bgr exchanges red and blue"),
-    ] = "auto"
-    prefix: Annotated[str, Help("start of the file names, such as Pred_; default: as found")] = ""
-    suffix: Annotated[str, Help("end of the file names, such as _pred; default: as found")] = ""
+        Help("of coloured files: dataset, or a YAML file with the key palette"),
+    ] = "dataset"
+    prefix: Annotated[str, Help("start of the file names, such as Pred_")] = ""
+    suffix: Annotated[str, Help("end of the file names, such as _pred")] = ""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import hydra
 from hydra._internal import defaults_list
@@ -160,6 +160,13 @@ def top_level() -> tuple[tuple[str, ...], tuple[str, ...]]:
     return tuple(nodes), tuple(key for key in own if key not in nodes)
 
 
+def resolved(config: DictConfig) -> dict[str, Any]:
+    """The plain values of a configuration; InputError as of `check_keys`."""
+    check_keys(config)
+    plain: Any = OmegaConf.to_container(config, resolve=True)
+    return cast("dict[str, Any]", plain)
+
+
 def check_keys(keys: Iterable[Any]) -> None:
     """Refuse a key that ``conf/config.yaml`` does not declare, naming the nearest that it does."""
     known = [key for each in top_level() for key in each]
@@ -189,6 +196,8 @@ def register_resolvers() -> None:
     ``${by_network:{CMX:start_cmx}}``: of the class of the network, with ``_heads`` and ``_rotary``.
     ``${px:64}``: 64 pixels of the paper's images, scaled to the images of the scale.
     ``${scenes:600,6}``: 600 scenes of an embedded data set, or 6 where the scale takes a few.
+    ``${first:${.crop_hw}}``: the first entry of a list, which may itself be resolved; null of null.
+    ``${embedded:120,null}``: 120 for an embedded data set, null for images of the user.
     """
     Plugins.instance()  # registers Hydra's own sources, once
     SourcesRegistry.instance().types["file"] = _ParsedOnce
@@ -197,10 +206,16 @@ def register_resolvers() -> None:
         "by_scale": _by_scale,
         "by_network": _by_network,
         "px": lambda pixels, *, _root_: round(pixels * float(_root_.scale.pixel_factor)),
+        "first": lambda values: None if values is None else values[0],
+        "embedded": lambda ours, own, *, _root_: ours if _is_embedded(_root_.dataset) else own,
         "scenes": lambda many, few, *, _root_: few if _root_.scale.get("few_scenes") else many,
     }
     for name, resolve in resolvers.items():
         OmegaConf.register_new_resolver(name, resolve, replace=True)
+
+
+def _is_embedded(dataset: DictConfig) -> bool:
+    return str(dataset.get("_target_")).startswith("rgbt.synth.")
 
 
 def _choices_of_children(overrides: Any, children: list[Any], self_added: bool) -> DictConfig:

@@ -47,8 +47,6 @@ COMMANDS = {
     "spatial": Entry("analysis.spatial", "measure the statistics of a data set by region"),
     "figures": Entry("analysis.figures.__main__", "draw a figure of the papers"),
     "check": Entry("rgbt.data.check", "validate a whole data set and report its problems"),
-    "prepare": Entry("rgbt.data.prepare.__main__", "convert a download into a data set folder"),
-    "cache": Entry("rgbt.data.cache.__main__", "decode a data set into a cache, or remove it"),
     "export": Entry("rgbt.export", "write a network as ONNX, compared with the network"),
     "weights": Entry("rgbt.weights", "inspect a file of weights, or export the weights of a run"),
     "archive": Entry("rgbt.archive", "keep the results of runs in the repository"),

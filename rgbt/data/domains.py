@@ -33,11 +33,10 @@ class Domain:
         teacher_view: the same for the network of "experiment:..."; null for other labels.
         threshold: least confidence of a pixel that keeps its label of "experiment:..."; 0 for all
             else.
-        confidence: whether the loss of a pixel is weighted by the confidence of its label; needs
-            pseudo-labels.
+        confidence: whether the loss of a pixel is weighted by the confidence of its label.
 
     Raises:
-        InputError: a setting has no effect with these labels.
+        InputError: confidences of labels that have none.
     """
 
     split: Text
@@ -49,18 +48,10 @@ class Domain:
     confidence: bool = False
 
     def __post_init__(self) -> None:
-        predicts = self.labels.startswith("experiment:")
-        if not predicts and (self.threshold or self.teacher_view is not None):
-            raise InputError(
-                f"domains: threshold and teacher_view have no effect with labels={self.labels}, "
-                "because they require labels=experiment:... Set teacher_view=null and threshold=0 "
-                "for that domain."
-            )
         if self.confidence and self.labels in (GIVEN, NONE):
             raise InputError(
                 f"domains: confidence=true requires pseudo-labels, but labels={self.labels} have "
-                "no confidence. Name a folder written by rgbt predict ... pseudo_labels=true, or "
-                "set confidence=false."
+                "no confidence."
             )
 
     def requires(self, key: str) -> Iterator[Requirement]:
@@ -104,30 +95,26 @@ class Domains:
     def __post_init__(self) -> None:
         if self.source.labels == NONE:
             raise InputError(
-                "domains.source.labels=none, but every scheme requires labels of the source. Set "
-                "it to given, or name a folder of pseudo-labels."
+                "domains.source.labels=none, but every scheme requires labels of the source."
             )
-        heads = self.heads
-        if self.target is not None and len(heads) == 1 and None in self._own_heads():
+        heads, target = self.heads, self.target
+        is_two = len(heads) == 2
+        if target is not None and (self.source.head is None) != (target.head is None):
             raise InputError(
                 "domains: source and target must both have a head, or neither; got "
-                f"{self.source.head or 'null'} and {self.target.head or 'null'}."
+                f"{self.source.head or 'null'} and {target.head or 'null'}."
             )
-        if (self.target_is is not None) != (len(heads) == 2):
+        if (self.target_is is not None) != is_two or (self.tested_head == "source" and not is_two):
             raise InputError(
-                f"domains.target_is={self.target_is or 'null'} with {len(heads)} heads. The "
-                "setting selects one of two heads: set it for two heads, and to null otherwise."
+                f"domains.target_is={self.target_is or 'null'} and domains.tested_head="
+                f"{self.tested_head} with {len(heads)} heads: target_is selects one of two heads "
+                "and is null otherwise; tested_head=source requires two heads."
             )
         if self.target_is == "view" and self.named["target"].view in (None, self.source.view):
             raise InputError(
                 "domains.target_is=view selects the head of an image by its view, but both "
-                f"domains have the view {self.source.view or 'null'}. Give domains.target.view "
-                "another value, or set domains.target_is=night."
-            )
-        if self.tested_head == "source" and len(heads) < 2:
-            raise InputError(
-                f"domains.tested_head=source requires two heads, but there are {len(heads)}; set "
-                "it to own."
+                f"domains have the view {self.source.view or 'null'}; set domains.target_is=night, "
+                "or another domains.target.view."
             )
 
     @property

@@ -2,41 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import hashlib
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError, check_choice, nearest
-from rgbt.data.folder.frames import FolderFrame, Patterns, patterns_of
-from rgbt.data.folder.splits import SplitRule
-from rgbt.data.images import PairPattern, PairReader, Range, check_limits, reader_of_patterns
+from rgbt.data.files import is_there, within
+from rgbt.data.images import PairPattern, PairReader, Range, check_size
 from rgbt.data.labels import LabelCodes
-from rgbt.data.named_files import check_size, existing_file, hash_of_files
+from rgbt.data.patterns import Frame, Patterns
+from rgbt.data.splits import SplitRule
 from rgbt.requirements import Record
 from rgbt.types import Sample
 
 SplitNames = Mapping[str, tuple[str, ...]]
 """Split -> names, of the splits whose names could be read."""
-
-
-class Expected(NamedTuple):
-    """Numbers of the published data set, with which `rgbt check` compares a copy.
-
-    Attributes:
-        name: of the data set; those with another name are not compared.
-        day_night: split -> its images by day and at night, without mirrored copies.
-        images: split -> its images.
-        hw: size of the images.
-    """
-
-    name: str
-    day_night: Mapping[str, tuple[int, int]] = {}
-    images: Mapping[str, int] = {}
-    hw: tuple[int, int] | None = None
 
 
 class FileDataset:
@@ -46,7 +31,7 @@ class FileDataset:
     if they differ.
 
     Args:
-        root: its folder, which exists.
+        root: its folder.
         name: used in messages and tables.
         num_classes: number of classes; other nodes of the configuration interpolate it.
         classes: their names, in order of the class index.
@@ -62,7 +47,8 @@ class FileDataset:
         rule: divides its frames into splits, where a subclass does not.
 
     Raises:
-        InputError: numbers of classes, names and colours differ, or a class that is not one.
+        InputError: no such folder; numbers of classes, names and colours that differ; or a class
+            that is not one.
     """
 
     images: PairReader
@@ -75,7 +61,7 @@ class FileDataset:
 
     def __init__(  # noqa: PLR0913 - settings of every data set
         self,
-        root: Path,
+        root: str,
         name: str,
         num_classes: int,
         classes: tuple[str, ...],
@@ -84,13 +70,15 @@ class FileDataset:
         background: tuple[str, ...],
         unscored: tuple[str, ...] = (),
     ) -> None:
-        for key, length in (("classes", len(classes)), ("palette", len(palette))):
-            if length != num_classes:
+        self.root = Path(root).expanduser()
+        if not self.root.is_dir():
+            raise InputError(f"dataset.root: no such folder: {root}")
+        for key, values in (("classes", classes), ("palette", palette)):
+            if len(values) != num_classes:
                 raise InputError(
-                    f"dataset.num_classes is {num_classes} but dataset.{key} has {length} "
+                    f"dataset.num_classes is {num_classes} but dataset.{key} has {len(values)} "
                     "entries; both numbers must be equal."
                 )
-        self.root = root
         self.name = name
         self.num_classes = num_classes
         self.classes = classes
@@ -119,26 +107,43 @@ class FileDataset:
             for word in chosen:
                 check_choice(f"dataset.{key}", word, self.classes)
 
-    def follow(self, layout: PairPattern, thermal_range: Range | None) -> None:
+    def follow(self, rgb: str, thermal: str, label: str | None, limits: Range | None) -> None:
         """Read images by the patterns of a user's configuration; InputError for invalid ones."""
-        check_limits(thermal_range)
-        self.clipping = thermal_range
-        self.patterns = patterns_of(*layout)
-        self.images = reader_of_patterns(layout, thermal_range)
+        if limits is not None and not limits[0] < limits[1]:
+            raise InputError(
+                f"dataset.thermal_range: expected [low, high], got {list(limits)}: the thermal "
+                "values that become black and white."
+            )
+        self.patterns = Patterns.of(rgb, thermal, label)
+        self.images = PairReader(
+            layouts=(PairPattern(rgb, thermal),),
+            thermal_range=limits,
+            advice="dataset.thermal with the pattern of dataset.rgb reads a fourth channel as "
+            "thermal; values that are no grey levels of 8 bits require dataset.thermal_range="
+            "[low, high], the values that become black and white",
+        )
+
+    def listed(self, split: str) -> tuple[str, ...]:
+        """Names of a known split, in order; () if there are none, InputError if unreadable."""
+        return self.rule.names(split)
 
     def has(self, split: str) -> bool:
         """Whether any sample of `split` exists; InputError if the split is unknown."""
         self.check_split(split)
-        return self.rule.has(split)
+        if split not in self._names:
+            self._names[split] = self.listed(split)
+        return bool(self._names[split])
 
     def names(self, split: str) -> tuple[str, ...]:
         """Names of a split, in order; InputError if it is unknown, missing or empty."""
-        self.check_split(split)
-        if split not in self._names:
-            self._names[split] = self.rule.names(split)
+        if not self.has(split):
+            raise InputError(
+                f"split '{split}' of {self.name} is empty: expected "
+                f"{self.splits.get(split, 'nothing')} in {self.root}."
+            )
         return self._names[split]
 
-    def frame(self, name: str) -> FolderFrame:
+    def frame(self, name: str) -> Frame:
         """The files of `name`; InputError if there can be no such frame."""
         raise NotImplementedError
 
@@ -159,6 +164,15 @@ class FileDataset:
         paths = (frame.rgb, frame.thermal, frame.label)
         return tuple(dict.fromkeys(path for path in paths if path is not None))
 
+    def existing(self, what: str, path: Path, name: str) -> Path:
+        """`path`, one file of the sample `name`; InputError if it is missing or outside `root`."""
+        if not is_there(path):
+            raise InputError(
+                f"'{name}': its {what} {path} is missing; restore it, or skip unreadable frames "
+                "with data.on_error=skip."
+            )
+        return within(path, self.root)
+
     def read(self, name: str) -> Sample:
         """The sample called `name`, decoded.
 
@@ -178,30 +192,23 @@ class FileDataset:
     def pair(self, name: str) -> Sample:
         """The images of `read` alone, without the label; InputError as there."""
         frame = self.frame(name)
-        rgb = existing_file("RGB image", frame.rgb, name, self.root)
-        return self.images.read(
-            name, rgb, existing_file("thermal image", frame.thermal, name, self.root)
-        )
+        rgb = self.existing("RGB image", frame.rgb, name)
+        return self.images.read(name, rgb, self.existing("thermal image", frame.thermal, name))
 
     def label(self, name: str) -> NDArray[np.uint8] | None:
         """The label of `read` alone, (H, W) uint8, or None; InputError as there."""
         path = self.frame(name).label
-        if path is None:
-            return None
-        return self.codes.read(existing_file("label", path, name, self.root))
+        return None if path is None else self.codes.read(self.existing("label", path, name))
 
     def decoding(self) -> dict[str, Any]:
         """Settings that change what `read` makes of the files."""
-        return {
-            "codes": sorted(self.codes.codes.items()),
-            "layouts": [list(layout) for layout in self.images.layouts],
-            **{key: getattr(self.images, key) for key in ("thermal_range", "most_tint", "crop")},
-        }
+        keys = ("layouts", "thermal_range", "most_tint", "crop")
+        settings = {key: getattr(self.images, key) for key in keys}
+        return {"codes": sorted(self.codes.codes.items()), **settings}
 
     def fingerprint(self) -> str:
         """See `hash_of_files`; splits that are not there are empty."""
-        names = {split: self.names(split) if self.has(split) else () for split in self.splits}
-        return hash_of_files(names, self.files)
+        return hash_of_files({split: self.listed(split) for split in self.splits}, self.files)
 
     # Members for `rgbt check`.
 
@@ -209,15 +216,6 @@ class FileDataset:
     def title(self) -> str:
         """The layout, for a headline."""
         return type(self).__name__
-
-    expected: Expected | None = None
-    """Numbers of the published data set."""
-
-    clipping: Range | None = None
-    """Range of thermal values whose shares are reported; None: none is."""
-
-    most_clipped: float = 1.0
-    """Largest share of the thermal values of a split that may be outside `clipping`."""
 
     mirrored: str | None = None
     """Suffix of the names of mirrored copies, which only training splits may list."""
@@ -230,23 +228,11 @@ class FileDataset:
         """The source of a split; splits of one source may share names."""
         return (self.splits[split],)
 
-    def thermal_values(self, name: str) -> NDArray[Any]:
-        """Values of the thermal camera that are read, (H, W); InputError as of `read`."""
-        frame = self.frame(name)
-        path = existing_file("thermal image", frame.thermal, name, self.root)
-        is_packed = frame.rgb == frame.thermal
-        values = self.images.whole(name, path, path)[1] if is_packed else self.images.values(path)
-        return self.images.cut(values, name)
-
     def unused(self, lists: SplitNames) -> Iterable[Path]:
         """Files of the layout that belong to no image of a split."""
         used = {path for names in lists.values() for name in names for path in self.files(name)}
-        return {
-            match.path
-            for pattern in self.patterns
-            if pattern is not None
-            for match in pattern.files(self.root)
-        } - used
+        patterns = (pattern for pattern in self.patterns if pattern is not None)
+        return {match.path for each in patterns for match in each.files(self.root)} - used
 
     def own_problems(self, lists: SplitNames) -> list[str]:  # noqa: ARG002 - of subclasses
         """Further problems of names and files; no image is opened."""
@@ -255,3 +241,34 @@ class FileDataset:
     def own_notes(self, lists: SplitNames) -> list[str]:  # noqa: ARG002 - of subclasses
         """Further remarks."""
         return []
+
+
+def hash_of_files(
+    splits: Mapping[str, tuple[str, ...]], files: Callable[[str], Iterable[Path]]
+) -> str:
+    """SHA-256 in hexadecimal over the names of every split and the sizes of their files.
+
+    Nothing is decoded and folders are left out, so that equal copies have equal fingerprints.
+
+    Args:
+        splits: split -> its names; () where the split is not there.
+        files: name -> its files; a missing file has size -1.
+    """
+    sizes: dict[str, list[int]] = {}
+    digest = hashlib.sha256()
+    for split in sorted(splits):
+        digest.update(f"{split} {len(splits[split])}\n".encode())
+        for name in splits[split]:
+            if name not in sizes:
+                sizes[name] = [size_of(path) for path in files(name)]
+            digest.update(f"{name} {sizes[name]}\n".encode())
+    return digest.hexdigest()
+
+
+def size_of(path: Path) -> int:
+    """Bytes of a file, -1 if it is missing."""
+    # A path through a file instead of a folder is missing as well.
+    try:
+        return path.stat().st_size
+    except (FileNotFoundError, NotADirectoryError):
+        return -1

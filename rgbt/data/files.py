@@ -1,57 +1,192 @@
-"""Decode files into RGB, thermal and label arrays, and refuse files that would be misread.
+"""Read bytes, lists, images and arrays, and refuse files that would be misread.
 
-OpenCV only decodes here. By default it drops a fourth channel, and it returns B, G, R. The thermal
-image is in the alpha channel, so the four channels must not be processed as one image.
+Pillow decodes and verifies images. The thermal image may be in the alpha channel, so the four
+channels must not be processed as one image.
 """
 
 from __future__ import annotations
 
 import io
+import os
 import struct
 import tokenize
 import zlib
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, TiffImagePlugin, UnidentifiedImageError
 
 from rgbt.checks import InputError, one_line
-from rgbt.data.integrity import JPEG, LEFT_OUT, PNG, read_image, read_whole
 
 Array = NDArray[np.uint8]
 
+FORMATS = ("PNG", "JPEG", "TIFF", "BMP")
+ENDS = {"PNG": b"\0\0\0\0IEND\xaeB`\x82", "JPEG": b"\xff\xd9"}
+"""Last bytes of these formats, which decoders do not require."""
+
+DEPTHS = {"1": 1, "L": 8, "P": 8, "RGB": 8, "RGBA": 8, "I;16": 16, "I;16B": 16, "I": 32, "F": 32}
+"""Pillow's modes that are read, and the bits of a channel in memory."""
+
+# Only libtiff refuses a damaged directory of a TIFF; Pillow warns, and reads the rest.
+TiffImagePlugin.READ_LIBTIFF = True
+
+LEFT_OUT = "replace it, or skip unreadable files with data.on_error=skip"
+
 UNREADABLE = (
     *(OSError, ValueError, SyntaxError, EOFError, OverflowError, struct.error, zlib.error),
-    Image.DecompressionBombError,
+    *(TypeError, KeyError, IndexError, Image.DecompressionBombError),
 )
 """Exceptions of Pillow for damaged files."""
 
 
-def read_packed(path: Path, advice: str) -> tuple[Array, Array]:
-    """RGB (H, W, 3) and thermal (H, W), both uint8, of a file with channels R, G, B, thermal.
+def read_bytes(path: Path) -> bytes:
+    """Every byte of `path`.
 
-    `advice` ends the message about a file of other channels.
+    Raises:
+        InputError: a missing file, a broken link, not a regular file, or an error of the system.
     """
-    image = _decode(path)
-    if channels(image) != 4:
+    try:
+        if path.exists() and not path.is_file():  # a pipe would be waited for
+            raise InputError(f"{path} is not a regular file; {LEFT_OUT}.")
+        return path.read_bytes()
+    except (FileNotFoundError, NotADirectoryError):
+        link = f" (a link to {path.readlink()})" if path.is_symlink() else ""
+        raise InputError(f"{path} is missing{link}.") from None
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({error.strerror}); {LEFT_OUT}.") from error
+
+
+def read_names(path: Path, key: str) -> tuple[str, ...]:
+    """Stripped lines of a list file in order, without empty ones; `key` begins the messages.
+
+    Raises:
+        InputError: as `read_bytes`, not a text in UTF-8, or no line.
+    """
+    try:
+        text = read_bytes(path).decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = "\0"
+    except InputError as error:
+        raise InputError(f"{key}: {error}") from None
+    names = tuple(line.strip() for line in text.splitlines() if line.strip())
+    if "\0" in text or not names:
+        raise InputError(f"{key}: '{path}': expected a text in UTF-8 with one name per line.")
+    return names
+
+
+def is_there(path: Path) -> bool:
+    """Whether `path` exists; broken links and files without permission count too."""
+    try:
+        path.lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    except OSError:
+        return True
+    return True
+
+
+def within(path: Path, root: Path) -> Path:
+    """`path`, if it is below `root` after resolving all links.
+
+    A reader checks every file that it opens: a line of a list may contain "../..", and a link in a
+    downloaded folder may lead anywhere. A missing file passes; `read_bytes` reports it.
+
+    Raises:
+        InputError: it is outside `root`.
+    """
+    home = _resolved(str(root))
+    # Folders hold thousands of files: a folder is resolved once, and a file only if it is a link.
+    folder, name = os.path.split(path)
+    is_plain = name not in ("", os.curdir, os.pardir) and not path.is_symlink()
+    found = f"{_resolved(folder)}{os.sep}{name}" if is_plain else os.path.realpath(path)
+    # `os.path`, because `Path` raises for a folder without permission, which is not outside.
+    if found.startswith(home.rstrip(os.sep) + os.sep) or not os.path.exists(found):  # noqa: PTH110
+        return path
+    raise InputError(
+        f"{path} leads out of dataset.root, to {found}. Set dataset.root to the folder that holds "
+        "the files themselves, or copy the files (cp -rL)."
+    )
+
+
+@lru_cache(maxsize=4096)
+def _resolved(folder: str) -> str:
+    return os.path.realpath(folder)
+
+
+def opened(path: Path) -> tuple[Image.Image, int]:
+    """A decoded image, and the bits per channel of its file.
+
+    The checksums of a PNG are compared. JPEG, TIFF and BMP have none: damage inside them is
+    refused if the decoder fails, and otherwise changes pixels.
+
+    Raises:
+        InputError: missing, damaged, another format or colour mode, or more bits than are decoded.
+    """
+    data = read_bytes(path)
+    try:
+        with Image.open(io.BytesIO(data), formats=FORMATS) as image:
+            image.verify()
+        image = Image.open(io.BytesIO(data), formats=FORMATS)
+        image.load()
+        tags = getattr(image, "tag_v2", {})  # of a TIFF; the header of a PNG is its first chunk
+        bits = data[24] if image.format == "PNG" else max(np.ravel(tags.get(258, 8)).tolist())
+    except UNREADABLE as error:
+        is_other = isinstance(error, UnidentifiedImageError)  # whose message has an address
+        reason = f"no {', '.join(FORMATS)}" if is_other else one_line(error)
+        raise InputError(f"{path} cannot be decoded ({reason}); {LEFT_OUT}.") from error
+    if ENDS.get(str(image.format), b"") not in data:
+        raise InputError(f"{path} cannot be decoded (its end is missing); {LEFT_OUT}.")
+    if bits > DEPTHS.get(image.mode, 0):
         raise InputError(
-            f"{path}: expected 4 channels (red, green, blue, thermal), got {channels(image)}; "
-            f"use the original file, or {advice}."
+            f"{path}: {image.mode} images of {bits} bits per channel are not read; save 8 bits per "
+            "channel, or one channel of 16."
         )
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGRA2RGB), np.uint8), image[..., 3].copy()
+    return image, bits
+
+
+def decode(path: Path) -> NDArray[Any]:
+    """An image as written, (H, W) or (H, W, C) in the order R, G, B, A; InputError as `opened`.
+
+    Palettes become the colours that are shown.
+    """
+    image: Image.Image = opened(path)[0]
+    if image.mode == "P":
+        image = image.convert("RGBA" if "transparency" in image.info else "RGB")
+    array = np.asarray(image)
+    return array.astype(np.uint16) if image.mode.startswith("I;16") else array
+
+
+def channels(image: NDArray[Any]) -> int:
+    """Channels of (H, W) or (H, W, C)."""
+    return 1 if image.ndim == 2 else image.shape[2]
+
+
+def decode_bytes(path: Path, number: int, advice: str) -> Array:
+    """An image of so many channels of 8 bits; InputError for another, which ends in `advice`."""
+    image = decode(path)
+    if image.dtype != np.uint8:
+        raise InputError(f"{path}: expected 8 bits per channel, got {image.dtype}.")
+    if channels(image) != number:
+        raise InputError(
+            f"{path}: expected {number} channels (red, green, blue{', thermal' * (number == 4)}), "
+            f"got {channels(image)}; {advice}."
+        )
+    return image
+
+
+def read_packed(path: Path, advice: str) -> tuple[Array, Array]:
+    """RGB (H, W, 3) and thermal (H, W), both uint8, of a file with channels R, G, B, thermal."""
+    image = decode_bytes(path, 4, f"use the original file, or {advice}")
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGBA2RGB), np.uint8), image[..., 3].copy()
 
 
 def read_rgb(path: Path, advice: str = "use the original file") -> Array:
     """RGB (H, W, 3) uint8 of a file of three channels; `advice` ends the message about others."""
-    rgb = _decode(path)
-    if channels(rgb) != 3:
-        raise InputError(
-            f"{path}: expected 3 channels (red, green, blue), got {channels(rgb)}; {advice}."
-        )
-    return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_BGR2RGB), np.uint8)
+    return decode_bytes(path, 3, advice)
 
 
 def read_indices(path: Path) -> NDArray[Any]:
@@ -60,23 +195,18 @@ def read_indices(path: Path) -> NDArray[Any]:
     Of a PNG with a palette the indices are returned, not the colours.
 
     Raises:
-        InputError: missing, not decodable, several channels, or a format that changes values:
-            JPEG, and grey PNG of less than 8 bits, which decoders scale.
+        InputError: as `opened`, several channels, or a format that changes values: JPEG, and grey
+            PNG of less than 8 bits, which decoders scale.
     """
-    data = read_image(path)
-    depth, colours = data[24:26] if data.startswith(PNG) and len(data) > 25 else (8, 0)
-    if data.startswith(JPEG) or (colours == 0 and depth < 8):
-        kind = "a JPEG, which changes values" if data.startswith(JPEG) else f"a PNG of {depth} bit"
+    image, bits = opened(path)
+    whole = image.mode == "P" or (image.mode in ("L", "I", "I;16", "I;16B") and bits >= 8)
+    if image.format == "JPEG" or not whole:
         raise InputError(
-            f"{path}: expected unchanged class indices, got {kind}; save labels as PNG of 8 bits."
+            f"{path}: expected one channel of class indices of 8 bits, got {image.format} of mode "
+            f"{image.mode}; save the indices themselves as PNG, not their colours."
         )
-    label = _palette_indices(data, path) if colours == 3 else _decoded(data, path)
-    if channels(label) != 1:
-        raise InputError(
-            f"{path}: expected one channel of class indices, got {channels(label)} channels; "
-            "save the indices themselves, not their colours."
-        )
-    return label
+    array = np.asarray(image)
+    return array.astype(np.uint16) if image.mode.startswith("I;16") else array
 
 
 def read_colours(path: Path) -> Array:
@@ -85,23 +215,18 @@ def read_colours(path: Path) -> Array:
     Of a PNG with a palette the colours are returned; an opaque fourth channel is dropped.
 
     Raises:
-        InputError: missing, not decodable, not 8 bit, other channels, or a JPEG.
+        InputError: as `opened`, a JPEG, one channel, or a pixel that is transparent.
     """
-    data = read_image(path)
-    if data.startswith(JPEG):
+    image, _ = opened(path)
+    if image.format == "JPEG" or image.mode not in ("P", "RGB", "RGBA"):
         raise InputError(
-            f"{path}: expected unchanged colours, got a JPEG, which changes them; save labels as "
-            "PNG."
+            f"{path}: expected unchanged colours (red, green, blue of 8 bits), got {image.format} "
+            f"of mode {image.mode}; save a PNG, or read indices with dataset.ids."
         )
-    image = _decoded(data, path)
-    if channels(image) == 4 and (image[..., 3] == np.iinfo(image.dtype).max).all():
-        image = image[..., :3]
-    if channels(image) != 3 or image.dtype != np.uint8:
-        raise InputError(
-            f"{path}: expected colours (red, green, blue of 8 bits), got {channels(image)} "
-            f"channel(s) of {image.dtype}; a label of one channel holds indices, see dataset.ids."
-        )
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
+    rgba = np.array(image.convert("RGBA"))
+    if (rgba[..., 3] < 255).any():
+        raise InputError(f"{path}: some pixels are transparent; save colours without transparency.")
+    return np.asarray(cv2.cvtColor(rgba, cv2.COLOR_RGBA2RGB), np.uint8)
 
 
 def read_array(path: Path, what: str) -> NDArray[Any]:
@@ -110,62 +235,17 @@ def read_array(path: Path, what: str) -> NDArray[Any]:
     Raises:
         InputError: missing, damaged, or something else.
     """
-    data = read_whole(path)
-    if data.startswith(b"PK"):
+    try:
+        file = io.BytesIO(read_bytes(path))
+        array = np.load(file, allow_pickle=False)
+        if isinstance(array, np.ndarray) and file.read(1):
+            raise ValueError("more bytes than its header announces")
+    except InputError:
+        raise
+    except (ValueError, EOFError, MemoryError, OSError, tokenize.TokenError) as error:
+        raise InputError(
+            f"{path} cannot be read as an array of {what} ({one_line(error)}); {LEFT_OUT}."
+        ) from error
+    if not isinstance(array, np.ndarray):
         raise InputError(f"{path}: expected {what}, got several arrays; use the original file.")
-    try:
-        array: NDArray[Any] = np.load(io.BytesIO(data), allow_pickle=False)
-    except (ValueError, EOFError, MemoryError, tokenize.TokenError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(
-            f"{path} cannot be read as an array ({one_line(error)}): the file is damaged or not "
-            f"an array; {LEFT_OUT}."
-        ) from error
     return array
-
-
-def decode(path: Path) -> NDArray[Any]:
-    """An image as written, (H, W) or (H, W, C) in the order B, G, R: any depth, every channel.
-
-    All readers of images raise its InputError: missing, cut short, not decodable; and one for
-    another depth, or other channels, than they name.
-    """
-    return _decoded(read_image(path), path)
-
-
-def channels(image: NDArray[Any]) -> int:
-    """Channels of (H, W) or (H, W, C)."""
-    return 1 if image.ndim == 2 else image.shape[2]
-
-
-def _decode(path: Path) -> Array:
-    image = decode(path)
-    if image.dtype != np.uint8:
-        raise InputError(f"{path}: expected 8 bits per channel, got {image.dtype}.")
-    return np.asarray(image, np.uint8)
-
-
-def _decoded(data: bytes, path: Path) -> NDArray[Any]:
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:  # a header with more pixels than possible
-        if error.code == cv2.Error.StsNoMem:
-            raise MemoryError(f"{path} cannot be decoded, because its pixels do not fit") from error
-        image = None
-    if image is None:
-        raise InputError(
-            f"{path} cannot be decoded, because the file is damaged or not an image; {LEFT_OUT}."
-        )
-    return np.asarray(image)
-
-
-def _palette_indices(data: bytes, path: Path) -> Array:
-    # OpenCV returns the colours of the palette, which do not determine the indices.
-    try:
-        with Image.open(io.BytesIO(data)) as image:
-            return np.array(image, np.uint8)
-    except UNREADABLE as error:
-        raise InputError(
-            f"{path} cannot be decoded, because the file is damaged or not an image; {LEFT_OUT}."
-        ) from error

@@ -7,6 +7,7 @@ configured. It refuses files that it cannot read exactly.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -17,13 +18,11 @@ import numpy as np
 from annotated_types import Interval
 from numpy.typing import NDArray
 
-from rgbt.checks import InputError, nearest
-from rgbt.data.file_dataset import FileDataset, SplitNames
-from rgbt.data.folder.frames import FolderFrame
-from rgbt.data.freiburg_layout import TEST, TRAIN, find_frames, inside
+from rgbt.checks import InputError, check_choice
+from rgbt.data.file_dataset import FileDataset, SplitNames, size_of
 from rgbt.data.images import PairPattern, PairReader
 from rgbt.data.labels import indices
-from rgbt.data.named_files import existing_file, existing_root, size_of
+from rgbt.data.patterns import NO_VALUES, Frame, Patterns, WordValues
 from rgbt.ranges import Colour, Names, NumClasses, Text
 from rgbt.types import IGNORE, Sample
 
@@ -35,6 +34,15 @@ PALETTE = (
     *((128, 64, 128), (244, 35, 232), (70, 70, 70), (196, 196, 196), (190, 153, 153)),
     *((153, 153, 153), (107, 142, 35), (152, 251, 152), (70, 130, 180), (220, 20, 60)),
     *((0, 0, 142), (119, 11, 32), (138, 43, 226), (0, 0, 0)),
+)
+TRAIN = tuple(
+    f"train/{{sequence}}/{{piece}}/{kind}/{kind}_{{stamp}}.png"
+    for kind in ("fl_rgb", "fl_ir_aligned", "fl_rgb_labels")
+)
+TEST = (
+    "{part}/{time}/ImagesRGB/{stamp}_rgb.png",
+    "{part}/{time}/ImagesIR/{stamp}_ir.png",
+    "{part}/{time}/SegmentationClass/{stamp}_rgb.npy",
 )
 SPLITS = {
     "train": "train/seq_*_day/*/fl_rgb/fl_rgb_*.png",
@@ -55,13 +63,15 @@ LAYOUTS = (
     PairPattern(*TRAIN[:2]),
     PairPattern(*TEST[:2]),
     # Of one part of the archive the stamps of RGB end in a 0 more than those of thermal.
-    PairPattern(TEST.rgb.replace("{stamp}", "{stamp}0"), TEST.thermal),
+    PairPattern(TEST[0].replace("{stamp}", "{stamp}0"), TEST[1]),
 )
 
 MOST_STRETCH = 0.02
 """Largest relative difference of the aspect ratios of label and frame, due to rounding."""
 
 Array = NDArray[np.uint8]
+Files = Mapping[tuple[str, ...], Path]
+"""Values of the words of a pattern -> file."""
 
 
 class Freiburg(FileDataset):
@@ -88,24 +98,8 @@ class Freiburg(FileDataset):
     semantic segmentation using domain adaptation with thermal images" (TU Eindhoven, 2022) and its
     code.
 
-    Args:
-        root: folder that holds `train`, `test` or both.
-        name: see `FileDataset`, as `num_classes`, `classes` and `palette`.
-        unscored: classes that are counted but left out of every mean over classes.
-        background: classes that are no object, see `rgbt.dataset.LabelledDataset`.
-        crop: first row, row after the last, first column, column after the last of the part of
-            every frame and label that is used; None: whole frames.
-        thermal_range: (low, high) counts that become black and white: [21800, 23700] in the thesis,
-            [21800, 25000] in the HeatNet release.
-        ignored_test: classes that are ignored in "val" and "test" (they become 255):
-            "ignore" in HeatNet, none in the code of the thesis. In training they stay classes.
-        val_sequences: day sequences ("seq_04_day") or pieces of them ("seq_03_day/00") that form
-            "val". (): all 12,170 frames by day are for training, as in the thesis and its port of
-            HeatNet, and there is no "val".
-
-    Raises:
-        InputError: no such root, neither part in it, an invalid crop, range or class, or numbers of
-            classes, names and colours that differ.
+    Arguments: the keys of conf/dataset/freiburg.yaml, which describes each. InputError: no such
+    root, another layout, or settings that do not fit each other.
     """
 
     title = "layout of Freiburg Thermal"
@@ -125,9 +119,8 @@ class Freiburg(FileDataset):
         ignored_test: Names = ("ignore",),
         val_sequences: Names = (),
     ) -> None:
-        folder = existing_root(root, "that holds train and test")
         super().__init__(
-            *(folder, name, num_classes, classes, palette),
+            *(root, name, num_classes, classes, palette),
             background=background,
             unscored=unscored,
         )
@@ -135,24 +128,18 @@ class Freiburg(FileDataset):
         self.crop = crop
         self.ignored_test = ignored_test
         self.val_sequences = val_sequences
-        self._split_frames: dict[str, tuple[FolderFrame, ...]] = {}
-        if not any(inside(folder, part).is_dir() for part in ("train", "test")):
+        if not {"train", "test"} & {path.name.lower() for path in self.root.iterdir()}:
             raise InputError(
-                f"dataset.root: '{root}' holds neither the folder train nor the folder test; give "
-                "the folder into which both archives were unpacked."
+                f"dataset.root: '{root}' holds neither the folder train nor the folder test."
             )
-        if crop is not None and not (0 <= crop[0] < crop[1] and 0 <= crop[2] < crop[3]):
+        if crop is not None and not (crop[0] < crop[1] and crop[2] < crop[3]):
             raise InputError(
                 "dataset.crop: expected [first row, row after the last, first column, column after "
                 f"the last], such as {list(CROP)}, got {list(crop)}."
             )
-        if not 0 <= thermal_range[0] < thermal_range[1] < 2**16:
-            raise InputError(
-                "dataset.thermal_range: expected counts 0 <= low < high <= 65535, such as "
-                f"{list(THERMAL_RANGE)}, got {list(thermal_range)}."
-            )
+        if not thermal_range[0] < thermal_range[1]:
+            raise InputError(f"dataset.thermal_range: {list(thermal_range)} is no range of counts.")
         self.codes = indices(num_classes)
-        self.clipping = thermal_range
         self.images = PairReader(
             layouts=LAYOUTS,
             thermal_range=thermal_range,
@@ -167,52 +154,28 @@ class Freiburg(FileDataset):
         """Split -> the pattern of its files."""
         return {key: each for key, each in SPLITS.items() if key != "val" or self.val_sequences}
 
-    def has(self, split: str) -> bool:
-        """Whether `split` has frames; InputError if the split is unknown ("val" is known)."""
-        return bool(self._of(split))
+    def check_split(self, split: str) -> None:
+        """Refuse a split that is not one of `splits`, but for "val", which may be empty."""
+        if split != "val":
+            super().check_split(split)
 
-    def names(self, split: str) -> tuple[str, ...]:
+    def listed(self, split: str) -> tuple[str, ...]:
         """Names of a split, sorted by folder and file, the day before the night.
 
         Raises:
-            InputError: unknown split, no frame of it, a missing sequence of "val".
+            InputError: `val_sequences` names none.
         """
-        frames = self._of(split)
-        if split == "val" and not self.val_sequences:
-            raise InputError(
-                f"{self.name} has no validation split, because dataset.val_sequences=[]; name day "
-                "sequences that are held out of training, such as "
-                "dataset.val_sequences=[seq_04_day]."
-            )
-        hint = f"unpack the archive '{split.partition('_')[0]}' there"
-        if split in ("train", "train_day", "val"):
-            by_day = [each for each in self._frames.values() if _time_of(each) == "train_day"]
-            known = {word for frame in by_day for word in _sequences(frame)}
-            for word in self.val_sequences if by_day else ():
-                if word not in known:
-                    raise InputError(
-                        f"dataset.val_sequences: there is no day sequence '{word}' in {self.root}; "
-                        f"{nearest(word, {each for each in known if '/' not in each})}."
-                    )
-            if split == "val":
-                hint = (
-                    f"dataset.val_sequences is {list(self.val_sequences)}; name existing day "
-                    "sequences"
-                )
-            elif by_day:
-                hint = "every day sequence is in dataset.val_sequences; remove one of them"
-        if not frames:
-            raise InputError(
-                f"split '{split}' of {self.name} is empty: expected {self.splits[split]} in "
-                f"{self.root}; {hint}."
-            )
-        return tuple(frame.name for frame in frames)
+        days = [frame for frame in self._frames.values() if _time_of(frame) == "train_day"]
+        known = sorted({word for frame in days for word in _sequences(frame)})
+        for word in self.val_sequences if known and split in ("train", "train_day", "val") else ():
+            check_choice("dataset.val_sequences", word, known)
+        return self._of(split)
 
     def read(self, name: str) -> Sample:
         """See `FileDataset`; cut, thermal as grey levels, without a label in training at night."""
         frame = self.frame(name)
-        rgb = existing_file("RGB image", frame.rgb, name, self.root)
-        thermal = existing_file("thermal image", frame.thermal, name, self.root)
+        rgb = self.existing("RGB image", frame.rgb, name)
+        thermal = self.existing("thermal image", frame.thermal, name)
         pixels, values = self.images.whole(name, rgb, thermal)
         # A label is resized to the whole frame, and cropped with it.
         label = None if frame.label is None else self._label(frame, frame.label, values.shape)
@@ -227,12 +190,8 @@ class Freiburg(FileDataset):
 
     def decoding(self) -> dict[str, Any]:
         """Settings that change what `read` makes of the files."""
-        return {
-            **super().decoding(),
-            "ignored_test": sorted(self.ignored_test),
-            "val_sequences": sorted(self.val_sequences),
-            "classes": self.classes,
-        }
+        own = {"ignored_test": self.ignored_test, "val_sequences": self.val_sequences}
+        return {**super().decoding(), **own, "classes": self.classes}
 
     def nights(self, names: tuple[str, ...]) -> tuple[bool, ...]:
         """Whether each frame is in a night folder; InputError if there is no such frame."""
@@ -242,14 +201,14 @@ class Freiburg(FileDataset):
         """As `hash_of_files`, with the settings of labels (crop, `ignored_test`)."""
         digest = hashlib.sha256(f"{self.crop} {sorted(self.ignored_test)}\n".encode())
         for split in sorted(SPLITS):
-            names = [frame.name for frame in self._of(split)]
+            names = self._of(split)
             digest.update(f"{split} {len(names)} {' '.join(names)}\n".encode())
         for name in self._frames:
             sizes = [size_of(path) for path in self.files(name)]
             digest.update(f"{name} {sizes}\n".encode())
         return digest.hexdigest()
 
-    def frame(self, name: str) -> FolderFrame:
+    def frame(self, name: str) -> Frame:
         """The files of `name`; InputError if there is no such frame."""
         if name not in self._frames:
             raise InputError(f"{self.name} ({self.root}) has no frame called '{name}'.")
@@ -261,62 +220,86 @@ class Freiburg(FileDataset):
 
     def unused(self, lists: SplitNames) -> list[Path]:  # noqa: ARG002 - as every data set
         """Thermal images and labels without an RGB image."""
-        return self._frames_and_unused[1]
-
-    def own_problems(self, lists: SplitNames) -> list[str]:
-        """Frames in two parts, by their time stamps; names differ between the parts."""
-
-        def forms(name: str) -> tuple[str, str]:
-            """The stamp without and with the number in the burst, which may be left out."""
-            stamp = self.frame(name).values["stamp"]
-            return stamp.removesuffix("0"), stamp
-
-        problems = []
-        for test in ("test_day", "test_night"):
-            for other in ("train_day", "train_night", "val"):
-                trained = {form: name for name in lists.get(other, ()) for form in forms(name)}
-                both = [name for name in lists.get(test, ()) if forms(name)[0] in trained]
-                problems += [
-                    f"splits {test} and {other} share {len(both)} frames by their time stamps; "
-                    f"the first is '{name}', which is '{trained[forms(name)[0]]}'."
-                    for name in both[:1]
-                ]
-        return problems
-
-    @cached_property
-    def _frames_and_unused(self) -> tuple[dict[str, FolderFrame], list[Path]]:
-        """See `find_frames`; listed once, so later changes of the folder have no effect."""
-        return find_frames(self.root)
+        used = {path for frame in self._frames.values() for path in frame[2:]}
+        return [path for path in self._listed[1] if path not in used]
 
     @property
-    def _frames(self) -> dict[str, FolderFrame]:
-        return self._frames_and_unused[0]
+    def _frames(self) -> dict[str, Frame]:
+        """Name -> frame, of training, test by day, test by night."""
+        return self._listed[0]
 
-    def _of(self, split: str) -> tuple[FolderFrame, ...]:
-        if split != "val":  # empty by choice where no sequence is held out
-            self.check_split(split)
-        if split not in self._split_frames:
-            wanted = {"train": "train_day", "val": "val_day"}.get(split, split)
-            self._split_frames[split] = tuple(
-                frame for frame in self._frames.values() if self._part(frame).startswith(wanted)
+    @cached_property
+    def _listed(self) -> tuple[dict[str, Frame], list[Path]]:
+        """The frames, and all thermal images and labels; listed once.
+
+        Names are "seq_00_day_00_<seconds>_<nanoseconds>" and "test_night_<...>_<...>"; among the
+        values of a frame is its "time".
+
+        Raises:
+            InputError: two frames of one name, or two RGB images with one thermal image.
+        """
+        frames: dict[str, Frame] = {}
+        rgb_of: dict[Path, Path] = {}
+        partners: list[Path] = []
+        tests = ({"part": "test", "time": time} for time in ("day", "night"))
+        for texts, known in ((TRAIN, NO_VALUES), *((TEST, values) for values in tests)):
+            rgb, *others = Patterns.of(*texts)
+            thermals, labels = (
+                {tuple(v.values()): path for path, v in each.files(self.root, known, any_case=True)}
+                for each in others
+                if each is not None
             )
-        return self._split_frames[split]
+            partners += [*thermals.values(), *labels.values()]
+            for path, values in rgb.files(self.root, known, any_case=True):
+                frame = self._frame(path, values, thermals, labels)
+                if frame.name in frames or frame.thermal in rgb_of:
+                    raise InputError(
+                        f"{path}: another frame is called '{frame.name}' too, or has the same "
+                        f"thermal image {frame.thermal}; remove or rename one."
+                    )
+                frames[frame.name], rgb_of[frame.thermal] = frame, path
+        return frames, partners
 
-    def _part(self, frame: FolderFrame) -> str:
+    def _frame(self, rgb: Path, values: WordValues, thermals: Files, labels: Files) -> Frame:
+        """The files of an RGB image; `values` has its part and time if it is of the test part."""
+        words, is_test = tuple(values.values()), "part" in values
+        times = [t for t in ("day", "night") if t in values.get("sequence", values.get("time", ""))]
+        if len(times) != 1:
+            raise InputError(
+                f"{rgb}: expected a sequence with day or night in its name, such as seq_00_day."
+            )
+        expected = Patterns.of(*(TEST if is_test else TRAIN)).frame(self.root, "", values)
+        # Stamps of RGB and label end in the number of the frame in its burst, always 0. Stamps of
+        # thermal images do so in one part of the archive only.
+        without = (*words[:-1], words[-1].removesuffix("0")) if is_test else words
+        return Frame(
+            name="_".join(words),
+            values={**values, "time": times[0]},
+            rgb=rgb,
+            thermal=thermals.get(words) or thermals.get(without) or expected.thermal,
+            label=labels.get(words, expected.label) if is_test or times == ["day"] else None,
+        )
+
+    def _of(self, split: str) -> tuple[str, ...]:
+        part = {"train": "train_day", "val": "val_day"}.get(split, split)
+        frames = self._frames.items()
+        return tuple(name for name, frame in frames if self._part(frame).startswith(part))
+
+    def _part(self, frame: Frame) -> str:
         """The part and time of a frame: "val_day" of training days that are held out."""
         time = _time_of(frame)
         held_out = time == "train_day" and set(_sequences(frame)) & set(self.val_sequences)
         return "val_day" if held_out else time
 
-    def _label(self, frame: FolderFrame, path: Path, hw: tuple[int, ...]) -> Array:
+    def _label(self, frame: Frame, path: Path, hw: tuple[int, ...]) -> Array:
         """The label, resized to the frame with the nearest pixel."""
-        label = self.codes.read(existing_file("label", path, frame.name, self.root))
+        label = self.codes.read(self.existing("label", path, frame.name))
         if label.shape != hw:
             aspects = [height / width for height, width in (label.shape, hw)]
             if abs(aspects[0] / aspects[1] - 1) > MOST_STRETCH:
                 raise InputError(
                     f"{path} has {label.shape[0]}x{label.shape[1]} pixels but its frame "
-                    f"{hw[0]}x{hw[1]}, which is another aspect ratio. Use the label of the whole "
+                    f"{hw[0]}x{hw[1]}, which is another aspect ratio; use the label of the whole "
                     "frame."
                 )
             size = (hw[1], hw[0])
@@ -329,12 +312,12 @@ class Freiburg(FileDataset):
         return label
 
 
-def _time_of(frame: FolderFrame) -> str:
+def _time_of(frame: Frame) -> str:
     """The part of the archive and the time of a frame: "train_night"."""
     return f"{frame.values.get('part', 'train')}_{frame.values['time']}"
 
 
-def _sequences(frame: FolderFrame) -> tuple[str, str]:
+def _sequences(frame: Frame) -> tuple[str, str]:
     """The training sequence of a frame, and the piece of it: "seq_00_day", "seq_00_day/00"."""
     sequence = frame.values["sequence"]
     return sequence, f"{sequence}/{frame.values['piece']}"

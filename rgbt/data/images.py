@@ -6,7 +6,6 @@ so that new images of any folder are read like the training images.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -19,7 +18,6 @@ from numpy.typing import NDArray
 
 from rgbt.checks import InputError
 from rgbt.data.files import channels, decode, read_array, read_packed, read_rgb
-from rgbt.data.named_files import check_size
 from rgbt.types import Sample
 
 Array = NDArray[np.uint8]
@@ -29,17 +27,15 @@ Range = tuple[Level, Level]
 
 
 class PairPattern(NamedTuple):
-    """Patterns of the files of a pair (`rgbt.data.folder.pattern`), relative to a root.
+    """Patterns of the files of a pair (`rgbt.data.patterns`), relative to a root.
 
     Attributes:
         rgb: of the RGB images.
         thermal: of the thermal images; equal to `rgb` where thermal is the fourth channel.
-        label: of the labels, which are not read as images; None if they lie elsewhere.
     """
 
     rgb: str
     thermal: str
-    label: str | None = None
 
     def __str__(self) -> str:
         if self.rgb == self.thermal:
@@ -74,9 +70,7 @@ class PairReader:
             grey is their mean, floor((c1 + c2 + c3) / 3 + 1/2).
         crop: first row, row after the last, first column, column after the last of the part that
             is used; None: whole images.
-        advice: end of the message about a thermal image of other channels or bits.
-        packed_advice: end of the message about a packed file that has not four channels.
-        rgb_advice: end of the message about an RGB image that has not three channels.
+        advice: end of the message about images of other channels or bits.
     """
 
     layouts: tuple[PairPattern, ...]
@@ -85,8 +79,6 @@ class PairReader:
     most_tint: int = 0
     crop: tuple[int, int, int, int] | None = None
     advice: str = "use the original file"
-    packed_advice: str = "give separate images as rgb=FILE thermal=FILE, or in two folders"
-    rgb_advice: str = "use the original file"
 
     def read(self, name: str, rgb: Path, thermal: Path) -> Sample:
         """The pair, read like a training sample, without a label.
@@ -103,15 +95,15 @@ class PairReader:
                 data set, sizes differ, or are smaller than the crop.
         """
         if rgb == thermal and not any(layout.rgb == layout.thermal for layout in self.layouts):
-            pixels, levels = read_packed(rgb, self.packed_advice)
+            pixels, levels = read_packed(rgb, "give separate images")
             return Sample(rgb=pixels, thermal=levels, label=None, name=name)
         return self.sample(name, *self.whole(name, rgb, thermal), thermal)
 
     def whole(self, name: str, rgb: Path, thermal: Path) -> tuple[Array, NDArray[Any]]:
         """RGB (H, W, 3) and thermal values (H, W) of whole images; errors as of `read`."""
         if rgb == thermal:
-            return read_packed(rgb, self.packed_advice)
-        pixels, values = read_rgb(rgb, self.rgb_advice), self.values(thermal)
+            return read_packed(rgb, "give separate images of RGB and thermal")
+        pixels, values = read_rgb(rgb, self.advice), self.values(thermal)
         check_size(pixels, "thermal", values, name, thermal)
         return pixels, values
 
@@ -127,34 +119,26 @@ class PairReader:
         Raises:
             InputError: it cannot be read, has channels that differ, other bits, or NaN.
         """
-        if path.suffix.lower() == ".npy":
-            values = read_array(path, "thermal values of shape (rows, columns)")
-        else:
-            values = decode(path)
-        return self.check_values(values, path)
+        is_array = path.suffix.lower() == ".npy"
+        return self.check_values(read_array(path, "numbers") if is_array else decode(path), path)
 
     def check_values(self, values: NDArray[Any], path: Path) -> NDArray[Any]:
         """Thermal values as (H, W); errors as of `values`, in messages with the name `path`."""
-        if values.dtype.kind not in "iuf" or values.ndim not in (2, 3):
+        of_counts = values.dtype == np.uint16 and values.ndim == 2
+        if self.counts:
+            wanted, fits = "a thermal image of 16 bits (counts) and one channel", of_counts
+        elif self.thermal_range is None:
+            wanted, fits = "thermal values of 8 bits per pixel", values.dtype == np.uint8
+        else:
+            wanted, fits = "thermal values", values.dtype.kind in "iuf"
+        if not fits or values.ndim not in (2, 3):
             raise InputError(
-                f"{path}: expected thermal values of shape (rows, columns), got {values.shape} "
-                f"{values.dtype}; save integers or floats."
-            )
-        if self.counts and (values.dtype != np.uint16 or values.ndim != 2):
-            raise InputError(
-                f"{path}: expected a thermal image of 16 bits (counts of the camera) and one "
-                f"channel, got {values.dtype} and {channels(values)}; {self.advice}."
-            )
-        if self.thermal_range is None and values.dtype != np.uint8:
-            raise InputError(
-                f"{path}: expected 8 bits per pixel, got {values.dtype}; {self.advice}."
+                f"{path}: expected {wanted} of shape (rows, columns), got {values.dtype} of shape "
+                f"{values.shape}; {self.advice}."
             )
         if values.dtype.kind == "f" and not np.isfinite(values).all():
             wrong = np.count_nonzero(~np.isfinite(values))
-            raise InputError(
-                f"{path}: {wrong} thermal values are NaN or infinite; replace them with a "
-                "temperature (of a neighbour, or outside dataset.thermal_range)."
-            )
+            raise InputError(f"{path}: {wrong} thermal values are NaN or infinite; replace them.")
         return values if values.ndim == 2 else self._mean(values, path)
 
     def cut(self, image: NDArray[Pixel], name: str) -> NDArray[Pixel]:
@@ -164,9 +148,8 @@ class PairReader:
         top, bottom, left, right = self.crop
         if bottom > image.shape[0] or right > image.shape[1]:
             raise InputError(
-                f"'{name}': the frame is {image.shape[0]}x{image.shape[1]} pixels but "
-                f"dataset.crop={list(self.crop)} reaches to row {bottom} and column {right}. Give "
-                "a crop inside the frame, or dataset.crop=null for whole frames."
+                f"dataset.crop={list(self.crop)} reaches to row {bottom} and column {right}, but "
+                f"'{name}' has {image.shape[0]}x{image.shape[1]} pixels."
             )
         return image[top:bottom, left:right]
 
@@ -174,35 +157,31 @@ class PairReader:
         """(H, W) of (H, W, 3) with channels that are equal, or almost."""
         # Whole channels are compared: comparing their interleaved pixels takes five times as long.
         first, *others = map(np.asarray, cv2.split(values))
-        equal = all(np.array_equal(first, other) for other in others)
-        if values.shape[2] == 3 and equal:
+        is_three = values.shape[2] == 3
+        if is_three and all(np.array_equal(first, other) for other in others):
             return first
-        tint = None
-        if values.shape[2] == 3 and values.dtype == np.uint8:
+        tint = 256
+        if is_three and values.dtype == np.uint8:
             lowest = np.minimum(np.minimum(first, others[0]), others[1])
             tint = int((np.maximum(np.maximum(first, others[0]), others[1]) - lowest).max())
-        if tint is None or tint > self.most_tint:
-            apart = f" that differ by up to {tint} levels" if tint else " that differ" * (not equal)
-            within = f" to within {self.most_tint} levels" if self.most_tint else ""
+        if tint > self.most_tint:
             raise InputError(
-                f"{path}: expected a thermal image of one channel or three equal ones{within}, got "
-                f"{channels(values)} channels{apart}; {self.advice}."
+                f"{path}: expected a thermal image of one channel or three equal ones (within "
+                f"{self.most_tint} levels), got {channels(values)} channels that differ by up to "
+                f"{tint}; {self.advice}."
             )
         # A third is never one half, so that halves need no rule: 1/3 goes down, 2/3 up.
         return np.asarray((values.sum(axis=-1, dtype=np.uint16) + 1) // 3, np.uint8)
 
 
-def reader_of_patterns(layout: PairPattern, thermal_range: Range | None) -> PairReader:
-    """The reader of a user's own files, whose messages name the settings of their data set."""
-    return PairReader(
-        layouts=(layout,),
-        thermal_range=thermal_range,
-        advice="grey levels must have 8 bits in one channel or in three equal channels; "
-        "other values require dataset.thermal_range=[low, high], the values that "
-        "become black and white",
-        packed_advice="give dataset.thermal a separate pattern",
-        rgb_advice="dataset.thermal with the same pattern reads a fourth channel as thermal",
-    )
+def check_size(rgb: Array, what: str, image: NDArray[Any], name: str, path: Path | None) -> None:
+    """Refuse an image (H', W') of `path` that is not of the size of `rgb` (H, W, 3)."""
+    if image.shape != rgb.shape[:2]:
+        raise InputError(
+            f"'{name}': RGB is {rgb.shape[0]}x{rgb.shape[1]} pixels but {what} is "
+            f"{image.shape[0]}x{image.shape[1]}; both must show the same pixels. Align them "
+            f"first: {path}."
+        )
 
 
 def grey(values: NDArray[Any], limits: Range | None, path: Path) -> Array:
@@ -217,26 +196,12 @@ def grey(values: NDArray[Any], limits: Range | None, path: Path) -> Array:
         return np.asarray(values, np.uint8)
     if values.dtype == np.uint8 and limits[0] >= 255:
         raise InputError(
-            f"{path}: expected camera values in dataset.thermal_range={plain(limits)}, got 8 "
-            "bits; use the original file, or set dataset.thermal_range=null for grey levels."
+            f"{path}: expected camera values in dataset.thermal_range={list(limits)}, got 8 bits; "
+            "use the original file, or set dataset.thermal_range=null for grey levels."
         )
     if values.dtype == np.uint16:
         return np.take(_levels_of_16_bits(*limits), values)
     return _stretched(values, *limits)
-
-
-def check_limits(limits: Range | None) -> None:
-    """Refuse limits that are not a range."""
-    if limits is not None and not -math.inf < limits[0] < limits[1] < math.inf:
-        raise InputError(
-            "dataset.thermal_range: expected [low, high] with low < high, the thermal values that "
-            f"become black and white, got {plain(limits)}."
-        )
-
-
-def plain(limits: Range) -> str:
-    """The two numbers as they are typed: 21800 and not 21800.0."""
-    return f"[{limits[0]:g}, {limits[1]:g}]" if max(map(abs, limits)) < 1e5 else str(list(limits))
 
 
 @lru_cache(maxsize=4)

@@ -9,7 +9,7 @@ import numpy as np
 from annotated_types import Len
 from numpy.typing import NDArray
 
-from rgbt.checks import InputError, nearest
+from rgbt.checks import InputError, check_choice
 from rgbt.ranges import Byte, Names, NumClasses, Text
 
 
@@ -35,24 +35,13 @@ class LabelMap:
 
     def __post_init__(self) -> None:
         for name in self.groups:
-            if name not in self.targets:
-                raise InputError(
-                    f"label_map.groups: '{name}' is not a class of label_map.targets; "
-                    f"{nearest(name, self.targets)}."
-                )
+            check_choice("label_map.groups", name, self.targets)
         mapped = sorted(source for group in self.groups.values() for source in group)
-        known = range(self.num_source)
-        wrong = {
-            "unknown": [source for source in mapped if source not in known],
-            "mapped twice": [a for a, b in zip(mapped, mapped[1:], strict=False) if a == b],
-            "not mapped": [source for source in known if source not in mapped],
-        }
-        for what, ids in wrong.items():
-            if ids:
-                raise InputError(
-                    f"label_map.groups: expected every id from 0 to {self.num_source - 1} once, "
-                    f"but {', '.join(map(str, dict.fromkeys(ids)))} is {what}; correct the lists."
-                )
+        if mapped != list(range(self.num_source)):
+            raise InputError(
+                f"label_map.groups: expected every id from 0 to {self.num_source - 1} once, got "
+                f"{mapped}."
+            )
 
     def __call__(self, classes: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Ids of the data set for ids of the network, any shape, below `num_source`."""
@@ -63,14 +52,8 @@ class LabelMap:
 
     def check(self, num_source: int, targets: tuple[str, ...], dataset: str) -> None:
         """Refuse a network or a data set with other classes than those of this map."""
-        if num_source != self.num_source:
+        if (num_source, targets) != (self.num_source, self.targets):
             raise InputError(
-                f"label_map is for a network with {self.num_source} classes, but "
-                f"model.num_classes is {num_source}. Choose the label_map for the classes of the "
-                "network."
-            )
-        if targets != self.targets:
-            raise InputError(
-                f"label_map maps to the classes {', '.join(self.targets)}, but {dataset} has "
-                f"{', '.join(targets)}; choose another label_map or data set."
+                f"label_map maps {self.num_source} classes to {', '.join(self.targets)}, but the "
+                f"network has {num_source} classes and {dataset} has {', '.join(targets)}."
             )

@@ -12,12 +12,13 @@ import numpy as np
 from annotated_types import Interval
 from numpy.typing import NDArray
 
-from rgbt.checks import InputError, nearest
+from rgbt.checks import InputError, check_choice
 from rgbt.data.files import read_array, read_colours, read_indices
 from rgbt.ranges import Colour
 from rgbt.types import IGNORE
 
 Array = NDArray[np.uint8]
+PixelCounts = NDArray[np.int64]
 LabelValue = Annotated[int, Interval(ge=-(2**31), lt=2**31)]
 Colours = Mapping[str, Colour | tuple[Colour, ...]]
 
@@ -57,7 +58,14 @@ class LabelCodes:
             of_known = np.array([self.codes[code] for code in known.tolist()], np.int16)
             classes = np.where(known[at] == raw, of_known[at], -1)
         if classes.min(initial=0) < 0:
-            raise InputError(f"{path}: {self._unknown(raw[classes < 0])}")
+            values, counts = np.unique(raw[classes < 0], return_counts=True)
+            code, count = int(values[counts.argmax()]), counts.max()
+            shown = [code // 65536, code // 256 % 256, code % 256] if self.of_colours else code
+            raise InputError(
+                f"{path}: {'colour' if self.of_colours else 'label value'} {shown} ({count} pixels;"
+                f" one of {len(values)} unknown values) has no class in "
+                f"{self.key or 'this data set'} and is not ignored."
+            )
         return np.asarray(classes, np.uint8)
 
     @cached_property
@@ -78,38 +86,11 @@ class LabelCodes:
             )
         return raw
 
-    def _unknown(self, unknown: NDArray[Any]) -> str:
-        values, counts = np.unique(unknown, return_counts=True)
-        code, count = int(values[counts.argmax()]), counts.max()
-        more = f", most frequent of {len(values)} unknown ones" if len(values) > 1 else ""
-        if not self.key:
-            listed = ", ".join(map(str, values[:8].tolist()))
-            last = max(set(self.codes) - {IGNORE})
-            return (
-                f"label value {listed} is out of range; expected 0 to {last}, or {IGNORE} to "
-                "ignore a pixel."
-            )
-        if self.of_colours:
-            colour = [code // 65536, code // 256 % 256, code % 256]
-            return (
-                f"colour {colour} ({count} pixels{more}) is neither in dataset.colours nor in "
-                "dataset.ignored; add it there, or save labels without resizing them."
-            )
-        return (
-            f"label value {code} ({count} pixels{more}) is neither in dataset.ids nor in "
-            f"dataset.ignored (known: {', '.join(map(str, sorted(self.codes)))}); add it there."
-        )
-
 
 def indices(num_classes: int, *ignored: int) -> LabelCodes:
     """Values that are class indices; 255 and `ignored` do not count."""
     codes = {value: value for value in range(num_classes)}
     return LabelCodes({**codes, **dict.fromkeys((*ignored, IGNORE), IGNORE)})
-
-
-def read_label(path: Path, num_classes: int) -> Array:
-    """Class indices (H, W) uint8 below `num_classes`, or 255; errors as of `LabelCodes.read`."""
-    return indices(num_classes).read(path)
 
 
 def label_codes(
@@ -118,38 +99,35 @@ def label_codes(
     colours: Colours | None,
     ignored: tuple[int | Colour, ...],
 ) -> LabelCodes:
-    """The map of label values of a configuration, see `rgbt.data.folder.dataset.Folder`.
+    """The map of label values of a configuration, see `rgbt.data.folder.Folder`.
 
     Without `ids` and `colours` a value is the index of its class; 255 is ignored unless `ids` gives
     it a class.
 
     Raises:
-        InputError: both ids and colours, an unknown class, an invalid value or colour, or one
-            that occurs twice.
+        InputError: both ids and colours, an unknown class, or a value that occurs twice.
     """
     if ids is not None and colours is not None:
-        raise InputError(
-            "dataset.ids and dataset.colours: labels hold either numbers or colours; set one of "
-            "them to null."
-        )
+        raise InputError("dataset.ids and dataset.colours: set one of them to null.")
     key = "dataset.ids" if colours is None else "dataset.colours"
+    pairs: list[tuple[str, int | Colour]]
     if colours is None:
         words = dict(enumerate(classes)) if ids is None else ids
-        pairs: list[tuple[str, int | Colour]] = [(word, value) for value, word in words.items()]
+        pairs = [(word, value) for value, word in words.items()]
     else:
         pairs = [(word, one) for word, given in colours.items() for one in each_colour(given)]
     for word, _ in pairs:
-        if word not in classes:
-            raise InputError(f"{key}: '{word}' is not a class; {nearest(word, classes)}.")
+        check_choice(key, word, classes)
     codes: dict[int, int] = {}
     named = [(classes.index(word), value) for word, value in pairs]
     for index, value in [*named, *((IGNORE, value) for value in ignored)]:
-        code = _code(value, of_colours=colours is not None)
-        if code in codes:
+        if isinstance(value, int) != (colours is None):
             raise InputError(
-                f"{key}: {_plain(value)} occurs twice in the classes and dataset.ignored; every "
-                "value must have one meaning."
+                f"dataset.ignored: {value} is no value of labels as {key} describes them."
             )
+        code = value if isinstance(value, int) else 65536 * value[0] + 256 * value[1] + value[2]
+        if code in codes:
+            raise InputError(f"{key}: {value} occurs twice in the classes and dataset.ignored.")
         codes[code] = index
     if colours is None:
         codes.setdefault(IGNORE, IGNORE)
@@ -164,22 +142,6 @@ def each_colour(given: Colour | tuple[Colour, ...]) -> tuple[Colour, ...]:
     return (cast(Colour, given),) if is_one else cast(tuple[Colour, ...], given)
 
 
-def _code(value: int | Colour, *, of_colours: bool) -> int:
-    if isinstance(value, int) == of_colours:
-        wanted = "a colour [red, green, blue]" if of_colours else "a whole number"
-        raise InputError(
-            f"dataset.ignored: expected {wanted}, as in the labels, got {_plain(value)}."
-        )
-    if isinstance(value, int):
-        return value
-    red, green, blue = value
-    return 65536 * red + 256 * green + blue
-
-
-def _plain(value: int | Colour) -> str:
-    return str(value if isinstance(value, int) else list(value))
-
-
 def painted(num_classes: int) -> tuple[Colour, ...]:
     """Colours that differ for up to 256 classes, the first of them black.
 
@@ -191,3 +153,9 @@ def painted(num_classes: int) -> tuple[Colour, ...]:
         return sum((number >> 3 * place & 1) << 7 - place for place in range(3))
 
     return tuple((level(i), level(i >> 1), level(i >> 2)) for i in range(num_classes))
+
+
+def label_pixels(label: Array, num_classes: int) -> PixelCounts:
+    """(K + 1,) pixels of each class in a label (H, W); the last are ignored."""
+    counts = np.bincount(label.ravel(), minlength=IGNORE + 1)
+    return np.append(counts[:num_classes], counts[IGNORE])

@@ -50,9 +50,3 @@ class LoaderSettings:
     class_temperature: Positive = 0.01
     min_class_pixels: Annotated[int, Interval(ge=0, le=10**8)] = 3000
     min_crop_ratio: NonNegative = 0.5
-
-    def __post_init__(self) -> None:
-        if self.cache is not None:
-            from rgbt.data.cache.dataset import check_cache  # only here: it imports OpenCV
-
-            check_cache("data.cache", self.cache)

@@ -7,36 +7,31 @@ worker processes. Where several processes train one run, each loads every W-th s
 
 from __future__ import annotations
 
-import errno
 import logging
 import multiprocessing
+import os
 import re
-from collections.abc import Callable, Iterable, Iterator
+import signal
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from itertools import count
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar, cast
 
+import cv2
 import numpy as np
 import torch
-from torch.utils.data import DataLoader
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset, get_worker_info
 
-from rgbt.checks import InputError, RunError
-from rgbt.data.batches import Transform, collate
+from rgbt.checks import InputError, RunError, without_controls
 from rgbt.data.loader_settings import LoaderSettings as LoaderSettings  # as conf/ names it
-from rgbt.data.reader import (
-    BatchReader,
-    EvalExamples,
-    LoadedBatch,
-    MakeExample,
-    SplitReader,
-    TrainExamples,
-    no_shared_memory,
-    signals_blocked,
-    start_worker,
-)
 from rgbt.dataset import LabelledDataset
 from rgbt.processes import num_processes, rank
 from rgbt.randomness import numpy_generator
-from rgbt.types import Batch, Loadable
+from rgbt.types import Batch, Example, Loadable, Sample, TwoDomains
 
 if TYPE_CHECKING:
     from rgbt.data.rare_classes import RareClasses
@@ -51,9 +46,167 @@ EVAL_ADVICE = "; set data.eval_batch_size=1"
 
 DEAD_WORKER = re.compile(r"DataLoader worker .*(exited unexpectedly|killed by signal)")
 
-LOCKS_PER_WORKER = 16
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Signals that end a command (`rgbt.runtime.signals`)."""
+
+LOOK_S = 2.0
+"""Interval at which a worker checks that its main process exists."""
 
 Kind = TypeVar("Kind", bound=Loadable)
+
+MakeExample = Callable[[Any, dict[str, str]], Any]
+"""(key, skipped) -> example, or None if it is left out; adds unreadable names to `skipped`."""
+
+
+class Transform(Protocol):
+    """Makes examples of samples (see `rgbt.transforms.crm.CrmTransform`)."""
+
+    def train(self, sample: Sample, rng: np.random.Generator) -> Example:
+        """Augmented example; every draw comes from `rng`."""
+        ...
+
+    def test(self, sample: Sample) -> Example:
+        """Example for evaluation, the same every time."""
+        ...
+
+
+@dataclass(frozen=True)
+class Examples:
+    """Reads and transforms the samples of one split.
+
+    Attributes:
+        dataset: reads samples.
+        names: the split.
+        transform: makes examples.
+        skip_errors: record an unreadable sample instead of raising.
+        seed: run seed.
+    """
+
+    dataset: LabelledDataset
+    names: tuple[str, ...]
+    transform: Transform
+    skip_errors: bool
+    seed: int = 0
+
+    def read(self, name: str, skipped: dict[str, str]) -> Sample | None:
+        """The sample; None, with the reason in `skipped`, if it is skipped."""
+        try:
+            return self.dataset.read(name)
+        except InputError as error:
+            if not self.skip_errors:
+                raise
+            skipped[name] = str(error)
+            return None
+
+    def first_readable(self, names: Sequence[str], skipped: dict[str, str]) -> Sample:
+        """The first of these samples that can be read; InputError if there is none."""
+        for name in names:
+            sample = self.read(name, skipped)
+            if sample is not None:
+                return sample
+        raise InputError(
+            f"none of the {len(names)} training samples of {self.dataset.name} can be read; the "
+            f"first one: {skipped[names[0]]}"
+        )
+
+    def train(self, key: tuple[int, int], skipped: dict[str, str]) -> Example:
+        """The augmented example of (epoch, index in the split), or of the next readable sample."""
+        epoch, index = key
+        sample = self.first_readable((*self.names[index:], *self.names[:index]), skipped)
+        return self.transform.train(sample, numpy_generator(self.seed, "augment", epoch, index))
+
+    def test(self, key: str, skipped: dict[str, str]) -> Example | None:
+        """The example of a name for evaluation, or None if it cannot be read."""
+        sample = self.read(key, skipped)
+        return None if sample is None else self.transform.test(sample)
+
+
+def collate(examples: Sequence[Example], advice: str = "") -> Batch:
+    """Stack examples of one size (see `rgbt.types.Batch` for shapes and dtypes).
+
+    `advice` ends the message if sizes differ; it names the key to change.
+
+    Raises:
+        InputError: images or labels differ in size, naming the first two that do; only some of the
+            labels carry confidences.
+    """
+    first = examples[0]
+    for example in examples[1:]:
+        for what in ("rgb", "label"):
+            expected, found = getattr(first, what).shape[:2], getattr(example, what).shape[:2]
+            if found != expected:
+                raise InputError(
+                    f"all {what} images of one batch must have one size, got "
+                    f"{expected[0]}x{expected[1]} ('{first.name}') and {found[0]}x{found[1]} "
+                    f"('{example.name}'){advice}."
+                )
+        if (first.confidence is None) != (example.confidence is None):
+            raise InputError(
+                f"all labels of one batch must carry confidences, or none; '{first.name}' and "
+                f"'{example.name}' differ. Write the pseudo-labels of the whole split again."
+            )
+
+    def stacked(images: Iterable[NDArray[Any] | None]) -> Tensor | None:
+        present = [image for image in images if image is not None]
+        return torch.from_numpy(np.stack(present)) if present else None
+
+    rgb_BHWC = torch.from_numpy(np.stack([example.rgb for example in examples]))
+    thermal_BHW = torch.from_numpy(np.stack([example.thermal for example in examples]))
+    return Batch(
+        rgb=rgb_BHWC.permute(0, 3, 1, 2).contiguous(),
+        thermal=thermal_BHW[:, None],
+        label=torch.from_numpy(np.stack([example.label for example in examples])),
+        name=tuple(example.name for example in examples),
+        centre_yx=torch.tensor([example.centre_yx for example in examples]),
+        position=stacked(example.position for example in examples),
+        original_hw=torch.tensor([example.original_hw for example in examples]),
+        confidence=stacked(example.confidence for example in examples),
+    )
+
+
+@dataclass(frozen=True)
+class LoadedBatch:
+    """The result of a worker.
+
+    Attributes:
+        batch: a dataclass of tensors; None if every sample was left out, or after an error.
+        skipped: name -> error.
+        error: message of an InputError; a text, because torch wraps exceptions of workers.
+    """
+
+    batch: Loadable | None = None
+    skipped: dict[str, str] = field(default_factory=dict)
+    error: str = ""
+
+    def pin_memory(self) -> LoadedBatch:
+        """The batch in pinned memory; called by a thread of the loader."""
+        return self if self.batch is None else replace(self, batch=_each(self.batch, _pinned))
+
+
+class BatchReader(Dataset[LoadedBatch]):
+    """Makes the batch of a list of keys.
+
+    Args:
+        make_example: called once per key.
+        advice: see `collate`.
+    """
+
+    def __init__(self, make_example: MakeExample, advice: str):
+        self.make_example = make_example
+        self.advice = advice
+
+    def __getitem__(self, keys: list[Any]) -> LoadedBatch:
+        """The batch of `keys`, without the samples that are left out."""
+        skipped: dict[str, str] = {}
+        try:
+            found = [self.make_example(key, skipped) for key in keys]
+            examples = [example for example in found if example is not None]
+            batch = collate(examples, self.advice) if examples else None
+            if batch is not None and get_worker_info() is not None:
+                batch = _each(batch, _shared)
+        except InputError as error:
+            return LoadedBatch(skipped=skipped, error=str(error))
+        return LoadedBatch(batch, skipped)
 
 
 class Batches(Iterator[Kind]):
@@ -84,7 +237,13 @@ class Batches(Iterator[Kind]):
             # Without it the loader draws the seed of its workers from the global generator.
             generator=torch.Generator(),
         )
-        self._loaded = cast(Iterator[LoadedBatch], _started(loader, settings.num_workers))
+        # Processes are started with these signals blocked in all threads: some libraries, such as
+        # Arrow, start threads of their own in a process as soon as it is forked.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
+        try:
+            self._loaded = cast(Iterator[LoadedBatch], iter(loader))
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     def __next__(self) -> Kind:
         """The next batch that holds at least one sample.
@@ -107,7 +266,7 @@ class Batches(Iterator[Kind]):
                 ) from error
             for name, reason in loaded.skipped.items():
                 if name not in self.skipped:
-                    LOG.warning("skipped '%s': %s", name, reason)
+                    LOG.warning("%s", without_controls(f"skipped '{name}': {reason}"))
             self.skipped.update(loaded.skipped)
             if loaded.error:
                 self.close()
@@ -119,24 +278,6 @@ class Batches(Iterator[Kind]):
         """Stop the worker processes; no batch can be read afterwards."""
         # Workers end when the loader's iterator is deleted, and a traceback may keep it alive.
         self._loaded = iter(())
-
-
-def _started(loader: DataLoader[Any], num_workers: int) -> Iterator[Any]:
-    """The loader's iterator, which starts its worker processes.
-
-    Raises:
-        InputError: the system has no shared memory or locks left.
-    """
-    try:
-        # A loader that fails while it starts prints its own traceback. These locks, a few more than
-        # it needs, fail earlier.
-        _ = [multiprocessing.Lock() for _ in range(LOCKS_PER_WORKER * num_workers)]
-        with signals_blocked():
-            return iter(loader)
-    except OSError as error:
-        if error.errno != errno.ENOSPC:
-            raise
-        raise InputError(no_shared_memory(str(error.strerror))) from None  # not a disk
 
 
 def train_batches(  # noqa: PLR0913 - most trainings draw no classes
@@ -154,9 +295,8 @@ def train_batches(  # noqa: PLR0913 - most trainings draw no classes
 
     Epoch e is a permutation of the split drawn from (seed, "order", e), cut into whole batches; the
     incomplete last one is dropped. Sample i of epoch e is augmented from (seed, "augment", e, i).
-    So ``steps=range(10, 20)`` continues ``range(10)`` exactly.
-
-    With `rare`, sample i of epoch e is drawn by its class from (seed, "rare class", e, i) instead.
+    So ``steps=range(10, 20)`` continues ``range(10)`` exactly. With `rare`, sample i of epoch e is
+    drawn by its class from (seed, "rare class", e, i) instead.
 
     Raises:
         InputError: the split is smaller than a batch, or, with on_error="skip", unreadable; the
@@ -164,20 +304,19 @@ def train_batches(  # noqa: PLR0913 - most trainings draw no classes
     """
     per_epoch = steps_per_epoch(dataset, settings, split)
     names = dataset.names(split)
-    source = SplitReader(dataset, names, transform, settings.on_error == "skip")
-    make: MakeExample = TrainExamples(source, transform.train, seed)
+    source = Examples(dataset, names, transform, settings.on_error == "skip", seed)
+    make: MakeExample = source.train
     if rare is not None:
         from rgbt.data.rare_classes import RareClassExamples  # few runs draw by class
 
-        make = RareClassExamples(source, transform.train, seed, rare)
+        make = RareClassExamples(source, rare)
     order = partial(numpy_generator, seed, "order")
     whole_batches = _train_keys(
         len(names), settings.batch_size, per_epoch, steps, None if rare else order
     )
     own_samples = slice(rank(), None, num_processes())
     keys = (keys[own_samples] for keys in whole_batches)
-    reader = BatchReader(make, partial(collate, advice=CROP_ADVICE))
-    return Batches(reader, keys=keys, settings=settings)
+    return Batches(BatchReader(make, CROP_ADVICE), keys=keys, settings=settings)
 
 
 def eval_batches(
@@ -188,14 +327,11 @@ def eval_batches(
     Process r of W has the batches r, r + W, r + 2 W, ..., possibly none.
     """
     names = dataset.names(split)
-    source = SplitReader(dataset, names, transform, settings.on_error == "skip")
+    source = Examples(dataset, names, transform, settings.on_error == "skip")
     size = settings.eval_batch_size
     keys = [list(names[start : start + size]) for start in range(0, len(names), size)]
-    return Batches(
-        BatchReader(EvalExamples(source), partial(collate, advice=EVAL_ADVICE)),
-        keys=keys[rank() :: num_processes()],
-        settings=settings,
-    )
+    reader = BatchReader(source.test, EVAL_ADVICE)
+    return Batches(reader, keys=keys[rank() :: num_processes()], settings=settings)
 
 
 def steps_per_epoch(
@@ -217,16 +353,11 @@ def steps_per_epoch(
 
 
 def check_batch_size(settings: LoaderSettings, processes: int) -> None:
-    """Refuse a training batch that this number of processes cannot share equally.
-
-    Raises:
-        InputError: the number does not divide the samples of a batch.
-    """
+    """Refuse a training batch that this number of processes cannot share equally (InputError)."""
     if settings.batch_size % processes:
         raise InputError(
             f"data.batch_size is {settings.batch_size}, which {processes} devices cannot share "
-            f"equally. Set data.batch_size to a multiple of {processes}, or trainer.devices to a "
-            f"divisor of {settings.batch_size}."
+            f"equally; set a multiple of {processes}, or another trainer.devices."
         )
 
 
@@ -251,3 +382,116 @@ def _train_keys(
 
 def _unchanged(loaded: Any) -> Any:
     return loaded
+
+
+def start_worker(_: int) -> None:
+    """Settings of a worker process."""
+    # There is one process per core; threads of OpenCV would compete with them.
+    cv2.setNumThreads(0)
+    # A terminal and a cluster signal all processes of a run. The main process needs its workers
+    # to finish its step, and then ends them. A fork server starts workers without our mask.
+    signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """Exit when the main process sends SIGTERM, or has ended."""
+    # Not os.getppid: in a sweep a server forks the workers, and lives longer than the main process.
+    parent = multiprocessing.parent_process()
+    assert parent is not None, "a worker has a main process"
+    while parent.is_alive():
+        received = signal.sigtimedwait(ENDING, LOOK_S)
+        if received and received.si_signo == signal.SIGTERM and received.si_pid == parent.pid:
+            break
+    os._exit(0)
+
+
+def _each(batch: Any, change: Callable[[Tensor], Tensor]) -> Any:
+    """`batch`, a dataclass, with `change` applied to each of its tensors."""
+    values = {each.name: getattr(batch, each.name) for each in fields(batch)}
+    tensors = {name: value for name, value in values.items() if isinstance(value, Tensor)}
+    return replace(batch, **{name: change(value) for name, value in tensors.items()})
+
+
+def _pinned(tensor: Tensor) -> Tensor:
+    return tensor.pin_memory()
+
+
+def _shared(tensor: Tensor) -> Tensor:
+    """`tensor` in memory that the main process can read.
+
+    The worker's queue would do so too, but in a thread whose errors are not reported: the main
+    process would wait forever.
+    """
+    try:
+        tensor.share_memory_()  # type: ignore[no-untyped-call]
+    except RuntimeError as error:
+        raise InputError(
+            f"The loader processes cannot get shared memory in /dev/shm ({error}). Enlarge it "
+            "(docker run --shm-size=8g), or load in the main process with data.num_workers=0."
+        ) from None
+    return tensor
+
+
+@dataclass(frozen=True)
+class LoadedPair:
+    """The batches of both domains; on the device they are `TwoDomains`.
+
+    Attributes:
+        source: with labels.
+        target: with or without labels.
+        step: optimiser step that it is for, counted from the start of the run.
+    """
+
+    source: Loadable
+    target: Loadable
+    step: int
+
+    @property
+    def name(self) -> tuple[str, ...]:
+        """Names of all samples, those of the source first."""
+        return self.source.name + self.target.name
+
+    def to(self, device: torch.device | str) -> TwoDomains:
+        """Both batches on `device` (see `Batch.to`)."""
+        return TwoDomains(self.source.to(device), self.target.to(device), self.step)
+
+
+class PairedBatches(Iterator[LoadedPair]):
+    """A batch of the source with a batch of the target, each from its own stream.
+
+    The two lists may differ in length. Each is shuffled again at its end, and an epoch of the run
+    is one of the source. Each process has its own samples of both (`train_batches`).
+
+    Args:
+        source: of the labelled domain.
+        target: of the other one.
+        first: number of the first pair, counted from the start of the run.
+        per_step: pairs of one optimiser step, whose number they have.
+    """
+
+    def __init__(
+        self, source: Batches[Loadable], target: Batches[Loadable], *, first: int, per_step: int
+    ) -> None:
+        self._both = (source, target)
+        self._numbers = count(first)
+        self._per_step = per_step
+
+    def __next__(self) -> LoadedPair:
+        """The next pair; errors as of `Batches`."""
+        try:
+            source, target = [next(each) for each in self._both]
+        except BaseException:
+            self.close()
+            raise
+        return LoadedPair(source, target, next(self._numbers) // self._per_step)
+
+    @property
+    def skipped(self) -> dict[str, str]:
+        """Name -> error, of the samples skipped so far."""
+        return self._both[0].skipped | self._both[1].skipped
+
+    def close(self) -> None:
+        """Stop the worker processes of both."""
+        for each in self._both:
+            each.close()

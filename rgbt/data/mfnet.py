@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-import re
+from pathlib import Path
 from typing import Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from rgbt.checks import InputError
-from rgbt.data.file_dataset import Expected, FileDataset, SplitNames
-from rgbt.data.folder.frames import FolderFrame, Patterns
-from rgbt.data.folder.splits import ByList
+from rgbt.data.file_dataset import FileDataset
+from rgbt.data.files import read_array
 from rgbt.data.images import PairPattern, PairReader
 from rgbt.data.labels import indices
-from rgbt.data.named_files import existing_root
+from rgbt.data.patterns import Frame, Patterns
+from rgbt.data.splits import ByList
+from rgbt.dataset import LabelledDataset, reader_of
 from rgbt.ranges import Colour, Names, NumClasses, Text
 
 Layout = Literal["packed", "folders"]
@@ -24,24 +28,14 @@ PALETTE = (
     *((0, 0, 0), (64, 0, 128), (64, 64, 0), (0, 128, 192), (0, 0, 192)),
     *((128, 128, 0), (64, 64, 128), (192, 128, 128), (192, 64, 0)),
 )
-LAYOUTS: dict[Layout, PairPattern] = {
-    "packed": PairPattern("images/{name}.png", "images/{name}.png", "labels/{name}.png"),
-    "folders": PairPattern("RGB/{name}.png", "Thermal/{name}.png", "Label/{name}.png"),
+LAYOUTS: dict[Layout, tuple[str, str, str]] = {
+    "packed": ("images/{name}.png", "images/{name}.png", "labels/{name}.png"),
+    "folders": ("RGB/{name}.png", "Thermal/{name}.png", "Label/{name}.png"),
 }
-FOLDERS = {
-    name: tuple(dict.fromkeys(str(text).partition("/")[0] for text in patterns))
-    for name, patterns in LAYOUTS.items()
-}
-EITHER_LAYOUT = " or ".join("+".join(folders) for folders in FOLDERS.values())
 SPLITS = {split: f"{split}.txt" for split in ("train", "val", "test", "test_day", "test_night")}
 
-NAME = re.compile(r"\d{5}[DN](_flip)?")
 MIRRORED = "_flip"
-
-
-def time_of(name: str) -> str:
-    """The last letter of `name` before the suffix of mirrored copies: D by day, N at night."""
-    return name.removesuffix(MIRRORED)[-1:]
+NEXT = "next"
 
 
 class MFNet(FileDataset):
@@ -57,25 +51,12 @@ class MFNet(FileDataset):
     the SpatialSeg and Temporal downloads. Class 0 is a class ("unlabeled", trained and scored as
     in the published tables); 255 is ignored.
 
-    Args:
-        root: folder that holds the split lists.
-        name: see `FileDataset`, as `num_classes`, `classes` and `palette`.
-        background: classes that are no object, see `rgbt.dataset.LabelledDataset`.
-        splits: split -> list file in `root`; two splits may share one list.
-        layout: "packed", "folders", or "auto": the one with existing folders (packed first).
-
-    Raises:
-        InputError: no such root, no known layout, or numbers of classes, names and colours differ.
+    Arguments: the keys of conf/dataset/mfnet.yaml, which describes each. InputError: no such
+    root, another layout, or settings that do not fit each other.
     """
 
-    images = PairReader(
-        layouts=tuple(PairPattern(*layout[:2]) for layout in LAYOUTS.values()),
-        packed_advice="dataset.layout=folders for separate images",
-    )
+    images = PairReader(layouts=tuple(PairPattern(*layout[:2]) for layout in LAYOUTS.values()))
     mirrored = MIRRORED
-    expected = Expected(
-        "mfnet", day_night={"train": (410, 374), "val": (205, 187), "test": (205, 188)}
-    )
 
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
         self,
@@ -89,23 +70,23 @@ class MFNet(FileDataset):
         splits: dict[Text, Text] = SPLITS,
         layout: Literal["auto"] | Layout = "auto",
     ) -> None:
-        folder = existing_root(root, f"that holds {EITHER_LAYOUT} and the split lists")
-        super().__init__(folder, name, num_classes, classes, palette, background=background)
-        for known, folders in FOLDERS.items():
-            if layout in ("auto", known) and all((folder / each).is_dir() for each in folders):
-                self.layout = known
-                break
-        else:
-            wanted = EITHER_LAYOUT if layout == "auto" else "+".join(FOLDERS[layout])
-            raise InputError(
-                f"dataset.root: '{root}' does not hold the folders {wanted}; give the folder of "
-                "the data set itself."
-            )
+        super().__init__(root, name, num_classes, classes, palette, background=background)
+        folders = {
+            known: {text.partition("/")[0] for text in texts} for known, texts in LAYOUTS.items()
+        }
+        wanted = [each for each in LAYOUTS if layout in ("auto", each)]
+        found = [
+            each for each in wanted if all((self.root / name).is_dir() for name in folders[each])
+        ]
+        if not found:
+            listed = " or ".join("+".join(sorted(folders[each])) for each in wanted)
+            raise InputError(f"dataset.root: '{root}' does not hold the folders {listed}.")
+        self.layout = found[0]
         self.patterns = Patterns.of(*LAYOUTS[self.layout])
         self.codes = indices(num_classes)
-        self.rule = ByList(folder, dict(splits), "dataset.splits")
+        self.rule = ByList(self.root, dict(splits), "dataset.splits")
 
-    def frame(self, name: str) -> FolderFrame:
+    def frame(self, name: str) -> Frame:
         """The files of `name`."""
         return self.patterns.frame(self.root, name, {"name": name})
 
@@ -114,15 +95,14 @@ class MFNet(FileDataset):
 
         None if none does, InputError if only some do.
         """
-        without = [name for name in names if time_of(name) not in ("D", "N")]
-        if len(without) == len(names):
-            return None
-        if without:
+        times = [name.removesuffix(MIRRORED)[-1:] for name in names]
+        without = [name for name, time in zip(names, times, strict=True) if time not in ("D", "N")]
+        if without and len(without) < len(names):
             raise InputError(
-                f"the name '{without[0]}' does not state a time of day: expected a name that ends "
-                f"in D or N (before '{MIRRORED}'); rename it in the split lists of {self.root}."
+                f"the name '{without[0]}' in {self.root} does not state a time of day, as others "
+                f"do: expected a name that ends in D or N (before '{MIRRORED}')."
             )
-        return tuple(time_of(name) == "N" for name in names)
+        return None if without else tuple(time == "N" for time in times)
 
     @property
     def title(self) -> str:
@@ -133,12 +113,95 @@ class MFNet(FileDataset):
         """Lists by time of day only repeat names of others, and need not exist."""
         return super().repeats(split) and not self.has(split)
 
-    def own_problems(self, lists: SplitNames) -> list[str]:
-        """Names of another form."""
-        return [
-            f"split {split}: '{name}' is not five digits followed by D or N (with or without "
-            f"'{MIRRORED}')."
-            for split, names in lists.items()
-            for name in dict.fromkeys(names)
-            if not NAME.fullmatch(name)
-        ]
+
+class NextFrames:
+    """The second frames of a data set, and the positions of their points in the first frames.
+
+    They are in the folder `next` beside the images. `synth` writes it (``dataset.ego_forward_m``);
+    any data set in MFNet's layout may hold one:
+
+        next/                 the same layout and the same names, one moment later
+        next/flow/NAME.npy    (H, W, 2) float32: for every pixel of the second frame, how many
+                              (rows, columns) further the same point lies in the first; NaN if it
+                              is hidden there or outside
+
+    Args:
+        first: the data set of the first frames, in MFNet's layout.
+
+    Attributes:
+        dataset: reader of the second frames.
+
+    Raises:
+        InputError: the data set has no second frames, or another layout.
+    """
+
+    def __init__(self, first: LabelledDataset) -> None:
+        first = reader_of(first)
+        root = first.root / NEXT
+        if not isinstance(first, MFNet) or not (root / "flow").is_dir():
+            raise InputError(
+                f"{first.name} ({first.root}) has no second frames: expected MFNet's layout with "
+                f"the folder {NEXT}/ of images, labels and flow. dataset=synth writes it with "
+                "dataset.ego_forward_m=0.5; frames=virtual does not require it."
+            )
+        self.dataset = MFNet(
+            str(root),
+            name=f"{first.name}/{NEXT}",
+            num_classes=first.num_classes,
+            classes=first.classes,
+            background=first.background,
+            palette=first.palette,
+            splits=dict(first.splits),
+            layout=first.layout,
+        )
+
+    def flow(self, name: str, image_hw: tuple[int, int]) -> NDArray[np.float32]:
+        """Offset (H, W, 2) of each pixel of the second frame to its position in the first.
+
+        Args:
+            name: of the frame.
+            image_hw: its size, which the flow must have.
+
+        Returns:
+            (rows, columns); NaN if the point was not visible.
+
+        Raises:
+            InputError: no flow, or one of another size.
+        """
+        path = self._path(name)
+        flow = read_array(path, "rows and columns")
+        if flow.dtype.kind != "f" or flow.shape != (*image_hw, 2):
+            raise InputError(
+                f"{path}: expected real numbers of shape {(*image_hw, 2)} (rows, columns) like its "
+                f"frame, got {flow.dtype} of shape {flow.shape}."
+            )
+        return np.asarray(flow, np.float32)
+
+    def source(self, name: str, image_hw: tuple[int, int]) -> tuple[NDArray[np.int64], ...]:
+        """Position of each pixel of the second frame in the first frame.
+
+        Args:
+            name: of the frame.
+            image_hw: its size, which the flow must have.
+
+        Returns:
+            rows and columns (H, W) int64, nearest pixels; -1 if the point was not visible.
+
+        Raises:
+            InputError: no flow, one of another size, or one that leads out of the image.
+        """
+        flow = self.flow(name, image_hw)
+        grid = np.moveaxis(np.indices(image_hw), 0, -1)
+        seen = np.isfinite(flow[..., 0]) & np.isfinite(flow[..., 1])
+        first_yx = np.rint(np.where(seen[..., None], grid + flow, 0)).astype(np.int64)
+        if (first_yx < 0).any() or (first_yx >= image_hw).any():
+            raise InputError(
+                f"{self._path(name)} points outside the first frame of "
+                f"{image_hw[0]}x{image_hw[1]} pixels; points that were not visible there must be "
+                "NaN."
+            )
+        first_yx[~seen] = -1
+        return first_yx[..., 0], first_yx[..., 1]
+
+    def _path(self, name: str) -> Path:
+        return self.dataset.root / "flow" / f"{name}.npy"

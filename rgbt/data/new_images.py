@@ -1,170 +1,197 @@
-"""Find pairs of files in a folder of new images, by the layouts of a data set.
-
-A folder is read by the first layout of which it has a complete pair; other files are named.
-"""
+"""Find the images to predict: a split, a folder of new images, one file, two files or arrays."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, Literal
 
-from rgbt.checks import InputError
-from rgbt.data.files import channels, decode
-from rgbt.data.folder.pattern import NO_VALUES, PathMatch, Pattern, WordValues, in_order, what_is_in
-from rgbt.data.images import PairPattern
+import numpy as np
+
+from rgbt.checks import InputError, nearest
+from rgbt.data.images import PairPattern, PairReader, ReadsPairs
+from rgbt.data.patterns import Pattern, in_order, what_is_in
+from rgbt.dataset import LabelledDataset, reader_of
+from rgbt.types import Sample
 
 KINDS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
-"""Suffixes of image files, in lower case; thermal images may also be .npy."""
+"""Suffixes of image files."""
 
 PLAIN = (
-    PairPattern("rgb/{name}.png", "thermal/{name}.png"),
+    *(PairPattern(f"rgb/{{name}}{kind}", f"thermal/{{name}}{kind}") for kind in KINDS),
     PairPattern("{name}.png", "{name}.png"),
 )
-"""Layouts accepted for every data set; suffixes may be any of `KINDS`."""
-
-KEY = "input"
+"""Layouts that are read for every data set: folders rgb and thermal, or files of four channels."""
 
 
-class NewPair(NamedTuple):
-    """Two files and the name of their sample; the same file twice if thermal is its channel 4."""
-
-    name: str
-    rgb: Path
-    thermal: Path
-
-
-class NewImages(NamedTuple):
-    """Content of a folder.
+@dataclass(frozen=True)
+class ToPredict:
+    """Images to predict, in order.
 
     Attributes:
-        pairs: in the order of their names, 9 before 10.
-        alone: RGB image without a thermal image -> expected path of the latter.
-        others: images that belong to no pair and are not labels.
+        names: of the images; names of written files begin with them.
+        read: name -> its images, without a label.
+        folders: of the files, which must not be overwritten.
+        skipped: name -> error, of skipped images; `samples` adds to it.
     """
 
-    pairs: tuple[NewPair, ...]
-    alone: dict[Path, Path]
-    others: tuple[Path, ...]
+    names: tuple[str, ...]
+    read: Callable[[str], Sample]
+    folders: frozenset[Path]
+    skipped: dict[str, str] = field(default_factory=dict)
+
+    def samples(self, on_error: Literal["raise", "skip"]) -> Iterator[Sample]:
+        """The images one after the other.
+
+        Raises:
+            InputError: one cannot be read and `on_error` is "raise", or none can.
+        """
+        for name in self.names:
+            try:
+                sample = self.read(name)
+            except InputError as error:
+                if on_error == "raise":
+                    raise
+                self.skipped[name] = str(error)
+                continue
+            yield sample
+        if self.names and self.skipped.keys() >= set(self.names):
+            first = self.skipped[self.names[0]]
+            raise InputError(f"none of the {len(self.names)} images can be read: {first}")
+
+    def check_out(self, out: Path) -> None:
+        """Refuse a folder that holds the input images, which would be overwritten."""
+        if out.resolve() in {folder.resolve() for folder in self.folders}:
+            raise InputError(f"out={out} holds the input images; choose another folder.")
+        twice = [name for name in self.names if f"{name}_overlay" in self.names]
+        if twice:
+            raise InputError(
+                f"out: the files of '{twice[0]}' and '{twice[0]}_overlay' are the same."
+            )
 
 
-def find_pairs(folder: Path, layouts: Sequence[PairPattern], name: str) -> NewImages:
-    """The pairs in the existing `folder`.
+def of_split(dataset: LabelledDataset, split: str) -> ToPredict:
+    """The images of a split; labels are not read if the data set can read pairs alone."""
+    names = dataset.names(split)
+    reader = reader_of(dataset)
+    read = reader.pair if isinstance(reader, ReadsPairs) else reader.read
+    folders = {path.parent for name in names for path in dataset.files(name)}
+    return ToPredict(names, read, frozenset(folders))
 
-    The layouts of the data set `name` are tried from its root, then from the folders inside it
-    (without their first pieces), then `PLAIN`. Case is ignored. Other suffixes than those of a
-    layout are used only if its own give no pair.
+
+def of_path(dataset: LabelledDataset, text: str, on_error: Literal["raise", "skip"]) -> ToPredict:
+    """The image of a packed file, or the pairs of a folder.
+
+    A folder is read by the patterns of the data set, or by `PLAIN`: the first of them that matches
+    a pair. An RGB image without a thermal image is left out if `on_error` is "skip".
 
     Raises:
-        InputError: no complete pair, two of one name, or two thermal images for one RGB image.
+        InputError: no such path, no pair in the folder, two pairs of one name, an RGB image without
+            a thermal one.
     """
-    tiers, inner = [], list(layouts)
-    while inner:
-        tiers.append(inner)
-        inner = [shorter for each in inner if (shorter := _inside(each)) is not None]
-    alone: dict[Path, Path] = {}
-    for tier in (*tiers, *([plain] for plain in PLAIN)):
-        for any_kind in (False, True):
-            found = _in_tier(folder, tier, any_kind=any_kind)
-            if found.pairs:
-                return found
-            alone = alone or found.alone
-    reason = f"{folder} holds {what_is_in(folder)}"
-    for rgb, thermal in list(alone.items())[:1]:
-        reason = (
-            f"the thermal image of {rgb} would be {thermal}, but {thermal.parent} holds "
-            f"{what_is_in(thermal.parent)}"
-        )
-    raise InputError(
-        f"{KEY}={folder} holds no pair of images: {reason}. Expected the files of {name} "
-        f"({'; '.join(map(str, layouts))}; also without the first folders), folders rgb and "
-        "thermal with equal names, or PNG files of four channels (red, green, blue, thermal). To "
-        "predict a single pair, use rgb=FILE thermal=FILE instead of input."
-    )
-
-
-def _inside(layout: PairPattern) -> PairPattern | None:
-    """The layout relative to its first folder; None if RGB and thermal have different ones."""
-    first, _, rgb = layout.rgb.partition("/")
-    other, _, thermal = layout.thermal.partition("/")
-    if first != other or "{" not in rgb or "{" not in thermal:
-        return None
-    if not set(Pattern(thermal, KEY).words) <= set(Pattern(rgb, KEY).words):
-        return None
-    of_label, _, label = (layout.label or "").partition("/")
-    return PairPattern(rgb, thermal, label if of_label == first and "{" in label else None)
-
-
-def _in_tier(folder: Path, layouts: Sequence[PairPattern], *, any_kind: bool) -> NewImages:
-    pairs: dict[Path, NewPair] = {}
-    alone: dict[Path, Path] = {}
-    labels: set[Path] = set()
-    for layout in layouts:
-        labels |= {path for path, _ in _files(layout.label, folder, any_kind=True)}
-        rgb = Pattern(layout.rgb, KEY)
-        candidates = dict(_files(layout.rgb, folder, any_kind=any_kind))
-        is_packed = layout.rgb == layout.thermal
-        if is_packed and not all(map(_has_four_channels, list(candidates)[:1])):
-            continue
-        for path in candidates.keys() - pairs.keys():
-            values = candidates[path]
-            thermal = path if is_packed else _partner(layout, folder, values, any_kind=any_kind)
-            if thermal is None:
-                alone[path] = Pattern(layout.thermal, KEY).path(folder, values)
-            else:
-                pairs[path] = NewPair("_".join(values[each] for each in rgb.words), path, thermal)
-    partners = {pair.thermal for pair in pairs.values() if pair.thermal != pair.rgb} | labels
-    named: dict[str, NewPair] = {}
-    for pair in (pairs[path] for path in sorted(pairs) if path not in partners):
-        if pair.name in named:
-            raise InputError(
-                f"{KEY}: {named[pair.name].rgb} and {pair.rgb} would both be called "
-                f"'{pair.name}'; rename or move one of them."
-            )
-        named[pair.name] = pair
-    used = {*pairs, *partners}
-    every = sorted(
-        path
-        for path in (folder.rglob("*") if named else ())
-        if path.suffix.lower() in KINDS and not path.name.startswith(".")
-    )
-    return NewImages(
-        tuple(named[name] for name in sorted(named, key=in_order)),
-        {path: alone[path] for path in sorted(alone) if path not in used},
-        tuple(path for path in every if path not in {*used, *alone}),
-    )
-
-
-def _files(
-    text: str | None, folder: Path, values: WordValues = NO_VALUES, *, any_kind: bool
-) -> Iterator[PathMatch]:
-    """Images whose paths match `text`, or match it except for the suffix."""
-    if text is None:
-        return
-    stem, dot, ending = text.rpartition(".")
-    kinds = (ending, *(kind[1:] for kind in (*KINDS, ".npy"))) if any_kind and dot else (ending,)
-    for kind in dict.fromkeys(kinds):
-        yield from Pattern(f"{stem}{dot}{kind}", KEY).files(folder, values, any_case=True)
-
-
-def _partner(
-    layout: PairPattern, folder: Path, values: WordValues, *, any_kind: bool
-) -> Path | None:
-    """The thermal image of an RGB image; an exact match of the name is preferred."""
-    exact = Pattern(layout.thermal, KEY).path(folder, values)
-    found = list(dict(_files(layout.thermal, folder, values, any_kind=any_kind)))
-    if exact in found or not found:
-        return exact if found else None
-    if len(found) > 1:
+    folder, images = Path(text), images_of(dataset)
+    if folder.is_file():
+        return of_files(dataset, folder, folder)
+    if not folder.is_dir():
         raise InputError(
-            f"{KEY}={folder}: {found[0]} and {found[1]} could both be the thermal image of one "
-            "pair; remove or rename one of them."
+            f"input={text}: this is neither a file, nor a folder, nor a split of {dataset.name}; "
+            f"splits: {nearest(text, dataset.splits)}."
         )
-    return found[0]
+    pairs: dict[str, tuple[Path, Path]] = {}
+    layouts = iter((*images.layouts, *PLAIN))
+    while not any(thermal.is_file() for _, thermal in pairs.values()):
+        layout = next(layouts, None)
+        if layout is None:
+            wanted = "; ".join(map(str, images.layouts))
+            raise InputError(
+                f"input={folder} holds no pair of images but {what_is_in(folder)}; expected "
+                f"{wanted}, or folders rgb and thermal with equal names, or PNG files of four "
+                "channels. To predict a single pair, use rgb=FILE thermal=FILE."
+            )
+        pairs = _pairs(folder, layout)
+    alone = {str(rgb): f"{rgb} has no {path}." for rgb, path in pairs.values() if not path.exists()}
+    for reason in list(alone.values())[: on_error == "raise"]:
+        raise InputError(
+            f"input={text}: {len(alone)} RGB images have no thermal image: {reason} Restore it, or "
+            "skip such images with data.on_error=skip."
+        )
+    pairs = {name: pair for name, pair in pairs.items() if str(pair[0]) not in alone}
+    folders = {folder, *(file.parent for pair in pairs.values() for file in pair)}
+    names = tuple(sorted(pairs, key=in_order))
+    read: Callable[[str], Sample] = lambda name: images.read(name, *pairs[name])  # noqa: E731
+    return ToPredict(names, read, frozenset(folders), alone)
 
 
-def _has_four_channels(path: Path) -> bool:
-    try:
-        return channels(decode(path)) == 4
-    except InputError:  # reading it raises this error again
-        return True
+def _pairs(folder: Path, layout: PairPattern) -> dict[str, tuple[Path, Path]]:
+    """Name -> RGB and expected thermal image, of one layout."""
+    rgb, thermal = Pattern(layout.rgb, "input"), Pattern(layout.thermal, "input")
+    found = rgb.files(folder)
+    # If all are in one folder, "{name}.png" matches 7.png and 7_ir.png, which is "{name}_ir.png".
+    partners = {thermal.path(folder, v) for _, v in found if rgb.text != thermal.text}
+    pairs: dict[str, tuple[Path, Path]] = {}
+    for path, values in found:
+        name = "_".join(values[word] for word in rgb.words)
+        if path in partners:
+            continue
+        if name in pairs:
+            raise InputError(f"input: {pairs[name][0]} and {path} would both be called '{name}'.")
+        pairs[name] = (path, thermal.path(folder, values))
+    return pairs
+
+
+def of_files(dataset: LabelledDataset, rgb: Path, thermal: Path) -> ToPredict:
+    """One pair, named after its RGB file; the same file twice is a packed one."""
+    images = images_of(dataset)
+    return ToPredict(
+        (rgb.stem,),
+        lambda name: images.read(name, rgb, thermal),
+        frozenset({rgb.parent, thermal.parent}),
+    )
+
+
+def of_arrays(dataset: LabelledDataset, rgb: Any, thermal: Any) -> Sample:
+    """One pair of arrays, without a label.
+
+    Thermal values of 8 bits are grey levels, as in `Sample`. Values of other types are those of the
+    camera, and both images are read like files of the data set: cut, and scaled by its
+    ``thermal_range``.
+
+    Args:
+        dataset: of the network.
+        rgb: (H, W, 3) uint8, RGB order.
+        thermal: (H, W), uint8 or camera values.
+
+    Raises:
+        InputError: other types, shapes or values.
+    """
+    rgb, thermal = np.asarray(rgb), np.asarray(thermal)
+    if rgb.dtype != np.uint8 or rgb.shape != (*thermal.shape, 3) or thermal.ndim != 2:
+        raise InputError(
+            "expected rgb uint8 of shape (rows, columns, 3) and thermal of shape (rows, columns), "
+            f"got {rgb.dtype} {rgb.shape} and {thermal.dtype} {thermal.shape}."
+        )
+    reader = reader_of(dataset)
+    if thermal.dtype != np.uint8:
+        images = images_of(dataset)
+        path = Path("thermal")
+        return images.sample("image", rgb, images.check_values(thermal, path), path)
+    limits = reader.images.thermal_range if isinstance(reader, ReadsPairs) else None
+    if limits is not None and limits[0] < 255:
+        raise InputError(
+            f"thermal: 8 bits may be grey levels or values of dataset.thermal_range={list(limits)};"
+            " convert values of the camera to float32, or give the paths of both files."
+        )
+    return Sample(np.ascontiguousarray(rgb), np.ascontiguousarray(thermal), None, "image")
+
+
+def images_of(dataset: LabelledDataset) -> PairReader:
+    """The reader of new images of a data set; InputError if it has none."""
+    reader = reader_of(dataset)
+    if not isinstance(reader, ReadsPairs):
+        raise InputError(
+            f"{type(reader).__name__} does not declare how to read new images. Name one of its "
+            f"splits ({', '.join(reader.splits)}), or give the class `images` and `pair` (see "
+            "docs/tutorials/own-data-set.md)."
+        )
+    return reader.images

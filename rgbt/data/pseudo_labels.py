@@ -23,7 +23,7 @@ from typing_extensions import TypedDict
 
 from rgbt.checks import InputError
 from rgbt.data.files import decode
-from rgbt.data.labels import read_label
+from rgbt.data.labels import indices
 from rgbt.dataset import DatasetWrapper, LabelledDataset
 from rgbt.files.plain_files import read_json
 from rgbt.types import Sample
@@ -134,18 +134,13 @@ def read_pair(
         raise InputError(
             f"'{name}' has no pseudo-label in {folder}; predict the split that it belongs to."
         )
-    label = read_label(label_path(folder, name), num_classes)
+    label = indices(num_classes).read(label_path(folder, name))
     path = confidence_path(folder, name)
-    confidence = decode(path) if path.is_file() else None
-    if confidence is None or confidence.dtype != np.uint16 or confidence.shape != label.shape:
-        found = (
-            "none that can be read"
-            if confidence is None
-            else f"{8 * confidence.itemsize} bit, {' x '.join(map(str, confidence.shape))}"
-        )
+    confidence = decode(path)
+    if confidence.dtype != np.uint16 or confidence.shape != label.shape:
         raise InputError(
-            f"{path}: expected one channel of 16 bit and {label.shape[0]} x {label.shape[1]} "
-            f"pixels, as the label has, got {found}; choose another folder."
+            f"{path}: expected 16 bits of shape {label.shape}, as the label has, got "
+            f"{confidence.dtype} of shape {confidence.shape}."
         )
     return label, np.asarray(confidence, np.uint16)
 
@@ -181,10 +176,9 @@ class PseudoLabelled(DatasetWrapper):
         sample = self.source.read(name)
         label, confidence = self.labels.read(name, len(self.labels.classes))
         if label.shape != sample.thermal.shape:
-            sizes = [" x ".join(map(str, each.shape)) for each in (sample.thermal, label)]
             raise InputError(
-                f"'{name}' has {sizes[0]} pixels but its pseudo-label in {self.labels.folder} "
-                f"{sizes[1]}; predict them for the data set as it is cut now."
+                f"'{name}' has {sample.thermal.shape} pixels but its pseudo-label in "
+                f"{self.labels.folder} {label.shape}; predict them for the data set as it is now."
             )
         carried = confidence if self.with_confidence else None
         return replace(sample, label=label, confidence=carried)

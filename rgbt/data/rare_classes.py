@@ -7,19 +7,23 @@ that batches depend neither on loader processes nor on where a run resumes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError
-from rgbt.data.class_pixels import PixelCounts, class_pixels
+from rgbt.data.labels import PixelCounts, label_pixels
 from rgbt.data.loader_settings import LoaderSettings
-from rgbt.data.reader import SplitReader
+from rgbt.data.loaders import Examples
 from rgbt.dataset import LabelledDataset
 from rgbt.randomness import numpy_generator
-from rgbt.types import Example, Sample
+from rgbt.types import Example
+
+NUM_THREADS = 4
+"""Labels that are decoded at a time."""
 
 MOST_REDRAWS = 10
 """Times that a crop is drawn again. Released: DAFormer, mmseg/datasets/uda_dataset.py."""
@@ -94,23 +98,29 @@ def count_rare_classes(
         InputError: a label cannot be read (on_error="raise"); a class occurs, but no image has
             enough of it; nothing is labelled.
     """
-    names = dataset.names(split)
-    pixels = class_pixels(dataset, names, skip_errors=settings.on_error == "skip")
+
+    def counted(name: str) -> PixelCounts:
+        try:
+            label = dataset.label(name)
+        except InputError:
+            if settings.on_error == "raise":
+                raise
+            label = None
+        nothing = np.zeros(dataset.num_classes, np.int64)
+        return nothing if label is None else label_pixels(label, dataset.num_classes)[:-1]
+
+    with ThreadPoolExecutor(NUM_THREADS) as pool:
+        pixels = np.stack(list(pool.map(counted, dataset.names(split))))
     scored = np.array([name not in dataset.unscored for name in dataset.classes])
     classes = np.flatnonzero(scored & pixels.any(0))
-    if not classes.size:
-        raise InputError(
-            f"data.sampling=rare_classes: the labels of {split} of {dataset.name} have no pixel of "
-            "a class; set data.sampling=shuffled."
-        )
     least = settings.min_class_pixels
-    for index in classes:
-        if pixels[:, index].max() <= least:
-            raise InputError(
-                f"data.min_class_pixels={least}: no image of {split} of {dataset.name} has more "
-                f"pixels of '{dataset.classes[index]}', at most {pixels[:, index].max()}; set a "
-                "lower number."
-            )
+    rare = [dataset.classes[index] for index in classes if pixels[:, index].max() <= least]
+    if rare or not classes.size:
+        raise InputError(
+            f"data.min_class_pixels={least}: no image of {split} of {dataset.name} has more pixels "
+            f"of '{rare[0] if rare else 'any class'}'; set a lower number, or "
+            "data.sampling=shuffled."
+        )
     return RareClasses(
         classes=tuple(classes.tolist()),
         names=tuple(dataset.classes[index] for index in classes),
@@ -125,15 +135,11 @@ class RareClassExamples:
     """Augmented examples of drawn classes; a key is (epoch, number of the sample in it).
 
     Attributes:
-        source: reads samples.
-        make: (sample, generator) -> example: the transform's `train`.
-        seed: run seed.
+        source: reads and augments samples.
         rare: how images are drawn.
     """
 
-    source: SplitReader
-    make: Callable[[Sample, np.random.Generator], Example]
-    seed: int
+    source: Examples
     rare: RareClasses
 
     def __call__(self, key: Sequence[int], skipped: dict[str, str]) -> Example:
@@ -146,14 +152,14 @@ class RareClassExamples:
         Raises:
             InputError: no image of the class can be read.
         """
-        drawn, positions = self.rare.draw(numpy_generator(self.seed, "rare class", *key))
+        drawn, positions = self.rare.draw(numpy_generator(self.source.seed, "rare class", *key))
         names = [self.source.names[position] for position in positions]
         sample = self.source.first_readable(names, skipped)
-        rng = numpy_generator(self.seed, "augment", *key)
-        example = self.make(sample, rng)
+        rng = numpy_generator(self.source.seed, "augment", *key)
+        example = self.source.transform.train(sample, rng)
         least = self.rare.min_crop_pixels
         for _ in range(MOST_REDRAWS):
             if least is None or np.count_nonzero(example.label == drawn) > least:
                 break
-            example = self.make(sample, rng)
+            example = self.source.transform.train(sample, rng)
         return example

@@ -13,7 +13,6 @@ again.
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
@@ -77,9 +76,12 @@ class State:
 
     @classmethod
     def of(cls, payload: Mapping[str, Any]) -> State:
-        """The state in a checkpoint; TypeError or ValueError if there is none."""
+        """The state in a checkpoint; TypeError if there is none."""
         text = json.dumps(payload.get("state"))
-        return TypeAdapter(cls).validate_json(text, strict=True)
+        try:
+            return TypeAdapter(cls).validate_json(text, strict=True)
+        except ValueError as error:
+            raise TypeError(one_line(str(error))) from error
 
 
 def training_payload(
@@ -110,7 +112,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     Raises:
         InputError: missing, damaged, or not a checkpoint of rgbt; nothing in it is executed.
     """
-    payload = _shared(read_torch_file(path), {})
+    payload = read_torch_file(path)
     loaded: dict[str, Any] = payload if isinstance(payload, dict) else {}
     networks = {key: loaded[key] for key in ("model", UNAVERAGED) if key in loaded}
     for group in ("others", "optimizers"):
@@ -119,17 +121,6 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     if "model" not in loaded or not all(isinstance(each, dict) for each in networks.values()):
         raise InputError(f"{path} is no checkpoint written by `rgbt run`.")
     return loaded
-
-
-def _shared(value: Any, known: dict[int, Any]) -> Any:
-    """`value` with one object for equal texts: what is saved again has the same bytes."""
-    if isinstance(value, str):
-        return sys.intern(value)
-    if id(value) not in known and isinstance(value, dict):
-        known[id(value)] = {_shared(k, known): _shared(each, known) for k, each in value.items()}
-    elif id(value) not in known and isinstance(value, list | tuple):
-        known[id(value)] = type(value)(_shared(each, known) for each in value)
-    return known.get(id(value), value)
 
 
 def check_origin(payload: Mapping[str, Any], source: Path, key: str, settings: str) -> None:
@@ -258,9 +249,8 @@ class Checkpoints:
         """Write the weights if this step is the best, then the state."""
         self.folder.mkdir(parents=True, exist_ok=True)
         if state.step == state.best_step > 0:
-            # The same bytes after resuming: without the versions of modules.
             origin = {"key": state.key, "settings": state.settings}
-            save(self.best, {"model": dict(payload["model"]), "step": state.step, NOTE: origin})
+            save(self.best, {"model": payload["model"], "step": state.step, NOTE: origin})
         save(self.last, payload)
 
     def load(self) -> tuple[dict[str, Any], State]:
@@ -299,7 +289,7 @@ class Checkpoints:
     def _saying_what_to_do(self) -> Iterator[None]:
         try:
             yield
-        except (InputError, TypeError, ValueError) as error:
+        except (InputError, TypeError) as error:
             said = one_line(str(error)).rstrip(".")
             advice = "remove the folder and rerun the command to train the run from the start."
             raise RunError(f"{self.folder}: {said}; {advice}") from error

@@ -109,8 +109,9 @@ class Recipe:
         batch_size: samples per step, of all devices together.
         max_steps: optimiser steps.
         eval_every: steps between evaluations.
-        train_sizes: shortest edges that the training resize draws from, pixels.
-        crop_hw: training crop, pixels.
+        train_sizes: shortest edges that the training resize draws from, pixels; null keeps the
+            files' size.
+        crop_hw: training crop, pixels; null takes whole images.
         lr: base learning rate.
         backbone_multiplier: factor of `lr` for what is pretrained.
         critic_lr: learning rate of a discriminator, where the scheme has one.
@@ -144,8 +145,9 @@ class Scale:
     Attributes:
         name: of its file.
         pixel_factor: size of a scale's images relative to the paper's, for ``${px:...}``.
-        train_sizes: shortest edges that the training resize draws from, pixels.
-        crop_hw: training crop, pixels.
+        train_sizes: shortest edges that the training resize draws from, pixels; null keeps the
+            files' size.
+        crop_hw: training crop, pixels; null takes whole images.
         test_short_edge: shortest edge of the images in evaluation; null keeps the files' size.
             Counts are always taken at the resolution of the label file.
         num_points: points per mask at which the set criterion compares masks.
@@ -160,8 +162,8 @@ class Scale:
 
     name: Text
     pixel_factor: Annotated[float, Interval(gt=0, le=16)]
-    train_sizes: Lengths
-    crop_hw: Size
+    train_sizes: Lengths | None
+    crop_hw: Size | None
     test_short_edge: Pixels | None
     num_points: NumPoints
     batch_size: BatchSize

@@ -14,12 +14,18 @@ import rgbt
 from rgbt.assembly.session import Session
 from rgbt.checks import InputError
 from rgbt.class_scores import classes_of
-from rgbt.data.batches import collate
 from rgbt.data.domains import TestedHead
-from rgbt.data.to_predict import of_split
+from rgbt.data.loaders import collate
+from rgbt.data.new_images import of_split
 from rgbt.evaluation.prediction import heads_of, view_of
-from rgbt.exported.description import Description, require_packages
-from rgbt.exported.graph import OPSET, ScoresOfImages, onnx_bytes, traced
+from rgbt.exported.graph import (
+    OPSET,
+    Description,
+    ScoresOfImages,
+    onnx_bytes,
+    require_packages,
+    traced,
+)
 from rgbt.exported.onnx_network import ExportedNetwork
 from rgbt.files.atomic import write_atomic
 from rgbt.requirements import record_of

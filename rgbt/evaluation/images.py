@@ -20,9 +20,9 @@ from rgbt.class_scores import best_of
 from rgbt.config.command import composing
 from rgbt.config.component import build
 from rgbt.config.compose import compose
-from rgbt.data.batches import collate
 from rgbt.data.label_map import LabelMap
-from rgbt.data.loaders import eval_batches
+from rgbt.data.loaders import collate, eval_batches
+from rgbt.data.new_images import ToPredict, of_files, of_path, of_split
 from rgbt.data.pseudo_labels import (
     FORMAT,
     FULL,
@@ -31,9 +31,8 @@ from rgbt.data.pseudo_labels import (
     confidence_path,
     label_path,
 )
-from rgbt.data.to_predict import ToPredict, of_files, of_path, of_split
 from rgbt.engine.progress import progress
-from rgbt.evaluation.prediction import Predictor, decode_ahead, view_of, weights_digest
+from rgbt.evaluation.prediction import Predictor, view_of, weights_digest
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.evaluation.segmentation import legend_of
 from rgbt.files.atomic import write_atomic
@@ -78,9 +77,8 @@ def write_images(
             write_png(out / f"{sample.name}.png", classes)
             written += 1
             display.advance(task)
-    for what, named in (("skipped", [*images.skipped.values()]), ("of no pair", images.others)):
-        if named:
-            info(f"{len(named)} image(s) {what}; the first: {named[0]}")
+    for first in list(images.skipped.values())[:1]:
+        info(f"{len(images.skipped)} image(s) skipped; the first: {first}")
     return f"{written} images in {out.resolve()}"
 
 
@@ -164,7 +162,6 @@ def _predict(
     label_map: LabelMap | None,
 ) -> dict[str, Any]:
     """Predict and write all images of the split; the part of the manifest that counts them."""
-    decode_ahead(session, request.split)
     names = session.dataset.names(request.split)
     batches = eval_batches(session.dataset, request.split, session.transform, session.loading)
     predictor = Predictor(session, session.model, request)

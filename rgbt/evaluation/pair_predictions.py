@@ -27,8 +27,7 @@ from rgbt.config.common_options import PredictionFormatOptions
 from rgbt.config.component import build
 from rgbt.config.compose import compose
 from rgbt.data.loader_settings import LoaderSettings
-from rgbt.data.prediction_files import Affixes, find_affixes, opened_folder
-from rgbt.data.prediction_format import FormatOptions, recognise_format
+from rgbt.data.predictions import Affixes, FormatOptions, PredictionReader, prediction_paths
 from rgbt.data.sequences import FramesInOrder
 from rgbt.dataset import LabelledDataset
 from rgbt.engine.progress import progress
@@ -39,7 +38,6 @@ from rgbt.evaluation.temporal_consistency import Pairs, count_predicted, to_byte
 from rgbt.metrics import pair_list
 from rgbt.metrics.metric import Regions
 from rgbt.metrics.pair_list import PAIR_LIST, Frames, ListedPair, PairList, second_name
-from rgbt.terminal import info
 from rgbt.transforms.views import ViewSets
 from rgbt.types import Batch
 
@@ -132,24 +130,17 @@ def _write(batch: Batch, names: Sequence[str], out: Path) -> None:
 class FolderPredictions:
     """Frames `names` predicted by any method, read from its label images in `folder`.
 
-    `sentence` is what the files were read as. InputError: files are missing or of several kinds.
+    InputError: files are missing.
     """
 
     def __init__(
         self, folder: Path, dataset: LabelledDataset, names: Sequence[str], given: FormatOptions
     ) -> None:
-        there = {
-            each.relative_to(folder).with_suffix("").as_posix() for each in folder.rglob("*.png")
-        }
-        affixes = find_affixes(there, names, given.affixes)
-        self._paths = {name: folder / f"{affixes.file_stem(name)}.png" for name in names}
-        missing = [name for name in names if affixes.file_stem(name) not in there]
+        self._paths = prediction_paths(folder, names, given.affixes)
+        missing = [path for path in self._paths.values() if not path.is_file()]
         if missing:
-            path = self._paths[missing[0]]
-            raise InputError(f"predictions={path} and {len(missing) - 1} more do not exist.")
-        paths = self._paths.values()
-        self._reader, said = recognise_format(paths, dataset.classes, dataset.palette, given)
-        self.sentence = " ".join(filter(None, (said, affixes.sentence)))
+            raise InputError(f"predictions={missing[0]} and {len(missing) - 1} more do not exist.")
+        self._reader = PredictionReader(dataset.classes, dataset.palette, given)
 
     def __call__(self, batch: Batch, names: Sequence[str]) -> Tensor:
         """See `rgbt.evaluation.pair_frames.Predict`; InputError: a file of another size."""
@@ -180,9 +171,6 @@ def count_predictions(
         names = wanted.images
     affixes = Affixes(options.prefix, options.suffix)
     given = FormatOptions(form=options.format, palette=options.palette, affixes=affixes)
-    with opened_folder(folder) as opened:
-        predict = FolderPredictions(opened, source.dataset, names, given)
-        request = EvaluationRequest(split=split, keep=pairing.pictured(source, split))
-        pairs = count_predicted(source, predict, request, pairing, CPU)
-    info(predict.sentence)
-    return pairs, source
+    predict = FolderPredictions(folder, source.dataset, names, given)
+    request = EvaluationRequest(split=split, keep=pairing.pictured(source, split))
+    return count_predicted(source, predict, request, pairing, CPU), source

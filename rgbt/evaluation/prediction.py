@@ -17,13 +17,11 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from rich.progress import TaskID
 from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
 from rgbt.assembly.session import Session
 from rgbt.checks import InputError, check_choice
-from rgbt.data.cache.dataset import cached_layer
 from rgbt.data.domains import TestedHead
 from rgbt.data.loaders import eval_batches
 from rgbt.dataset import LabelledDataset, Subset
@@ -139,23 +137,6 @@ def counts_of(
         absent=data.regions.absent,
         run=data.run if isinstance(data, Session) else "",
     )
-
-
-def decode_ahead(session: Session, *splits: str) -> None:
-    """Fill the image cache with these splits, if there is one, before other processes read it."""
-    dataset = cached_layer(session.dataset)
-    if dataset is None:
-        return
-    names = tuple(name for split in splits for name in dataset.names(split))
-    tasks: dict[str, TaskID] = {}
-    with progress() as display:
-
-        def advance(what: str, done: int, total: int) -> None:
-            if what not in tasks:
-                tasks[what] = display.add_task(what, total=total, note="images")
-            display.update(tasks[what], completed=done, total=total)
-
-        dataset.ensure(names, advance)
 
 
 def weights_digest(model: nn.Module) -> str:

@@ -36,7 +36,7 @@ from rgbt.types import VIEWS, Sample, View
 
 if TYPE_CHECKING:
     from rgbt.data.label_map import LabelMap
-    from rgbt.data.to_predict import ToPredict
+    from rgbt.data.new_images import ToPredict
     from rgbt.metrics.details import Details
 
 DEFAULT_VIEW, BEST = "default", "best"  # of the options `modality` and `checkpoint`

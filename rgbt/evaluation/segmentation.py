@@ -78,11 +78,10 @@ def evaluate(session: Session, model: nn.Module, request: EvaluationRequest) -> 
         InputError: a file cannot be read, or a request that does not fit the network or the data.
     """
     predictor = Predictor(session, model, request)
-    split, wanted = request.split, request.batch_norm
+    split = request.split
     if request.corruption is not None:
         session = request.corruption.applied_to(session, split)
     counters = _detail_counters(session, request)
-    prediction.decode_ahead(session, split, *(wanted.splits if wanted is not None else ()))
     parts = []
     unmeasured: list[str] = []
     for names, sources in prediction.parts_of_split(session.dataset, request):

@@ -18,7 +18,7 @@ from rgbt.assembly.session import Session
 from rgbt.checks import InputError
 from rgbt.engine.progress import progress
 from rgbt.evaluation.pair_frames import Compared, FlowRecord, Pairing, Predict, Scenes, scenes
-from rgbt.evaluation.prediction import EvaluationData, Predictor, counts_of, decode_ahead
+from rgbt.evaluation.prediction import EvaluationData, Predictor, counts_of
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.metrics.counting import pair_counts
 from rgbt.metrics.counts import Counts
@@ -57,7 +57,6 @@ def count_pairs(
     assert request.corruption is None, "pairs are counted of clean images"
     # Requests that cannot be measured are refused before anything is drawn or predicted.
     pairing.check(session)
-    decode_ahead(session, request.split)
     predictor = Predictor(session, model, request)
     return count_predicted(
         session, lambda batch, _: predictor.classes(batch), request, pairing, session.device

@@ -38,13 +38,13 @@ FLICKER = "flicker"
 """Share of the pixels seen in three frames whose class changes and changes back; 0 is best."""
 
 BOUNDARY_MIOU = "boundary_mIoU"
-"""Mean over classes of the boundary IoU (`rgbt.metrics.boundary`)."""
+"""Mean over classes of the boundary IoU (`rgbt.metrics.details`)."""
 
 BOUNDARY_IOU = "boundary_IoU"
 """The same of one class: ``of_class("car", BOUNDARY_IOU)``."""
 
 ECE = "ECE"
-"""Expected calibration error (`rgbt.metrics.calibration`); 0 is best."""
+"""Expected calibration error (`rgbt.metrics.details`); 0 is best."""
 
 DISTANCE = "distance"
 SIZE = "size"
@@ -71,14 +71,6 @@ def of_class(name: str, score: str) -> str:
     return f"class/{name}/{score}"
 
 
-def in_bin(kind: str, name: str) -> str:
-    """A score of one bin: ``in_bin(DISTANCE, "10-20")``, the mIoU between 10 and 20 metres.
-
-    ``in_bin(SIZE, "64-256")`` is the mean recall of objects of 64 to 256 pixels.
-    """
-    return f"{kind}/{name}"
-
-
 def in_region(number: int, name: str) -> str:
     """A score of boundaries, calibration, distance or size inside one region."""
     return f"region/{number}/{name}"
@@ -102,8 +94,10 @@ def by_head(head: str, name: str) -> str:
     return f"{head}_head/{name}"
 
 
-FRACTIONS = {MIOU, MACC, MPRECISION, MF1, PIXEL_ACCURACY, BOUNDARY_MIOU, BOUNDARY_IOU, ECE}
-FRACTIONS |= {WARPING_ERROR, FLICKER}
+FRACTIONS = {
+    *(MIOU, MACC, MPRECISION, MF1, PIXEL_ACCURACY, BOUNDARY_MIOU, BOUNDARY_IOU, ECE),
+    *(WARPING_ERROR, FLICKER),
+}
 
 
 def in_percent(name: str, value: float) -> float:

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
-from rgbt.checks import InputError
+from rgbt.checks import InputError, one_line
 from rgbt.files.atomic import write_atomic
 from rgbt.files.plain_files import read_json
 
@@ -91,27 +91,16 @@ def read_list(place: Path) -> PairList:
 
 
 def check_same(listed: PairList, wanted: PairList) -> None:
-    """Refuse predictions of other images than those that are counted."""
+    """Refuse predictions of other images than those that are counted, by InputError."""
     if not listed.complete:
         raise InputError(
             f"the export of {listed.name} was interrupted; rerun its command, then predict again."
         )
-    for key in ("split", "frames"):
+    for key in ("split", "frames", "dataset", "views", "pairs"):
         given, expected = getattr(wanted, key), getattr(listed, key)
         if given != expected:
             raise InputError(
-                f"the pairs were exported with {key}={expected}, but {key}={given} is counted; "
-                f"set {key}={expected}."
+                f"{key}: the pairs were exported from {one_line(expected)} ({listed.name}, sets "
+                f"{', '.join(listed.sets) or 'none'}), but {one_line(given)} ({wanted.name}, sets "
+                f"{', '.join(wanted.sets) or 'none'}) is counted; give the settings of the export."
             )
-    if listed.dataset != wanted.dataset:
-        raise InputError(
-            f"the pairs were exported from other images ({listed.name}, {listed.dataset[:8]}) than "
-            f"those of {wanted.name} ({wanted.dataset[:8]}); name the data set of the export."
-        )
-    if (listed.views, listed.pairs) != (wanted.views, wanted.pairs):
-        sets = ", ".join(listed.sets) or "real frames"
-        raise InputError(
-            f"the pairs were exported with another set of views ({sets}; {listed.views}) than the "
-            f"one that is counted ({', '.join(wanted.sets) or 'real frames'}; {wanted.views}); "
-            "give the consistency settings of the export."
-        )

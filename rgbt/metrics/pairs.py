@@ -24,7 +24,7 @@ import numpy as np
 
 from rgbt.metrics import names
 from rgbt.metrics.metric import Absent
-from rgbt.metrics.scores import Matrices, Scores, iou, known_mean, ratio
+from rgbt.metrics.scores import Matrices, Scores, class_mean, iou, ratio
 
 Protocol = Literal["aligned", "released", "next", "flow", "triples"]
 PROTOCOLS: tuple[Protocol, ...] = get_args(Protocol)
@@ -165,4 +165,4 @@ def _by_set(pairs: Matrices) -> Scores:
 
 def _over_sets(scores: Scores) -> Scores:
     """(..., S, K) -> (..., K)."""
-    return known_mean(np.swapaxes(scores, -1, -2))
+    return class_mean(np.swapaxes(scores, -1, -2))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 from rgbt.metrics import names
@@ -10,12 +9,7 @@ from rgbt.metrics.counts import Counts
 from rgbt.metrics.details import Details, details_of
 from rgbt.metrics.pairs import HEADLINES, protocol_of
 
-IMAGE = "image"
-"""Column of the whole image."""
-
 MEAN = "mean"
-
-ALL_IMAGES = "all images"
 
 
 @dataclass(frozen=True)
@@ -40,87 +34,69 @@ class ScoreGrid:
 
 def score_grid(counts: Counts) -> ScoreGrid:
     """The scores of counts; only their classes, partition and time of day are used."""
-    details = details_of(counts.partition)
-    protocol = protocol_of(counts.partition)
+    details, protocol = details_of(counts.partition), protocol_of(counts.partition)
+    labels = {
+        name: f"{name} (not in means)" if name in counts.unscored else name
+        for name in counts.classes
+    }
+
+    def by_class(scores: tuple[str, ...]) -> list[tuple[str, tuple[str, ...]]]:
+        return [
+            (label, tuple(names.of_class(name, each) for each in scores))
+            for name, label in labels.items()
+        ]
+
     if protocol is not None:
-        return _of_pairs(HEADLINES[protocol], counts)
+        scores = HEADLINES[protocol]
+        rows = [*by_class(scores), ("all images", scores)]
+        rows += [
+            (part, tuple(names.subset(part, each) for each in scores)) for part in counts.parts()
+        ]
+        columns = tuple(score.replace("_", " ") for score in scores)
+        return ScoreGrid("Consistency of pairs of frames in percent", columns, tuple(rows))
+    groups = 1 if details is None else details.groups
+    numbers = range(1, counts.counts.shape[1] // groups + 1)
+    regions = tuple(f"region {number}" for number in numbers)
     if details is None:
-        regions = range(1, counts.counts.shape[1] + 1)
-        row = (*map(names.region, regions), names.MIOU, names.VAR)
-        columns = (*map(_region, regions), names.MIOU, names.VAR)
+        row = (*map(names.region, numbers), names.MIOU, names.VAR)
+        columns = (*regions, names.MIOU, names.VAR)
         return ScoreGrid("mIoU in percent by region", columns, ((names.MIOU, row),))
-    numbers = range(1, counts.counts.shape[1] // details.groups + 1)
     if details.bins:
-        return _by_bin(details, counts, numbers)
-    columns = (IMAGE, *map(_region, numbers))
+        means = _bins(details)
+        rows = [*by_class(means), (MEAN, means)]
+        rows += [
+            (f"{MEAN}, {region}", tuple(names.in_region(number, each) for each in means))
+            for number, region in zip(numbers, regions, strict=True)
+        ]
+        title = "IoU in percent by distance in metres"
+        if details.kind == "size":
+            title = "Recall in percent by size of the object in pixels"
+        return ScoreGrid(title, details.bins, tuple(rows))
+    columns = ("image", *regions)
     if details.kind == "calibration":
         title = f"Expected calibration error in percent points, {details.groups} bins"
         return ScoreGrid(title, columns, (("all pixels", _everywhere(names.ECE, numbers)),))
-    of_class = _everywhere(names.BOUNDARY_IOU, numbers)
-    rows = [
-        (label, tuple(names.of_class(name, each) for each in of_class))
-        for name, label in _labels(counts)
-    ]
+    rows = by_class(_everywhere(names.BOUNDARY_IOU, numbers))
     rows.append((MEAN, _everywhere(names.BOUNDARY_MIOU, numbers)))
     title = f"Boundary IoU in percent, width {100 * details.setting[0]:g} % of the image diagonal"
     title += ", with the border of the image" if details.with_border else ""
     return ScoreGrid(title, columns, tuple(rows))
 
 
-def _of_pairs(scores: tuple[str, ...], counts: Counts) -> ScoreGrid:
-    """By class, and of all images, of those of the day and of the night."""
-    rows = [
-        (label, tuple(names.of_class(name, score) for score in scores))
-        for name, label in _labels(counts)
-    ]
-    rows.append((ALL_IMAGES, scores))
-    rows += [
-        (part, tuple(names.subset(part, score) for score in scores)) for part in counts.parts()
-    ]
-    columns = tuple(score.replace("_", " ") for score in scores)
-    return ScoreGrid("Consistency of pairs of frames in percent", columns, tuple(rows))
-
-
 def headlines(counts: Counts) -> tuple[str, ...]:
     """The scores of details that a comparison shows: means, by region or bin."""
     details = details_of(counts.partition)
-    if details is None:
-        raise ValueError(f"{counts.partition}: expected counts of details.")
+    assert details is not None, "counts of details"
     if details.bins:
-        return tuple(names.in_bin(details.kind, each) for each in details.bins)
+        return _bins(details)
     score = names.ECE if details.kind == "calibration" else names.BOUNDARY_MIOU
     return _everywhere(score, range(1, counts.counts.shape[1] // details.groups + 1))
 
 
-def _by_bin(details: Details, counts: Counts, numbers: Sequence[int]) -> ScoreGrid:
-    means = tuple(names.in_bin(details.kind, each) for each in details.bins)
-    rows = [
-        (label, tuple(names.of_class(name, mean) for mean in means))
-        for name, label in _labels(counts)
-    ]
-    rows.append((MEAN, means))
-    rows += [
-        (f"{MEAN}, {_region(number)}", tuple(names.in_region(number, mean) for mean in means))
-        for number in numbers
-    ]
-    title = "IoU in percent by distance in metres"
-    if details.kind == "size":
-        title = "Recall in percent by size of the object in pixels"
-    return ScoreGrid(title, details.bins, tuple(rows))
+def _bins(details: Details) -> tuple[str, ...]:
+    return tuple(f"{details.kind}/{each}" for each in details.bins)
 
 
-def _everywhere(score: str, numbers: Sequence[int]) -> tuple[str, ...]:
+def _everywhere(score: str, numbers: range) -> tuple[str, ...]:
     """A score in the whole image and in each region."""
     return (score, *(names.in_region(number, score) for number in numbers))
-
-
-def _labels(counts: Counts) -> list[tuple[str, str]]:
-    """Name and label of each class."""
-    return [
-        (name, f"{name} (not in means)" if name in counts.unscored else name)
-        for name in counts.classes
-    ]
-
-
-def _region(number: int) -> str:
-    return f"region {number}"

@@ -5,17 +5,12 @@ kept. Scores are fractions 0..1; variances are in squared percent points, as the
 
 A score whose denominator has no pixel (0 / 0) is, by `absent`:
     "released": 0 and takes part in means, as in the CRM and SpatialSeg releases and their tables,
-                and in the averages that the RTFNet and Temporal releases report. (These two keep
-                NaN for the class; the scalars that Temporal sends to TensorBoard are plain means,
-                NaN where a class is.)
+                and in the averages that the RTFNet and Temporal releases report.
     "exclude":  NaN and is left out of means, as in the CMX release.
-The denominator decides, by score and by region. IoU and F1 lack one where the class is neither
-labelled nor predicted: one false pixel of a class that no label holds makes its IoU 0 with either
-convention, so that "exclude" still lowers the mean. Recall lacks one where the class is not
-labelled, precision where it is not predicted; means of different scores may therefore be over
-different classes. The data set says which convention its published tables use (`dataset.absent`).
-Means are over the scored classes alone (`rgbt.metrics.counts.Counts.scored`): a class that is left
-out counts in none of them, whether it has pixels or not and whatever `absent` says.
+The denominator decides, by score and by region: IoU and F1 lack one where the class is neither
+labelled nor predicted, recall where it is not labelled, precision where it is not predicted. One
+false pixel of a class that no label holds makes its IoU 0 with either convention. Means are over
+the scored classes alone (`rgbt.metrics.counts.Counts.scored`).
 """
 
 from __future__ import annotations
@@ -68,18 +63,11 @@ def f1(counts: Matrices, absent: Absent) -> Scores:
     return ratio(2 * right, labelled + predicted, absent)
 
 
-def known_mean(scores: Scores) -> Scores:
-    """Mean over the last dimension, of anything but classes, without NaN: (..., X) -> (...).
-
-    NaN where nothing is left.
-    """
-    return _mean(scores, ~np.isnan(scores))
-
-
-def class_mean(scores: Scores, scored: Scored) -> Scores:
+def class_mean(scores: Scores, scored: Scored = None) -> Scores:
     """Mean over the scored classes without NaN, (..., K) -> (...); NaN where nothing is left."""
     known = ~np.isnan(scores)
-    return _mean(scores, known if scored is None else known & scored)
+    chosen = known if scored is None else known & scored
+    return _divide(np.where(chosen, scores, 0.0).sum(-1), chosen.sum(-1), np.nan)
 
 
 def miou(counts: Matrices, absent: Absent, scored: Scored) -> Scores:
@@ -102,8 +90,8 @@ def variance(region_scores: ArrayLike) -> Scores:
     all are.
     """
     percents = 100 * np.asarray(region_scores, dtype=np.float64)
-    distances = percents - known_mean(percents)[..., None]
-    return known_mean(distances**2)
+    distances = percents - class_mean(percents)[..., None]
+    return class_mean(distances**2)
 
 
 def pixel_accuracy(counts: Matrices) -> Scores:
@@ -162,12 +150,9 @@ MEANS: dict[str, Callable[[Matrices, Absent, Scored], Scores]] = {
 def summary(counts: Counts, absent: Absent) -> dict[str, float]:
     """Every score that is followed over a run, by its name in `rgbt.metrics.names`.
 
-    Over all images: means over the scored classes, variance over regions, mIoU of each region, IoU
-    of each class (unscored ones too); mIoU and variance again for day and for night if the data
-    set distinguishes them.
-
-    Returns:
-        name -> fraction, or squared percent points for the variance. NaN: nothing to score.
+    Means, variance over regions, mIoU of each region, IoU of each class (unscored ones too); mIoU
+    and variance again for day and for night if the data set distinguishes them. Fractions, squared
+    percent points for the variance; NaN: nothing to score.
     """
     whole, scored = counts.whole(), counts.scored
     by_class = iou(whole, absent)
@@ -234,12 +219,6 @@ def _sums(counts: Matrices) -> tuple[Scores, Scores, Scores]:
 def ratio(part: Scores, whole: Scores, absent: Absent) -> Scores:
     """``part / whole``; where that is 0 / 0 as `absent` says. Shapes are kept."""
     return _divide(part, whole, 0.0 if absent == "released" else np.nan)
-
-
-def _mean(scores: Scores, chosen: NDArray[np.bool_]) -> Scores:
-    """Mean over the last dimension of what is chosen; NaN where nothing is."""
-    total = np.where(chosen, scores, 0.0).sum(-1)
-    return _divide(total, chosen.sum(-1), np.nan)
 
 
 def _divide(part: Scores, whole: NDArray[np.generic], undefined: float) -> Scores:

@@ -20,13 +20,9 @@ class Critic(nn.Module):
     Source: AdaptSegNet, Sec. 3.2 ("discriminator"); HeatNet and the thesis use the same.
     Weights keep torch's initialisation, as released.
 
-    Args:
-        in_channels: of the map that is judged: K for scores or probabilities.
-        base_width: channels of the first convolution; doubled by each of the next three.
-        upsample: enlarge the verdicts 32 times, back to the size of the map (HeatNet); false:
-            one verdict per 32 pixels (AdaptSegNet, thesis with two heads).
-        align_corners: of that enlargement; false in HeatNet's release, true in the thesis' port
-            of it. Must be false where nothing is enlarged.
+    The arguments are the keys of `critic` in ``conf/scheme/adversarial_heatnet.yaml``; `base_width`
+    is doubled by each of the next three convolutions. `align_corners` is false in HeatNet's release
+    and true in the thesis' port of it; AdaptSegNet and the thesis with two heads do not enlarge.
 
     Raises:
         InputError: align_corners without upsample.

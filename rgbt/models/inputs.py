@@ -31,16 +31,9 @@ Deviation = Annotated[float, Interval(ge=0.001, le=10_000)]
 class Inputs(nn.Module):
     """Images in [0, 1] to what a network was trained on: ``(255 x - mean) / std`` per channel.
 
-    Args:
-        rgb_order: "rgb"; "bgr" as OpenCV reads files; or "gray": all three channels are the luma
-            0.299 R + 0.587 G + 0.114 B (ITU-R BT.601).
-        rgb_mean: in grey levels 0..255, in the order of `rgb_order`; as `rgb_std`, > 0.
-        rgb_std: see there.
-        thermal_mean: one value per channel that the network's thermal branch takes: the single
-            thermal channel is repeated for three; as `thermal_std`, > 0.
-        thermal_std: see there.
-        thermal_scale: "fixed": 255 is white; "image_max": every image is divided by its own
-            maximum first (an image of zeros stays one).
+    The arguments are the keys of ``conf/model/inputs/crm.yaml``. "gray" is the luma 0.299 R +
+    0.587 G + 0.114 B (ITU-R BT.601) in all three channels. A single thermal channel is repeated
+    for three values. With "image_max", an image of zeros stays one.
 
     Raises:
         InputError: not 1 or 3 thermal channels; lists of different length.

@@ -170,7 +170,7 @@ def _packed_counts(counts: Counts, shared: Path) -> bytes:
         "shared": _write_shared(common, shared),
         "dtype": array.dtype.str,
         "shape": array.shape,
-        **{name: getattr(counts, name) for name in ("partition", "dataset", "split", "absent")},
+        **{key: getattr(counts, key) for key in ("partition", "dataset", "split", "absent", "run")},
     }
     images_last = np.ascontiguousarray(np.moveaxis(array, 0, -1))
     planes = images_last.view(np.uint8).reshape(-1, array.itemsize).T

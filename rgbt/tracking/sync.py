@@ -10,10 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from rgbt.checks import InputError
+from rgbt.checks import InputError, without_controls
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
 from rgbt.runs.folder import REPLACED, RunFolder, is_finished, runs_dir_of, runs_in
+from rgbt.terminal import info
 from rgbt.tracking.mlflow_store import EXPERIMENT, MlflowTracking, StoreBusyError, reason_of
 from rgbt.tracking.tracker import Status
 
@@ -59,12 +60,12 @@ def main(options: Options, overrides: list[str]) -> int:
         try:
             status: Status = "RUNNING" if folder.is_locked() else "KILLED"
             run_id = tracking.sync(folder, "FINISHED" if is_finished(folder.path) else status)
-            sys.stdout.write(f"{folder.path}  ->  MLflow run {run_id}\n")
+            sys.stdout.write(without_controls(f"{folder.path}  ->  MLflow run {run_id}\n"))
         except Exception as error:  # A store may fail in any way; the next folder may be sent.
             if options.run and isinstance(error, InputError):
                 raise
             failed += 1
-            sys.stderr.write(f"rgbt: {folder.path} was not sent ({reason_of(error)}).\n")
+            info(f"{folder.path} was not sent ({reason_of(error)}).")
             if isinstance(error, StoreBusyError | TimeoutError):
                 break  # waited for once, not for every run
     sys.stdout.write(f"open MLflow  {tracking.ui_command()}\n")

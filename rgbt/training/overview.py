@@ -21,7 +21,7 @@ MILLION = 1e6
 
 
 def announce_training(setup: TrainingSetup, name: str, folder: Path) -> None:
-    """Print device, network, images, steps and run folder of a training.
+    """Print device, network, images, their sizes, steps and run folder of a training.
 
     With rare class sampling, also the probability of each class.
     """
@@ -33,6 +33,7 @@ def announce_training(setup: TrainingSetup, name: str, folder: Path) -> None:
         ("device", device_line(session)),
         ("network", f"{network_line(session)}{others}"),
         ("images", f"{session.dataset.name}: {', '.join(counts)}"),
+        ("sizes", ", ".join(f"{name} {h}x{w}" for name, (h, w) in setup.sizes.items())),
         *([("drawn", setup.rare.shares())] if setup.rare else []),
         ("steps", f"{trainer.max_steps} {_of_steps(setup)}"),
         ("folder", str(folder)),

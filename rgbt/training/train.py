@@ -21,7 +21,7 @@ from rgbt.checks import InputError
 from rgbt.data.domains import TestedHead
 from rgbt.engine.checkpoint import Checkpoints, State, restore_weights
 from rgbt.engine.trainer import WAIT_SHARE, Loaded, Trainer
-from rgbt.evaluation.prediction import decode_ahead, view_of
+from rgbt.evaluation.prediction import view_of
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.evaluation.segmentation import (
     EvaluationResult,
@@ -84,12 +84,8 @@ def train(
         announce_upstream(setup, description.name, upstream_of)
     else:
         announce_training(setup, description.name, spec.folder)
-    for turn in range(2):  # process 0 writes what is missing in the cache of images
-        if turn == min(rank(), 1):
-            decode_ahead(setup.session, *setup.names)
-        agreed(None)
     if rank() > 0:
-        Run(setup, SilentFolder(spec.folder), Tracking(), description).complete()
+        Training(setup, SilentFolder(spec.folder), Tracking(), description).complete()
         return
     tracking: Tracking = spec.tracking.build()
     if spec.is_finished:
@@ -99,7 +95,7 @@ def train(
             tracking.refresh(kept, known)
     folder = RunFolder(spec.folder)
     with folder.lock():
-        Run(setup, folder, tracking, description).complete()
+        Training(setup, folder, tracking, description).complete()
     if upstream_of:
         print_upstream_result(folder, description.name)
     else:
@@ -125,8 +121,8 @@ class SilentFolder(RunFolder):
 
 
 @dataclass(frozen=True)
-class Run:
-    """An unfinished run: trains, evaluates and fills its folder.
+class Training:
+    """The training of one run: trains, evaluates and fills its folder.
 
     `selected` are the counts of the last evaluation on the selection split, by the split and view.
     """

@@ -12,8 +12,8 @@ from analysis.details import entry as details_entry
 from analysis.flow_error import compare_flows, entry, read_measured
 from analysis.uncertainty import Resampling, compare
 from rgbt.checks import InputError
+from rgbt.metrics.counting import pair_counts
 from rgbt.metrics.counts import Counts
-from rgbt.metrics.pairs import pair_counts
 from tests.commands import Call, assert_one_sentence
 
 PAIRS = 24

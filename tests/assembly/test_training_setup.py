@@ -16,15 +16,13 @@ from rgbt.assembly import training_setup
 from rgbt.assembly.training_setup import set_up_training, validate
 from rgbt.checks import InputError
 from rgbt.config.compose import compose
-from rgbt.data import pairs, rare_classes
+from rgbt.data import rare_classes
 from rgbt.data.pseudo_labels import FORMAT
 from rgbt.engine.network_settings import Recomputed
-from rgbt.evaluation.prediction import decode_ahead
 from rgbt.run import main
 from rgbt.runs.run_spec import RunSpec
 from rgbt.runs.specify import specify
-from rgbt.types import Batch
-from tests.commands import SPLITS, Call, assert_one_sentence, words_of
+from tests.commands import Call, assert_one_sentence
 
 SIZES = (
     *("dataset=synth_freiburg", "dataset.num_train_day=3", "dataset.num_train_night=2"),
@@ -66,7 +64,7 @@ def test_rare_classes_are_those_of_the_source_as_it_is_labelled(
     for module, name, instead in (
         (rare_classes, "count_rare_classes", lambda *args: counted.append(args) or "rare"),
         (training_setup, "train_batches", lambda *args: drawn.append(args)),
-        (pairs, "PairedBatches", lambda *_, **__: None),
+        (training_setup, "PairedBatches", lambda *_, **__: None),
         (training_setup, "_labelled", lambda *_: relabelled),
     ):
         monkeypatch.setattr(module, name, instead)
@@ -166,32 +164,6 @@ def test_validate_view_of_the_teacher_passes(composed: Composed) -> None:
         spec = composed("multi_head_night_stage1", f"domains.target.{word}")
         validate(spec)
         assert not spec.folder.exists()
-
-
-@pytest.fixture
-def cached(data: Path, tmp_path: Path) -> RunSpec:
-    """A small network on MFNet, with a cache."""
-    model = ("model=mfnet_tiny", "loss=cross_entropy", "masker=none")
-    place = (f"data.cache={tmp_path / 'cache'}", "data.num_workers=0")
-    words = [word for word in words_of(data, tmp_path / "runs", *model) if "masker." not in word]
-    return specify(compose((*words, *place)))
-
-
-def test_all_that_is_read_is_decoded_before_the_first_step(
-    cached: RunSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A full or read-only disk is reported before anything is trained."""
-    validate(cached)
-    assert not (tmp_path / "cache").exists(), "a validation writes nothing"
-    setup = set_up_training(cached)
-    decode_ahead(setup.session, *setup.names)
-    dataset: Any = setup.session.dataset
-
-    monkeypatch.setattr(dataset.source, "read", None)  # nothing is decoded again
-    for split, names in SPLITS.items():
-        assert [dataset.read(name).name for name in names] == names, split
-    one = next(setup.batches(range(1)))
-    assert isinstance(one, Batch)
 
 
 def test_network_settings_are_applied_and_keep_the_loss(composed: Composed) -> None:

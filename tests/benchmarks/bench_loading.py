@@ -25,7 +25,7 @@ from torch.utils.data import DataLoader
 
 from rgbt.config.component import build
 from rgbt.config.compose import compose
-from rgbt.data.cache.dataset import CachedDataset
+from rgbt.data.cache import CachedDataset
 from rgbt.data.loaders import LoaderSettings, train_batches
 from rgbt.data.mfnet import MFNet
 from rgbt.dataset import LabelledDataset
@@ -79,8 +79,8 @@ def per_sample(batches: Iterator[Any]) -> tuple[float, float]:
 
 
 def speeds(dataset: MFNet, cache: Path) -> None:
-    mapped = CachedDataset(dataset, cache, num_threads=2)
-    _, built = seconds(lambda: mapped.ensure(dataset.names("train")))
+    mapped = CachedDataset(dataset, str(cache))
+    _, built = seconds(lambda: [mapped.read(name) for name in dataset.names("train")])
     ways: dict[str, Way] = {
         "release": released(dataset),
         "files": ours(dataset),
@@ -115,8 +115,7 @@ def compare(dataset: MFNet, cache: Path, draws: int) -> None:
     names = dataset.names("train")
     samples = ReleasedSamples(dataset.root, names)
     rng = np.random.default_rng(1)
-    mapped = CachedDataset(dataset, cache, num_threads=2)
-    mapped.ensure(names)
+    mapped = CachedDataset(dataset, str(cache))
 
     def theirs() -> Iterator[tuple[np.ndarray, np.ndarray]]:
         for index in rng.integers(len(names), size=draws):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from rgbt.checks import InputError
-from rgbt.data.folder.dataset import Folder
+from rgbt.data.folder import Folder
 from rgbt.randomness import numpy_generator
 from tests.conftest import write_png
 

@@ -1,4 +1,4 @@
-"""A small data set in the layouts of KP, with contents that follow from the names."""
+"""A small data set in the layout of KP, with contents that follow from the names."""
 
 from __future__ import annotations
 
@@ -53,19 +53,6 @@ def write_kp(root: Path, names: Iterable[str] = NAMES) -> Path:
         write_jpeg(image_path(root, name, "visible"), rgb)
         write_jpeg(image_path(root, name, "lwir"), np.dstack([thermal] * 3))
         write_png(root / "labels" / f"{name}.png", label)
-    return root
-
-
-def write_ms_uda(root: Path, names: Iterable[str] = NAMES) -> Path:
-    """Images and labels as MS-UDA has them."""
-    for name in names:
-        rgb, thermal, label = contents(name)
-        recording, video, frame = name.split("_")
-        time = "val_night" if recording in NIGHTS else "val_day"
-        folder = root / "pseudo_KP" / time
-        write_png(folder / f"{recording}_{video}_visible_{frame}.png", rgb)
-        write_png(folder / f"{recording}_{video}_lwir_{frame}.png", np.dstack([thermal] * 3))
-        write_png(root / "labels" / time / f"{name}.png", label)
     return root
 
 

@@ -1,8 +1,7 @@
-"""A small data set in the layouts of PST900, with contents that follow from the names."""
+"""A small data set in the layout of PST900, with contents that follow from the names."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -37,13 +36,4 @@ def write_pst900(root: Path, train: tuple[str, ...] = TRAIN, test: tuple[str, ..
     raw = np.full(HW, 30000, np.uint16)
     for kind in ("thermal_raw", "depth"):
         write_png(root / "train" / kind / f"{(train or TRAIN)[0]}.png", raw)
-    return root
-
-
-def write_lists(root: Path, lists: Mapping[str, tuple[str, ...]]) -> Path:
-    """One folder of each kind, and lists of names."""
-    for split, names in lists.items():
-        for name in names:
-            write_triple(root, name)
-        (root / f"{split}.txt").write_text("\n".join(names) + "\n")
     return root

@@ -30,22 +30,14 @@ def two(target_is: str, **changes: Any) -> Domains:
 
 
 PREDICTED = ("experiment:x/best.pt", "/some/folder")
-REFUSED_DOMAINS = [
-    *((labels, {"threshold": 0.5}, "no effect") for labels in ("given", "none", "/a/folder")),
-    *((labels, {"teacher_view": "rgb"}, "no effect") for labels in ("given", "none", "/a/folder")),
-    *((labels, {"confidence": True}, "confidence=true") for labels in ("given", "none")),
-]
 
 
-@pytest.mark.parametrize(("labels", "setting", "word"), REFUSED_DOMAINS)
-def test_setting_without_effect_on_labels_is_refused(
-    labels: str, setting: dict[str, Any], word: str
-) -> None:
-    with pytest.raises(InputError, match=f"{word}.*") as raised:
-        domain(labels=labels, **setting)
-    assert f"labels={labels}" in str(raised.value)
-    assert domain(labels=PREDICTED[0], **setting).labels == PREDICTED[0]
-    assert domain(labels=PREDICTED[1], confidence=True).confidence
+@pytest.mark.parametrize("labels", ["given", "none"])
+def test_confidence_of_labels_without_one_is_refused(labels: str) -> None:
+    with pytest.raises(InputError, match=f"confidence=true requires .* labels={labels}"):
+        domain(labels=labels, confidence=True)
+    for predicted in PREDICTED:
+        assert domain(labels=predicted, confidence=True).confidence
 
 
 def heads(source: str | None, target: str | None, **changes: Any) -> dict[str, Any]:
@@ -58,10 +50,10 @@ def heads(source: str | None, target: str | None, **changes: Any) -> dict[str, A
         ({"source": domain(labels="none")}, "domains.source.labels=none"),
         (heads("day", None), "got day and null"),
         (heads(None, "dark"), "got null and dark"),
-        (heads("a", "b"), "domains.target_is=null with 2 heads"),
-        (heads(None, None, target_is="view"), "domains.target_is=view with 0 heads"),
-        (heads(None, None, target_is="night"), "domains.target_is=night with 0 heads"),
-        (heads("a", "a", target_is="night"), "domains.target_is=night with 1 heads"),
+        (heads("a", "b"), "domains.target_is=null .* with 2 heads"),
+        (heads(None, None, target_is="view"), "domains.target_is=view .* with 0 heads"),
+        (heads(None, None, target_is="night"), "domains.target_is=night .* with 0 heads"),
+        (heads("a", "a", target_is="night"), "domains.target_is=night .* with 1 heads"),
         (heads(None, None, tested_head="source"), "tested_head=source requires two heads"),
         (heads("a", "a", tested_head="source"), "tested_head=source requires two heads"),
         (heads("a", "b", target_is="view"), "target_is=view"),
@@ -116,43 +108,3 @@ def test_the_head_of_a_night() -> None:
         assert found.head_of(view, False, "own") == "day"
         with pytest.raises(InputError, match="does not state which images were taken at night"):
             found.head_of(view, None, "own")
-
-
-@pytest.mark.parametrize("target_is", ["view", "night"])
-@pytest.mark.parametrize("night", [True, False, None])
-def test_requested_head_predicts_all_images(target_is: str, night: bool | None) -> None:
-    found = two(target_is, tested_head="source")
-    for view in ("rgb", "thermal"):
-        assert found.head_of(view, night, "source") == "day"
-        assert found.head_of(view, night, "target") == "dark"
-
-
-@pytest.mark.parametrize(
-    ("found", "own"),
-    [
-        (two("view"), "dark for thermal, day otherwise"),
-        (two("night"), "day by day, dark at night"),
-        (two("night", tested_head="source"), "day by day, dark at night"),
-    ],
-    ids=["view", "night", "tested with one"],
-)
-def test_heads_in_words_names_heads(found: Domains, own: str) -> None:
-    """The requested head is returned, not the configured one."""
-    assert found.heads_in_words("own") == own
-    assert found.heads_in_words("source") == "day for all images"
-    assert found.heads_in_words("target") == "dark for all images"
-
-
-@pytest.mark.parametrize(
-    "found",
-    [
-        domains(),
-        domains(source=domain(head="a")),
-        domains(target=domain()),
-        domains(source=domain(head="a"), target=domain(head="a")),
-    ],
-    ids=["none", "one", "two domains", "one of two domains"],
-)
-def test_heads_in_words_is_empty_for_one_head(found: Domains) -> None:
-    for requested in ("own", "source", "target"):
-        assert found.heads_in_words(requested) == ""

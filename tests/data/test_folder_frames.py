@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rgbt.data.folder.frames import FolderFrame
-from rgbt.data.folder.pattern import Pattern, in_order
-from rgbt.data.folder.splits import ByShare
+from rgbt.data.patterns import Frame, Pattern, in_order
+from rgbt.data.splits import ByShare
 from tests.conftest import write_png
 from tests.data.folder_files import (
     HW,
@@ -40,46 +39,6 @@ def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
 PLAIN = {key: text.replace("{split}", "{part}") for key, text in PATTERNS.items()}
 
 
-@pytest.mark.parametrize(
-    ("keys", "said"),
-    [
-        ({"rgb": "/rgb/{name}.png"}, "dataset.rgb: expected a path below dataset.root"),
-        ({"rgb": "../{name}.png"}, "dataset.rgb: .* without '..'"),
-        ({"rgb": "rgb//{name}.png"}, "dataset.rgb: .* doubled slashes"),
-        ({"rgb": "rgb/{name.png"}, "dataset.rgb: expected words in braces"),
-        ({"rgb": "rgb/{}.png"}, "dataset.rgb: expected words in braces"),
-        ({"rgb": "rgb/{sequence}{name}.png"}, "dataset.rgb: .* with other text between"),
-        (
-            {"rgb": "rgb/1.png"},
-            "dataset.rgb: .* is a single file; replace the names of frames with {name}",
-        ),
-        ({"rgb": "rgb/{frame}.png"}, "dataset.rgb: .* has the word frame but no name; replace"),
-        (
-            {"rgb": "{split}/colour/{name}.png"},
-            "nothing matches 'colour'; test holds ir, mask",
-        ),
-        ({"rgb": "{split}/rgb/{name}.jpg"}, "nothing matches '{name}.jpg'; rgb holds 1.png, 2.png"),
-        ({"thermal": "{split}/ir/{name}.tif"}, "dataset.thermal: .* but ir holds 1_ir.tif, 2_ir"),
-        ({"thermal": "{scene}/ir/{name}.tif"}, "uses {scene}, which dataset.rgb"),
-        ({"label": "{split}/labels/{name}.png"}, "dataset.label: .*labels holds nothing"),
-        ({"label": "test/mask/{name}.png"}, "'test_1' and 'train_1' would share .*test/mask/1.png"),
-        ({"label": "{split}/mask/{name}.JPG"}, "are JPEG files, which change values"),
-        ({"lists": {"train": "a.txt"}}, "dataset.lists and {split} in dataset.rgb both define"),
-        (
-            {"lists": {"train": "a.txt"}, "shares": {"train": 1.0}, **PLAIN},
-            "dataset.lists and dataset.shares both define",
-        ),
-        (PLAIN, "no setting defines the splits. Write {split} in dataset.rgb"),
-        ({"folders": {"train": "train"}, **PLAIN}, "no setting defines the splits"),
-        ({"shares_seed": 1}, "dataset.shares_seed and dataset.block require dataset.shares"),
-        ({"block": 3}, "dataset.shares_seed and dataset.block require dataset.shares"),
-    ],
-)
-def test_wrong_descriptions_are_refused(sound: Path, keys: dict[str, Any], said: str) -> None:
-    sentence = refused(lambda: folder(sound, **keys))
-    assert re.search(said.replace("{", r"\{"), sentence), sentence
-
-
 def test_words_of_a_pattern(tmp_path: Path) -> None:
     for name in ("a_b_7.png", "a_b_x.jpg", "._a_b_7.png", "c.png"):
         (tmp_path / "s1" / "rgb").mkdir(parents=True, exist_ok=True)
@@ -106,43 +65,7 @@ def test_order_of_names() -> None:
     assert sorted(names, key=in_order) == ["e100", "f", "f009", "f9", "f9_2", "f10"]
 
 
-def test_two_files_of_one_name(root: Path) -> None:
-    for path in ("a/b_c.png", "a_b/c.png"):
-        write_png(root / path, np.zeros((*HW, 3), np.uint8))
-    keys = {"thermal": "{sequence}/{name}.png", "label": None, "shares": {"train": 1.0}}
-    assert refused(lambda: folder(root, rgb="{sequence}/{name}.png", **keys)) == (
-        f"dataset.rgb: {root}/a/b_c.png and {root}/a_b/c.png would both be called 'a_b_c'; rename "
-        "one of them."
-    )
-
-
-def test_folder_without_permission_is_refused(sound: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def deny(_: object) -> list[str]:
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr("rgbt.data.folder.pattern.os.listdir", deny)
-    assert refused(lambda: folder(sound)) == (
-        f"{sound} cannot be listed: permission denied; allow access (chmod a+rx)."
-    )
-
-
 # Splits
-
-
-def test_splits_by_folder(sound: Path) -> None:
-    dataset = folder(sound, folders={"train": "train", "val": "test", "test": "test"})
-    assert dataset.names("val") == dataset.names("test") == ("test_1", "test_2")
-    missing = folder(sound, folders={"train": "training", "test": "test"})
-    assert not missing.has("train")
-    assert missing.has("test")
-    assert refused(lambda: missing.names("train")) == (
-        "dataset.folders: split 'train' is empty, because dataset.rgb='{split}/rgb/{name}.png' "
-        "has no file with 'training' for {split}. Existing values: test, train, val. Set one of "
-        "them in dataset.folders, {train: ...}."
-    )
-    for ask in (dataset.names, dataset.has):
-        said = refused(lambda ask=ask: ask("tset"))
-        assert "no split 'tset'; did you mean 'test'" in said
 
 
 def test_lines_of_a_list(root: Path, tmp_path: Path) -> None:
@@ -156,8 +79,7 @@ def test_lines_of_a_list(root: Path, tmp_path: Path) -> None:
     assert dataset.has("train")
     assert not dataset.has("val")
     assert refused(lambda: dataset.names("val")) == (
-        f"dataset.lists.val: the list '{root}/val.txt' does not exist; write it (one name per "
-        "line), or name another list with dataset.lists.val=..."
+        f"split 'val' of folder is empty: expected val.txt in {root}."
     )
     (tmp_path / "mine.txt").write_text("test_1\n")
     dataset = listed(root, "train_1", lists={"train": str(tmp_path / "mine.txt")})
@@ -173,11 +95,11 @@ def test_bare_names_in_a_list(root: Path) -> None:
     )
     assert refused(lambda: listed(root, "frame_1 label_1", "x").names("train")) == (
         f"dataset.lists.train: none of the 2 lines of {root}/list.txt is a frame. The first is "
-        "'frame_1 label_1'; expected names such as 'test_1' or paths such as 'test/rgb/1.png'."
+        "'frame_1 label_1'; expected names such as 'test_1'."
     )
 
 
-def frames_of(*paths: str) -> dict[str, FolderFrame]:
+def frames_of(*paths: str) -> dict[str, Frame]:
     """Frames of {sequence}/{name}, or {camera}/{sequence}/{name}; nothing is on the disk."""
     words = ("camera", "sequence", "name")
     frames = {}
@@ -185,11 +107,11 @@ def frames_of(*paths: str) -> dict[str, FolderFrame]:
         pieces = path.split("/")
         values = dict(zip(words[-len(pieces) :], pieces, strict=True))
         name = "_".join(pieces)
-        frames[name] = FolderFrame(name, values, Path(path), Path(path), None)
+        frames[name] = Frame(name, values, Path(path), Path(path), None)
     return frames
 
 
-def drawn(frames: dict[str, FolderFrame], **keys: Any) -> ByShare:
+def drawn(frames: dict[str, Frame], **keys: Any) -> ByShare:
     shares = {"train": 0.5, "val": 0.25, "test": 0.25}
     return ByShare(frames, **{"shares": shares, "seed": 0, "block": None, **keys})
 
@@ -216,7 +138,6 @@ def test_shares_of_blocks() -> None:
         names = set(rule.names(split))
         assert names == set().union(*(block for block in blocks if block & names))
         assert list(rule.names(split)) == sorted(names, key=in_order)
-        assert rule.has(split)
 
 
 def test_shares_keep_cameras_of_one_moment_together() -> None:
@@ -229,35 +150,71 @@ def test_shares_keep_cameras_of_one_moment_together() -> None:
         assert sorted(moments[:2]) == sorted(moments[2:])  # left before right
 
 
-def test_shares_in_a_folder(root: Path) -> None:
-    """Without the word {sequence} the whole folder is one."""
-    shares = {"train": 0.5, "val": 0.5}
-    dataset = folder(root, **PLAIN, shares=shares, block=2)
-    assert [len(dataset.names(split)) for split in shares] == [4, 2]
-    others = [folder(root, **PLAIN, shares=shares, block=2, shares_seed=seed) for seed in range(8)]
-    assert len({other.names("val") for other in others}) > 1
-    by_part = {key: text.replace("{split}", "{sequence}") for key, text in PATTERNS.items()}
-    dataset = folder(root, **by_part, shares=shares)
-    assert {len(dataset.names(split)) for split in shares} == {3}
-
-
 @pytest.mark.parametrize(
     ("keys", "said"),
     [
-        ({"shares": {"train": 0.5, "val": 0.4}}, "expected shares above 0 that add up to 1"),
-        ({"shares": {"train": 1.5, "val": -0.5}}, "expected shares above 0 that add up to 1"),
-        ({"shares": {"train": float("nan"), "val": 1.0}}, "expected shares above 0"),
-        ({}, "3 splits are to be drawn from 1 sequence(s), .* Set dataset.block"),
-        ({"block": 10}, "3 splits are to be drawn from 2 block(s)"),
+        ({"rgb": "/rgb/{name}.png"}, "dataset.rgb: expected a path below dataset.root"),
+        ({"rgb": "../{name}.png"}, "dataset.rgb: expected a path below"),
+        ({"rgb": "rgb//{name}.png"}, "dataset.rgb: expected a path below"),
+        ({"rgb": "rgb/{name.png"}, "dataset.rgb: expected a path below dataset.root with words"),
+        ({"rgb": "rgb/{}.png"}, "dataset.rgb: expected"),
+        ({"rgb": "rgb/{sequence}{name}.png"}, "dataset.rgb: .* other text between them"),
+        ({"rgb": "rgb/1.png"}, "dataset.rgb: expected"),
+        ({"rgb": "rgb/{frame}.png"}, "dataset.rgb: .* has no {name}"),
+        ({"rgb": "{split}/rgb/{name}.jpg"}, "matches no file in .*, which holds test, train, val"),
+        ({"thermal": "{split}/ir/{name}.tif"}, "dataset.thermal: .* but ir holds 1_ir.tif, 2_ir"),
+        ({"thermal": "{scene}/ir/{name}.tif"}, "dataset.thermal: .* 'scene' is not a valid choice"),
+        ({"label": "{split}/labels/{name}.png"}, "dataset.label: .*labels holds nothing"),
+        ({"label": "test/mask/{name}.png"}, "several frames would share .*test/mask/1.png"),
+        ({"lists": {"train": "a.txt"}}, "got {split} in dataset.rgb and dataset.lists"),
         (
-            {"block": 4, "shares": {"train": 0.9, "val": 0.05, "test": 0.05}},
-            "gets no frame, because 5 units of up to 4 frames stay together",
+            {"lists": {"train": "a.txt"}, "shares": {"train": 1.0}, **PLAIN},
+            "got dataset.lists and dataset.shares",
+        ),
+        (PLAIN, "must define the splits, got none"),
+        ({"folders": {"train": "train"}, **PLAIN}, "exactly one of .* must define the splits"),
+        ({"shares_seed": 1}, "dataset.shares_seed and dataset.block require dataset.shares"),
+        ({"shares": {"train": 0.5, "val": 0.4}, **PLAIN}, "dataset.shares: expected shares above"),
+        ({"shares": {"train": 1.5, "val": -0.5}, **PLAIN}, "dataset.shares: expected shares above"),
+        ({"shares": {"train": 0.5, "val": 0.5}, **PLAIN}, "split 'val' gets no frame"),
+        (
+            {"shares": {"train": 0.9, "val": 0.1}, "block": 5, **PLAIN},
+            "split 'val' gets no frame, .* in 2 unit",
         ),
     ],
 )
-def test_shares_that_cannot_be(keys: dict[str, Any], said: str) -> None:
-    frames = frames_of(*(f"s/{number}" for number in range(20)))
-    sentence = refused(lambda: drawn(frames, **keys))
-    assert sentence.startswith("dataset.")
-    for words in said.split(" .* "):
-        assert words in sentence
+def test_wrong_descriptions_are_refused(sound: Path, keys: dict[str, Any], said: str) -> None:
+    sentence = refused(lambda: folder(sound, **keys))
+    assert re.search(said.replace("{", r"\{"), sentence), sentence
+
+
+def test_two_files_of_one_name_and_a_folder_without_permission(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for path in ("a/b_c.png", "a_b/c.png"):
+        write_png(root / path, np.zeros((*HW, 3), np.uint8))
+    keys = {"thermal": "{sequence}/{name}.png", "label": None, "shares": {"train": 1.0}}
+    assert refused(lambda: folder(root, rgb="{sequence}/{name}.png", **keys)) == (
+        f"dataset.rgb: {root}/a/b_c.png and {root}/a_b/c.png would both be called 'a_b_c'; rename "
+        "one of them."
+    )
+    closed = root / "val" / "rgb"
+    monkeypatch.setattr("rgbt.data.patterns.os.access", lambda path, mode: path != closed)
+    assert refused(lambda: folder(root)).startswith(f"{closed} cannot be listed: permission denied")
+
+
+def test_splits_by_folder_and_by_shares_of_a_folder(sound: Path) -> None:
+    dataset = folder(sound, folders={"train": "train", "val": "test", "test": "test"})
+    assert dataset.names("val") == dataset.names("test") == ("test_1", "test_2")
+    missing = folder(sound, folders={"train": "training", "test": "test"})
+    assert not missing.has("train")
+    assert missing.has("test")
+    assert "expected training/rgb/{name}.png in" in refused(lambda: missing.names("train"))
+    # Without the word {sequence} the whole folder is one.
+    shares = {"train": 0.5, "val": 0.5}
+    drawn = [folder(sound, **PLAIN, shares=shares, block=2, shares_seed=n) for n in range(8)]
+    assert {len(each.names("train")) for each in drawn} == {4}
+    assert len({each.names("val") for each in drawn}) > 1
+    by_part = {key: text.replace("{split}", "{sequence}") for key, text in PATTERNS.items()}
+    dataset = folder(sound, **by_part, shares=shares)
+    assert {len(dataset.names(split)) for split in shares} == {3}

@@ -25,12 +25,12 @@ def test_ids_are_mapped_one_by_one() -> None:
     [
         (
             {"car": (0, 1), "rode": (2, 3)},
-            "'rode' is not a class of label_map.targets; did you mean",
+            "'rode' is not a valid choice; did you mean",
         ),
-        ({"car": (0, 1), "road": (3,)}, "every id from 0 to 3 once, but 2 is not mapped"),
-        ({"car": (0, 1, 2), "road": (2, 3)}, "but 2 is mapped twice"),
-        ({"car": (0, 1, 2), "road": (3, 4)}, "but 4 is unknown"),
-        ({"car": (0, 1, -1), "road": (2, 3)}, "but -1 is unknown"),
+        ({"car": (0, 1), "road": (3,)}, "every id from 0 to 3 once, got [0, 1, 3]"),
+        ({"car": (0, 1, 2), "road": (2, 3)}, "got [0, 1, 2, 2, 3]"),
+        ({"car": (0, 1, 2), "road": (3, 4)}, "got [0, 1, 2, 3, 4]"),
+        ({"car": (0, 1, -1), "road": (2, 3)}, "got [-1, 0, 1, 2, 3]"),
     ],
 )
 def test_every_id_is_mapped_once(groups: dict[str, tuple[int, ...]], said: str) -> None:
@@ -42,12 +42,12 @@ def test_every_id_is_mapped_once(groups: dict[str, tuple[int, ...]], said: str) 
 def test_other_networks_and_data_sets_are_refused() -> None:
     label_map = LabelMap(num_source=2, targets=TARGETS, groups={"car": (0, 1)})
     label_map.check(2, TARGETS, "streets")
-    with pytest.raises(InputError, match=r"network with 2 classes, but model.num_classes is 9"):
+    with pytest.raises(InputError, match=r"maps 2 classes .* network has 9 classes"):
         label_map.check(9, TARGETS, "streets")
-    with pytest.raises(InputError, match=r"maps to the classes road, car, but streets has sky"):
+    with pytest.raises(InputError, match=r"to road, car, but .* streets has sky"):
         label_map.check(2, ("sky",), "streets")
     # The same names under other ids are other classes.
-    with pytest.raises(InputError, match=r"classes road, car, but streets has car, road"):
+    with pytest.raises(InputError, match=r"to road, car, but .* streets has car, road"):
         label_map.check(2, TARGETS[::-1], "streets")
 
 
@@ -80,9 +80,3 @@ def test_released_maps(name: str, expected: tuple[int, ...]) -> None:
     assert label_map.targets == tuple(dataset.classes)
     ids = np.arange(label_map.num_source, dtype=np.uint8)
     assert tuple(label_map(ids).tolist()) == expected
-
-
-def test_no_map_and_no_such_map() -> None:
-    assert label_map_of("none") is None
-    with pytest.raises(InputError, match=r"no label_map 'vistas'; did you mean"):
-        label_map_of("vistas")

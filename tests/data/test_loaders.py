@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import dataclasses
-import errno
 import logging
 import multiprocessing
 import os
@@ -13,10 +12,15 @@ import torch
 
 from rgbt.checks import InputError, RunError
 from rgbt.data import loaders
-from rgbt.data.batches import collate
-from rgbt.data.loaders import LoaderSettings, eval_batches, steps_per_epoch, train_batches
+from rgbt.data.loaders import (
+    LoadedBatch,
+    LoaderSettings,
+    collate,
+    eval_batches,
+    steps_per_epoch,
+    train_batches,
+)
 from rgbt.data.mfnet import MFNet
-from rgbt.data.reader import LoadedBatch
 from rgbt.transforms.crm import CrmTransform
 from rgbt.types import Batch, Sample
 from tests.transforms import recipes
@@ -46,34 +50,6 @@ def assert_equal(one: Batch, other: Batch) -> None:
     for each in dataclasses.fields(Batch):
         a, b = getattr(one, each.name), getattr(other, each.name)
         assert torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b, each.name
-
-
-def test_shapes_and_dtypes(dataset: MFNet) -> None:
-    batch = next(train_batches(dataset, "train", crm(), settings(), 0, range(1)))
-    assert batch.position is not None
-    shapes = [batch.rgb.shape, batch.thermal.shape, batch.label.shape, batch.position.shape]
-    assert [tuple(shape) for shape in shapes] == [
-        (4, 3, 12, 16),
-        (4, 1, 12, 16),
-        (4, 12, 16),
-        (4, 2, 12, 16),
-    ]
-    assert (batch.rgb.dtype, batch.thermal.dtype) == (torch.uint8, torch.uint8)
-    assert (batch.label.dtype, batch.position.dtype) == (torch.uint8, torch.float32)
-    assert batch.to("cpu").label.dtype == torch.int64
-    assert (batch.centre_yx.dtype, batch.original_hw.dtype) == (torch.int64, torch.int64)
-    assert batch.original_hw.tolist() == [[24, 32]] * 4
-    assert batch.rgb.is_contiguous()
-
-
-def test_label_comes_from_the_position(dataset: MFNet, expected_pair) -> None:
-    """Through the whole chain, batch and all: label[crop] == label of the file[position]."""
-    for batch in train_batches(dataset, "train", crm(), settings(), 3, range(4)):
-        assert batch.position is not None
-        for index, name in enumerate(batch.name):
-            label = torch.from_numpy(expected_pair(name, (24, 32))[2]).long()
-            row, column = batch.position[index].long()
-            assert torch.equal(batch.label[index], label[row, column])
 
 
 def test_same_batches_whatever_the_workers(dataset: MFNet) -> None:
@@ -225,62 +201,6 @@ def test_skip_with_nothing_left(dataset: MFNet) -> None:
         next(batches)
 
 
-@pytest.mark.parametrize("cache", ["", " ", "none", "None", "null", "false", False])
-def test_invalid_cache_folder_is_refused(cache: object) -> None:
-    """They would be folders where the command was typed."""
-    sentence = (
-        rf"^data\.cache: {cache!r} is not a folder; expected auto or a folder \(write \./NAME .*"
-    )
-    with pytest.raises(InputError, match=sentence):
-        settings(cache=cache)
-    for known in (None, "auto", "./none", "/fast/disk"):
-        assert settings(cache=known).cache == known
-
-
-@pytest.mark.parametrize(
-    ("workers", "ahead", "gpu"), [(0, None, True), (2, 5, True), (2, 5, False)]
-)
-def test_arguments_of_the_loader(
-    dataset: MFNet, monkeypatch: pytest.MonkeyPatch, workers: int, ahead: int | None, gpu: bool
-) -> None:
-    """Batches ahead of the one that is used, and pinned where there is a GPU to copy them to."""
-    requested: dict[str, object] = {}
-
-    def loader(reader: object, **words: object) -> list[object]:
-        requested.update(words)
-        return []
-
-    monkeypatch.setattr(loaders, "DataLoader", loader)
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: gpu)
-    changed = settings(num_workers=workers, prefetch=5)
-    assert list(eval_batches(dataset, "val", crm(), changed)) == []
-    assert (requested["num_workers"], requested["prefetch_factor"]) == (workers, ahead)
-    assert requested["pin_memory"] is gpu
-
-
-def test_all_of_a_batch_is_pinned(dataset: MFNet, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pages are locked on machines with a GPU alone."""
-    locked: dict[int, torch.Tensor] = {}
-
-    def lock(tensor: torch.Tensor) -> torch.Tensor:
-        copy = tensor.clone()
-        locked[id(copy)] = copy
-        return copy
-
-    monkeypatch.setattr(torch.Tensor, "pin_memory", lock)
-    batch = next(train_batches(dataset, "train", crm(), settings(), 0, range(1)))
-    pinned = LoadedBatch(batch, {"x": "why"}).pin_memory()
-    assert pinned.skipped == {"x": "why"}
-    assert isinstance(pinned.batch, type(batch))
-    values = {each.name: getattr(pinned.batch, each.name) for each in dataclasses.fields(batch)}
-    tensors = {name for name, value in values.items() if isinstance(value, torch.Tensor)}
-    assert {"rgb", "thermal", "label", "original_hw"} < tensors
-    assert {name for name, value in values.items() if id(value) in locked} == tensors
-    assert_equal(batch.to("cpu"), pinned.batch.to("cpu"))
-    empty = LoadedBatch(error="why")
-    assert empty.pin_memory() is empty
-
-
 def confident(sample: Sample, value: float | None) -> Sample:
     assert sample.label is not None
     full = None if value is None else np.full(sample.label.shape, value, np.float32)
@@ -300,7 +220,9 @@ def test_confidences_are_stacked_for_all_or_none(dataset: MFNet) -> None:
     assert found.shape == batch(0.25, 0.75).label.shape
     assert found.flatten(1).unique(dim=1).tolist() == [[0.25], [0.75]]
     assert batch(None, None).confidence is None
-    message = f"Those of '{NAMES[1]}' do and those of '{NAMES[0]}' do not"
+    message = (
+        f"all labels of one batch must carry confidences, or none; '{NAMES[0]}' and '{NAMES[1]}'"
+    )
     with pytest.raises(InputError, match=message):
         batch(None, 0.75)
 
@@ -315,18 +237,6 @@ def test_full_shared_memory_is_reported(dataset: MFNet, monkeypatch: pytest.Monk
         next(batches)
 
 
-def test_full_shared_memory_before_start_is_reported(
-    dataset: MFNet, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse() -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(loaders.multiprocessing, "Lock", refuse)
-    with pytest.raises(InputError, match=r"/dev/shm .*num_workers=0") as caught:
-        train_batches(dataset, "train", crm(), settings(num_workers=2), 0, range(2))
-    assert caught.value.__suppress_context__, "caught once, not as a full disk as well"
-
-
 def test_killed_worker_is_reported(dataset: MFNet, monkeypatch: pytest.MonkeyPatch) -> None:
     main = os.getpid()
 
@@ -339,3 +249,28 @@ def test_killed_worker_is_reported(dataset: MFNet, monkeypatch: pytest.MonkeyPat
     batches = train_batches(dataset, "train", crm(), settings(num_workers=1), 0, range(2))
     with pytest.raises(RunError, match=r"loader process died .*memory.*data\.num_workers"):
         next(batches)
+
+
+@pytest.mark.parametrize(("workers", "ahead"), [(0, None), (2, 5)])
+@pytest.mark.parametrize("gpu", [False, True])
+def test_batches_are_prefetched_and_pinned(
+    dataset: MFNet, monkeypatch: pytest.MonkeyPatch, workers: int, ahead: int | None, gpu: bool
+) -> None:
+    """Batches ahead of the one that is used, and pinned where there is a GPU to copy them to."""
+    batch = next(train_batches(dataset, "train", crm(), settings(), 0, range(1)))
+    requested: dict[str, object] = {}
+
+    def loader(reader: object, **words: object) -> list[object]:
+        requested.update(words)
+        return []
+
+    monkeypatch.setattr(loaders, "DataLoader", loader)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: gpu)
+    assert not list(eval_batches(dataset, "val", crm(), settings(num_workers=workers, prefetch=5)))
+    assert (requested["num_workers"], requested["prefetch_factor"]) == (workers, ahead)
+    assert requested["pin_memory"] is gpu
+    locked: list[torch.Tensor] = []  # pages are locked on machines with a GPU alone
+    monkeypatch.setattr(torch.Tensor, "pin_memory", lambda self: locked.append(self) or self)
+    LoadedBatch(batch).pin_memory()
+    assert len(locked) == sum(isinstance(each, torch.Tensor) for each in vars(batch).values())
+    assert LoadedBatch(error="why").pin_memory().error == "why"

@@ -9,9 +9,8 @@ import pytest
 import torch
 
 from rgbt.checks import InputError
-from rgbt.data.loaders import LoaderSettings, train_batches
+from rgbt.data.loaders import LoadedPair, LoaderSettings, PairedBatches, train_batches
 from rgbt.data.mfnet import MFNet
-from rgbt.data.pairs import LoadedPair, PairedBatches
 from rgbt.transforms.fixed_size import ThesisTransform
 from rgbt.types import Batch
 
@@ -61,30 +60,6 @@ def assert_equal_pairs(one: LoadedPair, other: LoadedPair) -> None:
     assert one.step == other.step
 
 
-def test_each_stream_is_what_it_is_alone(dataset: MFNet) -> None:
-    both = list(pairs(dataset, range(9)))
-    for split, seed, side in (("train", 3, "source"), ("val", 4, "target")):
-        alone = list(stream(dataset, split, seed, range(9)))
-        assert len(alone) == len(both) == 9
-        for batch, pair in zip(alone, both, strict=True):
-            assert_equal(batch, getattr(pair, side))
-    assert both[0].name == both[0].source.name + both[0].target.name
-
-
-def test_lists_of_two_lengths_are_shuffled_separately(dataset: MFNet) -> None:
-    """Three whole batches of seven by day, two of four at night."""
-    both = list(pairs(dataset, range(12)))
-    for start in range(0, 12, 3):
-        names = [name for pair in both[start : start + 3] for name in pair.source.name]
-        assert len(set(names)) == 6
-    orders = []
-    for start in range(0, 12, 2):
-        names = [name for pair in both[start : start + 2] for name in pair.target.name]
-        assert sorted(names) == NIGHT
-        orders.append(tuple(names))
-    assert len(set(orders)) > 1
-
-
 def test_starting_later_continues(dataset: MFNet) -> None:
     whole = list(pairs(dataset, range(20)))
     late = list(pairs(dataset, range(10, 20)))
@@ -117,11 +92,3 @@ def test_unreadable_file_stops_both_domains(dataset: MFNet, workers: int) -> Non
         list(found)
     assert list(found) == []
     assert multiprocessing.active_children() == []
-
-
-def test_skipped_files_of_both_are_named(dataset: MFNet) -> None:
-    for name in (DAY[0], NIGHT[0]):
-        dataset.files(name)[0].write_bytes(b"damaged")
-    found = pairs(dataset, range(6), on_error="skip")
-    assert len(list(found)) == 6
-    assert set(found.skipped) == {DAY[0], NIGHT[0]}

@@ -74,9 +74,9 @@ def test_invalid_folders_are_refused(folder: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("confidence", "found"),
     [
-        (np.zeros(HW, np.uint8), "got 8 bit, 2 x 3"),
-        (np.zeros((2, 4), np.uint16), "got 16 bit, 2 x 4"),
-        (None, "got none that can be read"),
+        (np.zeros(HW, np.uint8), "uint8 of shape (2, 3)"),
+        (np.zeros((2, 4), np.uint16), "uint16 of shape (2, 4)"),
+        (None, "is missing"),
     ],
 )
 def test_invalid_confidences_are_refused(
@@ -87,7 +87,7 @@ def test_invalid_confidences_are_refused(
         path.unlink()
     else:
         assert cv2.imwrite(str(path), confidence)
-    with pytest.raises(InputError, match="16 bit and 2 x 3 pixels") as raised:
+    with pytest.raises(InputError, match="16 bits of shape|is missing") as raised:
         PseudoLabels(folder).read(NAMES[0], 9)
     assert found in str(raised.value)
 
@@ -115,10 +115,12 @@ def test_labels_of_other_size_are_refused(dataset: MFNet, folder: Path) -> None:
     with pytest.raises(InputError, match="'00002N' has no pseudo-label in"):
         labelled.read(NAMES[1])
     write(folder, NAMES[1], LABEL[:, :2], CONFIDENCE[:, :2])
-    with pytest.raises(InputError, match=r"'00002N' has 2 x 3 pixels but its .* 2 x 2; predict"):
+    with pytest.raises(
+        InputError, match=r"'00002N' has \(2, 3\) pixels but its .* \(2, 2\); predict"
+    ):
         labelled.read(NAMES[1])
     write(folder, NAMES[1], LABEL + 1, CONFIDENCE)
-    with pytest.raises(InputError, match="label value 9 is out of range"):
+    with pytest.raises(InputError, match="label value 9 "):
         labelled.read(NAMES[1])
     say(folder, classes=("road", "car"))
     with pytest.raises(InputError, match=r"classes road, car, but mfnet has unlabeled, car"):

@@ -79,10 +79,10 @@ def test_unscored_classes_are_not_drawn(dataset: MFNet) -> None:
 
 
 def test_class_without_an_image_is_refused(dataset: MFNet) -> None:
-    with pytest.raises(InputError, match=r"pixels=60: no image of .* 'person', at most 6"):
+    with pytest.raises(InputError, match=r"pixels=60: no image of .* more pixels of 'person'"):
         count_rare_classes(dataset, "train", settings(min_class_pixels=60))
     dataset.unscored = dataset.classes
-    with pytest.raises(InputError, match="no pixel of a class; set data.sampling=shuffled"):
+    with pytest.raises(InputError, match="any class.* data.sampling=shuffled"):
         count_rare_classes(dataset, "train", settings())
 
 
@@ -107,9 +107,17 @@ def test_crop_is_drawn_again_until_it_shows_enough(
         return SimpleNamespace(label=np.repeat(sample, next(left)))
 
     drawn, _ = rare.draw(numpy_generator(3, "rare class", 0, 5))
-    source: Any = SimpleNamespace(names=list(PIXELS), first_readable=lambda names, skipped: drawn)
-    RareClassExamples(source, make, 3, rare)((0, 5), {})
+    source: Any = SimpleNamespace(
+        names=list(PIXELS),
+        first_readable=lambda names, skipped: drawn,
+        transform=SimpleNamespace(train=make),
+        seed=3,
+    )
+    RareClassExamples(source, rare)((0, 5), {})
     assert len(set(seen)) == len(seen) == calls
+    # The draws of the augmentation are those of (seed, "augment", epoch, number) alone, and not
+    # those that have chosen the class.
+    assert seen == numpy_generator(3, "augment", 0, 5).random(calls).tolist()
 
 
 def batches(dataset: MFNet, steps: range, seed: int = 7, **changes: Any) -> list[Batch]:

@@ -11,13 +11,12 @@ import pytest
 import yaml
 
 from rgbt.checks import InputError
-from rgbt.data.file_dataset import FileDataset
+from rgbt.data.file_dataset import FileDataset, hash_of_files
 from rgbt.data.freiburg import Freiburg
 from rgbt.data.kp import KP
 from rgbt.data.mfnet import MFNet
-from rgbt.data.named_files import hash_of_files
 from rgbt.data.pst900 import PST900
-from rgbt.data.video.mvseg import MVSeg
+from rgbt.data.video import MVSeg
 from tests.data.test_bad_data import KINDS
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -76,7 +75,7 @@ def test_reader_reaches_a_worker_and_refuses_other_splits(kind: str, tmp_path: P
 
 @pytest.mark.parametrize("reader", READERS.values())
 def test_wrong_roots_and_numbers_are_refused(reader: type[FileDataset], tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="the folder '/nowhere' does not exist"):
+    with pytest.raises(InputError, match="dataset.root: no such folder: /nowhere"):
         reader("/nowhere")
     with pytest.raises(InputError, match=r"dataset\.(root|num_classes)"):
         reader(str(tmp_path))

@@ -11,8 +11,8 @@ import pytest
 from PIL import Image
 
 from rgbt.checks import InputError
-from rgbt.data.report import check_dataset
-from rgbt.data.video.mvseg import MVSeg
+from rgbt.data.check import check_dataset
+from rgbt.data.video import MVSeg
 from tests.conftest import write_png
 from tests.data.video_files import HW, contents, video, write_mvseg, write_videos
 
@@ -87,25 +87,6 @@ def test_mvseg_gap_begins_another_sequence_or_is_refused(mvseg: Path) -> None:
         MVSeg(str(mvseg), gaps="refuse").sequences("test")
 
 
-def test_mvseg_without_videos_is_refused(mvseg: Path) -> None:
-    for path in (mvseg / "data" / "d" / "visible").iterdir():
-        path.unlink()
-    with pytest.raises(InputError, match="video 'd' is empty: .*visible holds nothing"):
-        MVSeg(str(mvseg))
-    shutil.rmtree(mvseg / "data" / "d")
-    with pytest.raises(InputError, match=r"lists.test: video 'd' has no frames"):
-        MVSeg(str(mvseg)).names("test")
-    shutil.rmtree(mvseg / "data")
-    with pytest.raises(InputError, match="does not hold the folder data"):
-        MVSeg(str(mvseg))
-
-
-def test_a_missing_thermal_image_is_named(mvseg: Path) -> None:
-    (mvseg / "data" / "d" / "infrared" / "00238i.png").unlink()
-    with pytest.raises(InputError, match="'d_00238': its thermal image .*00238i.png is missing"):
-        MVSeg(str(mvseg)).read("d_00238")
-
-
 @pytest.mark.parametrize("gone", ["visible/00239v.png", "infrared/00238i.png"])
 def test_a_frame_without_its_partner_is_reported(mvseg: Path, gone: str) -> None:
     path = mvseg / "data" / "d" / gone
@@ -120,17 +101,6 @@ def test_a_frame_without_its_partner_is_reported(mvseg: Path, gone: str) -> None
     assert dataset.sequences("train")
     with pytest.raises(InputError, match=f"no {kind} image.*; restore it, or set dataset.gaps"):
         dataset.sequences("test")
-
-
-def test_the_last_frame_without_rgb_image_is_reported(tmp_path: Path) -> None:
-    root = write_videos(tmp_path)
-    (root / "y" / "rgb" / "10.png").unlink()
-    problems = check_dataset(video(root)).problems
-    assert problems[-1] == f"{root}/y/ir/10.png has no RGB image."
-    with pytest.raises(InputError, match=r"10\.png has no RGB image"):
-        video(root).sequences("test")
-    shutil.rmtree(root / "y" / "rgb")  # a video of which nothing else is listed
-    assert len(video(root).own_problems({})) == 4
 
 
 def test_fingerprint_covers_frames_without_a_label(mvseg: Path) -> None:
@@ -152,45 +122,41 @@ def test_one_video_of_packed_images_without_labels(tmp_path: Path) -> None:
         dataset.names("train")
 
 
-def test_first_class_is_background_if_the_data_set_says_so(tmp_path: Path) -> None:
-    root = write_videos(tmp_path)
-    found = [video(root, background=each).record for each in ((), ("car",), ("background",))]
-    assert [each.first_class for each in found] == ["object", "object", "background"]
+def test_missing_files_of_mvseg_are_named(mvseg: Path) -> None:
+    (mvseg / "data" / "d" / "infrared" / "00238i.png").unlink()
+    with pytest.raises(InputError, match="'d_00238': its thermal image .*00238i.png is missing"):
+        MVSeg(str(mvseg)).read("d_00238")
+    shutil.rmtree(mvseg / "data" / "d")
+    with pytest.raises(InputError, match=r"lists.test: video 'd' has no frames"):
+        MVSeg(str(mvseg)).names("test")
+    shutil.rmtree(mvseg / "data")
+    with pytest.raises(InputError, match="does not hold the folder data"):
+        MVSeg(str(mvseg))
 
 
 def test_videos_with_mistakes_are_refused(tmp_path: Path) -> None:
     root = write_videos(tmp_path / "data")
-    (root / "x" / "rgb" / "2.png").rename(root / "x" / "rgb" / "02.png")
-    shutil.copy(root / "x" / "rgb" / "02.png", root / "x" / "rgb" / "2.png")
+    assert video(root).sequences("test")[0] == ("x_1", "x_2", "x_3")
+    two, second, last = (root / "x" / "rgb" / f"{name}.png" for name in ("2", "02", "last"))
+    shutil.copy(two, second)
     with pytest.raises(InputError, match="two frames with the number 2, 'x_0?2' and 'x_0?2'"):
         video(root)
-    (root / "x" / "rgb" / "02.png").unlink()
-    shutil.copy(root / "x" / "rgb" / "2.png", root / "x" / "rgb" / "last.png")
-    with pytest.raises(InputError, match="the frame 'last' of video 'x' has no number"):
+    second.rename(last)
+    with pytest.raises(InputError, match=r"the frame \S+last.png of a video has no number"):
         video(root)
-    (root / "x" / "rgb" / "last.png").unlink()
-    (root / "x" / "rgb" / "2.png").unlink()
+    last.unlink()
+    two.unlink()
     # Its other frames are two apart, those of the other video one.
     with pytest.raises(InputError, match="video 'x' lacks frame 2, which should follow 'x_1'"):
         video(root).sequences("test")
-    (root / "z" / "rgb").mkdir(parents=True)
-    with pytest.raises(InputError, match="video 'z' is empty: .*rgb holds nothing"):
-        video(root)
-
-
-def test_a_frame_in_another_case_is_refused(tmp_path: Path) -> None:
-    root = write_videos(tmp_path)
-    assert video(root).sequences("test")[0] == ("x_1", "x_2", "x_3")
-    last = root / "x" / "rgb" / "3.png"
-    last.rename(last.with_suffix(".PNG"))
-    with pytest.raises(InputError, match=r"3\.PNG differs from dataset\.rgb=.* rename it"):
-        video(root)
-
-
-def test_messages_name_the_settings_of_a_video(tmp_path: Path) -> None:
-    root = write_videos(tmp_path)
+    (root / "y" / "rgb" / "10.png").unlink()
+    (root / "y.txt").write_text("y")
+    problems = check_dataset(video(root)).problems
+    assert f"{root}/y/ir/10.png has no RGB image." in problems
+    with pytest.raises(InputError, match=r"10\.png has no RGB image"):
+        video(root, lists={"test": "y.txt"}).sequences("test")
     write_png(root / "x" / "ir" / "1.png", np.full(HW, 30000, np.uint16))
-    with pytest.raises(InputError, match=r"got uint16; .* require dataset\.thermal_range=\[low"):
+    with pytest.raises(InputError, match=r"got uint16 .* require dataset\.thermal_range=\[low"):
         video(root).read("x_1")
     with pytest.raises(InputError, match=r"dataset\.lists has no split 'train'; known: test"):
         video(root, lists=None).names("train")

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from rgbt.data.video.dataset import Video
+from rgbt.data.video import Video
 from rgbt.randomness import numpy_generator
 from tests.conftest import write_png
 

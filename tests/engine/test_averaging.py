@@ -7,13 +7,13 @@ from typing import Any
 
 import pytest
 import torch
-from tests.checkpoints.test_torch_files import same
 from torch import Tensor, nn
 
 from rgbt.averaging import AveragedNetwork
 from rgbt.engine.averaging import EvaluatedWeights
 from rgbt.engine.checkpoint import State, load_checkpoint
 from rgbt.engine.settings import TrainerSettings
+from tests.checkpoints.test_torch_files import same
 from tests.engine.test_trainer import SETTINGS, batches, make, make_two, stopping_after
 
 

@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 import torch
 from lightning_fabric import Fabric
-from tests.checkpoints.test_torch_files import same
 from torch import Tensor, nn
 
 from rgbt.checks import RunError
@@ -21,6 +20,7 @@ from rgbt.engine.settings import TrainerSettings
 from rgbt.engine.trainer import Trainer
 from rgbt.randomness import torch_generator
 from rgbt.types import Batch, GeneratorOf, Phase
+from tests.checkpoints.test_torch_files import same
 
 SETTINGS = {
     "max_steps": 6,

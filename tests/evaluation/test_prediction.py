@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
 
 from rgbt.checks import InputError
-from rgbt.data.cache.dataset import CachedDataset
 from rgbt.data.domains import Domain, Domains
-from rgbt.data.mfnet import MFNet
 from rgbt.engine.prediction import Prediction
-from rgbt.evaluation.prediction import Predictor, decode_ahead, heads_of, view_of
-from rgbt.evaluation.request import CorruptedDataset, EvaluationRequest, choose_corruption
+from rgbt.evaluation.prediction import Predictor, heads_of, view_of
+from rgbt.evaluation.request import EvaluationRequest
 from rgbt.requirements import Record
 from rgbt.types import Batch, Output
 
@@ -90,26 +86,3 @@ def test_predictor_chooses_heads_by_the_names_of_a_batch() -> None:
     found = predictor.probabilities(batch)[:, 1, 0, 0].tolist()
     assert found == pytest.approx([0.269, 0.731, 0.269], abs=1e-3)
     assert not session.model.training
-
-
-@pytest.mark.parametrize("corrupted", [False, True])
-def test_decode_ahead_decodes_the_requested_splits(
-    write_mfnet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, corrupted: bool
-) -> None:
-    splits = {"train": ["00001D", "00002N"], "val": ["00003D"], "test": ["00004N"]}
-    dataset = CachedDataset(MFNet(str(write_mfnet(splits))), tmp_path / "cache", num_threads=1)
-    noise = choose_corruption("noise").at("8")
-    session = SimpleNamespace(
-        dataset=CorruptedDataset(dataset, noise, "val") if corrupted else dataset
-    )
-    decode_ahead(session, "train", "val")
-    labels = {name: dataset.source.label(name) for name in (*splits["train"], *splits["val"])}
-
-    def refuses(name: str) -> None:
-        raise InputError(f"{name} was decoded")
-
-    monkeypatch.setattr(dataset.source, "read", refuses)
-    for name, label in labels.items():
-        np.testing.assert_array_equal(dataset.read(name).label, label)
-    with pytest.raises(InputError, match="00004N was decoded"):
-        dataset.read("00004N")

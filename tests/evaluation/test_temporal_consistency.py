@@ -18,7 +18,7 @@ from torch.nn import functional as F
 from rgbt.assembly.session import Session, open_session
 from rgbt.checks import InputError
 from rgbt.config.compose import compose
-from rgbt.data.next_frames import NextFrames
+from rgbt.data.mfnet import NextFrames
 from rgbt.evaluation.pair_frames import FlowRecord, Pairing, _record
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.evaluation.temporal_consistency import consistency_table, consistency_values, count_pairs

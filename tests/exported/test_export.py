@@ -135,7 +135,7 @@ def test_another_view_or_head_than_that_of_the_graph_is_refused(
     images = torch.rand(1, 3, 48, 64), torch.rand(1, 1, 48, 64)
     assert network.record.heads == ("night",)
     assert network(*images, views=("rgbt",), head="night").logits.shape == (1, 9, 48, 64)
-    with pytest.raises(ValueError, match="has the head 'night', but 'day' is requested"):
+    with pytest.raises(ValueError, match="head=day: .* has the head 'night'"):
         network(*images, head="day")
     with pytest.raises(ValueError, match="predicts from rgbt alone"):
         network(*images, views=("rgb",))
@@ -171,21 +171,9 @@ def test_damaged_files_are_refused(exported: Path, tmp_path: Path, call: Call) -
     assert_one_sentence(err, "there is no such file")
 
 
-def test_any_changed_byte_is_found(exported: Path) -> None:
-    """Also one in a constant, which is a valid number after the change."""
-    content = exported.read_bytes()
-    rng = np.random.default_rng(0)
-    for position in [0, len(content) - 1, *rng.integers(0, len(content), 100).tolist()]:
-        damaged = bytearray(content)
-        damaged[position] ^= 0x10
-        with pytest.raises(ValueError, match=r"model\.onnx"):
-            ExportedNetwork(bytes(damaged), exported)
-
-
-def test_bytes_changed_by_another_program_raise_one_sentence_or_none(
+def test_changed_bytes_raise_one_sentence_or_none(
     changed: Callable[[Change], Path],
 ) -> None:
-    """Without the checksum, onnxruntime has to judge."""
     path = changed(lambda proto: None)
     content = path.read_bytes()
     rng = np.random.default_rng(0)
@@ -232,10 +220,10 @@ def test_other_classes_inputs_or_metadata_are_refused(changed: Callable[[Change]
         metadata(proto, "view").value = '"sonar"'
 
     for change, sentence in (
-        (fewer_classes, "its 2 classes require"),
-        (other_input, "has the inputs"),
-        (no_metadata, "was not written by rgbt"),
-        (damaged, "its description is damaged"),
+        (fewer_classes, "inputs and outputs"),
+        (other_input, "inputs and outputs"),
+        (no_metadata, "no description of rgbt"),
+        (damaged, "no description of rgbt"),
     ):
         with pytest.raises(ValueError, match=sentence):
             ExportedNetwork.read(changed(change))

@@ -136,11 +136,3 @@ def test_the_thermal_vector_is_0_at_first_and_reaches_thermal_alone() -> None:
     net.backbone.thermal_embedding.add_(torch.arange(8.0))
     after = [net(*pair, views=(view,)).logits for view in ("rgb", "thermal")]
     assert [torch.equal(a, b) for a, b in zip(before, after, strict=True)] == [True, False]
-
-
-def test_the_learning_rate_of_the_backbone_is_that_of_the_encoder_alone() -> None:
-    net = nano(tuning="full")
-    encoder = {id(p) for p in net.backbone.encoder.parameters()}
-    for group in ADAMW(net).param_groups:
-        for parameter in group["params"]:
-            assert group["lr"] == pytest.approx(0.1 if id(parameter) in encoder else 1.0)

@@ -11,8 +11,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.checks import InputError
-from rgbt.models.mask2former.decoder import QueryAttention
 from rgbt.models.mask2former.network import Fusion, Request, semantic_logits
 from rgbt.models.mask2former.pixel_decoder import (
     DeformableAttention,
@@ -24,7 +22,7 @@ from rgbt.models.mask2former.swin import PatchMerging, relative_index, shift_mas
 from rgbt.types import VIEWS, MaskPair
 from tests.models import plain
 from tests.models.golden import network
-from tests.models.plain import cells, count, images, normal, randomise
+from tests.models.plain import cells, count, images, normal
 
 nano = partial(plain.nano, "mask2former")
 BOTH = pytest.mark.parametrize("name", ["mask2former", "dinov2"])
@@ -188,13 +186,6 @@ def test_calls_that_do_not_fit_raise(call: dict[str, Any]) -> None:
         nano().eval()(*images(3), **call)
 
 
-@pytest.mark.parametrize("grid", [(3, 3), (2, 2), (32, 48), (5, 7)])
-@BOTH
-def test_cells_that_do_not_divide_the_image_are_refused(name: str, grid: tuple[int, int]) -> None:
-    with pytest.raises(InputError, match=r"masker.patch_size"):
-        plain.nano(name).eval()(*images(1), cells(1, *grid))
-
-
 @pytest.mark.parametrize("fp32", [True, False])
 def test_autocast_keeps_the_pixel_decoder_in_single_precision_on_request(fp32: bool) -> None:
     net = nano(pixel_decoder_fp32=fp32).train()
@@ -298,22 +289,6 @@ def test_deformable_attention_starts_by_looking_around() -> None:
             expected = torch.tensor(direction) * (point + 1.0)
             torch.testing.assert_close(bias[head, point], expected, rtol=0, atol=1e-6)
     assert not layer.sampling_offsets.weight.any()
-
-
-def test_attention_equals_torch_module() -> None:
-    ours, theirs = QueryAttention(8, 2), nn.MultiheadAttention(8, 2, batch_first=True)
-    theirs.load_state_dict(randomise(ours))
-    query, key, value = normal(2, 3, 8, seed=1), normal(2, 5, 8, seed=2), normal(2, 5, 8, seed=3)
-    allowed = normal(2, 3, 5, seed=4) < 0.3
-    allowed |= ~allowed.any(-1, keepdim=True)
-    blocked = ~allowed.repeat_interleave(2, dim=0)
-    found = ours(query, key, value, allowed)
-    torch.testing.assert_close(found, theirs(query, key, value, attn_mask=blocked)[0])
-    torch.testing.assert_close(ours(query, key, value, None), theirs(query, key, value)[0])
-    with torch.autocast("cpu", torch.bfloat16):
-        rounded = ours(query, key, value, allowed)
-    assert rounded.dtype == torch.bfloat16
-    torch.testing.assert_close(rounded.float(), found, rtol=0.05, atol=0.05)
 
 
 @pytest.mark.parametrize("factor", [2, 4, 8])

@@ -13,12 +13,12 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from PIL import PngImagePlugin
 
 from rgbt.checks import InputError
 from rgbt.config.plain_command import PlainCommand
 from rgbt.data.files import decode
 from rgbt.files.atomic import write_atomic
-from rgbt.metrics.archive import Archive
 from tests.commands import Call, NoOptions, assert_one_sentence, only_run, short, train
 
 SMALL_MB = 2
@@ -46,11 +46,7 @@ def hidden() -> BaseException:
         return error
 
 
-def of_a_named_file() -> BaseException:
-    return OSError(errno.EDQUOT, "Disk quota exceeded", str(Path.cwd() / "none" / "a.png"))
-
-
-@pytest.mark.parametrize("error", [full, hidden, of_a_named_file])
+@pytest.mark.parametrize("error", [full, hidden])
 def test_full_disk_is_one_message(call: Call, error) -> None:
     code, _, err = call(raising(error))
     assert code == 1
@@ -71,12 +67,6 @@ def test_message_that_hides_its_cause_stays(call: Call) -> None:
 def of_torch() -> BaseException:
     with pytest.raises(RuntimeError) as told:
         torch.empty(2**52, dtype=torch.uint8)
-    return told.value
-
-
-def of_numpy() -> BaseException:
-    with pytest.raises(MemoryError) as told:
-        np.empty(2**52, np.uint8)
     return told.value
 
 
@@ -111,14 +101,12 @@ def test_an_image_that_does_not_fit_into_memory_is_not_called_damaged(
 ) -> None:
     path = tmp_path / "a.png"
     cv2.imwrite(str(path), np.zeros((8, 8, 3), np.uint8))
-    error = cv2.error("Insufficient memory")
-    error.code = cv2.Error.StsNoMem
 
-    def decoding(*_: object) -> None:
-        raise error
+    def load(*_: object) -> None:
+        raise MemoryError
 
-    monkeypatch.setattr(cv2, "imdecode", decoding)
-    with pytest.raises(MemoryError, match=r"a.png cannot be decoded, because its pixels do not"):
+    monkeypatch.setattr(PngImagePlugin.PngImageFile, "load", load)
+    with pytest.raises(MemoryError):
         decode(path)
 
 
@@ -139,15 +127,10 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 
 def test_what_was_whole_before_the_disk_was_full_stays_whole(small_disk: Path) -> None:
-    kind = Archive("things 1", "things", "make it", {"numbers": "u N"})
-    noise = np.random.default_rng(0).integers(0, 256, SMALL_MB * 2**20, np.uint8)
-    kind.save(small_disk / "a.npz", {"numbers": noise[:1000]})
+    noise = np.random.default_rng(0).bytes(2 * SMALL_MB * 2**20)
     write_atomic(small_disk / "a.json", b"old")
     with pytest.raises(OSError, match="No space left"):
-        kind.save(small_disk / "a.npz", {"numbers": noise})
-    with pytest.raises(OSError, match="No space left"):
-        write_atomic(small_disk / "a.json", noise.tobytes() * 2)
-    np.testing.assert_array_equal(kind.load(small_disk / "a.npz")["numbers"], noise[:1000])
+        write_atomic(small_disk / "a.json", noise)
     assert (small_disk / "a.json").read_bytes() == b"old"
 
 

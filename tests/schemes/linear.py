@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.data.domains import Domain, Domains
-from rgbt.data.pairs import LoadedPair
+from rgbt.data.loaders import LoadedPair
 from rgbt.engine.checkpoint import State
 from rgbt.engine.optimizers import SGD
 from rgbt.engine.settings import TrainerSettings

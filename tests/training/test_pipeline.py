@@ -18,7 +18,7 @@ from rgbt.config.compose import compose
 from rgbt.files.atomic import holding
 from rgbt.run import main
 from rgbt.runs.folder import RunFolder
-from rgbt.runs.naming import TAGS, describe
+from rgbt.runs.naming import TAGS
 from rgbt.runs.run_spec import Dependency, RunSpec
 from rgbt.runs.specify import specify
 from rgbt.training import pipeline
@@ -106,12 +106,6 @@ def test_pipeline_chain_is_trained_from_its_beginning(run: Pipeline) -> None:
     assert training.validated == [*stages, "multi_head_modified_night_init"]
 
 
-def test_pipeline_teacher_of_a_teacher_is_trained_first(run: Pipeline) -> None:
-    training = run("heatnet_rgb_only")
-    assert training.trained == ["thermal_teacher", "heatnet"]
-    assert training.labels == [("thermal_teacher", "heatnet"), ("heatnet", "heatnet_rgb_only")]
-
-
 def test_pipeline_finished_upstream_runs_are_reused(run: Pipeline, tmp_path: Path) -> None:
     run("multi_head_modified_night_init")
     again = run("multi_head_modified_night_init")
@@ -156,14 +150,6 @@ def test_pipeline_failed_upstream_run_ends_it(run: Pipeline, error: BaseExceptio
         run("sh_adversarial", training=Training(refused=[error]))
     if isinstance(error, InputError):
         assert str(raised.value) == "upstream run sh_source of sh_adversarial: no file."
-
-
-def test_upstream_run_is_named_as_a_run_of_its_own() -> None:
-    for seed in (0, 1):
-        (source,) = spec_of("sh_adversarial", f"seed={seed}", "trainer.max_steps=3").upstream
-        description = describe(source)
-        assert description.name == f"trainer.max_steps=3 seed={seed} · sh_source"
-        assert description.tags["rgbt.group"] == "sh_source trainer.max_steps=3"
 
 
 def test_fresh_names_upstream_runs_of_other_code(
@@ -223,11 +209,6 @@ def test_run_reports_ignored_pretrained_and_takes_tags_of_the_environment(
         )
         assert err == (ignored if experiment == "heatnet" else "")
     assert runs == [("sh_adversarial", {"row": "1"}), ("heatnet", {"row": "1"})]
-
-
-def test_pipeline_tags_belong_to_the_requested_run(run: Pipeline) -> None:
-    training = run("sh_adversarial")
-    assert training.tags == {"sh_source": None, "sh_adversarial": {"row": "1"}}
 
 
 @contextmanager

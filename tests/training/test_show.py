@@ -11,7 +11,7 @@ import pytest
 
 from rgbt.run import main
 from rgbt.runs.folder import Description, RunFolder, read_description
-from tests.commands import Call, Trained, only_run, short, train, words_of
+from tests.commands import Call, Trained, only_run, short, words_of
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -46,13 +46,6 @@ def test_a_finished_run_is_shown_without_torch_and_mlflow(
     assert "mIoU" in done.stdout
 
 
-def test_a_removed_run_is_trained(call: Call, words: list[str], data: Path, tmp_path: Path) -> None:
-    shutil.rmtree(only_run(tmp_path / "runs"))
-    code, _, err = train(call, data, tmp_path / "runs", "+experiment=crm", *short(1))
-    assert (code, "is already finished" in err) == (0, False), err
-    assert only_run(tmp_path / "runs")
-
-
 def test_a_finished_run_is_compared_with_the_present_files(
     call: Call, words: list[str], data: Path
 ) -> None:
@@ -62,11 +55,6 @@ def test_a_finished_run_is_compared_with_the_present_files(
     code, out, err = call(main, *words)
     assert (code, "mIoU" in out) == (0, True)
     assert "other files" not in err, "a result can be shown without its data"
-
-
-def test_ignored_weights_are_reported(call: Call, words: list[str]) -> None:
-    _, _, err = call(main, *words, "model.weights=null", "pretrained=swin.pth")
-    assert "pretrained=swin.pth is ignored: the experiment crm does not use" in err
 
 
 def test_a_finished_run_keeps_its_name_unless_the_new_one_says_more(

@@ -14,7 +14,6 @@ import pytest
 from rgbt.assembly import training_setup
 from rgbt.assembly.training_setup import TrainingSetup
 from rgbt.checks import InputError
-from rgbt.data import pairs
 from rgbt.requirements import record_of
 from rgbt.transforms.rotating import HeatNetTransform, SemsegTransform, rotated
 from rgbt.types import IGNORE, Example, Sample
@@ -236,7 +235,7 @@ def test_heatnet_target_keeps_blocks_and_thermal(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(
         training_setup, "train_batches", lambda *given: taken.append(given[2]) or SimpleNamespace()
     )
-    monkeypatch.setattr(pairs, "PairedBatches", lambda *_, **__: None)
+    monkeypatch.setattr(training_setup, "PairedBatches", lambda *_, **__: None)
     spec = specified(("+experiment=heatnet_original",))
     named = {"domains": spec.domains, "loading": spec.data, "trainer": spec.trainer}
     session: Any = SimpleNamespace(spec=spec, transform=full, **named)

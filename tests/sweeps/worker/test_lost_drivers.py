@@ -44,7 +44,7 @@ def start(*arguments: Any) -> BaseProcess:
 
 
 def end(process: BaseProcess) -> int | None:
-    process.join(120)
+    process.join(600)  # the machine may be busy
     return process.exitcode
 
 

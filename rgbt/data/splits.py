@@ -1,4 +1,4 @@
-"""Divide the frames of a folder into splits by path, by list or by random shares."""
+"""Divide frames into splits by path, by list or by random shares."""
 
 from __future__ import annotations
 
@@ -6,19 +6,18 @@ from collections import Counter, defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Protocol
 
 from rgbt.checks import InputError
-from rgbt.data.folder.frames import FolderFrame
-from rgbt.data.folder.pattern import NAME, SEQUENCE, SPLIT, Pattern, in_order
-from rgbt.data.integrity import is_there, read_names
+from rgbt.data.files import is_there, read_names
+from rgbt.data.patterns import NAME, SEQUENCE, SPLIT, Frame, Pattern, in_order
 from rgbt.randomness import numpy_generator
 
 FOLDERS = {split: split for split in ("train", "val", "test")}
 """Default values of {split}."""
 
-Frames = Mapping[str, FolderFrame]
+Frames = Mapping[str, Frame]
 
 
 class SplitRule(Protocol):
@@ -29,12 +28,8 @@ class SplitRule(Protocol):
         """Split -> its definition, for messages."""
         ...
 
-    def has(self, split: str) -> bool:
-        """Whether a known split has a frame or a list."""
-        ...
-
     def names(self, split: str) -> tuple[str, ...]:
-        """Names of a known split; InputError if it is missing or empty."""
+        """Names of a known split; () if there are none."""
         ...
 
 
@@ -55,29 +50,11 @@ class ByFolder:
     @property
     def splits(self) -> dict[str, str]:
         """Split -> the pattern of its files."""
-        braces = f"{{{SPLIT}}}"
-        return {
-            split: self.pattern.text.replace(braces, word) for split, word in self.folders.items()
-        }
-
-    def has(self, split: str) -> bool:
-        """Whether there is a frame in its folder."""
-        return bool(self._of(split))
+        text = self.pattern.text
+        return {split: text.replace(f"{{{SPLIT}}}", word) for split, word in self.folders.items()}
 
     def names(self, split: str) -> tuple[str, ...]:
-        """Names in its folder; InputError if there are none."""
-        names = self._of(split)
-        if not names:
-            known = sorted({frame.values[SPLIT] for frame in self.frames.values()})
-            raise InputError(
-                f"dataset.folders: split '{split}' is empty, because "
-                f"dataset.rgb='{self.pattern.text}' has no file with '{self.folders[split]}' for "
-                f"{{{SPLIT}}}. Existing values: {', '.join(known)}. Set one of them in "
-                f"dataset.folders, {{{split}: ...}}."
-            )
-        return names
-
-    def _of(self, split: str) -> tuple[str, ...]:
+        """Names in its folder."""
         word = self.folders[split]
         return tuple(name for name, frame in self.frames.items() if frame.values[SPLIT] == word)
 
@@ -107,22 +84,15 @@ class ByList:
         """Split -> its list."""
         return dict(self.lists)
 
-    def has(self, split: str) -> bool:
-        """Whether its list exists."""
-        return is_there(self._path(split))
-
     def names(self, split: str) -> tuple[str, ...]:
-        """Names in the order of the list.
+        """Names in the order of the list; () if there is none.
 
         A line without a frame is kept, so that reading it raises the error. InputError if no line
-        is a frame, or if the list does not exist.
+        is a frame.
         """
-        path, key = self._path(split), f"{self.key}.{split}"
+        path, key = self.root / Path(self.lists[split]).expanduser(), f"{self.key}.{split}"
         if not is_there(path):
-            raise InputError(
-                f"{key}: the list '{path}' does not exist; write it (one name per line), or name "
-                f"another list with {key}=..."
-            )
+            return ()
         lines = read_names(path, key)
         if not self.frames:
             return lines
@@ -131,25 +101,20 @@ class ByList:
         if set(names).isdisjoint(self.frames):
             raise InputError(
                 f"{key}: none of the {len(lines)} lines of {path} is a frame. The first is "
-                f"'{lines[0]}'; expected names such as '{next(iter(self.frames))}' or paths such "
-                f"as '{_below(self.root, next(iter(self.frames.values())))}'."
+                f"'{lines[0]}'; expected names such as '{next(iter(self.frames))}'."
             )
         return names
-
-    def _path(self, split: str) -> Path:
-        return self.root / Path(self.lists[split]).expanduser()
 
     def _forms(self) -> dict[str, str]:
         """Everything that a line may be -> the name of the frame; names come before all else."""
         shared = Counter(frame.values[NAME] for frame in self.frames.values())
         forms = {name: name for name in self.frames}
         for name, frame in self.frames.items():
-            path = _below(self.root, frame)
-            alone = frame.values[NAME]
+            path = frame.rgb.relative_to(self.root).as_posix()
             for form in ("/".join(frame.values.values()), path, _stem(path)):
                 forms.setdefault(form, name)
-            if shared[alone] == 1:
-                forms.setdefault(alone, name)
+            if shared[frame.values[NAME]] == 1:
+                forms.setdefault(frame.values[NAME], name)
         return forms
 
 
@@ -168,8 +133,8 @@ class ByShare:
         block: frames of a unit; None: sequences stay whole.
 
     Raises:
-        InputError: shares that are not positive or not 1 together, nothing that can be
-            drawn, or a split that would get no frame.
+        InputError: shares that are not positive or not 1 together, or a split that would get no
+            frame.
     """
 
     frames: Frames
@@ -178,37 +143,25 @@ class ByShare:
     block: int | None
 
     def __post_init__(self) -> None:
-        if not all(share > 0 for share in self.shares.values()) or (
-            abs(sum(self.shares.values()) - 1) > 1e-6
-        ):
+        shares = self.shares.values()
+        if not all(share > 0 for share in shares) or abs(sum(shares) - 1) > 1e-6:
             raise InputError(
                 "dataset.shares: expected shares above 0 that add up to 1, such as {train: 0.8, "
                 f"val: 0.1, test: 0.1}}, got {self.shares}."
             )
-        units = self.units
-        if len(units) < len(self.shares):
-            raise InputError(
-                f"dataset.shares: {len(self.shares)} splits are to be drawn from {len(units)} "
-                f"{'sequence' if self.block is None else 'block'}(s), and neighbouring frames "
-                "stay together. Set dataset.block, the number of consecutive frames that stay "
-                "together (some seconds of a drive), or use fewer splits."
-            )
         empty = [split for split in self.shares if not self.drawn[split]]
         if empty:
             raise InputError(
-                f"dataset.shares: split '{empty[0]}' gets no frame, because {len(units)} units of "
-                f"up to {max(map(len, units))} frames stay together. Set a smaller dataset.block, "
-                "a larger share, or another dataset.shares_seed."
+                f"dataset.shares: split '{empty[0]}' gets no frame, because neighbours stay "
+                f"together, in {len(self.units)} unit(s) of up to {max(map(len, self.units))} "
+                "frames. Set a smaller dataset.block (frames that stay together), a larger share, "
+                "or another dataset.shares_seed."
             )
 
     @property
     def splits(self) -> dict[str, str]:
         """Split -> its share."""
         return {split: f"{share:g} of the frames" for split, share in self.shares.items()}
-
-    def has(self, split: str) -> bool:
-        """Every split has frames."""
-        return split in self.shares
 
     def names(self, split: str) -> tuple[str, ...]:
         """Names of a split in the order of all frames."""
@@ -218,7 +171,7 @@ class ByShare:
     @cached_property
     def units(self) -> list[list[str]]:
         """Names that stay together."""
-        sequences: dict[str, list[FolderFrame]] = defaultdict(list)
+        sequences: dict[str, list[Frame]] = defaultdict(list)
         for frame in self.frames.values():
             sequences[frame.values.get(SEQUENCE, "")].append(frame)
         units = []
@@ -244,11 +197,6 @@ class ByShare:
         return found
 
 
-def _below(root: Path, frame: FolderFrame) -> str:
-    return frame.rgb.relative_to(root).as_posix()
-
-
 def _stem(line: str) -> str:
     """`line` without what follows the last dot of its last piece."""
-    folder, slash, last = line.rpartition("/")
-    return f"{folder}{slash}{last.rpartition('.')[0] or last}"
+    return str(PurePath(line).with_suffix("")) if PurePath(line).name else line

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import random
+import shutil
 import struct
 import zipfile
 from collections.abc import Iterator
+from dataclasses import asdict, replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,7 @@ from typing import Any
 import pytest
 import torch
 
+from rgbt import evaluate
 from rgbt.checkpoints.read import read
 from rgbt.checkpoints.torch_files import save
 from rgbt.checks import InputError, RunError
@@ -25,7 +28,10 @@ from rgbt.engine.checkpoint import (
     restore_weights,
     training_payload,
 )
+from rgbt.metrics.counts import Counts
+from rgbt.runs.result import RunResult
 from tests.checkpoints.test_read import Calls
+from tests.commands import Call, Trained, short
 from tests.damage import damaged
 
 
@@ -234,6 +240,38 @@ def test_nothing_in_a_checkpoint_runs(tmp_path: Path) -> None:
     assert not marker.exists()
 
 
+def test_checkpoints_and_counts_of_another_run_are_refused(
+    trained: Trained, call: Call, tmp_path: Path
+) -> None:
+    words = ("+experiment=mfnet", "masker.patch_size=null", *short(1))
+    first, other = trained(*words, "seed=1"), trained(*words, "seed=2")
+    folder = Path(shutil.copytree(first, tmp_path / "runs" / first.name))
+    evaluated = (f"run={folder}", f"out={tmp_path / 'counts.npz'}")
+    code, _, err = call(evaluate.entry, *evaluated)
+    assert code == 0, err
+    assert Counts.load(tmp_path / "counts.npz").run == RunResult(folder).counts().run == first.name
+    (tmp_path / "counts.npz").unlink()
+    config = folder / "config.yaml"
+    stored = config.read_text()
+    config.write_text(stored.replace("seed: 1\n", "seed: 3\n", 1))
+    code, _, err = call(evaluate.entry, *evaluated)
+    assert (code, "config.yaml was changed after training" in err) == (2, True)
+    config.write_text(stored)
+    shutil.copy(other / "best.pt", folder)
+    code, _, err = call(evaluate.entry, *evaluated)
+    assert (code, f"belongs to the run {other.name}" in err) == (2, True)
+    shutil.copy(other / "counts_test.npz", folder)
+    with pytest.raises(InputError, match=f"counts of the run {other.name}"):
+        RunResult(folder).counts()
+    # A state of another run is not resumed.
+    state = State(seed=3, step=7, best_step=7, key="a", settings="b")
+    run = Checkpoints(tmp_path / "a")
+    run.commit(payload() | {"state": asdict(state)}, state)
+    assert run.load_best(state).keys() == payload()["model"].keys()
+    with pytest.raises(RunError, match="belongs to the run a, not to c"):
+        run.load_best(replace(state, key="c"))
+
+
 def test_a_file_that_cannot_be_written_leaves_the_old_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -249,3 +287,56 @@ def test_a_file_that_cannot_be_written_leaves_the_old_one(
         save(path, payload())
     assert path.read_bytes() == before
     assert [each.name for each in tmp_path.iterdir()] == ["last.pt"]
+
+
+def moment(stored: dict[str, Any]) -> None:
+    stored["state"][0]["exp_avg"] = torch.zeros(7)
+
+
+def whole_numbers(stored: dict[str, Any]) -> None:
+    stored["state"][0]["exp_avg"] = torch.zeros_like(
+        stored["state"][0]["exp_avg"], dtype=torch.int64
+    )
+
+
+def betas(stored: dict[str, Any]) -> None:
+    stored["param_groups"][0]["betas"] = "0.9"
+
+
+def groups(stored: dict[str, Any]) -> None:
+    stored["param_groups"] *= 2
+
+
+def another_parameter(stored: dict[str, Any]) -> None:
+    stored["state"][99] = stored["state"][0]
+
+
+@pytest.mark.parametrize("change", [moment, whole_numbers, betas, groups, another_parameter])
+def test_optimizer_state_of_other_shape_or_type_is_refused(change: Any) -> None:
+    parameter = torch.nn.Parameter(torch.zeros(2, 3))
+    optimizer = torch.optim.AdamW([parameter], lr=0.1)
+    parameter.grad = torch.ones(2, 3)
+    optimizer.step()
+    stored = optimizer.state_dict()
+    restore_optimizer(optimizer, stored, Path("last.pt"))
+    change(stored)
+    with pytest.raises(InputError, match=r"last\.pt holds the state of a different optimizer"):
+        restore_optimizer(optimizer, stored, Path("last.pt"))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        *({"step": -1}, {"step": 1.5}, {"seed": "3"}, {"best_score": None}, {"skipped": "a"}),
+        *(
+            {"skipped": [3]},
+            {"unlogged": [1.0]},
+            {"unlogged": {"loss": "1"}},
+        ),
+    ],
+)
+def test_state_of_other_types_is_refused(wrong: dict[str, Any]) -> None:
+    stored = payload()
+    assert State.of(stored).unlogged == {}
+    with pytest.raises(TypeError):
+        State.of({"state": stored["state"] | wrong})

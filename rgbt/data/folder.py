@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from fnmatch import fnmatchcase
 from functools import cached_property
 from pathlib import Path
@@ -17,58 +17,25 @@ from typing import Annotated
 from annotated_types import Interval
 
 from rgbt.checks import InputError, check_choice
-from rgbt.data.file_dataset import FileDataset, SplitNames
-from rgbt.data.folder.frames import (
-    FolderFrame,
-    check_partners,
-    find_frames,
-    without_rgb,
-)
-from rgbt.data.folder.pattern import SPLIT
-from rgbt.data.folder.splits import FOLDERS, ByFolder, ByList, ByShare, SplitRule
-from rgbt.data.images import PairPattern, Range
+from rgbt.data.file_dataset import FileDataset, SplitNames, hash_of_files
+from rgbt.data.images import Range
 from rgbt.data.labels import LabelValue, each_colour, label_codes, painted
-from rgbt.data.named_files import existing_root, hash_of_files
+from rgbt.data.patterns import SPLIT, Frame, check_partners, find_frames, without_rgb
+from rgbt.data.splits import FOLDERS, ByFolder, ByList, ByShare, SplitRule
 from rgbt.ranges import Colour, Names, NumClasses, Seed, Share, Text
 
 
 class Folder(FileDataset):
     """RGB-thermal pairs in any folder whose paths follow patterns.
 
-    A pattern is a path below the root with words in braces (`rgbt.data.folder.pattern`): {name}
-    is the frame, {split} its split, {sequence} a group of consecutive frames, and any other word
-    matches any text. The values of the words in the path of the RGB image, joined by "_", are the
-    name of a sample; thermal image and label have the same values in their paths.
+    A pattern is a path below the root with words in braces (`rgbt.data.patterns`): {name} is the
+    frame, {split} its split, {sequence} a group of consecutive frames, and any other word matches
+    any text. The values of the words in the path of the RGB image, joined by "_", are the name of a
+    sample; thermal image and label have the same values in their paths.
 
-    Args:
-        root: folder that the patterns are relative to.
-        num_classes: see `FileDataset`, as `classes`, `name` and `palette`.
-        classes: see there.
-        rgb: pattern of the RGB images, 8 bit, three channels.
-        thermal: pattern of the thermal images, one channel or three equal ones, of the size of the
-            RGB image; the same as `rgb` for files of four channels R, G, B, thermal.
-        label: pattern of the labels, images or `.npy`; None: the data set has no labels.
-        name: see there.
-        palette: None: the colours of `colours`, or colours that differ.
-        unscored: classes that are counted but left out of every mean over classes.
-        background: classes that are no object, see `rgbt.dataset.LabelledDataset`.
-        folders: split -> value of {split}; None: train, val and test.
-        lists: split -> list file in `root`; replaces `folders`.
-        shares: split -> share of the frames, 1 in total; replaces `folders`.
-        shares_seed: seed of the draw of `shares`.
-        block: number of consecutive frames that are drawn together; None: whole sequences.
-        unlabelled: splits without labels; no label files are expected.
-        ids: label value -> class; None: values are class indices.
-        colours: class -> its colour in label images, or several; replaces `ids`.
-        ignored: label values, or colours, that do not count.
-        thermal_range: (low, high) thermal values that become black and white; None: 8 bit.
-        night: pattern of the names of night images, with * and ?; None: unknown.
-
-    Raises:
-        InputError: no such root, patterns that match nothing, or invalid settings.
+    Arguments: the keys of conf/dataset/folder.yaml, which describes each. InputError: no such
+    root, another layout, or settings that do not fit each other.
     """
-
-    most_clipped = 0.5
 
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
         self,
@@ -95,23 +62,21 @@ class Folder(FileDataset):
         thermal_range: Range | None = None,
         night: Text | None = None,
     ) -> None:
-        folder = existing_root(root, f"that dataset.rgb='{rgb}' starts from")
         if palette is None:
             own = {word: each_colour(colour)[0] for word, colour in (colours or {}).items()}
             generated = zip(classes, painted(num_classes), strict=False)
             palette = tuple(own.get(word, colour) for word, colour in generated)
         super().__init__(
-            *(folder, name, num_classes, classes, palette),
+            *(root, name, num_classes, classes, palette),
             background=background,
             unscored=unscored,
         )
+        if len(set(classes)) < num_classes:
+            raise InputError(f"dataset.classes: a name occurs twice in {', '.join(classes)}.")
         self.night = night
-        for word in classes:
-            if classes.count(word) > 1:
-                raise InputError(f"dataset.classes: '{word}' occurs twice; rename one.")
         self.codes = label_codes(classes, ids, colours, ignored)
-        self.follow(PairPattern(rgb, thermal, label), thermal_range)
-        self.frames: Mapping[str, FolderFrame] = find_frames(self.root, self.patterns)
+        self.follow(rgb, thermal, label, thermal_range)
+        self.frames = find_frames(self.root, self.patterns)
         self.rule = self._rule_of(folders, lists, shares, (shares_seed, block))
         self.unlabelled = unlabelled
         for split in unlabelled:
@@ -120,13 +85,12 @@ class Folder(FileDataset):
         if set(self.splits) - set(unlabelled):
             self._check_labels_and_night()
 
-    def frame(self, name: str) -> FolderFrame:
+    def frame(self, name: str) -> Frame:
         """The files of `name`, without a label in splits that have none."""
         if name not in self.frames:
             raise InputError(
                 f"{self.name} ({self.root}) has no frame called '{name}': there is no such RGB "
-                f"image (dataset.rgb='{self.patterns.rgb.text}'); restore it, or remove the name "
-                "from the list."
+                f"image (dataset.rgb='{self.patterns.rgb.text}')."
             )
         frame = self.frames[name]
         return frame._replace(label=None) if name in self._without_labels else frame
@@ -140,9 +104,7 @@ class Folder(FileDataset):
     def fingerprint(self) -> str:
         """SHA-256 in hexadecimal over `hash_of_files` and the map of label values."""
         listed = {
-            split: tuple(name for name in self.names(split) if name in self.frames)
-            if self.has(split)
-            else ()
+            split: tuple(name for name in self.listed(split) if name in self.frames)
             for split in self.splits
         }
         meaning = json.dumps([sorted(self.codes.codes.items()), self.codes.of_colours])
@@ -152,8 +114,7 @@ class Folder(FileDataset):
     @property
     def title(self) -> str:
         """The patterns of its images."""
-        rgb, thermal, _ = self.images.layouts[0]
-        return f"RGB {rgb}, thermal {'channel 4' if rgb == thermal else thermal}"
+        return str(self.images.layouts[0])
 
     def unused(self, lists: SplitNames) -> Iterable[Path]:  # noqa: ARG002 - as every data set
         """Thermal images and labels without an RGB image."""
@@ -162,17 +123,13 @@ class Folder(FileDataset):
 
     def own_notes(self, lists: SplitNames) -> list[str]:
         """Frames of no split."""
-        listed = set().union(*lists.values())
-        unlisted = [name for name in self.frames if name not in listed]
-        return [
-            f"{len(unlisted)} frames are in no split; the first is '{name}'."
-            for name in unlisted[:1]
-        ]
+        others = [name for name in self.frames if name not in set().union(*lists.values())]
+        first = others[:1]
+        return [f"{len(others)} frames are in no split; the first is '{name}'." for name in first]
 
     @cached_property
     def _without_labels(self) -> frozenset[str]:
-        present = [split for split in self.unlabelled if self.has(split)]
-        return frozenset(name for split in present for name in self.names(split))
+        return frozenset(name for split in self.unlabelled for name in self.listed(split))
 
     def _rule_of(
         self,
@@ -181,29 +138,23 @@ class Folder(FileDataset):
         shares: dict[str, float] | None,
         draw: tuple[int, int | None],
     ) -> SplitRule:
-        given = {"folders": folders, "lists": lists, "shares": shares}
-        keys = [f"dataset.{key}" for key, value in given.items() if value is not None]
         in_path = SPLIT in self.patterns.rgb.words
-        if len(keys) > 1 or (in_path and keys not in ([], ["dataset.folders"])):
-            braces = [f"{{{SPLIT}}} in dataset.rgb"] if in_path else []
+        given = {
+            f"{{{SPLIT}}} in dataset.rgb": in_path or folders is not None,
+            "dataset.lists": lists is not None,
+            "dataset.shares": shares is not None,
+        }
+        if sum(given.values()) != 1 or (folders is not None and not in_path):
             raise InputError(
-                f"dataset: {' and '.join([*keys, *braces])} both define the splits; keep one of "
-                "them. (Use another word, such as {part}, for a folder that is not a split.)"
+                f"dataset: exactly one of {', '.join(given)} must define the splits, got "
+                f"{' and '.join(key for key, each in given.items() if each) or 'none'}."
             )
         if shares is None and draw != (0, None):
-            raise InputError(
-                "dataset.shares_seed and dataset.block require dataset.shares, which is null. Set "
-                "dataset.shares, or omit both."
-            )
+            raise InputError("dataset.shares_seed and dataset.block require dataset.shares.")
         if shares is not None:
             return ByShare(self.frames, shares, *draw)
         if lists is not None:
             return ByList(self.root, lists, frames=self.frames)
-        if not in_path:
-            raise InputError(
-                f"dataset: no setting defines the splits. Write {{{SPLIT}}} in dataset.rgb "
-                "instead of train, val and test, or set dataset.lists or dataset.shares."
-            )
         return ByFolder(self.frames, self.patterns.rgb, FOLDERS if folders is None else folders)
 
     def _check_labels_and_night(self) -> None:
@@ -213,6 +164,5 @@ class Folder(FileDataset):
         if self.night is not None and not any(self.nights(tuple(self.frames)) or ()):
             raise InputError(
                 f"dataset.night: none of {len(self.frames)} names matches '{self.night}'; the "
-                f"first name is '{next(iter(self.frames))}'. Correct the pattern, or set it to "
-                "null."
+                f"first name is '{next(iter(self.frames))}'."
             )

@@ -1,1 +1,0 @@
-"""Cache decoded images in memory-mapped files."""

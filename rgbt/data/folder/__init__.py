@@ -1,1 +1,0 @@
-"""Read a user's own RGB-thermal data, described by one YAML file."""

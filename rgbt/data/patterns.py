@@ -1,0 +1,239 @@
+"""Patterns of paths such as "{split}/rgb/{name}.png", and the frames whose files match them."""
+
+from __future__ import annotations
+
+import glob
+import os
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import NamedTuple
+
+from rgbt.checks import InputError, check_choice
+
+NAME, SPLIT, SEQUENCE = "name", "split", "sequence"
+"""Words with a meaning: the frame, its split, a group of consecutive frames."""
+
+WordValues = Mapping[str, str]
+"""Word -> its value in the path of a file."""
+
+NO_VALUES: WordValues = MappingProxyType({})
+
+
+class PathMatch(NamedTuple):
+    """A file, or a folder above it, and the values of the words in its path."""
+
+    path: Path
+    values: WordValues
+
+
+class Pattern:
+    """Paths below a root, in which a word in braces matches any text without a slash.
+
+    A word that occurs twice has the same value in both positions. Of two words in one piece of the
+    path the first matches as much as possible: "{sequence}_{name}.png" reads a_b_c.png as a_b, c.
+
+    Args:
+        text: pieces joined by "/", relative to the root; such as "{split}/ir/{name}_ir.tif".
+        key: of the configuration, for messages.
+
+    Attributes:
+        words: in braces, in order.
+
+    Raises:
+        InputError: an absolute path, "..", an unpaired brace, two words with nothing between them,
+            or no word.
+    """
+
+    def __init__(self, text: str, key: str) -> None:
+        self.text = text
+        self.key = key
+        self.words = tuple(dict.fromkeys(re.findall(r"\{(\w+)\}", text)))
+        is_below = set(text.split("/")).isdisjoint(("", ".", ".."))
+        has_others = re.search(r"[{}]", re.sub(r"\{[^\W\d]\w*\}", "", text)) or "}{" in text
+        if not is_below or has_others or not self.words:
+            raise InputError(
+                f"{key}: expected a path below dataset.root with words in braces and other text "
+                f"between them, such as {{split}}/rgb/{{name}}.png, got '{text}'."
+            )
+
+    def path(self, root: Path, values: WordValues) -> Path:
+        """The file of `values`, which has every word."""
+        return root / _filled(self.text, values)
+
+    def files(
+        self, root: Path, values: WordValues = NO_VALUES, *, any_case: bool = False
+    ) -> list[PathMatch]:
+        """The paths below `root` that match, sorted; words with a value match this one alone.
+
+        Names that begin with a dot are left out, as operating systems write such files.
+
+        Raises:
+            InputError: a folder may not be listed.
+        """
+        text = _filled(self.text, values)
+        wild = re.sub(r"\{\w+\}", "*", glob.escape(text))
+        if any_case:
+            wild = re.sub(r"[^\W\d_]", lambda each: f"[{each[0].lower()}{each[0].upper()}]", wild)
+        above = wild.rpartition("/")[0]
+        while above:
+            for found in glob.glob(above, root_dir=root):  # noqa: PTH207 - see below
+                _check_listable(root / found)
+            above = above.rpartition("/")[0]
+        _check_listable(root)
+        expression = re.compile(_expression(text), re.IGNORECASE * any_case)
+        # That of `Path` lists hidden files, and no broken links.
+        paths = sorted(glob.glob(wild, root_dir=root), key=lambda each: each.split("/"))  # noqa: PTH207
+        matches = {path: expression.fullmatch(path) for path in paths}
+        return [
+            PathMatch(root / path, {**values, **match.groupdict()})
+            for path, match in matches.items()
+            if match
+        ]
+
+
+def _filled(text: str, values: WordValues) -> str:
+    """`text` with words replaced whose values are known."""
+    return re.sub(r"\{(\w+)\}", lambda word: values.get(word[1], word[0]), text)
+
+
+def _expression(text: str) -> str:
+    seen: set[str] = set()
+    parts = []
+    for index, part in enumerate(re.split(r"\{(\w+)\}", text)):
+        if index % 2 == 0:
+            parts.append(re.escape(part))
+        else:
+            parts.append(f"(?P={part})" if part in seen else f"(?P<{part}>[^/]+)")
+            seen.add(part)
+    return "".join(parts)
+
+
+def _check_listable(folder: Path) -> None:
+    """Refuse a folder without permission, which `glob` would leave out without a word."""
+    if folder.is_dir() and not os.access(folder, os.R_OK | os.X_OK):
+        raise InputError(f"{folder} cannot be listed: permission denied; allow access.")
+
+
+def what_is_in(folder: Path) -> str:
+    """The first few names in `folder`, for a message."""
+    names = sorted(path.name for path in folder.glob("[!.]*"))
+    more = f" and {len(names) - 4} more" if len(names) > 4 else ""
+    return ", ".join(names[:4]) + more if names else "nothing"
+
+
+def in_order(text: str) -> list[tuple[bool, int, str]]:
+    """Key to sort names by, numbers in them by their value: frame_9 comes before frame_10."""
+    pieces = re.split(r"([0-9]+)", text)
+    return [
+        (index % 2 == 0, int(piece) if index % 2 else 0, piece)
+        for index, piece in enumerate(pieces)
+    ]
+
+
+class Frame(NamedTuple):
+    """One pair of images and its label.
+
+    Attributes:
+        name: values of the words of the RGB pattern, joined by "_".
+        values: value of each word.
+        rgb: existing file.
+        thermal: expected file; the same one if thermal is its fourth channel.
+        label: expected file; None if the data set has no labels.
+    """
+
+    name: str
+    values: WordValues
+    rgb: Path
+    thermal: Path
+    label: Path | None
+
+
+class Patterns(NamedTuple):
+    """Patterns of the three images of a frame; `label` is None for a data set without labels."""
+
+    rgb: Pattern
+    thermal: Pattern
+    label: Pattern | None
+
+    @classmethod
+    def of(cls, rgb: str, thermal: str, label: str | None) -> Patterns:
+        """Those of the texts of a configuration; InputError for an invalid pattern."""
+        return cls(
+            Pattern(rgb, "dataset.rgb"),
+            Pattern(thermal, "dataset.thermal"),
+            None if label is None else Pattern(label, "dataset.label"),
+        )
+
+    def frame(self, root: Path, name: str, values: WordValues) -> Frame:
+        """The files of a frame, whether they exist or not; `values` has every word."""
+        label = None if self.label is None else self.label.path(root, values)
+        rgb, thermal = (pattern.path(root, values) for pattern in (self.rgb, self.thermal))
+        return Frame(name, values, rgb, thermal, label)
+
+
+def find_frames(root: Path, patterns: Patterns) -> dict[str, Frame]:
+    """Name -> frame, of every RGB image below `root`, in the order of the names (9 before 10).
+
+    Raises:
+        InputError: no {name} in the first pattern, a word that only another one has, no RGB image,
+            no thermal image, two frames of one name, or two that would share a partner.
+    """
+    rgb, thermal, label = patterns
+    if NAME not in rgb.words:
+        raise InputError(f"dataset.rgb: '{rgb.text}' has no {{{NAME}}}, which stands for frames.")
+    partners_of = [each for each in (thermal, label) if each is not None]
+    for pattern in partners_of:
+        for word in pattern.words:
+            check_choice(f"{pattern.key}: word of the pattern", word, rgb.words)
+    every = [
+        patterns.frame(root, "_".join(values[word] for word in rgb.words), values)
+        for _, values in rgb.files(root)
+    ]
+    # If all are in one folder, "{name}.png" matches 7.png and 7_ir.png, which is "{name}_ir.png".
+    partners = {path for each in every for path in (each.thermal, each.label) if path != each.rgb}
+    frames: dict[str, Frame] = {}
+    for frame in every:
+        if frame.rgb in partners:
+            continue
+        if frame.name in frames:
+            raise InputError(
+                f"dataset.rgb: {frames[frame.name].rgb} and {frame.rgb} would both be called "
+                f"'{frame.name}'; rename one of them."
+            )
+        frames[frame.name] = frame
+    if not frames:
+        raise InputError(
+            f"dataset.rgb: '{rgb.text}' matches no file in {root}, which holds {what_is_in(root)}."
+        )
+    found = {name: frames[name] for name in sorted(frames, key=in_order)}
+    for pattern in partners_of:
+        paths = [pattern.path(root, frame.values) for frame in found.values()]
+        if len(set(paths)) < len(paths):
+            shared = next(path for path in paths if paths.count(path) > 1)
+            raise InputError(
+                f"{pattern.key}: several frames would share {shared}; use every word of "
+                "dataset.rgb in which they differ."
+            )
+    check_partners(thermal, found.values(), root)
+    return found
+
+
+def check_partners(pattern: Pattern, frames: Iterable[Frame], root: Path) -> None:
+    """Refuse a pattern by which no frame of `frames`, if there are any, has an existing file."""
+    paths = [pattern.path(root, frame.values) for frame in frames]
+    if paths and not any(map(os.path.lexists, paths)):
+        raise InputError(
+            f"{pattern.key}: '{pattern.text}' matches no existing file: the first would be "
+            f"{paths[0]}, but {paths[0].parent.name} holds {what_is_in(paths[0].parent)}."
+        )
+
+
+def without_rgb(
+    root: Path, partners: Iterable[Pattern | None], frames: Iterable[Frame]
+) -> list[PathMatch]:
+    """Files of the patterns of thermal images and labels that belong to no frame."""
+    used = {path for each in frames for path in (each.rgb, each.thermal, each.label)}
+    matches = [match for each in partners if each is not None for match in each.files(root)]
+    return [match for match in matches if match.path not in used]

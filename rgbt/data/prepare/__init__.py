@@ -1,1 +1,0 @@
-"""Prepare the files of a data set from a download: ``rgbt prepare``."""

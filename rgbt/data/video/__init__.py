@@ -1,1 +1,0 @@
-"""Read videos of RGB-thermal frames, of which all, some or none are labelled."""
