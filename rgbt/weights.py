@@ -8,9 +8,9 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import Annotated
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 
 from rgbt.checks import InputError, one_line
 from rgbt.config.common_options import Checkpoint, RunsDir, Trust
@@ -20,10 +20,6 @@ from rgbt.config.options import Help
 from rgbt.config.plain_command import CommandGroup, PlainCommand
 from rgbt.config.stored_config import check_targets, parse_trust, read_settings
 from rgbt.terminal import plain_text
-
-if TYPE_CHECKING:  # --help does not wait for torch
-    from rgbt.checkpoints.load import Plan
-    from rgbt.checkpoints.read import Contents
 
 NOT_SETTINGS = ("_target_", "weights", "fresh", "inputs")
 
@@ -42,7 +38,9 @@ def inspect(options: InspectOptions, overrides: list[str]) -> int:
     Overrides choose the network: model=mask2former_tiny model.fresh=[sem_seg_head]. Without any it
     is the network of the run that the file is in.
     """
-    from rgbt.checkpoints.load import recognised
+    import torch
+
+    from rgbt.checkpoints.load import plan_for, recognised
     from rgbt.checkpoints.read import read
     from rgbt.checkpoints.starts import start_lines
     from rgbt.runs.run_spec import file_digest
@@ -61,42 +59,25 @@ def inspect(options: InspectOptions, overrides: list[str]) -> int:
         *start_lines(path.name, digest, available("experiment")),
     ]
     print_rich(path_lines(lines))
-    node = _model_node(contents, overrides, parse_trust(options.trust))
-    if node is None:
-        return 0
-    plan = _plan(node, contents)
-    print_rich(plain_text(plan.sentence()))
-    if plan.convention:
-        print_rich(path_lines([("trained with", " ".join(plan.convention))]))
-    return int(bool(plan.problems))
-
-
-def _model_node(
-    contents: Contents, overrides: list[str], trust: tuple[str, ...]
-) -> DictConfig | None:
-    """The network of the overrides or of the run beside the file; None: there is neither."""
+    beside = path.parent / "config.yaml"
     if overrides:
-        return cast(DictConfig, compose(overrides).model)
-    beside = contents.path.parent / "config.yaml"
-    if not (contents.ours and beside.is_file()):
-        return None
-    model = read_settings(beside).get("model")
-    check_targets({"model": model}, trust, str(beside), group="model")
-    return cast(DictConfig, OmegaConf.create({"model": model}).model)
-
-
-def _plan(node: DictConfig, contents: Contents) -> Plan:
-    """What the file sets in the network of a node."""
-    import torch
-
-    from rgbt.checkpoints.load import plan_for
-
+        node = compose(overrides).model
+    elif contents.ours and beside.is_file():
+        model = read_settings(beside).get("model")
+        check_targets({"model": model}, parse_trust(options.trust), str(beside), group="model")
+        node = OmegaConf.create({"model": model}).model
+    else:
+        return 0
     try:
         with torch.device("meta"):  # no memory for its weights, where it can be built so
             network = build(node)
     except (NotImplementedError, RuntimeError):
         network = build(node)
-    return plan_for(network, contents, tuple(node.get("fresh") or ()))
+    plan = plan_for(network, contents, tuple(node.get("fresh") or ()))
+    print_rich(plain_text(plan.sentence()))
+    if plan.convention:
+        print_rich(path_lines([("trained with", " ".join(plan.convention))]))
+    return int(bool(plan.problems))
 
 
 @dataclass(frozen=True)

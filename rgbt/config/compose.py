@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import hydra
 from hydra._internal import defaults_list
@@ -158,6 +158,13 @@ def top_level() -> tuple[tuple[str, ...], tuple[str, ...]]:
     written = [key for key, value in own.items() if isinstance(value, Mapping)]
     nodes = dict.fromkeys([*(group for group in chosen if " " not in group), *written])
     return tuple(nodes), tuple(key for key in own if key not in nodes)
+
+
+def resolved(config: DictConfig) -> dict[str, Any]:
+    """The plain values of a configuration; InputError as of `check_keys`."""
+    check_keys(config)
+    plain: Any = OmegaConf.to_container(config, resolve=True)
+    return cast("dict[str, Any]", plain)
 
 
 def check_keys(keys: Iterable[Any]) -> None:

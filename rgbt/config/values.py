@@ -41,11 +41,13 @@ def _adapter(annotation: Any) -> Any:
 
 
 def refusal(path: str, error: pydantic.ValidationError) -> InputError:
-    """The first message of pydantic, with the key of the refused value in front."""
+    """The first message of pydantic, with the key of the refused value in front; below `path`."""
     first = error.errors()[0]
     for step in first["loc"]:
         if isinstance(step, int):
             path += f"[{step}]"
         elif step.isidentifier() and step not in KINDS:
             path += f".{step}"
-    return InputError(f"'{path}': {one_line(first['msg'])}, got {repr(first['input'])[:80]}.")
+    return InputError(
+        f"'{path.lstrip('.')}': {one_line(first['msg'])}, got {repr(first['input'])[:80]}."
+    )

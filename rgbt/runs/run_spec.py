@@ -16,6 +16,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Generic, Literal, NamedTuple, TypeVar, cast, overload
 
+from typing_extensions import TypedDict  # pydantic takes no other before Python 3.12
+
 from rgbt.checks import InputError
 from rgbt.config.component import Component, checked_nodes
 from rgbt.config.stored_config import EXTERNAL, targets
@@ -108,6 +110,17 @@ class SourceSeeds(NamedTuple):
     weights: int
     order: int
     masks: int
+
+
+class Values(TypedDict):
+    """Every plain value at the top of the configuration."""
+
+    name: Text
+    seed: Seed
+    runs_dir: Text
+    fresh: bool
+    pretrained: Text | None
+    out: Text | None
 
 
 @dataclass(frozen=True)
@@ -206,8 +219,7 @@ class RunSpec:
         Raises:
             InputError: a missing value, an unknown key, a value of a wrong type or range.
         """
-        for key, annotation in VALUES.items():
-            check_value(key, self.plain[key], annotation)
+        check_value("", {key: self.plain[key] for key in Values.__annotations__}, Values)
         self.use([name for name in NODES if name not in vars(self)])
         for each in self.dependencies:
             each.run.check()
@@ -413,12 +425,6 @@ NODES: dict[str, Node[Any]] = {
     name: node for name, node in vars(RunSpec).items() if isinstance(node, Node)
 }
 """Every node of the configuration with its policy."""
-
-VALUES: dict[str, Any] = {
-    **{"name": Text, "seed": Seed, "runs_dir": Text, "fresh": bool},
-    **{"pretrained": Text | None, "out": Text | None},
-}
-"""Every plain value at the top of the configuration with its type."""
 
 NOT_IN_KEY = (
     *("name", "runs_dir", "out"),

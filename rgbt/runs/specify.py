@@ -22,18 +22,18 @@ from rgbt.config.component import RUN_SETTINGS
 from rgbt.config.compose import (
     SEARCH_PATH,
     available,
-    check_keys,
     compose,
     flatten,
     register_resolvers,
+    resolved,
 )
 from rgbt.config.values import check_value
 from rgbt.files.yaml_files import parse_yaml
+from rgbt.ranges import Seed
 from rgbt.runs.run_spec import (
     NODES,
     SHARED,
     SHARED_BY_COMMON,
-    VALUES,
     WEIGHTS,
     CheckpointFile,
     Dependency,
@@ -93,12 +93,11 @@ def requested_run(
 def _spec_of(
     config: DictConfig, overrides: Sequence[str], upstream: tuple[Dependency, ...]
 ) -> RunSpec:
-    check_keys(config)
-    plain = cast("dict[str, Any]", OmegaConf.to_container(config, resolve=True))
+    plain = resolved(config)
     for name in NODES:
         if not isinstance(plain.get(name), dict) or "_target_" not in plain[name]:
             raise InputError(f"'{name}' must be a mapping with `_target_`.")
-    check_value("seed", plain["seed"], VALUES["seed"])
+    check_value("seed", plain["seed"], Seed)
     # Training again is a request to the command, and no property of the run.
     fresh = plain["fresh"] is True
     plain = plain if not fresh else {**plain, "fresh": False}

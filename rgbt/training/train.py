@@ -85,7 +85,7 @@ def train(
     else:
         announce_training(setup, description.name, spec.folder)
     if rank() > 0:
-        Run(setup, SilentFolder(spec.folder), Tracking(), description).complete()
+        Training(setup, SilentFolder(spec.folder), Tracking(), description).complete()
         return
     tracking: Tracking = spec.tracking.build()
     if spec.is_finished:
@@ -95,7 +95,7 @@ def train(
             tracking.refresh(kept, known)
     folder = RunFolder(spec.folder)
     with folder.lock():
-        Run(setup, folder, tracking, description).complete()
+        Training(setup, folder, tracking, description).complete()
     if upstream_of:
         print_upstream_result(folder, description.name)
     else:
@@ -121,8 +121,8 @@ class SilentFolder(RunFolder):
 
 
 @dataclass(frozen=True)
-class Run:
-    """An unfinished run: trains, evaluates and fills its folder.
+class Training:
+    """The training of one run: trains, evaluates and fills its folder.
 
     `selected` are the counts of the last evaluation on the selection split, by the split and view.
     """

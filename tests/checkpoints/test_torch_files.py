@@ -164,6 +164,14 @@ def test_damaged_files_of_others_raise_one_kind_of_error(tmp_path: Path, kind: s
     assert 10 < refused < 200
 
 
+def test_a_tensor_of_another_shape_or_type_than_its_place_is_refused(tmp_path: Path) -> None:
+    model, weights = trained()[0], payload()["model"]
+    name = "0.weight"
+    for wrong in (weights[name].double(), weights[name].mT[:, :3], weights[name].to_sparse(), "x"):
+        with pytest.raises(InputError, match=f"{name} is .* instead of 8x4x3x3 float32"):
+            restore_weights(model, {**weights, name: wrong}, tmp_path / "best.pt")
+
+
 WRONG: list[Any] = [
     *(None, True, -1, 1.5, "x", b"x", [], [1], {}, {"a": 1}, ("a", "b"), torch.zeros(7)),
     *(torch.zeros(8, 4, 3, 3, dtype=torch.int64), torch.zeros(8, 4, 3, 3).double()),
@@ -243,12 +251,14 @@ def test_nothing_in_a_checkpoint_runs(tmp_path: Path) -> None:
 def test_checkpoints_and_counts_of_another_run_are_refused(
     trained: Trained, call: Call, tmp_path: Path
 ) -> None:
-    words = ("+experiment=mfnet", *short(1))
+    words = ("+experiment=mfnet", "masker.patch_size=null", *short(1))
     first, other = trained(*words, "seed=1"), trained(*words, "seed=2")
     folder = Path(shutil.copytree(first, tmp_path / "runs" / first.name))
     evaluated = (f"run={folder}", f"out={tmp_path / 'counts.npz'}")
-    assert call(evaluate.entry, *evaluated)[0] == 0
+    code, _, err = call(evaluate.entry, *evaluated)
+    assert code == 0, err
     assert Counts.load(tmp_path / "counts.npz").run == RunResult(folder).counts().run == first.name
+    (tmp_path / "counts.npz").unlink()
     config = folder / "config.yaml"
     stored = config.read_text()
     config.write_text(stored.replace("seed: 1\n", "seed: 3\n", 1))

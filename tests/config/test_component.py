@@ -17,7 +17,7 @@ from rgbt.config.component import Component, build, setting_types
 from rgbt.config.compose import conf_dir
 from rgbt.config.values import check_value
 from rgbt.ranges import Pixels, Share
-from rgbt.runs.run_spec import NODES, VALUES
+from rgbt.runs.run_spec import NODES, Values
 from tests.models.golden import alone, compose
 
 
@@ -135,8 +135,10 @@ def test_every_number_and_text_has_a_range(target: str) -> None:
 
 
 def test_top_level_keys_have_a_range() -> None:
-    assert not [kind for kind in VALUES.values() if unbounded(TypeAdapter(kind).json_schema())]
-    assert check_value("seed", 0, VALUES["seed"]) == 0
+    assert not unbounded(TypeAdapter(Values).json_schema()["properties"]["seed"])
+    text = {"pretrained": None, "out": None}
+    good = {"name": "a", "seed": 0, "runs_dir": "runs", "fresh": False, **text}
+    assert check_value("", good, Values) == good
     for wrong in (-1, 2**32, True, 0.5, None):
         with pytest.raises(InputError, match="^'seed'"):
-            check_value("seed", wrong, VALUES["seed"])
+            check_value("", {**good, "seed": wrong}, Values)

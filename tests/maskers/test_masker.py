@@ -8,11 +8,10 @@ import math
 import numpy as np
 import pytest
 import torch
-from omegaconf import OmegaConf
 
 from rgbt.checks import InputError
 from rgbt.config.component import build
-from rgbt.config.compose import conf_dir, register_resolvers
+from rgbt.config.compose import compose
 from rgbt.maskers.masker import (
     Masker,
     bernoulli,
@@ -32,10 +31,7 @@ VARIANTS = ["none", "crm", "irm", "mic", "square", "grbm_paper", "grbm_released"
 
 def configured(variant: str, scale: str = "paper", **changes: object) -> Masker:
     """The masker of conf/masker/<variant>.yaml at a scale, with some settings changed."""
-    register_resolvers()
-    factor = OmegaConf.load(conf_dir() / "scale" / f"{scale}.yaml").scale.pixel_factor
-    masker = OmegaConf.load(conf_dir() / "masker" / f"{variant}.yaml")
-    config = OmegaConf.create({"scale": {"pixel_factor": factor}, "masker": masker})
+    config = compose([f"masker={variant}", f"scale={scale}"])
     config.masker.update(changes)
     return build(config.masker)
 

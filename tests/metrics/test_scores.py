@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -184,19 +183,6 @@ def test_a_region_of_unscored_pixels_alone() -> None:
     assert np.isnan(value("region/2", counts, "exclude"))
     expected = (100 * (IN_LEFT["exclude"] - IN_RIGHT) / 2) ** 2
     assert value("Var", counts, "exclude") == pytest.approx(expected)
-
-
-def test_day_and_night_and_chosen_images_leave_it_out_too() -> None:
-    counts = counts_of([LEFT, LEFT], [RIGHT, RIGHT], night=(False, True))
-    day, night = 100 * IN_LEFT["released"], 100 * IN_RIGHT
-    assert value("day/mIoU", counts, "released") == pytest.approx(day)
-    assert value("night/mIoU", counts, "released") == pytest.approx(night)
-    summary = scores.summary(counts, "released")
-    assert 100 * summary["day/mIoU"] == pytest.approx(day)
-    assert summary["night/Var"] == pytest.approx(0)
-    chosen = [counts.select(["00001"]), counts.parts()["day"], replace(counts, split="val")]
-    assert [each.unscored for each in chosen] == [("void",)] * 3
-    assert value("mIoU", chosen[0], "released") == pytest.approx(night)
 
 
 def test_absent_notes_by_hand() -> None:

@@ -267,6 +267,17 @@ def test_label_and_depth_of_a_box_follow_the_camera() -> None:
     assert sorted(seen)[1] == (label == CAR).sum()
 
 
+def test_normals_are_those_of_the_facets_and_point_at_the_camera() -> None:
+    road, camera = draw_road(0, 3, FACTORS), camera_of(FACTORS)
+    facets = facets_of(ground_quads(road), place_objects(0, 3, road, FACTORS))
+    normals = draw(facets, camera).normals[1:].astype(float)
+    first, second, third = facets.corners[:, :3].astype(float).transpose(1, 0, 2)
+    for edge in (second - first, third - first):
+        edge /= np.linalg.norm(edge, axis=1, keepdims=True)
+        assert np.abs((edge * normals).sum(1)).max() < 1e-3
+    assert ((np.array(camera.position) - first) * normals).sum(1).min() > -1e-3
+
+
 def test_far_objects_are_drawn_before_near_ones() -> None:
     placed = sorted_for_drawing(place_objects(0, 2, draw_road(0, 2, FACTORS), FACTORS))
     order = [(thing.layer, -thing.z) for thing in placed]

@@ -11,7 +11,7 @@ import pytest
 from rgbt.engine.checkpoint import State
 from rgbt.runs.folder import Description, RunFolder
 from rgbt.tracking.mlflow_store import NoTracking
-from rgbt.training.train import Run
+from rgbt.training.train import Training
 
 
 def stderr_of(
@@ -22,7 +22,7 @@ def stderr_of(
     nothing: Any = None
     setup: Any = SimpleNamespace(session=SimpleNamespace(loading=SimpleNamespace(cache=cache)))
     capsys.readouterr()
-    Run(setup, nothing, nothing, nothing)._report(kept)
+    Training(setup, nothing, nothing, nothing)._report(kept)
     return capsys.readouterr().err
 
 
@@ -63,9 +63,9 @@ def test_a_run_that_is_stopped_while_its_tracking_begins_is_closed(
             self.ended = status
 
     tracking, prepared = Slow(), cast(Any, SimpleNamespace(session=None))
-    monkeypatch.setattr(Run, "_claim", lambda *_: None)
+    monkeypatch.setattr(Training, "_claim", lambda *_: None)
     with pytest.raises(KeyboardInterrupt):
-        Run(prepared, RunFolder(tmp_path), tracking, Description("a", {}, {})).complete()
+        Training(prepared, RunFolder(tmp_path), tracking, Description("a", {}, {})).complete()
     assert tracking.ended == "KILLED"
 
 
@@ -85,5 +85,5 @@ def test_steps_that_were_not_saved_are_named_on_resuming(
         trainer: Any = SimpleNamespace(
             resume=lambda _: False, settings=SimpleNamespace(log_every=1)
         )
-        Run(setup, folder, nothing, nothing)._resume(trainer, state)
+        Training(setup, folder, nothing, nothing)._resume(trainer, state)
         assert capsys.readouterr().err == said
