@@ -1,4 +1,6 @@
-"""Keep the results of runs in the repository: ``rgbt archive add run=all``, ``rgbt archive check``.
+"""Keep the results of runs in the repository.
+
+usage: rgbt archive add run=all, rgbt archive check, or rgbt archive rekey
 
 See `rgbt.runs.archive` for the files. Exit code 1 of ``check``: a run is damaged, or its command
 now has another key.

@@ -59,7 +59,11 @@ def test_command_explains_itself_and_refuses_a_wrong_option(
     assert (
         "rgbt run" if name in ("run", "check", "masks") else f"usage: rgbt {name} "
     ) in out or name == "weights"
-    words = {"weights": ("inspect", "x.pth"), "reproduce": ("table=spatialseg/table3",)}
+    words = {
+        "weights": ("inspect", "x.pth"),
+        "archive": ("check",),
+        "reproduce": ("table=spatialseg/table3",),
+    }
     for given in ((name, *words.get(name, ()), "spilt=1"), (f"{name}x\x1b[2J", "spilt=1")):
         code, out, err = call(main, *given)
         assert (code, out) == (2, "")

@@ -245,8 +245,8 @@ def name_twice(data: Path, predicted: Path) -> None:
 
 OF_METHOD, VIEW, LABEL = "predictions={tmp}/predicted", "00202N_view2.png", "labels/00201D.png"
 REFUSED: dict[str, tuple[tuple[str, ...], str, Callable[[Path, Path], None] | None]] = {
-    "sets": ((OF_METHOD, "consistency.sets=[released_1]"), "set of views", None),
-    "split": ((OF_METHOD, "split=val"), "split=test", None),
+    "sets": ((OF_METHOD, "consistency.sets=[released_1]"), "views: the pairs were exported", None),
+    "split": ((OF_METHOD, "split=val"), "split: the pairs were exported", None),
     "list": ((OF_METHOD, "pairs={tmp}"), "pairs=FOLDER", None),
     "run": ((OF_METHOD, "run=runs/1c0ffe"), "'run'", None),
     "both": ((OF_METHOD, "export={tmp}/more"), "'predictions'", None),
@@ -257,7 +257,11 @@ REFUSED: dict[str, tuple[tuple[str, ...], str, Callable[[Path, Path], None] | No
     "other files": (("export={tmp}",), "export=", None),
     "no prediction": ((OF_METHOD,), VIEW, lambda _, folder: (folder / VIEW).unlink()),
     "small prediction": ((OF_METHOD,), VIEW, lambda _, folder: small(folder / VIEW)),
-    "other label": ((OF_METHOD,), "other images", lambda data, _: small(data / LABEL)),
+    "other label": (
+        (OF_METHOD,),
+        "dataset: the pairs were exported",
+        lambda data, _: small(data / LABEL),
+    ),
     "interrupted export": ((OF_METHOD,), "interrupted", interrupt),
     "one name for two": ((OF_METHOD,), "00201D_view1", name_twice),
 }

@@ -50,7 +50,7 @@ RUN = [
             ("scheme.view.camera.height=1024", "set the intrinsics of your camera"),
             ("consistency.view.camera.cx=900", "principal point"),
             ("scheme.view.yaw=[-50,50]", "leave no rectangle"),
-            *(("scheme=supervised", "frames=2"), ("loss.second=none", "set loss.beta=0")),
+            *(("scheme=supervised", "frames=2"), ("loss.second=none", "loss.beta=1")),
             ("loss@loss.segmentation=set_criterion", "outputs=masks"),
             ("consistency.sets=released_1", "'consistency.sets'"),
         )

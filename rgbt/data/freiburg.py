@@ -159,6 +159,12 @@ class Freiburg(FileDataset):
         if split != "val":
             super().check_split(split)
 
+    def names(self, split: str) -> tuple[str, ...]:
+        """Names of a split, in order; InputError if it is unknown or empty."""
+        if split == "val" and not self.val_sequences:
+            raise InputError("dataset.val_sequences=[]: name the sequences of the split 'val'.")
+        return super().names(split)
+
     def listed(self, split: str) -> tuple[str, ...]:
         """Names of a split, sorted by folder and file, the day before the night.
 

@@ -87,7 +87,7 @@ def test_conventions_are_side_by_side_only_where_they_differ(table: ScoreTable) 
     assert "released counts that as 0, exclude leaves the class out" in convention_line(table)
     labels = [row[0] for row in region_grid(table).rows]
     assert labels[:2] == ["mIoU released", "mIoU exclude"]
-    full = score_table(counts(np.ones((2, 3, 3)), np.ones((2, 3, 3))), "ours")
+    full = score_table(counts(np.ones((2, 3, 3), int), np.ones((2, 3, 3), int)), "ours")
     assert full.conventions() == ("released",)
     assert "the same numbers" in convention_line(full)
     assert [row[0] for row in region_grid(full).rows[:3]] == ["mIoU", "mAcc", "ground"]
