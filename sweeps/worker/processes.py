@@ -21,7 +21,7 @@ from typing import Protocol
 from rgbt.checks import InputError
 from rgbt.runs.source_code import counted_modules
 
-PRELOADED = "sweeps.worker.preload"
+CWD_LAST, PRELOADED = "rgbt.runtime.cwd_last", "sweeps.worker.preload"
 GPUS = "CUDA_VISIBLE_DEVICES"
 GRACE_S = 20.0
 """Time between SIGTERM and SIGKILL of a process that is stopped."""
@@ -58,7 +58,7 @@ class LocalExecutor:
         """See `Executor.start`."""
         log.parent.mkdir(parents=True, exist_ok=True)
         # Without effect once the server runs. The user's own modules that planned points have read.
-        self._context.set_forkserver_preload([*counted_modules(), PRELOADED])
+        self._context.set_forkserver_preload([CWD_LAST, *counted_modules(), PRELOADED])
         arguments = (tuple(command), dict(environment), str(log), str(Path.cwd()))
         process = self._context.Process(target=_run_module, args=arguments)
         process.start()
