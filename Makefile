@@ -4,6 +4,7 @@
 # make test-servers  the tests on PostgreSQL and an MLflow server, started on loopback
 # make lint       formatting, lint, types, spelling
 # make docs       checks the pages and their code, builds the site into site/index.html
+# make mutants    named faults (tests/mutants/*.yaml), each of which a test has to find
 # make bench      benchmarks, as ratios measured in one run
 
 PYTHON ?= python3
@@ -18,7 +19,7 @@ SPREAD ?= -n auto --maxprocesses 4 --dist worksteal
 # What is spelled: tests misspell names on purpose.
 TEXTS := README.md CONTRIBUTING.md CHANGELOG.md CITATION.cff docs conf rgbt sweeps analysis hydra_plugins
 
-.PHONY: demo test test-all test-servers lint docs bench
+.PHONY: demo test test-all test-servers lint docs mutants bench
 
 demo: $(VENV)/.ready
 	$(BIN)/python -m rgbt.run +experiment=grbm
@@ -46,6 +47,9 @@ docs: $(VENV)/.ready
 	$(BIN)/python -m pytest $(SPREAD) -m "docs and not slow" tests/docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 	@echo "built site/index.html; with search: $(BIN)/python -m http.server --directory site"
+
+mutants: $(VENV)/.ready
+	$(BIN)/python -m tests.mutants
 
 bench: $(VENV)/.ready
 	for file in tests/benchmarks/bench_*.py; do echo "== $$file"; $(BIN)/python -m tests.benchmarks.$$(basename $$file .py) || exit 1; done
