@@ -39,7 +39,7 @@ from rgbt.losses.distances import sdc, sdn
 from rgbt.losses.set_criterion import SetCriterion
 from rgbt.models.inputs import expand_cells
 from rgbt.models.mask2former.model import Mask2Former
-from rgbt.models.mask2former.swin import PATCH
+from rgbt.models.swin import PATCH
 from rgbt.types import Batch, MaskPair, Output
 from tests.benchmarks.reference_criterion import Replayed, reference_criterion
 

@@ -18,7 +18,7 @@ from rgbt.models.mask2former.pixel_decoder import (
     shrink,
     sine_code,
 )
-from rgbt.models.mask2former.swin import PatchMerging, relative_index, shift_mask
+from rgbt.models.swin import PatchMerging, relative_index, shift_mask
 from rgbt.types import VIEWS, MaskPair
 from tests.models import plain
 from tests.models.golden import network

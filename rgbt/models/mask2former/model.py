@@ -20,8 +20,8 @@ from rgbt.models.mask2former.network import (
     NumQueries,
 )
 from rgbt.models.mask2former.pixel_decoder import HeadShape
-from rgbt.models.mask2former.swin import PATCH, Stage, Swin, SwinShape
 from rgbt.models.parts import check_heads
+from rgbt.models.swin import PATCH, Stage, Swin, SwinShape
 from rgbt.ranges import Blocks, Channels, Depths, MlpRatio, NumClasses, ShareBelowOne, Widths
 
 
