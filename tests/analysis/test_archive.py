@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from rgbt.archive import entry
+from analysis.archive.__main__ import entry
+from analysis.archive.files import add, archived
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
-from rgbt.runs.archive import add, archived
 from rgbt.runs.folder import RunFolder
 from rgbt.runs.naming import describe
 from rgbt.runs.result import RunResult

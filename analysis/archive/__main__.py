@@ -2,8 +2,8 @@
 
 usage: rgbt archive add run=all, rgbt archive check, or rgbt archive rekey
 
-See `rgbt.runs.archive` for the files. Exit code 1 of ``check``: a run is damaged, or its command
-now has another key.
+See `analysis.archive.files` for the files. Exit code 1 of ``check``: a run is damaged, or its
+command now has another key.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from rgbt.config.options import Help
 from rgbt.config.plain_command import CommandGroup, PlainCommand
 
 if TYPE_CHECKING:
-    from rgbt.runs.archive import ArchivedRun
+    from analysis.archive.files import ArchivedRun
 
 Archive = Annotated[Path, Help("folder of the archive")]
 
@@ -43,7 +43,7 @@ class ArchiveOptions:
 
 def add_runs(options: AddOptions, overrides: list[str]) -> int:
     """Add finished runs to the archive; a run that is in it already is left as it is."""
-    from rgbt.runs.archive import add
+    from analysis.archive.files import add
     from rgbt.runs.folder import find_run, is_finished, runs_in
     from rgbt.runs.result import RunResult
     from rgbt.terminal import plain_text, print_rich, warn
@@ -79,7 +79,7 @@ def rekey(options: ArchiveOptions, overrides: list[str]) -> int:
 
     The default of an added setting has to keep the behaviour. Who adds it knows.
     """
-    from rgbt.runs.archive import add
+    from analysis.archive.files import add
     from rgbt.runs.result import RunResult
     from rgbt.terminal import plain_text, print_rich
 
@@ -117,7 +117,7 @@ class ComparedRun:
 
 
 def _compared(archive: Path) -> Iterator[ComparedRun]:
-    from rgbt.runs.archive import archived
+    from analysis.archive.files import archived
 
     with tempfile.TemporaryDirectory() as scratch:
         for run in archived(archive):

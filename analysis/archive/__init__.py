@@ -1,0 +1,1 @@
+"""The results of runs as small files in the repository."""
