@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 
@@ -15,31 +15,34 @@ from sweeps.table.request import UNTIL_DECIDED, TableRequest
 from sweeps.verdicts.judge import CellRunId
 from sweeps.worker.planner import Planner
 
-SEED = "rgbt.seed"
+SEED, EXPERIMENT = "rgbt.seed", "rgbt.experiment"
 
 
-def finished_by_seed(runs_dir: Path) -> dict[int, set[str]]:
-    """Keys of the finished runs of a folder by their seed; damaged runs are left out.
+def finished_by_seed(runs_dir: Path) -> dict[int, dict[str, str]]:
+    """Seed -> key -> experiment of the finished runs of a folder; damaged runs are left out.
 
     Raises:
         InputError: there is no such folder.
     """
-    found: dict[int, set[str]] = {}
+    found: dict[int, dict[str, str]] = {}
     for folder in runs_in(runs_dir):
         run = RunResult(folder.path)
         with suppress(InputError, ValueError, TypeError):
             if run.is_finished:
-                found.setdefault(int(run.tags[SEED]), set()).add(run.key)
+                tags = run.tags
+                found.setdefault(int(tags[SEED]), {})[run.key] = tags[EXPERIMENT]
     return found
 
 
 def stored_runs(
     request: TableRequest,
     runs_dir: Path,
-    finished: Mapping[int, Collection[str]],
+    finished: Mapping[int, Mapping[str, str]],
     planner: Planner,
 ) -> dict[CellRunId, Outcome]:
     """The finished runs of every row; rows that cannot be composed have none.
+
+    A row is composed if a finished run is of its experiment, or if overrides are to be checked.
 
     Args:
         request: the table; its seeds do not matter.
@@ -52,9 +55,13 @@ def stored_runs(
     """
     runs: dict[CellRunId, Outcome] = {}
     errors = []
+    known = {f"+experiment={name}" for keys in finished.values() for name in keys.values()}
     for row in request.trained_rows:
+        words = request.overrides(row.label, 0)
+        if not request.extra and words[0] not in known:
+            continue
         try:
-            spec = planner.specify((*planner.base, *request.overrides(row.label, 0)))
+            spec = planner.specify((*planner.base, *words))
             keys = {seed: spec.with_seed(seed).key for seed in finished}
         except InputError as error:
             errors.append(error)
