@@ -27,7 +27,7 @@ def finished_by_seed(runs_dir: Path) -> dict[int, dict[str, str]]:
     found: dict[int, dict[str, str]] = {}
     for folder in runs_in(runs_dir):
         run = RunResult(folder.path)
-        with suppress(InputError, ValueError, TypeError):
+        with suppress(InputError, KeyError, ValueError, TypeError):
             if run.is_finished:
                 tags = run.tags
                 found.setdefault(int(tags[SEED]), {})[run.key] = tags[EXPERIMENT]

@@ -54,8 +54,9 @@ def plant(runs_dir: Path, tags: dict[str, str] | None = None) -> None:
             dataset = planner.fingerprint(run)
             folder = runs_dir / run.key
             folder.mkdir(parents=True)
-            described = {"name": run.key, "tags": {"rgbt.seed": str(seed), **(tags or {})}}
-            (folder / "run.json").write_text(json.dumps({**described, "params": {}}))
+            own = {"rgbt.experiment": "baseline", "rgbt.seed": str(seed), **(tags or {})}
+            described = {"name": run.key, "tags": own, "params": {}}
+            (folder / "run.json").write_text(json.dumps(described))
             replace(accuracy(share, seed), dataset=dataset).save(folder / "counts_test.npz")
             result = {"dataset": dataset, "test": {"mIoU": share / 100}}
             (folder / "result.json").write_text(json.dumps(result))
