@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -152,20 +152,26 @@ def _compare(run: ArchivedRun, folder: Path) -> ComparedRun:
         if (key not in before or key not in now or before[key] != now[key])
         and not any(key == out or key.startswith(f"{out}.") for out in NOT_IN_KEY)
     ]
-    is_added = all(key not in before for key in differing)
+    # Nothing says how an upstream run differs.
+    is_added = bool(differing) and all(key not in before for key in differing)
     reason = ", ".join(differing) or "a run that it depends on"
     return ComparedRun(run, "added" if is_added else "changed", reason, spec.key, spec.plain)
 
 
 def _rewrite(folder: Path, key: str, settings: Mapping[str, Any]) -> None:
-    """Give an unpacked run its new key and settings."""
+    """Give an unpacked run its new key and settings; its counts name the run, too."""
     from omegaconf import OmegaConf
 
+    from analysis.archive.files import counts_of
     from rgbt.files.plain_files import write_json
+    from rgbt.metrics.counts import Counts
     from rgbt.runs.folder import read_result
 
     (folder / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(dict(settings))))
     write_json(folder / "result.json", {**(read_result(folder) or {}), "key": key})
+    for path in counts_of(folder):
+        counts = Counts.load(path)
+        replace(counts, run=key if counts.run else "").save(path)
 
 
 entry = CommandGroup(

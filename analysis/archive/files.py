@@ -67,12 +67,12 @@ class ArchivedRun:
         return self.path.stem.partition("-")[0]
 
     def unpack(self, folder: Path) -> RunResult:
-        """The run as a folder in `folder`; a folder that exists is taken as it is.
+        """The run as ``<name of the file>/<key>`` in `folder`; one that exists is taken as it is.
 
         Raises:
             InputError: a damaged file, or one that belongs to another run.
         """
-        target = folder / self.path.stem
+        target = folder / self.path.stem / self.key
         if target.is_dir():
             return RunResult(target)
         folder.mkdir(parents=True, exist_ok=True)
@@ -85,6 +85,7 @@ class ArchivedRun:
             result = RunResult(unpacked).result
             if result.get("key", self.key) != self.key:
                 raise InputError(f"{self.path} holds the run {result['key']}; rename the file.")
+            target.parent.mkdir()
             unpacked.rename(target)
         return RunResult(target)
 
@@ -105,6 +106,11 @@ class ArchivedRun:
 def archived(folder: Path) -> list[ArchivedRun]:
     """All runs of an archive, by key."""
     return [ArchivedRun(path) for path in sorted(folder.glob("*.zip"))]
+
+
+def counts_of(folder: Path) -> list[Path]:
+    """The files of counts of a run folder."""
+    return sorted(each for pattern in COUNTS for each in folder.glob(pattern))
 
 
 def add(run: RunResult, folder: Path) -> ArchivedRun:
@@ -137,7 +143,7 @@ def _packed(run: RunResult, shared: Path) -> bytes:
         for entry in run.provenance
     ]
     members["provenance.json"] = json.dumps(entries, indent=1).encode()
-    for path in sorted(each for pattern in COUNTS for each in run.folder.glob(pattern)):
+    for path in counts_of(run.folder):
         name = path.relative_to(run.folder).as_posix()
         members[f"{name}.xz"] = _packed_counts(Counts.load(path), shared)
     file = io.BytesIO()

@@ -39,7 +39,7 @@ def run(tmp_path: Path) -> RunResult:
     folder.write_config(OmegaConf.to_yaml(OmegaConf.create(dict(spec.plain))))
     folder.describe(describe(spec))
     folder.add_provenance({"git_commit": "a" * 40, "cwd": "/home/me", "packages": {"torch": "2"}})
-    some(0).save(folder.path / "counts_test.npz")
+    some(0, run=spec.key).save(folder.path / "counts_test.npz")
     (folder.path / "evaluations").mkdir()
     replace(some(1), night=(True, False) * 6).save(folder.path / "evaluations/test_rgb.npz")
     PAIRS.save(folder.path / "evaluations/consistency_aligned_test.npz")
@@ -64,9 +64,10 @@ def test_unpacked_run_has_equal_counts(run: RunResult, tmp_path: Path) -> None:
 def test_same_results_are_one_file_and_others_are_kept(run: RunResult, tmp_path: Path) -> None:
     archive = tmp_path / "results"
     assert add(run, archive) == add(run, archive)
-    some(2).save(run.folder / "counts_test.npz")
+    some(2, run=run.key).save(run.folder / "counts_test.npz")
     other = add(run, archive)
     assert other.key == run.key
+    assert other.unpack(tmp_path / "unpacked").counts().run == run.key
     assert [each.path for each in archived(archive)] == [other.path, archive / f"{run.key}.zip"]
 
 
@@ -118,28 +119,42 @@ def test_archive_of_another_run_is_refused(run: RunResult, tmp_path: Path) -> No
 def write_settings(run: RunResult, **changed: object) -> None:
     """Give a run the settings of its command, with changes of its masker, and another key."""
     plain = dict(specified(WORDS).plain)
-    plain["masker"] = {k: v for k, v in {**plain["masker"], **changed}.items() if v is not None}
+    removed = [name for name, value in changed.items() if value is None]
+    masker = {**plain["masker"], **changed}
+    plain["masker"] = {name: masker[name] for name in masker if name not in removed}
     (run.folder / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(plain)))
 
 
 @pytest.mark.parametrize(
-    ("changed", "state"), [({"sampler": None}, "added"), ({"sampler": "bernoulli"}, "changed")]
+    ("changed", "state", "reason"),
+    [
+        ({"sampler": None}, "added", "masker.sampler"),
+        ({"sampler": "bernoulli"}, "changed", "masker.sampler"),
+        ({}, "changed", "a run that it depends on"),
+    ],
 )
 def test_check_reports_changed_keys(
-    call: Call, run: RunResult, tmp_path: Path, changed: dict[str, object], state: str
+    call: Call,
+    run: RunResult,
+    tmp_path: Path,
+    changed: dict[str, object],
+    state: str,
+    reason: str,
 ) -> None:
     archive = tmp_path / "results"
     folder = run.folder.rename(run.folder.with_name("0123456789ab"))
     write_settings(RunResult(folder), **changed)
+    some(0, run="0123456789ab").save(folder / "counts_test.npz")
     (folder / "result.json").write_text('{"dataset": "abc"}')
     add(RunResult(folder), archive)
     code, out, _ = call(entry, "check", f"archive={archive}")
     assert code == 1
     assert state in out
-    assert "masker.sampler" in out
+    assert reason in out
     assert call(entry, "rekey", f"archive={archive}")[0] == 0
-    names = [each.path.stem for each in archived(archive)]
-    assert names == [run.key if state == "added" else "0123456789ab"]
+    (only,) = archived(archive)
+    assert only.path.stem == (run.key if state == "added" else "0123456789ab")
+    assert only.unpack(tmp_path / "unpacked").counts().run == only.key
     assert call(entry, "check", f"archive={archive}")[0] == (0 if state == "added" else 1)
 
 
