@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -10,6 +11,7 @@ from torch.nn import functional as F
 from rgbt.checks import InputError
 from rgbt.config.component import build
 from rgbt.losses.cross_entropy import CrossEntropy, WithAuxiliary
+from rgbt.requirements import Record, check_requirements
 from rgbt.types import Output
 from tests.losses.problems import NOTHING, batch_of, seeded
 from tests.models.golden import compose
@@ -47,13 +49,11 @@ def test_nothing_labelled_costs_nothing() -> None:
     assert not logits.grad.any()
 
 
-def test_raises() -> None:
-    batch = batch_of(torch.zeros(1, 2, 2, dtype=torch.long))
-    plain = CrossEntropy(class_weights=None)
-    with pytest.raises(ValueError, match="label"):
-        plain(Output(torch.zeros(1, 3, 4, 4), {}), batch, NOTHING)
-    with pytest.raises(InputError, match="2 numbers"):
-        CrossEntropy(class_weights=(1.0, 2.0))(Output(torch.zeros(1, 3, 2, 2), {}), batch, NOTHING)
+def test_class_weights_of_another_number_are_refused() -> None:
+    records = {"dataset": SimpleNamespace(record=Record(num_classes=3))}
+    check_requirements({**records, "loss": CrossEntropy(class_weights=(1.0, 2.0, 3.0))})
+    with pytest.raises(InputError, match=r"loss.class_weights=\[1.0, 2.0\] requires num_classes=2"):
+        check_requirements({**records, "loss": CrossEntropy(class_weights=(1.0, 2.0))})
 
 
 def test_confidences_by_hand() -> None:

@@ -7,8 +7,8 @@ import torch
 from torch.nn import functional as F
 
 from rgbt.checks import RunError
-from rgbt.losses.matcher import assign, pairwise_costs, targets_of
 from rgbt.losses.points import Points, class_shares, most_uncertain, sample
+from rgbt.losses.set_criterion import assign, pairwise_costs, targets_of
 from rgbt.losses.spatial import PointWeights
 from tests.losses.problems import seeded
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from rgbt.losses.matcher import targets_of
+from rgbt.losses.set_criterion import targets_of
 from rgbt.types import Output
 from tests.benchmarks.reference_criterion import Replayed
 from tests.losses.problems import batch_of, criterion_of, recorded_losses
@@ -118,8 +118,8 @@ def test_released_matches(case: Golden) -> None:
     output, label = case.output(), case.label()
     hw = case.recipe["image_size"]
     targets = targets_of(batch_of(label).label, tuple(hw), 9, None)
-    matcher = criterion_of(num_classes=9, num_points=256).matcher
-    matches = matcher(output.aux["class_logits"], output.aux["mask_logits"], targets, case.draws())
+    criterion = criterion_of(num_classes=9, num_points=256)
+    matches = criterion.match(output.aux["class_logits"], output.aux["mask_logits"], targets, case.draws())
     assert matches.label.tolist() == sum(case.recipe["target_classes"], [])
     for row, layer in enumerate(case.order):
         assert np.array_equal(matches.query[row], case.matches(layer))

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from rgbt.checks import InputError, RunError
-from rgbt.losses import matcher
+from rgbt.losses import set_criterion
 from rgbt.losses.points import Points
-from rgbt.losses.set_criterion import Sampling, mask_and_dice
+from rgbt.losses.set_criterion import SetCriterion, mask_and_dice
 from rgbt.losses.spatial import PLAIN, PointWeights, SpatialWeight
 from rgbt.types import Output
 from tests.benchmarks.reference_criterion import Replayed, reference_criterion
@@ -25,13 +25,13 @@ def gradients(parts: dict[str, Tensor], output: Output) -> list[Tensor]:
     return list(torch.autograd.grad(total, list(output.aux.values()), retain_graph=True))
 
 
-def replayed(sampling: Sampling, sets: tuple[int, int], batch: Any) -> Any:
+def replayed(criterion: SetCriterion, sets: tuple[int, int], batch: Any) -> Any:
     """The same draws for the batched criterion and for the reference, 64 matcher points."""
     layers, passes = sets
     targets = sum(len(set(label.unique().tolist()) - {255}) for label in batch.label)
     source = Points(seeded(5), device=torch.device("cpu"))
     matcher = source.matcher(layers * passes, len(batch.label), 64)
-    loss = source.loss(layers * passes, targets, sampling.candidates + sampling.fresh)
+    loss = source.loss(layers * passes, targets, criterion.num_drawn)
     return Replayed(matcher, loss, passes)
 
 
@@ -51,7 +51,7 @@ def test_equals_the_loop_over_passes_layers_and_images(
 ) -> None:
     output, batch = problem_of(*sizes)
     criterion = criterion_of(spatial=spatial)
-    draws = replayed(criterion.sampling, sizes[:2], batch)
+    draws = replayed(criterion, sizes[:2], batch)
     batched = criterion.compare(output, batch, draws)
     expected = reference_criterion(criterion, output, batch, draws)
     for name, part in batched.items():
@@ -65,7 +65,7 @@ def test_equals_the_loop_over_passes_layers_and_images(
 def test_more_targets_than_queries(queries: int) -> None:
     output, batch = problem_of(2, 2, 2, queries=queries)
     criterion = criterion_of()
-    draws = replayed(criterion.sampling, (2, 2), batch)
+    draws = replayed(criterion, (2, 2), batch)
     batched = criterion.compare(output, batch, draws)
     expected = reference_criterion(criterion, output, batch, draws)
     for name, part in batched.items():
@@ -118,10 +118,10 @@ def test_predictions_and_labels_that_do_not_fit_are_refused() -> None:
     nan = {**aux, "class_logits": aux["class_logits"] * float("nan")}
     cut = {**aux, "mask_logits": aux["mask_logits"][:, :1]}
     for loss, given, changed, error, word in (
-        (criterion_of(num_classes=4), output, batch, ValueError, "class_logits"),
-        (criterion, Output(None, cut), batch, ValueError, "mask_logits"),
-        (criterion, output, replace(batch, label=label[:1]), ValueError, "label"),
-        (criterion, output, replace(batch, label=label.repeat(1, 2, 1)), ValueError, "not fit"),
+        (criterion_of(num_classes=4), output, batch, ValueError, "do not fit"),
+        (criterion, Output(None, cut), batch, ValueError, "do not fit"),
+        (criterion, output, replace(batch, label=label[:1]), ValueError, "do not fit"),
+        (criterion, output, replace(batch, label=label.repeat(1, 2, 1)), ValueError, "do not fit"),
         (criterion, output, replace(batch, label=label + 1), ValueError, "expected 0 to 4 or 255"),
         (criterion_of(spatial=EDGE), output, replace(batch, position=None), InputError, "position"),
         (criterion, Output(None, nan), batch, RunError, "matching cost"),
@@ -176,5 +176,5 @@ def test_losses_do_not_depend_on_the_chunks(monkeypatch: Any) -> None:
         return torch.stack(list(criterion.compare(output, batch, points).values()))
 
     whole = losses()
-    monkeypatch.setattr(matcher, "CHUNK_BYTES", 1)
+    monkeypatch.setattr(set_criterion, "CHUNK_BYTES", 1)
     assert torch.allclose(whole, losses(), rtol=1e-6)

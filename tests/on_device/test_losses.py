@@ -13,8 +13,8 @@ from torch import Tensor
 
 from rgbt.losses.cross_entropy import CrossEntropy
 from rgbt.losses.distances import sdc
-from rgbt.losses.matcher import Matcher, targets_of
 from rgbt.losses.points import Points
+from rgbt.losses.set_criterion import targets_of
 from rgbt.losses.spatial import PLAIN
 from rgbt.losses.temporal import con, con_acc, dice
 from rgbt.losses.unlabelled import VERDICT_LOSSES, Entropy, MaxSquares, guidance, judged
@@ -86,13 +86,13 @@ def test_set_criterion(name: str) -> None:
 
 def test_matches() -> None:
     output, batch = problem_of(2, 3, 2)
-    matcher = Matcher(num_points=64, class_weight=2.0, mask_weight=5.0, dice_weight=5.0)
+    criterion = criterion_of()
     found = []
     for to in (CPU, device()):
         label = batch.label.to(to)
         targets = targets_of(label, (24, 32), CLASSES, None)
         logits = (each.detach().to(to) for each in output.aux.values())
-        found.append(matcher(*logits, targets, Points(seeded(2), device=to)))
+        found.append(criterion.match(*logits, targets, Points(seeded(2), device=to)))
     for one, other in zip(*found, strict=True):
         assert np.array_equal(one, other)
 
