@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from rgbt.models.parts import drop_channels
-from rgbt.schemes.teacher import Teacher, frozen_copy
+from rgbt.schemes.self_training import Teacher
 
 
 class Net(nn.Module):
@@ -85,14 +85,3 @@ def test_statistics_are_those_of_the_student() -> None:
     assert teacher.network().norm.running_mean.item() == 3.0
 
 
-def test_frozen_copy_is_the_network_as_it_was() -> None:
-    """Weight 2, mean 3 and variance 4, whatever the network has become."""
-    network = Net()
-    network.norm.running_mean.fill_(3.0)
-    network.norm.running_var.fill_(4.0)
-    copied = frozen_copy(network)
-    network.weight.data.fill_(5.0)
-    network(images(), torch.Generator())
-    found = copied(images())
-    torch.testing.assert_close(found, 2 * (images() - 3) / (4 + network.norm.eps) ** 0.5)
-    assert not found.requires_grad
