@@ -17,8 +17,7 @@ from rgbt.types import IGNORE, Batch, Loss, Output
 
 ClassWeights = Annotated[tuple[NonNegative, ...], Len(1, 255)]
 
-TINY = torch.finfo(torch.float32).tiny
-"""Smallest divisor; it only matters where nothing counts and the sum that is divided is 0."""
+TINY = torch.finfo(torch.float32).tiny  # divisor where nothing counts, of a sum that is 0
 
 
 class CrossEntropy:

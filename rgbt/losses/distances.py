@@ -34,10 +34,7 @@ def sdc(teacher: Tensor, student: Tensor) -> Tensor:
 
 
 def sdn(teacher: Tensor, rgb: Tensor, thermal: Tensor) -> Tensor:
-    """Self-distillation of non-local representations: `sdc` of `rgb` plus `sdc` of `thermal`.
-
-    Source: CRM, Eq. (3). `rgb` and `thermal`: the masked pass predicted from one image alone.
-    """
+    """Self-distillation of non-local representations (CRM, Eq. 3), of R' and T' to F."""
     return sdc(teacher, rgb) + sdc(teacher, thermal)
 
 
@@ -46,13 +43,11 @@ def thing_cells(
 ) -> Tensor:
     """(B, h, w) bool: cells of which one thing class has at least `min_share` of the pixels.
 
-    A cell has ceil(H / h) x ceil(W / w) pixels; what lies outside the label is of no class.
+    A cell of a label (B, H, W) has ceil(H / h) x ceil(W / w) pixels; what lies outside the label is
+    of no class. With a share above 0.5, no second class has as many pixels.
 
     Released: lhoyer/DAFormer (e6f6e04), mmseg/utils/utils.py, downscale_label_ratio, whose cells
     divide the label.
-
-    Of a `label` (B, H, W), a map of `feature_hw` (h, w) and the indices of the thing classes.
-    `min_share` is above 0.5, so that no second class has as many pixels, to 1.
     """
     kernel = [-(-side // cells) for side, cells in zip(label.shape[1:], feature_hw, strict=True)]
     rows, columns = (
@@ -102,10 +97,7 @@ class FeatureDistance:
     def __call__(
         self, features: Tensor, initial: Tensor, label: Tensor, classes: tuple[str, ...]
     ) -> Tensor:
-        """The weighted distance, (): of two maps (B, C, h, w) for a label (B, H, W).
-
-        `classes` are those of the data set, in the order of their indices.
-        """
+        """The weighted distance, () float32, of two maps (B, C, h, w) for a label (B, H, W)."""
         hw = (features.shape[2], features.shape[3])
         cells = thing_cells(label, hw, self.indices(classes), self.min_share)
         return self.weight * feature_distance(features, initial, cells)

@@ -29,8 +29,8 @@ class Points:
     requests the matcher's points of all (layer, pass) pairs, then for the loss points of all pairs;
     within a loss set, the points of one mask are its candidates followed by its random remainder.
 
-    A coordinate takes the 2^15 centres of a regular grid (a step is 0.02 pixels of a 640-pixel
-    image): four coordinates come from one random integer, in half the time of four floats.
+    A coordinate is one of 2^15 centres of a regular grid: four come from one random integer, in
+    half the time of four floats.
     """
 
     def __init__(self, generator: torch.Generator, *, device: torch.device) -> None:
@@ -62,7 +62,7 @@ class Points:
 def sample(maps: Tensor, points: Tensor, outside: Literal["zeros", "border"] = "zeros") -> Tensor:
     """Bilinear values (R, C, S, N) of maps (R, C, h, w) at points (R, S, N, 2).
 
-    `outside` lies beyond the outermost pixel centres.   Source: Mask2Former, point_features.py.
+    `outside` lies beyond the outermost pixel centres (Mask2Former, point_features.py).
     """
     return F.grid_sample(maps, points, mode="bilinear", padding_mode=outside, align_corners=False)
 
@@ -71,9 +71,7 @@ def class_shares(label: Tensor, points: Tensor, num_classes: int) -> Tensor:
     """Bilinear values of the binary masks of all classes at points, without making the masks.
 
     The same as `sample` of the one-hot label, in a fraction of the time: the four labels around a
-    point are read once, not once per class. (B, H, W) int64, of which 255 is no class, at points
-    (S, B, N, 2) -> (S, B, K, N) float32; what is missing to a sum of 1 over K is ignored or
-    outside.
+    point are read once. (B, H, W) int64, of which 255 is no class, at (S, B, N, 2) -> (S, B, K, N).
     """
     height, width = label.shape[1:]
     sets, images, count = points.shape[:3]

@@ -84,17 +84,11 @@ class SetCriterion:
     def __call__(
         self, output: Output, batch: Batch, generator: torch.Generator
     ) -> dict[str, Tensor]:
-        """The parts "class", "mask" and "dice", weighted and summed over the layers.
+        """The parts "class", "mask" and "dice", (P,) float32, weighted and summed over the layers.
 
-        Args:
-            output: `aux` holds "class_logits" (L, P, B, Q, K+1) and "mask_logits"
-                (L, P, B, Q, h, w) of P passes over the same B images; the last of the L layers is
-                the prediction.
-            batch: with `label` (B, H, W), H <= 4h and W <= 4w; some weights read `position`.
-            generator: draws the points (order: `rgbt.losses.points.Points`).
-
-        Returns:
-            name -> (P,) float32.
+        `output.aux` holds "class_logits" (L, P, B, Q, K+1) and "mask_logits" (L, P, B, Q, h, w) of
+        P passes over the same B images; the last of the L layers is the prediction. The label is
+        (B, H, W), H <= 4h and W <= 4w. The generator draws the points.
 
         Raises:
             InputError: positions missing for the weighted loss.
@@ -254,8 +248,7 @@ def pairwise_costs(
 ) -> Tensor:
     """(R, Q, K): mask and dice cost of every query against every target, see `SetCriterion.match`.
 
-    x (R, Q, N) are mask logits at points, which are overwritten, and t (R, K, N) targets there,
-    already weighted where there are `weights` (R, N).
+    x (R, Q, N) are mask logits, overwritten, and t (R, K, N) targets, already weighted.
     """
     total: Tensor | float = x.shape[-1]
     smoothing: Tensor | float = 1.0
@@ -274,12 +267,7 @@ def pairwise_costs(
 
 
 def assign(cost: Tensor, targets: Targets) -> Matches:
-    """Cheapest assignment of queries to the classes present, for (S, B, Q, K) float32 costs.
-
-    Raises:
-        RunError: a cost that is not finite.
-        ValueError: a label that is neither a class nor 255.
-    """
+    """Cheapest assignment of queries to the classes present, for (S, B, Q, K) float32 costs."""
     parts = [cost.flatten(), whole(targets.present).flatten(), targets.unknown.reshape(1)]
     numbers = torch.cat([part.float() for part in parts]).cpu().numpy()
     cost_SBQK = numbers[: cost.numel()].reshape(cost.shape)

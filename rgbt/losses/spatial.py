@@ -34,26 +34,21 @@ class SpatialWeight:
     ("conventional"), and prints neither formula nor numbers. It reads no position: `centre` and
     `d_max` have no effect.
 
-    d is the distance in pixels of the original image. Paper: everything below `focus` is open; the
-    default of each is the choice nearest to the text or to Mask2Former.
-    With ``alpha: 0`` or ``focus: none`` the loss is the plain one whatever the other settings.
+    d is the distance in pixels of the original image from pixel (rows // 2, columns // 2) of it,
+    followed through resizing, cropping and flipping, or of the crop. Paper: alpha is 2, everything
+    below `focus` is open; the default of each is the choice nearest to the text or to Mask2Former.
+    With ``alpha: 0`` or ``focus: none`` the loss is the plain one whatever the other settings are.
     """
 
-    alpha: NonNegative = 0.0  # paper: 2
-    focus: Literal["none", "edge", "center", "boundary"] = "none"  # where the weight is largest
-    # Distance from pixel (rows // 2, columns // 2) of the original image, followed through
-    # resizing, cropping and flipping, or of the crop.
+    alpha: NonNegative = 0.0
+    focus: Literal["none", "edge", "center", "boundary"] = "none"
     centre: Literal["tracked", "crop"] = "tracked"
-    # The largest distance within the original image or within the crop.
     d_max: Literal["original", "crop"] = "original"
-    # Padded rows and columns weigh as the farthest pixel (or one without a boundary), 1, or 0.
     padding: Literal["map", "one", "zero"] = "map"
-    # The cross-entropy is divided by the number of points (Eq. 16: W x H) or by their weights.
-    normaliser: Literal["points", "weights"] = "points"
-    # 1 in numerator and denominator, as in the unweighted loss, or none (Eq. 17).
-    dice_smoothing: Literal["one", "none"] = "one"
-    match: Literal["unweighted", "weighted"] = "unweighted"  # the matching costs
-    passes: Literal["all", "fused"] = "all"  # all predictions, or those from RGB-T alone
+    normaliser: Literal["points", "weights"] = "points"  # Eq. 16 divides by W x H
+    dice_smoothing: Literal["one", "none"] = "one"  # Eq. 17 has none
+    match: Literal["unweighted", "weighted"] = "unweighted"
+    passes: Literal["all", "fused"] = "all"
 
     @property
     def active(self) -> bool:

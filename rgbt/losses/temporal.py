@@ -1,8 +1,7 @@
 """The loss of two frames of a scene (Temporal, Eqs. 2 to 4), and the soft overlaps that it is of.
 
 The caller makes the second frame and warps the first prediction to it. A ratio is one of sums over
-the batch, so that the sums are those of all processes. Not here: the dice term of matched queries
-(`rgbt.losses.set_criterion`).
+the batch, so that the sums are those of all processes.
 """
 
 from __future__ import annotations
@@ -22,11 +21,9 @@ from rgbt.ranges import NonNegative
 from rgbt.requirements import Record, Requirement, record_of
 from rgbt.types import IGNORE, Frame, Loss
 
-Form = Literal["paper", "released"]
-"""Which of two printed sets of choices: those of Temporal's paper, or those of its release."""
+Form = Literal["paper", "released"]  # the choices of Temporal's paper, or of its release
 
-SIGMA = 1e-7
-"""Keeps denominators above 0 (Temporal, Eq. 2; release)."""
+SIGMA = 1e-7  # keeps denominators above 0 (Temporal, Eq. 2; release)
 
 OWN = ("dice", "con", "con_acc")
 
@@ -80,7 +77,7 @@ class TemporalLoss:
         """The weighted parts, which add up to L.
 
         Args:
-            first: frame 1: logits (B, K, H, W), label (B, H, W) int64 with 255 = ignore.
+            first: frame 1.
             second: frame 2, of the same sizes.
             warped: (B, K, H, W) probabilities of frame 1, warped to frame 2; only where the record
                 says `reads_warped`. Or (B, K, ceil(H / 2), ceil(W / 2)): frame 2 is compared at
@@ -131,9 +128,8 @@ def dice(probabilities: Tensor, label: Tensor, form: Form) -> Tensor:
     gradient, so that agreement costs the share of absent classes.   Released: pixels labelled 0
     are left out, yet K still divides: the range ends at the share of foreground classes present.
 
-    p (B, K, H, W) in [0, 1] sums to 1 over K, any float dtype; y (B, H, W) int64, 255 is left
-    out. () in [0, 1], float32 for half precision too. Where no pixel counts: 1 (paper), 0
-    (released), with a gradient of 0.
+    p (B, K, H, W), y (B, H, W) int64, 255 is left out -> () in [0, 1], float32 for half precision
+    too. Where no pixel counts: 1 (paper), 0 (released), with a gradient of 0.
     """
     probabilities = single(probabilities)
     target = _Target(label, probabilities, form)
@@ -154,8 +150,7 @@ def con(warped: Tensor, second: Tensor, valid: Tensor, form: Form) -> Tensor:
 
     p and q (B, K, H, W): probabilities of the first frame, warped to the second, and of the
     second; `valid` (B, H, W) bool: pixels that count, labelled or not. () in [0, 1], float32 for
-    half precision too; 1, with a gradient of 0, where no pixel is valid. It can be differentiated
-    once.
+    half precision too; 1, with a gradient of 0, where no pixel is valid. Differentiable once.
     """
     pairs = single(warped), single(second), valid
     sums: tuple[Tensor, Tensor] = _PairSums.apply(*pairs)  # type: ignore[no-untyped-call]
@@ -175,9 +170,8 @@ def con_acc(warped: Tensor, second: Tensor, label: Tensor, form: Form) -> Tensor
     Paper: f = 2, so that full agreement costs 1/3; a class without a pixel costs 1.   Released:
     f = 3; pixels labelled 0 are left out, a class without a pixel costs 0, K still divides.
 
-    p and q as in `con`; y (B, H, W) int64 of the second frame, 255 is left out. () float32 for
-    half precision too, in [1/3, 1] (paper) or [0, 1] (released). Where no pixel counts: 1 (paper),
-    0 (released), with a gradient of 0.
+    p and q as in `con`; y (B, H, W) int64 of the second frame, 255 is left out. In [1/3, 1] (paper)
+    or [0, 1] (released). Where no pixel counts: 1 (paper), 0 (released), with a gradient of 0.
     """
     warped, second = single(warped), single(second)
     target = _Target(label, second, form)
@@ -232,7 +226,7 @@ class _PairSums(torch.autograd.Function):
         weight = counted.to(first.dtype)
         products, sums = [], []
         for p, q in zip(first.unbind(1), second.unbind(1), strict=True):
-            p = p * weight  # noqa: PLW2901
+            p = p * weight
             products.append((p * q).sum())
             sums.append((p + q * weight).sum())
         return torch.stack(products), torch.stack(sums)

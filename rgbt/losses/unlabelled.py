@@ -8,7 +8,6 @@ compute in float32 at least.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -78,10 +77,7 @@ class Entropy:
     weight: NonNegative
 
     def __call__(self, probabilities: Tensor) -> dict[str, Tensor]:
-        """The part "entropy", (), of (B, K, H, W) in [0, 1] that sum to 1 over K.
-
-        Its gradient is finite at 0 too.
-        """
+        """The part "entropy", (), of (B, K, H, W) in [0, 1] that sum to 1 over K."""
         probabilities = single(probabilities)
         surprise = -probabilities * probabilities.clamp(min=LEAST).log()
         return {"entropy": self.weight * surprise.sum(1).mean() / _most(probabilities)}
@@ -167,11 +163,7 @@ def logistic(verdicts: Tensor, value: float) -> Tensor:
     return F.binary_cross_entropy_with_logits(verdicts, torch.full_like(verdicts, value))
 
 
-VERDICT_LOSSES: dict[str, Callable[[Tensor, float], Tensor]] = {
-    "least_squares": least_squares,
-    "cross_entropy": logistic,
-}
-"""By their names in the configuration."""
+VERDICT_LOSSES = {"least_squares": least_squares, "cross_entropy": logistic}
 
 
 def judged(logits: Tensor, how: Judged) -> Tensor:

@@ -35,15 +35,13 @@ class Adversarial:
 
         A = d(D(target), y_s) [+ d(D(source), y_t) with `both_ways`]
 
-    w is 1, or the mean over pixels of 1 - c, c being the confidence of the target's labels.
+    w is 1, or the mean over pixels of 1 - c, c being the confidence of the target's labels. The
+    settings are the keys of ``conf/scheme/adversarial_heatnet.yaml``.
 
     Source: thesis (J. Sun), Eqs. 4 to 6; HeatNet, Sec. III; AdaptSegNet, Eqs. 1 to 3; ADVENT.
     Released, HeatNet and the thesis' port: one optimiser for both networks, with torch 1.7, which
-    also steps the network of the other phase with gradients of 0 (`idle_steps`). For RMSprop this
-    halves the memory of the mean of squared gradients; with a constant gradient every step is
-    sqrt(1 + alpha) = 1.41 times as long.
-
-    The settings are the keys of ``conf/scheme/adversarial_heatnet.yaml``.
+    also steps the network of the other phase with gradients of 0 (`idle_steps`). RMSprop's mean of
+    squares then decays, and every step is sqrt(1 + alpha) = 1.41 times as long.
     """
 
     model: nn.Module
@@ -65,7 +63,7 @@ class Adversarial:
     idle_steps: Literal["none", "released"] = "none"
 
     def __post_init__(self) -> None:
-        values = {"source": self.source_value, "target": self.target_value}
+        self.values = values = {"source": self.source_value, "target": self.target_value}
         setting = f"scheme.source_value={self.source_value:g}, target_value={self.target_value:g}"
         if self.source_value == self.target_value:
             raise InputError(f"{setting}: the discriminator requires two different numbers.")
@@ -77,19 +75,16 @@ class Adversarial:
         # Fabric's wrapper takes the place of the network here.
         self.others: dict[str, nn.Module] = {CRITIC: self.critic}
         self.cost_of = VERDICT_LOSSES[self.verdict_loss]
-        self.values = values
 
     @property
     def record(self) -> Record:
         """Labels of the target where they are read, confidence where it weighs."""
         labels = self.supervise_target
         setting = f"scheme.supervise_target={str(labels).lower()}"
-        required = [Requirement("domains", "target_labels", labels, setting)]
-        if self.weighed_by_confidence:
-            setting = "scheme.weighed_by_confidence=true"
-            required.append(Requirement("domains", "target_confidence", True, setting))
+        weighed = ("domains", "target_confidence", True, "scheme.weighed_by_confidence=true")
         return self.passes.record_with(
-            *required,
+            Requirement("domains", "target_labels", labels, setting),
+            *((Requirement(*weighed),) if self.weighed_by_confidence else ()),
             *record_of(self.others[CRITIC]).requires,
             networks=self.others,
             builders={CRITIC: self.critic_optimizer},

@@ -35,8 +35,7 @@ class CRM:
     With a masker that hides nothing there is no masked pass (the rows without masking of CRM
     Table 3a, which the release cannot run); the distillation weights must then be 0.
 
-    The network takes `passes`, `num_predictions` and `num_masks` as `rgbt.models.mask2former` does,
-    and the loss returns one value per stacked pass.
+    The loss returns one value per stacked pass.
     """
 
     model: nn.Module

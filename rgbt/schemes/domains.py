@@ -20,13 +20,9 @@ Gradients = Literal["apart", "kept", "together"]
                that step (thesis' code, stage with labels on both domains: nothing is cleared)
     together   both with the sum of both, one after the other (thesis' code, adversarial stage),
                so that shared parameters are stepped twice
-
-Where gradients are clipped (published: they are not), with "kept" the target's is added to what the
-source's was clipped to.
 """
 
-WHOLE_IMAGES = Requirement("masker", "hides_cells", False)
-"""Of a scheme without a masked pass."""
+WHOLE_IMAGES = Requirement("masker", "hides_cells", False)  # of a scheme without a masked pass
 
 
 class ViewAndHead(Protocol):
@@ -48,10 +44,7 @@ class SourceAndTarget(Protocol):
 
 
 def draw_masks(masker: AnyMasker, batch: Batch, generator: torch.Generator) -> MaskPair:
-    """Hidden cells of the samples of this process, (B, h, w) bool each.
-
-    The masker draws for the samples of all processes, so that it needs to know nothing of them.
-    """
+    """Hidden cells (B, h, w) of this process' samples; the masker draws for those of all."""
     height, width = batch.rgb.shape[-2:]
     masks = masker((height, width), whole(batch.centre_yx), generator)
     return MaskPair(*(own(mask) for mask in masks))
@@ -72,13 +65,9 @@ def scores(output: Output) -> Tensor:
 class Passes:
     """The passes of both domains through the network, and their losses.
 
-    `loss` is that of one domain's scores and labels; `gradients` are "apart" where there is one
-    optimiser.
-
-    Attributes:
-        optimizers: name -> beginnings of the names of parameters that it leaves out. With a head
-            for each domain, one optimiser per domain, which share all but the heads (thesis,
-            Sec. III-B); else "main" for everything.
+    `optimizers` has the beginnings of parameters that each leaves out, by name. With a head for
+    each domain, one optimiser per domain, which share all but the heads (thesis, Sec. III-B); else
+    "main" for everything, and the gradients are "apart".
     """
 
     def __init__(
@@ -126,8 +115,8 @@ class Passes:
         assert domain is not None, "a scheme of two domains has a target"
         # A pass with masks has draws of its own.
         generator = generator_of(f"{name} network" + (" masked" if masks else ""))
-        called: Callable[..., Output] = self.model if network is None else network
-        return called(batch.rgb, batch.thermal, masks, generator=generator, **options_of(domain))
+        network = self.model if network is None else network
+        return network(batch.rgb, batch.thermal, masks, generator=generator, **options_of(domain))
 
     def supervised(
         self, name: str, batch: Batch, generator_of: GeneratorOf
@@ -138,10 +127,7 @@ class Passes:
         return output, {f"{name}/{part}": values.sum() for part, values in parts.items()}
 
     def phases(self, cost: Callable[[str], dict[str, Tensor]]) -> Iterator[Phase]:
-        """A step that costs what is computed for "source" and then for "target".
-
-        With one optimiser both are one backward pass; with two, see `Gradients`.
-        """
+        """A step that costs what is computed for "source" and then for "target"."""
         if len(self.optimizers) == 1 or self.gradients == "together":
             yield Phase(tuple(self.optimizers), cost("source") | cost("target"))
             return

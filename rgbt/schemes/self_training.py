@@ -1,7 +1,6 @@
 """Self-training: a teacher, which is an average of the network, labels the target in every step.
 
-No run of a teacher is needed before (`domains.target.labels=experiment:...` has one). Class mixing
-pastes the pixels of some classes of a source image on a target image.
+Class mixing pastes the pixels of some classes of a source image on a target image.
 """
 
 from __future__ import annotations
@@ -30,12 +29,8 @@ CONFIDENT_SHARE, CONFIDENCE = "teacher/confident_share", "teacher/confidence"
 """Names in the log: share of the target's pixels whose highest probability reaches the threshold,
 and the mean of the highest probabilities."""
 
-NUM_VALUES = 256
-"""Values of a label: the classes and 255, which is pasted like a class."""
-
-LUMA = (0.299, 0.587, 0.114)
-"""Of red, green and blue (ITU-R BT.601)."""
-
+NUM_VALUES = 256  # of a label: the classes and 255, which is pasted like a class
+LUMA = (0.299, 0.587, 0.114)  # of red, green and blue (ITU-R BT.601)
 Normalisation = Literal["batch", "running"]
 
 
@@ -44,12 +39,9 @@ class Teacher:
 
         w' <- a w' + (1 - a) w,   a = min(1 - 1 / (t + 1), decay),   t = 0, 1, ...
 
-    In step 0, a is 0 and the teacher is a copy of the network. Buffers are not averaged. With the
-    normalisation "batch" it is in training mode without dropout, stochastic depth and changes of
-    statistics; with "running" in evaluation mode. `average` is w', which a checkpoint has.
-
-    Source: Tarvainen and Valpola, "Mean teachers are better role models".   Released: DACS,
-    DAFormer, HRDA, MIC, whose decay is 0.99 in DACS and else 0.999; "batch".
+    Buffers are not averaged. With the normalisation "batch" it is in training mode without dropout,
+    stochastic depth and changes of statistics; with "running" in evaluation mode. `average` is w'.
+    Source: Tarvainen and Valpola, "Mean teachers are better role models".   Released: "batch".
     """
 
     def __init__(self, network: nn.Module, *, decay: float, normalisation: Normalisation) -> None:
@@ -66,7 +58,7 @@ class Teacher:
 
     def network(self) -> nn.Module:
         """The teacher, ready to predict; normalisations that the student froze stay frozen."""
-        teacher: nn.Module = self.average.module.eval()
+        teacher = self.average.module.eval()
         if self._normalisation == "batch":
             both = zip(teacher.modules(), self._student[0].modules(), strict=True)
             for norm, own in both:
@@ -85,16 +77,13 @@ class SelfTraining:
     The teacher predicts labels of the unchanged target. The mix is the target, with half of the
     classes of the source pasted on it, after strong augmentation. Its labels are those of the
     source where it is pasted, with weight 1, and those of the teacher elsewhere, with the weight q
-    of `rgbt.losses.unlabelled`. The masked images hide cells of the target, and are trained with
-    the labels of the teacher. MIC masks those of the target, and from day to night those of both.
+    of `rgbt.losses.unlabelled`. The masked images hide cells of the target (MIC; from day to night
+    of both), and have the labels of the teacher. Of an RGB-thermal pair, both images are pasted
+    with the same pixels, and masked with the cells that `masker.pairing` gives each. A domain that
+    sees one image pastes what it sees (`seen_as`).
 
-    Of an RGB-thermal pair, both images are pasted with the same pixels, and masked with the cells
-    that `masker.pairing` gives each. A domain that sees one image pastes what it sees
-    (`seen_as`).
-
-    The feature distance (`rgbt.losses.distances`) compares the last stage of the encoder, of
-    the unchanged source, with that of the network as it was when training started: with the weights
-    and running statistics of `model.weights`, in evaluation mode.
+    The feature distance (`rgbt.losses.distances`) compares the last stage of the encoder, of the
+    unchanged source, with that of the network that training started from, in evaluation mode.
 
     Source: DACS; DAFormer, Sec. 3.1 and 3.3 (rare class sampling: `rgbt.data.rare_classes`); MIC.
     Paper: q is a share of each image (DAFormer).   Released: of the batch.
@@ -204,11 +193,9 @@ class SelfTraining:
 def pasted_pixels(label: Tensor, generator: torch.Generator) -> Tensor:
     """(B, H, W) bool: the pixels of half of the classes, drawn for every image.
 
-    With n values in the labels (B, H, W) int64 of the batch, ceil(n / 2) of them are drawn for each
-    image, without replacement. A drawn value that the image does not have pastes nothing.
-
-    Source: ClassMix; DACS.   Released: DACS, DAFormer, HRDA and MIC, whose values are those of the
-    batch and include 255.
+    With n values in the labels of the batch, 255 among them, ceil(n / 2) are drawn for each image,
+    without replacement. A drawn value that the image does not have pastes nothing.
+    Source: ClassMix; DACS, DAFormer, HRDA and MIC as released.
     """
     present = torch.zeros(NUM_VALUES, device=label.device)
     present = mean_count(present.index_fill(0, label.flatten(), 1.0)) > 0
@@ -225,10 +212,7 @@ def pasted_pixels(label: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def mixed(source: Batch, target: Batch, pasted: Tensor) -> Batch:
-    """The target with the pixels `pasted` (B, H, W) of the source in both images and the label.
-
-    Pasted pixels have weight 1; the others keep the confidence of the target, which it must have.
-    """
+    """The target with the pixels `pasted` (B, H, W) of the source, which have weight 1."""
     assert target.confidence is not None, "pseudo-labels have a weight"
     return replace(
         target,
@@ -242,9 +226,7 @@ def mixed(source: Batch, target: Batch, pasted: Tensor) -> Batch:
 def seen_as(batch: Batch, own: View | None, other: View | None) -> Batch:
     """The batch with what its domain sees, in the channels that another domain sees.
 
-    RGB becomes thermal as its luma; thermal becomes RGB as grey. A domain that sees RGB alone has
-    no thermal images to paste. Domains with the same view, or with both images, paste what they
-    have.
+    RGB becomes thermal as its luma; thermal becomes RGB as grey; else it stays as it is.
     """
     if {own, other} != {"rgb", "thermal"}:
         return batch

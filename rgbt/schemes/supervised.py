@@ -15,10 +15,7 @@ from rgbt.types import AnyMasker, Batch, GeneratorOf, Loss, Phase
 
 @dataclass(kw_only=True, eq=False)
 class Supervised:
-    """Train on the labels with one pass; a masker that hides something masks that pass.
-
-    The network is given the view and the head of the source.
-    """
+    """Train on the labels with one pass; a masker that hides something masks that pass."""
 
     model: nn.Module
     loss: Loss

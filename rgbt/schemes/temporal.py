@@ -29,8 +29,7 @@ class Temporal:
     one after the other, as released; else as one batch, which is the same function and faster.
 
     Paper: the first prediction ("segmentation map") is warped to the second frame; whether its
-        gradient stops is left open.
-    Released: scores are warped and normalised afterwards, and no gradient passes.
+    gradient stops is open.   Released: scores are warped, then normalised; no gradient passes.
 
     The loss is one of two frames (`rgbt.losses.temporal.TemporalLoss`), the view draws and applies
     virtual views (`rgbt.transforms.views.VirtualView`). At the resolution "half", the scores of

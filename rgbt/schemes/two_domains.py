@@ -49,13 +49,10 @@ class LabelledDomains:
 class UnlabelledTarget:
     """Segmentation of the source, and a loss without labels on the target.
 
-    `unlabelled` maps the probabilities (B, K, H, W) of the target to named, weighted scalars. The
-    auxiliary head may also be trained with the guidance of both heads
-    (`rgbt.losses.unlabelled.guidance`); released with a weight of 0.01, the product of 0.1 and 0.1.
+    `unlabelled` maps the probabilities (B, K, H, W) of the target to named, weighted scalars; the
+    auxiliary head may also be trained with the guidance of both heads (`guidance`).
 
     Source: MaxSquareLoss; ADVENT (direct entropy minimisation); thesis (J. Sun), Sec. III-A.
-
-    The settings are the keys of ``conf/scheme/max_squares.yaml``.
     """
 
     model: nn.Module

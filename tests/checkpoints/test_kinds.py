@@ -22,8 +22,8 @@ from tests.checkpoints.files import holds, like, named, network, saved
 from tests.checkpoints.imagenet import deep_resnet_file, mit_file, resnet_file, swin_file
 from tests.models import golden
 from tests.models.plain import images, normal, randomise
-from tests.models.test_dinov2_encoder import published_shapes as published_dinov2
-from tests.models.test_dinov3_encoder import published_shapes as published_dinov3
+from tests.models.test_dino import published_dinov3
+from tests.models.test_dino import published_shapes as published_dinov2
 
 Tensors = OrderedDict[str, Tensor]
 SWIN = {"embed_dim": 32, "depths": [1, 1, 2, 1], "num_heads": [1, 2, 4, 8], "window_size": 5}

@@ -10,11 +10,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.checks import InputError
 from rgbt.models.cmnext import PoolingGate, PpxBlock, window_mean
-from rgbt.models.cmx.fusion import CrossAttention, Rectification
-from rgbt.models.cmx.mit import mit_blocks
 from rgbt.models.cmx.model import drop_rates
+from rgbt.models.cmx.parts import CrossAttention, Rectification, mit_blocks
 from tests.models.golden import network
 from tests.models.plain import generator, images, nano, normal, randomise
 
@@ -46,14 +44,6 @@ def test_rectified_maps_go_on_and_fused_maps_to_the_decoder(name: str) -> None:
     expected = [x for pair in rectified[:3] for x in pair] + [out for _, out in fused]
     assert len(fed) == len(expected) == 10
     assert all(a is b for a, b in zip(fed, expected))
-
-
-@BOTH
-def test_images_that_are_too_small_raise(name: str) -> None:
-    """Stage 1 has maps of a quarter of the image and a kernel of 8: 29 pixels give 8 places."""
-    with pytest.raises(InputError, match=r"model.sr_ratios.*29.*28 x 64"):
-        nano(name).eval()(*images(1, 28, 64))
-    assert nano(name, sr_ratios=[2, 1, 1, 1]).eval()(*images(1, 5, 5)).logits is not None
 
 
 def test_eps_of_every_normalisation() -> None:

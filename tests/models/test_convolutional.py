@@ -1,4 +1,4 @@
-"""Convolutional networks: second computations where no record exists, what is seen, starts."""
+"""Inputs and convolutional networks: by hand, by second computations, what is seen, starts."""
 
 from __future__ import annotations
 
@@ -11,9 +11,221 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.checks import InputError
-from tests.models.plain import Plain, count, generator, half, images, nano, randomise
+from rgbt.config.component import build
+from rgbt.models.inputs import Inputs, expand_cells
+from rgbt.models.parts import (
+    BasicBlock,
+    Bottleneck,
+    UpBlock,
+    bottleneck_stage,
+    drop_channels,
+    enlarge,
+    keep_factors,
+)
+from rgbt.types import MaskPair
+from tests.models.golden import compose
+from tests.models.plain import Plain, generator, half, images, nano, normal, randomise
 from tests.models.test_contract import LITERAL, MODIFIED
 
+# ---- inputs ----
+
+
+def inputs(**changes: Any) -> Inputs:
+    values: dict[str, Any] = {
+        **{"rgb_order": "rgb", "rgb_mean": (0.0, 51.0, 102.0), "rgb_std": (255.0, 51.0, 25.5)},
+        **{"thermal_mean": (0.0,), "thermal_std": (255.0,), "thermal_scale": "fixed"},
+    }
+    return Inputs(**{**values, **changes})
+
+
+def ones(height: int = 32, width: int = 32, count: int = 1) -> tuple[torch.Tensor, torch.Tensor]:
+    return torch.ones(count, 3, height, width), torch.full((count, 1, height, width), 0.5)
+
+
+def test_channels_are_shifted_and_scaled_in_grey_levels() -> None:
+    rgb, thermal = inputs()(*ones())
+    # By hand: 255 grey levels over 255; 204 over 51; 153 over 25.5.
+    assert rgb[0, :, 0, 0].tolist() == pytest.approx([1.0, 4.0, 6.0])
+    assert thermal.shape == (1, 1, 32, 32)
+    assert thermal.unique().item() == pytest.approx(0.5)
+    three = inputs(thermal_mean=(0.0, 127.5, 0.0), thermal_std=(255.0, 255.0, 127.5))
+    assert three.thermal_channels == 3
+    assert three(*ones())[1][0, :, 0, 0].tolist() == pytest.approx([0.5, 0.0, 1.0])
+
+
+def test_bgr_swaps_the_images_channels_and_not_the_means() -> None:
+    red = torch.tensor([1.0, 0.0, 0.0]).view(1, 3, 1, 1).expand(1, 3, 32, 32)
+    rgb, _ = inputs(rgb_order="bgr")(red, ones()[1])
+    assert rgb[0, :, 0, 0].tolist() == pytest.approx([0.0, -1.0, 6.0])
+
+
+@pytest.mark.parametrize(("channel", "luma"), [(0, 0.299), (1, 0.587), (2, 0.114)])
+def test_gray_is_the_luma_in_all_three_channels(channel: int, luma: float) -> None:
+    """ITU-R BT.601; the means are those of `inputs`."""
+    image = torch.zeros(1, 3, 32, 32)
+    image[:, channel] = 1
+    rgb, _ = inputs(rgb_order="gray")(image, ones()[1])
+    expected = [255 * luma / 255, (255 * luma - 51) / 51, (255 * luma - 102) / 25.5]
+    assert rgb[0, :, 5, 7].tolist() == pytest.approx(expected, rel=1e-5)
+
+
+def test_every_thermal_image_is_divided_by_its_own_maximum() -> None:
+    rgb, thermal = ones(count=3)
+    thermal[0, 0, 0, 0], thermal[1], thermal[2] = 0.25, 0.125, 0.0
+    _, scaled = inputs(thermal_scale="image_max")(rgb, thermal)
+    assert [each.unique().tolist() for each in scaled] == [[0.5, 1.0], [1.0], [0.0]]
+
+
+def test_padding_and_hidden_pixels_are_the_mean() -> None:
+    rgb, thermal = ones(40, 60)
+    hidden = torch.zeros(1, 2, 2, dtype=torch.bool)
+    hidden[0, 1, 1] = True
+    images = inputs()(rgb, thermal, MaskPair(hidden, ~hidden), multiple=32)
+    assert images.rgb.shape[-2:] == images.thermal.shape[-2:] == (64, 64)
+    assert images.rgb[..., 40:, :].abs().sum() == images.rgb[..., 60:].abs().sum() == 0
+    # Cells are 32 x 32 of the padded image: rows 32..39 and columns 32..59 are hidden in RGB.
+    assert (images.rgb[0, 0, :40, :60] == 0).sum() == 8 * 28
+    assert (images.thermal[0, 0, :40, :60] != 0).sum() == 8 * 28
+
+
+def test_cells_become_squares_of_units() -> None:
+    hidden = torch.tensor([[[True, False]]])
+    pixels = expand_cells(MaskPair(hidden, hidden), 1, (32, 64))
+    assert pixels.rgb.shape == (1, 32, 64)
+    assert pixels.rgb[0, :, :32].all()
+    assert not pixels.rgb[0, :, 32:].any()
+    assert expand_cells(MaskPair(hidden, hidden), 1, (32, 64), 4).thermal.shape == (1, 8, 16)
+    for grid, unit in (((3, 2), 1), ((1, 1), 1), ((16, 32), 4)):
+        hidden = torch.zeros(1, *grid, dtype=torch.bool)
+        with pytest.raises(InputError, match=r"masker.patch_size"):
+            expand_cells(MaskPair(hidden, hidden), 1, (32, 64), unit)
+
+
+@pytest.mark.parametrize(
+    ("option", "rgb", "thermal"),
+    [
+        # White and mid-grey thermal in each release's convention, by hand.
+        ("crm", [2.248908, 2.428571, 2.640000], [(127.5 - 127) / 60]),
+        ("unit", [1.0] * 3, [0.5]),
+        ("half", [1.0] * 3, [0.0]),
+        ("half_three", [1.0] * 3, [0.0] * 3),
+        ("gray_three", [(1 - 0.369) / 0.321] * 3, [0.0] * 3),
+        ("temporal", [1.0] * 3, [1.0] * 3),
+        ("cmx", [2.248908, 2.428571, 2.640000], [0.065502, 0.196429, 0.417778]),
+        ("cmx_released", [2.248908, 2.428571, 2.640000], [0.065502, 0.196429, 0.417778]),
+        ("caffe", [255 - 104.007, 255 - 116.669, 255 - 122.679],
+         [127.5 - 104.007, 127.5 - 116.669, 127.5 - 122.679]),
+    ],
+)  # fmt: skip
+def test_conventions_of_the_releases(option: str, rgb: list[float], thermal: list[float]) -> None:
+    found = build(compose(f"model/inputs={option}").model.inputs)(*ones())
+    for image, expected in zip(found, (rgb, thermal), strict=True):
+        assert image[0, :, 0, 0].tolist() == pytest.approx(expected, rel=1e-6, abs=1e-5)
+
+
+# ---- parts and the discriminator ----
+
+
+@pytest.mark.parametrize(
+    ("stage", "strides", "dilations"),
+    [
+        (nn.Sequential(BasicBlock(6, 6)), (1, 1), (1, 1)),
+        (nn.Sequential(BasicBlock(3, 6)), (1, 1), (1, 1)),
+        (nn.Sequential(BasicBlock(6, 6, stride=2)), (2, 1), (1, 1)),
+        (nn.Sequential(Bottleneck(8, 2)), (1, 1), (1, 1)),
+        (nn.Sequential(Bottleneck(8, 2, stride=2, dilation=3)), (1, 2), (3, 1)),
+        (bottleneck_stage(3, 2, 3, dilations=(2, 4)), (1, 1), (2, 4)),
+        (bottleneck_stage(3, 2, 3, stride=2, dilations=(1, 2), stride_at="1x1"), (2, 1), (1, 2)),
+    ],
+)
+def test_residual_blocks_by_their_weights(
+    stage: Any, strides: tuple[int, int], dilations: tuple[int, int]
+) -> None:
+    plain = Plain(randomise(nn.ModuleDict({"a": stage}).eval()))
+    x = normal(2, stage[0].conv1.in_channels, 9, 12)
+    expected = plain.stage("a", x, strides=strides, dilations=dilations)
+    assert (expected > 0).float().mean() > 0.2
+    torch.testing.assert_close(stage(x), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_factors_are_zero_or_the_inverse_of_the_probability() -> None:
+    factors = keep_factors(torch.tensor([0.0, 0.2]), (2, 5000), generator(), torch.device("cpu"))
+    assert factors.shape == (2, 2, 5000)
+    assert factors[0].unique().tolist() == [1.0]
+    assert factors[1].unique().tolist() == [0.0, 1.25]
+    # 10,000 draws: standard error 0.005.
+    assert factors[1].mean().item() == pytest.approx(1.0, abs=0.02)
+
+
+def test_whole_channels_are_dropped_before_the_first_block_and_after_every_one() -> None:
+    x, seen = torch.ones(4, 500, 2, 2), []
+    blocks = [nn.Identity(), nn.Identity()]
+    for block in blocks:
+        block.register_forward_pre_hook(lambda _m, args: seen.append(args[0]))
+    result = enlarge(x, blocks, (0.5, 0.2), generator())
+    for found, values, dropped in zip(
+        (*seen, result),
+        ({0.0, 2.0}, {0.0, 2.5}, {0.0, 3.125}),
+        (0.5, 1 - 0.5 * 0.8, 1 - 0.5 * 0.8**2),
+        strict=True,
+    ):
+        assert torch.equal(found.amin((2, 3)), found.amax((2, 3)))
+        assert set(found.unique().tolist()) == values
+        # 2,000 draws: standard error 0.011
+        assert (found == 0).float().mean().item() == pytest.approx(dropped, abs=0.05)
+    assert torch.equal(enlarge(x, blocks, (0.0, 0.0), None), x)
+    with pytest.raises(ValueError, match="generator"):
+        drop_channels(x, 0.5, None)
+
+
+@pytest.mark.parametrize(
+    ("align_corners", "row"),
+    [
+        (False, [0.0, 1.0, 3.0, 4.0]),  # centres of the new cells lie at -1/4, 1/4, 3/4, 5/4
+        (True, [0.0, 4 / 3, 8 / 3, 4.0]),  # at 0, 1/3, 2/3, 1
+    ],
+)
+def test_up_block_by_hand(align_corners: bool, row: list[float]) -> None:
+    block = UpBlock(1, 1, align_corners=align_corners).eval()
+    state = block.state_dict()
+    # The middle tap alone, doubled, plus 1; normalised with mean 4 and deviation 2.
+    state["conv.0.weight"].zero_()[0, 0, 1, 1] = 2.0
+    state["conv.0.bias"].fill_(1.0)
+    state["conv.1.running_mean"].fill_(4.0)
+    state["conv.1.running_var"].fill_(4.0 - 1e-5)
+    state["conv.2.weight"].fill_(0.5)
+    found = block(torch.tensor([0.0, 4.0]).view(1, 1, 1, 2))
+    normalised = [(2 * value + 1 - 4) / 2 for value in row]
+    expected = [value if value > 0 else 0.5 * value for value in normalised]
+    torch.testing.assert_close(found[0, 0], torch.tensor([expected, expected]))
+
+
+def test_critic_shapes() -> None:
+    for upsample, size, verdicts in (
+        (False, (320, 640), (10, 20)),
+        (True, (320, 640), (320, 640)),
+        (False, (120, 160), (3, 5)),
+        (True, (120, 160), (96, 160)),
+        (False, (32, 63), (1, 1)),
+    ):
+        with torch.device("meta"):
+            found = nano("critic", upsample=upsample)(torch.empty(2, 2, *size))
+        assert found.shape[2:] == verdicts
+
+
+@pytest.mark.parametrize("align_corners", [False, True])
+@torch.no_grad()
+def test_critic_verdicts_are_enlarged_between_their_centres(align_corners: bool) -> None:
+    small, large = nano("critic"), nano("critic", upsample=True, align_corners=align_corners)
+    large.load_state_dict(randomise(small))
+    x, rows = normal(1, 2, 64, 32), torch.arange(64)
+    top, bottom = small(x)[0, 0, :, 0]
+    share = rows / 63 if align_corners else ((rows + 0.5) / 32 - 0.5).clamp(0, 1)
+    expected = top + share * (bottom - top)
+    torch.testing.assert_close(large(x)[0, 0], expected[:, None].expand(64, 32))
+
+
+# ---- networks ----
 Found = dict[str, Tensor]
 
 
@@ -24,7 +236,7 @@ def bilinear(x: Tensor, size: Any, *, corners: bool) -> Tensor:
 def semseg(net: Any, rgb: Tensor, thermal: Tensor) -> Found:
     """Sides of 8 n + 1 pixels."""
     plain = Plain(net.state_dict())
-    x = rgb if net.modalities == "rgb" else thermal.expand(-1, 3, -1, -1)
+    x = rgb if net.record.views == ("rgb",) else thermal.expand(-1, 3, -1, -1)
     for number, stride in ((0, 2), (3, 1), (6, 1)):
         x = plain.normed(f"layer0.{number}", f"layer0.{number + 1}", x, stride=stride).relu()
     x = plain.stage("layer1", F.max_pool2d(x, 3, 2, 1))
@@ -141,20 +353,6 @@ def test_thermal_encoder_of_rtfnet_never_sees_the_rgb_image() -> None:
     assert torch.equal(*seen)
 
 
-@pytest.mark.parametrize("name", ["deeplabv2", "semseg", "mfnet", "rtfnet"])
-@torch.no_grad()
-def test_thermal_images_of_one_and_three_channels(name: str) -> None:
-    """One backbone for RGB and thermal repeats the channel; a stem of its own has as many."""
-    one, three = (nano(name, inputs=half(channels)).eval() for channels in (1, 3))
-    if name in ("deeplabv2", "semseg"):
-        three.load_state_dict(one.state_dict())
-        views = one.record.views[-1:]
-        assert torch.equal(*(net(*images(1), views=views).logits for net in (one, three)))
-    else:
-        assert count(three) > count(one)
-        assert three(*images(1)).logits.shape == one(*images(1)).logits.shape
-
-
 @pytest.mark.parametrize(
     ("name", "setting", "slope"), [("mfnet", "final_activation", 0.2), ("rtfnet", "final_relu", 0)]
 )
@@ -166,26 +364,6 @@ def test_last_activation_bends_the_same_logits(name: str, setting: str, slope: f
     torch.testing.assert_close(with_it, torch.where(without >= 0, without, without * slope))
 
 
-@pytest.mark.parametrize(
-    ("name", "others"),
-    [
-        ("rtfnet", {"deconv"}),
-        ("semseg", {"ppm", "cls", "aux"}),
-        ("deeplabv2", {"heads", "auxiliary"}),
-        ("pspnet", {"psp", "up_", "final"}),
-    ],
-)
-def test_new_modules_have_the_larger_rate(name: str, others: set[str]) -> None:
-    net = nano(name)
-    names = [each for each, _ in net.named_parameters()]
-    new = [each for each in names if not each.startswith(net.record.pretrained_parts)]
-    assert {each.split(".")[0].rstrip("12345") for each in new} == others
-    assert len(new) < len(names)
-
-
-# ---- DeepLab v2 ----------------------------------------------------------------------------------
-
-
 def test_first_head_and_rgb_are_the_defaults() -> None:
     net, pair = nano("deeplabv2").eval(), images(1, 32, 32)
     with torch.no_grad():
@@ -194,16 +372,6 @@ def test_first_head_and_rgb_are_the_defaults() -> None:
         assert not torch.equal(first, net(*pair, head="target").logits)
     with pytest.raises(InputError, match="did you mean 'target'"):
         net(*pair, head="targe")
-
-
-def test_one_head_is_trained_alone_and_rates_that_do_not_count_are_parameters() -> None:
-    net = nano("deeplabv2", auxiliary=False, summed_rates=(2, 4))
-    assert count(net) == count(nano("deeplabv2", auxiliary=False))
-    net(*images(2), head="target").logits.square().mean().backward()
-    trained = {name for name, p in net.named_parameters() if p.grad is not None}
-    counted = [f"heads.target.aspp.conv2d_list.{i}.{p}" for i in (0, 1) for p in ("weight", "bias")]
-    backbone = [name for name, _ in net.named_parameters() if name.startswith("backbone.")]
-    assert trained == {*backbone, *counted}
 
 
 def test_statistics_move_where_norms_are_not_trained() -> None:
@@ -217,9 +385,6 @@ def test_statistics_move_where_norms_are_not_trained() -> None:
     before = net.backbone.bn1.running_mean.clone()
     net(*images(2, 32, 32), generator=generator())
     assert not torch.equal(before, net.backbone.bn1.running_mean)
-
-
-# ---- initial weights -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

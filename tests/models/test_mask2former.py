@@ -11,13 +11,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.models.mask2former.network import Fusion, Request, semantic_logits
-from rgbt.models.mask2former.pixel_decoder import (
+from rgbt.models.mask2former.head import (
     DeformableAttention,
     centre_grid,
     shrink,
     sine_code,
 )
+from rgbt.models.mask2former.network import Fusion, Request, semantic_logits
 from rgbt.models.swin import PatchMerging, relative_index, shift_mask
 from rgbt.types import VIEWS, MaskPair
 from tests.models import plain

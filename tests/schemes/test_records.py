@@ -11,8 +11,7 @@ from torch import nn
 from rgbt.models.critic import Critic
 from rgbt.requirements import Record, record_of
 from tests.schemes.linear import K, domains, network
-from tests.schemes.test_adversarial import HEATNET, scheme_of
-from tests.schemes.test_domains import labelled, unlabelled
+from tests.schemes.test_domains import HEATNET, labelled, scheme_of, unlabelled
 from tests.schemes.test_schemes import Halves, Nothing
 from tests.schemes.test_schemes import scheme as crm
 from tests.schemes.test_self_training import DISTANCE
@@ -41,12 +40,8 @@ CRITIC = {"in_channels": K, "base_width": 4, "upsample": False, "align_corners":
 
 CASES: dict[str, tuple[Callable[[], Any], dict[tuple[str, str], Any]]] = {
     "labels": (lambda: labelled(network(False), False, "apart"), {**TWO, LABELS: True}),
-    "gradients kept": (
+    "gradients": (
         lambda: labelled(network(True), True, "kept"),
-        {**TWO, HEADS: True, LABELS: True},
-    ),
-    "gradients together": (
-        lambda: labelled(network(True), True, "together"),
         {**TWO, HEADS: True, LABELS: True},
     ),
     "no labels": (lambda: unlabelled(network(False)), {**TWO, LABELS: False}),

@@ -1,22 +1,23 @@
-"""The network of an author is fed, and its scores are found, as of every network here."""
+"""Networks of checkouts: built, adapted, fed, and their scores found; mistakes name the setting."""
 
 from __future__ import annotations
 
-import copy
 import random
+import sys
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import torch
-from torch.nn import functional as F
 
 from rgbt.checkpoints.load import load_weights
 from rgbt.checks import InputError
-from rgbt.models.external.calling import edge_map, picked, scores_at, structure
+from rgbt.files.adapters import adapter_of
+from rgbt.models.external.adapting import Untrained, replaced
+from rgbt.models.external.network import edge_map, picked, scores_at, structure
 from rgbt.requirements import record_of
 from rgbt.types import MaskPair
 from tests.models.external.standins import (
@@ -29,6 +30,169 @@ from tests.models.external.standins import (
     write_checkout,
 )
 
+# ---- building ----
+NAMESPACE = f"""{HEAD}
+class Net(Base):
+    def __init__(self, cfg=None, norm_layer=nn.BatchNorm2d):
+        super().__init__(cfg.num_classes if "num_classes" in cfg else cfg["k"])
+        self.names = [each for each in cfg.modals], cfg.deep.eps
+"""
+
+
+def test_namespaces_have_attributes_and_keys(tmp_path: Path) -> None:
+    folder = write_checkout(tmp_path, {"model/net.py": NAMESPACE})
+    cfg = {"num_classes": 3, "modals": ["img", "thermal"], "deep": {"eps": 1e-3}}
+    net = external(folder, arguments={}, namespaces={"cfg": cfg})
+    assert net.network.names == (["img", "thermal"], 1e-3)
+    del cfg["deep"]
+    with pytest.raises(InputError, match="the namespace has no value 'deep'"):
+        external(folder, arguments={}, namespaces={"cfg": cfg})
+
+
+@pytest.mark.parametrize(
+    ("changes", "key"),
+    [
+        ({"constructor": "model.nets:Net"}, r"constructor=model.nets:Net: ModuleNotFoundError"),
+        ({"constructor": "model.net:Nett"}, "constructor=model.net:Nett: AttributeError"),
+        ({"constructor": "os:system"}, "constructor=os:system: os is not a module of"),
+        ({"constructor": "none.py:network"}, "constructor=none.py:network: FileNotFoundError"),
+        (
+            {"constructor": "model.net:build", "arguments": {}},
+            "constructor=model.net:build returned int 3",
+        ),
+        ({"arguments": {"classes": 3}}, "constructor=.*unexpected keyword argument 'classes'"),
+        ({"constructor": "model.stops:Net"}, "constructor=model.stops:Net: SystemExit: 2"),
+        ({"root": "nowhere"}, "checkout: no such folder: .*nowhere"),
+        ({"root": "../evil"}, "root=../evil leads out of model.checkout="),
+        ({"root": "link"}, "root=link leads out of model.checkout="),
+    ],
+)
+def test_mistake_names_its_setting(tmp_path: Path, changes: dict[str, object], key: str) -> None:
+    files = {"model/net.py": f"{STACKED}\ndef build():\n    return 3\n"}
+    folder = write_checkout(tmp_path / "code", {**files, "model/stops.py": "raise SystemExit(2)"})
+    evil = write_checkout(tmp_path / "evil", {"model/net.py": "raise KeyboardInterrupt"})
+    (folder / "link").symlink_to(evil)
+    with pytest.raises(InputError, match=rf"^model\.{key}"):
+        external(folder, **changes)
+
+
+def test_second_checkout_of_a_process_is_refused(tmp_path: Path) -> None:
+    first = external(write_checkout(tmp_path / "a", {"model/net.py": STACKED}))
+    again = external(tmp_path / "a")
+    assert type(again.network) is type(first.network)
+    other = write_checkout(tmp_path / "b", {"model/net.py": STACKED})
+    with pytest.raises(InputError, match="use another process"):
+        external(other)
+
+
+def test_module_of_another_folder_is_not_taken_for_the_checkouts(tmp_path: Path) -> None:
+    mine = ModuleType("model.net")
+    mine.Net = torch.nn.Identity  # type: ignore[attr-defined]
+    sys.modules["model.net"] = mine
+    with pytest.raises(InputError, match=r"model\.net is not a module of"):
+        external(write_checkout(tmp_path, {"model/net.py": STACKED}))
+
+
+def test_network_may_import_when_it_is_called(tmp_path: Path) -> None:
+    lazy = STACKED.replace("return", "from model.late import TWO\n        return TWO *")
+    files = {"model/net.py": lazy, "model/late.py": "TWO = 2", "json.py": "raise SystemExit"}
+    net = external(write_checkout(tmp_path, files)).eval()
+    rgb, thermal = images()
+    expected = 2 * net.network.conv(torch.cat([rgb, thermal], 1))
+    torch.testing.assert_close(net(rgb, thermal).logits, expected)
+    assert sys.path[-1] == str(tmp_path)  # nothing of ours is looked for there first
+
+
+def test_weights_follow_the_generator_also_of_numpy(tmp_path: Path) -> None:
+    code = "import numpy as np\nimport random\n" + STACKED.replace(
+        "super().__init__()",
+        "super().__init__()\n        self.drawn = np.random.rand(), random.random()",
+    )
+    folder = write_checkout(tmp_path, {"model/net.py": code})
+
+    def built(seed: int) -> tuple[object, torch.Tensor]:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            network = external(folder).network
+        return network.drawn, network.conv.weight
+
+    (first, weight), (again, same), (other, _) = built(0), built(0), built(1)
+    assert first == again != other
+    assert torch.equal(weight, same)
+
+
+ODD = f"""
+import absent.tools as tools
+from absent.registry import ARCH, twice
+{HEAD}
+@ARCH.register()
+class Unused(nn.Module):
+    pass
+
+class Net(Base):
+    def __init__(self, n_class):
+        super().__init__(n_class)
+        self.two = twice(1)
+        self.load_state_dict(torch.load("/home/author/pretrained.pth"), strict=False)
+        self.index = torch.tensor([1.5]).cuda()
+
+    def forward(self, x):
+        return self.conv(x) + self.index
+"""
+ADAPTER = """
+import torch
+from rgbt.models.external.adapting import allow_cpu, replace_in, replaced, skip_init, stand_in
+
+
+def network(n_class):
+    skip_init("toolbox")
+    stand_in("absent.tools")
+    stand_in("absent.registry", twice=lambda value: 2 * value)
+    allow_cpu()
+    from toolbox.net import Net
+
+    replace_in(Net, torch=replaced(torch, load=lambda _: {}))
+    return Net(n_class)
+"""
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="`.cuda()` is no mistake there")
+def test_adapter_builds_an_odd_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for kind in (torch.Tensor, torch.nn.Module):
+        monkeypatch.setattr(kind, "cuda", kind.cuda)  # restored after the test
+    monkeypatch.setenv("RGBT_CONF", f"{tmp_path / 'none'},{tmp_path / 'conf'}")
+    write_checkout(tmp_path / "conf/model/external", {"odd.py": ADAPTER})
+    files = {"toolbox/__init__.py": "raise SystemExit", "toolbox/net.py": ODD}
+    folder = write_checkout(tmp_path / "code", files)
+    load = torch.load
+    for _ in range(2):
+        net = external(folder, constructor="odd.py:network").eval()
+    rgb, thermal = images()
+    expected = net.network.conv(torch.cat([rgb, thermal], 1)) + 1.5
+    torch.testing.assert_close(net(rgb, thermal).logits, expected)
+    assert net.network.two == 2
+    assert torch.load is load
+
+
+def test_untrained_functions_ignore_pretrained() -> None:
+    module = ModuleType("zoo")
+    module.build = lambda depth, pretrained=False: (depth, pretrained)  # type: ignore[attr-defined]
+    assert Untrained(module).build(18, pretrained=True) == (18, False)
+    changed = replaced(module, build=1)
+    assert (changed.build, module.build(2)) == (1, (2, False))  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("name", ["../external/gmnet.py", "/tmp/gmnet.py", "none.py"])  # noqa: S108
+def test_adapter_lies_beside_a_recipe(name: str) -> None:
+    assert adapter_of("model.net:Net") is None
+    found = adapter_of("gmnet.py:network")
+    assert found is not None
+    assert found.with_suffix(".yaml").is_file()
+    with pytest.raises(FileNotFoundError):
+        adapter_of(f"{name}:network")
+
+
+# ---- calling ----
 LIST = PAIR.replace("def forward(self, rgb, thermal):", "def forward(self, x):").replace(
     "both = torch.cat([rgb, thermal[:, :1]], 1)", "both = torch.cat([x[0], x[1][:, :1]], 1)"
 )
@@ -105,7 +269,8 @@ def test_paths_lead_through_lists_keys_attributes_and_elements() -> None:
     assert picked(output, (1, "out", "scores", -1)) == 3
     assert picked(output, (2, "*", "a")).shape == (4, 2)
     assert [picked(output, path) for path in ((7,), (1, "in"), (0, 0))] == [None] * 3
-    assert structure([1, (2, 3), None, "a", 5]) == "list (int 1, tuple of 2, None, str 'a', ...)"
+    words = "list (int 1, tuple (int 2, float 3.0), None, str 'a')"
+    assert structure([1, (2, 3.0), None, "a"]) == words
 
 
 SCORES = torch.ones(2, 3, 4, 5)
@@ -148,15 +313,6 @@ def test_forward_returns_scores_of_every_pixel_also_of_odd_sides(tmp_path: Path)
         assert out.logits.dtype == torch.float32
     with pytest.raises(InputError, match=r"model\.scores: .* scores of \(3, 4\) .* \(12, 16\)"):
         external(folder, multiple=4).eval()(*images(2, 9, 13))
-
-
-def test_exact_sizes_resize_images_and_scores(tmp_path: Path) -> None:
-    exact = STACKED.replace("return", "assert x.shape[2:] == (16, 24)\n        return")
-    net = external(write_checkout(tmp_path, {"model/net.py": exact}), size_hw=(16, 24)).eval()
-    rgb, thermal = images()
-    shown = F.interpolate(torch.cat([rgb, thermal], 1), size=(16, 24), mode="bilinear")
-    expected = F.interpolate(net.network.conv(shown), size=(8, 12), mode="bilinear")
-    torch.testing.assert_close(net(rgb, thermal).logits, expected)
 
 
 def test_hidden_pixels_do_not_count(tmp_path: Path) -> None:
@@ -217,13 +373,6 @@ def test_training_may_read_other_scores(tmp_path: Path) -> None:
     assert [(each.node, each.key) for each in record.requires] == [("loss", "reads_auxiliary")]
 
 
-def test_copy_is_a_network_of_its_own(tmp_path: Path) -> None:
-    net = external(write_checkout(tmp_path, {"model/net.py": STACKED})).eval()
-    teacher = copy.deepcopy(net)
-    assert torch.equal(teacher(*images()).logits, net(*images()).logits)
-    assert teacher.network.conv.weight is not net.network.conv.weight
-
-
 STATE: dict[str, Any] = {"conv.weight": torch.ones(3, 4, 1, 1), "conv.bias": torch.zeros(3)}
 
 
@@ -246,13 +395,3 @@ def test_weights_of_the_author_are_loaded(
     load_weights(net, tmp_path / "author.pth")
     assert bool((net.network.conv.weight == 1).all())
     assert not net.network.conv.bias.any()
-
-
-def test_weights_that_do_not_fit_are_refused(tmp_path: Path) -> None:
-    folder = write_checkout(tmp_path / "code", {"model/net.py": STACKED})
-    torch.save({"conv.weight": STATE["conv.weight"], "head": torch.ones(1)}, tmp_path / "w.pth")
-    net = external(folder)
-    before = copy.deepcopy(net.state_dict())
-    with pytest.raises(InputError, match=r"conv\.bias.*head"):
-        load_weights(net, tmp_path / "w.pth")
-    assert all(torch.equal(before[key], value) for key, value in net.state_dict().items())

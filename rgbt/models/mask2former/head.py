@@ -1,4 +1,6 @@
-"""Pixel decoder: deformable attention over strides 32, 16, 8, then one step up to stride 4.
+"""The head of Mask2Former: pixel decoder, and the decoder in which queries read their own masks.
+
+The pixel decoder has deformable attention over strides 32, 16, 8, then one step up to stride 4.
 
 Shape letters beside those of `rgbt.types`: `S` tokens of all levels together, `S_l` of one level.
 """
@@ -14,11 +16,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-GROUPS = 32
-"""Groups of every group normalisation (Mask2Former release)."""
+GROUPS = 32  # of every group normalisation (Mask2Former release)
 NUM_LEVELS = 3
-POINTS = 4
-"""Sampling points per head and level (Deformable DETR, Sec. 4.1; Mask2Former release)."""
+POINTS = 4  # sampled per head and level (Deformable DETR, Sec. 4.1; Mask2Former release)
 
 Levels = tuple[tuple[int, int], ...]
 """Rows and columns of every level."""
@@ -26,7 +26,7 @@ Levels = tuple[tuple[int, int], ...]
 
 @dataclass(frozen=True, kw_only=True)
 class HeadShape:
-    """Sizes of both decoders; see `rgbt.models.mask2former.model.Mask2Former`."""
+    """Sizes of both decoders; keys of ``conf/model/mask2former_swin_t.yaml``."""
 
     num_classes: int
     hidden_dim: int
@@ -44,22 +44,14 @@ class PixelPyramid(NamedTuple):
 
     Mask features are W f + b with the last 1 x 1 convolution (W, b). They are handed on as the
     three factors: e (W f + b) = (e W) f + e b costs less, for fewer embeddings e than pixels.
-
-    Attributes:
-        fine: f, (M, C, H/4, W/4) of the first M of B samples, M <= B.
-        reduced: f of all samples at strides 32, 16, 8, (B, C, S_l) each, without gradient.
-        weight: W, (C, C).
-        bias: b, (C,).
-        tokens: (B, S_l, C) at strides 32, 16, 8, row-major.
-        levels: rows and columns of these three.
     """
 
-    fine: Tensor
-    reduced: tuple[Tensor, ...]
-    weight: Tensor
-    bias: Tensor
-    tokens: tuple[Tensor, ...]
-    levels: Levels
+    fine: Tensor  # f, (M, C, H/4, W/4) of the first M of B samples
+    reduced: tuple[Tensor, ...]  # f of all at strides 32, 16, 8, (B, C, S_l), without gradient
+    weight: Tensor  # W, (C, C)
+    bias: Tensor  # b, (C,)
+    tokens: tuple[Tensor, ...]  # (B, S_l, C) at strides 32, 16, 8, row-major
+    levels: Levels  # of these three
 
 
 @lru_cache(maxsize=64)
@@ -68,9 +60,8 @@ def centre_grid(levels: Levels, device: torch.device) -> tuple[Tensor, Tensor]:
 
         (x, y) = 2 (column + 1/2) / columns - 1,  2 (row + 1/2) / rows - 1;  2 / columns, 2 / rows
 
-    Source: Deformable DETR, Sec. 4.1 (reference points).
-
-    (2, S) and (levels, 1, 2, 1) float32, x first; kept per size.
+    (2, S) and (levels, 1, 2, 1) float32, x first; kept per size.   Source: Deformable DETR,
+    Sec. 4.1 (reference points).
     """
     with torch.inference_mode(False):
         centres = []
@@ -88,10 +79,8 @@ def sine_code(hw: tuple[int, int], dim: int, device: torch.device) -> Tensor:
         angle(p, k) = 2 pi p / (P + 1e-6) / 10000^(2 floor(k / 2) / (dim / 2)),  p = 1..P
         code(p, k) = sin(angle) for even k, cos(angle) for odd k
 
+    `dim` is a multiple of 4; (rows * columns, dim) float32, row-major, kept per size.
     Source: DETR, supplement A.4; normalised variant as in Mask2Former.
-
-    `hw` are rows and columns, `dim` is a multiple of 4; (rows * columns, dim) float32, row-major,
-    kept per size.
     """
 
     def axis(size: int) -> Tensor:
@@ -112,7 +101,6 @@ class DeformableAttention(nn.Module):
         out_q = W_o sum_j a_qj  value(reference_q + offset_qj),   sum_j a_qj = 1 per head
 
     At first, head m of M looks at 1..4 pixels in direction 2 pi m / M, all samples of equal weight.
-
     Source: Deformable DETR, Eq. (3).
     """
 
@@ -138,10 +126,7 @@ class DeformableAttention(nn.Module):
             nn.init.zeros_(layer.bias)
 
     def forward(self, query: Tensor, tokens: Tensor, levels: Levels) -> Tensor:
-        """Attention of all tokens to all levels: (B, S, C) -> (B, S, C).
-
-        `query` are the tokens with their position code.
-        """
+        """(B, S, C) -> (B, S, C); `query` are the tokens with their position code."""
         batch, length, dim = tokens.shape
         # Everything is computed with tokens last, as grid_sample wants it: no transposed copies.
         tokens, query = tokens.transpose(1, 2), query.transpose(1, 2)
@@ -189,8 +174,7 @@ class EncoderLayer(nn.Module):
     def forward(self, tokens: Tensor, position: Tensor, levels: Levels) -> Tensor:
         """(B, S, C) -> (B, S, C); `position` (S, C) is added to the queries only."""
         tokens = self.norm1(tokens + self.self_attn(tokens + position, tokens, levels))
-        out: Tensor = self.norm2(tokens + self.linear2(F.relu(self.linear1(tokens))))
-        return out
+        return self.norm2(tokens + self.linear2(F.relu(self.linear1(tokens))))
 
 
 class LevelEncoder(nn.Module):
@@ -222,16 +206,13 @@ class ConvNorm(nn.Conv2d):
 
     def forward(self, input: Tensor) -> Tensor:
         """(B, c, H, W) -> (B, C, H, W)."""
-        out: Tensor = self.norm(super().forward(input))
-        return out
+        return self.norm(super().forward(input))
 
 
 class PixelDecoder(nn.Module):
-    """Features of four strides to mask features and three levels of tokens.
+    """Features of four strides, of `widths` channels, to mask features and three levels of tokens.
 
     Source: Mask2Former, Sec. 3.2 and 4.1; MSDeformAttn variant of its release.
-
-    `widths` are channels at strides 4, 8, 16, 32.
     """
 
     def __init__(self, widths: tuple[int, int, int, int], shape: HeadShape) -> None:
@@ -252,17 +233,16 @@ class PixelDecoder(nn.Module):
         for convolution in (*projections, self.mask_features):
             nn.init.zeros_(convolution.get_parameter("bias"))
 
-    def forward(self, features: list[Tensor], num_masks: int | None = None) -> PixelPyramid:
+    def forward(self, features: list[Tensor], num_masks: int) -> PixelPyramid:
         """Features (B, C_s, H/s, W/s), s = 4, 8, 16, 32, to mask features and tokens.
 
-        Only the first `num_masks` samples have masks (None: all). No gradient is computed of the
-        mask features of the others.
+        Only the first `num_masks` samples have masks. No gradient is computed of the mask features
+        of the others.
         """
-        count = features[0].shape[0] if num_masks is None else num_masks
         if not self.fp32:
-            return self._decode(features, count)
+            return self._decode(features, num_masks)
         with torch.autocast(features[0].device.type, enabled=False):
-            return self._decode([each.float() for each in features], count)
+            return self._decode([each.float() for each in features], num_masks)
 
     def _decode(self, features: list[Tensor], num_masks: int) -> PixelPyramid:
         fine, *coarse = features
@@ -275,11 +255,11 @@ class PixelDecoder(nn.Module):
         stride_8 = per_level[-1].unflatten(1, levels[-1]).permute(0, 3, 1, 2)
         finest = self._finest(fine[:num_masks], stride_8[:num_masks])
         with torch.no_grad():
-            reduced = _reduce(finest, levels)
+            every = [finest]
             if num_masks < fine.shape[0]:
-                others = self._finest(fine[num_masks:], stride_8[num_masks:])
-                pairs = zip(reduced, _reduce(others, levels), strict=True)
-                reduced = tuple(torch.cat(pair) for pair in pairs)
+                every.append(self._finest(fine[num_masks:], stride_8[num_masks:]))
+            factors = [finest.shape[-1] // columns for _, columns in levels]
+            reduced = tuple(torch.cat([shrink(x, f).flatten(2) for x in every]) for f in factors)
         weight, bias = self.mask_features.weight, self.mask_features.get_parameter("bias")
         return PixelPyramid(finest, reduced, weight.flatten(1), bias, per_level, levels)
 
@@ -293,17 +273,164 @@ class PixelDecoder(nn.Module):
         return F.relu(self.layer_1(summed))
 
 
-def _reduce(fine: Tensor, levels: Levels) -> tuple[Tensor, ...]:
-    """(B, C, H, W) at the sizes of all levels, (B, C, S_l) each."""
-    return tuple(shrink(fine, fine.shape[-1] // columns).flatten(2) for _, columns in levels)
-
-
 def shrink(x: Tensor, factor: int) -> Tensor:
     """Bilinear resize by an even factor: the mean of the four pixels around each new centre.
 
-    Equals `interpolate(mode="bilinear", align_corners=False)`, which is slow on CPU. Sides of x
-    (..., H, W) are multiples of `factor`: (..., H / factor, W / factor).
+    Equals `interpolate(mode="bilinear", align_corners=False)`, which is slow on CPU; (..., H, W) ->
+    (..., H / factor, W / factor).
     """
     low, high = factor // 2 - 1, factor // 2
     rows = x[..., low::factor, :] + x[..., high::factor, :]
     return (rows[..., low::factor] + rows[..., high::factor]) / 4
+
+
+# ---- queries ----
+
+
+class QueryAttention(nn.Module):
+    """`torch.nn.MultiheadAttention` that takes one mask for all heads without repeating it."""
+
+    def __init__(self, dim: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.in_proj_weight = nn.Parameter(torch.empty(3 * dim, dim))
+        self.in_proj_bias = nn.Parameter(torch.zeros(3 * dim))
+        self.out_proj = nn.Linear(dim, dim)
+        nn.init.xavier_uniform_(self.in_proj_weight)
+        nn.init.xavier_uniform_(self.out_proj.weight)
+        nn.init.zeros_(self.out_proj.bias)
+
+    def forward(self, query: Tensor, key: Tensor, value: Tensor, allowed: Tensor | None) -> Tensor:
+        """(B, Q, C), (B, S, C) twice -> (B, Q, C); `allowed` (B, Q, S) bool is what may be read."""
+        weights, biases = self.in_proj_weight.chunk(3), self.in_proj_bias.chunk(3)
+        q, k, v = (
+            F.linear(x, w, b).view(*x.shape[:2], self.heads, -1).transpose(1, 2)
+            for x, w, b in zip((query, key, value), weights, biases, strict=True)
+        )
+        mask = None if allowed is None else allowed[:, None]
+        if q.device.type == "cpu" and q.dtype in (torch.bfloat16, torch.float16):
+            # The gradient takes up to three times as long in bfloat16 as in single precision.
+            with torch.autocast("cpu", enabled=False):
+                out = F.scaled_dot_product_attention(q.float(), k.float(), v.float(), mask)
+        else:
+            out = F.scaled_dot_product_attention(q, k, v, mask)
+        return self.out_proj(out.transpose(1, 2).flatten(2))
+
+
+class AttentionLayer(nn.Module):
+    """Queries read one level, or each other; added, then normalised."""
+
+    def __init__(self, name: str, dim: int, heads: int) -> None:
+        super().__init__()
+        self.add_module(name, QueryAttention(dim, heads))  # the released name
+        self.norm = nn.LayerNorm(dim)
+
+    def forward(
+        self, queries: Tensor, placed: Tensor, memory: tuple[Tensor, Tensor], allowed: Tensor | None
+    ) -> Tensor:
+        """(B, Q, C), without and with position, and keys and values (B, S, C) -> (B, Q, C)."""
+        attention, norm = self.children()
+        return norm(queries + attention(placed, *memory, allowed))
+
+
+class FfnLayer(nn.Module):
+    """Linear, ReLU, linear; added, then normalised."""
+
+    def __init__(self, dim: int, ffn_dim: int) -> None:
+        super().__init__()
+        self.linear1 = nn.Linear(dim, ffn_dim)
+        self.linear2 = nn.Linear(ffn_dim, dim)
+        self.norm = nn.LayerNorm(dim)
+        for layer in (self.linear1, self.linear2):
+            nn.init.xavier_uniform_(layer.weight)
+
+    def forward(self, queries: Tensor) -> Tensor:
+        """(B, Q, C) -> (B, Q, C)."""
+        return self.norm(queries + self.linear2(F.relu(self.linear1(queries))))
+
+
+class MaskEmbed(nn.Module):
+    """Three linear layers with ReLU between them: query -> mask embedding."""
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        self.layers = nn.ModuleList(nn.Linear(dim, dim) for _ in range(3))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, Q, C) -> (B, Q, C)."""
+        first, second, third = self.layers
+        return third(F.relu(second(F.relu(first(x)))))
+
+
+class Predictor(nn.Module):
+    """Query decoder with a prediction before the first and after every layer.
+
+    Layer i reads level i mod 3 (strides 32, 16, 8).   Source: Mask2Former, Sec. 3.2, Eq. (1)-(2).
+    """
+
+    def __init__(self, shape: HeadShape) -> None:
+        super().__init__()
+        dim, heads, count = shape.hidden_dim, shape.attention_heads, range(shape.decoder_layers)
+        self.transformer_self_attention_layers = nn.ModuleList(
+            AttentionLayer("self_attn", dim, heads) for _ in count
+        )
+        self.transformer_cross_attention_layers = nn.ModuleList(
+            AttentionLayer("multihead_attn", dim, heads) for _ in count
+        )
+        self.transformer_ffn_layers = nn.ModuleList(
+            FfnLayer(dim, shape.decoder_ffn_dim) for _ in count
+        )
+        self.decoder_norm = nn.LayerNorm(dim)
+        self.query_feat = nn.Embedding(shape.num_queries, dim)
+        self.query_embed = nn.Embedding(shape.num_queries, dim)
+        self.level_embed = nn.Embedding(NUM_LEVELS, dim)
+        self.class_embed = nn.Linear(dim, shape.num_classes + 1)
+        self.mask_embed = MaskEmbed(dim)
+
+    def forward(self, pyramid: PixelPyramid) -> tuple[Tensor, Tensor]:
+        """Predictions of the initial queries and after each layer, L in all, the last one final.
+
+        Class logits (L, B, Q, K + 1), last column = no object, and mask logits (L, M, Q, H/4, W/4)
+        of the M samples of `PixelPyramid.fine`, a view of memory ordered M, L, Q, H/4, W/4.
+        """
+        memories = []  # keys and values of the three levels, each (B, S_l, C)
+        every_level = zip(pyramid.tokens, pyramid.levels, self.level_embed.weight, strict=True)
+        for tokens, hw, embed in every_level:
+            values = tokens + embed
+            memories.append((values + sine_code(hw, values.shape[-1], values.device), values))
+        position = self.query_embed.weight
+        queries = self.query_feat.weight.expand(pyramid.tokens[0].shape[0], -1, -1)
+        normed: list[Tensor] = [self.decoder_norm(queries)]
+        embeds: list[Tensor] = [self.mask_embed(normed[0])]
+        layers = zip(
+            self.transformer_cross_attention_layers,
+            self.transformer_self_attention_layers,
+            self.transformer_ffn_layers,
+            strict=True,
+        )
+        for index, (cross_attention, self_attention, ffn) in enumerate(layers):
+            level = index % NUM_LEVELS
+            # Read where the own mask has probability 1/2 or more, if anywhere. Resizing is linear:
+            # a resized mask is the product of the embedding with resized features, which costs the
+            # size of the level instead of the size of the mask.
+            with torch.no_grad():
+                inside = _mask_logits(embeds[-1], pyramid, pyramid.reduced[level]) >= 0
+                allowed = inside | ~inside.any(-1, keepdim=True)
+            queries = cross_attention(queries, queries + position, memories[level], allowed)
+            placed = queries + position
+            queries = ffn(self_attention(queries, placed, (placed, queries), None))
+            normed.append(self.decoder_norm(queries))
+            embeds.append(self.mask_embed(normed[-1]))
+
+        # The masks of all layers are one matrix product: no copy, one gradient of the features.
+        class_logits = self.class_embed(torch.stack(normed))
+        embed = torch.cat(embeds, dim=1)[: pyramid.fine.shape[0]]
+        masks = _mask_logits(embed, pyramid, pyramid.fine.flatten(2))
+        masks = masks.view(masks.shape[0], len(embeds), -1, *pyramid.fine.shape[-2:])
+        return class_logits, masks.transpose(0, 1)
+
+
+def _mask_logits(embed: Tensor, pyramid: PixelPyramid, fine: Tensor) -> Tensor:
+    """(B, Q, C) mask embeddings times mask features of `fine` (B, C, pixels) -> (B, Q, pixels)."""
+    offset = embed @ pyramid.bias[:, None]
+    return torch.baddbmm(offset.expand(-1, -1, fine.shape[-1]), embed @ pyramid.weight, fine)

@@ -1,17 +1,29 @@
-"""The vision transformers of DINOv2 and DINOv3 by a second computation; entries of their files."""
+"""DINOv2 and DINOv3: entries of their files, a second computation, positions, updates, pyramid."""
 
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
-from rgbt.models.dinov2.encoder import Encoder, LoraProjection, resized_positions
+from rgbt.engine.optimizers import AdamW
+from rgbt.models.dinov2.encoder import (
+    Encoder,
+    LoraProjection,
+    RotaryPositions,
+    resized_positions,
+    rotated,
+)
+from rgbt.models.dinov2.model import Level
+from rgbt.types import VIEWS
+from tests.models import plain
 from tests.models.golden import network
-from tests.models.plain import count, normal, randomise
+from tests.models.plain import cells, count, images, normal, randomise
 
 ROTARY: dict[str, Any] = {
     **{"position_grid": None, "position_resize": None, "rope_base": 100.0},
@@ -46,28 +58,6 @@ def published_shapes(width: int, registers: int) -> dict[str, tuple[int, ...]]:
         vectors = ("norm1.weight", "norm1.bias", "norm2.weight", "norm2.bias")
         shapes |= {f"blocks.{block}.{n}": (d,) for n in (*vectors, "ls1.gamma", "ls2.gamma")}
     return shapes
-
-
-@pytest.mark.parametrize(
-    ("yaml", "width", "registers", "entries", "values"),
-    [
-        ("dinov2_vits14", 384, 0, 175, 22_056_576),
-        ("dinov2_vits14_reg", 384, 4, 176, 22_058_112),
-        ("dinov2_vitb14", 768, 0, 175, 86_580_480),
-        ("dinov2_vitb14_reg", 768, 4, 176, 86_583_552),
-    ],
-)
-def test_the_encoder_has_the_entries_of_the_published_file(
-    yaml: str, width: int, registers: int, entries: int, values: int
-) -> None:
-    with torch.device("meta"):
-        net = network(yaml).backbone.encoder
-    state = {name: tuple(value.shape) for name, value in net.state_dict().items()}
-    assert state == published_shapes(width, registers)
-    assert (len(state), count(net)) == (entries, values)
-
-
-# ---- a second computation from the state dict ----------------------------------------------------
 
 
 def turned(x: Tensor, hw: tuple[int, int], first: int, periods: Tensor) -> Tensor:
@@ -160,9 +150,6 @@ def test_tokens_equal_a_second_computation(changes: dict[str, Any], hw: tuple[in
             torch.testing.assert_close(own, expected, rtol=1e-4, atol=1e-5)
 
 
-# ---- positions -----------------------------------------------------------------------------------
-
-
 def cubic(t: float, a: float) -> float:
     """Keys' cubic kernel; PyTorch has a = -0.75, and -0.5 with antialiasing."""
     t = abs(t)
@@ -209,9 +196,6 @@ def test_positions_are_resized_in_both_published_forms(hw: tuple[int, int], form
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
 
 
-# ---- hidden patches, thermal vector, updates -----------------------------------------------------
-
-
 @torch.no_grad()
 def test_hidden_patches_do_not_count_and_show_the_mask_token() -> None:
     net = encoder()
@@ -225,14 +209,6 @@ def test_hidden_patches_do_not_count_and_show_the_mask_token() -> None:
     net.mask_token.add_(1.0)
     assert not torch.equal(net(first, hidden, layers=(3,))[0], plain)
     assert torch.equal(net(first, layers=(3,))[0], net(first, hidden & False, layers=(3,))[0])
-
-
-@torch.no_grad()
-def test_an_added_vector_equals_another_bias_of_the_patches() -> None:
-    net, image, added = encoder(), normal(1, 3, 20, 20), normal(12, seed=3)
-    (found,) = net(image, layers=(3,), added=added)
-    net.patch_embed["proj"].bias.add_(added)
-    torch.testing.assert_close(found, net(image, layers=(3,))[0])
 
 
 @pytest.mark.parametrize("parts", [("q", "v"), ("q", "k", "v"), ("k",)])
@@ -254,18 +230,6 @@ def test_updates_equal_a_changed_projection(parts: Any) -> None:
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5)
 
 
-# ---- initial weights -----------------------------------------------------------------------------
-
-
-def test_a_is_drawn_as_in_the_release_of_lora() -> None:
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        lora = LoraProjection(300, rank=40, alpha=1.0, parts=("q",))
-    assert float(lora.down["q"].detach().abs().max()) <= 300**-0.5
-    assert float(lora.down["q"].detach().std()) == pytest.approx((3 * 300) ** -0.5, rel=0.02)
-    assert not lora.up["q"].any()
-
-
 @pytest.mark.parametrize(("yaml", "deviation"), [("dinov2_tiny", 1e-6), ("dinov3_tiny", 0.02)])
 def test_initial_weights_are_drawn_as_in_the_release(yaml: str, deviation: float) -> None:
     with torch.random.fork_rng():
@@ -281,3 +245,175 @@ def test_initial_weights_are_drawn_as_in_the_release(yaml: str, deviation: float
     for weight in drawn:
         assert float(weight.detach().std()) == pytest.approx(0.02, rel=0.1)
     assert not net.blocks[0].attn.qkv.bias.any()
+
+
+def published_dinov3(width: int, *, gated: bool = False) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of a published file of S, S+ or B."""
+    d = width
+    shapes = published_shapes(width, registers=0)
+    del shapes["pos_embed"]
+    shapes |= {"storage_tokens": (1, 4, d), "rope_embed.periods": (16,)}
+    shapes["patch_embed.proj.weight"] = (d, 3, 16, 16)
+    for block in range(12):
+        at = f"blocks.{block}"
+        shapes[f"{at}.attn.qkv.bias_mask"] = (3 * d,)
+        if gated:
+            first, second = (shapes.pop(f"{at}.mlp.fc{n}.weight") for n in (1, 2))
+            for name, shape in (("w1", first), ("w2", first), ("w3", second)):
+                shapes[f"{at}.mlp.{name}.weight"] = shape
+                shapes[f"{at}.mlp.{name}.bias"] = shape[:1]
+            del shapes[f"{at}.mlp.fc1.bias"], shapes[f"{at}.mlp.fc2.bias"]
+    return shapes
+
+
+@pytest.mark.parametrize(
+    ("yaml", "shapes", "values"),
+    [
+        ("dinov2_vits14", published_shapes(384, 0), 22_056_576),
+        ("dinov2_vits14_reg", published_shapes(384, 4), 22_058_112),
+        ("dinov2_vitb14", published_shapes(768, 0), 86_580_480),
+        ("dinov2_vitb14_reg", published_shapes(768, 4), 86_583_552),
+        ("dinov3_vits16", published_dinov3(384), 21_601_152),
+        ("dinov3_vits16plus", published_dinov3(384, gated=True), 28_697_472),
+        ("dinov3_vitb16", published_dinov3(768), 85_669_632),
+    ],
+)
+def test_the_encoder_has_the_entries_of_the_published_file(
+    yaml: str, shapes: dict[str, tuple[int, ...]], values: int
+) -> None:
+    with torch.device("meta"):
+        net = network(yaml).backbone.encoder
+    state = {name: tuple(value.shape) for name, value in net.state_dict().items()}
+    if "dinov3" in yaml:
+        state["storage_tokens"] = state.pop("register_tokens")
+    assert state == {n: s for n, s in shapes.items() if not n.endswith("bias_mask")}
+    assert count(net) == values
+
+
+@torch.no_grad()
+def test_the_bias_of_the_keys_does_not_count() -> None:
+    net, image = encoder(**ROTARY), normal(1, 3, 8, 16)
+    before = net(image, layers=(3,))[0]
+    query, key, value = net.blocks[0].attn.qkv.bias.chunk(3)
+    key.add_(1.0)
+    assert torch.equal(net(image, layers=(3,))[0], before)
+    for part in (query, value):
+        part.add_(1.0)
+        after = net(image, layers=(3,))[0]
+        assert not torch.equal(after, before)
+        before = after
+
+
+def test_rotation_by_hand() -> None:
+    """Three rows and one column: rows at -2/3, 0 and 2/3, the column at 0; periods 1 and 10."""
+    positions = RotaryPositions(8, 100.0)
+    torch.testing.assert_close(positions.periods, torch.tensor([1.0, 10.0]))
+    cos, sin = positions((3, 1), 1)
+    full, tenth = 2 * math.pi * 2 / 3, 2 * math.pi * 2 / 30
+    angles = torch.tensor([[0.0, 0.0], [-full, -tenth], [0.0, 0.0], [full, tenth]])
+    angles = torch.cat([angles, torch.zeros(4, 2)], 1).tile(2)
+    torch.testing.assert_close(cos, angles.cos())
+    torch.testing.assert_close(sin, angles.sin())
+
+
+def test_half_precision_is_rounded_after_the_rotation() -> None:
+    x = normal(1, 1, 4, 8).bfloat16()
+    rotation = RotaryPositions(8, 100.0)((3, 1), 1)
+    assert torch.equal(rotated(x, rotation), rotated(x.float(), rotation).bfloat16())
+
+
+# ---- the network ----
+nano = partial(plain.nano, "dinov2")
+ADAMW = AdamW(
+    **{"lr": 1.0, "backbone_multiplier": 0.1, "weight_decay": 0.05, "decay_biases": True},
+    betas=(0.9, 0.999),
+    eps=1e-8,
+)
+
+
+@pytest.mark.parametrize(
+    ("patch", "token_px", "hw"), [(4, 8, (32, 48)), (14, 16, (56, 84)), (8, 8, (64, 96))]
+)
+def test_a_patch_covers_token_px_pixels(patch: int, token_px: int, hw: tuple[int, int]) -> None:
+    net, seen = nano(patch=patch, token_px=token_px).eval(), []
+    net.backbone.encoder.register_forward_pre_hook(lambda _, args: seen.append(args[0]))
+    pair = images(1)
+    net(*pair)
+    for image, found in zip(pair, seen, strict=True):
+        assert found.shape == (1, 3, *hw)
+        if patch == token_px:  # nothing is resized
+            torch.testing.assert_close(found, (2 * image - 1).expand(-1, 3, -1, -1))
+
+
+@torch.no_grad()
+def test_levels_equal_a_second_computation() -> None:
+    x = normal(1, 4, 2, 3)
+    finer = Level(4, token_px=8, stride=4)
+    weight, bias = finer[0].weight, finer[0].bias  # (in, out, 2, 2), without overlap
+    expected = torch.zeros(1, 2, 4, 6)
+    for row in range(4):
+        for column in range(6):
+            pixel = x[0, :, row // 2, column // 2] @ weight[:, :, row % 2, column % 2] + bias
+            expected[0, :, row, column] = F.layer_norm(pixel, (2,))
+    torch.testing.assert_close(finer(x), expected)
+    coarser = Level(4, token_px=8, stride=16)
+    highest = x[..., :2, :2].amax((2, 3))
+    torch.testing.assert_close(coarser(x[..., :2, :2])[..., 0, 0], F.layer_norm(highest, (4,)))
+
+
+@torch.no_grad()
+def test_every_level_takes_the_tokens_of_its_block() -> None:
+    """With four blocks, a change of the third one reaches the levels of the third and fourth."""
+    net = nano(layers=(1, 2, 3, 4)).eval()
+    image = normal(1, 3, 32, 48)
+    before = net.backbone.maps("rgb", image, None, None)
+    net.backbone.encoder.blocks[2].mlp.fc2.bias.add_(1.0 * torch.arange(8))
+    after = net.backbone.maps("rgb", image, None, None)
+    same = [torch.equal(a, b) for a, b in zip(before, after, strict=True)]
+    assert same == [True, True, False, False]
+
+
+@pytest.mark.parametrize("tuning", ["frozen", "lora"])
+def test_the_encoder_is_not_trained(tuning: str) -> None:
+    net = nano(tuning=tuning).train()
+    before = {name: value.clone() for name, value in net.backbone.encoder.state_dict().items()}
+    optimizer = ADAMW(net)
+    listed = {id(p) for group in optimizer.param_groups for p in group["params"]}
+    assert listed == {id(p) for p in net.parameters() if p.requires_grad}
+    aux = net(*images(4), cells(4), passes=2, views=VIEWS).aux
+    sum((x * normal(*x.shape, seed=2)).sum() for x in aux.values()).backward()
+    optimizer.step()
+    assert all(p.grad is None for p in net.backbone.encoder.parameters())
+    after = net.backbone.encoder.state_dict()
+    assert all(torch.equal(after[name], value) for name, value in before.items())
+    assert bool(len(net.backbone.lora)) == (tuning == "lora")
+
+
+@pytest.mark.parametrize("per_modality", [True, False])
+@torch.no_grad()
+def test_updates_change_nothing_at_first_and_then_their_modality(per_modality: bool) -> None:
+    frozen = nano(tuning="frozen").eval()
+    net = nano(tuning="lora", lora_per_modality=per_modality).eval()
+    assert set(net.backbone.lora) == ({"rgb", "thermal"} if per_modality else {"both"})
+    own = {k: v for k, v in net.state_dict().items() if k.startswith("backbone.lora.")}
+    net.load_state_dict({**frozen.state_dict(), **own})
+    pair, masks = images(2), cells(2)
+
+    def logits(of: nn.Module) -> list[torch.Tensor]:
+        return [of(*pair, masks, views=(view,)).logits for view in ("rgb", "thermal")]
+
+    before = logits(net)
+    assert all(torch.equal(a, b) for a, b in zip(before, logits(frozen), strict=True))
+    net.backbone.lora["thermal" if per_modality else "both"][0].up["v"].copy_(normal(8, 2))
+    same = [torch.equal(a, b) for a, b in zip(before, logits(net), strict=True)]
+    assert same == [per_modality, False]
+
+
+@torch.no_grad()
+def test_the_thermal_vector_is_0_at_first_and_reaches_thermal_alone() -> None:
+    net, pair = nano().eval(), images(1)
+    assert not net.backbone.thermal_embedding.any()
+    before = [net(*pair, views=(view,)).logits for view in ("rgb", "thermal")]
+    net.backbone.thermal_embedding.add_(torch.arange(8.0))
+    after = [net(*pair, views=(view,)).logits for view in ("rgb", "thermal")]
+    assert [torch.equal(a, b) for a, b in zip(before, after, strict=True)] == [True, False]
