@@ -168,8 +168,7 @@ class Masker:
 
 
 def num_taken(grid_hw: tuple[int, int], ratio: float) -> int:
-    """How many cells a mask takes: ``ceil(h w ratio)`` (CRM release, mask generator)."""
-    # 20 * 0.55 is 11.000000000000002 in binary; that excess must not cost a cell.
+    """``ceil(h w ratio)`` cells (CRM release); 20 * 0.55 = 11.000000000000002 are eleven."""
     return math.ceil(grid_hw[0] * grid_hw[1] * ratio - 1e-9)
 
 

@@ -1,7 +1,7 @@
 """Draw examples of a masker: ``rgbt masks +experiment=grbm out=masks.png``.
 
-One column per training sample, augmented as in training: RGB and thermal with their hidden cells
-greyed out; last column: how often each cell is hidden. A picture to look at, not a measurement.
+One column per training sample, augmented as in training: RGB and thermal, hidden cells in grey;
+last column: how often each cell is hidden.
 """
 
 from __future__ import annotations

@@ -34,11 +34,9 @@ MAP_NORM_EPS = 1e-6  # of the thermal patch embeddings and after its stages; the
 
 
 class PoolingGate(nn.Module):
-    """Gate of a map from its means over windows of several sizes.
+    """Gate of a map from its means over windows of several sizes (CMNeXt release).
 
-        sigmoid(conv1x1(c + sum_k mean_k(c))) x + x,   c = depthwise 7x7 of x
-
-    Source: CMNeXt release.
+    sigmoid(conv1x1(c + sum_k mean_k(c))) x + x,   c = depthwise 7x7 of x
     """
 
     def __init__(self, dim: int, windows: tuple[int, ...]) -> None:
@@ -82,10 +80,8 @@ class ConvFfn(nn.Module):
 class PpxBlock(nn.Module):
     """Gated pooling and a feed-forward network; the channels of what passes by are weighted.
 
-        y = x + l1 gate(norm(x))        w = sigmoid(conv over channels of the means of y)
-        w y + l2 ffn(norm(y))           l1, l2: a learned factor per channel
-
-    Source: CMNeXt release.
+    y = x + l1 gate(norm(x))        w = sigmoid(conv over channels of the means of y)
+    w y + l2 ffn(norm(y))           l1, l2: a learned factor per channel
     """
 
     def __init__(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import partial
+from functools import partial, reduce
 from itertools import pairwise
 from typing import Annotated, Literal
 
@@ -30,8 +30,6 @@ class Backbone(nn.Module):
     sits on the 3x3 convolution.
 
     Source: DeepLab v2, Sec. 3.1.   Released: AdaptSegNet, ADVENT, MaxSquareLoss, thesis.
-
-    Arguments: see `DeepLabV2`; `width` is its base_width.
     """
 
     def __init__(
@@ -76,11 +74,7 @@ class AtrousPyramid(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, in, h, w) -> (N, out, h, w)."""
-        first, *others = self.summed
-        result = self.conv2d_list[first](x)
-        for index in others:
-            result = result + self.conv2d_list[index](x)
-        return result
+        return reduce(torch.add, (self.conv2d_list[index](x) for index in self.summed))
 
 
 class DeepLabHead(nn.Module):

@@ -120,5 +120,5 @@ class MFNet(Network):
 
 
 def doubled(x: Tensor) -> Tensor:
-    """Every pixel four times: (N, C, H, W) -> (N, C, 2 H, 2 W)."""
+    """(N, C, H, W) -> (N, C, 2 H, 2 W)."""
     return F.interpolate(x, scale_factor=2.0, mode="nearest")

@@ -18,13 +18,12 @@ from rgbt.processes import num_processes, own
 from rgbt.ranges import ShareBelowOne
 
 DropRates = tuple[ShareBelowOne, ShareBelowOne]
-"""Channel dropout before the first block, and after every block; each in [0, 1)."""
+"""Channel dropout before the first block, and after every block."""
 
 Keep = Tensor | tuple[None, None]
 """Factors of the two residuals of a block, (2, N, 1, 1, 1); None where nothing is dropped."""
 
 ALL_KEPT = (None, None)
-
 StrideAt = Literal["1x1", "3x3"]
 
 
@@ -143,10 +142,7 @@ class UpBlock(nn.Module):
 def enlarge(
     x: Tensor, blocks: Iterable[nn.Module], rates: DropRates, generator: torch.Generator | None
 ) -> Tensor:
-    """`x` (N, C, H, W) through the blocks, with channels dropped before the first and after each.
-
-    Rates (0, 0) drop nothing and need no generator, as in evaluation.
-    """
+    """`x` (N, C, H, W) through the blocks; channels are dropped before the first and after each."""
     first, later = rates
     x = drop_channels(x, first, generator)
     for block in blocks:
@@ -223,10 +219,7 @@ def bottleneck_stage(
     dilations: tuple[int, int] = (1, 1),
     stride_at: StrideAt = "3x3",
 ) -> nn.Sequential:
-    """Bottlenecks of one width, the first strided; 4 * width channels leave the stage.
-
-    `dilations` are those of the first block and of the others.
-    """
+    """Bottlenecks, the first strided; dilations are those of the first block and the others."""
     first, others = dilations
     made = [Bottleneck(in_channels, width, stride=stride, dilation=first, stride_at=stride_at)]
     for _ in range(blocks - 1):

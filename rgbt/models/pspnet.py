@@ -99,9 +99,8 @@ class PSPNet(Network):
 class PSPNetEncoder(nn.Module):
     """ResNet whose last two stages are dilated instead of strided.
 
-    Stem and first two stages exist once per image of so many `channels`. The first block of a
-    dilated stage is not dilated; after two branches the third stage keeps its width and has no
-    projection.
+    Stem and first two stages exist once per image. The first block of a dilated stage is not
+    dilated; after two branches the third stage keeps its width and has no projection.
     """
 
     def __init__(
@@ -157,8 +156,7 @@ class PyramidPooling(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, C, h, w) -> (N, out, h, w), >= 0."""
-        # A 1x1 convolution of joined, enlarged maps is the sum of the enlarged 1x1 convolutions of
-        # the small ones; a fifth of the multiplications remains.
+        # A convolution of joined, enlarged maps is the sum of the enlarged ones of the small maps.
         *shares, own = torch.split(self.bottleneck.weight, x.shape[1], dim=1)
         result = F.conv2d(x, own, self.bottleneck.bias)
         for stage, share in zip(self.stages, shares, strict=True):

@@ -33,8 +33,8 @@ BASIC = (18, 34)  # the others have bottlenecks, which end in four times as many
 class Upception(nn.Module):
     """1x1, 3x3 and a third convolution, added to a shortcut, then a ReLU unless `relu` is false.
 
-    Source: RTFNet, Upception block A (3x3 convolution, identity) and block B (`up`: transposed
-    convolution, transposed shortcut: twice the size).
+    Block A has a 3x3 convolution and the identity, block B (`up`) a transposed convolution and a
+    transposed shortcut: twice the size.
     """
 
     def __init__(self, in_channels: int, channels: int, *, up: bool, relu: bool = True) -> None:

@@ -123,10 +123,8 @@ class WindowAttention(nn.Module):
         rows, columns = height // side, width // side
         # Windows and heads are cut out of the projected map in one copy.
         qkv = self.qkv(x).view(n, rows, side, columns, side, 3, self.heads, -1)
-        qkv = qkv.permute(5, 0, 1, 3, 6, 2, 4, 7).reshape(
-            3, n, rows * columns, self.heads, side * side, -1
-        )
-        q, k, v = qkv.unbind(0)
+        shape = 3, n, rows * columns, self.heads, side * side, -1
+        q, k, v = qkv.permute(5, 0, 1, 3, 6, 2, 4, 7).reshape(shape).unbind(0)
 
         # (heads, t, t) or, for shifted windows, (windows, heads, t, t) with t = window^2.
         bias = F.embedding(self.relative_position_index, self.relative_position_bias_table)

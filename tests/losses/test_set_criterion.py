@@ -99,13 +99,6 @@ def source(seed: int = 0) -> Points:
     return Points(seeded(seed), device=torch.device("cpu"))
 
 
-@pytest.mark.parametrize("count", [3, 64])
-def test_draws_do_not_depend_on_the_number_of_sets(count: int) -> None:
-    one_by_one = source()
-    pieces = [one_by_one.loss(n, 3, count) for n in (1, 3, 1)]
-    assert torch.equal(source().loss(5, 3, count), torch.cat(pieces))
-
-
 def test_points_are_uniform_and_independent() -> None:
     points = source().matcher(2, 4, 50_000).reshape(-1, 2)
     assert points.abs().max() < 1

@@ -12,7 +12,7 @@ from torch.nn import functional as F
 
 from rgbt.models.cmnext import PoolingGate, PpxBlock, window_mean
 from rgbt.models.cmx.model import drop_rates
-from rgbt.models.cmx.parts import CrossAttention, Rectification, mit_blocks
+from rgbt.models.cmx.parts import CrossAttention, Rectification
 from tests.models.golden import network
 from tests.models.plain import generator, images, nano, normal, randomise
 
@@ -158,15 +158,6 @@ def test_rates_reach_the_blocks_of_each_stream(
     first, second = (seen[path.format(prefix, 3, 0)] for prefix in keeps)
     assert not torch.equal(first, second)
     assert not torch.equal(first[0], first[1])
-
-
-def test_a_dropped_residual_leaves_the_sample_alone() -> None:
-    block = drawn(mit_blocks((4,) * 4, (2,) * 4, (1,) * 4, 2.0, norm_eps=1e-6)(0))
-    x = normal(3, 2, 2, 4)
-    out = block(x, torch.tensor([[0.0, 1, 0], [0, 1, 2]]).view(2, 3, 1, 1, 1))
-    torch.testing.assert_close(out[0], x[0])
-    torch.testing.assert_close(out[1], block(x)[1])
-    torch.testing.assert_close(out[2:], x[2:] + 2 * block.mlp(block.norm2(x[2:])))
 
 
 # ---- thermal blocks of CMNeXt --------------------------------------------------------------------

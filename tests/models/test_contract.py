@@ -8,10 +8,8 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from rgbt.checks import InputError
-from rgbt.geometry.padding import padded_hw
 from rgbt.types import VIEWS, MaskPair
 from tests.models.golden import network
 from tests.models.plain import NANO, cells, count, generator, images, nano, normal, randomise
@@ -94,18 +92,6 @@ def test_hidden_pixels_do_not_count(name: str, changes: dict[str, Any]) -> None:
     with torch.no_grad():
         assert torch.equal(net(*pair, masks).logits, net(*changed, masks).logits)
         assert not torch.allclose(net(*pair).logits, net(*changed).logits)
-
-
-@pytest.mark.parametrize(
-    ("name", "multiple"),
-    [("mfnet", 16), ("rtfnet", 32), ("pspnet", 8), ("mask2former", 32), ("dinov2", 32)],
-)
-def test_padding_is_the_mean(name: str, multiple: int) -> None:
-    """60 x 84 equals the top left part of a larger image that is the mean, 1/2, elsewhere."""
-    net, pair = nano(name).eval(), images(1, 60, 84)
-    height, width = padded_hw((60, 84), multiple)
-    full = (F.pad(image, (0, width - 84, 0, height - 60), value=0.5) for image in pair)
-    torch.testing.assert_close(net(*pair).logits, net(*full).logits[..., :60, :84])
 
 
 @NETWORKS
@@ -195,22 +181,6 @@ def test_settings_that_do_not_fit_name_the_key(
 ) -> None:
     with pytest.raises(InputError, match=word):
         nano(name, **changes)
-
-
-@pytest.mark.parametrize(
-    ("yaml", "key", "value"),
-    [
-        ("mfnet", "rgb_widths", "[2,3,4,5]"),
-        ("cmx_b0", "mlp_ratio", 0.01),
-        ("cmnext_b0", "thermal_mlp_ratios", "[1,1,0.01,1]"),
-        ("cmnext_b0", "pool_windows", "[3,4]"),
-        ("mask2former_tiny", "hidden_dim", 48),
-        ("dinov2_tiny", "embed_dim", 6),
-    ],
-)
-def test_settings_outside_their_range_name_the_key(yaml: str, key: str, value: object) -> None:
-    with pytest.raises(InputError, match=f"model.{key}"):
-        network(yaml, **{key: value})
 
 
 R50 = {"depths": "[3,4,6,3]"}

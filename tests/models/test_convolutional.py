@@ -16,7 +16,6 @@ from rgbt.models.inputs import Inputs, expand_cells
 from rgbt.models.parts import (
     BasicBlock,
     Bottleneck,
-    UpBlock,
     bottleneck_stage,
     drop_channels,
     enlarge,
@@ -25,7 +24,7 @@ from rgbt.models.parts import (
 from rgbt.types import MaskPair
 from tests.models.golden import compose
 from tests.models.plain import Plain, generator, half, images, nano, normal, randomise
-from tests.models.test_contract import LITERAL, MODIFIED
+from tests.models.test_contract import CASES, LITERAL, MODIFIED
 
 # ---- inputs ----
 
@@ -42,30 +41,17 @@ def ones(height: int = 32, width: int = 32, count: int = 1) -> tuple[torch.Tenso
     return torch.ones(count, 3, height, width), torch.full((count, 1, height, width), 0.5)
 
 
-def test_channels_are_shifted_and_scaled_in_grey_levels() -> None:
-    rgb, thermal = inputs()(*ones())
-    # By hand: 255 grey levels over 255; 204 over 51; 153 over 25.5.
-    assert rgb[0, :, 0, 0].tolist() == pytest.approx([1.0, 4.0, 6.0])
-    assert thermal.shape == (1, 1, 32, 32)
-    assert thermal.unique().item() == pytest.approx(0.5)
-    three = inputs(thermal_mean=(0.0, 127.5, 0.0), thermal_std=(255.0, 255.0, 127.5))
-    assert three.thermal_channels == 3
-    assert three(*ones())[1][0, :, 0, 0].tolist() == pytest.approx([0.5, 0.0, 1.0])
-
-
 def test_bgr_swaps_the_images_channels_and_not_the_means() -> None:
     red = torch.tensor([1.0, 0.0, 0.0]).view(1, 3, 1, 1).expand(1, 3, 32, 32)
     rgb, _ = inputs(rgb_order="bgr")(red, ones()[1])
     assert rgb[0, :, 0, 0].tolist() == pytest.approx([0.0, -1.0, 6.0])
 
 
-@pytest.mark.parametrize(("channel", "luma"), [(0, 0.299), (1, 0.587), (2, 0.114)])
-def test_gray_is_the_luma_in_all_three_channels(channel: int, luma: float) -> None:
-    """ITU-R BT.601; the means are those of `inputs`."""
-    image = torch.zeros(1, 3, 32, 32)
-    image[:, channel] = 1
+def test_gray_is_the_luma_in_all_three_channels() -> None:
+    image = torch.tensor([1.0, 0.5, 0.25]).view(1, 3, 1, 1).expand(1, 3, 32, 32)
     rgb, _ = inputs(rgb_order="gray")(image, ones()[1])
-    expected = [255 * luma / 255, (255 * luma - 51) / 51, (255 * luma - 102) / 25.5]
+    grey = 255 * (0.299 + 0.587 / 2 + 0.114 / 4)  # ITU-R BT.601
+    expected = [grey / 255, (grey - 51) / 51, (grey - 102) / 25.5]
     assert rgb[0, :, 5, 7].tolist() == pytest.approx(expected, rel=1e-5)
 
 
@@ -107,7 +93,6 @@ def test_cells_become_squares_of_units() -> None:
         # White and mid-grey thermal in each release's convention, by hand.
         ("crm", [2.248908, 2.428571, 2.640000], [(127.5 - 127) / 60]),
         ("unit", [1.0] * 3, [0.5]),
-        ("half", [1.0] * 3, [0.0]),
         ("half_three", [1.0] * 3, [0.0] * 3),
         ("gray_three", [(1 - 0.369) / 0.321] * 3, [0.0] * 3),
         ("temporal", [1.0] * 3, [1.0] * 3),
@@ -130,9 +115,7 @@ def test_conventions_of_the_releases(option: str, rgb: list[float], thermal: lis
     ("stage", "strides", "dilations"),
     [
         (nn.Sequential(BasicBlock(6, 6)), (1, 1), (1, 1)),
-        (nn.Sequential(BasicBlock(3, 6)), (1, 1), (1, 1)),
         (nn.Sequential(BasicBlock(6, 6, stride=2)), (2, 1), (1, 1)),
-        (nn.Sequential(Bottleneck(8, 2)), (1, 1), (1, 1)),
         (nn.Sequential(Bottleneck(8, 2, stride=2, dilation=3)), (1, 2), (3, 1)),
         (bottleneck_stage(3, 2, 3, dilations=(2, 4)), (1, 1), (2, 4)),
         (bottleneck_stage(3, 2, 3, stride=2, dilations=(1, 2), stride_at="1x1"), (2, 1), (1, 2)),
@@ -176,41 +159,6 @@ def test_whole_channels_are_dropped_before_the_first_block_and_after_every_one()
     assert torch.equal(enlarge(x, blocks, (0.0, 0.0), None), x)
     with pytest.raises(ValueError, match="generator"):
         drop_channels(x, 0.5, None)
-
-
-@pytest.mark.parametrize(
-    ("align_corners", "row"),
-    [
-        (False, [0.0, 1.0, 3.0, 4.0]),  # centres of the new cells lie at -1/4, 1/4, 3/4, 5/4
-        (True, [0.0, 4 / 3, 8 / 3, 4.0]),  # at 0, 1/3, 2/3, 1
-    ],
-)
-def test_up_block_by_hand(align_corners: bool, row: list[float]) -> None:
-    block = UpBlock(1, 1, align_corners=align_corners).eval()
-    state = block.state_dict()
-    # The middle tap alone, doubled, plus 1; normalised with mean 4 and deviation 2.
-    state["conv.0.weight"].zero_()[0, 0, 1, 1] = 2.0
-    state["conv.0.bias"].fill_(1.0)
-    state["conv.1.running_mean"].fill_(4.0)
-    state["conv.1.running_var"].fill_(4.0 - 1e-5)
-    state["conv.2.weight"].fill_(0.5)
-    found = block(torch.tensor([0.0, 4.0]).view(1, 1, 1, 2))
-    normalised = [(2 * value + 1 - 4) / 2 for value in row]
-    expected = [value if value > 0 else 0.5 * value for value in normalised]
-    torch.testing.assert_close(found[0, 0], torch.tensor([expected, expected]))
-
-
-def test_critic_shapes() -> None:
-    for upsample, size, verdicts in (
-        (False, (320, 640), (10, 20)),
-        (True, (320, 640), (320, 640)),
-        (False, (120, 160), (3, 5)),
-        (True, (120, 160), (96, 160)),
-        (False, (32, 63), (1, 1)),
-    ):
-        with torch.device("meta"):
-            found = nano("critic", upsample=upsample)(torch.empty(2, 2, *size))
-        assert found.shape[2:] == verdicts
 
 
 @pytest.mark.parametrize("align_corners", [False, True])
@@ -302,9 +250,7 @@ def test_values_of_semseg_equal_a_second_computation(modalities: str) -> None:
 
 
 @pytest.mark.parametrize("changes", [{}, MODIFIED, LITERAL])
-@pytest.mark.parametrize(
-    ("rates", "size"), [((2, 4, 6, 8), (96, 120)), ((2, 4), (96, 120)), ((2, 4), (61, 83))]
-)
+@pytest.mark.parametrize(("rates", "size"), [((2, 4, 6, 8), (96, 120)), ((2, 4), (61, 83))])
 @torch.no_grad()
 def test_values_of_deeplab_equal_a_second_computation(
     changes: dict[str, Any], rates: tuple[int, ...], size: tuple[int, int]
@@ -314,29 +260,17 @@ def test_values_of_deeplab_equal_a_second_computation(
     rgb, thermal = images(2, *size)
     for view, head in (("rgb", "source"), ("thermal", "target")):
         image = rgb if view == "rgb" else thermal.expand_as(rgb)
-        check(
-            net(rgb, thermal, views=(view,), head=head), deeplabv2(net, 2 * image - 1, head, rates)
-        )
+        found = net(rgb, thermal, views=(view,), head=head)
+        check(found, deeplabv2(net, 2 * image - 1, head, rates))
 
 
-@pytest.mark.parametrize(
-    ("name", "changes", "view"),
-    [
-        *(("pspnet", {"modalities": m}, "rgbt") for m in ("late_fusion", "early_fusion")),
-        *(
-            (name, {"modalities": m}, m)
-            for name in ("pspnet", "semseg")
-            for m in ("rgb", "thermal")
-        ),
-        ("mfnet", {}, "rgbt"),
-        ("rtfnet", {}, "rgbt"),
-        ("deeplabv2", {}, "rgb"),
-    ],
-)
+@pytest.mark.parametrize(("name", "changes"), CASES)
 @torch.no_grad()
-def test_what_is_seen(name: str, changes: dict[str, Any], view: str) -> None:
+def test_the_images_of_the_first_view_are_seen(name: str, changes: dict[str, Any]) -> None:
     net, (rgb, thermal) = nano(name, **changes).eval(), images(1, 61, 83)
     randomise(net)
+    view = changes.get("modalities", "rgb" if name in ("semseg", "deeplabv2") else "rgbt")
+    view = "rgbt" if "fusion" in view else view
     assert net.record.views[0] == view
     before = net(rgb, thermal).logits
     sees_rgb = not torch.equal(before, net(1 - rgb, thermal).logits)
@@ -387,25 +321,6 @@ def test_statistics_move_where_norms_are_not_trained() -> None:
     assert not torch.equal(before, net.backbone.bn1.running_mean)
 
 
-@pytest.mark.parametrize(
-    ("name", "changes", "deviation"),
-    [("deeplabv2", {"base_width": 8, **MODIFIED}, 0.01), ("pspnet", {"base_width": 16}, 0.02)],
-)
-def test_convolutions_are_drawn_as_released(
-    name: str, changes: dict[str, Any], deviation: float
-) -> None:
-    net = nano(name, **changes)
-    drawn = torch.cat([m.weight.flatten() for m in net.modules() if isinstance(m, nn.Conv2d)])
-    assert drawn.mean().item() == pytest.approx(0, abs=1e-4)
-    assert drawn.std().item() == pytest.approx(deviation, rel=0.01)
-    norms = [m for m in net.modules() if isinstance(m, nn.BatchNorm2d)]
-    scales = torch.cat([m.weight for m in norms])
-    assert scales.mean().item() == pytest.approx(1, abs=2e-3)
-    expected = 0.02 if name == "pspnet" else 0.0
-    assert scales.std().item() == pytest.approx(expected, rel=0.1)
-    assert all((m.bias == 0).all() for m in norms)
-
-
 def test_thermal_stem_of_rtfnet_starts_as_the_mean_of_the_rgb_stem_or_anew() -> None:
     mean, anew = nano("rtfnet"), nano("rtfnet", thermal_stem="xavier")
     weight = mean.encoder_rgb_conv1.weight
@@ -417,21 +332,3 @@ def test_thermal_stem_of_rtfnet_starts_as_the_mean_of_the_rgb_stem_or_anew() -> 
     assert list(anew.record.drawn_anew) == ["encoder_thermal_conv1."]
     three = nano("rtfnet", inputs=half(3))
     assert torch.equal(three.encoder_thermal_conv1.weight, three.encoder_rgb_conv1.weight)
-
-
-def test_encoders_start_by_fan_out_and_the_decoder_of_rtfnet_by_both_fans() -> None:
-    """Normal, variance 2 / fan_out; decoder: uniform within sqrt(6 / both fans)."""
-    net, other = nano("rtfnet", base_width=32), nano("semseg", base_width=64, depths=(1, 1, 1, 1))
-    for weight, fan in (
-        (net.encoder_thermal_layer3[1].conv2.weight, 9 * 128),
-        (other.layer4[0].conv2.weight, 9 * 512),
-    ):
-        assert weight.std().item() == pytest.approx(math.sqrt(2 / fan), rel=0.02)
-    for weight, fans in (
-        (net.deconv1[0].conv2.weight, 9 * (256 + 256)),
-        (net.deconv1[1].conv1.weight, 256 + 128),
-        (net.deconv1[1].upsample[0].weight, 4 * (256 + 128)),
-    ):
-        bound = math.sqrt(6 / fans)
-        assert 0.99 * bound < weight.abs().max().item() <= bound
-        assert weight.std().item() == pytest.approx(bound / math.sqrt(3), rel=0.02)

@@ -12,7 +12,6 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.models.mask2former.head import (
-    DeformableAttention,
     centre_grid,
     shrink,
     sine_code,
@@ -21,18 +20,10 @@ from rgbt.models.mask2former.network import Fusion, Request, semantic_logits
 from rgbt.models.swin import PatchMerging, relative_index, shift_mask
 from rgbt.types import VIEWS, MaskPair
 from tests.models import plain
-from tests.models.golden import network
 from tests.models.plain import cells, count, images, normal
 
 nano = partial(plain.nano, "mask2former")
 BOTH = pytest.mark.parametrize("name", ["mask2former", "dinov2"])
-
-
-def test_logits_only_for_one_prediction() -> None:
-    net = nano().eval()
-    assert net(*images(2)).logits is not None
-    assert net(*images(2), views=("rgb", "thermal")).logits is None
-    assert net(*images(2), passes=2).logits is None
 
 
 @pytest.mark.parametrize("training", [False, True])
@@ -219,16 +210,6 @@ def test_semantic_logits_by_hand() -> None:
     torch.testing.assert_close(scores[0, 1], torch.full((5, 6), 3 / 8))
 
 
-@pytest.mark.parametrize(
-    ("name", "start", "millions"),
-    [("t", 0, 27.53), ("t", 2, 29.02), ("t", 4, 55.04), ("s", 4, 97.68), ("b", 4, 173.49)],
-)
-def test_shared_stages(name: str, start: int, millions: float) -> None:
-    with torch.device("meta"):
-        net = network(f"mask2former_swin_{name}", share_start=start)
-    assert round(count(net.backbone) / 1e6, 2) == millions
-
-
 # ---- parts ---------------------------------------------------------------------------------------
 
 CPU = torch.device("cpu")
@@ -278,17 +259,6 @@ def test_centre_grid_by_hand() -> None:
     centre, scale = centre_grid(((1, 2),), CPU)
     assert centre.tolist() == [[-0.5, 0.5], [0.0, 0.0]]
     assert scale.flatten().tolist() == [1.0, 2.0]
-
-
-def test_deformable_attention_starts_by_looking_around() -> None:
-    """Four heads look right, down, left, up, at 1..4 pixels."""
-    layer = DeformableAttention(8, heads=4, num_levels=1)
-    bias = layer.sampling_offsets.bias.view(4, 4, 2)
-    for head, direction in enumerate([(1, 0), (0, 1), (-1, 0), (0, -1)]):
-        for point in range(4):
-            expected = torch.tensor(direction) * (point + 1.0)
-            torch.testing.assert_close(bias[head, point], expected, rtol=0, atol=1e-6)
-    assert not layer.sampling_offsets.weight.any()
 
 
 @pytest.mark.parametrize("factor", [2, 4, 8])

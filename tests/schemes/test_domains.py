@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from rgbt.checks import InputError
 from rgbt.engine.checkpoint import State
-from rgbt.engine.optimizers import SGD, RMSprop, step_without_gradient
+from rgbt.engine.optimizers import SGD, RMSprop
 from rgbt.losses.unlabelled import MaxSquares
 from rgbt.schemes.adversarial import Adversarial
 from rgbt.schemes.supervised import Supervised
@@ -499,20 +499,6 @@ def test_seven_alternating_steps_are_those_written_out(
         made.fit(pairs(first, confidence=True), state)
     linear.assert_same(model, expected.values)
     linear.assert_same(scheme.others["critic"], expected.judge)
-
-
-def test_step_without_gradient_acts_on_momentum_and_decay_of_stepped_parameters() -> None:
-    """Momentum 0.5 and decay 0.1: d = 0.1 p, b = 0.5 b + d, p -= b. New parameters stay."""
-    old, new = (nn.Parameter(torch.tensor(value)) for value in (2.0, 3.0))
-    optimizer = torch.optim.SGD([old, new], lr=1.0, momentum=0.5, weight_decay=0.1)
-    old.grad = torch.tensor(1.0)
-    optimizer.step()  # b = 1 + 0.2, p = 2 - 1.2
-    assert old.item() == pytest.approx(0.8)
-    new.grad = torch.tensor(7.0)  # of another phase
-    step_without_gradient(optimizer)  # b = 0.6 + 0.08, p = 0.8 - 0.68
-    assert (old.item(), new.item()) == (pytest.approx(0.12), 3.0)
-    assert old.grad is None
-    assert new.grad is None
 
 
 @pytest.mark.parametrize(

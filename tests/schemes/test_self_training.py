@@ -22,7 +22,6 @@ from rgbt.requirements import Record, record_of
 from rgbt.schemes.self_training import (
     CONFIDENCE,
     CONFIDENT_SHARE,
-    LUMA,
     SelfTraining,
     Teacher,
     mixed,
@@ -146,13 +145,6 @@ def test_teacher_predicts_without_dropout_and_changes_no_statistics(norm: str) -
     assert teacher.network().norm.running_mean.item() == 5.0
 
 
-def test_frozen_normalisation_stays_frozen() -> None:
-    network = Net()
-    network.norm.eval()
-    found = teacher_of(network).network()(PIXELS)
-    torch.testing.assert_close(found, 2 * PIXELS / (1 + network.norm.eps) ** 0.5)
-
-
 # ---- a step --------------------------------------------------------------------------------------
 
 THRESHOLD = 0.44
@@ -177,14 +169,14 @@ def scheme_of(model: Linear, *, jitter: float = 0.0, **changes: Any) -> Any:
         **{"decay": 0.999, "teacher_norm": "batch", "threshold": THRESHOLD},
         **{"weighted_by": "batch", "ignored_top": 0.0, "ignored_bottom": 0.0},
         **{"mixing": "classes", "masked_weight": 0.5, "masked_images": "target"},
-        **{"domains": domains(False, labels="none", view="rgb"), "masker": Halves(), **changes},
+        **{"domains": domains(False, labels="none", view="rgb"), "masker": Halves()},
+        **{"loss": CrossEntropy(class_weights=None), **changes},
     }
     strong = StrongAugmentation(
         **{"jitter_probability": jitter, "jitter_strength": 0.2, "blur_probability": jitter},
         blur_sigma=(0.15, 1.15),
     )
-    loss = CrossEntropy(class_weights=None)
-    return SelfTraining(model=model, loss=loss, augmentation=strong, **settings)
+    return SelfTraining(model=model, augmentation=strong, **settings)
 
 
 DISTANCE: dict[str, Any] = {
@@ -334,21 +326,6 @@ def test_ignored_rows_leave_rows_for_pseudo_labels() -> None:
     torch.testing.assert_close(phase_of(scheme, data).parts["target/cross_entropy"], expected)
     with pytest.raises(InputError, match="must be below 1"):
         scheme_of(network(False), ignored_top=0.5, ignored_bottom=0.5)
-
-
-def test_thermal_target_gets_the_luma_of_a_source_that_sees_rgb() -> None:
-    model, data = network(False), batches()
-    scheme = scheme_of(model, domains=domains(False, labels="none"), masked_weight=0.0)
-    phase = phase_of(scheme, data)
-    thermal = data.target.thermal.expand(-1, 3, -1, -1)
-    probability, label = logits(model, thermal).softmax(1).max(1)
-    share = (probability >= THRESHOLD).float().mean()
-    pasted = pasted_pixels(data.source.label, generator_of("class mix"))
-    luma = torch.einsum("c,bchw->bhw", torch.tensor(LUMA), data.source.rgb)[:, None]
-    image = torch.where(pasted[:, None], luma.expand(-1, 3, -1, -1), thermal)
-    mixed_label = torch.where(pasted, data.source.label, label)
-    expected = cost(logits(model, image), mixed_label, torch.where(pasted, 1.0, share))
-    torch.testing.assert_close(phase.parts["target/cross_entropy"], expected)
 
 
 def test_labels_are_those_of_the_average_of_the_steps_before() -> None:

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from tests.processes import run_in_processes
-from tests.schemes.several import CASES, Values, run_cases, ten_steps
+from tests.schemes.several import CASES, Values, run_case, ten_steps
 
 NUMBERS = pytest.mark.parametrize("num_processes", [2, pytest.param(4, marks=pytest.mark.slow)])
 TOLERANCE = 1e-5
@@ -28,7 +28,7 @@ def together(num_processes: int) -> list[tuple[dict[str, Values], list[float]]]:
 
 
 def everything() -> tuple[dict[str, Values], list[float]]:
-    return run_cases(tuple(CASES)), ten_steps("crm")
+    return {name: run_case(name) for name in CASES}, ten_steps("crm")
 
 
 def kind(name: str) -> str:

@@ -45,8 +45,6 @@ class CmxEncoder(nn.Module):
 
     The next stage continues with what the rectification returns; the decoder reads what the fusion
     returns.   Source: CMX, Sec. III-A.
-
-    `drop_rates` (2, blocks) are probabilities of stochastic depth, RGB's and thermal's.
     """
 
     def __init__(
@@ -213,8 +211,7 @@ class CMX(CmxNetwork):
     network, other inputs, and an unused layer `voting`).
 
     The arguments are the keys of ``conf/model/cmx_b2.yaml``. The release trains with a
-    `decoder_norm_eps` of 1e-3 and, as its evaluation skips the set-up of weights, evaluates with
-    1e-5.
+    `decoder_norm_eps` of 1e-3, and evaluates with 1e-5, without the set-up of weights.
     """
 
     def __init__(  # noqa: PLR0913 - each is a key of conf/model/*.yaml

@@ -118,9 +118,6 @@ def initialise(module: nn.Module, *, divide_groups: bool = True) -> None:
         nn.init.zeros_(module.bias)
 
 
-# ---- between the streams ----
-
-
 class ChannelWeights(nn.Module):
     """How much of each channel of a map the other stream takes up, from the whole image.
 

@@ -2,7 +2,6 @@
 
 Entries have the names and shapes of the published files, except `register_tokens`, which DINOv3
 names `storage_tokens`, and the mask of its bias, which has no entry here.
-
 Letters beyond `rgbt.types`: ``d`` width, ``h w`` rows and columns of patches, ``T`` tokens: class,
 registers, then patches row by row.
 """
@@ -103,7 +102,7 @@ def rotated(x: Tensor, rotation: Rotation) -> Tensor:
 class KeylessLinear(nn.Linear):
     """Joint projection of queries, keys and values with a bias whose third for keys counts as 0.
 
-    Source: DINOv3 release, `layers/attention.py`, mask_k_bias. The published files have the third.
+    Source: DINOv3 release, `layers/attention.py`, mask_k_bias.
     """
 
     def forward(self, input: Tensor) -> Tensor:
@@ -173,7 +172,7 @@ class Block(nn.Module):
 
         x + s1 attention(norm(x)),  then  x + s2 mlp(norm(x))
 
-    Source: Vision Transformer, Eqs. (2) and (3); LayerScale: CaiT (Touvron et al., ICCV 2021).
+    Source: Vision Transformer, Eqs. (2) and (3); LayerScale: CaiT (ICCV 2021).
     """
 
     def __init__(

@@ -27,7 +27,6 @@ from rgbt.models.mask2former.network import (
 from rgbt.ranges import Blocks, Channels, Epsilon, MlpRatio, NumClasses, Positive
 
 STRIDES = (4, 8, 16, 32)
-Tuning = Literal["frozen", "lora", "full"]
 
 
 class ChannelNorm(nn.LayerNorm):
@@ -153,7 +152,7 @@ class DinoMask2Former(MaskNetwork):
         position_resize: Resize | None,
         token_px: Literal[8, 16],
         layers: Annotated[tuple[Blocks, ...], Len(1, 4)],
-        tuning: Tuning,
+        tuning: Literal["frozen", "lora", "full"],
         lora_rank: Channels,
         lora_alpha: Positive,
         lora_parts: Annotated[tuple[Part, ...], Len(1, 3)],

@@ -28,11 +28,7 @@ from rgbt.ranges import NumClasses, Size, Text
 from rgbt.requirements import Record, Requirement
 from rgbt.types import MaskPair, Output, View
 
-OWN = "network."
-"""Before every name of the author's network in `state_dict`."""
-
-EVALUATION_SEED = 0
-"""Seed of what a network draws in evaluation, so that two evaluations agree."""
+OWN = "network."  # before every name of the author's network in `state_dict`
 
 Feed = Literal["stacked", "pair", "pair_and_edges", "list", "dicts", "thermal"]
 
@@ -52,8 +48,7 @@ ScorePath = Annotated[tuple[Index | Text, ...], Len(0, 16)]
 
 ScorePaths = Annotated[tuple[ScorePath, ...], Len(1, 16)]
 
-_held: set[Path] = set()
-"""The folder whose modules this process has imported: modules of two could have one name."""
+_held: set[Path] = set()  # the folder whose modules this process has imported
 
 _python = importlib.import_module("random")
 _numpy = np.random.mtrand._rand  # NumPy's global generator
@@ -75,9 +70,7 @@ class Namespace(dict[str, Any]):
 class ExternalNetwork(nn.Module):
     """A network that is built from its author's checkout, whose code is executed.
 
-    What it draws at random comes from the generator of the step, in evaluation from a fixed seed;
-    global generators do not advance.
-
+    What it draws at random comes from the generator of the step, in evaluation from a fixed seed.
     The arguments are the keys of ``conf/model/external.yaml``.
     """
 
@@ -137,7 +130,7 @@ class ExternalNetwork(nn.Module):
             maps.append(padded(edge_map(rgb, thermal), self.multiple))
         if self.size_hw is not None:
             maps = [_resized(each, self.size_hw) for each in maps]
-        seed = EVALUATION_SEED
+        seed = 0  # two evaluations agree
         if self.training:
             assert generator is not None, "a network in training gets the generator of the step"
             drawn = torch.randint(2**31, (), generator=generator, device=generator.device)

@@ -128,7 +128,7 @@ class DeformableAttention(nn.Module):
     def forward(self, query: Tensor, tokens: Tensor, levels: Levels) -> Tensor:
         """(B, S, C) -> (B, S, C); `query` are the tokens with their position code."""
         batch, length, dim = tokens.shape
-        # Everything is computed with tokens last, as grid_sample wants it: no transposed copies.
+        # Tokens are last, as grid_sample wants them: no transposed copies.
         tokens, query = tokens.transpose(1, 2), query.transpose(1, 2)
         value = _project(self.value_proj, tokens).view(batch * self.heads, -1, length)
         weights = _project(self.attention_weights, query)
@@ -411,8 +411,7 @@ class Predictor(nn.Module):
         for index, (cross_attention, self_attention, ffn) in enumerate(layers):
             level = index % NUM_LEVELS
             # Read where the own mask has probability 1/2 or more, if anywhere. Resizing is linear:
-            # a resized mask is the product of the embedding with resized features, which costs the
-            # size of the level instead of the size of the mask.
+            # a resized mask is the product of the embedding with resized features.
             with torch.no_grad():
                 inside = _mask_logits(embeds[-1], pyramid, pyramid.reduced[level]) >= 0
                 allowed = inside | ~inside.any(-1, keepdim=True)

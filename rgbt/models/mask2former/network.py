@@ -37,8 +37,7 @@ RECORD = Record(
         "sem_seg_head.pixel_decoder.transformer.encoder.layers.*",
         "sem_seg_head.predictor.transformer_*_layers.*",
     ),
-)
-"""Of every such network, without its backbone."""
+)  # of every such network, without its backbone
 
 Widths = tuple[int, int, int, int]
 Maps = list[Tensor]
@@ -56,8 +55,7 @@ class Request(NamedTuple):
 class Fusion(nn.ModuleDict):
     """The normalised maximum (or sum) of the maps of both modalities, level by level.
 
-    Source: CRM, Sec. III-B.   Released: batch normalisation of the fused maps only; the maps of
-    a single modality leave as their branch normalised them.
+    Source: CRM, Sec. III-B.   Released: the maps of a single modality are not normalised again.
     """
 
     def __init__(self, widths: Widths, fusion: FusionKind) -> None:

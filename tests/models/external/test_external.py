@@ -15,6 +15,7 @@ import torch
 
 from rgbt.checkpoints.load import load_weights
 from rgbt.checks import InputError
+from rgbt.exported.onnx_network import exported_network
 from rgbt.files.adapters import adapter_of
 from rgbt.models.external.adapting import Untrained, replaced
 from rgbt.models.external.network import edge_map, picked, scores_at, structure
@@ -216,7 +217,6 @@ TWO = ((0,),)
     [
         (STACKED, {}, "unit"),
         (STACKED.replace("channels=4", "channels=6"), {}, "unit_three"),
-        (PAIR, {"feed": "pair", "scores": TWO}, "unit"),
         (PAIR, {"feed": "pair", "scores": TWO}, "imagenet_449"),
         (LIST, {"feed": "list", "scores": TWO}, "imagenet_unit"),
         (DICTS, {"feed": "dicts", "scores": (("*", "sem_seg"),)}, "crm"),
@@ -255,14 +255,6 @@ def test_edge_map_is_that_of_opencv() -> None:
     assert (halves[0].astype(int) + halves[1] > 255).any()
 
 
-def test_edges_are_padded_and_resized_as_the_images(tmp_path: Path) -> None:
-    sizes = EDGES.replace("return", "assert rgb.shape[2:] == (16, 24)\n        return")
-    folder = write_checkout(tmp_path, {"model/net.py": sizes})
-    for changes in ({"multiple": 8}, {"size_hw": (16, 24)}):
-        net = external(folder, inputs="unit_three", feed="pair_and_edges", **changes).eval()
-        assert net(*images(2, 10, 20)).logits.shape == (2, 3, 10, 20)
-
-
 def test_paths_lead_through_lists_keys_attributes_and_elements() -> None:
     output = [1, {"out": SimpleNamespace(scores=(2, 3))}, [{"a": torch.ones(2)}] * 4]
     assert picked(output, ()) is output
@@ -273,29 +265,14 @@ def test_paths_lead_through_lists_keys_attributes_and_elements() -> None:
     assert structure([1, (2, 3.0), None, "a"]) == words
 
 
-SCORES = torch.ones(2, 3, 4, 5)
-
-
-def test_scores_of_several_paths_are_added() -> None:
-    found = scores_at((SCORES, [2 * SCORES]), ((0,), (1, 0)), "model.scores", (2, 3))
-    assert torch.equal(found, 3 * SCORES)
-
-
-@pytest.mark.parametrize(
-    ("output", "path"),
-    [
-        ([SCORES], (3,)),
-        ({"out": SCORES}, ("in",)),
-        ((SCORES, 1), ()),
-        (SCORES, (0,)),
-        (torch.ones(2, 5, 4, 5), ()),
-        (torch.ones(1, 3, 4, 5), ()),
-        (SCORES.long(), ()),
-    ],
-)
-def test_other_outputs_are_refused(output: Any, path: Any) -> None:
-    with pytest.raises(InputError, match=r"^model.scores: expected scores \(2, 3, h, w\)"):
-        scores_at(output, (path,), "model.scores", (2, 3))
+def test_scores_of_several_paths_are_added_and_other_outputs_refused() -> None:
+    scores = torch.ones(2, 3, 4, 5)
+    found = scores_at((scores, [2 * scores]), ((0,), (1, 0)), "model.scores", (2, 3))
+    assert torch.equal(found, 3 * scores)
+    others = (([scores], (3,)), ((scores, 1), ()), (scores[:1], ()), (scores.long(), ()))
+    for output, path in (*others, (scores, (0,)), (scores[:, :2], ())):
+        with pytest.raises(InputError, match=r"^model.scores: expected scores \(2, 3, h, w\)"):
+            scores_at(output, (path,), "model.scores", (2, 3))
 
 
 STRIDED = STACKED.replace(
@@ -311,8 +288,18 @@ def test_forward_returns_scores_of_every_pixel_also_of_odd_sides(tmp_path: Path)
         out = net.train(training)(*images(2, 9, 13), generator=torch.Generator())
         assert (out.logits.shape, out.aux) == ((2, 3, 9, 13), {})
         assert out.logits.dtype == torch.float32
+    exported = exported_network(net.eval(), "rgbt", (9, 13), "strided")
+    torch.testing.assert_close(*(each(*images(2, 9, 13)).logits for each in (exported, net)))
     with pytest.raises(InputError, match=r"model\.scores: .* scores of \(3, 4\) .* \(12, 16\)"):
         external(folder, multiple=4).eval()(*images(2, 9, 13))
+
+
+def test_edges_are_padded_and_resized_as_the_images(tmp_path: Path) -> None:
+    sizes = EDGES.replace("return", "assert rgb.shape[2:] == (16, 24)\n        return")
+    folder = write_checkout(tmp_path, {"model/net.py": sizes})
+    for changes in ({"multiple": 8}, {"size_hw": (16, 24)}):
+        net = external(folder, inputs="unit_three", feed="pair_and_edges", **changes).eval()
+        assert net(*images(2, 10, 20)).logits.shape == (2, 3, 10, 20)
 
 
 def test_hidden_pixels_do_not_count(tmp_path: Path) -> None:
@@ -373,25 +360,14 @@ def test_training_may_read_other_scores(tmp_path: Path) -> None:
     assert [(each.node, each.key) for each in record.requires] == [("loss", "reads_auxiliary")]
 
 
-STATE: dict[str, Any] = {"conv.weight": torch.ones(3, 4, 1, 1), "conv.bias": torch.zeros(3)}
-
-
-@pytest.mark.parametrize(
-    ("content", "prefix"),
-    [
-        (STATE, ""),
-        ({"segmenter": STATE, "epoch_start": 3}, ""),
-        ({"state_dict": {f"module.{key}": value for key, value in STATE.items()}}, ""),
-        ({f"net.{key}": value for key, value in STATE.items()}, "net."),
-        ({f"network.{key}": value for key, value in STATE.items()}, ""),  # of this project
-    ],
-)
-def test_weights_of_the_author_are_loaded(
-    tmp_path: Path, content: dict[str, Any], prefix: str
-) -> None:
+@pytest.mark.parametrize("names", ["{}", "module.{}", "net.{}", "network.{}"])
+def test_weights_of_the_author_are_loaded(tmp_path: Path, names: str) -> None:
+    """ "network." is before the names of this project's own files."""
     folder = write_checkout(tmp_path / "code", {"model/net.py": STACKED})
-    torch.save(content, tmp_path / "author.pth")
-    net = external(folder, weights_prefix=prefix)
+    state = {"conv.weight": torch.ones(3, 4, 1, 1), "conv.bias": torch.zeros(3)}
+    named = {names.format(key): value for key, value in state.items()}
+    torch.save({"state_dict": named, "epoch_start": 3}, tmp_path / "author.pth")
+    net = external(folder, weights_prefix="net." if names == "net.{}" else "")
     load_weights(net, tmp_path / "author.pth")
     assert bool((net.network.conv.weight == 1).all())
     assert not net.network.conv.bias.any()
