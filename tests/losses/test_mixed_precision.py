@@ -40,14 +40,14 @@ MASKS = drawn(2, 3, B, 6, H // 4, W // 4, seed=7)
 Loss = Callable[..., dict[str, Tensor]]
 
 
-def of_sets(spatial: Any) -> Loss:
-    criterion = criterion_of(num_classes=K, spatial=spatial)
-    names = ("class_logits", "mask_logits")
-    return lambda *two: criterion(Output(None, dict(zip(names, two))), BATCH, seeded())
+def of_sets(classes: Tensor, masks: Tensor) -> dict[str, Tensor]:
+    criterion = criterion_of(num_classes=K, spatial=EDGE)
+    output = Output(None, {"class_logits": classes, "mask_logits": masks})
+    return criterion(output, BATCH, seeded())
 
 
-def of_frames(second: Any, form: Any) -> Loss:
-    criterion = TemporalLoss(segmentation=CE, alpha=1.0, beta=1.0, second=second, form=form)
+def of_frames(second: Any) -> Loss:
+    criterion = TemporalLoss(segmentation=CE, alpha=1.0, beta=1.0, second=second, form="paper")
 
     def loss(a: Tensor, b: Tensor) -> dict[str, Tensor]:
         frames = (Frame(Output(each, {}), BATCH, each) for each in (a, b))
@@ -56,28 +56,15 @@ def of_frames(second: Any, form: Any) -> Loss:
     return loss
 
 
-def squares(ratio: float | None) -> Loss:
-    return MaxSquares(weight=1.0, normalisation="pixels", image_wise_ratio=ratio)
-
-
 LOSSES: dict[str, tuple[Loss, tuple[Tensor, ...]]] = {
-    "set criterion": (of_sets(PLAIN), (CLASSES, MASKS)),
-    "spatial": (of_sets(EDGE), (CLASSES, MASKS)),
+    "set criterion": (of_sets, (CLASSES, MASKS)),
     "sdc": (lambda a, b: {"sdc": sdc(a, b)}, (CLASSES[0, 0], CLASSES[1, 0])),
-    "cross-entropy": (lambda s: CE(Output(s, {}), BATCH, seeded()), (SCORES,)),
-    "with confidence": (lambda s: CE(Output(s, {}), CONFIDENT, seeded()), (SCORES,)),
-    **{
-        f"{second} {form}": (of_frames(second, form), (SCORES, OTHERS))
-        for second in ("dice", "con", "con_acc")
-        for form in ("paper", "released")
-    },
+    "cross-entropy": (lambda s: CE(Output(s, {}), CONFIDENT, seeded()), (SCORES,)),
+    **{each: (of_frames(each), (SCORES, OTHERS)) for each in ("dice", "con", "con_acc")},
     **{n: (lambda v, f=f: {"d": f(v, 0.25)}, (VERDICTS,)) for n, f in VERDICT_LOSSES.items()},
-    **{
-        f"judged {how}": (lambda s, how=how: {"m": judged(s, how).square().mean()}, (SCORES,))
-        for how in ("probabilities", "logits", "self_information")
-    },
+    "judged": (lambda s: {"m": judged(s, "self_information").square().mean()}, (SCORES,)),
     "entropy": (Entropy(weight=1.0), (P,)),
-    **{f"max squares {ratio}": (squares(ratio), (P,)) for ratio in (None, 0.2)},
+    "squares": (MaxSquares(weight=1, normalisation="pixels", image_wise_ratio=0.2), (P,)),
 }
 
 

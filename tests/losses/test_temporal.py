@@ -316,19 +316,3 @@ def test_released_values_and_gradients(name: str) -> None:
         part, frame = ("dice_1", first) if which == "dice" else (which, second)
         (gradient,) = torch.autograd.grad(parts[part], frame.logits)
         assert case.deviation(f"grad.{part.replace('_1', '1')}", gradient) <= 5e-10
-
-
-@pytest.mark.parametrize(
-    ("changes", "requires"),
-    [
-        ({}, False),
-        ({"form": "released", "alpha": 0.0}, False),  # con reads no label
-        ({"form": "released", "alpha": 0.0, "second": "con_acc"}, True),
-        ({"form": "released"}, True),
-    ],
-)
-def test_released_sums_require_class_0_to_be_the_background(
-    changes: dict[str, Any], requires: bool
-) -> None:
-    keys = [each.key for each in loss_of(**changes).record.requires]
-    assert ("first_class" in keys) == requires

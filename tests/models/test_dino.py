@@ -15,7 +15,6 @@ from rgbt.engine.optimizers import AdamW
 from rgbt.models.dinov2.encoder import (
     Encoder,
     LoraProjection,
-    RotaryPositions,
     resized_positions,
 )
 from rgbt.models.dinov2.model import Level
@@ -303,16 +302,6 @@ def test_the_bias_of_the_keys_does_not_count() -> None:
         before = after
 
 
-def test_rotation_by_hand() -> None:
-    """Three rows and one column: rows at -2/3, 0 and 2/3, the column at 0; periods 1 and 10."""
-    positions = RotaryPositions(8, 100.0)
-    torch.testing.assert_close(positions.periods, torch.tensor([1.0, 10.0]))
-    cos, sin = positions((3, 1), 1)
-    full, tenth = 2 * math.pi * 2 / 3, 2 * math.pi * 2 / 30
-    angles = torch.tensor([[0.0, 0.0], [-full, -tenth], [0.0, 0.0], [full, tenth]])
-    angles = torch.cat([angles, torch.zeros(4, 2)], 1).tile(2)
-    torch.testing.assert_close(cos, angles.cos())
-    torch.testing.assert_close(sin, angles.sin())
 
 
 # ---- the network ----

@@ -160,10 +160,10 @@ def values_of(module: nn.Module) -> Values:
     return {name: p.flatten(1) if p.dim() > 1 else p for name, p in each}
 
 
-def pixels(batch: Batch, view: str) -> tuple[Tensor, Tensor]:
+def pixels(batch: Batch, view: str, scale: float = 255) -> tuple[Tensor, Tensor]:
     """(N, 3) float64 in [0, 1] and (N,) labels."""
     image = batch.rgb if view == "rgb" else batch.thermal.expand(-1, 3, -1, -1)
-    return image.permute(0, 2, 3, 1).reshape(-1, 3).double() / 255, batch.label.reshape(-1)
+    return image.permute(0, 2, 3, 1).reshape(-1, 3).double() / scale, batch.label.reshape(-1)
 
 
 def scores(values: Values, x: Tensor, head: str) -> Tensor:

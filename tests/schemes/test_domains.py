@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from itertools import islice
 from math import log
 from pathlib import Path
@@ -211,80 +211,6 @@ def distance(verdicts: Tensor, value: float, how: str) -> Tensor:
     return -(value * s.log() + (1 - value) * (1 - s).log()).mean()
 
 
-@dataclass
-class ByHand:
-    """A network and a discriminator as matrices, stepped as the documentation says."""
-
-    settings: dict[str, Any]
-    heads: bool
-    values: Values
-    judge: Values
-
-    def __post_init__(self) -> None:
-        names = (DAY, DARK) if self.heads else (ONLY, ONLY)
-        self.names = dict(zip(("source", "target"), names, strict=True))
-        self.day, self.dark = stepped(self.heads)
-        self.of_critic = Momentum(CRITIC)
-
-    def verdicts(self, seen: Tensor, judge: Values) -> Tensor:
-        return seen @ judge["weight"].T + judge["bias"]
-
-    def cost_of(self, pair: TwoDomains, name: str) -> Cost:
-        """Segmentation and adversarial cost of a domain."""
-        given, judge = self.settings, dict(self.judge)
-        batch, view = (pair.source, "rgb") if name == "source" else (pair.target, "thermal")
-        x, y = linear.pixels(batch, view)
-        wrong = given["target_value" if name == "source" else "source_value"]
-        weight = given["weight"]
-        if given["weighed_by_confidence"]:
-            weight = weight * (1 - pair.target.confidence.double()).mean()
-
-        def cost(values: Values) -> Tensor:
-            z = linear.scores(values, x, self.names[name])
-            found = torch.zeros((), dtype=torch.float64)
-            if name == "source" or given["supervise_target"]:
-                found = found + linear.nats(z, y)
-            if name == "target" or given["both_ways"]:
-                verdicts = self.verdicts(shown(z, given["judged"]), judge)
-                found = found + weight * distance(verdicts, wrong, given["verdict_loss"])
-            return found
-
-        return cost
-
-    def critic_step(self, pair: TwoDomains, at: tuple[Values, Values]) -> None:
-        given = self.settings
-        maps = [
-            shown(
-                linear.scores(values, linear.pixels(batch, view)[0], self.names[name]),
-                given["judged"],
-            )
-            for values, batch, view, name in (
-                (at[0], pair.source, "rgb", "source"),
-                (at[1], pair.target, "thermal", "target"),
-            )
-        ]
-        wanted = (given["source_value"], given["target_value"])
-
-        def cost(judge: Values) -> Tensor:
-            costs = [
-                distance(self.verdicts(seen, judge), value, given["verdict_loss"])
-                for seen, value in zip(maps, wanted, strict=True)
-            ]
-            return (0.5 if given["halved"] else 1.0) * (costs[0] + costs[1])
-
-        self.of_critic.step(self.judge, linear.gradient(cost, self.judge))
-
-    def step(self, pair: TwoDomains) -> None:
-        if self.settings["alternates"] and pair.step % 2 == 0:
-            self.critic_step(pair, (self.values, self.values))
-            return
-        costs = self.cost_of(pair, "source"), self.cost_of(pair, "target")
-        mode = self.settings["gradients"]
-        at = linear.written_out(self.values, mode, self.day, self.dark, *costs)
-        if not self.settings["alternates"]:
-            self.critic_step(pair, at)
-
-
 LOGISTIC = {"verdict_loss": "cross_entropy", "halved": True}
 UNPAIRED = {**HEATNET, "weighed_by_confidence": False, "supervise_target": False}
 CASES: dict[str, tuple[bool, dict[str, Any]]] = {
@@ -305,19 +231,37 @@ BY_CASE = pytest.mark.parametrize(("heads", "changes"), CASES.values(), ids=CASE
 
 
 @BY_CASE
-def test_three_steps_of_network_and_critic(
-    tmp_path: Path, heads: bool, changes: dict[str, Any]
-) -> None:
-    model = network(heads)
+def test_parts_of_both_phases_by_their_formulas(heads: bool, changes: dict[str, Any]) -> None:
+    model, given = network(heads), {**PAPERS, **changes}
     scheme = scheme_of(model, heads, **changes)
-    confidence = scheme.weighed_by_confidence
-    values = linear.values_of(model), linear.values_of(critic())
-    by_hand = ByHand({**PAPERS, **changes}, heads, *values)
-    for pair in islice(pairs(confidence=confidence), 3):
-        by_hand.step(pair)
-    linear.trained(scheme, model, tmp_path, 3, confidence)
-    linear.assert_same(model, by_hand.values)
-    linear.assert_same(scheme.others["critic"], by_hand.judge)
+    values, judge = linear.values_of(model), linear.values_of(scheme.others["critic"])
+    pair = pair_at(confidence=scheme.weighed_by_confidence)
+    weight = given["weight"]
+    if given["weighed_by_confidence"]:
+        weight = weight * (1 - pair.target.confidence.double()).mean()
+    numbers = {name: given[f"{name}_value"] for name in ("source", "target")}
+    expected: dict[str, Tensor] = {}
+    for name, other, view, head in (
+        ("source", "target", "rgb", DAY if heads else ONLY),
+        ("target", "source", "thermal", DARK if heads else ONLY),
+    ):
+        x, y = linear.pixels(getattr(pair, name), view, scale=1)
+        z = linear.scores(values, x, head)
+        verdicts = shown(z, given["judged"]) @ judge["weight"].T + judge["bias"]
+        cost, wrong = (
+            distance(verdicts, numbers[each], given["verdict_loss"]) for each in (name, other)
+        )
+        if name == "source" or given["supervise_target"]:
+            expected[f"{name}/ce"] = linear.nats(z, y)
+        if name == "target" or given["both_ways"]:
+            expected[f"{name}/adversarial"] = weight * wrong
+        expected[f"critic/{name}"] = (0.5 if given["halved"] else 1.0) * cost
+    steps = (0, 1) if given["alternates"] else (0,)
+    phases = [each for step in steps for each in phases_of(scheme, replace(pair, step=step))]
+    found = {name: part for phase in phases for name, part in phase.parts.items()}
+    assert found.keys() == expected.keys()
+    for name, part in found.items():
+        assert part.item() == pytest.approx(expected[name].item(), rel=1e-5), name
 
 
 @BY_CASE
@@ -452,53 +396,27 @@ def test_every_pass_of_a_step_asks_for_a_generator_of_its_own(
 
 # ---- HeatNet's one RMSprop for two networks ------------------------------------------------------
 
-RATE, ALPHA, EPS = 0.01, 0.9, 1e-8
 
-
-@dataclass
-class MeanSquares:
-    """RMSprop without momentum, as its formula: v = a v + (1 - a) g^2; p -= r g / (sqrt(v) + e)."""
-
-    names: tuple[str, ...]
-    squares: Values = field(default_factory=dict)
-
-    def step(self, values: Values, gradient: Values) -> None:
-        for name in self.names:
-            before = self.squares.get(name, torch.zeros_like(values[name]))
-            self.squares[name] = ALPHA * before + (1 - ALPHA) * gradient[name] ** 2
-            values[name] = values[name] - RATE * gradient[name] / (self.squares[name].sqrt() + EPS)
-
-    def decay(self) -> None:
-        """A step with a gradient of 0: the mean decays, the value stays."""
-        self.squares = {name: ALPHA * each for name, each in self.squares.items()}
-
-
-@pytest.mark.parametrize("idle_steps", ["none", "released"])
-@pytest.mark.parametrize("stop", [0, 3])
-def test_seven_alternating_steps_are_those_written_out(
-    tmp_path: Path, idle_steps: str, stop: int
-) -> None:
-    """Also where they are resumed; the released optimizer decays what the idle network has."""
-    values = linear.values_of(network(False)), linear.values_of(critic())
-    expected = ByHand(HEATNET, False, *values)
-    of_network, of_critic = MeanSquares((SHARED, ONLY)), MeanSquares(CRITIC)
-    expected.day, expected.of_critic = of_network, of_critic  # type: ignore[assignment]
-    for pair in islice(pairs(confidence=True), 7):
-        expected.step(pair)
-        if idle_steps == "released":
-            (of_network if pair.step % 2 == 0 else of_critic).decay()
-
-    model, builder = network(False), RMSprop(lr=RATE, alpha=ALPHA, eps=EPS)
-    settings: dict[str, Any] = {**HEATNET, "idle_steps": idle_steps}
-    scheme = scheme_of(model, critic_optimizer=builder, **settings)
-    for first, last in ((0, stop), (stop, 7)) if stop else ((0, 7),):
-        made = linear.trainer(scheme, model, tmp_path, last, checkpoint_every=1)
+def test_idle_optimizers_decay_their_mean_of_squares_and_move_nothing(tmp_path: Path) -> None:
+    """Of three alternating steps, the network's is the second one, and idle in the third."""
+    found = {}
+    for idle_steps in ("none", "released"):
+        model, builder = network(False), RMSprop(lr=0.01, alpha=0.9, eps=1e-8)
+        changes: dict[str, Any] = {**HEATNET, "critic_optimizer": builder}
+        scheme = scheme_of(model, **{**changes, "idle_steps": idle_steps})
+        made = linear.trainer(scheme, model, tmp_path / idle_steps, 3)
         made.optimizers = {"main": builder(model), "critic": builder(scheme.others["critic"])}
-        state = State(seed=0)
-        assert made.resume(state) == bool(first)
-        made.fit(pairs(first, confidence=True), state)
-    linear.assert_same(model, expected.values)
-    linear.assert_same(scheme.others["critic"], expected.judge)
+        made.fit(pairs(confidence=True), State(seed=0))
+        states = made.optimizers["main"].state
+        found[idle_steps] = (
+            linear.values_of(model),
+            [each["square_avg"] for each in states.values()],
+        )
+    (values, squares), (same, decayed) = found["none"], found["released"]
+    assert all(torch.equal(values[name], same[name]) for name in values)
+    assert len(squares) == 2
+    for before, after in zip(squares, decayed, strict=True):
+        torch.testing.assert_close(after, 0.9 * before)
 
 
 @pytest.mark.parametrize(
