@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from rgbt.synth.datasets import MFNET_LAYOUT
-from rgbt.synth.export import Plan, write_shot
+from rgbt.synth.export import Plan, shots_of, write_shot
 from rgbt.synth.factors import SceneFactors
 from rgbt.synth.scene import render_scene
 from tests.benchmarks.timing import in_turns
@@ -39,7 +39,7 @@ def main(num_scenes: int) -> None:
     for index in range(20):
         render_scene(0, index, factors)
     plan = Plan(name="x", seed=0, numbers={"train": num_scenes}, factors=factors)
-    shots = MFNET_LAYOUT.shots(plan)
+    shots = shots_of(MFNET_LAYOUT, plan)
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         rows = {

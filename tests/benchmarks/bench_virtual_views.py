@@ -34,12 +34,9 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from rgbt.engine.device import keep_memory
-from rgbt.geometry.camera import Camera
-from rgbt.geometry.halving import halved_mean
-from rgbt.geometry.homography import homography
+from rgbt.geometry.camera import Camera, Rule, homography, inner_rectangle
 from rgbt.geometry.padding import pad_to
-from rgbt.geometry.rectangle import Rule, inner_rectangle
-from rgbt.geometry.warp import Resampling, Warp, powers_of_two
+from rgbt.geometry.warp import Resampling, Warp, halved_mean, powers_of_two
 
 HW = (480, 640)
 BATCH = 8

@@ -20,14 +20,21 @@ from torch.nn import functional as F
 from torch.utils.data import Dataset
 
 from rgbt.geometry.padding import STRIDE
-from rgbt.transforms.crm import ColourJitter
+from rgbt.transforms.crm import CrmTransform
 
 SIZES = tuple(range(240, 961, 48))
 CROP_HW = (240, 320)
 FAR = 400.0
 """What the release pads its map of distances with."""
 
-JITTER = ColourJitter(
+JITTER = CrmTransform(
+    sizes=None,
+    max_size=None,
+    crop_hw=None,
+    flip_probability=0.0,
+    colour="released",
+    test_short_edge=None,
+    track_position=False,
     colour_probability=0.5,
     brightness_delta=32.0,
     contrast_range=(0.5, 1.5),
@@ -97,9 +104,8 @@ class ReleasedSamples(Dataset[dict[str, Any]]):
         return tuple(each[top : top + height, left : left + width] for each in arrays)
 
     def _coloured(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
-        colours = JITTER.draw_colours(self.rng)
-        rgb = colours.rgb(np.ascontiguousarray(image[..., :3]))
-        thermal = colours.thermal(np.ascontiguousarray(image[..., 3]))
+        parts = np.ascontiguousarray(image[..., :3]), np.ascontiguousarray(image[..., 3])
+        rgb, thermal = JITTER.coloured(*parts, self.rng)
         return np.concatenate([rgb, thermal[..., None]], axis=-1).astype(np.float32)
 
     def _mask(self, centre: tuple[int, int]) -> NDArray[np.bool_]:

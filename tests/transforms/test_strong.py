@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import colorsys
 
-import cv2
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from rgbt.randomness import torch_generator
-from rgbt.transforms.strong import StrongAugmentation, blurred, jittered, to_hsv, to_rgb
+from rgbt.transforms.strong import StrongAugmentation, blurred, jittered
 
 
 def augmentation(jitter: float = 1.0, blur: float = 1.0) -> StrongAugmentation:
@@ -108,18 +106,3 @@ def test_draws_are_replayed_and_their_number_is_fixed() -> None:
     assert torch.equal(first[0][0], third[0][0])
     assert not torch.equal(first[0][0], second[0][0])
     assert torch.equal(first[1], second[1])
-
-
-def test_hsv_is_opencv_s() -> None:
-    """Every fifth level of each channel; the whole cube was compared once, all are equal."""
-    levels = torch.arange(0, 256, 5)
-    rgb = torch.stack(torch.meshgrid(levels, levels, levels, indexing="ij"), -1).view(1, -1, 3)
-    expected = cv2.cvtColor(rgb.numpy().astype(np.uint8), cv2.COLOR_RGB2HSV)
-    np.testing.assert_array_equal(torch.stack(to_hsv(rgb), -1), expected)
-    hue = torch.arange(180)
-    hsv = torch.stack(torch.meshgrid(hue, levels, levels, indexing="ij"), -1).view(1, -1, 3)
-    whole = hsv[:, : hsv.shape[1] // 64 * 64]  # OpenCV rounds otherwise at the end of a row
-    expected = cv2.cvtColor(whole.numpy().astype(np.uint8), cv2.COLOR_HSV2RGB)
-    np.testing.assert_array_equal(to_rgb(*whole.unbind(-1)), expected)
-    # By hand: hue 15 is 30 degrees, half way from red to yellow.
-    assert to_rgb(*torch.tensor([15, 255, 200])).tolist() == [200, 100, 0]
