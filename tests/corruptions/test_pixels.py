@@ -151,13 +151,6 @@ def test_misregistered_by_exactly_so_many_pixels_in_one_direction(
     assert drawn == set(DIRECTIONS)
 
 
-def test_the_direction_is_the_same_at_every_severity() -> None:
-    kind, source = Misregistered(severities=(4.0,)), sample()
-    near, far = (kind(source, severity, rng_of()).thermal for severity in (4, 8))
-    (direction,) = [d for d in DIRECTIONS if np.array_equal(near, moved(source.thermal, *d))]
-    np.testing.assert_array_equal(far, moved(source.thermal, 2 * direction[0], 2 * direction[1]))
-
-
 @pytest.mark.parametrize(
     "make",
     [

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from rgbt.checks import InputError
@@ -116,62 +115,27 @@ def test_largest_rectangles_by_hand() -> None:
     torch.testing.assert_close(found, torch.tensor(expected, dtype=torch.float64))
 
 
-def outline(h: Tensor) -> NDArray[np.float64]:
-    """(4, 2): corners of the first frame, pixel edges, in the view; in order around it."""
-    right, bottom = HW[1] - 0.5, HW[0] - 0.5
-    frame = [[-0.5, -0.5, 1], [right, -0.5, 1], [right, bottom, 1], [-0.5, bottom, 1]]
-    points = np.array(frame) @ h.numpy().T
-    assert (points[:, 2] > 0).all()
-    return np.asarray(points[:, :2] / points[:, 2:])
+def shown(edges: np.ndarray, h: np.ndarray, slack: float = 0.0) -> np.ndarray:
+    """(N,): whether all corners of rectangles (N, 4) lie in the view and show the first frame."""
+    corners = np.stack(
+        [*(edges[:, [0, 0, 2, 2]], edges[:, [1, 3, 1, 3]], np.ones((len(edges), 4)))]
+    )
+    back = np.einsum("ij,jnk->ink", np.linalg.inv(h), corners)
+    last = np.array([HW[1], HW[0]])[:, None, None] - 0.5 + slack
+    places = [corners[:2], back[:2] / back[2]]
+    inside = [(each >= -0.5 - slack).all((0, 2)) & (each <= last).all((0, 2)) for each in places]
+    return inside[0] & inside[1] & (back[2] > 0).all(1) & (edges[:, :2] < edges[:, 2:]).all(1)
 
 
-def span(x: NDArray[np.float64], polygon: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
-    """Lowest and highest y of a convex polygon at columns x; high < low beside it."""
-    low, high = np.full_like(x, np.inf), np.full_like(x, -np.inf)
-    for a, b in zip(polygon, np.roll(polygon, -1, 0), strict=True):
-        if a[0] == b[0]:
-            continue
-        on = (x >= min(a[0], b[0])) & (x <= max(a[0], b[0]))
-        y = a[1] + (x - a[0]) / (b[0] - a[0]) * (b[1] - a[1])
-        low, high = np.where(on, np.minimum(low, y), low), np.where(on, np.maximum(high, y), high)
-    return low, high
-
-
-def searched(polygon: NDArray[np.float64]) -> float:
-    """Largest area by looking: for many left sides the best right one, then closing in.
-
-    The logarithm of the area is concave in both, so a search by thirds finds the right side, and
-    the best left side lies between the neighbours of the best one tried.
-    """
-    low, high = max(polygon[:, 0].min(), -0.5), min(polygon[:, 0].max(), HW[1] - 0.5)
-
-    def sizes(left: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:
-        (top1, bottom1), (top2, bottom2) = span(left, polygon), span(right, polygon)
-        bottom = np.minimum(np.minimum(bottom1, bottom2), HW[0] - 0.5)
-        height = bottom - np.maximum(np.maximum(top1, top2), -0.5)
-        return np.where(height > 0, (right - left) * height, height)
-
-    lefts, best = np.linspace(low, high, 101)[:-1], 0.0
-    for _ in range(5):
-        near, far = lefts.copy(), np.full_like(lefts, high)
-        for _ in range(70):
-            third = (far - near) / 3
-            better = sizes(lefts, near + third) < sizes(lefts, far - third)
-            near, far = np.where(better, near + third, near), np.where(better, far, far - third)
-        found = sizes(lefts, (near + far) / 2)
-        best, at = max(best, float(found.max())), int(found.argmax())
-        lefts = np.linspace(lefts[max(at - 1, 0)], lefts[min(at + 1, 99)], 100)
-    return best
-
-
-def test_no_rectangle_of_a_search_is_larger() -> None:
-    views = random_views(12, 0)
-    for h, rectangle in zip(views, inner_rectangle(views, HW, "largest").numpy(), strict=True):
-        polygon, (left, top, right, bottom) = outline(h), rectangle
-        low, high = span(np.array([left, right]), polygon)
-        assert low.max() - 2e-6 < top < bottom < high.min() + 2e-6
-        assert -0.5 <= left + 2e-6 < right - 2e-6 <= HW[1] - 0.5
-        assert (right - left) * (bottom - top) == pytest.approx(searched(polygon), rel=1e-6)
+def test_no_rectangle_nearby_is_larger() -> None:
+    """The problem is concave: what no near rectangle exceeds is the largest."""
+    views, rng = random_views(12, 0), np.random.default_rng(0)
+    for h, found in zip(views.numpy(), inner_rectangle(views, HW, "largest").numpy(), strict=True):
+        near = found + rng.normal(size=(20_000, 4)) * 10.0 ** rng.uniform(-3, 2, (20_000, 1))
+        sizes = (near[:, 2:] - near[:, :2]).prod(1)[shown(near, h)]
+        assert shown(found[None], h, 1e-5).all()
+        assert len(sizes) > 100
+        assert sizes.max() <= (found[2:] - found[:2]).prod() + 0.01
 
 
 @pytest.mark.parametrize("rule", ["largest", "corners"])

@@ -77,7 +77,7 @@ def test_source_by_hand() -> None:
     assert columns.tolist() == [[1, 0], [1, -1]]
 
 
-@pytest.mark.parametrize("hw", [(8, 96), (64, 90)])
-def test_other_sizes_are_refused(hw: tuple[int, int]) -> None:
-    with pytest.raises(InputError, match="flow: expected one size"):
-        estimate(np.zeros(hw, np.uint8), frames()[0])
+def test_other_sizes_are_refused() -> None:
+    for hw in ((8, 96), (64, 90)):
+        with pytest.raises(InputError, match="flow: expected one size"):
+            estimate(np.zeros(hw, np.uint8), frames()[0])

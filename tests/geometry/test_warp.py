@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -182,34 +181,6 @@ def test_levels_are_rounded_after_each_interpolation() -> None:
     torch.testing.assert_close(255 * rounded, stepwise, atol=1e-3, rtol=0)
     at_the_end = (255 * both.bilinear(values)).round()
     assert float((255 * rounded - at_the_end).abs().max()) > 0.5
-
-
-def opencv(warp: Warp, values: Tensor, how: int) -> Tensor:
-    """The release's way for (B, C, H, W) float32: warp, cut whole pixels, resize."""
-    out = []
-    height, width = warp.image_hw
-    edges = (warp.rectangle + 0.5).int().tolist()
-    for image, h, (left, top, right, bottom) in zip(values, warp.homography, edges, strict=True):
-        array = image.permute(1, 2, 0).numpy()
-        canvas = cv2.warpPerspective(array, h.numpy(), (width, height), flags=how)
-        cut = canvas.reshape(height, width, -1)[top:bottom, left:right]
-        resized = cv2.resize(cut, (width, height), interpolation=how)
-        out.append(torch.from_numpy(resized.reshape(height, width, -1)).permute(2, 0, 1))
-    return torch.stack(out)
-
-
-def test_twice_is_what_opencv_does() -> None:
-    """Nearly: OpenCV rounds points to 1/32 pixel for nine channels."""
-    views = random_views(3, 11, "zxy")
-    warp = Warp(views, inner_rectangle(views, HW, "corners"), HW, "twice")
-    coarse = torch.rand(3, 9, 30, 40, generator=torch.Generator().manual_seed(0))
-    values = torch.nn.functional.interpolate(coarse, HW, mode="bilinear")
-    difference = (warp.bilinear(values) - opencv(warp, values, cv2.INTER_LINEAR)).abs()
-    assert float(difference.mean()) < 2e-4
-    assert float(difference.max()) < 0.02
-    label = torch.randint(0, 9, (3, 1, *HW), generator=torch.Generator().manual_seed(1)).float()
-    differs = warp.nearest(label, 0) != opencv(warp, label, cv2.INTER_NEAREST)
-    assert float(differs.float().mean()) < 2e-3  # every pixel its own label: points on a boundary
 
 
 # ---- half sizes -----------------------------------------------------------------------------

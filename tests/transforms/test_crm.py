@@ -25,17 +25,6 @@ def test_scale_and_truncate_by_hand(dtype: Any) -> None:
     assert scale_and_truncate(image, offset=-100.5).tolist() == [[0, 0, 0, 99]]
 
 
-def test_uint8_and_float_scale_alike() -> None:
-    rng = np.random.default_rng(0)
-    image = rng.integers(0, 256, (16, 16, 3), dtype=np.uint8)
-    for _ in range(20):
-        factor, offset = rng.uniform(0.5, 1.5), rng.uniform(-32, 32)
-        np.testing.assert_array_equal(
-            scale_and_truncate(image, factor, offset),
-            scale_and_truncate(image.astype(np.float32), factor, offset),
-        )
-
-
 @pytest.mark.parametrize("factor", [0.5, 0.8, 1.2, 1.5])
 def test_saturation_of_uint8_is_scaled(factor: float) -> None:
     hue, saturation, value = colorsys.rgb_to_hsv(200 / 255, 120 / 255, 100 / 255)

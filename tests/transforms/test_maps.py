@@ -52,16 +52,6 @@ def test_nearest_source_is_that_of_torch(source: int) -> None:
     assert nearest(np.array([[4, 7]]), (2, 4)).tolist() == [[4, 4, 7, 7]] * 2
 
 
-def test_bilinear_by_hand() -> None:
-    """Doubling 0, 8: samples at -1/4 (clamped), 1/4, 3/4, 5/4 (clamped)."""
-    image = np.array([[0, 8]], np.uint8)
-    small = Sample(np.repeat(image[..., None], 3, 2), image, None, "x")
-    found = Maps.of(small).resize((1, 4), dtype=np.float32)
-    assert found.thermal.tolist() == bilinear(image, (1, 4)).tolist() == [[0, 2, 6, 8]]
-    assert found.rgb[..., 1].tolist() == [[0, 2, 6, 8]]
-    assert found.columns.tolist() == [0, 0, 1, 1]
-
-
 @pytest.mark.parametrize("short_edge", [24, 31, 57, 96])
 def test_bilinear_is_that_of_torch(short_edge: int) -> None:
     sample, hw = noise(3), short_edge_hw((48, 64), short_edge, None)

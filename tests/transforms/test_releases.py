@@ -20,6 +20,7 @@ from torch.nn import functional as F
 
 from rgbt.config.component import build, constructor
 from rgbt.config.compose import compose, conf_dir
+from rgbt.transforms.fixed_size import recoloured
 from rgbt.types import IGNORE, Example, Sample
 from tests.transforms.recipes import SIZES, noise
 
@@ -106,7 +107,7 @@ def cmx(t: Any, sample: Sample, rng: np.random.Generator) -> Arrays:
 def cmnext(t: Any, sample: Sample, rng: np.random.Generator) -> Arrays:
     rgb = sample.rgb
     if rng.random() < t.colour_probability:
-        rgb = by_loops(rgb, rng.uniform(*t.colour_range, size=3))
+        rgb = recoloured(rgb, *rng.uniform(*t.colour_range, size=3))
     flipped = rng.random() < t.flip_probability
     if rng.random() < t.blur_probability:
         rgb = np.asarray(cv2.GaussianBlur(rgb, (3, 3), t.blur_deviation))
@@ -119,21 +120,6 @@ def cmnext(t: Any, sample: Sample, rng: np.random.Generator) -> Arrays:
         spans.append((first, min(crop, length - first)))
     (top, height), (left, width) = spans
     return framed(cut(arrays, top, left, height, width), t.crop_hw, (0, 0), 0, 0)
-
-
-def by_loops(image: np.ndarray, factors: np.ndarray) -> np.ndarray:
-    """Brightness, contrast and saturation of torchvision, each truncated to whole grey levels."""
-    weights = np.float32([0.2989, 0.587, 0.114])
-
-    def mix(image: np.ndarray, other: Any, factor: float) -> np.ndarray:
-        share = np.float32(factor)
-        both = share * image.astype(np.float32) + (1 - share) * np.float32(other)
-        return np.trunc(np.clip(both, 0, 255)).astype(np.uint8)
-
-    image = mix(image, 0, factors[0])
-    grey = np.trunc(image.astype(np.float32) @ weights)
-    image = mix(image, grey.mean(dtype=np.float32), factors[1])
-    return mix(image, np.trunc(image.astype(np.float32) @ weights)[..., None], factors[2])
 
 
 def rtfnet(t: Any, sample: Sample, rng: np.random.Generator) -> Arrays:
@@ -339,7 +325,6 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "thermal_contrast_range": [0.5, 1.5],
     },
     "crm_released": {"colour": "released"},
-    "none": {},
     "rtfnet_released": {"flip_probability": 0.5, "cut_share": 0.1},
     "cmx_released": {"factors": [0.5, 0.75, 1, 1.25, 1.5, 1.75], "flip_probability": 0.5},
     "cmnext_released": {
