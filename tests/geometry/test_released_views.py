@@ -6,8 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from rgbt.geometry.homography import homography
-from rgbt.geometry.rectangle import inner_rectangle
+from rgbt.geometry.camera import homography, inner_rectangle
 from rgbt.geometry.warp import Warp
 from tests.geometry.views import HW, RELEASED, Recorded
 from tests.models.golden import FOLDER
