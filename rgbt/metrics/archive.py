@@ -53,10 +53,8 @@ class Archive:
                 raise ValueError(f"expected the mark '{self.mark}', got '{one_line(mark)}'")
             return build(arrays)
         except Exception as error:  # zipfile and NumPy raise anything on damaged bytes
-            raise InputError(
-                f"'{path}' is not a readable file of {self.what} ({one_line(error)}); "
-                f"{self.advice}."
-            ) from error
+            reason = f"is not a readable file of {self.what} ({one_line(error)})"
+            raise InputError(f"'{path}' {reason}; {self.advice}.") from error
 
 
 def _digest(arrays: Mapping[str, NDArray[Any]]) -> str:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from rgbt.averaging import AveragedNetwork
-from rgbt.engine.averaging import EvaluatedWeights
+from rgbt.engine.checkpoint import EvaluatedWeights
 from rgbt.engine.checkpoint import State, load_checkpoint
 from rgbt.engine.settings import TrainerSettings
 from tests.checkpoints.test_torch_files import same

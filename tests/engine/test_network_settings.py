@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from rgbt.checks import InputError
 from rgbt.engine.checkpoint import restore_optimizer
-from rgbt.engine.network_settings import Recomputed, place, prepare_training
+from rgbt.engine.device import Recomputed, place, prepare_training
 from rgbt.engine.optimizers import AdamW
 from rgbt.engine.settings import TrainerSettings
 from rgbt.requirements import Record

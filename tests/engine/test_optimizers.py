@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from rgbt.engine.optimizers import SGD, Adam, AdamW, RMSprop, parameter_groups, trainable
+from rgbt.engine.optimizers import SGD, Adam, AdamW, RMSprop, parameter_groups
 from rgbt.requirements import Record
 from tests.models.plain import nano
 
@@ -77,7 +77,8 @@ def test_frozen_and_shared_parameters_come_never_and_once() -> None:
     model = TwoHeads()
     model.heads["target"].weight = model.heads["source"].weight
     model.backbone.bias.requires_grad_(False)
-    assert sum(p.numel() for p in trainable(model)) == 4 + 2 + 1 + 1
+    groups = parameter_groups(model, (), ())
+    assert sum(p.numel() for group in groups.values() for p in group) == 4 + 2 + 1 + 1
     groups = parameter_groups(model, (), ("backbone.",))
     assert sum(len(group) for group in groups.values()) == 3
 

@@ -40,7 +40,7 @@ def test_fix_threads_refuses_what_would_take_fewer(
 ) -> None:
     monkeypatch.setenv(name, value)
     if is_refused:
-        with pytest.raises(InputError, match=rf"trainer.threads=2: .*{name}={value} .*unset"):
+        with pytest.raises(InputError, match=rf"trainer.threads=2: unset {name}={value}"):
             fix_threads(2)
     else:
         fix_threads(2)

@@ -15,7 +15,6 @@ from rgbt.metrics.counting import (
     DetailCounter,
     RegionCounter,
     areas,
-    boundary_pixels,
     outlined,
     pair_counts,
 )
@@ -155,15 +154,6 @@ def square(size: int, low: int, high: int) -> np.ndarray:
 
 
 BOUNDARY, BORDER = Details("boundary", (0.02,)), Details("boundary", (0.02, 1.0))
-
-
-@pytest.mark.parametrize(
-    ("hw", "width", "expected"),
-    # Diagonals 5 (0.1), 200 (4), 800 (16); 2.5 is rounded to the even number.
-    [((3, 4), 0.02, 1), ((120, 160), 0.02, 4), ((480, 640), 0.02, 16), ((3, 4), 0.5, 2)],
-)
-def test_boundary_pixels_are_a_share_of_the_diagonal(hw, width, expected) -> None:
-    assert boundary_pixels(hw, width) == expected
 
 
 def test_boundaries_of_a_square_that_is_predicted_one_pixel_to_the_right() -> None:

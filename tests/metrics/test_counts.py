@@ -64,7 +64,7 @@ def test_selected_images_keep_their_order_and_time() -> None:
     assert chosen.night == (True, False)
     assert chosen.unscored == ("car",)
     assert np.array_equal(chosen.counts, example().counts[[2, 0]])
-    with pytest.raises(InputError, match=r"'00009N'.*split 'test'"):
+    with pytest.raises(InputError, match=r"'00009N'.*'test'"):
         example().select(["00009N"])
 
 

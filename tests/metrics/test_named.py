@@ -133,12 +133,12 @@ def test_values_by_hand(counts: Counts, metric: str, absent: Any, expected: floa
         (counts_of(), "ECE", "details=calibration"),
         (BOUNDARIES, "mIoU", "score of single frames.*of boundary"),
         (BOUNDARIES, "distance/0-10", "score of distance"),
-        (BY_DISTANCE, "distance/0-20", "the bins 0-10, 10-40, 40-inf"),
+        (BY_DISTANCE, "distance/0-20", "have 0-10, 10-40, 40-inf"),
         (BY_DISTANCE, "region/3/distance/0-10", "the regions 1 to 2"),
         (CALIBRATED, "class/cat/ECE", "no class 'cat'"),
-        (pairs_of(partition="triples1"), "TC", "use flicker"),
-        (pairs_of(partition="flow1"), "flicker", "use TC, CA, CA_released, warping_error"),
-        (pairs_of(partition="released1"), "warping_error", "use TC, CA, CA_released"),
+        (pairs_of(partition="triples1"), "TC", "have flicker"),
+        (pairs_of(partition="flow1"), "flicker", "have TC, CA, CA_released, warping_error"),
+        (pairs_of(partition="released1"), "warping_error", "have TC, CA, CA_released; use"),
     ],
 )
 def test_scores_that_counts_do_not_have_are_refused(counts, metric: str, word: str) -> None:
