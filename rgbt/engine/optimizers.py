@@ -77,8 +77,9 @@ class SGD:
         # On a GPU the default makes a copy of all gradients to add the decay; the fused one none.
         # On a CPU it would change the last bits of published runs.
         fused = True if any(p.is_cuda for group in groups for p in group["params"]) else None
-        given = {"momentum": self.momentum, "weight_decay": self.weight_decay}
-        return torch.optim.SGD(groups, lr=self.lr, fused=fused, **given)
+        return torch.optim.SGD(
+            groups, momentum=self.momentum, weight_decay=self.weight_decay, fused=fused
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,9 +14,7 @@ from numpy.typing import NDArray
 from rgbt.checks import InputError, one_line
 from rgbt.files.atomic import replacing
 
-FORMAT, DIGEST = "format", "digest"
-"""Members of every file: its mark, and the SHA-256 of all others."""
-
+FORMAT, DIGEST = "format", "digest"  # members of every file
 T = TypeVar("T")
 
 
@@ -37,11 +35,7 @@ class Archive:
             np.savez_compressed(file, **arrays)
 
     def load(self, path: Path, build: Callable[[dict[str, Any]], T]) -> T:
-        """What `build` makes of the arrays that `save` wrote; nothing in the file is executed.
-
-        Raises:
-            InputError: no such file, a damaged one, or another kind of file.
-        """
+        """What `build` makes of what `save` wrote; InputError: no, damaged or another file."""
         if not path.is_file():
             raise InputError(f"the file of {self.what} '{path}' does not exist; {self.advice}.")
         try:

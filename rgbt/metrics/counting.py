@@ -21,10 +21,11 @@ if TYPE_CHECKING:
 
 Map: TypeAlias = "NDArray[Any] | Tensor"
 Counted = NDArray[np.int64]
-Axis = tuple[NDArray[Any], int]
 
 
-def histogram(*axes: Axis, where: NDArray[np.bool_], weights: Any = None) -> Counted:
+def histogram(
+    *axes: tuple[NDArray[Any], int], where: NDArray[np.bool_], weights: Any = None
+) -> Counted:
     """(s1, s2, ...): numbers of the pixels `where`, by indices (H, W) with s1, s2, ... values.
 
     `weights` are whole numbers (H, W) that are added instead of 1.
@@ -69,13 +70,9 @@ def pair_counts(
 ) -> Counted:
     """(K + 1, K, K) counts of one pair of frames: label (row K: no class), first, second.
 
-    Args:
-        first: prediction 0..K-1 of the first frame, as the protocol compares it (see
-            `rgbt.metrics.pairs`); anything 0..255 where not `valid`.
-        second: prediction of the second frame; `label` is its label.
-        label: as of `RegionCounter`.
-        num_classes: K, 1..255.
-        valid: bool, pixels that count; None: all.
+    `first` is the prediction of the first frame as the protocol compares it (see
+    `rgbt.metrics.pairs`), anything where not `valid`; `second` and its `label` as of
+    `RegionCounter`. `valid` are the pixels that count; None: all.
     """
     every = np.ones(tuple(label.shape), bool) if valid is None else valid
     maps = _maps(first=first, second=second, label=label, valid=every)
@@ -87,7 +84,7 @@ def pair_counts(
 
 @dataclass(frozen=True)
 class DetailCounter:
-    """Counts what details need of one image (see `rgbt.metrics.details`); K is `num_classes`."""
+    """Counts what details need of one image (see `rgbt.metrics.details`)."""
 
     num_classes: int
     regions: Regions
@@ -101,8 +98,8 @@ class DetailCounter:
     def __call__(self, label: Map, prediction: Map, values: Map | None = None) -> Counted:
         """(R G, M, K) counts of one image; label and prediction as of `RegionCounter`.
 
-        `values` are by kind: of "calibration" the probability 0..1 of the prediction; of "distance"
-        metres > 0, inf: the sky; of "size" the number of the object, 0: none.
+        `values`: of "calibration" the probability of the prediction; of "distance" metres > 0,
+        inf: the sky; of "size" the number of the object, 0: none.
         """
         given = {"label": label, "prediction": prediction}
         given |= {} if values is None else {"values": values}

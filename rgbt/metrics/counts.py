@@ -34,9 +34,6 @@ class Counts:
         unscored: classes that are left out of every mean over classes; their pixels count.
         absent: convention for absent classes (`rgbt.metrics.scores`) of the evaluation.
         run: key of the run whose network predicted; "" for others.
-
-    Raises:
-        ValueError: sizes do not agree, `unscored` is no class or all, or no such convention.
     """
 
     counts: NDArray[np.integer]
@@ -63,9 +60,9 @@ class Counts:
             )
         if self.night is not None and len(self.night) != len(self.names):
             raise ValueError(f"night: expected {len(self.names)} values, got {len(self.night)}.")
-        scored_classes(self.classes, self.unscored)
         if self.absent not in get_args(Absent):
             raise ValueError(f"absent: expected released or exclude, got '{self.absent}'.")
+        scored_classes(self.classes, self.unscored)
 
     @property
     def scored(self) -> NDArray[np.bool_]:
@@ -74,21 +71,18 @@ class Counts:
 
     def by_region(self) -> NDArray[np.int64]:
         """(R, K, K): all images together."""
-        summed: NDArray[np.int64] = self.counts.sum(0, dtype=np.int64)
-        return summed
+        return np.asarray(self.counts.sum(0, dtype=np.int64))
 
     def whole(self) -> NDArray[np.int64]:
         """(K, K): all images, whole image (the regions cover every pixel once)."""
-        summed: NDArray[np.int64] = self.counts.sum((0, 1), dtype=np.int64)
-        return summed
+        return np.asarray(self.counts.sum((0, 1), dtype=np.int64))
 
     def select(self, names: Iterable[str]) -> Counts:
         """The counts of the images called `names`, in that order; InputError: an unknown name."""
         index_of = {name: index for index, name in enumerate(self.names)}
         wanted = tuple(names)
-        for name in wanted:
-            if name not in index_of:
-                raise InputError(f"image '{name}' is not among those counted of '{self.split}'.")
+        if missing := set(wanted) - index_of.keys():
+            raise InputError(f"'{self.split}': image '{min(missing)}' is not counted.")
         return self._take([index_of[name] for name in wanted])
 
     def parts(self) -> dict[str, Counts]:
@@ -141,8 +135,8 @@ def check_same_means(first: Counts, other: Counts) -> None:
     if set(first.unscored) != set(other.unscored):
         left_out = [", ".join(each.unscored) or "no class" for each in (first, other)]
         raise InputError(
-            f"counts whose means leave out {left_out[0]} cannot be compared with counts whose "
-            f"means leave out {left_out[1]}. Evaluate both with the same dataset.unscored."
+            f"counts whose means leave out {left_out[0]} cannot be compared with those that leave "
+            f"out {left_out[1]}. Evaluate both with the same dataset.unscored."
         )
 
 
@@ -151,7 +145,6 @@ def convention(every: Iterable[Counts]) -> Absent:
     found = {counts.absent for counts in every}
     if len(found) > 1:
         raise InputError(
-            "the counts use different conventions for absent classes (released: they score 0; "
-            "exclude: they are left out of means). Choose absent=released or absent=exclude."
+            "absent: the counts use both conventions. Choose absent=released or absent=exclude."
         )
     return found.pop()

@@ -11,15 +11,13 @@ setting, such as "ring5-distance-10-20-40". Region r has a row for each of G gro
     size         bins + 1     label by prediction (K x K); the last group is in no object
 
 Summed over the groups, the counts of the last two are the usual ones. Depth and object are those of
-the labelled scene: a pixel wrongly predicted as car counts at the distance of what is really there.
-A wrong pixel has no object of its class, so that recall by size is defined, and IoU is not. The
-size of an object is its visible area in the whole image, in pixels.
+the labelled scene. A wrong pixel has no object of its class, so that recall by size is defined, and
+IoU is not. The size of an object is its visible area in the whole image, in pixels.
 
 The boundary of a class are the pixels of its mask within d pixels of its outline, as left by d
 erosions with 3x3 pixels. d is a share of the image diagonal, at least 1 pixel. Ignored pixels are
-not counted, and their edges are no outlines; the prediction is compared as if it were ignored there
-too. Source: Cheng et al.: "Boundary IoU", CVPR 2021, Sec. 4. In its released code the border of the
-image is an outline too, which raises the scores of the outer regions.
+not counted, and their edges are no outlines. Source: Cheng et al.: "Boundary IoU", CVPR 2021, Sec.
+4. In its released code the border of the image is an outline too.
 """
 
 from __future__ import annotations
@@ -37,39 +35,27 @@ KINDS: tuple[DetailKind, ...] = get_args(DetailKind)
 
 BOTH, LABEL, PREDICTED = range(3)
 NUMBER, CORRECT, CONFIDENCE = range(3)
-"""Rows of the counts, see the module."""
-
-OF_SCENES: tuple[DetailKind, ...] = ("distance", "size")
-"""Kinds that need `rgbt.types.SceneMaps`."""
-
-WIDTH: Final = 0.02
-"""Width of a boundary as a share of the image diagonal (Cheng et al., CVPR 2021, Sec. 4)."""
-
+OF_SCENES: tuple[DetailKind, ...] = ("distance", "size")  # need `rgbt.types.SceneMaps`
+WIDTH: Final = 0.02  # of a boundary, share of the image diagonal (Cheng et al., Sec. 4)
 DEFAULTS: dict[DetailKind, tuple[float, ...]] = {
     "boundary": (WIDTH,),
     "calibration": (15.0,),  # equal bins (Guo et al., ICML 2017, Sec. 5)
     "distance": (10.0, 20.0, 40.0),
     "size": (64.0, 256.0, 1024.0),  # squares of 8, 16 and 32 pixels
 }
-"""Setting of each kind unless another one is chosen."""
-
 MOST_EDGES: Final = 20
-
 UNITS: Final = 10_000
-"""Units of a confidence of 1. The confidence of a pixel is rounded to whole units before it is
-added, so that all counts are integers; this changes an error by at most 0.005 percent points."""
+"""Units of a confidence of 1, to which that of a pixel is rounded, so that all counts are integers;
+this changes an error by at most 0.005 percent points."""
 
 
 @dataclass(frozen=True)
 class Details:
     """A kind of counts and its setting.
 
-    Attributes:
-        kind: see the module.
-        setting: of boundaries their width as a share of the image diagonal, 0.001..0.2, and then
-            1 if the border of the image is an outline; of calibration the number of bins; of
-            distance (metres) and size (pixels of the image) the rising edges between bins, above
-            0. InputError: out of range.
+    The setting is: of boundaries their width as a share of the image diagonal, 0.001..0.2, and then
+    1 if the border of the image is an outline; of calibration the number of bins; of distance
+    (metres) and size (pixels) the rising edges between bins. InputError: out of range.
     """
 
     kind: DetailKind
@@ -81,9 +67,8 @@ class Details:
         elif self.kind in OF_SCENES:
             rising = all(low < high for low, high in self._edges())
             if not rising or not 1 <= len(self.setting) <= MOST_EDGES:
-                given = ",".join(map(_text, self.setting))
-                expected = f"expected 1 to {MOST_EDGES} rising numbers above 0"
-                raise InputError(f"{self.kind}s={given}: {expected}.")
+                given = f"{self.kind}s={','.join(map(_text, self.setting))}"
+                raise InputError(f"{given}: expected 1 to {MOST_EDGES} rising numbers above 0.")
 
     def _edges(self) -> pairwise[tuple[float, float]]:
         return pairwise((0.0, *self.setting, math.inf))
@@ -109,18 +94,13 @@ class Details:
         return "-".join([regions, self.kind, *map(_text, self.setting)])
 
 
-def default(kind: DetailKind) -> Details:
-    """A kind with its default setting."""
-    return Details(kind, DEFAULTS[kind])
-
-
 def requested(
     kinds: str, boundary: tuple[float, bool], distances: str, sizes: str
 ) -> tuple[Details, ...]:
     """The details that options of a command request; `kinds` is a list, "all" or "none".
 
     `boundary` is the width, and whether the border of the image is an outline; `distances` and
-    `sizes` are lists of edges. InputError: an unknown kind, or a setting out of range.
+    `sizes` are lists of edges.
     """
     if kinds in ("none", "[]"):
         return ()
@@ -136,7 +116,7 @@ def requested(
             try:
                 setting = tuple(map(float, split_list(text, f"{kind}s")))
             except ValueError as error:
-                raise InputError(f"{kind}s={text}: expected numbers, with commas.") from error
+                raise InputError(f"{kind}s={text}: {error}.") from error
         found.append(Details(kind, setting))
     return tuple(found)
 

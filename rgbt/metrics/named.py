@@ -11,7 +11,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,19 +22,19 @@ from rgbt.metrics.details import KINDS, DetailKind, details_of
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.scores import MEANS, Matrices, Scores
 
-OF_PAIRS: dict[str, Callable[[Matrices, Absent], Scores]] = {
+ByClass = Callable[[Matrices, Absent], Scores]
+"""Counts -> fractions (..., K)."""
+
+OF_PAIRS: dict[str, ByClass] = {
     names.TC: pairs.tc,
     names.CA: pairs.ca,
     names.CA_RELEASED: pairs.ca_released,
 }
-"""Scores by class of (..., S (K + 1), K, K) counts of pairs of frames as fractions (..., K)."""
-
+# Pixels that change and all pixels (..., K), by the class of the first frame.
 CHANGES: dict[str, Callable[[Matrices], tuple[Scores, Scores]]] = {
     names.WARPING_ERROR: pairs.changed,
     names.FLICKER: pairs.flickered,
 }
-"""Pixels that change and all pixels (..., K), by the class of the first frame."""
-
 SCORES_OF: dict[pairs.Protocol, tuple[str, ...]] = {
     "aligned": (*OF_PAIRS, names.WARPING_ERROR),
     "released": tuple(OF_PAIRS),
@@ -43,15 +42,11 @@ SCORES_OF: dict[pairs.Protocol, tuple[str, ...]] = {
     "flow": (*OF_PAIRS, names.WARPING_ERROR),
     "triples": (names.FLICKER,),
 }
-"""Protocol of pairs of frames -> the scores of its counts."""
-
-BY_CLASS: dict[str, Callable[[Matrices, Absent], Scores]] = {
+BY_CLASS: dict[str, ByClass] = {
     **{"IoU": scores.iou, "acc": scores.recall, names.DISTANCE: scores.iou},
     **dict.fromkeys((names.BOUNDARY_MIOU, names.BOUNDARY_IOU), scores.boundary_iou),
     names.SIZE: lambda counts, _: scores.object_recall(counts),
 }
-"""Scores of one region and bin by class as fractions (..., K)."""
-
 SINGLE, PAIRS = "single frames", "pairs of frames"
 EVERYWHERE = ("", "region", "class", "class region")
 SCORES: dict[str, tuple[str, tuple[str, ...]]] = {
@@ -74,15 +69,7 @@ NAME = re.compile(
 
 @dataclass(frozen=True)
 class ParsedMetric:
-    """A metric name, taken apart.
-
-    Attributes:
-        part: "day", "night", or None for all images.
-        score: one of `SCORES`, or "IoU" of a class.
-        class_name: of one class alone, or None.
-        region: number from 1, or None for the whole image.
-        bin: of distance and size, e.g. "10-20"; "" for others.
-    """
+    """A metric name, taken apart: None for all images, classes, regions (from 1); "" for no bin."""
 
     metric: str
     part: str | None
@@ -99,15 +86,13 @@ class ParsedMetric:
     @property
     def details(self) -> DetailKind | None:
         """Kind of details that have the score; None: other counts."""
-        return cast(DetailKind, self.needs) if self.needs in KINDS else None
+        return self.needs if self.needs in KINDS else None
 
 
 def parse(metric: str) -> ParsedMetric:
     """Take a metric name apart; InputError: it is none, with the nearest one."""
     if (found := NAME.fullmatch(metric)) and not metric.endswith("/"):
-        scope = " ".join(
-            key for key, group in (("class", "name"), ("region", "region")) if found[group]
-        )
+        scope = f"{'class ' * bool(found['name'])}{'region' * bool(found['region'])}".strip()
         score, which = found["score"], found["bin"] or ""
         is_binned = score in (names.DISTANCE, names.SIZE)
         is_known = scope in SCORES.get(score, ("", ()))[1] if score else bool(scope)
@@ -116,9 +101,7 @@ def parse(metric: str) -> ParsedMetric:
             score = score or ("IoU" if found["name"] else names.MIOU)
             return ParsedMetric(metric, found["part"], score, found["name"], region, which)
     known = nearest(re.sub("^(day|night)/", "", metric), [*SCORES, "region/<n>", "class/<name>"])
-    raise InputError(
-        f"'{metric}' is not a metric; {known}; each may have the prefix day/ or night/."
-    )
+    raise InputError(f"'{metric}' is not a metric; {known}; each also as day/ or night/...")
 
 
 def value(metric: str, counts: Counts, absent: Absent) -> float:
@@ -127,8 +110,7 @@ def value(metric: str, counts: Counts, absent: Absent) -> float:
     NaN: nothing to score. `absent`: how a class without pixels counts, see `rgbt.metrics.scores`.
 
     Raises:
-        InputError: no such metric, class or region, a metric that such counts do not have, or
-            images without a time of day.
+        InputError: no such metric, class or region, or one that such counts do not have.
     """
     parsed = parse(metric)
     by_region = images_of(parsed, counts).by_region()
@@ -138,24 +120,18 @@ def value(metric: str, counts: Counts, absent: Absent) -> float:
 def values(
     parsed: ParsedMetric, by_region: Matrices, like: Counts, absent: Absent
 ) -> NDArray[np.float64]:
-    """The score of many summed counts at once, e.g. one per resample; errors as of `value`.
+    """(...): the score of many summed counts at once, e.g. one per resample; see also `value`.
 
     Args:
         parsed: the score; its part (day, night) has been taken by `images_of` before summing.
         by_region: (..., R, K, K), summed over images; of details (..., R G, M, K).
         like: counts of the same classes, scored ones and partition; nothing else of it is used.
         absent: see `value`.
-
-    Returns:
-        (...), units as of `value`.
     """
     check_kind(parsed, like.partition)
     name, details = parsed.class_name, details_of(like.partition)
     if name is not None and name not in like.classes:
-        known = nearest(name, like.classes)
-        raise InputError(
-            f"'{parsed.metric}': the data set of the run has no class '{name}'; {known}."
-        )
+        raise InputError(f"'{parsed.metric}': no class '{name}'; {nearest(name, like.classes)}.")
     index = None if name is None else like.classes.index(name)
 
     def mean_or_class(by_class: Scores) -> Scores:
@@ -184,10 +160,7 @@ def values(
 
 
 def pair_scores(score: str, by_region: Matrices, partition: str, absent: Absent) -> Scores:
-    """A score of `OF_PAIRS` by class, fractions (..., K).
-
-    CA along an estimated flow is over labelled pixels; NaN without any.
-    """
+    """A score of `OF_PAIRS` by class (..., K); CA along an estimated flow is of labelled pixels."""
     if pairs.protocol_of(partition) == "flow" and score != names.TC:
         known = pairs.only_labelled(by_region)
         without = np.isnan(known[..., :1, 0, 0])
@@ -196,17 +169,15 @@ def pair_scores(score: str, by_region: Matrices, partition: str, absent: Absent)
 
 
 def check_kind(parsed: ParsedMetric, partition: str) -> None:
-    """Refuse a score of other counts; InputError says how counts that have it are made."""
+    """Refuse a score of other counts; InputError says how these are made."""
     details, protocol = details_of(partition), pairs.protocol_of(partition)
     has = details.kind if details else PAIRS if protocol else SINGLE
     these = f"these counts ({partition})"
     if has != parsed.needs:
         command = "consistency" if parsed.needs == PAIRS else "evaluate"
         option = f" details={parsed.details}" if parsed.details else ""
-        raise InputError(
-            f"'{parsed.metric}' is a score of {parsed.needs}, but {these} are of {has}; use counts "
-            f"of rgbt {command} run=...{option}"
-        )
+        said = f"'{parsed.metric}' is a score of {parsed.needs}, but {these} are of {has}"
+        raise InputError(f"{said}; use counts of rgbt {command} run=...{option}")
     known = SCORES_OF[protocol] if protocol else details.bins if details else ()
     word = parsed.score if protocol else parsed.bin
     if word and known and word not in known:
@@ -214,21 +185,14 @@ def check_kind(parsed: ParsedMetric, partition: str) -> None:
 
 
 def images_of(parsed: ParsedMetric, counts: Counts) -> Counts:
-    """The images that a metric is over: all, those of the day or those of the night.
-
-    Raises:
-        InputError: the split does not hold both, the data set does not distinguish them, or such
-            counts do not have the metric.
-    """
+    """The images that a metric is over: all, or those of day or night; InputError: not both."""
     check_kind(parsed, counts.partition)
     if parsed.part is None:
         return counts
     parts = counts.parts()
     if parsed.part not in parts:
-        raise InputError(
-            f"'{parsed.metric}': split '{counts.split}' of the run's data set does not contain "
-            "both images marked as day and images marked as night."
-        )
+        both = "both images marked as day and images marked as night"
+        raise InputError(f"'{parsed.metric}': split '{counts.split}' does not contain {both}.")
     return parts[parsed.part]
 
 

@@ -33,45 +33,19 @@ DAY = "day"
 NIGHT = "night"
 REGION_PROFILE = "profile/iou_by_region"  # as a line: the step is the region number
 
+# Names made of parts.
+region = "region/{}".format  # mIoU of a region, 1 = innermost, left or top
+class_iou = "class/{}".format  # IoU of a class
+of_class = "class/{}/{}".format  # a score of a class: "class/car/TC"
+in_region = "region/{}/{}".format  # a score of details inside a region
+subset = "{}/{}".format  # a score over the images of a part: "day/mIoU"
+consistency = "{}/{}".format  # TC or CA by protocol; under "released" CA is that of `CA_RELEASED`
+by_head = "{}_head/{}".format  # as one of two heads predicts: "source_head/night/mIoU"
+
 FRACTIONS = {
     *(MIOU, MACC, MPRECISION, MF1, PIXEL_ACCURACY, BOUNDARY_MIOU, BOUNDARY_IOU, ECE),
     *(WARPING_ERROR, FLICKER),
 }
-
-
-def region(number: int) -> str:
-    """The mIoU of region `number`, 1 = innermost, left or top."""
-    return f"region/{number}"
-
-
-def class_iou(name: str) -> str:
-    """IoU of the class called `name`."""
-    return f"class/{name}"
-
-
-def of_class(name: str, score: str) -> str:
-    """A score of one class, e.g. ``of_class("car", TC)``: "class/car/TC"."""
-    return f"class/{name}/{score}"
-
-
-def in_region(number: int, name: str) -> str:
-    """A score of details inside one region."""
-    return f"region/{number}/{name}"
-
-
-def consistency(score: str, protocol: str) -> str:
-    """`TC` or `CA` among the scores of a run; under "released" CA is that of `CA_RELEASED`."""
-    return f"{score}/{protocol}"
-
-
-def subset(part: str, name: str) -> str:
-    """Metric `name` over the images of one part, e.g. ``subset(DAY, MIOU)``: "day/mIoU"."""
-    return f"{part}/{name}"
-
-
-def by_head(head: str, name: str) -> str:
-    """Metric `name` as one of two heads predicts: ``by_head("source", "night/mIoU")``."""
-    return f"{head}_head/{name}"
 
 
 def in_percent(name: str, value: float) -> float:
@@ -82,8 +56,7 @@ def in_percent(name: str, value: float) -> float:
 def shown(values: Mapping[str, float]) -> dict[str, float]:
     """Values as MLflow shows them: scores in percent with two decimals, as the papers print them.
 
-    Its charts write 0.62 for a fraction, and its tables all sixteen digits. The folder keeps the
-    exact values.
+    Its charts write 0.62 for a fraction, and its tables all sixteen digits.
     """
     scores = {n for n in values if _is_fraction(n) or n.split("/")[-1] == VAR}
     return {n: round(in_percent(n, v), 2) if n in scores else v for n, v in values.items()}

@@ -77,10 +77,7 @@ def check_same(listed: PairList, wanted: PairList) -> None:
     if not listed.complete:
         raise InputError(f"the export of {listed.name} was interrupted; rerun it, then predict.")
     for key in ("split", "frames", "dataset", "views", "pairs"):
-        given, expected = getattr(wanted, key), getattr(listed, key)
-        if given != expected:
-            exported, counted = one_line(expected), one_line(given)
-            raise InputError(
-                f"{key}: the pairs were exported from {exported} ({listed.name}), but {counted} "
-                f"({wanted.name}) is counted; give the settings of the export."
-            )
+        exported, counted = (one_line(getattr(each, key)) for each in (listed, wanted))
+        if getattr(listed, key) != getattr(wanted, key):
+            said = f"the pairs were exported from {exported}, but {counted} is counted"
+            raise InputError(f"{key}: {said}; give the settings of the export.")

@@ -31,6 +31,7 @@ from rgbt.metrics.scores import Matrices, Scores, class_mean, iou, ratio
 Protocol = Literal["aligned", "released", "next", "flow", "triples"]
 PROTOCOLS: tuple[Protocol, ...] = get_args(Protocol)
 
+# The main scores of a protocol, TC and CA first: CA of the paper, or that of its release.
 HEADLINES: dict[Protocol, tuple[str, ...]] = {
     "aligned": (names.TC, names.CA),
     "released": (names.TC, names.CA_RELEASED),
@@ -38,7 +39,6 @@ HEADLINES: dict[Protocol, tuple[str, ...]] = {
     "flow": (names.TC, names.CA, names.WARPING_ERROR),
     "triples": (names.FLICKER,),
 }
-"""The main scores of a protocol, TC and CA first: CA of the paper, or that of its release."""
 
 
 def partition_name(protocol: Protocol, sets: int, views: str = "") -> str:
@@ -63,30 +63,25 @@ def tc(pairs: Matrices, absent: Absent) -> Scores:
 
         |P1 = P2 = c| / |P1 = c or P2 = c|,  of every set alone, then the mean over the S sets
 
-    Source: Temporal, Fig. 4; release, evaluation code. `absent`, for a class that neither frame of
-    a set shows: "released" 0 (the release, whose denominator has 1e-10 more); "exclude" NaN, left
-    out of the mean over the sets; NaN where no set shows the class.
+    Source: Temporal, Fig. 4; release, evaluation code, whose denominator has 1e-10 more. By
+    `absent`, a class that neither frame of a set shows is left out of the mean over the sets.
     """
     return _over_sets(iou(_by_set(pairs).sum(-3), absent))
 
 
 def ca(pairs: Matrices, absent: Absent) -> Scores:
-    """Consistent accuracy of each class: both predictions and the label over their exact union.
+    """Consistent accuracy of each class, as `tc`. Source: Temporal, Fig. 4 (E over A + ... + G).
 
-        |P1 = P2 = Y2 = c| / |P1 = c or P2 = c or Y2 = c|
-
-    Source: Temporal, Fig. 4 (E over A + ... + G). Otherwise as `tc`.
+    |P1 = P2 = Y2 = c| / |P1 = c or P2 = c or Y2 = c|
     """
     three, sizes, overlaps = _triples(pairs)
     return _over_sets(ratio(three, sizes - overlaps + three, absent))
 
 
 def ca_released(pairs: Matrices, absent: Absent) -> Scores:
-    """`ca` as coded, which counts what two of the three share, and not the third, twice.
+    """`ca` as coded (Temporal release), which counts what just two of the three share twice.
 
-        |P1 = P2 = Y2 = c| / (|P1 = c| + |P2 = c| + |Y2 = c| - 2 |P1 = P2 = Y2 = c|)
-
-    Source: Temporal release, evaluation code.
+    |P1 = P2 = Y2 = c| / (|P1 = c| + |P2 = c| + |Y2 = c| - 2 |P1 = P2 = Y2 = c|)
     """
     three, sizes, _ = _triples(pairs)
     return _over_sets(ratio(three, sizes - 2 * three, absent))
@@ -103,8 +98,7 @@ def only_labelled(pairs: Matrices) -> Scores:
 def changed(pairs: Matrices) -> tuple[Scores, Scores]:
     """Pixels by the class of the first frame: those with another class in the second, and all.
 
-    Source: warping error of Lai et al., "Learning Blind Video Temporal Consistency" (ECCV 2018),
-    with classes in place of colours. Summed over the S sets.
+    Source: Lai et al. (ECCV 2018), with classes in place of colours. Summed over the S sets.
     """
     frames = _by_set(pairs).sum((-4, -3))
     every = frames.sum(-1)

@@ -12,13 +12,7 @@ from rgbt.metrics.pairs import HEADLINES, protocol_of
 
 @dataclass(frozen=True)
 class ScoreGrid:
-    """A table of metric names (`rgbt.metrics.named`).
-
-    Attributes:
-        title: what the scores are, with their unit.
-        columns: titles of the columns.
-        rows: label and names, one for each column.
-    """
+    """A table of metric names: its title with the unit, titles of columns, and rows of names."""
 
     title: str
     columns: tuple[str, ...]
@@ -33,11 +27,18 @@ class ScoreGrid:
 def score_grid(counts: Counts) -> ScoreGrid:
     """The scores of counts; only their classes, partition and time of day are used."""
     details, protocol = details_of(counts.partition), protocol_of(counts.partition)
+
+    def by_class(scores: tuple[str, ...]) -> list[tuple[str, tuple[str, ...]]]:
+        labels = {name: f"{name} (not in means)" for name in counts.unscored}
+        return [
+            (labels.get(name, name), tuple(names.of_class(name, each) for each in scores))
+            for name in counts.classes
+        ]
+
     if protocol is not None:
         scores = HEADLINES[protocol]
-        rows = [*_by_class(counts, scores), ("all images", scores)]
-        for part in counts.parts():
-            rows.append((part, tuple(names.subset(part, each) for each in scores)))
+        rows = [*by_class(scores), ("all images", scores)]
+        rows += [(part, tuple(names.subset(part, s) for s in scores)) for part in counts.parts()]
         columns = tuple(score.replace("_", " ") for score in scores)
         return ScoreGrid("Consistency of pairs of frames in percent", columns, tuple(rows))
     numbers = _regions(counts, details)
@@ -46,22 +47,24 @@ def score_grid(counts: Counts) -> ScoreGrid:
         row = (*map(names.region, numbers), names.MIOU, names.VAR)
         columns = (*regions, names.MIOU, names.VAR)
         return ScoreGrid("mIoU in percent by region", columns, ((names.MIOU, row),))
-    means = headlines(counts)
-    if details.bins:
-        rows = [*_by_class(counts, means), ("mean", means)]
-        for number, region in zip(numbers, regions, strict=True):
-            rows.append((f"mean, {region}", tuple(names.in_region(number, m) for m in means)))
-        title = "IoU in percent by distance in metres"
-        if details.kind == "size":
-            title = "Recall in percent by size of the object in pixels"
-        return ScoreGrid(title, details.bins, tuple(rows))
-    columns = ("image", *regions)
+    means, columns = headlines(counts), details.bins or ("image", *regions)
     if details.kind == "calibration":
         title = f"Expected calibration error in percent points, {details.groups} bins"
         return ScoreGrid(title, columns, (("all pixels", means),))
-    rows = [*_by_class(counts, _everywhere(names.BOUNDARY_IOU, numbers)), ("mean", means)]
-    title = f"Boundary IoU in percent, width {100 * details.setting[0]:g} % of the image diagonal"
-    title += ", with the border of the image" if len(details.setting) > 1 else ""
+    if details.kind == "boundary":
+        rows = by_class(_everywhere(names.BOUNDARY_IOU, numbers))
+        title = (
+            f"Boundary IoU in percent, width {100 * details.setting[0]:g} % of the image diagonal"
+        )
+        title += ", with the border of the image" if len(details.setting) > 1 else ""
+        return ScoreGrid(title, columns, (*rows, ("mean", means)))
+    rows = [*by_class(means), ("mean", means)]
+    for number in numbers:
+        row = tuple(names.in_region(number, each) for each in means)
+        rows.append((f"mean, region {number}", row))
+    title = "IoU in percent by distance in metres"
+    if details.kind == "size":
+        title = "Recall in percent by size of the object in pixels"
     return ScoreGrid(title, columns, tuple(rows))
 
 
@@ -82,11 +85,3 @@ def _regions(counts: Counts, details: Details | None) -> range:
 def _everywhere(score: str, numbers: range) -> tuple[str, ...]:
     """A score in the whole image and in each region."""
     return (score, *(names.in_region(number, score) for number in numbers))
-
-
-def _by_class(counts: Counts, scores: tuple[str, ...]) -> list[tuple[str, tuple[str, ...]]]:
-    rows = []
-    for name in counts.classes:
-        label = f"{name} (not in means)" if name in counts.unscored else name
-        rows.append((label, tuple(names.of_class(name, each) for each in scores)))
-    return rows

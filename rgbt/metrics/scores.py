@@ -1,9 +1,8 @@
 """Compute all scores from counts.
 
-Counts are (..., K, K), rows = label, columns = prediction; leading dimensions (regions, images) are
-kept. Scores of classes are (..., K), means (...): fractions 0..1; variances are in squared percent
-points, as the papers print them. Means are over the scored classes alone
-(`rgbt.metrics.counts.Counts.scored`).
+Counts are (..., K, K), rows = label, columns = prediction. Scores of classes are (..., K), means
+over the scored ones (`rgbt.metrics.counts.Counts.scored`) are (...): fractions 0..1; variances are
+in squared percent points, as the papers print them.
 
 A score whose denominator has no pixel (0 / 0) is, by `absent`:
     "released": 0 and takes part in means, as in the CRM and SpatialSeg releases and their tables,
@@ -28,15 +27,11 @@ from rgbt.metrics.metric import Absent
 
 Scores = NDArray[np.float64]
 Matrices = NDArray[np.integer] | NDArray[np.float64]
-Scored = NDArray[np.bool_] | None
-"""(K,): which classes means are over; None: all."""
+Scored = NDArray[np.bool_] | None  # (K,): which classes means are over; None: all
 
 
 def iou(counts: Matrices, absent: Absent) -> Scores:
-    """Intersection over union of each class: ``TP / (TP + FP + FN)``.
-
-    Source: SpatialSeg, Eq. 18; CRM, RTFNet and Temporal releases.
-    """
+    """Intersection over union of each class: ``TP / (TP + FP + FN)`` (SpatialSeg, Eq. 18)."""
     right, labelled, predicted = _sums(counts)
     return ratio(right, labelled + predicted - right, absent)
 
@@ -54,11 +49,7 @@ def precision(counts: Matrices, absent: Absent) -> Scores:
 
 
 def f1(counts: Matrices, absent: Absent) -> Scores:
-    """``2 TP / (2 TP + FP + FN)`` of each class.
-
-    Released (Temporal): from precision and recall, hence NaN also for a class that is there and
-    never found right; here that is 0 under both settings.
-    """
+    """``2 TP / (2 TP + FP + FN)``; released (Temporal): NaN for a class that is never found."""
     right, labelled, predicted = _sums(counts)
     return ratio(2 * right, labelled + predicted, absent)
 
@@ -76,11 +67,9 @@ def miou(counts: Matrices, absent: Absent, scored: Scored) -> Scores:
 
 
 def variance(region_scores: ArrayLike) -> Scores:
-    """Population variance over regions, in squared percent points; fractions (..., R) -> (...).
+    """``10^4 / R  sum_r (s_r - mean s)^2``, without NaN regions; fractions (..., R) -> (...).
 
-        10^4 / R  sum_r (s_r - mean s)^2
-
-    Source: SpatialSeg, Eq. 19. Regions that are NaN (no class to score) are left out.
+    Source: SpatialSeg, Eq. 19.
     """
     percents = 100 * np.asarray(region_scores, dtype=np.float64)
     distances = percents - class_mean(percents)[..., None]
@@ -94,10 +83,7 @@ def pixel_accuracy(counts: Matrices) -> Scores:
 
 
 def boundary_iou(counts: Matrices, absent: Absent) -> Scores:
-    """``|G_d and P_d| / |G_d or P_d|`` of each class, of counts of boundaries (..., 3, K).
-
-    Source: Cheng et al.: "Boundary IoU", CVPR 2021, Sec. 4.
-    """
+    """``|G_d and P_d| / |G_d or P_d|`` of each class, of counts of boundaries (..., 3, K)."""
     both, label, predicted = (counts[..., row, :].astype(np.float64) for row in range(3))
     return ratio(both, label + predicted - both, absent)
 
@@ -105,11 +91,9 @@ def boundary_iou(counts: Matrices, absent: Absent) -> Scores:
 def ece(counts: Matrices) -> Scores:
     """``sum_b |correct_b - confidence_b| / sum_b number_b``, of counts (..., M, 3, K).
 
-    That is the mean over pixels of ``|acc(B_m) - conf(B_m)|``. All pixels of all images are pooled,
-    those of unscored classes included; NaN without pixels.
-
-    Source: Guo et al.: "On Calibration of Modern Neural Networks", ICML 2017, Eq. 3, with M equal
-    bins (0, 1/M], (1/M, 2/M], ... of the highest probability of each pixel.
+    That is the mean over pixels of ``|acc(B_m) - conf(B_m)|``, those of unscored classes included;
+    NaN without pixels. Source: Guo et al.: "On Calibration of Modern Neural Networks", ICML 2017,
+    Eq. 3, with M equal bins (0, 1/M], (1/M, 2/M], ... of the highest probability of each pixel.
     """
     number, correct, confidence = np.moveaxis(counts.sum(-1, dtype=np.float64), -1, 0)
     gaps = np.abs(correct - confidence / UNITS).sum(-1)
@@ -117,10 +101,7 @@ def ece(counts: Matrices) -> Scores:
 
 
 def object_recall(counts: Matrices) -> Scores:
-    """Recall of each class among the pixels of objects; NaN where no object of that size has any.
-
-    That is whatever the convention for absent classes: most classes have no objects of most sizes.
-    """
+    """Recall of each class among the pixels of objects; NaN without an object of that size."""
     return recall(counts, "exclude")
 
 
@@ -131,15 +112,10 @@ MEANS: dict[str, Callable[[Matrices, Absent, Scored], Scores]] = {
     names.MF1: lambda counts, absent, scored: class_mean(f1(counts, absent), scored),
     names.PIXEL_ACCURACY: lambda counts, _, __: pixel_accuracy(counts),
 }
-"""Scores of (..., K, K) matrices as fractions (...), over the scored classes."""
 
 
 def summary(counts: Counts, absent: Absent) -> dict[str, float]:
-    """Every score that is followed over a run, by its name in `rgbt.metrics.names`.
-
-    Means, variance over regions, mIoU of each region, IoU of each class (unscored ones too); mIoU
-    and variance again for day and for night if the data set distinguishes them.
-    """
+    """Every score that is followed over a run, by its name in `rgbt.metrics.names`."""
     whole, scored = counts.whole(), counts.scored
     result = _mean_and_variance(counts, absent)
     result |= {name: float(mean(whole, absent, scored)) for name, mean in MEANS.items()}
@@ -167,11 +143,10 @@ def absent_notes(
     split: str,
     absent: Absent,
 ) -> tuple[str, ...]:
-    """Footnotes of a class table, about absent scored classes, which change the means.
+    """Footnotes of a class table, from (R, K, K) counts: absent scored classes change the means.
 
-    At most three sentences without a full stop, of the (R, K, K) counts of all images: about
-    classes that are neither labelled nor predicted, classes that are predicted only, and classes
-    that some regions lack.
+    Classes that are neither labelled nor predicted, that are predicted only, and that some regions
+    lack.
     """
     counted = {"released": "counted as 0", "exclude": "left out of the mean"}[absent]
     labelled = by_region.sum(-1) > 0
@@ -181,15 +156,13 @@ def absent_notes(
     for each in np.flatnonzero(scored & there.any(0) & ~there.all(0)).tolist():
         regions = [str(number) for number in (np.flatnonzero(~there[:, each]) + 1)]
         lacks.append(f"{classes[each]} (region{'s' * (len(regions) > 1)} {', '.join(regions)})")
-    every = np.array(classes)
+    gone, unlabelled = (np.array(classes)[scored & each].tolist() for each in (gone, unlabelled))
     named = {
-        f"absent from the {split} split: {{}} ({counted})": every[scored & gone],
-        f"predicted, but not labelled in the {split} split: {{}} (IoU 0)": every[
-            scored & unlabelled
-        ],
+        f"absent from the {split} split: {{}} ({counted})": gone,
+        f"predicted, but not labelled in the {split} split: {{}} (IoU 0)": unlabelled,
         f"absent from some regions: {{}}; {counted} there": lacks,
     }
-    return tuple(note.format(", ".join(each)) for note, each in named.items() if len(each))
+    return tuple(note.format(", ".join(each)) for note, each in named.items() if each)
 
 
 def _sums(counts: Matrices) -> tuple[Scores, Scores, Scores]:
