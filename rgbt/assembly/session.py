@@ -22,8 +22,7 @@ from rgbt.data.cache import CachedDataset
 from rgbt.data.domains import Domains
 from rgbt.data.loader_settings import LoaderSettings
 from rgbt.dataset import LabelledDataset
-from rgbt.engine.device import autocast, choose_device, fix_threads, keep_memory
-from rgbt.engine.network_settings import place
+from rgbt.engine.device import autocast, choose_device, fix_threads, keep_memory, place
 from rgbt.engine.prediction import Prediction
 from rgbt.engine.settings import TrainerSettings
 from rgbt.metrics.metric import Regions

@@ -24,8 +24,8 @@ from rgbt.checks import InputError
 from rgbt.data.domains import GIVEN, NONE, Domain
 from rgbt.data.loaders import Batches, PairedBatches, steps_per_epoch, train_batches
 from rgbt.dataset import LabelledDataset
+from rgbt.engine.device import prepare_training
 from rgbt.engine.fabric import open_fabric
-from rgbt.engine.network_settings import prepare_training
 from rgbt.engine.schedules import Schedule
 from rgbt.engine.settings import TrainerSettings
 from rgbt.engine.trainer import Scheme

@@ -1,8 +1,4 @@
-"""Batch normalisation of a run with several processes: over the whole batch, or over its parts.
-
-With `trainer.batch_norm_parts` 1, mean and variance are those of the samples of all processes, and
-the result does not depend on their number. Otherwise each process normalises its own samples.
-"""
+"""Batch normalisation of a run with several processes: over the whole batch, or over its parts."""
 
 from __future__ import annotations
 
@@ -14,30 +10,19 @@ from rgbt.checks import InputError
 from rgbt.processes import agreed, num_processes, total
 
 OF_TORCH = (nn.BatchNorm1d, nn.BatchNorm2d, nn.BatchNorm3d)
-"""Classes that can be replaced without a change of behaviour."""
 
 
 def check_batch_norm_parts(parts: int, processes: int) -> None:
     """Refuse parts of a batch that this number of processes does not make."""
     if parts not in (1, processes):
-        raise InputError(
-            f"trainer.batch_norm_parts is {parts}, but the run has {processes} devices; set it to "
-            f"1 or {processes}."
-        )
+        raise InputError(f"trainer.batch_norm_parts={parts}: expected 1 or {processes} (devices).")
 
 
 def synchronise_batch_norm(model: nn.Module) -> nn.Module:
-    """Let every batch normalisation read the batch of all processes.
+    """Let every batch normalisation read the batch of all processes; nothing with one process.
 
-    Parameters, buffers and their names stay the same. On CUDA devices torch's own modules are
-    used. With one process, `model` is returned as it is.
-
-    Args:
-        model: on its device, before an optimizer or a wrapper refers to its modules; changed in
-            place, unless it is itself a normalisation.
-
-    Raises:
-        InputError: a subclass of torch's normalisations, whose behaviour would be lost.
+    Parameters, buffers and their names stay the same; the model is changed in place, unless it is
+    itself a normalisation. InputError: a subclass of torch's normalisations would be lost.
     """
     if num_processes() == 1:
         return model
@@ -45,9 +30,8 @@ def synchronise_batch_norm(model: nn.Module) -> nn.Module:
         known = (*OF_TORCH, nn.SyncBatchNorm, SynchronisedBatchNorm)
         if isinstance(module, _BatchNorm) and type(module) not in known:
             raise InputError(
-                f"model: '{name}' is a {type(module).__name__}, a class derived from a batch "
-                "normalisation of torch, which several devices cannot synchronise; set "
-                f"trainer.batch_norm_parts={num_processes()}."
+                f"model: several devices cannot synchronise '{name}', a {type(module).__name__}; "
+                f"set trainer.batch_norm_parts={num_processes()}."
             )
     if any(parameter.is_cuda for parameter in model.parameters()):
         on_cuda: nn.Module = nn.SyncBatchNorm.convert_sync_batchnorm(model)  # type: ignore[no-untyped-call]
@@ -55,11 +39,21 @@ def synchronise_batch_norm(model: nn.Module) -> nn.Module:
     return _converted(model)
 
 
-def share_running_statistics(model: nn.Module) -> None:
-    """Give every process the running statistics of process 0.
+def _converted(module: nn.Module) -> nn.Module:
+    """`module` with every batch normalisation of torch replaced, with its own tensors."""
+    if isinstance(module, OF_TORCH):
+        made = SynchronisedBatchNorm(module.num_features)
+        made.__dict__ |= module.__dict__
+        return made
+    for name, child in module.named_children():
+        module.add_module(name, _converted(child))
+    return module
 
-    Needed before an evaluation or a checkpoint where each process normalises its own samples;
-    the statistics have no effect on training. Called by all processes.
+
+def share_running_statistics(model: nn.Module) -> None:
+    """Give every process the running statistics of process 0; called by all.
+
+    Needed before an evaluation or a checkpoint where each process normalises its own samples.
     """
     norms = [module for module in model.modules() if isinstance(module, _BatchNorm)]
     buffers = [buffer for norm in norms for buffer in norm.buffers(recurse=False)]
@@ -68,10 +62,10 @@ def share_running_statistics(model: nn.Module) -> None:
 
 
 class SynchronisedBatchNorm(_BatchNorm):
-    """Batch normalisation over the samples of all processes, for devices without one of torch.
+    """Batch normalisation over the samples of all processes, as many each; torch has one for CUDA.
 
-    All processes have as many values. The variance of the batch is computed from differences to
-    the mean, so that the result equals that of one process to rounding.
+    The variance is computed from differences to the mean, so that the result equals that of one
+    process to rounding.
     """
 
     def forward(self, input: Tensor) -> Tensor:  # noqa: A002 - the name in torch
@@ -105,14 +99,3 @@ class SynchronisedBatchNorm(_BatchNorm):
 
     def _check_input_dim(self, input: Tensor) -> None:  # noqa: A002 - the name in torch
         """Any number of dimensions."""
-
-
-def _converted(module: nn.Module) -> nn.Module:
-    """`module` with every batch normalisation of torch replaced, with its own tensors."""
-    if isinstance(module, OF_TORCH):
-        made = SynchronisedBatchNorm(module.num_features)
-        made.__dict__ |= module.__dict__
-        return made
-    for name, child in module.named_children():
-        module.add_module(name, _converted(child))
-    return module

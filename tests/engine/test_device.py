@@ -1,4 +1,4 @@
-"""Settings of the network: recomputed activations, memory format, compiled forward."""
+"""Threads, recomputed activations, memory format, compiled forward."""
 
 from __future__ import annotations
 
@@ -11,26 +11,20 @@ from torch import Tensor, nn
 
 from rgbt.checks import InputError
 from rgbt.engine.checkpoint import restore_optimizer
-from rgbt.engine.network_settings import Recomputed, place, prepare_training
+from rgbt.engine.device import Recomputed, fix_threads, place, prepare_training
 from rgbt.engine.optimizers import AdamW
 from rgbt.engine.settings import TrainerSettings
 from rgbt.requirements import Record
-from tests.engine.test_trainer import SETTINGS
+from tests.engine.test_trainer import ADAMW, SETTINGS
 from tests.models.plain import generator, images, nano
 
 CPU = torch.device("cpu")
 ALL_VIEWS = ("rgbt", "rgb", "thermal")
 DROPS = {"drop_path_rate": 0.4}
 CASES: list[Any] = [
-    ("mfnet", {}),
-    ("rtfnet", {}),
-    ("pspnet", {}),
-    ("deeplabv2", {}),
-    ("cmx", {**DROPS, "decoder_dropout": 0.3}),
-    ("mask2former", DROPS),
-    ("mask2former", {**DROPS, "share_start": 2}),
-    ("cmnext", {**DROPS, "decoder_dropout": 0.3}),
-    ("dinov2", {}),
+    *((name, {}) for name in ("mfnet", "rtfnet", "pspnet", "deeplabv2", "dinov2")),
+    *((name, {**DROPS, "decoder_dropout": 0.3}) for name in ("cmx", "cmnext")),
+    *(("mask2former", changes) for changes in (DROPS, {**DROPS, "share_start": 2})),
     ("dinov2", {"tuning": "lora"}),
 ]
 ONE_EACH = ("mfnet", "rtfnet", "pspnet", "deeplabv2", "cmx", "cmnext", "mask2former")
@@ -113,26 +107,28 @@ def test_recomputation_leaves_the_buffers_of_the_network() -> None:
     assert counts == {2}  # forward passes
 
 
-class Own(nn.Module):
+def own(*recomputed: str) -> nn.Module:
     """A user's network."""
-
-    def __init__(self, *recomputed: str) -> None:
-        super().__init__()
-        self.record = Record(recomputed=recomputed)
-        self.blocks = nn.Sequential(nn.Linear(3, 3), nn.Linear(3, 3))
+    net = nn.ModuleDict({"blocks": nn.Sequential(nn.Linear(3, 3), nn.Linear(3, 3))})
+    net.record = Record(recomputed=recomputed)
+    return net
 
 
-@pytest.mark.parametrize("recomputed", [(), ("layers.*",)])
-def test_network_that_declares_no_module_is_refused(recomputed: tuple[str, ...]) -> None:
-    with pytest.raises(InputError, match="activation_checkpointing: .* record of Own"):
-        prepare_training(Own(*recomputed), settings(activation_checkpointing=True))
-
-
-def test_star_stands_for_one_part_of_a_name() -> None:
-    net = Own("blocks.*")
+@pytest.mark.parametrize(
+    ("recomputed", "changes", "words"),
+    [
+        ((), {}, "record of ModuleDict"),
+        (("layers.*",), {}, "record of ModuleDict"),
+        (("blocks.*",), {"compile": "default"}, "cannot be used with trainer.compile"),
+    ],
+)
+def test_recomputation_that_is_impossible_is_refused(recomputed, changes, words: str) -> None:
+    net = own("blocks.*")  # a star stands for one part of a name
     prepare_training(net, settings(activation_checkpointing=True))
-    assert all(isinstance(block.forward, Recomputed) for block in net.blocks)
-    assert not isinstance(net.blocks.forward, Recomputed)
+    found = [isinstance(each.forward, Recomputed) for each in net.modules()]
+    assert found == [False, False, True, True]
+    with pytest.raises(InputError, match=f"activation_checkpointing: .*{words}"):
+        prepare_training(own(*recomputed), settings(activation_checkpointing=True, **changes))
 
 
 @pytest.mark.parametrize("name", ["mfnet", "rtfnet", "pspnet", "deeplabv2", "cmx", "cmnext"])
@@ -152,12 +148,10 @@ def test_channels_last_differs_by_rounding_alone(name: str) -> None:
 @pytest.mark.parametrize("formats", [("contiguous", "channels_last"), ("channels_last",) * 2])
 def test_resumed_optimizer_has_the_layout_of_the_network(formats: tuple[str, str]) -> None:
     """A fused optimizer reads parameter and moments in the order of memory."""
-    builder = AdamW(lr=1e-2, backbone_multiplier=1.0, weight_decay=0.1, decay_biases=True,
-                    betas=(0.9, 0.999), eps=1e-8)  # fmt: skip
 
     def start(memory_format: str) -> tuple[nn.Module, torch.optim.Optimizer]:
         net = place(nano("rtfnet"), CPU, settings(memory_format=memory_format))
-        return net, builder(net)
+        return net, AdamW(**ADAMW)(net)
 
     def step(net: nn.Module, optimizer: torch.optim.Optimizer) -> None:
         for number, parameter in enumerate(net.parameters()):
@@ -178,44 +172,6 @@ def test_resumed_optimizer_has_the_layout_of_the_network(formats: tuple[str, str
         torch.testing.assert_close(found, expected)
 
 
-def test_compiled_and_recomputed_is_refused() -> None:
-    with pytest.raises(InputError, match="activation_checkpointing: cannot be used with"):
-        prepare_training(nano("mfnet"), settings(compile="default", activation_checkpointing=True))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "changes", "most"),
-    [
-        *((name, {}, 1) for name in ONE_EACH if name not in ("pspnet", "mask2former")),
-        ("mask2former", {}, 1),
-        ("mask2former", DROPS, 12),
-        ("cmx", {**DROPS, "decoder_dropout": 0.3}, 12),
-    ],
-)
-def test_graph_is_broken_by_draws_alone(
-    name: str, changes: dict[str, Any], most: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Without a compiler: graphs are run as they are. Evaluation makes none."""
-    graphs: list[Any] = []
-
-    def compile_eagerly(forward: Any, mode: str) -> Any:  # noqa: ARG001
-        def backend(graph: Any, _: Any) -> Any:
-            graphs.append(graph)
-            return graph.forward
-
-        torch._dynamo.reset()
-        return torch._dynamo.optimize(backend)(forward)
-
-    monkeypatch.setattr(torch, "compile", compile_eagerly)
-    net = nano(name, **changes)
-    prepare_training(net, settings(compile="default"))
-    net.eval()(*images(1))
-    assert graphs == []
-    net.train()(*images(2), generator=generator())
-    assert 1 <= len(graphs) <= most
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "changes"), [CASES[i] for i in (0, 1, 4, 5)])
 def test_compiled_steps_give_the_same_losses(name: str, changes: dict[str, Any]) -> None:
@@ -225,3 +181,24 @@ def test_compiled_steps_give_the_same_losses(name: str, changes: dict[str, Any])
     assert list(net.state_dict()) == list(plain.state_dict())
     for expected, found in zip(trained(plain, 5), trained(net, 5), strict=True):
         torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-4)
+
+
+@pytest.fixture
+def kept_threads() -> Any:
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.usefixtures("kept_threads")
+def test_fix_threads_does_not_depend_on_the_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    for num_threads in (1, 3):
+        fix_threads(num_threads)
+        assert torch.get_num_threads() == num_threads
+    for name, ends, fits in (("OMP_DYNAMIC", "TRUE", "false"), ("OMP_THREAD_LIMIT", "1", "2")):
+        monkeypatch.setenv(name, fits)
+        fix_threads(2)
+        monkeypatch.setenv(name, ends)
+        with pytest.raises(InputError, match=rf"trainer.threads=2: unset {name}={ends}"):
+            fix_threads(2)
+        monkeypatch.delenv(name)
