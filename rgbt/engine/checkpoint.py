@@ -24,8 +24,7 @@ from annotated_types import Ge
 from pydantic import TypeAdapter
 from torch import Tensor, nn
 
-from rgbt.checkpoints.read import NOTE
-from rgbt.checkpoints.torch_files import is_plain, misfits, read_torch_file, save
+from rgbt.checkpoints.files import NOTE, is_plain, misfits, read_torch_file, save
 from rgbt.checks import InputError, RunError, not_finite, one_line
 
 UNAVERAGED = "unaveraged"

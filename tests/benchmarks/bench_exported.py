@@ -21,8 +21,7 @@ from rgbt.config.command import built
 from rgbt.config.compose import available
 from rgbt.evaluation.export import compare
 from rgbt.evaluation.profiled_network import from_overrides
-from rgbt.exported.graph import ScoresOfImages
-from rgbt.exported.onnx_network import exported_network
+from rgbt.exported.onnx_network import ScoresOfImages, exported_network
 from rgbt.randomness import derive
 from rgbt.requirements import record_of
 
