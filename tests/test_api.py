@@ -15,8 +15,8 @@ import pytest
 
 import rgbt
 from rgbt import predict
-from rgbt.checkpoints.read import NOTE
-from rgbt.checkpoints.torch_files import read_torch_file, save
+from rgbt.checkpoints.files import NOTE
+from rgbt.checkpoints.files import read_torch_file, save
 from rgbt.checks import InputError
 from rgbt.config.stored_config import read_settings
 from rgbt.metrics.counts import Counts

@@ -20,8 +20,7 @@ from pydantic import TypeAdapter
 from torch import Tensor, nn
 
 from rgbt.averaging import AveragedNetwork
-from rgbt.checkpoints.read import NOTE
-from rgbt.checkpoints.torch_files import is_plain, misfits, read_torch_file, save
+from rgbt.checkpoints.files import NOTE, is_plain, misfits, read_torch_file, save
 from rgbt.checks import InputError, RunError, one_line
 from rgbt.engine.settings import TrainerSettings
 

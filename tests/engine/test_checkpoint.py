@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from torch import nn
 
-from rgbt.checkpoints.torch_files import save
+from rgbt.checkpoints.files import save
 from rgbt.checks import InputError, RunError
 from rgbt.engine import checkpoint
 from rgbt.engine.checkpoint import Checkpoints, State, load_checkpoint, restore_weights

@@ -10,7 +10,6 @@ from rgbt.config.compose import compose
 from rgbt.run import main
 from rgbt.runs.run_spec import WEIGHTS, RunSpec
 from rgbt.runs.specify import specify
-from rgbt.training.pipeline import topological_order
 from tests.commands import Call
 
 EXPERIMENTS = sorted(path.stem for path in Path("conf/experiment").glob("*.yaml"))
@@ -72,7 +71,7 @@ def test_start_shares_what_does_not_change_its_result() -> None:
 
 def test_stages_of_a_chain_begin_with_the_start() -> None:
     run = spec_of("multi_head_night", "seed=2", "runs_dir=/none")
-    assert [(each.name, each.seed) for each in topological_order(run)] == [
+    assert [(each.name, each.seed) for each in run.pending] == [
         ("start_deeplabv2_heads", 1002),
         ("start_pspnet", 1002),
         ("thermal_teacher", 2),
