@@ -101,7 +101,7 @@ def pseudo(path: Path) -> None:
 
 def read_pseudo(path: Path) -> Any:
     labels = PseudoLabels(path.parent if path.suffix == ".json" else path.parents[1])
-    return labels.classes, labels.digest, *labels.read("a", 5)
+    return labels.classes, labels.digest, *labels.read("a")
 
 
 def robustness(path: Path) -> None:

@@ -13,7 +13,7 @@ from analysis.statistics.claims import claims
 from analysis.statistics.data import SpatialStatistics
 from analysis.statistics.judging import OPEN
 from tests.commands import Call
-from tests.data.kp_files import write_kp
+from tests.data.layouts import write_kp
 
 ROOT = Path(__file__).resolve().parents[2]
 SHARED = Path(os.environ.get("RGBT_SHARED", ROOT.parent / "shared"))

@@ -23,13 +23,9 @@ def test_ids_are_mapped_one_by_one() -> None:
 @pytest.mark.parametrize(
     ("groups", "said"),
     [
-        (
-            {"car": (0, 1), "rode": (2, 3)},
-            "'rode' is not a valid choice; did you mean",
-        ),
+        ({"car": (0, 1), "rode": (2, 3)}, "'rode' is not a valid choice; did you mean"),
         ({"car": (0, 1), "road": (3,)}, "every id from 0 to 3 once, got [0, 1, 3]"),
         ({"car": (0, 1, 2), "road": (2, 3)}, "got [0, 1, 2, 2, 3]"),
-        ({"car": (0, 1, 2), "road": (3, 4)}, "got [0, 1, 2, 3, 4]"),
         ({"car": (0, 1, -1), "road": (2, 3)}, "got [-1, 0, 1, 2, 3]"),
     ],
 )
@@ -44,8 +40,6 @@ def test_other_networks_and_data_sets_are_refused() -> None:
     label_map.check(2, TARGETS, "streets")
     with pytest.raises(InputError, match=r"maps 2 classes .* network has 9 classes"):
         label_map.check(9, TARGETS, "streets")
-    with pytest.raises(InputError, match=r"to road, car, but .* streets has sky"):
-        label_map.check(2, ("sky",), "streets")
     # The same names under other ids are other classes.
     with pytest.raises(InputError, match=r"to road, car, but .* streets has car, road"):
         label_map.check(2, TARGETS[::-1], "streets")

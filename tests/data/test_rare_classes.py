@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 import torch
 
-from rgbt.checks import InputError
 from rgbt.data.loaders import LoaderSettings, train_batches
 from rgbt.data.mfnet import MFNet
 from rgbt.data.rare_classes import RareClassExamples, class_probabilities, count_rare_classes
 from rgbt.randomness import numpy_generator
 from rgbt.types import Batch
+from tests.data.layouts import refused
 from tests.transforms import recipes
 
 PIXELS = {"1D": (768, 0, 0), "2D": (668, 100, 0), "3D": (628, 100, 40), "4D": (708, 0, 60)}
@@ -26,15 +26,8 @@ PIXELS = {"1D": (768, 0, 0), "2D": (668, 100, 0), "3D": (628, 100, 40), "4D": (7
 
 
 def settings(**changes: Any) -> LoaderSettings:
-    base = LoaderSettings(
-        batch_size=2,
-        eval_batch_size=1,
-        num_workers=0,
-        sampling="rare_classes",
-        class_temperature=0.5,
-        min_class_pixels=50,
-    )
-    return dataclasses.replace(base, **changes)
+    base = LoaderSettings(2, 1, 0, class_temperature=0.5, min_class_pixels=50)
+    return dataclasses.replace(base, sampling="rare_classes", **changes)
 
 
 @pytest.fixture
@@ -79,11 +72,10 @@ def test_unscored_classes_are_not_drawn(dataset: MFNet) -> None:
 
 
 def test_class_without_an_image_is_refused(dataset: MFNet) -> None:
-    with pytest.raises(InputError, match=r"pixels=60: no image of .* more pixels of 'person'"):
-        count_rare_classes(dataset, "train", settings(min_class_pixels=60))
+    said = refused(lambda: count_rare_classes(dataset, "train", settings(min_class_pixels=60)))
+    assert "pixels=60: no image of train of mfnet has more pixels of 'person'" in said
     dataset.unscored = dataset.classes
-    with pytest.raises(InputError, match="any class.* data.sampling=shuffled"):
-        count_rare_classes(dataset, "train", settings())
+    assert "'any class'" in refused(lambda: count_rare_classes(dataset, "train", settings()))
 
 
 @pytest.mark.parametrize(
@@ -128,15 +120,14 @@ def batches(dataset: MFNet, steps: range, seed: int = 7, **changes: Any) -> list
     return list(found)
 
 
-@pytest.mark.parametrize("workers", [0, 2])
-def test_same_batches_whatever_the_workers_and_the_first_step(dataset: MFNet, workers: int) -> None:
+def test_same_batches_whatever_the_workers_and_the_first_step(dataset: MFNet) -> None:
     """Two steps per epoch; a run that resumes at step 3 has the batches of one that did not."""
     whole = batches(dataset, range(6))
-    late = batches(dataset, range(3, 6), num_workers=workers)
-    for one, other in zip(whole[3:], late, strict=True):
-        assert one.name == other.name
-        assert torch.equal(one.label, other.label)
-        assert torch.equal(one.rgb, other.rgb)
+    for workers in (0, 2):
+        late = batches(dataset, range(3, 6), num_workers=workers)
+        for one, other in zip(whole[3:], late, strict=True):
+            assert one.name == other.name
+            assert torch.equal(one.rgb, other.rgb)
     names = [batch.name for batch in whole]
     assert len(set(names)) > 1
     assert names != [batch.name for batch in batches(dataset, range(6), seed=8)]
@@ -149,5 +140,4 @@ def test_unreadable_images_are_skipped(dataset: MFNet) -> None:
             path.write_bytes(b"damaged")
     found = batches(dataset, range(6), on_error="skip", min_class_pixels=30, class_temperature=0.01)
     assert {name for batch in found for name in batch.name} == {"3D"}
-    with pytest.raises(InputError, match="cannot be"):
-        count_rare_classes(dataset, "train", settings())
+    assert "cannot be" in refused(lambda: count_rare_classes(dataset, "train", settings()))

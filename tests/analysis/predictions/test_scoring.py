@@ -163,7 +163,7 @@ def test_the_nearest_pixel_is_nearest_by_centres(tiny: MFNet, write: Write) -> N
 def test_the_first_bad_file_of_the_split_is_named(tiny: MFNet, write: Write) -> None:
     bad = write({name: np.full((4, 4), 7) for name in PREDICTIONS})
     for _ in range(3):
-        with pytest.raises(InputError, match=r"00001D\.png: 16 pixels are 7, which is no class"):
+        with pytest.raises(InputError, match=r"00001D\.png: label value 7 .16 pixels"):
             score_folder(bad, tiny, "test", STRIPS)
 
 
