@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import cache
 from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -13,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from analysis.archive.files import ArchivedRun, archived, counts_of
-from rgbt.checks import InputError, nearest, split_list
+from rgbt.checks import InputError, nearest, one_line, split_list
 from rgbt.files.plain_files import read_json
 from rgbt.metrics import names
 from rgbt.metrics.counts import Counts
@@ -23,15 +25,7 @@ from rgbt.metrics.named import parse, value
 from rgbt.metrics.pairs import file_name, protocol_of
 from rgbt.metrics.score_grid import score_grid
 from rgbt.metrics.scores import MEANS, iou, miou, recall, variance
-from rgbt.runs.folder import (
-    GROUP,
-    Description,
-    RunFolder,
-    counts_name,
-    find_run,
-    is_finished,
-    runs_in,
-)
+from rgbt.runs.folder import GROUP, RunFolder, counts_name, find_run, is_finished, runs_in
 from rgbt.runs.result import RunResult
 from rgbt.terminal import info, warn
 from rgbt.types import VIEWS
@@ -40,6 +34,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 SEED, EXPERIMENT = "rgbt.seed", "rgbt.experiment"
+ROBUSTNESS = "robustness"
+"""Tags of runs, and the folder below ``evaluations`` with counts of corrupted images."""
 
 CLEAN, ALL = "clean", "all"
 """Condition of images as they are, as the run is made for; subset of all images of a split."""
@@ -60,14 +56,15 @@ Frames = Literal["", "aligned", "released", "next", "flow", "triples"]
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A file of counts of a run.
+    """A file of counts.
 
     Attributes:
         path: of the file.
         condition: `CLEAN`, an input ("rgb"), or a corruption ("noise"), each followed by what else
             was changed: another head, checkpoint, data set or statistics of batch normalisation.
-        severity: of the corruption; NaN for others.
-        title: of the corruption, as shown; "" for others.
+        severity: of the corruption, 0 is the clean image; NaN for others.
+        row: the corruption alone: "noise", "rgb_removed", "features-thermal"; "" for others.
+        title: of the corruption, as shown.
         unit: of the severity; "" where there is one alone.
     """
 
@@ -75,8 +72,25 @@ class Evaluation:
     counts: Counts
     condition: str = CLEAN
     severity: float = math.nan
+    row: str = ""
     title: str = ""
     unit: str = ""
+
+
+def level_of(path: Path) -> Evaluation:
+    """A file of ``rgbt robustness``, which has a description beside it.
+
+    Raises:
+        InputError: a damaged file, or one of another command.
+    """
+    file, advice = path.with_suffix(".json"), "remove it, and rgbt robustness makes it again"
+    made = read_json(file, dict[str, Any], advice)
+    try:
+        row, title, unit = (str(made[key]) for key in ("row", "title", "unit"))
+        severity = float(made["severity"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{file} is not of rgbt robustness ({one_line(error)}).") from error
+    return Evaluation(path, Counts.load(path), row, severity, row, title, unit)
 
 
 def finished_runs(runs: Path | str = "runs", archive: Path | str = "results") -> list[RunResult]:
@@ -121,34 +135,30 @@ def evaluations_of(run: RunResult, split: str = "test") -> Iterator[Evaluation]:
     for path in counts_of(run.folder):
         try:
             found = _evaluation(run, path)
-        except (InputError, KeyError, TypeError, ValueError) as error:
+        except InputError as error:
             warn(f"{path} is left out: {error}")
             continue
-        if found and found.counts.split == split:
+        # Clean images once more, with their corruptions, are those that the run ended with.
+        is_again = found.row == found.condition == CLEAN
+        if found.counts.split == split and not is_again:
             yield found
 
 
-def _evaluation(run: RunResult, path: Path) -> Evaluation | None:
-    """What a file is of; its name and the description beside it say so. None: again clean."""
+def _evaluation(run: RunResult, path: Path) -> Evaluation:
+    """What a file is of; its name and the description beside it say so."""
     counts = run.counts(path.relative_to(run.folder).as_posix())
     if path.parent == run.folder:
         return Evaluation(path, counts)
-    other = [] if counts.dataset == run.fingerprint else [f"dataset {counts.dataset[:8]}"]
-    if (made_file := path.with_suffix(".json")).is_file():
-        made = read_json(made_file, dict[str, Any], "rgbt robustness makes it again")
-        rest = path.parent.name.removeprefix(counts.split).strip("_")
-        condition = " ".join(filter(None, [str(made["row"]), rest, *other]))
-        if condition == CLEAN:  # as the run ended
-            return None
-        severity, title, unit = float(made["severity"]), str(made["title"]), str(made["unit"])
-        return Evaluation(path, counts, condition, severity, title, unit)
-    if protocol_of(counts.partition):
-        rest = path.stem.rpartition(f"_{counts.split}")[2].strip("_")
-        return Evaluation(path, counts, " ".join(filter(None, [CLEAN, rest, *other])))
-    after = f"({'|'.join(VIEWS)})_{regions_of(counts.partition)}(.*?)(-({'|'.join(KINDS)}))?"
-    match = re.fullmatch(f".*_{re.escape(counts.split)}_{after}", path.stem)
-    words = [match[1], match[2].strip("_")] if match else [path.stem]
-    return Evaluation(path, counts, " ".join(filter(None, [*words, *other])))
+    other = "" if counts.dataset == run.fingerprint else f"dataset {counts.dataset[:8]}"
+    if path.parent.parent.name == ROBUSTNESS:
+        level, rest = level_of(path), path.parent.name.removeprefix(counts.split).strip("_")
+        return replace(level, condition=" ".join(filter(None, (level.row, rest, other))))
+    words = [CLEAN, path.stem.rpartition(f"_{counts.split}")[2].strip("_")]
+    if protocol_of(counts.partition) is None:
+        after = f"({'|'.join(VIEWS)})_{regions_of(counts.partition)}(.*?)(-({'|'.join(KINDS)}))?"
+        match = re.fullmatch(f".*_{re.escape(counts.split)}_{after}", path.stem)
+        words = [match[1], match[2].strip("_")] if match else [path.stem]
+    return Evaluation(path, counts, " ".join(filter(None, [*words, other])))
 
 
 def score_frame(counts: Counts, absent: Absent | None = None) -> pd.DataFrame:
@@ -216,9 +226,8 @@ def results(
 
     frames = []
     for run in finished_runs(runs, archive):
-        tags = run.tags
+        tags, seed = run.tags, _seed_of(run)
         texts = run.key, tags.get(EXPERIMENT, ""), tags.get(GROUP, "")
-        seed = int(tags[SEED]) if tags.get(SEED, "").lstrip("-").isdecimal() else pd.NA
         for each in evaluations_of(run, split):
             if not evaluations and each.path.parent != run.folder:
                 continue
@@ -253,28 +262,34 @@ class NamedCounts:
 
 
 def open_counts(
-    text: str, runs_dir: Path | str = "runs", split: str = "", frames: Frames = ""
+    text: str,
+    runs_dir: Path | str = "runs",
+    split: str = "",
+    frames: Frames = "",
+    archive: Path | str = "results",
 ) -> tuple[NamedCounts, ...]:
     """The counts that `text` names, the seeds of one method one after the other.
 
     Args:
         text: a run (folder, config key or MLflow run id), a file of counts (.npz), the name of a
-            group ("grbm sigma_div=2": all its seeds in `runs_dir`), or several of these with commas
-            between them.
+            group ("grbm sigma_div=2": all its seeds), or several of these with commas between them.
         runs_dir: where runs lie.
         split: "": the test split of runs, and whatever a file holds.
         frames: of runs, counts of single frames, or of pairs of frames by one protocol
             (`rgbt.metrics.pairs`); "": single frames of runs, and whatever a file holds.
+        archive: where archived runs lie, which have keys and groups as those of `runs_dir`.
 
     Raises:
         InputError: there is no such thing, a run has no counts of the split or of pairs, or a file
             is of others.
     """
-    root = Path(runs_dir)
+    finished = cache(lambda: finished_runs(runs_dir, archive))
     # A group's name may hold commas itself: "crm train_sizes=[240,480]".
-    is_whole = Path(text).suffix != ".npz" and bool(_of_group(text, root))
+    is_whole = "," in text and not text.endswith(".npz") and bool(_of_group(text, finished()))
     words = [text] if is_whole else split_list(text, RUNS)
-    found = [each for word in words for each in _open(word, root, split, frames)]
+    found = [
+        each for word in words for each in _open(word, Path(runs_dir), finished, split, frames)
+    ]
     for named in found:
         counts = named.counts
         if split and counts.split != split:
@@ -317,10 +332,9 @@ def _check_trainings_differ(text: str, found: Sequence[NamedCounts]) -> None:
             )
 
 
-def groups_in(runs_dir: Path | str) -> list[str]:
-    """Names of all groups with finished runs in a folder."""
-    runs = [run for run in _runs(Path(runs_dir)) if run.is_finished]
-    return sorted({_description(run).tags.get(GROUP, "") for run in runs} - {""})
+def groups_in(runs_dir: Path | str, archive: Path | str = "results") -> list[str]:
+    """Names of all groups of finished runs."""
+    return sorted({run.tags.get(GROUP, "") for run in finished_runs(runs_dir, archive)} - {""})
 
 
 def label_of(counts: Sequence[NamedCounts]) -> str:
@@ -328,45 +342,43 @@ def label_of(counts: Sequence[NamedCounts]) -> str:
     return " + ".join(dict.fromkeys(each.label for each in counts))
 
 
-def _open(word: str, runs_dir: Path, split: str, frames: Frames) -> list[NamedCounts]:
+def _open(
+    word: str,
+    runs_dir: Path,
+    finished: Callable[[], list[RunResult]],
+    split: str,
+    frames: Frames,
+) -> list[NamedCounts]:
     path = Path(word).expanduser()
     if path.suffix == ".npz":
         return [_of_file(path)]
-    grouped = _of_group(word, runs_dir)
-    if grouped:
-        return [_of_run(folder, split, frames) for folder in grouped]
-    if _is_folder(path) and not (path / "config.yaml").is_file():
-        return [_of_scores(path)]
     try:
-        folder = find_run(word, runs_dir)
-    except (InputError, OSError) as error:  # OSError: longer than a file's name may be
-        groups = groups_in(runs_dir)
-        known = f" or a group of {runs_dir} ({nearest(word, groups)})" if groups else ""
-        raise InputError(
-            f"'{word}' is not a run folder, config key or MLflow run id in {runs_dir}, nor a file "
-            f"of counts (.npz){known}."
-        ) from error
-    return [_of_run(RunResult(folder), split, frames)]
-
-
-def _is_folder(path: Path) -> bool:
-    try:
-        return path.is_dir()
-    except OSError:  # longer than a file's name may be
-        return False
+        chosen = [RunResult(find_run(word, runs_dir))]
+    except (InputError, OSError):  # OSError: longer than a file's name may be
+        chosen = [run for run in finished() if run.key == word] or _of_group(word, finished())
+    if chosen:
+        return [_of_run(run, split, frames) for run in chosen]
+    with suppress(OSError):
+        if path.is_dir():
+            return [_of_scores(path)]
+    groups = sorted({run.tags.get(GROUP, "") for run in finished()} - {""})
+    known = f" or a group of {runs_dir} ({nearest(word, groups)})" if groups else ""
+    raise InputError(
+        f"'{word}' is not a run folder, config key or MLflow run id in {runs_dir}, nor a file "
+        f"of counts (.npz){known}."
+    )
 
 
 def _of_scores(folder: Path) -> NamedCounts:
     """The counts in a folder that `analysis.score` wrote: by rings, as the papers' tables are."""
     files = sorted(folder.glob("counts_ring*.npz")) or sorted(folder.glob("counts_*.npz"))
-    if not files:
+    if len(files) != 1:
+        found = ", ".join(file.name for file in files)
         raise InputError(
-            f"{folder} contains neither a run (config.yaml) nor counts (counts_*.npz); to count "
-            "label images of a method: rgbt score predictions=... dataset=..."
-        )
-    if len(files) > 1:
-        raise InputError(
-            f"{folder} contains {', '.join(file.name for file in files)}; name one of these files."
+            f"{folder} contains {found}; name one of these files."
+            if files
+            else f"{folder} contains neither a run (config.yaml) nor counts (counts_*.npz); to "
+            "count label images of a method: rgbt score predictions=... dataset=..."
         )
     return _of_file(files[0])
 
@@ -379,40 +391,27 @@ def _of_file(path: Path) -> NamedCounts:
     return NamedCounts(label, path, Counts.load(path))
 
 
-def _of_group(word: str, runs_dir: Path) -> list[RunResult]:
-    runs = _runs(runs_dir) if word else []  # "" is no group, but that of runs without one
-    return [r for r in runs if word == _description(r).tags.get(GROUP) and r.is_finished]
-
-
-def _runs(runs_dir: Path) -> list[RunResult]:
-    return [RunResult(run.path) for run in runs_in(runs_dir)] if runs_dir.is_dir() else []
+def _of_group(word: str, runs: Sequence[RunResult]) -> list[RunResult]:
+    """The runs of a group; "" is no group, but that of runs without one."""
+    return [run for run in runs if word and word == run.tags.get(GROUP)]
 
 
 def _of_run(run: RunResult, split: str, frames: Frames) -> NamedCounts:
     split = split or "test"
-    path = run.folder / file_name(frames, split) if frames else run.folder / counts_name(split)
-    if frames and not path.is_file():
+    name = file_name(frames, split) if frames else counts_name(split)
+    if frames and not (run.folder / name).is_file():
         views = {"next": "next", "flow": "video", "triples": "video"}.get(frames, "virtual")
         raise InputError(
-            f"{run.folder} has no counts of pairs of frames {path.relative_to(run.folder)}; "
-            f"rgbt consistency run={run.folder} split={split} frames={views} makes them once it is "
-            "finished."
+            f"{run.folder} has no counts of pairs of frames {name}; rgbt consistency "
+            f"run={run.folder} split={split} frames={views} makes them once it is finished."
         )
     if not run.is_finished:
         info(f"{run.folder} is not finished; its counts are those of its last evaluation.")
-    description = _description(run)
-    seed = description.tags.get(SEED, "")
-    return NamedCounts(
-        label=description.tags.get(GROUP) or run.key,
-        path=path,
-        counts=Counts.load(path) if frames else run.counts(split),
-        run=run,
-        seed=int(seed) if seed else None,
-    )
+    counts = run.counts(name if frames else split)
+    label = run.tags.get(GROUP) or run.key
+    return NamedCounts(label, run.folder / name, counts, run, _seed_of(run))
 
 
-def _description(run: RunResult) -> Description:
-    try:
-        return run.description
-    except (InputError, TypeError):  # a damaged run.json of some run is no reason to stop
-        return Description("", {}, {})
+def _seed_of(run: RunResult) -> int | None:
+    text = run.tags.get(SEED, "")
+    return int(text) if text.isdecimal() else None

@@ -5,48 +5,32 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
-from analysis.results import RUNS, NamedCounts, open_counts
+from analysis.results import (
+    CLEAN,
+    ROBUSTNESS,
+    RUNS,
+    Evaluation,
+    NamedCounts,
+    level_of,
+    open_counts,
+)
 from rgbt.checks import InputError, nearest, split_list
-from rgbt.files.plain_files import read_json
 from rgbt.metrics.counts import Counts
 from rgbt.runs.naming import row_name
 
-FOLDER = Path("evaluations") / "robustness"
-FORMAT = "rgbt robustness 1"
-CLEAN = "clean"
-
-
-@dataclass(frozen=True)
-class Level:
-    """One severity of one corruption.
-
-    Attributes:
-        mark: name of its file, e.g. "noise-16".
-        row: the corruption: "clean", "noise", "rgb_removed", "features-thermal", ...
-        title: as shown.
-        unit: of the severity; "" where there is one alone.
-        severity: 0 is the clean image.
-        counts: the counts.
-    """
-
-    mark: str
-    row: str
-    title: str
-    unit: str
-    severity: float
-    counts: Counts
+Level = Evaluation
+"""One severity of one corruption."""
 
 
 @dataclass(frozen=True)
 class Training:
-    """One training with its levels, the clean images first.
+    """One training with its levels.
 
     Attributes:
         label: of its method.
         place: folder of the counts.
-        levels: clean, then by row and rising severity.
+        levels: the clean images, then by corruption and rising severity.
     """
 
     label: str
@@ -88,14 +72,10 @@ def trainings(text: str, runs_dir: Path | str = "runs", split: str = "") -> list
 
 
 def folder_of(named: NamedCounts) -> Path:
-    """Folder of the counts of a run's corrupted images.
-
-    Raises:
-        InputError: it is no run, or was not measured.
-    """
-    folder = named.path.parent / FOLDER / named.counts.split
+    """Folder of the counts of a run's corrupted images; InputError: no run, or not measured."""
+    folder = named.path.parent / "evaluations" / ROBUSTNESS / named.counts.split
     if not named.key or not folder.is_dir():
-        what = f"{named.path} is no run" if not named.key else f"{folder} is not there"
+        what = f"{folder} is not there" if named.key else f"{named.path} is no run"
         split = "" if named.counts.split == "test" else f" split={named.counts.split}"
         run = named.path.parent if named.key else "..."
         raise InputError(f"{what}; rgbt robustness run={run}{split} makes the counts.")
@@ -108,17 +88,11 @@ def levels_of(folder: Path) -> tuple[Level, ...]:
     Raises:
         InputError: no clean images, or a file that is damaged or of another kind.
     """
-    found = [_level(path) for path in sorted(folder.glob("*.json"))]
+    found = [level_of(path.with_suffix(".npz")) for path in sorted(folder.glob("*.json"))]
     if CLEAN not in {level.row for level in found}:
-        raise InputError(
-            f"{folder} contains no counts of clean images ({CLEAN}.json); rgbt robustness "
-            "measures them first."
-        )
-    return tuple(
-        sorted(
-            found, key=lambda at: (at.row != CLEAN, at.unit != "", at.title, at.row, at.severity)
-        )
-    )
+        raise InputError(f"{folder} contains no counts of clean images; rerun rgbt robustness.")
+    order = sorted(found, key=lambda at: (at.unit != "", at.title, at.row, at.severity))
+    return tuple(sorted(order, key=lambda at: at.row != CLEAN))
 
 
 def under(
@@ -144,24 +118,10 @@ def _under(named: NamedCounts, row: str, severity: str) -> NamedCounts:
     if not of_row:
         known = nearest(row, {level.row for level in levels})
         raise InputError(f"corruption={row} was not measured in {folder}; {known}.")
-    level = of_row.get(severity) or (None if severity or len(of_row) > 1 else [*of_row.values()][0])
+    only = next(iter(of_row.values())) if len(of_row) == 1 and not severity else None
+    level = of_row.get(severity, only)
     if level is None:
         raise InputError(
             f"severity={severity}: {folder} has {row} at {', '.join(of_row)}; give one of these."
         )
-    return replace(named, path=folder / f"{level.mark}.npz", counts=level.counts)
-
-
-def _level(path: Path) -> Level:
-    made = read_json(path, dict[str, Any], "remove it, and rgbt robustness makes it again")
-    if made.get("format") != FORMAT:
-        raise InputError(f"{path} was not written by rgbt robustness; name another folder.")
-    try:
-        of_level = {key: made[key] for key in ("row", "title", "unit")}
-        severity = float(made["severity"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            f"{path} does not describe what was measured ({error}); rgbt robustness makes it again."
-        ) from error
-    counts = Counts.load(path.with_suffix(".npz"))
-    return Level(path.stem, severity=severity, counts=counts, **of_level)
+    return replace(named, path=level.path, counts=level.counts)

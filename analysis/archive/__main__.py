@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 from rgbt.checks import InputError
 from rgbt.config.common_options import RunsDir
@@ -84,9 +84,7 @@ def rekey(options: ArchiveOptions, overrides: list[str]) -> int:
     from rgbt.terminal import plain_text, print_rich
 
     del overrides  # none is heeded
-    for each in list(_compared(options.archive)):
-        if each.settings is None or each.state != "added":
-            continue
+    for each in [each for each in _compared(options.archive) if each.state == "added"]:
         with tempfile.TemporaryDirectory() as scratch:
             folder = each.run.unpack(Path(scratch)).folder
             _rewrite(folder, each.key, each.settings)
@@ -97,40 +95,35 @@ def rekey(options: ArchiveOptions, overrides: list[str]) -> int:
     return 0
 
 
-@dataclass(frozen=True)
-class ComparedRun:
+class Compared(NamedTuple):
     """An archived run beside the run that its command requests today.
 
-    Attributes:
-        state: "same" key; "added": other key, but only for settings that were added; "changed":
-            other settings; "damaged", or its command does not compose any more.
-        reason: what differs.
-        key: today's key.
-        settings: today's configuration.
+    `state` is "same" (key); "added" (another key, but only for settings that were added);
+    "changed" (other settings); or "damaged", if the command does not compose any more, too.
     """
 
     run: ArchivedRun
-    state: Literal["same", "added", "changed", "damaged"]
+    state: str
     reason: str = ""
     key: str = ""
-    settings: Mapping[str, Any] | None = None
+    settings: Mapping[str, Any] = {}
 
 
-def _compared(archive: Path) -> Iterator[ComparedRun]:
+def _compared(archive: Path) -> Iterator[Compared]:
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
     from analysis.archive.files import archived
 
     with tempfile.TemporaryDirectory() as scratch:
         for run in archived(archive):
             try:
                 yield _compare(run, run.unpack(Path(scratch)).folder)
-            except InputError as error:
-                yield ComparedRun(run, "damaged", str(error))
+            except (InputError, HydraException, OmegaConfBaseException) as error:
+                yield Compared(run, "damaged", str(error))
 
 
-def _compare(run: ArchivedRun, folder: Path) -> ComparedRun:
-    from hydra.errors import HydraException
-    from omegaconf.errors import OmegaConfBaseException
-
+def _compare(run: ArchivedRun, folder: Path) -> Compared:
     from rgbt.config.compose import compose, flatten
     from rgbt.config.stored_config import read_settings
     from rgbt.runs.folder import read_description
@@ -139,12 +132,9 @@ def _compare(run: ArchivedRun, folder: Path) -> ComparedRun:
 
     description = read_description(folder)
     words = description.overrides if description else []
-    try:
-        spec = requested_run(compose(words), words)
-    except (HydraException, OmegaConfBaseException) as error:
-        raise InputError(f"its command does not compose: {error}") from error
+    spec = requested_run(compose(words), words)
     if spec.key == run.key:
-        return ComparedRun(run, "same")
+        return Compared(run, "same")
     before, now = (flatten(each) for each in (read_settings(folder / "config.yaml"), spec.plain))
     differing = [
         key
@@ -155,7 +145,7 @@ def _compare(run: ArchivedRun, folder: Path) -> ComparedRun:
     # Nothing says how an upstream run differs.
     is_added = bool(differing) and all(key not in before for key in differing)
     reason = ", ".join(differing) or "a run that it depends on"
-    return ComparedRun(run, "added" if is_added else "changed", reason, spec.key, spec.plain)
+    return Compared(run, "added" if is_added else "changed", reason, spec.key, spec.plain)
 
 
 def _rewrite(folder: Path, key: str, settings: Mapping[str, Any]) -> None:
@@ -177,9 +167,12 @@ def _rewrite(folder: Path, key: str, settings: Mapping[str, Any]) -> None:
 entry = CommandGroup(
     __doc__,
     {
-        "add": PlainCommand(AddOptions, add_runs, heeds=(), name="rgbt archive add"),
-        "check": PlainCommand(ArchiveOptions, check, heeds=(), name="rgbt archive check"),
-        "rekey": PlainCommand(ArchiveOptions, rekey, heeds=(), name="rgbt archive rekey"),
+        name: PlainCommand(options, command, heeds=(), name=f"rgbt archive {name}")
+        for name, options, command in (
+            ("add", AddOptions, add_runs),
+            ("check", ArchiveOptions, check),
+            ("rekey", ArchiveOptions, rekey),
+        )
     },
 )
 

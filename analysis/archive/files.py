@@ -54,11 +54,7 @@ DAMAGED = (
 
 @dataclass(frozen=True)
 class ArchivedRun:
-    """A run in the archive.
-
-    Attributes:
-        path: ``results/<key>.zip``, or ``<key>-<digest>.zip`` for other results of the same key.
-    """
+    """A run in the archive: ``<key>.zip``, or ``<key>-<digest>.zip`` for other results of a key."""
 
     path: Path
 
@@ -73,8 +69,9 @@ class ArchivedRun:
         Raises:
             InputError: a damaged file, or one that belongs to another run.
         """
-        folder = folder or cache_folder()
-        target = folder / hashlib.sha256(self.path.read_bytes()).hexdigest()[:16] / self.key
+        cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        folder = folder or Path(cache, "rgbt", "archive")
+        target = folder / _digest(self.path.read_bytes()) / self.key
         if target.is_dir():
             return RunResult(target)
         folder.mkdir(parents=True, exist_ok=True)
@@ -109,12 +106,6 @@ class ArchivedRun:
                     write_atomic(path, archive.read(entry))
 
 
-def cache_folder() -> Path:
-    """Where archived runs are unpacked for reading."""
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(home, "rgbt", "archive")
-
-
 def archived(folder: Path) -> list[ArchivedRun]:
     """All runs of an archive, by key."""
     return [ArchivedRun(path) for path in sorted(folder.glob("*.zip"))]
@@ -133,11 +124,12 @@ def add(run: RunResult, folder: Path) -> ArchivedRun:
     Raises:
         InputError: the run is not finished, or one of its files is damaged.
     """
+    if not run.is_finished:
+        raise InputError(f"{run.folder} is not finished; rerun its command.")
     content = _packed(run, folder / SHARED)
     path = folder / f"{run.key}.zip"
     if path.exists() and path.read_bytes() != content:
-        digest = hashlib.sha256(content).hexdigest()[:8]
-        path = folder / f"{run.key}-{digest}.zip"
+        path = folder / f"{run.key}-{_digest(content)[:8]}.zip"
     if not path.exists():
         write_atomic(path, content)
     return ArchivedRun(path)
@@ -145,8 +137,6 @@ def add(run: RunResult, folder: Path) -> ArchivedRun:
 
 def _packed(run: RunResult, shared: Path) -> bytes:
     """The bytes of ``<key>.zip``, equal for equal runs; shared arrays are written to `shared`."""
-    if not run.is_finished:
-        raise InputError(f"{run.folder} is not finished; rerun its command.")
     shared.mkdir(parents=True, exist_ok=True)
     texts = [path for name in TEXTS for path in sorted(run.folder.glob(name))]
     members = {path.relative_to(run.folder).as_posix(): path.read_bytes() for path in texts}
@@ -167,11 +157,6 @@ def _packed(run: RunResult, shared: Path) -> bytes:
     return file.getvalue()
 
 
-def _is_confusion(partition: str) -> bool:
-    """Whether counts are confusion matrices, whose rows sum to the pixels of the label."""
-    return details_of(partition) is None and protocol_of(partition) is None
-
-
 def _packed_counts(counts: Counts, shared: Path) -> bytes:
     """LZMA of a JSON line and of the bytes of the counts, images last and by significance."""
     array = counts.counts
@@ -181,7 +166,8 @@ def _packed_counts(counts: Counts, shared: Path) -> bytes:
         "classes": np.array(counts.classes),
         "unscored": np.array(counts.unscored, str),
     }
-    if _is_confusion(counts.partition):
+    # Of confusion matrices alone do the rows sum to the pixels of the label.
+    if details_of(counts.partition) is None and protocol_of(counts.partition) is None:
         common["labelled"] = array.sum(-1, dtype=np.int64)
         array = array.copy()
         array[..., range(array.shape[-1]), range(array.shape[-1])] = 0
@@ -217,7 +203,7 @@ def _write_shared(arrays: dict[str, NDArray[Any]], shared: Path) -> str:
     """The name of the file with these arrays, which is a digest of its content."""
     file = io.BytesIO()
     np.savez(file, allow_pickle=False, **arrays)
-    name = hashlib.sha256(file.getvalue()).hexdigest()[:16]
+    name = _digest(file.getvalue())
     if not (shared / f"{name}.npz.xz").exists():
         write_atomic(shared / f"{name}.npz.xz", lzma.compress(file.getvalue(), preset=9))
     return name
@@ -226,7 +212,11 @@ def _write_shared(arrays: dict[str, NDArray[Any]], shared: Path) -> str:
 def _read_shared(name: str, shared: Path) -> dict[str, NDArray[Any]]:
     path = shared / f"{Path(name).name}.npz.xz"
     content = lzma.decompress(path.read_bytes())
-    if hashlib.sha256(content).hexdigest()[:16] != name:
+    if _digest(content) != name:
         raise ValueError(f"{path} does not match its digest")
     with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
         return dict(arrays)
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:16]

@@ -10,6 +10,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from analysis.uncertainty.blocks import Values
 from analysis.uncertainty.contrasts import Evidence
 from analysis.uncertainty.intervals import Interval, Spread, images_and_seeds, student
 from analysis.uncertainty.sequence import half_width
@@ -208,19 +209,12 @@ def decide(
 
 @dataclass(frozen=True)
 class _Contrast:
-    """One contrast in the numbers that decide.
-
-    Attributes:
-        margin: distance of the estimate from the nearer end of the range, negative outside.
-        sd: over seeds (n - 1); NaN for fewer than two.
-        seeds: their number; 0 where all terms are fixed.
-        images: None with too few blocks.
-    """
+    """One contrast in the numbers that decide; its margin is negative outside of the range."""
 
     estimate: float
     margin: float
-    sd: float
-    seeds: int
+    sd: float  # over seeds (n - 1); NaN for fewer than two
+    seeds: int  # 0 where all terms are fixed
     images: Spread | None
 
     def half(self, rule: Rule, level: float, seeds: int) -> float:
@@ -253,34 +247,32 @@ class _Claim:
         return 1.0 - (1.0 - self.rule.level) / others
 
     def halves(self, kind: Kind, seeds: int = 0) -> list[float]:
-        """Half widths of the intervals that give the verdict `kind`.
-
-        Args:
-            kind: decides the level.
-            seeds: number of seeds to assume where it is above the present one.
-        """
+        """Half widths of the intervals that give `kind`, with `seeds` seeds where they are more."""
         level = self.level(kind)
         return [each.half(self.rule, level, max(each.seeds, seeds)) for each in self.contrasts]
 
-    def standings(self, kind: Kind, seeds: int = 0) -> list[float]:
-        """Margins in half widths: above 1 inside the range ("contradicted": outside)."""
-        sign = -1.0 if kind == "contradicted" else 1.0
-        pairs = zip(self.contrasts, self.halves(kind, seeds), strict=True)
-        return [_standing(sign * each.margin, half) for each, half in pairs]
+    def standings(self, kind: Kind, seeds: int = 0) -> Values:
+        """Margins in half widths, above 1 inside the range ("contradicted": outside).
+
+        0 where there is no interval, or neither a margin nor a width.
+        """
+        margins = np.array([each.margin for each in self.contrasts])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            found = margins / np.array(self.halves(kind, seeds))
+        return np.where(np.isnan(found), 0.0, -found if kind == "contradicted" else found)
 
     def kind(self, seeds: int = 0) -> Kind:
         """The verdict, by the present seeds or as if there were `seeds`."""
-        if sum(each > 1 for each in self.standings("holds", seeds)) >= self.needed:
+        if (self.standings("holds", seeds) > 1).sum() >= self.needed:
             return "holds"
-        if sum(each > 1 for each in self.standings("contradicted", seeds)) >= self.against:
+        if (self.standings("contradicted", seeds) > 1).sum() >= self.against:
             return "contradicted"
         return "undecided"
 
     def decisive(self, kind: Kind) -> int:
         """The contrast that is the last one to make the verdict, or the first one to prevent it."""
-        standings = self.standings(kind)
-        order = sorted(range(len(standings)), key=lambda place: -standings[place])
-        return order[(self.against if kind == "contradicted" else self.needed) - 1]
+        order = np.argsort(-self.standings(kind), kind="stable")
+        return int(order[(self.against if kind == "contradicted" else self.needed) - 1])
 
     def seeds_needed(self) -> float:
         """See `Verdict.seeds_needed`; more seeds never make an interval wider."""
@@ -297,20 +289,9 @@ class _Claim:
 def _contrast(evidence: Evidence, low: float, high: float) -> _Contrast:
     values = np.array(evidence.values)
     estimate = float(values.mean())
-    return _Contrast(
-        estimate=estimate,
-        margin=min(estimate - low, high - estimate),
-        sd=float(values.std(ddof=1)) if len(values) > 1 else math.nan,
-        seeds=len(evidence.seeds),
-        images=evidence.images,
-    )
-
-
-def _standing(margin: float, half: float) -> float:
-    """``margin / half``; 0 where there is no interval, or neither a margin nor a width."""
-    if not math.isfinite(half) or margin == 0:
-        return 0.0
-    return margin / half if half > 0 else math.copysign(math.inf, margin)
+    sd = float(values.std(ddof=1)) if len(values) > 1 else math.nan
+    margin = min(estimate - low, high - estimate)
+    return _Contrast(estimate, margin, sd, len(evidence.seeds), evidence.images)
 
 
 def _reason(kind: Kind, shown: _Contrast, half: float, seeds_needed: float) -> str:

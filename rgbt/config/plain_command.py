@@ -42,7 +42,6 @@ COMMANDS = {
     "report": Entry("analysis.report.__main__", "write one page with the whole MLflow store"),
     "compare": Entry("analysis.compare", "compare two methods: differences, intervals, p-values"),
     "details": Entry("analysis.details", "show boundary, calibration, distance and size scores"),
-    "flow": Entry("analysis.flow_error", "compare scores along an estimated and the exact flow"),
     "score": Entry("analysis.score", "score predictions of any method by region"),
     "spatial": Entry("analysis.spatial", "measure the statistics of a data set by region"),
     "figures": Entry("analysis.figures.__main__", "draw a figure of the papers"),
