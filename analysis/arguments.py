@@ -12,6 +12,9 @@ from annotated_types import Interval
 from rgbt.checks import InputError
 from rgbt.config.command import built
 from rgbt.config.options import Help
+from rgbt.files.atomic import write_atomic
+from rgbt.tables import csv_text
+from rgbt.terminal import path_lines, print_rich
 
 if TYPE_CHECKING:
     from rgbt.dataset import LabelledDataset
@@ -28,15 +31,13 @@ Blocks = Annotated[
     Help("images resampled together: auto, none, sequence, or a number of neighbouring frames"),
 ]
 
+Archive = Annotated[Path, Help("folder of archived runs")]
+
 Draws = Annotated[int, Interval(ge=0, le=2**31), Help("seed of the resampling")]
 
 
 def check_out(out: Path | None) -> None:
-    """Refuse a folder that cannot be written, before any work.
-
-    Raises:
-        InputError: it is a file, is below a file, or is not writable.
-    """
+    """Refuse a folder that cannot be written (InputError), before any work."""
     if out is None:
         return
     there = next(each for each in (out.absolute(), *out.absolute().parents) if each.exists())
@@ -50,10 +51,6 @@ def write_tables(
     out: Path | None, name: str, markdown: str, rows: Iterable[Sequence[object]]
 ) -> None:
     """Write ``name.md`` and ``name.csv`` (header first) into the folder, if one is named."""
-    from rgbt.files.atomic import write_atomic
-    from rgbt.tables import csv_text
-    from rgbt.terminal import path_lines, print_rich
-
     if out is None:
         return
     out.mkdir(parents=True, exist_ok=True)
@@ -64,11 +61,7 @@ def write_tables(
 
 
 def dataset_of(overrides: Sequence[str]) -> LabelledDataset:
-    """The data set that overrides choose.
-
-    Raises:
-        InputError: none is chosen, or wrong settings.
-    """
+    """The data set that overrides choose; InputError: none is chosen, or wrong settings."""
     # Without this the images of another data set would be scored against the embedded one.
     if not any(word.startswith("dataset=") for word in overrides):
         raise InputError(

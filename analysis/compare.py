@@ -8,20 +8,30 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
-from analysis.arguments import Blocks, Draws, Level, Resamples, check_out, write_tables
+import numpy as np
+
+from analysis.arguments import Archive, Blocks, Draws, Level, Resamples, check_out, write_tables
+from analysis.results import NamedCounts, groups_in, label_of, open_counts
+from analysis.robustness import under
+from analysis.uncertainty import Comparison, Interval, Resampling, compare
+from analysis.uncertainty.blocks import FEWEST
+from analysis.uncertainty.same_images import common
+from analysis.uncertainty.sentence import sentence
 from rgbt.checks import InputError, split_list
 from rgbt.config.common_options import RunsDir
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
-
-if TYPE_CHECKING:
-    from analysis.results import NamedCounts
-    from analysis.uncertainty import Comparison, Interval, Resampling
-    from rgbt.metrics.counts import Counts
-    from rgbt.metrics.metric import Absent
-    from rgbt.tables import TextTable
+from rgbt.metrics import names, score_grid
+from rgbt.metrics.counts import Counts, convention
+from rgbt.metrics.details import details_of
+from rgbt.metrics.metric import Absent
+from rgbt.metrics.named import parse
+from rgbt.metrics.pairs import HEADLINES, protocol_of
+from rgbt.metrics.scores import absent_notes
+from rgbt.tables import ABSENT, TextTable, number
+from rgbt.terminal import info, plain_text, print_rich, rich_table
 
 
 @dataclass(frozen=True)
@@ -55,11 +65,7 @@ class Options:
         ),
     ] = ""
     corruption: Annotated[
-        str,
-        Help(
-            "compare the counts of corrupted images of the runs (rgbt robustness run=...): "
-            "corruption=noise:rgb severity=16"
-        ),
+        str, Help("compare corrupted images (rgbt robustness): corruption=noise:rgb severity=16")
     ] = ""
     severity: Annotated[str, Help("severity of the corruption")] = ""
     paired: Annotated[
@@ -85,18 +91,12 @@ class Options:
     ] = "as counted"
     seed: Draws = 0
     runs_dir: RunsDir = Path("runs")
-    archive: Annotated[Path, Help("folder of archived runs")] = Path("results")
+    archive: Archive = Path("results")
     out: Annotated[Path | None, Help("output folder of comparison.md and comparison.csv")] = None
 
 
-def main(options: Options, overrides: list[str]) -> int:
+def main(options: Options, _: list[str]) -> int:
     """Compare two methods on the same images."""
-    from analysis.uncertainty import Resampling, compare
-    from analysis.uncertainty.sentence import sentence
-    from rgbt.metrics.named import parse
-    from rgbt.terminal import plain_text, print_rich, rich_table
-
-    del overrides  # none takes effect
     check_out(options.out)
     opened = _opened(options)
     a, b = _counts(opened, options.missing)
@@ -107,8 +107,7 @@ def main(options: Options, overrides: list[str]) -> int:
         seed=options.seed,
         absent=None if options.absent == "as counted" else options.absent,
     )
-    metrics = metrics_of(options.metrics, [*a, *b], settings)
-    paired = options.paired
+    metrics, paired = metrics_of(options.metrics, [*a, *b], settings), options.paired
     found = compare(a, b, metrics, settings, paired=paired, same_pixels=not paired)
     shown = " ".join(word for word in (options.corruption, options.severity) if word)
     labels = [f"{label} ({shown})" if shown else label for label in _labels(opened)]
@@ -135,11 +134,6 @@ def metrics_of(text: str, every: Sequence[Counts], settings: Resampling) -> list
     of their protocol (by day, by night). Day and night where all counts distinguish them and have
     enough images of them for `settings`.
     """
-    from analysis.uncertainty.blocks import FEWEST
-    from rgbt.metrics import names, score_grid
-    from rgbt.metrics.details import details_of
-    from rgbt.metrics.pairs import HEADLINES, protocol_of
-
     partition = every[0].partition
     if text != "auto":
         return split_list(text, "metrics")
@@ -165,7 +159,6 @@ def comparison_grid(
     found: Comparison, labels: Sequence[str], notes: tuple[str, ...] = ()
 ) -> TextTable:
     """One line per score."""
-    from rgbt.tables import ABSENT, TextTable, number
 
     def between(interval: Interval | None) -> str:
         return f"{interval.low:+.2f} to {interval.high:+.2f}" if interval else ABSENT
@@ -201,19 +194,7 @@ def _rows(found: Comparison) -> Iterator[tuple[object, ...]]:
 
 
 def absent_classes(every: Sequence[Counts], absent: Absent | None) -> tuple[str, ...]:
-    """Footnotes about classes that are absent from the counts of both methods.
-
-    Args:
-        every: counts of both methods, of the same images.
-        absent: convention of the table; None: that of the counts.
-    """
-    import numpy as np
-
-    from rgbt.metrics.counts import convention
-    from rgbt.metrics.details import details_of
-    from rgbt.metrics.pairs import protocol_of
-    from rgbt.metrics.scores import absent_notes
-
+    """Footnotes about classes that the counts of both methods lack, by `absent` or as counted."""
     first = every[0]
     if protocol_of(first.partition) is not None or details_of(first.partition) is not None:
         return ()  # matrices of pairs of frames and of boundaries have no labels as rows
@@ -224,11 +205,7 @@ def absent_classes(every: Sequence[Counts], absent: Absent | None) -> tuple[str,
 
 def _opened(options: Options) -> list[tuple[NamedCounts, ...]]:
     """The trainings of both methods."""
-    from analysis.results import groups_in, open_counts
-    from analysis.robustness import under
-
     frames, corruption, severity = options.frames, options.corruption, options.severity
-    stored = options.runs_dir, options.archive
     if severity and not corruption:
         raise InputError("'severity' has no effect without corruption=..., for example noise.")
     if corruption and frames:
@@ -236,12 +213,12 @@ def _opened(options: Options) -> list[tuple[NamedCounts, ...]]:
     opened = []
     for key, side in (("a", options.a), ("b", options.b)):
         if not side:
-            groups = ", ".join(groups_in(*stored)) or "none"
+            groups = ", ".join(groups_in(options.runs_dir, options.archive)) or "none"
             raise InputError(
                 f"'{key}' has no value; give a run, a file of counts, or a group of runs. Groups "
                 f"in {options.runs_dir}: {groups}."
             )
-        found = open_counts(side, stored[0], options.split, frames, stored[1])
+        found = open_counts(side, options.runs_dir, options.split, frames, options.archive)
         opened.append(under(found, corruption, severity) if corruption else found)
     return opened
 
@@ -249,9 +226,6 @@ def _opened(options: Options) -> list[tuple[NamedCounts, ...]]:
 def _counts(
     opened: Sequence[tuple[NamedCounts, ...]], missing: str
 ) -> tuple[list[Counts], list[Counts]]:
-    from analysis.uncertainty.same_images import common
-    from rgbt.terminal import info
-
     methods = [[named.counts for named in each] for each in opened]
     shared = {each.path for each in opened[0]} & {each.path for each in opened[1]}
     if shared:
@@ -267,8 +241,6 @@ def _counts(
 
 def _labels(opened: Sequence[tuple[NamedCounts, ...]]) -> list[str]:
     """Labels that differ: the names of the methods, with their seeds where these are equal."""
-    from analysis.results import label_of
-
     plain = labels = [label_of(each) for each in opened]
     if plain[0] == plain[1]:
         seeds = [sorted(named.seed for named in each if named.seed is not None) for each in opened]

@@ -10,25 +10,26 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
-from analysis.arguments import Blocks, Draws, Level, Resamples, check_out, write_tables
+from analysis.arguments import Archive, Blocks, Draws, Level, Resamples, check_out, write_tables
+from analysis.results import Evaluation, NamedCounts, evaluations_of, label_of, open_counts
+from analysis.uncertainty import Estimate, Resampling, estimate
 from rgbt.checks import InputError
 from rgbt.config.common_options import RunsDir
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
-
-if TYPE_CHECKING:
-    from analysis.results import NamedCounts
-    from analysis.uncertainty import Estimate
-    from rgbt.metrics.counts import Counts
-    from rgbt.metrics.score_grid import ScoreGrid
-    from rgbt.tables import TextTable
-
-    Table = tuple[ScoreGrid, Mapping[str, Estimate]]
+from rgbt.metrics.counts import Counts
+from rgbt.metrics.details import KINDS, details_of, regions_of
+from rgbt.metrics.score_grid import ScoreGrid, score_grid
+from rgbt.tables import TextTable, number
+from rgbt.terminal import print_rich, rich_table
+from rgbt.types import VIEWS
 
 Key = tuple[str, str]
 """Input of the network ("" where a file does not tell), and partition of the counts."""
+
+Scores = tuple[ScoreGrid, Mapping[str, Estimate]]
 
 
 @dataclass(frozen=True)
@@ -48,28 +49,20 @@ class Options:
     blocks: Blocks = "auto"
     seed: Draws = 0
     runs_dir: RunsDir = Path("runs")
+    archive: Archive = Path("results")
     out: Annotated[Path | None, Help("output folder of details.md and details.csv")] = None
 
 
-def main(options: Options, overrides: list[str]) -> int:
+def main(options: Options, _: list[str]) -> int:
     """Show every stored score of a method by region, class, bin and input."""
-    from analysis.results import label_of, open_counts
-    from analysis.uncertainty import Resampling, estimate
-    from rgbt.metrics.score_grid import score_grid
-    from rgbt.terminal import print_rich, rich_table
-
-    del overrides  # none takes effect
     check_out(options.out)
     if not options.run:
         raise InputError("'run' has no value; give a run, a group of runs, or a file of counts.")
     settings = Resampling(
-        resamples=options.resamples,
-        level=options.level,
-        blocks=options.blocks,
-        seed=options.seed,
+        resamples=options.resamples, level=options.level, blocks=options.blocks, seed=options.seed
     )
-    opened = open_counts(options.run, options.runs_dir)
-    found: dict[Key, Table] = {}
+    opened = open_counts(options.run, options.runs_dir, archive=options.archive)
+    found: dict[Key, Scores] = {}
     for key, counts in _stored(opened, options.split).items():
         grid = score_grid(counts[0])
         found[key] = grid, estimate(counts, list(dict.fromkeys(grid.metrics)), settings)
@@ -90,10 +83,6 @@ def main(options: Options, overrides: list[str]) -> int:
 
 def _stored(opened: Sequence[NamedCounts], split: str) -> dict[Key, list[Counts]]:
     """The counts of a method by what they are of, one for each training."""
-    from analysis.results import Evaluation, evaluations_of
-    from rgbt.metrics.details import KINDS, details_of, regions_of
-    from rgbt.types import VIEWS
-
     stored = [
         [each for each in evaluations_of(named.run, split) if each.condition in VIEWS]
         if named.run
@@ -121,11 +110,8 @@ def _stored(opened: Sequence[NamedCounts], split: str) -> dict[Key, list[Counts]
     return {key: [found[key] for found in every] for key in keys}
 
 
-def _grids(found: Mapping[Key, Table], label: str) -> Iterator[TextTable]:
+def _grids(found: Mapping[Key, Scores], label: str) -> Iterator[TextTable]:
     """The scores as text; tables of one line are joined, with a line for each input."""
-    from rgbt.metrics.details import regions_of
-    from rgbt.tables import TextTable
-
     groups: dict[tuple[str, str, str], list[Key]] = {}
     for (view, partition), (grid, _) in found.items():
         alone = view if len(grid.rows) > 1 else ""
@@ -133,7 +119,7 @@ def _grids(found: Mapping[Key, Table], label: str) -> Iterator[TextTable]:
     for (alone, title, regions), keys in groups.items():
         grid = found[keys[0]][0]
         named = ", ".join(filter(None, (label, alone)))
-        is_joined = len(grid.rows) == 1 and keys[0][0]
+        is_joined = len(grid.rows) == 1 and keys[0][0] != ""
         rows = [
             (key[0] if is_joined else name, *_cells(found[key][1], metrics))
             for key in keys
@@ -144,17 +130,13 @@ def _grids(found: Mapping[Key, Table], label: str) -> Iterator[TextTable]:
 
 
 def _cells(estimates: Mapping[str, Estimate], metrics: Sequence[str]) -> Iterator[str]:
-    from rgbt.tables import number
-
     for each in (estimates[metric] for metric in metrics):
         ends = each.interval
         yield number(each.value) + (f" [{ends.low:.2f}, {ends.high:.2f}]" if ends else "")
 
 
-def _rows(found: Mapping[Key, Table]) -> Iterator[tuple[object, ...]]:
+def _rows(found: Mapping[Key, Scores]) -> Iterator[tuple[object, ...]]:
     """One line per score with all digits."""
-    from rgbt.metrics.details import details_of, regions_of
-
     yield "regions", "details", "input", "metric", "value", "sd", "seeds", "low", "high"
     for (view, partition), (_, estimates) in found.items():
         details = details_of(partition)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from analysis.archive.files import ArchivedRun, archived, counts_of
+from analysis.archive import ArchivedRun, archived, counts_of
 from rgbt.checks import InputError, nearest, one_line, split_list
 from rgbt.files.plain_files import read_json
 from rgbt.metrics import names
@@ -284,30 +284,19 @@ def open_counts(
             is of others.
     """
     finished = cache(lambda: finished_runs(runs_dir, archive))
-    # A group's name may hold commas itself: "crm train_sizes=[240,480]".
-    is_whole = "," in text and not text.endswith(".npz") and bool(_of_group(text, finished()))
-    words = [text] if is_whole else split_list(text, RUNS)
+    words = split_list(text, RUNS)
     found = [
         each for word in words for each in _open(word, Path(runs_dir), finished, split, frames)
     ]
-    for named in found:
-        counts = named.counts
+    for path, counts in ((named.path, named.counts) for named in found):
         if split and counts.split != split:
-            raise InputError(
-                f"{named.path} is of split '{counts.split}', not of split={split}; omit split=, "
-                "or name counts of that split."
-            )
+            raise InputError(f"{path} is of split '{counts.split}', not of split={split}.")
         if frames and protocol_of(counts.partition) != frames:
-            raise InputError(
-                f"{named.path} is by {counts.partition}, not frames={frames}; omit frames=, "
-                "or name a run or what rgbt consistency run=... counted so."
-            )
+            raise InputError(f"{path} is by {counts.partition}, not frames={frames}.")
     _check_trainings_differ(text, found)
-    labels = dict.fromkeys(each.label for each in found)
-    if len(labels) > 1:
+    if len(labels := dict.fromkeys(each.label for each in found)) > 1:
         info(
-            f"{' and '.join(labels)} are treated as seeds of one method, because they "
-            "were listed together."
+            f"{' and '.join(labels)} were listed together: they are treated as seeds of one method."
         )
     return tuple(found)
 
@@ -315,20 +304,17 @@ def open_counts(
 def _check_trainings_differ(text: str, found: Sequence[NamedCounts]) -> None:
     """Refuse a seed twice or equal counts: they are one training and would narrow the interval."""
     for first, second in combinations(found, 2):
-        if first.path == second.path:
-            raise InputError(f"'{text}' names {first.path} twice; one training counts once.")
+        is_one = first.label == second.label or not (first.run and second.run)
+        if is_one and np.array_equal(first.counts.counts, second.counts.counts):
+            raise InputError(
+                f"'{text}' names the same counts twice ({first.path} and {second.path}); one "
+                "training counts once."
+            )
         is_again = (first.label, first.seed) == (second.label, second.seed)
         if is_again and first.seed is not None:
             raise InputError(
                 f"'{text}' names seed {first.seed} of '{first.label}' twice ({first.key} and "
-                f"{second.key}, which differ in settings other than their overrides); name the "
-                "runs."
-            )
-        is_one = first.label == second.label or not (first.run and second.run)
-        if is_one and np.array_equal(first.counts.counts, second.counts.counts):
-            raise InputError(
-                f"'{text}': {first.path} and {second.path} hold the same counts; one training "
-                "counts once."
+                f"{second.key}, which differ in settings other than their overrides)."
             )
 
 
@@ -343,11 +329,7 @@ def label_of(counts: Sequence[NamedCounts]) -> str:
 
 
 def _open(
-    word: str,
-    runs_dir: Path,
-    finished: Callable[[], list[RunResult]],
-    split: str,
-    frames: Frames,
+    word: str, runs_dir: Path, finished: Callable[[], list[RunResult]], split: str, frames: Frames
 ) -> list[NamedCounts]:
     path = Path(word).expanduser()
     if path.suffix == ".npz":
@@ -361,7 +343,7 @@ def _open(
     with suppress(OSError):
         if path.is_dir():
             return [_of_scores(path)]
-    groups = sorted({run.tags.get(GROUP, "") for run in finished()} - {""})
+    groups = {run.tags.get(GROUP, "") for run in finished()} - {""}
     known = f" or a group of {runs_dir} ({nearest(word, groups)})" if groups else ""
     raise InputError(
         f"'{word}' is not a run folder, config key or MLflow run id in {runs_dir}, nor a file "
@@ -372,14 +354,13 @@ def _open(
 def _of_scores(folder: Path) -> NamedCounts:
     """The counts in a folder that `analysis.score` wrote: by rings, as the papers' tables are."""
     files = sorted(folder.glob("counts_ring*.npz")) or sorted(folder.glob("counts_*.npz"))
-    if len(files) != 1:
-        found = ", ".join(file.name for file in files)
+    if not files:
         raise InputError(
-            f"{folder} contains {found}; name one of these files."
-            if files
-            else f"{folder} contains neither a run (config.yaml) nor counts (counts_*.npz); to "
-            "count label images of a method: rgbt score predictions=... dataset=..."
+            f"{folder} contains neither a run (config.yaml) nor counts (counts_*.npz); to count "
+            "label images of a method: rgbt score predictions=... dataset=..."
         )
+    if len(files) > 1:
+        raise InputError(f"{folder} has {', '.join(f.name for f in files)}; name one of these.")
     return _of_file(files[0])
 
 
@@ -392,8 +373,7 @@ def _of_file(path: Path) -> NamedCounts:
 
 
 def _of_group(word: str, runs: Sequence[RunResult]) -> list[RunResult]:
-    """The runs of a group; "" is no group, but that of runs without one."""
-    return [run for run in runs if word and word == run.tags.get(GROUP)]
+    return [run for run in runs if word and word == run.tags.get(GROUP)]  # "": of no group
 
 
 def _of_run(run: RunResult, split: str, frames: Frames) -> NamedCounts:

@@ -6,15 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from analysis.results import (
-    CLEAN,
-    ROBUSTNESS,
-    RUNS,
-    Evaluation,
-    NamedCounts,
-    level_of,
-    open_counts,
-)
+from analysis.results import CLEAN, ROBUSTNESS, RUNS, Evaluation, NamedCounts, level_of, open_counts
 from rgbt.checks import InputError, nearest, split_list
 from rgbt.metrics.counts import Counts
 from rgbt.runs.naming import row_name

@@ -132,18 +132,16 @@ def make_blocks(
             for.
     """
     parts = np.zeros(len(names), np.int64) if strata is None else np.asarray(strata, np.int64)
-    singles, said, reason = [*np.arange(len(names))[:, None]], f"{len(names)} single images", ""
+    singles, said = [*np.arange(len(names))[:, None]], f"{len(names)} single images"
     if choice in ("none", 1):
         return _joined(singles, parts, said)
     sequences = _sequences(names, parts)
-    if not sequences and choice == "auto":
-        reason = f"Names such as '{names[0]}' have no consecutive frame numbers; {ALONE}."
-        return _joined(singles, parts, f"{said} (their names show no neighbours)", reason)
     if not sequences:
-        raise InputError(
-            f"blocks={choice}: names such as '{names[0]}' show no neighbouring frames (names that "
-            "differ in one number only); use blocks=none."
-        )
+        such = f"names such as '{names[0]}' show no neighbouring frames (that differ in one number)"
+        if choice != "auto":
+            raise InputError(f"blocks={choice}: {such}; use blocks=none.")
+        said, reason = f"{said} (their names show no neighbours)", f"N{such[1:]}; {ALONE}."
+        return _joined(singles, parts, said, reason)
     if choice == "auto":
         none = np.empty((0, len(names)))
         pieces, sizes, reason = _automatic(sequences, none if series is None else series)
@@ -176,12 +174,8 @@ def block_length(series: Values, sequences: Sequence[Places]) -> int:
     Politis and White (2009). Their rule for the window looks at any lag, with a bound that at 100
     images passes over correlations of 0.28; this one is for frames.
 
-    Args:
-        series: (N,) a value of every image.
-        sequences: places of the images of each sequence, in the order of their frames.
-
-    Returns:
-        at least 1.
+    Of an (N,) series of values of the images, and the places of the images of each sequence in the
+    order of their frames; at least 1.
     """
     count = len(series)
     centred = series - series.mean()
@@ -192,7 +186,7 @@ def block_length(series: Values, sequences: Sequence[Places]) -> int:
         long = [centred[each] for each in sequences if len(each) > lag]
         return float(sum(each[: len(each) - lag] @ each[lag:] for each in long)) / count
 
-    lags = np.array([autocovariance(lag) for lag in range(covered + 1)])
+    lags = np.array([*map(autocovariance, range(covered + 1))])
     above = lags[1:] > BAND / math.sqrt(count) * lags[0]
     last = len(above) if above.all() else int(np.argmin(above))
     if lags[0] <= 0 or last == 0:

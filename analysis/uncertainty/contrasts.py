@@ -67,8 +67,8 @@ class Evidence:
     """What the data say about one contrast.
 
     Attributes:
-        values: contrast of each seed that all terms with seeds have; of fixed terms alone, and of
-            methods whose seeds are not paired, one value. Percent points; of the variance squared.
+        values: contrast of each seed that all terms with seeds have; one value of fixed terms
+            alone, and of methods whose seeds are not paired. Percent points; of Var squared.
         seeds: of `values`; () where all terms are fixed or not paired.
         error: standard error, over the draw of the images, of the mean of `values`; NaN with too
             few blocks for it.

@@ -27,24 +27,17 @@ ONE_START = (
     "If a start shifts a difference by two standard deviations of the seeds, 18 % of claims about "
     "no difference hold with 3 seeds and 29 % with 5, and as many are contradicted."
 )
-"""Warning of a verdict on one common start; the rates are those of `FixedSeeds` in simulations."""
-
-FAR_FROM_NORMAL = (
-    "Seeds far from normal: if their scores are lognormal (sd 1 of the logarithm), 14 to 18 % of "
-    "verdicts about no difference are wrong with 3 to 10 seeds, instead of 5 %."
-)
-"""What no verdict covers: few seeds cannot show that they are not normally distributed."""
+"""Warning of a verdict on one common start; rates of `FixedSeeds` in simulations."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FixedSeeds:
     """Rule for a number of seeds that was chosen before any result was known.
 
-    The interval is that of `analysis.uncertainty.compare` for paired trainings: Student over images
-    and seeds, never narrower than over seeds alone.
-
-    Attributes:
-        level: confidence level of the interval.
+    The interval of `level` is that of `analysis.uncertainty.compare` for paired trainings: Student
+    over images and seeds, never narrower than over seeds alone. Few seeds cannot show whether they
+    are normal: with 3 to 10 lognormal ones (sd 1 of the logarithm), 14 to 18 % of the verdicts
+    about no difference are wrong instead of 5 %.
     """
 
     level: float = 0.95
@@ -59,12 +52,9 @@ class AnyTime:
     """Rule for seeds that are added until the verdict is clear.
 
     Seeds: a confidence sequence, see `analysis.uncertainty.sequence`. Images: Student's interval.
-    Each has half of the error rate, and the squares of their half widths add up. At a level of
-    95 %, at most 4.8 % of simulated sequences ever missed the truth (2 to 3,000 seeds). With the
-    whole error rate for each it was up to 9.8 %.
-
-    Attributes:
-        level: confidence level of the whole sequence of intervals.
+    Each has half of the error rate, and the squares of their half widths add up. At a `level` of
+    95 % for all intervals together, at most 4.8 % of simulated sequences ever missed the truth (2
+    to 3,000 seeds). With the whole error rate for each it was up to 9.8 %.
     """
 
     level: float = 0.95
@@ -82,25 +72,21 @@ Rule = FixedSeeds | AnyTime
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """What the data say about one claim.
-
-    The numbers are of one contrast, `decisive`. With several contrasts the level of its interval
-    is corrected for their number, see `decide`.
+    """What the data say about one claim, with the numbers of one of its contrasts.
 
     Attributes:
         estimate: the contrast, mean over paired seeds.
-        interval: of the contrast; None where images or seeds are too few for one.
+        interval: of the contrast, of a level that is corrected for the number of contrasts
+            (`decide`); None where images or seeds are too few for one.
         covers: what was drawn anew: the trainings of fixed terms are not.
-        smallest: smallest difference that these seeds and images could have shown, half of the
-            width of the interval; NaN without an interval.
+        smallest: smallest difference that could have been shown, half of the width of the interval.
         seeds: number of paired seeds used; 0 where all terms are fixed.
         seeds_needed: total number of paired seeds with which the present estimates would be
             decided; `seeds` where they are; inf: more than `MOST_SEEDS`, or the images alone leave
             it open; NaN: unknown.
         decisive: index of the contrast whose numbers are shown (the weakest for "all").
         reason: of "undecided", or which limit a verdict has; a short sentence.
-        starts: number of different starts from which the seeds were trained; None: unknown, or
-            none (random initial weights, which every seed draws anew).
+        starts: number of starts from which the seeds were trained; None: no common ones.
     """
 
     kind: Kind
@@ -123,17 +109,13 @@ class Verdict:
 def similar(margin: float) -> tuple[float, float]:
     """The range of "does as well as": it holds where the whole interval is inside the margin.
 
-    Two one-sided tests, each with half of the error rate. That no difference was shown is no
-    evidence for it: few seeds never show one. Source: Schuirmann, Journal of Pharmacokinetics and
-    Biopharmaceutics 15 (1987).
+    Two one-sided tests, each with half of the error rate; that no difference was shown is no
+    evidence for none. ValueError: the margin is no number above 0.
 
-    Raises:
-        ValueError: the margin is not a number above 0.
+    Source: Schuirmann, Journal of Pharmacokinetics and Biopharmaceutics 15 (1987).
     """
     if not 0 < margin < math.inf:
-        raise ValueError(
-            f"margin: expected the largest difference that counts as none, got {margin}."
-        )
+        raise ValueError(f"margin: expected the largest difference that is none, got {margin}.")
     return -margin, margin
 
 

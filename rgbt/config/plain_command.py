@@ -48,7 +48,7 @@ COMMANDS = {
     "check": Entry("rgbt.data.check", "validate a whole data set and report its problems"),
     "export": Entry("rgbt.export", "write a network as ONNX, compared with the network"),
     "weights": Entry("rgbt.weights", "inspect a file of weights, or export the weights of a run"),
-    "archive": Entry("analysis.archive.__main__", "keep the results of runs in the repository"),
+    "archive": Entry("analysis.archive", "keep the results of runs in the repository"),
     "sync": Entry("rgbt.tracking.sync", "send run folders to MLflow"),
     "ui": Entry("rgbt.tracking.ui", "open MLflow at the runs of a folder"),
     "masks": Entry("rgbt.maskers.sketch", "draw examples of a masker"),

@@ -199,7 +199,7 @@ def test_missing_images_are_refused_or_excluded(call: Call, tmp_path: Path):
         (["corruption=noise"], "is no run; rgbt robustness run=..."),
         (["out={}/crm.npz"], "is a file; choose a folder"),
         (["b={}/crm.npz"], "a and b both contain"),
-        (["a={0}/crm.npz,{0}/crm.npz"], "twice; one training counts once"),
+        (["a={0}/crm.npz,{0}/crm.npz"], "names the same counts twice"),
         (["b=crn"], "did you mean 'crm'?"),
         (["b={}/empty"], "contains neither a run (config.yaml) nor counts"),
         (["b={}/none.npz"], "the file of counts"),

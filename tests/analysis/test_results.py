@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.archive.files import add
+from analysis.archive import add
 from analysis.results import (
     COLUMNS,
     finished_runs,
@@ -121,7 +121,7 @@ def test_ambiguous_folder_of_scores_is_refused(tmp_path: Path, names: tuple[str,
     for name in names:
         some().save(tmp_path / f"counts_{name}.npz")
     files = ", ".join(f"counts_{name}.npz" for name in names)
-    with pytest.raises(InputError, match=f"{files}; name one"):
+    with pytest.raises(InputError, match=f"{files}; name one of these"):
         open_counts(str(tmp_path), tmp_path)
 
 
@@ -141,11 +141,11 @@ def test_ambiguous_folder_of_scores_is_refused(tmp_path: Path, names: tuple[str,
         ("aaa0,,aaa1", {}, "expected runs, files of counts or a group"),
         ("aaa0", {"split": "all"}, "no counts of the split 'all'.*rgbt.evaluate"),
         ("other method.npz", {"split": "val"}, "is of split 'test', not of split=val"),
-        ("aaa0,mlflow-aaa0", {}, "twice; one training counts once"),
-        (f"{CRM},aaa1", {}, "twice; one training counts once"),
+        ("aaa0,mlflow-aaa0", {}, "names the same counts twice"),
+        (f"{CRM},aaa1", {}, "names the same counts twice"),
         ("aaa0,runs/aaa0/counts_test.npz", {}, "twice"),
         ("aaa0,link.npz", {}, "twice"),
-        ("other method.npz,copy.npz", {}, "hold the same counts; one training"),
+        ("other method.npz,copy.npz", {}, "names the same counts twice"),
         ("aaa0,ggg0", {}, f"names seed 0 of '{CRM}' twice"),  # same overrides, another default
     ],
 )
@@ -156,7 +156,7 @@ def test_other_inputs_and_repeated_runs_are_refused(
     some(7).save(runs.parent / "copy.npz")
     np.savez(runs.parent / "images.npz", x=np.zeros(3))
     if "ggg0" in text:
-        make_run(runs, "ggg0", CRM, 0)
+        some(77).save(make_run(runs, "ggg0", CRM, 0) / "counts_test.npz")
     with pytest.raises(InputError, match=word):
         open_counts(text, **{"runs_dir": runs, **options})
 
