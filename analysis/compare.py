@@ -14,7 +14,6 @@ import numpy as np
 
 from analysis.arguments import Archive, Blocks, Draws, Level, Resamples, check_out, write_tables
 from analysis.results import NamedCounts, groups_in, label_of, open_counts
-from analysis.robustness import under
 from analysis.uncertainty import Comparison, Interval, Resampling, compare
 from analysis.uncertainty.blocks import FEWEST
 from analysis.uncertainty.same_images import common
@@ -64,10 +63,9 @@ class Options:
             "frames of videos); default: single frames"
         ),
     ] = ""
-    corruption: Annotated[
-        str, Help("compare corrupted images (rgbt robustness): corruption=noise:rgb severity=16")
+    condition: Annotated[
+        str, Help('input (rgbt evaluate) or corruption (rgbt robustness): thermal, "noise:rgb 16"')
     ] = ""
-    severity: Annotated[str, Help("severity of the corruption")] = ""
     paired: Annotated[
         bool,
         Help(
@@ -109,8 +107,8 @@ def main(options: Options, _: list[str]) -> int:
     )
     metrics, paired = metrics_of(options.metrics, [*a, *b], settings), options.paired
     found = compare(a, b, metrics, settings, paired=paired, same_pixels=not paired)
-    shown = " ".join(word for word in (options.corruption, options.severity) if word)
-    labels = [f"{label} ({shown})" if shown else label for label in _labels(opened)]
+    shown = f" ({options.condition})" if options.condition else ""
+    labels = [f"{label}{shown}" for label in _labels(opened)]
     grid = comparison_grid(found, labels, absent_classes([*a, *b], settings.absent))
     said = sentence(found, *labels)
     print_rich(rich_table(grid))
@@ -205,12 +203,9 @@ def absent_classes(every: Sequence[Counts], absent: Absent | None) -> tuple[str,
 
 def _opened(options: Options) -> list[tuple[NamedCounts, ...]]:
     """The trainings of both methods."""
-    frames, corruption, severity = options.frames, options.corruption, options.severity
-    if severity and not corruption:
-        raise InputError("'severity' has no effect without corruption=..., for example noise.")
-    if corruption and frames:
-        raise InputError(f"corruption={corruption} applies to single frames; omit frames=.")
-    opened = []
+    if options.condition and options.frames:
+        raise InputError(f"condition={options.condition} is of single frames; omit frames=.")
+    stored = options.runs_dir, options.split, options.frames, options.condition, options.archive
     for key, side in (("a", options.a), ("b", options.b)):
         if not side:
             groups = ", ".join(groups_in(options.runs_dir, options.archive)) or "none"
@@ -218,9 +213,7 @@ def _opened(options: Options) -> list[tuple[NamedCounts, ...]]:
                 f"'{key}' has no value; give a run, a file of counts, or a group of runs. Groups "
                 f"in {options.runs_dir}: {groups}."
             )
-        found = open_counts(side, options.runs_dir, options.split, frames, options.archive)
-        opened.append(under(found, corruption, severity) if corruption else found)
-    return opened
+    return [open_counts(side, *stored) for side in (options.a, options.b)]
 
 
 def _counts(

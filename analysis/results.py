@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cache
 from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -26,6 +25,7 @@ from rgbt.metrics.pairs import file_name, protocol_of
 from rgbt.metrics.score_grid import score_grid
 from rgbt.metrics.scores import MEANS, iou, miou, recall, variance
 from rgbt.runs.folder import GROUP, RunFolder, counts_name, find_run, is_finished, runs_in
+from rgbt.runs.naming import row_name
 from rgbt.runs.result import RunResult
 from rgbt.terminal import info, warn
 from rgbt.types import VIEWS
@@ -75,6 +75,12 @@ class Evaluation:
     row: str = ""
     title: str = ""
     unit: str = ""
+
+    @property
+    def said(self) -> str:
+        """Condition and severity: "noise 16"."""
+        severity = "" if math.isnan(self.severity) else f" {self.severity:g}"
+        return f"{self.condition}{severity}"
 
 
 def level_of(path: Path) -> Evaluation:
@@ -177,7 +183,7 @@ def score_frame(counts: Counts, absent: Absent | None = None) -> pd.DataFrame:
 
     absent = absent or counts.absent
     rows: list[tuple[str, int, str, str, float]] = []
-    if details_of(counts.partition) or protocol_of(counts.partition):
+    if not _is_plain(counts):
         for name in dict.fromkeys(score_grid(counts).metrics):
             of = parse(name)
             score = "/".join(filter(None, (of.score, of.bin)))
@@ -241,13 +247,7 @@ def results(
 
 @dataclass(frozen=True)
 class NamedCounts:
-    """Counts of a run or of a file, under the name that tables show.
-
-    Attributes:
-        label: of the method.
-        run: that they are of; None for a file.
-        seed: of the run; None for a file.
-    """
+    """Counts under the name of their method; of a run with a seed, or of a file without both."""
 
     label: str
     path: Path
@@ -266,6 +266,7 @@ def open_counts(
     runs_dir: Path | str = "runs",
     split: str = "",
     frames: Frames = "",
+    condition: str = "",
     archive: Path | str = "results",
 ) -> tuple[NamedCounts, ...]:
     """The counts that `text` names, the seeds of one method one after the other.
@@ -277,27 +278,28 @@ def open_counts(
         split: "": the test split of runs, and whatever a file holds.
         frames: of runs, counts of single frames, or of pairs of frames by one protocol
             (`rgbt.metrics.pairs`); "": single frames of runs, and whatever a file holds.
+        condition: of runs, counts of another input or of corrupted images (`Evaluation`):
+            "thermal", "noise 16", "removed:rgb"; "": as the runs ended.
         archive: where archived runs lie, which have keys and groups as those of `runs_dir`.
 
     Raises:
-        InputError: there is no such thing, a run has no counts of the split or of pairs, or a file
-            is of others.
+        InputError: there is no such thing, a run lacks what is requested, or a file is of others.
     """
-    finished = cache(lambda: finished_runs(runs_dir, archive))
-    words = split_list(text, RUNS)
-    found = [
-        each for word in words for each in _open(word, Path(runs_dir), finished, split, frames)
-    ]
-    for path, counts in ((named.path, named.counts) for named in found):
+    found: list[NamedCounts] = []
+    for word in split_list(text, RUNS):
+        for source in _named(word, Path(runs_dir), archive):
+            if isinstance(source, Path):
+                found.append(_of_file(source))
+            else:
+                found.append(_of_run(source, split or "test", frames, condition))
+    for path, counts in ((each.path, each.counts) for each in found):
         if split and counts.split != split:
             raise InputError(f"{path} is of split '{counts.split}', not of split={split}.")
         if frames and protocol_of(counts.partition) != frames:
             raise InputError(f"{path} is by {counts.partition}, not frames={frames}.")
     _check_trainings_differ(text, found)
     if len(labels := dict.fromkeys(each.label for each in found)) > 1:
-        info(
-            f"{' and '.join(labels)} were listed together: they are treated as seeds of one method."
-        )
+        info(f"{' and '.join(labels)}, listed together, are treated as seeds of one method.")
     return tuple(found)
 
 
@@ -328,40 +330,31 @@ def label_of(counts: Sequence[NamedCounts]) -> str:
     return " + ".join(dict.fromkeys(each.label for each in counts))
 
 
-def _open(
-    word: str, runs_dir: Path, finished: Callable[[], list[RunResult]], split: str, frames: Frames
-) -> list[NamedCounts]:
+def _named(word: str, runs_dir: Path, archive: Path | str) -> Sequence[RunResult | Path]:
+    """The runs, or the file of counts, that a word names."""
     path = Path(word).expanduser()
     if path.suffix == ".npz":
-        return [_of_file(path)]
+        return [path]
     try:
-        chosen = [RunResult(find_run(word, runs_dir))]
+        return [RunResult(find_run(word, runs_dir))]
     except (InputError, OSError):  # OSError: longer than a file's name may be
-        chosen = [run for run in finished() if run.key == word] or _of_group(word, finished())
-    if chosen:
-        return [_of_run(run, split, frames) for run in chosen]
+        finished = finished_runs(runs_dir, archive)
+    if chosen := [run for run in finished if word in (run.key, run.tags.get(GROUP))]:
+        return chosen
+    # A folder that `analysis.score` wrote has counts by rings, as the papers' tables are, and more.
+    files = []
     with suppress(OSError):
-        if path.is_dir():
-            return [_of_scores(path)]
-    groups = {run.tags.get(GROUP, "") for run in finished()} - {""}
+        files = sorted(path.glob("counts_ring*.npz")) or sorted(path.glob("counts_*.npz"))
+    if len(files) > 1:
+        raise InputError(f"{path} has {', '.join(f.name for f in files)}; name one of these.")
+    groups = {run.tags.get(GROUP, "") for run in finished} - {""}
     known = f" or a group of {runs_dir} ({nearest(word, groups)})" if groups else ""
-    raise InputError(
-        f"'{word}' is not a run folder, config key or MLflow run id in {runs_dir}, nor a file "
-        f"of counts (.npz){known}."
-    )
-
-
-def _of_scores(folder: Path) -> NamedCounts:
-    """The counts in a folder that `analysis.score` wrote: by rings, as the papers' tables are."""
-    files = sorted(folder.glob("counts_ring*.npz")) or sorted(folder.glob("counts_*.npz"))
     if not files:
         raise InputError(
-            f"{folder} contains neither a run (config.yaml) nor counts (counts_*.npz); to count "
-            "label images of a method: rgbt score predictions=... dataset=..."
+            f"'{word}' is not a run (folder, config key or MLflow run id in {runs_dir}), nor counts"
+            f" (.npz, or a folder of rgbt score){known}."
         )
-    if len(files) > 1:
-        raise InputError(f"{folder} has {', '.join(f.name for f in files)}; name one of these.")
-    return _of_file(files[0])
+    return files
 
 
 def _of_file(path: Path) -> NamedCounts:
@@ -372,12 +365,22 @@ def _of_file(path: Path) -> NamedCounts:
     return NamedCounts(label, path, Counts.load(path))
 
 
-def _of_group(word: str, runs: Sequence[RunResult]) -> list[RunResult]:
-    return [run for run in runs if word and word == run.tags.get(GROUP)]  # "": of no group
-
-
-def _of_run(run: RunResult, split: str, frames: Frames) -> NamedCounts:
-    split = split or "test"
+def _of_run(run: RunResult, split: str, frames: Frames, condition: str) -> NamedCounts:
+    label, seed = run.tags.get(GROUP) or run.key, _seed_of(run)
+    if not run.is_finished:
+        info(f"{run.folder} is not finished; its counts are those of its last evaluation.")
+    if condition:
+        known = [each for each in evaluations_of(run, split) if _is_plain(each.counts)]
+        name, *severity = condition.split(" ", 1)
+        wanted = " ".join((row_name(name), *severity))
+        chosen = [each for each in known if wanted in (each.condition, each.said)]
+        if len(chosen) != 1:
+            said = ", ".join(each.said for each in known)
+            raise InputError(
+                f"condition={condition} of {run.folder} is not one of {said} (rgbt evaluate and "
+                "rgbt robustness make more)."
+            )
+        return NamedCounts(label, chosen[0].path, chosen[0].counts, run, seed)
     name = file_name(frames, split) if frames else counts_name(split)
     if frames and not (run.folder / name).is_file():
         views = {"next": "next", "flow": "video", "triples": "video"}.get(frames, "virtual")
@@ -385,11 +388,13 @@ def _of_run(run: RunResult, split: str, frames: Frames) -> NamedCounts:
             f"{run.folder} has no counts of pairs of frames {name}; rgbt consistency "
             f"run={run.folder} split={split} frames={views} makes them once it is finished."
         )
-    if not run.is_finished:
-        info(f"{run.folder} is not finished; its counts are those of its last evaluation.")
     counts = run.counts(name if frames else split)
-    label = run.tags.get(GROUP) or run.key
-    return NamedCounts(label, run.folder / name, counts, run, _seed_of(run))
+    return NamedCounts(label, run.folder / name, counts, run, seed)
+
+
+def _is_plain(counts: Counts) -> bool:
+    """Whether they are of single frames, without details."""
+    return details_of(counts.partition) is None and protocol_of(counts.partition) is None
 
 
 def _seed_of(run: RunResult) -> int | None:

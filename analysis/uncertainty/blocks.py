@@ -41,7 +41,7 @@ BAND = 1.96
 
 @dataclass(frozen=True, kw_only=True)
 class Resampling:
-    """Settings of intervals and tests.
+    """Settings of intervals and tests; InputError: a value out of range.
 
     Attributes:
         resamples: number of resamples, 100..`MOST`.
@@ -51,11 +51,7 @@ class Resampling:
             that are equal but for one number); "auto": runs of consecutively numbered frames, cut
             where one is too long for that at the distance over which the scores of the images are
             correlated (Politis and White, 2004).
-        absent: how a class without pixels scores, see `rgbt.metrics.scores`; None: as the counts
-            say (`rgbt.metrics.counts.Counts.absent`).
-
-    Raises:
-        InputError: a value out of range.
+        absent: how a class without pixels scores (`rgbt.metrics.scores`); None: as counted.
     """
 
     resamples: int = 10_000
@@ -117,19 +113,14 @@ def make_blocks(
     series: Values | None = None,
     strata: ArrayLike | None = None,
 ) -> ImageBlocks:
-    """The blocks that `choice` asks for (see `Resampling.blocks`).
+    """The blocks of N images, of whose names those of one sequence differ in one number alone.
 
-    Args:
-        names: of N images; frames of one sequence differ in one number alone.
-        choice: see `Resampling.blocks`.
-        series: (L, N), influence of every image on each of L scores; read by "auto" alone, which
-            takes the longest of their block lengths.
-        strata: (N,) number of the stratum of each image, such as day and night: no block holds
-            images of two of them. None: there is one.
+    `choice` is that of `Resampling.blocks`. "auto" alone reads `series`, (L, N), the influence of
+    every image on each of L scores, and takes the longest of their block lengths. No block holds
+    images of two `strata`, (N,), such as day and night; None: there is one.
 
     Raises:
-        InputError: fewer than `FEWEST` blocks, or names without a number where frames are asked
-            for.
+        InputError: fewer than `FEWEST` blocks, or names without the number of a frame.
     """
     parts = np.zeros(len(names), np.int64) if strata is None else np.asarray(strata, np.int64)
     singles, said = [*np.arange(len(names))[:, None]], f"{len(names)} single images"

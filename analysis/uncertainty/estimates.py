@@ -38,7 +38,6 @@ class Estimate:
         trainings: interval over seeds, images as they are; None for one seed.
         both: interval over images and seeds; None where one of the two is.
         p: two-sided p-value of `interval` against 0; NaN without one.
-        evidence: the numbers that the intervals follow from.
     """
 
     value: float
@@ -67,13 +66,10 @@ class Estimate:
 
 
 def estimate_of(evidence: Evidence, level: float, metric: str = "") -> Estimate:
-    """Student's intervals of a contrast.
+    """Student's intervals of a contrast, or of a score called `metric`.
 
-    Args:
-        evidence: of the contrast.
-        level: of the intervals.
-        metric: of a score that is no difference; variances over regions and calibration errors
-            are never negative, and chance alone raises them and raises each resample again.
+    Variances over regions and calibration errors are never negative, and chance alone raises them
+    and raises each resample again.
     """
     value, used = float(np.mean(evidence.values)), evidence.images
     parsed = parse(metric) if metric else None
@@ -108,15 +104,10 @@ def estimate_of(evidence: Evidence, level: float, metric: str = "") -> Estimate:
 def estimate(
     seeds: Sequence[Counts], metrics: Sequence[str], settings: Resampling
 ) -> dict[str, Estimate]:
-    """Scores of one method.
-
-    Args:
-        seeds: counts of its trainings on the same images, one or more.
-        metrics: names, see `rgbt.metrics.named`.
-        settings: of the resampling.
+    """Scores of one method, of counts of one or more trainings on the same images.
 
     Returns:
-        metric -> estimate, in the requested order.
+        metric (`rgbt.metrics.named`) -> estimate, in the requested order.
 
     Raises:
         InputError: no such metric, class or region; seeds on different images; blocks that cannot
@@ -190,14 +181,9 @@ def compare(
 ) -> Comparison:
     """Compare two methods on the same images.
 
-    Args:
-        a: counts of the trainings of the first method, one or more.
-        b: of the second, on the same images.
-        metrics: names, see `rgbt.metrics.named`.
-        settings: of the resampling.
-        paired: counts i of `a` and of `b` are of the same training, evaluated in two ways. Seeds of
-            two methods are not paired (Welch).
-        same_pixels: whether both must count the same pixels of every image, by the same partition.
+    Of counts of one or more trainings of each, in the named metrics (`rgbt.metrics.named`).
+    Seeds of two methods are not `paired` (Welch), but counts i of `a` and of `b` may be of the same
+    training, evaluated in two ways. These need not count the `same_pixels` by the same partition.
 
     Raises:
         InputError: other images, classes, scored classes, regions or labels; fewer than `FEWEST`

@@ -6,7 +6,7 @@ import math
 from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 
@@ -151,17 +151,12 @@ def decide(
             only be contradicted, "any" can only hold, and "most" stays undecided.
 
     Raises:
-        ValueError: no evidence, several for "mean", an empty range, or no such `combine`.
+        ValueError: no evidence, or several for "mean".
     """
-    low, high = wanted
-    if not low < high:
-        raise ValueError(f"wanted: expected a lower and a higher end, got {low} and {high}.")
-    if combine not in get_args(Combine):
-        raise ValueError(f"combine: expected {', '.join(get_args(Combine))}, got '{combine}'.")
     if not evidences or (combine == "mean" and len(evidences) > 1):
         expected = "one evidence, of the mean contrast" if combine == "mean" else "evidence"
         raise ValueError(f"{combine}: expected {expected}, got {len(evidences)}.")
-    contrasts = tuple(_contrast(each, low, high) for each in evidences)
+    contrasts = tuple(_contrast(each, *wanted) for each in evidences)
     needed = {"all": len(contrasts), "most": len(contrasts) // 2 + 1, "any": 1, "mean": 1}[combine]
     claim = _Claim(contrasts, rule, needed)
     kind = claim.kind()

@@ -128,13 +128,13 @@ def test_ambiguous_folder_of_scores_is_refused(tmp_path: Path, names: tuple[str,
 @pytest.mark.parametrize(
     ("text", "options", "word"),
     [
-        ("aab0", {}, "'aab0' is not a run folder.*crm scale=demo"),
-        ("/no/such/folder", {}, "is not a run folder"),
-        ("mlflow-none", {}, "is not a run folder"),
+        ("aab0", {}, "'aab0' is not a run.*crm scale=demo"),
+        ("/no/such/folder", {}, "is not a run"),
+        ("mlflow-none", {}, "is not a run"),
         ("crm scale=dem", {}, "did you mean 'crm scale=demo'"),
-        (f"{LONG}1", {}, "is not a run folder"),
-        ("abc", {"runs_dir": "none"}, "'abc' is not a run folder"),
-        ("crm", {"runs_dir": "none"}, r"neither a run \(config.yaml\) nor counts .*rgbt score"),
+        (f"{LONG}1", {}, "is not a run"),
+        ("abc", {"runs_dir": "none"}, "'abc' is not a run"),
+        ("crm", {"runs_dir": "none"}, "is not a run .* nor counts"),
         ("none.npz", {}, "the file of counts"),
         ("images.npz", {}, "is not a readable file of counts"),
         ("", {}, "expected runs, files of counts or a group"),
@@ -168,7 +168,7 @@ def test_damaged_run_stops_nothing_else(runs: Path, capsys: pytest.CaptureFixtur
         (broken / name).write_text(text)
     assert len(open_counts("other method.npz", runs)) == 1
     assert CRM in groups_in(runs)
-    with pytest.raises(InputError, match="is not a run folder"):
+    with pytest.raises(InputError, match="is not a run"):
         open_counts("mlflow-nobody", runs)
     open_counts("aaa9", runs)
     assert "is not finished" in capsys.readouterr().err
