@@ -11,7 +11,7 @@ import pytest
 
 from analysis.uncertainty import Resampling
 from analysis.uncertainty.contrasts import Evidence, Resampler, Term, combine
-from analysis.uncertainty.effects import Effect, Noise, estimate_effects
+from analysis.uncertainty.effects import Noise, estimate_effects
 from analysis.uncertainty.intervals import over_images
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
@@ -41,37 +41,34 @@ def scores(values: object, drawn: object = None, images: int = 20) -> list[Evide
     ]
 
 
-def mean_of(cells: list[Evidence]) -> Effect:
-    return estimate_effects(cells, np.ones((1, len(cells))), "cells")[0]
-
-
 def test_effects_are_differences_of_halves() -> None:
     # Means of A are 9 and 2, of B 7.5 and 3.5. B adds 6 at A+ and 2 at A-: half of 4 is 2.
-    found = estimate_effects(scores([[1, 3, 6, 12]]), SIGNS, "cells")
-    assert [each.estimate.value for each in found] == [7, 4, 2]
+    cells = scores([[1, 3, 6, 12]])
+    found = estimate_effects(cells, np.vstack([SIGNS, np.ones(4)]), "cells")
+    assert [each.estimate.value for each in found] == [7, 4, 2, 5.5]
     assert all(each.estimate.both is None and not each.is_shown() for each in found)
-    assert mean_of(scores([[1, 3, 6, 12]])).estimate.value == 5.5
+    with pytest.raises(ValueError, match="balanced rows of 4"):
+        estimate_effects(cells, np.array([[1.0, 1, 1, -1]]), "cells")
 
 
-def test_error_of_cells_is_what_means_of_seeds_and_cells_leave() -> None:
-    # Seed 1 adds 10 to all cells and 1 to the last: left over are -+ 1/8 (three cells) and 3/8.
-    # Sum of squares 2 (3/64 + 9/64) = 3/8 over (2 - 1)(4 - 1) = 3: variance 1/8.
-    # An effect has weights -+ 1/2 over cells, means of two seeds: 1/8 x 4 x 1/4 / 2 = 1/16.
-    found = estimate_effects(scores([[0, 0, 0, 0], [10, 10, 10, 11]]), SIGNS, "cells")
-    assert [each.estimate.evidence.trainings.error for each in found] == pytest.approx(
-        [0.25, 0.25, 0.25]
-    )
-    # Of the effect itself: 0 and 1/2, standard deviation 1 / (2 sqrt(2)), over sqrt(2): 1/4.
-    found = estimate_effects(scores([[0, 0, 0, 0], [10, 10, 10, 11]]), SIGNS, "effects")
-    assert [each.estimate.evidence.trainings.error for each in found] == pytest.approx(
-        [0.25, 0.25, 0.25]
-    )
-
-
-def test_error_of_effects_is_of_each_effect() -> None:
-    # A is 1 and 3, B and A x B are 0 in both seeds.
-    found = estimate_effects(scores([[0, 0, 1, 1], [0, 0, 3, 3]]), SIGNS, "effects")
-    assert [each.estimate.evidence.trainings.error for each in found] == pytest.approx([1, 0, 0])
+@pytest.mark.parametrize(
+    ("values", "noise", "errors"),
+    [
+        # Seed 1 adds 10 to all cells and 1 to the last: left over are -+ 1/8 (three cells) and 3/8.
+        # Sum of squares 2 (3/64 + 9/64) = 3/8 over (2 - 1)(4 - 1) = 3: variance 1/8.
+        # An effect has weights -+ 1/2 over cells, means of two seeds: 1/8 x 4 x 1/4 / 2 = 1/16.
+        ([[0, 0, 0, 0], [10, 10, 10, 11]], "cells", [0.25, 0.25, 0.25]),
+        # Of the effect itself: 0 and 1/2, standard deviation 1 / (2 sqrt(2)), over sqrt(2): 1/4.
+        ([[0, 0, 0, 0], [10, 10, 10, 11]], "effects", [0.25, 0.25, 0.25]),
+        # A is 1 and 3, B and A x B are 0 in both seeds.
+        ([[0, 0, 1, 1], [0, 0, 3, 3]], "effects", [1, 0, 0]),
+    ],
+)
+def test_error_over_seeds_by_hand(values: object, noise: Noise, errors: list[float]) -> None:
+    found = estimate_effects(scores(values), SIGNS, noise)
+    spreads = [each.estimate.evidence.trainings for each in found]
+    assert [each.error for each in spreads] == pytest.approx(errors)
+    assert {each.freedom for each in spreads} == {3 if noise == "cells" else 1}
 
 
 def test_error_of_images_is_of_the_draws_of_all_cells_together() -> None:
@@ -82,16 +79,10 @@ def test_error_of_images_is_of_the_draws_of_all_cells_together() -> None:
     assert found[1].estimate.evidence.error == 0
 
 
-def test_effects_refuses_unbalanced_contrasts() -> None:
-    with pytest.raises(ValueError, match="balanced rows of 4"):
-        estimate_effects(scores([[1, 2, 3, 4]]), np.array([[1.0, 1, 1, -1]]), "cells")
-
-
 def test_combine_pairs_seeds_and_draws() -> None:
     one, two = scores([[3.0]], [[1.0], [2.0]])[0], scores([[1.0]], [[1.0], [0.0]])[0]
     found = combine((1.0, -1.0), (one, two))
-    assert found.values == (2.0,)
-    assert found.drawn.tolist() == [0.0, 2.0]
+    assert (found.values, found.drawn.tolist()) == ((2.0,), [0.0, 2.0])
     with pytest.raises(ValueError, match="the same seeds"):
         combine((1.0, -1.0), (one, replace(two, seeds=(4,))))
 
@@ -110,34 +101,18 @@ def iou(error: float) -> float:
     return 100 * (1 - error) / (1 + error)
 
 
-WEIGHTS = {"region/1": 1.0, "region/2": -1.0}
-
-
 def evidence(cells: list[dict[int, tuple[str, Counts]]], resamples: int = 100) -> list[Evidence]:
     """Region 1 less region 2 in every cell."""
     engine = Resampler(Resampling(resamples=resamples, blocks="none"), "names")
-    return [
-        engine.evidence(
-            [
-                Term(
-                    weight=weight,
-                    metric=metric,
-                    counts={seed: counts for seed, (_, counts) in cell.items()},
-                    keys={seed: key for seed, (key, _) in cell.items()},
-                )
-                for metric, weight in WEIGHTS.items()
-            ]
-        )
-        for cell in cells
-    ]
-
-
-def test_cells_are_contrasts_of_regions() -> None:
-    cells = [{0: ("a", counts(np.full((12, 2), 0.1)))}]
-    cells += [{0: ("b", counts(np.tile([0.2, 0.1], (12, 1))))}]
-    found = evidence(cells)
-    assert [each.values[0] for each in found] == pytest.approx([0, iou(0.2) - iou(0.1)])
-    assert [each.error for each in found] == pytest.approx([0, 0])  # all images are equal
+    found = []
+    for cell in cells:
+        keys, every = ({seed: each[n] for seed, each in cell.items()} for n in (0, 1))
+        terms = [
+            Term(weight=weight, metric=metric, counts=every, keys=keys)
+            for metric, weight in (("region/1", 1.0), ("region/2", -1.0))
+        ]
+        found.append(engine.evidence(terms))
+    return found
 
 
 def test_cells_pair_images_by_name_and_may_have_other_labels() -> None:
@@ -150,13 +125,9 @@ def test_cells_pair_images_by_name_and_may_have_other_labels() -> None:
     first, second = evidence([{0: ("a", one)}, {0: ("b", two)}])
     assert first.drawn.tolist() == second.drawn.tolist()
     assert first.error > 0.1
-
-
-def test_cells_without_anything_to_score_are_refused() -> None:
-    full = counts(np.full((12, 2), 0.1), absent="exclude")
-    empty = replace(full, counts=np.zeros_like(full.counts))
+    empty = replace(one, counts=np.zeros_like(one.counts), absent="exclude")
     with pytest.raises(InputError, match="run-b has nothing to score"):
-        evidence([{0: ("run-a", full)}, {0: ("run-b", empty)}])
+        evidence([{0: ("run-b", empty)}])
 
 
 TRUTH: Mapping[str, tuple[float, float]] = {
