@@ -76,8 +76,7 @@ class ArchivedRun:
     def unpack(self, folder: Path | None = None) -> RunResult:
         """The run as ``<digest of the file>/<key>`` in `folder` (None: the user's cache), once.
 
-        Raises:
-            InputError: a damaged file, or one that belongs to another run.
+        InputError: a damaged file, or one that belongs to another run.
         """
         cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
         folder = folder or Path(cache, "rgbt", "archive")
@@ -130,9 +129,7 @@ def add(run: RunResult, folder: Path) -> ArchivedRun:
     """Put a finished run into the archive `folder`; the same results are written once.
 
     Other results of the same key, from another machine, are kept beside as ``<key>-<digest>.zip``.
-
-    Raises:
-        InputError: the run is not finished, or one of its files is damaged.
+    InputError: the run is not finished, or one of its files is damaged.
     """
     if not run.is_finished:
         raise InputError(f"{run.folder} is not finished; rerun its command.")

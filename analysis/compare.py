@@ -126,11 +126,9 @@ def main(options: Options, _: list[str]) -> int:
 
 
 def metrics_of(text: str, every: Sequence[Counts], settings: Resampling) -> list[str]:
-    """The requested metrics; "auto": the usual scores of the counts, also by day and by night.
+    """The requested metrics; "auto": the usual scores of the counts.
 
-    Of single frames mIoU (by day, by night) and Var and every region; of pairs of frames the two
-    of their protocol (by day, by night). Day and night where all counts distinguish them and have
-    enough images of them for `settings`.
+    Means also by day and by night, where all counts have enough images of both for `settings`.
     """
     partition = every[0].partition
     if text != "auto":

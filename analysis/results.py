@@ -84,11 +84,7 @@ class Evaluation:
 
 
 def level_of(path: Path) -> Evaluation:
-    """A file of ``rgbt robustness``, which has a description beside it.
-
-    Raises:
-        InputError: a damaged file, or one of another command.
-    """
+    """A file of ``rgbt robustness``, with the description beside it; InputError if damaged."""
     file, advice = path.with_suffix(".json"), "remove it, and rgbt robustness makes it again"
     made = read_json(file, dict[str, Any], advice)
     try:
@@ -114,23 +110,17 @@ def finished_runs(runs: Path | str = "runs", archive: Path | str = "results") ->
         try:
             run = RunResult(source.path) if isinstance(source, RunFolder) else source.unpack()
             _ = run.result, run.description  # they can be read
-            if not _equal_counts(found.setdefault(run.key, run), run):
-                differing.add(run.key)
+            first = found.setdefault(run.key, run)
+            shared = {each.relative_to(run.folder) for each in counts_of(run.folder)}
+            shared &= {each.relative_to(first.folder) for each in counts_of(first.folder)}
+            for name in shared if first is not run else ():
+                one, two = (Counts.load(each.folder / name) for each in (first, run))
+                differing |= set() if np.array_equal(one.counts, two.counts) else {run.key}
         except InputError as error:
             warn(f"{source.path} is left out: {error}")
     for key in sorted(differing):
         warn(f"{key} is stored with other counts, too; those of {found[key].folder} are used.")
     return [found[key] for key in sorted(found)]
-
-
-def _equal_counts(first: RunResult, other: RunResult) -> bool:
-    """Whether what both runs have counted is equal."""
-    if first is other:
-        return True
-    paths = {path.relative_to(first.folder) for path in counts_of(first.folder)}
-    shared = sorted(paths & {path.relative_to(other.folder) for path in counts_of(other.folder)})
-    pairs = ([Counts.load(run.folder / each) for run in (first, other)] for each in shared)
-    return all(np.array_equal(one.counts, two.counts) for one, two in pairs)
 
 
 def evaluations_of(run: RunResult, split: str = "test") -> Iterator[Evaluation]:
@@ -168,11 +158,9 @@ def _evaluation(run: RunResult, path: Path) -> Evaluation:
 
 
 def score_frame(counts: Counts, absent: Absent | None = None) -> pd.DataFrame:
-    """Every score of counts, one a row.
+    """Every score of counts of single frames, of pairs of frames, or of details, one a row.
 
-    Args:
-        counts: of single frames, of pairs of frames, or of details.
-        absent: how a class without pixels scores (`rgbt.metrics.scores`); None: as the counts say.
+    `absent`: how a class without pixels scores (`rgbt.metrics.scores`); None: as counted.
 
     Returns:
         the columns `SCORE_COLUMNS`: subset ("all", "day", "night"), region (0: the whole image),
@@ -215,13 +203,8 @@ def results(
 ) -> pd.DataFrame:
     """Scores of all finished runs (`finished_runs`) as one frame: one score a row.
 
-    Args:
-        runs: folder of runs.
-        archive: folder of archived runs.
-        split: of the counts.
-        absent: see `score_frame`.
-        evaluations: whether to read counts of other inputs, corruptions, details and pairs of
-            frames, too, and not only those that a run ended with.
+    `absent` is that of `score_frame`. Without `evaluations`, only the counts that a run ended with
+    are read, and none of other inputs, corruptions, details and pairs of frames.
 
     Returns:
         the columns `COLUMNS`: run (its key), experiment, group (name that its seeds share), seed,

@@ -29,16 +29,10 @@ class Training:
 
 
 def trainings(text: str, runs_dir: Path | str = "runs", split: str = "") -> list[Training]:
-    """The trainings that `text` names, with all their levels.
+    """The trainings that `text` names, with all their levels; InputError: not measured.
 
-    Args:
-        text: runs or groups (see `analysis.results.open_counts`), or folders that
-            ``rgbt robustness out=...`` wrote, with commas.
-        runs_dir: where runs lie.
-        split: "": test.
-
-    Raises:
-        InputError: there is no such thing, or it was not measured.
+    `text`: runs or groups (see `analysis.results.open_counts`), or folders that
+    ``rgbt robustness out=...`` wrote, with commas.
     """
     found: list[tuple[str, Path]] = []
     for word in split_list(text, RUNS):
@@ -53,11 +47,7 @@ def trainings(text: str, runs_dir: Path | str = "runs", split: str = "") -> list
 
 
 def levels_of(folder: Path) -> tuple[Evaluation, ...]:
-    """Every level in a folder: clean first, then what has no severity, then by title.
-
-    Raises:
-        InputError: no clean images, or a file that is damaged or of another kind.
-    """
+    """Every level in a folder: clean first, then what has no severity, then by title."""
     found = [level_of(path.with_suffix(".npz")) for path in sorted(folder.glob("*.json"))]
     if CLEAN not in {level.row for level in found}:
         raise InputError(f"{folder} has no counts of clean images; rgbt robustness makes them.")
