@@ -14,8 +14,7 @@ import pytest
 
 import rgbt
 from rgbt import predict
-from rgbt.checkpoints.files import NOTE
-from rgbt.checkpoints.files import read_torch_file, save
+from rgbt.checkpoints.files import NOTE, read_torch_file, save
 from rgbt.checks import InputError
 from rgbt.config.stored_config import read_settings
 from rgbt.metrics.counts import Counts

@@ -302,8 +302,6 @@ def test_the_bias_of_the_keys_does_not_count() -> None:
         before = after
 
 
-
-
 # ---- the network ----
 nano = partial(plain.nano, "dinov2")
 ADAMW = AdamW(
