@@ -360,15 +360,6 @@ def test_weighted_losses_by_hand() -> None:
     assert torch.allclose(dice, torch.tensor([11 / 15]))
 
 
-def test_gradients() -> None:
-    generator = seeded(0)
-    x = torch.randn(3, 6, dtype=torch.float64, generator=generator, requires_grad=True)
-    t = torch.rand(3, 6, dtype=torch.float64, generator=generator)
-    w = PointWeights(1 + t, (1 + t).sum(-1), torch.zeros(3, dtype=torch.float64))
-    assert torch.autograd.gradcheck(lambda x: mask_and_dice(x, t, None), x)
-    assert torch.autograd.gradcheck(lambda x: mask_and_dice(x, t, w), x)
-
-
 def test_losses_do_not_depend_on_the_chunks(monkeypatch: Any) -> None:
     output, batch = problem_of(3, 4, 2)
     criterion = criterion_of()

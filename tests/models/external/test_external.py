@@ -104,24 +104,6 @@ def test_network_may_import_when_it_is_called(tmp_path: Path) -> None:
     assert sys.path[-1] == str(tmp_path)  # nothing of ours is looked for there first
 
 
-def test_weights_follow_the_generator_also_of_numpy(tmp_path: Path) -> None:
-    code = "import numpy as np\nimport random\n" + STACKED.replace(
-        "super().__init__()",
-        "super().__init__()\n        self.drawn = np.random.rand(), random.random()",
-    )
-    folder = write_checkout(tmp_path, {"model/net.py": code})
-
-    def built(seed: int) -> tuple[object, torch.Tensor]:
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
-            network = external(folder).network
-        return network.drawn, network.conv.weight
-
-    (first, weight), (again, same), (other, _) = built(0), built(0), built(1)
-    assert first == again != other
-    assert torch.equal(weight, same)
-
-
 ODD = f"""
 import absent.tools as tools
 from absent.registry import ARCH, twice
