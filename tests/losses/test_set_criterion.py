@@ -88,13 +88,6 @@ def test_assignment_is_the_cheapest_of_all() -> None:
         assert matches.query[one_set, 2] == cost[one_set, 1, :, 1].argmin()
 
 
-def test_targets_without_a_query() -> None:
-    targets = targets_of(torch.tensor([[[0, 1, 2]]]), (1, 3), 3, None)
-    cost = torch.tensor([[[[5.0, 1.0, 4.0], [5.0, 2.0, 3.0]]]])
-    # Queries 0 and 1 take classes 1 and 2 (1 + 3 = 4); class 0 is left without one.
-    assert assign(cost, targets).query.tolist() == [[-1, 0, 1]]
-
-
 def source(seed: int = 0) -> Points:
     return Points(seeded(seed), device=torch.device("cpu"))
 
