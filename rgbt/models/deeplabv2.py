@@ -155,10 +155,10 @@ class DeepLabV2(Network):
         pyramid = partial(AtrousPyramid, rates=rates, summed_rates=summed_rates)
         self.heads = nn.ModuleDict()
         for name in heads:
-            aspp, final = pyramid(channels, sizes[0]), nn.Identity()
+            aspp = pyramid(channels, sizes[0])
             ups = [UpBlock(*pair, align_corners=align_corners) for pair in pairwise(sizes)]
-            if decoder == "modified_heatnet":
-                final = nn.Conv2d(sizes[-1], num_classes, 1)
+            is_wide = decoder == "modified_heatnet"
+            final = nn.Conv2d(sizes[-1], num_classes, 1) if is_wide else nn.Identity()
             self.heads[name] = DeepLabHead(aspp, ups, final, dropout)
         self.auxiliary = pyramid(16 * base_width, num_classes) if auxiliary else None
         for module in self.modules():
