@@ -149,9 +149,11 @@ class DeepLabV2(Network):
         self.multiple = 1 if decoder == "basic" else 8
         self.backbone = Backbone(depths, base_width, ceil_mode=ceil_mode, train_norm=train_norm)
         channels = 32 * base_width
-        sizes = {"basic": (num_classes,), "modified_thesis": (num_classes,) * 4}.get(
-            decoder, tuple(channels // each for each in (2, 8, 32, 32))
-        )
+        sizes = {
+            "basic": (num_classes,),
+            "modified_heatnet": tuple(channels // each for each in (2, 8, 32, 32)),
+            "modified_thesis": (num_classes,) * 4,
+        }[decoder]
         pyramid = partial(AtrousPyramid, rates=rates, summed_rates=summed_rates)
         self.heads = nn.ModuleDict()
         for name in heads:
