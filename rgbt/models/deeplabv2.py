@@ -149,16 +149,18 @@ class DeepLabV2(Network):
         self.multiple = 1 if decoder == "basic" else 8
         self.backbone = Backbone(depths, base_width, ceil_mode=ceil_mode, train_norm=train_norm)
         channels = 32 * base_width
-        sizes = {"basic": (num_classes,), "modified_thesis": (num_classes,) * 4}.get(
-            decoder, tuple(channels // each for each in (2, 8, 32, 32))
-        )
+        sizes = {
+            "basic": (num_classes,),
+            "modified_heatnet": tuple(channels // each for each in (2, 8, 32, 32)),
+            "modified_thesis": (num_classes,) * 4,
+        }[decoder]
         pyramid = partial(AtrousPyramid, rates=rates, summed_rates=summed_rates)
         self.heads = nn.ModuleDict()
         for name in heads:
-            aspp, final = pyramid(channels, sizes[0]), nn.Identity()
+            aspp = pyramid(channels, sizes[0])
             ups = [UpBlock(*pair, align_corners=align_corners) for pair in pairwise(sizes)]
-            if decoder == "modified_heatnet":
-                final = nn.Conv2d(sizes[-1], num_classes, 1)
+            is_wide = decoder == "modified_heatnet"
+            final = nn.Conv2d(sizes[-1], num_classes, 1) if is_wide else nn.Identity()
             self.heads[name] = DeepLabHead(aspp, ups, final, dropout)
         self.auxiliary = pyramid(16 * base_width, num_classes) if auxiliary else None
         for module in self.modules():

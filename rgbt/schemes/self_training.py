@@ -158,8 +158,8 @@ class SelfTraining:
         if self.feature_distance is not None:
             with torch.no_grad():
                 initial = self.passes.output("source", source, generator_of, network=self.initial)
-            features = (each.aux["features"] for each in (output, initial))
-            distance = self.feature_distance(*features, source.label, self.dataset.classes)
+            now, start = output.aux["features"], initial.aux["features"]
+            distance = self.feature_distance(now, start, source.label, self.dataset.classes)
             parts["source/feature_distance"] = distance
         return parts
 

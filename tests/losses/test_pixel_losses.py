@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any, get_args
+from typing import Any
 
 import pytest
 import torch
@@ -16,9 +16,7 @@ from rgbt.checks import InputError
 from rgbt.losses.cross_entropy import CrossEntropy, WithAuxiliary
 from rgbt.losses.distances import FeatureDistance, feature_distance, sdc, sdn, thing_cells
 from rgbt.losses.unlabelled import (
-    VERDICT_LOSSES,
     Entropy,
-    Judged,
     MaxSquares,
     guidance,
     judged,
@@ -203,20 +201,6 @@ def test_image_wise_weights_against_loops(ratio: float) -> None:
             total -= sum(value**2 for value in pixel) / max(size, 1)
     assert squares(p, "pixels", ratio).item() == pytest.approx(total / (2 * 3), rel=1e-9)
     assert squares(p, "entries", ratio).item() == pytest.approx(total / (3 * 4), rel=1e-9)
-
-
-DIFFERENTIABLE: dict[str, Any] = {
-    **{f"squares {r}": lambda s, r=r: squares(s.softmax(1), "entries", r) for r in (None, 0.2)},
-    "entropy": lambda s: entropy(s.softmax(1)),
-    **{name: lambda s, f=loss: f(s, 0.25) for name, loss in VERDICT_LOSSES.items()},
-    **{how: lambda s, how=how: judged(s, how) for how in get_args(Judged)},
-}
-
-
-@pytest.mark.parametrize("name", DIFFERENTIABLE)
-def test_gradients_without_labels(name: str) -> None:
-    scores = torch.randn(2, 3, 2, 3, generator=seeded(1), dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(DIFFERENTIABLE[name], (scores,))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])

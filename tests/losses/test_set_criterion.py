@@ -88,13 +88,6 @@ def test_assignment_is_the_cheapest_of_all() -> None:
         assert matches.query[one_set, 2] == cost[one_set, 1, :, 1].argmin()
 
 
-def test_targets_without_a_query() -> None:
-    targets = targets_of(torch.tensor([[[0, 1, 2]]]), (1, 3), 3, None)
-    cost = torch.tensor([[[[5.0, 1.0, 4.0], [5.0, 2.0, 3.0]]]])
-    # Queries 0 and 1 take classes 1 and 2 (1 + 3 = 4); class 0 is left without one.
-    assert assign(cost, targets).query.tolist() == [[-1, 0, 1]]
-
-
 def source(seed: int = 0) -> Points:
     return Points(seeded(seed), device=torch.device("cpu"))
 
@@ -358,15 +351,6 @@ def test_weighted_losses_by_hand() -> None:
     bce, dice = mask_and_dice(x, t, w)
     assert torch.allclose(bce, torch.tensor([3.5 * math.log(2)]))
     assert torch.allclose(dice, torch.tensor([11 / 15]))
-
-
-def test_gradients() -> None:
-    generator = seeded(0)
-    x = torch.randn(3, 6, dtype=torch.float64, generator=generator, requires_grad=True)
-    t = torch.rand(3, 6, dtype=torch.float64, generator=generator)
-    w = PointWeights(1 + t, (1 + t).sum(-1), torch.zeros(3, dtype=torch.float64))
-    assert torch.autograd.gradcheck(lambda x: mask_and_dice(x, t, None), x)
-    assert torch.autograd.gradcheck(lambda x: mask_and_dice(x, t, w), x)
 
 
 def test_losses_do_not_depend_on_the_chunks(monkeypatch: Any) -> None:

@@ -15,13 +15,10 @@ from rgbt.checks import InputError
 from rgbt.geometry.warp import halved_label
 from rgbt.losses.cross_entropy import CrossEntropy
 from rgbt.losses.temporal import SIGMA, Form, TemporalLoss, con, con_acc, dice
-from rgbt.requirements import Requirement
 from rgbt.types import Frame, Output
 from tests.losses.problems import (
     NOTHING,
     batch_of,
-    criterion_of,
-    problem_of,
     recorded_losses,
     seeded,
 )
@@ -231,27 +228,6 @@ def test_means_of_two_by_two_pixels_are_compared_where_so_many_are_given(
     forms = {"con": lambda: con(warped, p, valid, "paper")}
     forms["con_acc"] = lambda: con_acc(warped, p, label, "paper")
     torch.testing.assert_close(parts[second], forms[second]())
-
-
-def test_masks_of_queries() -> None:
-    criterion, generator = criterion_of(), seeded(3)
-    frames = []
-    for seed in (0, 1):
-        output, batch = problem_of(3, 1, 2, seed=seed)
-        logits = torch.randn(2, 5, *batch.label.shape[1:], generator=generator)
-        frames.append(Frame(output, batch, logits))
-    valid = torch.ones_like(frames[0].batch.label, dtype=torch.bool)
-    loss = loss_of(segmentation=criterion)
-    assert Requirement("model", "outputs", "masks") in loss.record.requires
-    warped = frames[0].logits.softmax(1)
-    parts = loss(*frames, warped, valid, seeded(5))
-    # The set criterion has a dice of its own.
-    segmentation = ["class_1", "mask_1", "seg_dice_1", "class_2", "mask_2", "seg_dice_2"]
-    assert list(parts) == [*segmentation, "dice_1", "con"]
-    generator = seeded(5)
-    alone = [criterion(frame.output, frame.batch, generator) for frame in frames]
-    expected = [values.sum() for each in alone for values in each.values()]
-    assert torch.equal(torch.stack([parts[name] for name in segmentation]), torch.stack(expected))
 
 
 @pytest.mark.parametrize(

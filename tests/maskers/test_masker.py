@@ -88,17 +88,6 @@ def test_cells_of_mic_are_independent_and_the_same_in_both_images() -> None:
     assert counts.var().item() == pytest.approx(16.8, abs=1.6)
 
 
-@pytest.mark.parametrize("variant", ["crm", "square", "grbm_paper"])
-def test_three_patterns_are_equally_likely(variant) -> None:
-    masks = drawn(variant, 6000)
-    rgb, thermal = masks.rgb.any((1, 2)), masks.thermal.any((1, 2))
-    for pattern in (~rgb & thermal, rgb & ~thermal, rgb & thermal):
-        # Standard error 0.006.
-        assert pattern.double().mean().item() == pytest.approx(1 / 3, abs=0.03)
-    both = rgb & thermal
-    assert torch.equal(masks.thermal[both], ~masks.rgb[both])
-
-
 @pytest.mark.parametrize(
     ("shares", "rgb", "thermal"),
     [([1, 0, 0], False, True), ([0, 1, 0], True, False), ([0, 0, 1], True, True)],

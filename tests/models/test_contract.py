@@ -155,6 +155,9 @@ def test_views_and_images_that_do_not_fit_are_refused(name: str, changes: dict[s
         net(rgb, thermal[:1])
 
 
+ROTARY = {"position_grid": None, "position_resize": None, "rope_base": 9.0}
+
+
 @pytest.mark.parametrize(
     ("name", "changes", "word"),
     [
@@ -168,11 +171,7 @@ def test_views_and_images_that_do_not_fit_are_refused(name: str, changes: dict[s
         ("dinov2", {"position_grid": None}, "model.rope_base"),
         ("dinov2", {"position_resize": None}, "model.rope_base"),
         ("dinov2", {"rope_base": 100.0}, "model.rope_base"),
-        (
-            "dinov2",
-            {"position_grid": None, "position_resize": None, "rope_base": 9.0, "num_heads": 4},
-            "model.rope_base",
-        ),
+        ("dinov2", {**ROTARY, "num_heads": 4}, "model.rope_base"),
         ("critic", {"align_corners": True}, "critic.align_corners"),
     ],
 )
@@ -186,6 +185,10 @@ def test_settings_that_do_not_fit_name_the_key(
 R50 = {"depths": "[3,4,6,3]"}
 TWO = {"heads": "[source,target]"}
 AUXILIARY = {"auxiliary": True}
+# CMX-B1 and -B3 exist in the temporal release only, with an unused layer of 1467 parameters.
+CMX = (12_114_641, 44_477_260 - 1_467, 66_565_521, 106_318_668 - 1_467, 139_858_321, 181_058_961)
+CMNEXT = (10_287_337, 39_686_825, 58_686_017, 90_012_773, 116_560_396, 148_971_437)
+SWIN = {"t": 74.92, "s": 117.56, "b": 193.50}
 
 
 @pytest.mark.parametrize(
@@ -213,25 +216,11 @@ AUXILIARY = {"auxiliary": True}
         ("deeplabv2", 14, TWO | R50, 25_572_528),
         ("deeplabv2_two_heads_literal", 14, {}, 44_575_498),
         ("deeplabv2_two_heads_modified", 14, {}, 198_594_658),
-        ("cmx_b0", 9, {}, 12_114_641),
-        # B1 and B3 exist in the temporal release only, with an unused layer of 1467 parameters.
-        ("cmx_b1", 9, {}, 44_477_260 - 1_467),
-        ("cmx_b2", 9, {}, 66_565_521),
-        ("cmx_b3", 9, {}, 106_318_668 - 1_467),
-        ("cmx_b4", 9, {}, 139_858_321),
-        ("cmx_b5", 9, {}, 181_058_961),
-        # B0, B1 and B3 are commented out in the release.
-        ("cmnext_b0", 9, {}, 10_287_337),
-        ("cmnext_b1", 9, {}, 39_686_825),
-        ("cmnext_b2", 9, {}, 58_686_017),
-        ("cmnext_b3", 9, {}, 90_012_773),
-        ("cmnext_b4", 9, {}, 116_560_396),
-        ("cmnext_b5", 9, {}, 148_971_437),
+        *((f"cmx_b{size}", 9, {}, number) for size, number in enumerate(CMX)),
+        *((f"cmnext_b{size}", 9, {}, number) for size, number in enumerate(CMNEXT)),
         # In millions, as printed.
         ("cmnext_b2", 25, {}, 58.69),
-        ("mask2former_swin_t", 9, {}, 74.92),
-        ("mask2former_swin_s", 9, {}, 117.56),
-        ("mask2former_swin_b", 9, {}, 193.50),
+        *((f"mask2former_swin_{size}", 9, {}, number) for size, number in SWIN.items()),
         ("deeplabv2", 14, R50, 24.54),
         ("deeplabv2", 14, AUXILIARY | R50, 25.06),
         ("deeplabv2_two_heads_literal", 14, R50, 25.58),

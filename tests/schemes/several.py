@@ -234,24 +234,3 @@ def run_case(name: str) -> Values:
     for title, net in case.networks.items():
         found |= {f"buffer {title} {key}": each.clone() for key, each in net.named_buffers()}
     return found
-
-
-def ten_steps(name: str) -> list[float]:
-    """The losses of ten steps with AdamW, on a new batch each."""
-    case = CASES[name]()
-    net = case.networks["model"]
-    synchronise_batch_norm(net.train())
-    optimizer = torch.optim.AdamW(net.parameters(), lr=1e-4)  # as in the paper
-    losses = []
-    for step in range(10):
-        data = own_part(doubled(batch(purpose=f"batch {step}")))
-        generator_of = lambda purpose, step=step: torch_generator(0, purpose, step)  # noqa: E731
-        (phase,) = case.scheme.phases(data, generator_of)
-        optimizer.zero_grad()
-        loss = torch.stack(list(phase.parts.values())).sum()
-        loss.backward()
-        for parameter, gradient in zip(net.parameters(), averaged_gradients(net), strict=True):
-            parameter.grad = gradient
-        optimizer.step()
-        losses.append(float(mean_over_processes([loss])[0]))
-    return losses

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import islice
 from math import log
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from rgbt.schemes.supervised import Supervised
 from rgbt.schemes.two_domains import LabelledDomains, UnlabelledTarget
 from rgbt.types import IGNORE, TwoDomains
 from tests.schemes import linear
-from tests.schemes.linear import LR, MOMENTUM, Cost, K, Linear, Momentum, Values, network, pairs
+from tests.schemes.linear import LR, MOMENTUM, K, Linear, network, pairs
 
 DAY, DARK, ONLY, SHARED = "heads.day.weight", "heads.dark.weight", "only.weight", "backbone.weight"
 CRITIC = ("weight", "bias")
@@ -57,83 +56,48 @@ def unlabelled(model: Linear, heads: bool = False, **changes: Any) -> Unlabelled
     return UnlabelledTarget(model=model, **{**given, **changes})
 
 
-def supervised_costs(pair: Any, heads: bool) -> tuple[Cost, Cost]:
-    def cost(batch: Any, view: str, head: str) -> Cost:
-        x, y = linear.pixels(batch, view)
-        return lambda values: linear.nats(linear.scores(values, x, head), y)
-
+def costs_of(model: Linear, pair: TwoDomains, heads: bool) -> dict[str, float]:
+    """Cross-entropies of both domains, of what each sees."""
+    values, found = linear.values_of(model), {}
     names = (DAY, DARK) if heads else (ONLY, ONLY)
-    return cost(pair.source, "rgb", names[0]), cost(pair.target, "thermal", names[1])
+    for domain, view, head in zip(("source", "target"), ("rgb", "thermal"), names, strict=True):
+        x, y = linear.pixels(getattr(pair, domain), view)
+        found[f"{domain}/ce"] = linear.nats(linear.scores(values, x, head), y).item()
+    return found
 
 
-def stepped(heads: bool) -> tuple[Momentum, Momentum | None]:
-    day = Momentum((SHARED, DAY) if heads else (SHARED, ONLY))
-    return day, Momentum((SHARED, DARK)) if heads else None
+@pytest.mark.parametrize(
+    ("mode", "expected"),
+    [
+        ("apart", [(("source",), True), (("target",), True)]),
+        ("kept", [(("source",), True), (("target",), False)]),
+        ("together", [(("source", "target"), True)]),
+    ],
+)
+def test_two_heads_step_as_the_thesis_code(mode: str, expected: list[tuple[Any, bool]]) -> None:
+    """One optimizer each, of all but the other's head; the loop steps them phase by phase."""
+    model, pair = network(True), pair_at()
+    scheme = labelled(model, True, mode)
+    assert scheme.record.optimizers == {"source": ("heads.dark.",), "target": ("heads.day.",)}
+    phases = phases_of(scheme, pair)
+    assert [(phase.optimizers, phase.clear) for phase in phases] == expected
+    parts = {name: part.item() for phase in phases for name, part in phase.parts.items()}
+    assert parts == pytest.approx(costs_of(model, pair, True), rel=1e-5)
+    assert model.calls == [(("rgb",), "day", True), (("thermal",), "dark", True)]
 
 
-@pytest.mark.parametrize("mode", ["apart", "kept", "together"])
-def test_two_heads_step_as_the_thesis_code(tmp_path: Path, mode: str) -> None:
-    """Later steps tell whether each optimiser keeps momentum of its own for the backbone."""
-    model, optimizers = network(True), stepped(True)
-    values = linear.values_of(model)
-    for pair in islice(pairs(), 3):
-        linear.written_out(values, mode, *optimizers, *supervised_costs(pair, True))
-    log = linear.trained(labelled(model, True, mode), model, tmp_path, 3)
-    linear.assert_same(model, values)
-    assert model.calls[:2] == [(("rgb",), "day", True), (("thermal",), "dark", True)]
-    norms = ["source+target"] if mode == "together" else ["source", "target"]
-    found = sorted(name for name in log[0] if name.startswith("grad_norm"))
-    assert found == [f"grad_norm/{name}" for name in norms]
-    assert {"loss/source/ce", "loss/target/ce", "lr/source_0", "lr/target_0"} <= set(log[0])
-
-
-def test_one_head_is_one_backward_pass(tmp_path: Path) -> None:
-    model, optimizers = network(False), stepped(False)
-    values = linear.values_of(model)
-    for pair in islice(pairs(), 2):
-        linear.written_out(values, "apart", *optimizers, *supervised_costs(pair, False))
-    scheme = labelled(model, False, "apart")
-    (phase,) = phases_of(scheme, pair_at())
-    assert (phase.optimizers, phase.clear) == (("main",), True)
-    assert "grad_norm" in linear.trained(scheme, model, tmp_path, 2)[0]
-    linear.assert_same(model, values)
-
-
-@pytest.mark.parametrize("mode", ["apart", "kept", "together"])
-def test_accumulated_phases_equal_the_mean_of_both_batches(tmp_path: Path, mode: str) -> None:
-    """Two batches of a step are one of their mean, phase by phase, with and without clearing."""
-    model = network(True)
-    values = linear.values_of(model)
-    each = [supervised_costs(pair, True) for pair in islice(pairs(), 2)]
-
-    def mean(side: int) -> Cost:
-        return lambda v: (each[0][side](v) + each[1][side](v)) / 2
-
-    linear.written_out(values, mode, *stepped(True), mean(0), mean(1))
-    made = linear.trainer(labelled(model, True, mode), model, tmp_path, 1, accumulate=2)
-    made.fit(pairs(), State(seed=0))
-    linear.assert_same(model, values)
-
-
-def test_maximum_squares_step_reads_no_label_of_the_target(tmp_path: Path) -> None:
+def test_maximum_squares_step_reads_no_label_of_the_target() -> None:
     """-weight / 2 times the mean of squared probabilities over all entries."""
-
-    def squares(values: Values, batch: Any) -> Tensor:
-        x, _ = linear.pixels(batch, "thermal")
-        return -0.7 / 2 * linear.scores(values, x, ONLY).softmax(1).square().mean()
-
-    model, optimizers = network(False), stepped(False)
-    values = linear.values_of(model)
-    batches = list(islice(pairs(), 2))
-    for pair in batches:
-        source = supervised_costs(pair, False)[0]
-        target = lambda v, p=pair: squares(v, p.target)  # noqa: E731
-        linear.written_out(values, "apart", *optimizers, source, target)
-        pair.target.label.fill_(IGNORE)
-    made = linear.trainer(unlabelled(model), model, tmp_path, 2)
-    made.fit(iter(batches), State(seed=0))
-    linear.assert_same(model, values)
-    assert {"loss/source/ce", "loss/target/max_squares"} <= set(made.log[0])
+    model, pair = network(False), pair_at()
+    expected = costs_of(model, pair, False)
+    pair.target.label.fill_(IGNORE)
+    (phase,) = phases_of(unlabelled(model), pair)
+    assert (phase.optimizers, phase.clear) == (("main",), True)
+    z = linear.scores(linear.values_of(model), linear.pixels(pair.target, "thermal")[0], ONLY)
+    squares = -0.7 / 2 * z.softmax(1).square().mean()
+    assert set(phase.parts) == {"source/ce", "target/max_squares"}
+    assert phase.parts["source/ce"].item() == pytest.approx(expected["source/ce"], rel=1e-5)
+    assert phase.parts["target/max_squares"].item() == pytest.approx(squares.item(), rel=1e-5)
 
 
 def test_guidance_trains_the_auxiliary_head_alone_and_what_is_below() -> None:
@@ -147,7 +111,7 @@ def test_guidance_trains_the_auxiliary_head_alone_and_what_is_below() -> None:
     assert model.backbone.weight.grad is not None
 
     values, names = linear.values_of(model), (ONLY, "auxiliary.weight")
-    x = linear.pixels(next(pairs()).target, "thermal")[0]
+    x = linear.pixels(pair.target, "thermal")[0]
     main, aux = (linear.scores(values, x, name).softmax(1) for name in names)
     sure = (main.amax(1) > 0.4) | (aux.amax(1) > 0.4)
     assert 0 < sure.sum() < len(x)
@@ -245,7 +209,7 @@ def test_parts_of_both_phases_by_their_formulas(heads: bool, changes: dict[str, 
         ("source", "target", "rgb", DAY if heads else ONLY),
         ("target", "source", "thermal", DARK if heads else ONLY),
     ):
-        x, y = linear.pixels(getattr(pair, name), view, scale=1)
+        x, y = linear.pixels(getattr(pair, name), view)
         z = linear.scores(values, x, head)
         verdicts = shown(z, given["judged"]) @ judge["weight"].T + judge["bias"]
         cost, wrong = (

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.geometry.camera import Camera
-from rgbt.geometry.warp import Warp, halved_all, halved_label, halved_mean
+from rgbt.geometry.warp import Warp, halved_all, halved_mean
 from rgbt.models.mask2former.network import semantic_logits
 from rgbt.requirements import Record
 from rgbt.schemes.temporal import Temporal
@@ -62,23 +62,12 @@ class Recorded:
     ) -> dict[str, Tensor]:
         self.first, self.second, self.warped, self.valid = first, second, warped, valid
         parts = [(f.logits * f.batch.label[:, None]).square().mean() for f in (first, second)]
-        parts.append((warped - second.logits.softmax(1)).square().mean())
+        half = warped.shape[2:] != second.logits.shape[2:]
+        compared = halved_mean(second.logits) if half else second.logits
+        parts.append((warped - compared.softmax(1)).square().mean())
         queries = [frame.output.aux.get("class_logits") for frame in (first, second)]
         parts += [each.square().mean() for each in queries if each is not None]
         return {str(number): part for number, part in enumerate(parts)}
-
-
-class Halved(Recorded):
-    """The same of means over 2x2 pixels of the second frame."""
-
-    def __call__(
-        self, first: Frame, second: Frame, warped: Tensor, valid: Tensor, generator: Any
-    ) -> dict[str, Tensor]:
-        batch = replace(second.batch, label=halved_label(second.batch.label))
-        half = Frame(second.output, batch, halved_mean(second.logits))
-        parts = super().__call__(first, half, warped, valid, generator)
-        self.second = second
-        return parts
 
 
 def view(**changes: Any) -> VirtualView:
@@ -219,8 +208,8 @@ def test_half_resolution_warps_the_scores_averaged_over_two_by_two_pixels(
     camera = Camera(fx=70.0, fy=70.0, cx=31.5, cy=23.5, height=hw[0], width=hw[1])
     turned = view(mode="rotation", camera=camera)
     full, half = (
-        step(scheme(Net(nn.Identity()), loss=loss, view=turned, warps=warps, **more), batch(hw=hw))
-        for loss, more in ((Recorded(), {}), (Halved(), {"resolution": "half"}))
+        step(scheme(Net(nn.Identity()), view=turned, warps=warps, resolution=each), batch(hw=hw))
+        for each in ("full", "half")
     )
     scores = halved_mean(full.first.logits)
     warp = turned.warp(turned.draw(B, generator_of("virtual view")), hw).halved()
@@ -250,7 +239,7 @@ class Smaller(Half):
 
 def test_half_pixel_beyond_the_first_frame_does_not_count() -> None:
     """The last of five columns shows 4.4, and half a pixel further is 5.9, beyond 5.5."""
-    shown = scheme(Net(nn.Identity()), view=Smaller(), loss=Halved(), resolution="half")
+    shown = scheme(Net(nn.Identity()), view=Smaller(), loss=Recorded(), resolution="half")
     loss = step(shown, batch(1, (2, 5)))
     full = Smaller().warp(torch.zeros(1, 3), (2, 5))
     assert full.inside()[0, 0].tolist() == [False, False, False, True, True]

@@ -20,7 +20,6 @@ from rgbt.files.adapters import adapter_of
 from rgbt.models.external.adapting import Untrained, replaced
 from rgbt.models.external.network import edge_map, picked, scores_at, structure
 from rgbt.requirements import record_of
-from rgbt.types import MaskPair
 from tests.models.external.standins import (
     HEAD,
     PAIR,
@@ -92,34 +91,6 @@ def test_module_of_another_folder_is_not_taken_for_the_checkouts(tmp_path: Path)
     sys.modules["model.net"] = mine
     with pytest.raises(InputError, match=r"model\.net is not a module of"):
         external(write_checkout(tmp_path, {"model/net.py": STACKED}))
-
-
-def test_network_may_import_when_it_is_called(tmp_path: Path) -> None:
-    lazy = STACKED.replace("return", "from model.late import TWO\n        return TWO *")
-    files = {"model/net.py": lazy, "model/late.py": "TWO = 2", "json.py": "raise SystemExit"}
-    net = external(write_checkout(tmp_path, files)).eval()
-    rgb, thermal = images()
-    expected = 2 * net.network.conv(torch.cat([rgb, thermal], 1))
-    torch.testing.assert_close(net(rgb, thermal).logits, expected)
-    assert sys.path[-1] == str(tmp_path)  # nothing of ours is looked for there first
-
-
-def test_weights_follow_the_generator_also_of_numpy(tmp_path: Path) -> None:
-    code = "import numpy as np\nimport random\n" + STACKED.replace(
-        "super().__init__()",
-        "super().__init__()\n        self.drawn = np.random.rand(), random.random()",
-    )
-    folder = write_checkout(tmp_path, {"model/net.py": code})
-
-    def built(seed: int) -> tuple[object, torch.Tensor]:
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(seed)
-            network = external(folder).network
-        return network.drawn, network.conv.weight
-
-    (first, weight), (again, same), (other, _) = built(0), built(0), built(1)
-    assert first == again != other
-    assert torch.equal(weight, same)
 
 
 ODD = f"""
@@ -300,18 +271,6 @@ def test_edges_are_padded_and_resized_as_the_images(tmp_path: Path) -> None:
     for changes in ({"multiple": 8}, {"size_hw": (16, 24)}):
         net = external(folder, inputs="unit_three", feed="pair_and_edges", **changes).eval()
         assert net(*images(2, 10, 20)).logits.shape == (2, 3, 10, 20)
-
-
-def test_hidden_pixels_do_not_count(tmp_path: Path) -> None:
-    net = external(write_checkout(tmp_path, {"model/net.py": STACKED}), multiple=32).eval()
-    hidden = torch.zeros(1, 2, 2, dtype=torch.bool)
-    hidden[0, 1, 1] = True
-    rgb, thermal = images(1, 40, 50)
-    other = rgb.clone()
-    other[..., 32:, 32:] = 0.5
-    masks = MaskPair(hidden, torch.zeros_like(hidden))
-    assert torch.equal(net(rgb, thermal, masks).logits, net(other, thermal, masks).logits)
-    assert not torch.equal(net(rgb, thermal).logits, net(other, thermal).logits)
 
 
 def test_images_that_mix_are_passed_one_by_one(tmp_path: Path) -> None:
