@@ -1,7 +1,4 @@
-"""Everything of a sample that moves together, and what moves it: crop, flip, resize, pad.
-
-A transform has `train(sample, rng)`, which draws from `rng` alone, and `test(sample)`.
-"""
+"""Everything of a sample that moves together, and what moves it: crop, flip, resize, pad."""
 
 from __future__ import annotations
 
