@@ -50,12 +50,13 @@ class StrongAugmentation:
     ) -> tuple[Tensor, Tensor]:
         """Changed images: (B, 3, H, W) and (B, 1, H, W) float32 in [0, 1], as they were.
 
-        `generator` is on their device; the number of draws is always the same.
+        `generator` is of any device; the number of draws is always the same.
         """
-        device, names = rgb.device, (*CHANGES, *OF_THERMAL)
+        device, names = generator.device, (*CHANGES, *OF_THERMAL)
 
         def draw(count: int) -> Tensor:
-            return torch.rand(count, len(names) + 1, generator=generator, device=device)
+            drawn = torch.rand(count, len(names) + 1, generator=generator, device=device)
+            return drawn.to(rgb.device)
 
         whole = torch.rand(2 + len(CHANGES), generator=generator, device=device)
         *changes, blur = own_draw(draw, len(rgb)).unbind(1)
@@ -63,7 +64,7 @@ class StrongAugmentation:
             name: (self.jitter_strength * (2 * each - 1)).view(-1, 1, 1, 1)
             for name, each in zip(names, changes, strict=True)
         }
-        jitters, blurs, *order = whole.tolist()  # one wait for the device
+        jitters, blurs, *order = whole.tolist()
         if jitters < self.jitter_probability:
             for _, name in sorted(zip(order, CHANGES, strict=True)):
                 rgb = jittered(rgb, name, by[name])
