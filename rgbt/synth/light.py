@@ -108,8 +108,6 @@ def _night(light: Light, u: list[float], factor: float) -> Light:
 
 
 _MAX_LAMPS = 6
-
-
 Lamp = tuple[tuple[float, float, float], Floats, float]
 """A lamp that lights its surroundings: position, colour times strength, reach in metres."""
 
