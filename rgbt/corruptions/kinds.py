@@ -1,9 +1,8 @@
 """The corruptions, which change the pixels of a pair or show the thermal image of another frame.
 
 Severity 0 is the clean image and never reaches a corruption. Lengths are given in pixels of an
-image of 480 rows and scaled to the height of the file, so that one ladder serves MFNet (480),
-PST900 (720) and the embedded data (120). Frames are counted in the order of the split list, by day
-and by night apart; published lists leave frames out.
+image of 480 rows and scaled to the height of the file. Frames are counted in the order of the split
+list, by day and by night apart; published lists leave frames out.
 """
 
 from __future__ import annotations
@@ -65,7 +64,8 @@ class Corruption:
 
     def check(self, severity: float) -> None:
         """InputError for a severity (> 0) out of the bounds."""
-        check_range(f"severity ({self.unit})", severity, *self.bounds)
+        unit = f" ({self.unit})" if self.unit else ""
+        check_range(f"severity{unit}", severity, *self.bounds)
 
     def __call__(self, sample: Sample, severity: float, rng_of: RngOf) -> Sample:
         """The corrupted `sample`, uint8 as before; the label and the name stay.

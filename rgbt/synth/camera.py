@@ -24,16 +24,16 @@ def floats(values: Sequence[object] | NDArray[np.float64]) -> Floats:
     return np.array(values, np.float32)
 
 
+Key = tuple[int, int]
+"""Seed and index of a scene."""
+
 NEAR_M = 0.3
 """Nothing nearer than this along the optical axis is drawn."""
 
 
 @dataclass(frozen=True)
 class SynthCamera:
-    """Size of the image and focal length in pixels, position in metres, angles in radians.
-
-    `pitch` tilts downward, `yaw` turns to the right.
-    """
+    """Pixels; the position in metres; radians downward (`pitch`) and to the right (`yaw`)."""
 
     height: int
     width: int

@@ -46,8 +46,6 @@ def _ids(table: Table, scene: Scene) -> NDArray[np.uint8]:
     return ids
 
 
-# ---- MFNet ----------------------------------------------------------------------------------
-
 SKY = 65535
 """Depth of the sky in a file, and of anything farther than 655 m."""
 
@@ -132,8 +130,6 @@ def _mfnet_lists(shot: Shot) -> dict[str, str]:
 MFNET_LAYOUT = Layout(_mfnet_named, _mfnet_images, _mfnet_lists)
 
 
-# ---- KP -------------------------------------------------------------------------------------
-
 _FRAMES_PER_VIDEO = 40
 _SETS = {
     **{("train", False): (0, 1, 2), ("train", True): (3, 4, 5)},
@@ -168,8 +164,7 @@ def synth_kp(  # noqa: PLR0913 - each is a key of the configuration
     labels/setXX_VYYY_IZZZZZ.png                  class ids, 19 for void
     {train,val,test}{,_day,_night}.txt            one label file per line
 
-    Five of the 19 classes are in no scene (see `kp_ids`): where absent classes count as 0, as in
-    the published tables, no network scores more than 14 / 19 = 73.7 %.
+    Where absent classes count as 0, no network scores more than 14 / 19 = 73.7 % (`kp_ids`).
     """
     numbers = {"train": num_train, "val": num_val, "test": num_test}
     plan = Plan(name="synth_kp", seed=seed, numbers=numbers, factors=factors)
@@ -217,8 +212,6 @@ def kp_ids(scene: Scene) -> NDArray[np.uint8]:
     return np.where(on_bike, np.uint8(kp.CLASSES.index("rider")), ids)
 
 
-# ---- PST900 ---------------------------------------------------------------------------------
-
 VAL_BAG = 20
 """The recording of the training part that scenes for validation lie in."""
 
@@ -230,7 +223,7 @@ _STANDS_FOR = {
     **{COLOR_CONE: "fire_extinguisher", CAR_STOP: "backpack"},
     **{BUMP: "hand_drill", PERSON: "survivor"},
 }
-"""Which object of a street stands for which of the four; everything else is background."""
+"""Which object of a street stands for which of the four; others are background."""
 
 PST900_IDS = np.array(
     [pst900.CLASSES.index(_STANDS_FOR.get(label, "background")) for label in range(9)], np.uint8
@@ -254,8 +247,7 @@ def synth_pst900(  # noqa: PLR0913 - each is a key of the configuration
     {train,test}/{rgb,thermal,labels}/NAME.png, NAME as in 58_bag21_rect_rgb_frame0000000440
 
     These are streets and not tunnels. They imitate the files and the rarity of the four objects
-    (about 1 % of the pixels each). Results on them say nothing about PST900. ``val_bags=()`` leaves
-    the scenes for validation in training.
+    (about 1 % of the pixels each). ``val_bags=()`` leaves the scenes for validation in training.
     """
     numbers = {"train": num_train, "val": num_val, "test": num_test}
     plan = Plan(name="synth_pst900", seed=seed, numbers=numbers, factors=factors)
@@ -284,12 +276,9 @@ def _pst900_images(scene: Scene, shot: Shot) -> Images:
 PST900_LAYOUT = Layout(_pst900_named, _pst900_images)
 
 
-# ---- Freiburg Thermal -----------------------------------------------------------------------
-
 VAL_SEQUENCE = "seq_04_day"
-_SEQUENCES = {"train_day": 4, "train_night": 3}
-_PIECES = 2
-"""Of each sequence."""
+_SEQUENCES, _PIECES = {"train_day": 4, "train_night": 3}, 2
+"""Sequences of each split, and pieces of each of them."""
 
 _LARGE_LABELS = "train/seq_01_day/"
 """The sequence whose labels are twice the size of its frames."""
@@ -298,15 +287,9 @@ BLACK, WHITE = 21800, 23700
 """Counts of the grey levels 0 and 1, which some pixels lie beyond."""
 
 _MARGINS = ((0.151, 0.0), (0.172, 1.0), (0.826, 1.0), (0.845, 0.0))
-"""Corners (share of the width, of the height) of what the thermal camera sees, which leaves a few
-pixels of the crop without."""
+"""Corners (share of the width, of the height) of what the thermal camera sees."""
 
-_FREIBURG_LABELS = (
-    *("car", "person", "bicycle", "curb"),
-    *("background", "fence", "background", "road"),
-)
-"""Class of MFNet's labels 1 to 8."""
-
+_FREIBURG_LABELS = ["car", "person", "bicycle", "curb", "background", "fence", "background", "road"]
 FREIBURG_TABLE = class_table(freiburg.CLASSES, _FREIBURG_LABELS, "freiburg")
 
 
@@ -334,10 +317,8 @@ def synth_freiburg(  # noqa: PLR0913 - each is a key of the configuration
     The files have the irregularities of the archives: thermal images are counts of 16 bits that end
     in slanted black margins, because the thermal camera sees less than the RGB camera; labels of
     one sequence have another size than its frames; test folders are spelt in two ways, and stamps
-    there end in another 0 or not; test labels are arrays.
-
-    Labels are exact, those for training too, which in the real data set a network has predicted.
-    "ignore" is in test labels alone: what the thermal camera does not see.
+    there end in another 0 or not; test labels are arrays. "ignore" is in test labels alone: what
+    the thermal camera does not see.
     """
     numbers = {"train_day": num_train_day, "train_night": num_train_night}
     numbers |= {"val": num_val, "test": num_test}

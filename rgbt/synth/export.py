@@ -1,7 +1,4 @@
-"""Write scenes in the layout of a data set, once, with several processes if there are many.
-
-The layouts are defined in `rgbt.synth.datasets`.
-"""
+"""Write scenes in a layout of `rgbt.synth.datasets`, once, with several processes if many."""
 
 from __future__ import annotations
 
@@ -32,11 +29,8 @@ from rgbt.synth.scene import Scene, render_pair, render_scene
 VERSION = 3
 """Of the files. Raise it with every change that changes a byte, so that no cache is stale."""
 
-_WORTH_A_POOL = 200
-"""Scenes; fewer are written before a pool has started."""
-
-_WORTH_A_BAR = 100
-"""Scenes; about a second's work."""
+_WORTH_A_POOL, _WORTH_A_BAR = 200, 100
+"""Scenes: fewer are written before a pool has started, or in less than a second."""
 
 _FAST_PNG = [cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
 """A third of the time of the quickest ordinary compression, and smaller: the images are noisy."""
@@ -50,10 +44,7 @@ FRAMES = "next"
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """The plan of a written data set; equal plans give equal files.
-
-    `numbers` are scenes by split; `motion` leads to a second frame of every scene.
-    """
+    """A data set: scenes by split, and the motion to a second frame; equal plans, equal files."""
 
     name: str
     seed: int
@@ -63,10 +54,7 @@ class Plan:
 
 
 class Shot(NamedTuple):
-    """One scene to be written: its number, its split, whether it is night, its name and folder.
-
-    `place` is its number in the split, of `total`.
-    """
+    """One scene to be written: its number, that in its split (`place` of `total`), its names."""
 
     scene: int
     split: str
@@ -78,12 +66,10 @@ class Shot(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """Which files of which scenes a data set has.
+    """Which files a data set has.
 
-    Attributes:
-        named: the shots of a split with their names and folders.
-        images: the files of a scene.
-        lists: the split lists that a shot is in, if there are any, with its line.
+    The shots of a split with their names and folders, the files of a scene, and the split lists
+    that a shot is in, if there are any, with its line.
     """
 
     named: Callable[[list[Shot]], list[Shot]]
@@ -105,9 +91,8 @@ def shots_of(layout: Layout, plan: Plan) -> list[Shot]:
 def exported(layout: Layout, plan: Plan, cache_dir: str | Path | None) -> Path:
     """The folder of a data set, written now if it is not there yet.
 
-    It is written under another name and renamed when complete, so that an interrupted generation
-    leaves nothing that looks like a data set, and two at once cannot mix. The plan is stored in it.
-    `cache_dir` None: $XDG_CACHE_HOME/rgbt or ~/.cache/rgbt; InputError if it cannot be written.
+    It is renamed when complete, so that an interrupted generation leaves nothing and two cannot
+    mix. `cache_dir` None: $XDG_CACHE_HOME/rgbt or ~/.cache/rgbt; InputError if that is impossible.
     """
     text = json.dumps({"version": VERSION, **asdict(plan)}, sort_keys=True, indent=1)
     base = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "rgbt"

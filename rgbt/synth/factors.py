@@ -79,9 +79,8 @@ class EgoMotion:
 def with_factors(
     *left_out: str, **defaults: float
 ) -> Callable[[Callable[..., Made]], Callable[..., Made]]:
-    """Lets a function of ``factors: SceneFactors`` take each factor as a keyword of its own.
+    """Lets a function of ``factors: SceneFactors`` take each factor as a keyword, as a key is.
 
-    The keys of a data set in the configuration are the arguments of the function that makes it.
     `left_out` are factors that the data set decides itself; `defaults` are those that differ.
     """
 

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from rgbt.randomness import numpy_generator
-from rgbt.synth.camera import NEAR_M, Floats, SynthCamera, floats
+from rgbt.synth.camera import NEAR_M, Floats, Key, SynthCamera, floats
 from rgbt.synth.street import Placed
 
 _GOLDEN = 0.6180339887
@@ -33,8 +33,7 @@ class Light(NamedTuple):
         lit_windows: share of windows with light by night.
         visibility_m: distance at which 37 % of the light comes through.
         ambient: strength of the sky, whose colours are `zenith` above and `horizon`, as the haze.
-        cloud: how much clouds show, 0..1.
-        clear: a day without a cover of clouds.
+        cloud: how much clouds show, 0..1; `clear`: a day without a cover of them.
         others: factor on the light that cars and vending machines cast.
     """
 
@@ -109,14 +108,8 @@ def _night(light: Light, u: list[float], factor: float) -> Light:
 
 
 _MAX_LAMPS = 6
-
-
-class Lamp(NamedTuple):
-    """A lamp that lights its surroundings: position, colour times strength, reach in metres."""
-
-    position: tuple[float, float, float]
-    colour: Floats
-    reach_m: float
+Lamp = tuple[tuple[float, float, float], Floats, float]
+"""A lamp that lights its surroundings: position, colour times strength, reach in metres."""
 
 
 def lamplight(world_3HW: Floats, lamps: list[Lamp]) -> Floats:
@@ -124,13 +117,13 @@ def lamplight(world_3HW: Floats, lamps: list[Lamp]) -> Floats:
     if not lamps:
         return np.zeros_like(world_3HW)
     points = world_3HW.reshape(3, -1)
-    positions = floats([lamp.position for lamp in lamps])
-    reach = floats([lamp.reach_m for lamp in lamps])
-    colours = np.stack([lamp.colour for lamp in lamps], axis=1)
+    places, colours, reaches = zip(*lamps, strict=True)
+    positions, reach = floats(places), floats(reaches)
     # |p - q|^2 = |p|^2 - 2 p.q + |q|^2: one product of matrices for all lamps.
     squared = (points * points).sum(0) + (positions**2).sum(1)[:, None] - 2 * positions @ points
     nearness = 1.0 + np.maximum(squared, 0) / (reach**2)[:, None]
-    return np.asarray(colours @ (1.0 / (nearness * nearness)), np.float32).reshape(world_3HW.shape)
+    total = np.stack(colours, axis=1) @ (1.0 / (nearness * nearness))
+    return np.asarray(total, np.float32).reshape(world_3HW.shape)
 
 
 def headlight(world_3HW: Floats, camera: SynthCamera) -> Floats:
@@ -152,36 +145,32 @@ def is_oncoming(thing: Placed) -> bool:
 
 def lamps_of(placed: Sequence[Placed], light: Light) -> list[Lamp]:
     """The nearest lamps that light their surroundings; `placed` is sorted far to near."""
-    lamps, others = [], np.float32(light.others)
+    lamps: list[Lamp] = []
+    others = np.float32(light.others)
     for thing in (thing for thing in placed if thing.lit):
         x, z = thing.x, thing.z
         if thing.shape.name == "street_lamp":
-            lamps.append(Lamp((x + 1.35 * math.cos(thing.yaw), 5.4, z), light.lamp, 5.5))
+            lamps.append(((x + 1.35 * math.cos(thing.yaw), 5.4, z), light.lamp, 5.5))
         elif thing.shape.name == "vending_machine":
-            lamps.append(Lamp((x, 1.0, z - 0.7), floats([0.30, 0.33, 0.36]) * others, 1.6))
+            lamps.append(((x, 1.0, z - 0.7), floats([0.30, 0.33, 0.36]) * others, 1.6))
         elif is_oncoming(thing):
-            lamps.append(Lamp((x, 0.4, z - 4.0), floats([0.9, 0.85, 0.75]) * others, 1.8))
+            lamps.append(((x, 0.4, z - 4.0), floats([0.9, 0.85, 0.75]) * others, 1.8))
     return lamps[-_MAX_LAMPS:]
 
 
+_SUN, _HEADLAMP = floats([1.0, 0.95, 0.85]), floats([1.0, 0.97, 0.90])
 _SUN_SHARE = 0.33
-_SUN = floats([1.0, 0.95, 0.85])
-_HEADLAMP = floats([1.0, 0.97, 0.90])
 _REACH = 0.16
 """Distance at which a veil has half its strength, as a share of the image width."""
 
 
 def veil_of(
-    placed: Sequence[Placed],
-    camera: SynthCamera,
-    light: Light,
-    strength: float,
-    key: tuple[int, int],
+    placed: Sequence[Placed], camera: SynthCamera, light: Light, strength: float, key: Key
 ) -> Floats | None:
     """(3, H, W) light that is added to the image; None where there is no source of glare.
 
     Headlights 10 m ahead have the brightness `strength`, 1 = white of the day. In a share of the
-    clear days, which `key`, (seed, index) of the scene, draws, the sun is low at the road's end.
+    clear days the sun is low at the end of the road.
     """
     if strength == 0:
         return None

@@ -27,9 +27,7 @@ from rgbt.synth.street import (
 
 _GOLDEN = 0.6180339887
 _MAX_GROUP = 5
-RAIL_STEP_M = 2.0
-"""Length of one guardrail segment."""
-
+_RAIL_STEP_M = 2.0
 _CAR_PAINTS, _CLOTHES, _FACADES = map(paints, ("car", "clothes", "facade"))
 _STOPS = ("stop_block", "stop_bollard", "stop_cube")
 
@@ -38,7 +36,6 @@ _FAR_SHARES = {"demo": (0.34, 0.72, 0.82, 0.88, 1.0), "mfnet": (0.15, 0.62, 0.80
 """Object mix -> cumulative shares of the kinds, in the order of `_GROUPS`."""
 
 _FAR_Z = (26.0, 90.0)
-
 At = tuple[float, float]
 """(Z, lateral position) in metres."""
 
@@ -107,7 +104,7 @@ def _structures(road: Road, u: list[float], factors: SceneFactors) -> list[Place
     if u[0] < factors.rail_share:
         lateral = (-1 if u[1] < 0.5 else 1) * (road.half_width + 0.45)
         for number in range(4 + int(u[3] * 7)):
-            z = 3.5 + 7 * u[2] + RAIL_STEP_M * number
+            z = 3.5 + 7 * u[2] + _RAIL_STEP_M * number
             placed.append(road.place("guardrail", z, lateral, yaw=road.heading(z)))
     if u[4] < factors.bump_share:
         depth = factors.bump_farthest_m - factors.bump_nearest_m
@@ -118,9 +115,6 @@ def _structures(road: Road, u: list[float], factors: SceneFactors) -> list[Place
         bump = road.place("bump", z, lateral, yaw=yaw, scale=size, layer=GROUND)
         placed.append(bump._replace(shadow_from=NO_SHADOW))
     return placed
-
-
-# ---- one object -----------------------------------------------------------------------------
 
 
 def _paint(palette: list[Paint], u: float, shade: float) -> Paint:
@@ -177,9 +171,6 @@ def _stop(road: Road, row: Row, at: At, kind: int) -> Placed:
     return road.place(_STOPS[kind], *at, yaw=road.heading(at[0]) + 0.2 * (row[4] - 0.5))
 
 
-# ---- near groups ----------------------------------------------------------------------------
-
-
 def _cars(road: Road, rows: list[Row], z: float, side: int) -> list[Placed]:
     """One car: parked at the kerb or on the sidewalk, oncoming, or ahead in the own lane."""
     u = rows[0]
@@ -225,9 +216,8 @@ def _stops(road: Road, rows: list[Row], z: float, side: int) -> list[Placed]:
     """A row of two to four car stops: blocks beside the lane, or bollards along the sidewalk."""
     u = rows[0]
     kind = int(u[2] * len(_STOPS))
-    is_bollard = _STOPS[kind] == "stop_bollard"
-    lateral = side * (road.half_width + 0.55 if is_bollard else road.half_width - 0.55)
-    step = (2.4, 1.7, 1.9)[kind]
+    step, beside = ((2.4, -0.55), (1.7, 0.55), (1.9, -0.55))[kind]
+    lateral = side * (road.half_width + beside)
     chosen = enumerate(rows[: 2 + int(u[3] * 3)])
     return [_stop(road, row, (z + step * number, lateral), kind) for number, row in chosen]
 
@@ -251,10 +241,7 @@ _GROUPS: tuple[tuple[float, float, Callable[[Road, list[Row], float, int], list[
 """Nearest and farthest Z, and what places it given road, rows, Z and side (-1 left)."""
 
 
-# ---- scenery --------------------------------------------------------------------------------
-
-_LAST_Z = 85.0
-_FAR_TREE_M = 22.0
+_LAST_Z, _FAR_TREE_M = 85.0, 22.0
 
 
 def place_scenery(seed: int, index: int, road: Road) -> list[Placed]:
@@ -336,12 +323,11 @@ def _green(road: Road, row: Row, plot: Plot) -> list[Placed]:
     border = road.place(name, z, lateral, yaw=road.heading(z), scale=size, paints=paints)
     border = border._replace(layer=BACKDROP)
     behind = lateral + side * (2.2 + 2 * row[6])
-    sizes = (1.0 + 0.7 * row[COLOUR + 1], 1.0 + 0.7 * row[COLOUR + 2])
-    trees = [
-        _tree(road, (z + length * (0.45 * number - 0.2), behind), size, row[7 - number])
-        for number, size in enumerate(sizes)
-    ]
-    return [border, *trees]
+    placed = [border]
+    for number, u in enumerate(row[COLOUR + 1 : COLOUR + 3]):
+        at = (z + length * (0.45 * number - 0.2), behind)
+        placed.append(_tree(road, at, 1.0 + 0.7 * u, row[7 - number]))
+    return placed
 
 
 def _tree(road: Road, at: At, size: float, u: float, layer: int = BACKDROP) -> Placed:

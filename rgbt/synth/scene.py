@@ -1,8 +1,7 @@
 """Render one scene from its factors, and the second frame after a motion.
 
-RGB has sun or lamps on coloured surfaces, sky, haze, glow and camera noise. Thermal has
-temperatures with blur, drift and noise. It follows the materials, not the classes: an engine
-differs from a door, a parked car is as cold as the street, a warm outlet shines like a person.
+RGB has sun or lamps on coloured surfaces, sky, haze, glow and camera noise. Thermal has the
+temperatures of materials, not classes, with blur, drift and noise.
 """
 
 from __future__ import annotations
@@ -15,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.randomness import numpy_generator
-from rgbt.synth.camera import Floats, SynthCamera, camera_of, floats, flow_between
+from rgbt.synth.camera import Floats, Key, SynthCamera, camera_of, floats, flow_between
 from rgbt.synth.factors import EgoMotion, SceneFactors
-from rgbt.synth.light import Lamp, Light, draw_light, headlight, lamplight, lamps_of, veil_of
+from rgbt.synth.light import Light, draw_light, headlight, lamplight, lamps_of, veil_of
 from rgbt.synth.objects import place_objects, place_scenery
 from rgbt.synth.street import INDEX, Placed, column, draw_road, ground_quads
 from rgbt.synth.surface import (
@@ -38,11 +37,9 @@ _GLOW_RANGE = 4.0
 _GLASS = floats([0.035, 0.045, 0.055])[:, None, None]
 _WINDOW_GLOW = floats([0.95, 0.80, 0.48])[:, None, None]
 _GLOWS = column("glow_red", "glow_green", "glow_blue")
-_RGB_TEXTURES = column("rgb_texture")
+_RGB_TEXTURES, _HEAT_TEXTURES = column("rgb_texture"), column("heat_texture")
 _DAY, _NIGHT, _HEAT = (column(name) for name in ("day", "night", "heat"))
-_HEAT_TEXTURES = column("heat_texture")
 _PASSIVE = column("passive") > 0
-"""Materials that nothing heats but the sun."""
 
 _COLDEST, _SPAN = -45.0, 95.0
 """Range in degrees above the air that eight bits per facet cover."""
@@ -53,15 +50,13 @@ _LEVEL, _PER_DEGREE = 0.21, 0.026
 
 @dataclass(frozen=True)
 class Scene:
-    """One frame.
+    """One frame; the label has MFNet's class ids 0..8.
 
     Attributes:
-        label: MFNet's class ids 0..8.
         depth: (H, W) float32, metres along the optical axis; infinity for the sky.
         grey: (H, W) float32, `thermal` before it became bytes: 1 = full scale, and not clipped.
         material: (H, W) index of the material that each pixel shows.
         owner: (H, W) index into `placed` of the object that it shows; -1 for ground and sky.
-        placed: the objects of the scene, far ones before near ones.
     """
 
     rgb: NDArray[np.uint8]
@@ -80,10 +75,8 @@ class Scene:
 class ScenePair:
     """Two consecutive frames of one scene in which nothing moves but the camera.
 
-    Attributes:
-        flow: (H, W, 2) float32, for each pixel of `second` the displacement (rows, columns) to
-            where its surface point lies in `first`; NaN where that is behind the first camera.
-        visible: (H, W) bool, for each pixel of `second`: its surface point is seen in `first`.
+    For each pixel of `second`, `flow` (H, W, 2) float32 is the displacement (rows, columns) to its
+    surface point in `first`, NaN behind that camera; `visible` (H, W): whether that is seen.
     """
 
     first: Scene
@@ -128,8 +121,7 @@ def _frame(
     drawing = draw(facets, camera)
     shadow = shadow_map(placed, camera, light, whole=factors.whole_shadows)
     surface = surface_of(drawing, facets, camera, shadow, (seed, index))
-    veil = veil_of(placed, camera, light, factors.glare, (seed, index))
-    image = render_rgb(surface, light, lamps_of(placed, light), veil, factors, seed)
+    image = render_rgb(surface, light, placed, factors, (seed, index))
     heat = render_thermal(surface, light, factors)
     rgb_noise = numpy_generator(seed, "synth/rgb_noise", index, frame)
     thermal_noise = numpy_generator(seed, "synth/thermal_noise", index, frame)
@@ -155,29 +147,21 @@ def _visible(first: Scene, second: Scene, flow: Floats) -> NDArray[np.bool_]:
     target_rows, target_columns = rows + flow[..., 0], columns + flow[..., 1]
     inside = (target_rows >= 0) & (target_rows <= height - 1)
     inside &= (target_columns >= 0) & (target_columns <= width - 1)
-    to_rows = np.rint(np.where(inside, target_rows, 0)).astype(int)
-    to_columns = np.rint(np.where(inside, target_columns, 0)).astype(int)
+    targets = (target_rows, target_columns)
+    nearest = tuple(np.rint(np.where(inside, each, 0)).astype(int) for each in targets)
     points = second.camera.to_world(second.camera.rays(), 1.0 / second.depth)
     expected = first.camera.to_camera(np.moveaxis(points, 0, 2).astype(np.float64))[..., 2]
     expected = np.where(np.isinf(second.depth), np.inf, expected).astype(np.float32)
-    found = first.depth[to_rows, to_columns]
+    found = first.depth[nearest]
     with np.errstate(invalid="ignore", divide="ignore"):
         agrees = np.abs(1 / found - 1 / expected) < 0.03 / expected + 2e-3
     return np.asarray(inside & agrees)
 
 
 def render_rgb(
-    surface: Surface,
-    light: Light,
-    lamps: list[Lamp],
-    veil: Floats | None,
-    factors: SceneFactors,
-    seed: int,
+    surface: Surface, light: Light, placed: list[Placed], factors: SceneFactors, key: Key
 ) -> Floats:
-    """Light that reaches the sensor: (3, H, W) float32 in 0..1, gamma-encoded, without noise.
-
-    `veil` (3, H, W) is light scattered in the lens, `seed` of the data set gives the clouds.
-    """
+    """Light that reaches the sensor: (3, H, W) float32 in 0..1, gamma-encoded, without noise."""
     strength = texture_strength(factors)
     colour = average(_colour_table(surface, light), surface.drawing)
     glow = average(_glow_table(surface.facets, light), surface.drawing)
@@ -185,7 +169,7 @@ def render_rgb(
     texture = np.take(_RGB_TEXTURES, surface.material) * strength * surface.texture
     image *= np.maximum(1.0 + texture, 0.1)
     image += surface.window * (_GLASS - image)
-    image *= _lamplight(surface, light, lamps) if light.is_night else 1.0 - 0.72 * surface.shadow
+    image *= _lamplight(surface, light, placed) if light.is_night else 1.0 - 0.72 * surface.shadow
 
     depth = np.where(surface.drawing.ids == 0, 0, surface.depth)
     through = cv2.exp(depth * np.float32(-1 / light.visibility_m))
@@ -200,7 +184,8 @@ def render_rgb(
     # Below the last row that shows sky there is none to compute.
     last = int(np.flatnonzero(glow[..., 3].any(1)).max(initial=-1)) + 1
     share = glow[:last, :, 3] * np.float32(1 / 255)
-    image[:, :last] += share * _sky(surface.rays[:, :last], light, surface.camera, seed)
+    image[:, :last] += share * _sky(surface.rays[:, :last], light, surface.camera, key[0])
+    veil = veil_of(placed, surface.camera, light, factors.glare, key)
     if veil is not None:
         image += veil
     optical = image * (light.tint * np.float32(-1.7 * light.exposure))[:, None, None]
@@ -240,8 +225,8 @@ def _decoded(encoded_HW4: NDArray[np.uint8]) -> Floats:
     return value * value
 
 
-def _lamplight(surface: Surface, light: Light, lamps: list[Lamp]) -> Floats:
-    total = lamplight(surface.world, lamps)
+def _lamplight(surface: Surface, light: Light, placed: list[Placed]) -> Floats:
+    total = lamplight(surface.world, lamps_of(placed, light))
     own = (floats([1.0, 0.96, 0.86]) * light.headlight)[:, None, None]
     total += headlight(surface.world, surface.camera) * own
     total *= 1.0 - 0.5 * surface.shadow

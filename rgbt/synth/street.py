@@ -1,10 +1,9 @@
 """Materials and shapes, the record of a placed object, and the road with its strips on the ground.
 
 Materials (``materials.csv``) have a reflectance, degrees above the air by day and at night
-(plausible, not measured), further degrees when the object is warm (engine on, a body), amplitudes
-of the texture in RGB (relative) and in degrees, the light that they give off at night (1 = white of
-the day), whether nothing heats them but the sun, and the class of scenery made of them in KP and in
-Freiburg Thermal.
+(plausible, not measured), further degrees when the object is warm, amplitudes of the texture in RGB
+and in degrees, light that they give off at night (1 = white of the day), whether nothing heats them
+but the sun, and the classes of scenery made of them.
 
 Shapes (``shapes.csv``) are flat, convex faces in drawing order, one a line: x right, y up, z ahead
 (away from the camera for yaw 0), metres, standing on y = 0; `thin` ones are seen from both sides,
@@ -89,13 +88,10 @@ class Shape:
     """The faces of one kind of object, as arrays in drawing order.
 
     Attributes:
-        name: in the table.
-        corners: (F, 8, 3) float32.
-        num_corners: (F,) int.
+        corners: (F, 8, 3) float32, of which `num_corners` (F,) differ.
         meta: (F, 4) int: material index, label, paint (0: the material's own colour, 1 or 2: the
             object's first or second), thin.
-        half_width: half the extent along x, for shadows and collisions.
-        half_length: half the extent along z.
+        half_width: half the extent along x, `half_length` along z, for shadows and collisions.
         height: extent along y.
     """
 
@@ -110,13 +106,12 @@ class Shape:
     @classmethod
     def of(cls, name: str, faces: Sequence[tuple[NDArray[np.float32], Sequence[int]]]) -> Shape:
         """The shape of faces: corners (n, 3) and a row of `meta` each."""
-        counts = np.array([len(corners) for corners, _ in faces], np.intp)
-        missing = [((0, MAX_CORNERS - count), (0, 0)) for count in counts]
-        padded = [np.pad(each, m, mode="edge") for (each, _), m in zip(faces, missing, strict=True)]
-        corners = np.stack(padded)
+        outlines, meta = zip(*faces, strict=True)
+        counts = np.array([len(each) for each in outlines], np.intp)
+        at = np.arange(MAX_CORNERS)
+        corners = np.stack([each[at.clip(max=len(each) - 1)] for each in outlines])
         half_width, height, half_length = np.abs(corners).max((0, 1)).tolist()
-        meta = np.array([row for _, row in faces], np.intp)
-        return cls(name, corners, counts, meta, half_width, half_length, height)
+        return cls(name, corners, counts, np.array(meta, np.intp), half_width, half_length, height)
 
 
 @cache
@@ -181,8 +176,7 @@ def draw_rows(seed: int, index: int, pool: str, num: int) -> list[Row]:
 KERB_M = (0.24, 0.17)
 """Width and height of a kerb. Wider than a real one, so that it is seen at 120 x 160 pixels."""
 
-_STEPS = np.array([-4, 2, 5, 8, 12, 17, 24, 34, 50, 75, 120, 250], np.float32)
-
+_STEPS = floats([-4, 2, 5, 8, 12, 17, 24, 34, 50, 75, 120, 250])
 Numbers = float | NDArray[np.float64] | Floats
 
 
@@ -266,8 +260,12 @@ def ground_quads(road: Road) -> Quads:
         ("asphalt", UNLABELED, _strip(-w, w)),
         ("patch", UNLABELED, _rows(z, z + length, x, x + width)),
         *(("line", UNLABELED, rows) for rows in _markings(road)),
-        *_kerbs(road),
     ]
+    wide, high = road.kerb_m
+    for side in (side for side, present in zip((-1, 1), road.kerb, strict=True) if present):
+        top, face = _strip(side * w, side * (w + wide), (high, high)), (0, high)
+        strips.append(("kerb_top", CURVE, top))
+        strips.append(("kerb_face", CURVE, _strip(side * w, side * w, face)))
     names, labels, rows = zip(*strips, strict=True)
     counts = [1, *map(len, rows), 1]
     z, x = road.manhole[0], road.x(*road.manhole)
@@ -321,13 +319,3 @@ def _markings(road: Road) -> list[Floats]:
         stop = road.crossing_z - 1.6
         lines.append(_rows(stop, stop + 0.35, -road.half_width + 0.3, -0.1))
     return lines
-
-
-def _kerbs(road: Road) -> list[tuple[str, int, Floats]]:
-    width, height = road.kerb_m
-    strips = []
-    for side in (side for side, present in zip((-1, 1), road.kerb, strict=True) if present):
-        inner, outer = side * road.half_width, side * (road.half_width + width)
-        strips.append(("kerb_top", CURVE, _strip(inner, outer, (height, height))))
-        strips.append(("kerb_face", CURVE, _strip(inner, inner, (0, height))))
-    return strips

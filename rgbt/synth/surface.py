@@ -1,8 +1,7 @@
 """Draw the flat parts of a scene into a map of their numbers, and what follows for each pixel.
 
 The map has twice the image size. Labels and depth are read at pixel centres, so they are exact;
-colours are averaged around them (`average`), so edges are smooth. Position, texture, windows and
-shadow of each pixel come before any light.
+colours are averaged around them (`average`), so edges are smooth.
 """
 
 from __future__ import annotations
@@ -17,19 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.randomness import numpy_generator
-from rgbt.synth.camera import NEAR_M, Floats, SynthCamera, floats
+from rgbt.synth.camera import NEAR_M, Floats, Key, SynthCamera, floats
 from rgbt.synth.light import Light
 from rgbt.synth.street import COLOURS, INDEX, MAX_CORNERS, Placed, Quads
 
-SCALE = 2
-"""Facets are drawn at this multiple of the image size."""
+SCALE, _SHIFT = 2, 4
+"""Facets are drawn at this multiple of the image size, with so many binary digits."""
 
-_SHIFT = 4
 _SMALLEST = 0.8
 """Facets with a smaller projected extent, in pixels, are left out."""
 
-_TILE = 256
-_LAST_SHADOW_M = 45.0
+_TILE, _LAST_SHADOW_M = 256, 45.0
 _FACADES = [INDEX["facade"], INDEX["facade_side"]]
 
 
@@ -220,15 +217,12 @@ class Surface:
     """Maps (H, W) of one frame.
 
     Attributes:
-        rays: (3, H, W) in camera coordinates.
-        world: (3, H, W), metres.
+        rays: (3, H, W) in camera coordinates; `world`: (3, H, W), metres.
         depth: metres along the optical axis; infinity for the sky.
-        material: material index.
         texture: zero mean, about unit variance near the camera.
         patches: its coarse part: heat spreads, so its fine grain is not seen.
         window: share of the pixel that is a window.
         window_lit: 0..1, draw of the window: lit where below the share of lit ones.
-        shadow: 0..1.
     """
 
     facets: Facets
@@ -246,16 +240,9 @@ class Surface:
 
 
 def surface_of(
-    drawing: Drawing,
-    facets: Facets,
-    camera: SynthCamera,
-    shadow: Floats,
-    texture_key: tuple[int, int],
+    drawing: Drawing, facets: Facets, camera: SynthCamera, shadow: Floats, key: Key
 ) -> Surface:
-    """Surface maps of one frame; `shadow` is (H, W) of `shadow_map`.
-
-    `texture_key` is (seed, scene index): textures stay where they are when the camera moves.
-    """
+    """Surface maps of one frame; `shadow` is (H, W) of `shadow_map`."""
     rays = camera.rays()
     inverse_depth = drawing.inverse_depth(rays)
     world = camera.to_world(rays, inverse_depth)
@@ -265,7 +252,7 @@ def surface_of(
         depth = 1.0 / inverse_depth
     pixel_m = depth / np.float32(camera.focal)
     window, window_lit = _windows(world, pixel_m, material, drawing, facets, camera)
-    texture, patches = _texture(world, on_ground, pixel_m, texture_key)
+    texture, patches = _texture(world, on_ground, pixel_m, key)
     maps = (rays, world, depth, material, texture, patches, window, window_lit)
     return Surface(facets, camera, drawing, *maps, shadow * on_ground)
 
@@ -287,7 +274,7 @@ def sample_tile(seed: int, s: Floats, t: Floats) -> Floats:
 
 
 def _texture(
-    world: Floats, on_ground: NDArray[np.bool_], pixel_m: Floats, key: tuple[int, int]
+    world: Floats, on_ground: NDArray[np.bool_], pixel_m: Floats, key: Key
 ) -> tuple[Floats, Floats]:
     """Fine grain (5 cm) and coarse patches (40 cm) where pixels resolve them; patches alone."""
     seed, index = key

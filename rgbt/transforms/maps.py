@@ -1,7 +1,4 @@
-"""Everything of a sample that moves together, and what moves it: crop, flip, resize, pad.
-
-A transform has `train(sample, rng)`, which draws from `rng` alone, and `test(sample)`.
-"""
+"""Everything of a sample that moves together, and what moves it: crop, flip, resize, pad."""
 
 from __future__ import annotations
 
@@ -146,7 +143,7 @@ class Maps:
 
         column, row = np.rint(matrix @ [*self.centre_yx[::-1], 1.0])
         rotated = self.each(warped)
-        return rotated.around(row.clip(0, self.hw[0] - 1), column.clip(0, self.hw[1] - 1))
+        return rotated.around(int(row.clip(0, self.hw[0] - 1)), int(column.clip(0, self.hw[1] - 1)))
 
     def around(self, row: int, column: int) -> Maps:
         """The same with places that are counted from the pixel that shows the file's centre."""

@@ -50,21 +50,21 @@ class StrongAugmentation:
     ) -> tuple[Tensor, Tensor]:
         """Changed images: (B, 3, H, W) and (B, 1, H, W) float32 in [0, 1], as they were.
 
-        `generator` may be on any device; the number of draws is always the same.
+        `generator` is of any device; the number of draws is always the same.
         """
-        names = (*CHANGES, *OF_THERMAL)
+        device, names = generator.device, (*CHANGES, *OF_THERMAL)
 
         def draw(count: int) -> Tensor:
-            drawn = torch.rand(count, len(names) + 1, generator=generator, device=generator.device)
+            drawn = torch.rand(count, len(names) + 1, generator=generator, device=device)
             return drawn.to(rgb.device)
 
-        whole = torch.rand(2 + len(CHANGES), generator=generator, device=generator.device)
+        whole = torch.rand(2 + len(CHANGES), generator=generator, device=device)
         *changes, blur = own_draw(draw, len(rgb)).unbind(1)
         by = {
             name: (self.jitter_strength * (2 * each - 1)).view(-1, 1, 1, 1)
             for name, each in zip(names, changes, strict=True)
         }
-        jitters, blurs, *order = whole.tolist()  # one wait for the device
+        jitters, blurs, *order = whole.tolist()
         if jitters < self.jitter_probability:
             for _, name in sorted(zip(order, CHANGES, strict=True)):
                 rgb = jittered(rgb, name, by[name])

@@ -18,9 +18,8 @@ from rgbt.geometry.warp import Warp
 from rgbt.requirements import Record
 from rgbt.transforms.views import ViewSets, VirtualView, read_angles
 from rgbt.types import IGNORE, Batch
-from tests.geometry.views import RELEASED as RELEASED_CAMERA
+from tests.geometry.views import RELEASED as CAMERA
 
-CAMERA = RELEASED_CAMERA
 PAPER: dict[str, Any] = {
     **{"camera": CAMERA, "yaw": (-10.0, 10.0), "pitch": (-10.0, 10.0), "roll": (-5.0, 5.0)},
     **{"order": "zyx", "angles": "uniform", "mode": "both", "rectangle": "largest"},
@@ -46,8 +45,8 @@ def angles(*triples: tuple[float, float, float]) -> torch.Tensor:
     return torch.tensor(triples, dtype=torch.float64)
 
 
-def drawn(view: VirtualView, count: int = 4000, seed: int = 0) -> torch.Tensor:
-    return view.draw(count, torch.Generator().manual_seed(seed))
+def drawn(view: VirtualView) -> torch.Tensor:
+    return view.draw(4000, torch.Generator().manual_seed(0))
 
 
 def scene(label_hw: tuple[int, int] = HW) -> Batch:
@@ -69,8 +68,7 @@ def scene(label_hw: tuple[int, int] = HW) -> Batch:
 
 def test_uniform_angles_fill_their_own_intervals() -> None:
     found = drawn(paper(yaw=(-10.0, 2.0), pitch=(3.0, 4.0), roll=(-5.0, -5.0)))
-    assert found.shape == (4000, 3)
-    assert found.dtype == torch.float64
+    assert (found.shape, found.dtype) == ((4000, 3), torch.float64)
     low, high = found.min(0).values, found.max(0).values
     assert (low >= torch.tensor([-10.0, 3.0, -5.0])).all()
     assert (high <= torch.tensor([2.0, 4.0, -5.0])).all()
@@ -85,9 +83,6 @@ def test_integer_angles_are_whole_degrees_without_the_upper_end() -> None:
         assert sorted(set(found[:, column].tolist())) == list(range(low, high))
     counts = np.unique(found[:, 2], return_counts=True)[1]
     assert counts.min() > 330  # of 400 expected, standard deviation 19
-
-
-# ---- where pixels come from -----------------------------------------------------------------
 
 
 def test_rotation_does_not_cut_and_translation_does_nothing_else() -> None:
@@ -166,9 +161,6 @@ def test_released_images_are_whole_bytes_and_those_of_the_paper_are_not(make: An
     for image in (255 * found.rgb, 255 * found.thermal):
         off = (image - image.round()).abs().max()
         assert off < 1e-3 if make is released else off > 0.4
-
-
-# ---- what is refused ------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
