@@ -21,18 +21,15 @@ def check_batch_norm_parts(parts: int, processes: int) -> None:
 def synchronise_batch_norm(model: nn.Module) -> nn.Module:
     """Let every batch normalisation read the batch of all processes; nothing with one process.
 
-    Parameters, buffers and their names stay the same; the model is changed in place, unless it is
-    itself a normalisation. InputError: a subclass of torch's normalisations would be lost.
+    The state keeps its keys; the model is changed in place, unless it is itself a normalisation.
     """
     if num_processes() == 1:
         return model
+    known = (*OF_TORCH, nn.SyncBatchNorm, SynchronisedBatchNorm)
     for name, module in model.named_modules():
-        known = (*OF_TORCH, nn.SyncBatchNorm, SynchronisedBatchNorm)
         if isinstance(module, _BatchNorm) and type(module) not in known:
-            raise InputError(
-                f"model: several devices cannot synchronise '{name}', a {type(module).__name__}; "
-                f"set trainer.batch_norm_parts={num_processes()}."
-            )
+            said = f"model: several devices cannot synchronise '{name}' ({type(module).__name__})"
+            raise InputError(f"{said}; set trainer.batch_norm_parts={num_processes()}.")
     if any(parameter.is_cuda for parameter in model.parameters()):
         on_cuda: nn.Module = nn.SyncBatchNorm.convert_sync_batchnorm(model)  # type: ignore[no-untyped-call]
         return on_cuda
@@ -51,10 +48,7 @@ def _converted(module: nn.Module) -> nn.Module:
 
 
 def share_running_statistics(model: nn.Module) -> None:
-    """Give every process the running statistics of process 0; called by all.
-
-    Needed before an evaluation or a checkpoint where each process normalises its own samples.
-    """
+    """Give every process the running statistics of process 0; called by all."""
     norms = [module for module in model.modules() if isinstance(module, _BatchNorm)]
     buffers = [buffer for norm in norms for buffer in norm.buffers(recurse=False)]
     for buffer, value in zip(buffers, agreed([each.cpu() for each in buffers]), strict=True):
@@ -88,12 +82,11 @@ class SynchronisedBatchNorm(_BatchNorm):
 
     @torch.no_grad()
     def _track(self, mean: Tensor, unbiased_variance: Tensor) -> None:
-        assert self.num_batches_tracked is not None, "running statistics are tracked"
-        self.num_batches_tracked.add_(1)
-        share = self.momentum
-        if share is None:
-            share = 1.0 / float(self.num_batches_tracked)
-        for running, new in ((self.running_mean, mean), (self.running_var, unbiased_variance)):
+        tracked, number = (self.running_mean, self.running_var), self.num_batches_tracked
+        assert number is not None, "running statistics are tracked"
+        number.add_(1)
+        share = 1.0 / float(number) if self.momentum is None else self.momentum
+        for running, new in zip(tracked, (mean, unbiased_variance), strict=True):
             assert running is not None, "running statistics are tracked"
             running.mul_(1 - share).add_(new, alpha=share)
 

@@ -165,11 +165,7 @@ def restore_weights(model: nn.Module, weights: dict[str, Tensor], source: Path) 
 
 
 def restore_optimizer(optimizer: torch.optim.Optimizer, stored: Any, source: Path) -> None:
-    """Restore the state of an optimizer; InputError: it is that of another one.
-
-    Each tensor has the memory format of its parameter, because a fused optimizer reads both in the
-    order of memory, and a checkpoint may come from a run with another `trainer.memory_format`.
-    """
+    """Restore the state of an optimizer; InputError: it is that of another one."""
     try:
         groups = optimizer.state_dict()["param_groups"]
         _check_places(optimizer, groups, stored)
@@ -177,6 +173,8 @@ def restore_optimizer(optimizer: torch.optim.Optimizer, stored: Any, source: Pat
     except (ValueError, TypeError, LookupError, AttributeError, RuntimeError) as error:
         said = f"{source} holds the state of a different optimizer than that of this run"
         raise InputError(f"{said} ({one_line(error)}).") from error
+    # A fused optimizer reads parameters and moments in the order of memory, and a checkpoint may
+    # come from a run with another trainer.memory_format.
     for parameter, state in optimizer.state.items():
         for name, value in state.items():
             if isinstance(value, Tensor) and value.shape == parameter.shape:
@@ -184,10 +182,7 @@ def restore_optimizer(optimizer: torch.optim.Optimizer, stored: Any, source: Pat
 
 
 def _check_places(optimizer: torch.optim.Optimizer, groups: Any, stored: Any) -> None:
-    """Raise an error unless every setting is the same, and every value fits its place.
-
-    torch compares neither: a moment of another shape ends the next step by SIGSEGV.
-    """
+    """Raise an error for other settings, or for values at whose step torch would end by SIGSEGV."""
     for own, group in zip(groups, stored["param_groups"], strict=True):
         for key in own.keys() - CHANGING:
             if own[key] != group[key]:
@@ -199,12 +194,10 @@ def _check_places(optimizer: torch.optim.Optimizer, groups: Any, stored: Any) ->
     for index, state in stored["state"].items():
         place = places[index]
         for name, value in state.items():
-            is_fit = not isinstance(value, Tensor) or (
-                is_plain(value)
-                and value.is_floating_point()
-                and (value.ndim == 0 or (value.shape, value.dtype) == (place.shape, place.dtype))
-            )
-            if not is_fit:
+            if not isinstance(value, Tensor):
+                continue
+            is_fit = value.ndim == 0 or (value.shape, value.dtype) == (place.shape, place.dtype)
+            if not (is_fit and is_plain(value) and value.is_floating_point()):
                 raise ValueError(f"{name} of parameter {index} has another shape or type")
 
 
@@ -213,8 +206,7 @@ class Checkpoints:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.last = folder / "last.pt"
-        self.best = folder / "best.pt"
+        self.last, self.best = folder / "last.pt", folder / "best.pt"
 
     def commit(self, payload: dict[str, Any], state: State) -> None:
         """Write the weights if this step is the best, then the state."""
@@ -242,8 +234,7 @@ class Checkpoints:
             # Weights of a later step were written just before the run was killed.
             if found != state.best_step and found <= state.step:
                 raise InputError(f"{self.best} is of step {found}, not of {state.best_step}")
-        weights: dict[str, Any] = payload["model"]
-        return weights
+        return dict(payload["model"])
 
     @contextmanager
     def _saying_what_to_do(self) -> Iterator[None]:

@@ -80,10 +80,9 @@ def place(network: nn.Module, device: torch.device, settings: TrainerSettings) -
 
 
 def prepare_training(network: nn.Module, settings: TrainerSettings) -> None:
-    """Checkpoint the activations of a network and compile its forward in place, as set.
+    """Recompute the activations of a network or compile its forward, in place.
 
-    The keys of its state do not change, and evaluation uses the network as it is. InputError: both,
-    or a network that does not declare what is recomputed.
+    The keys of its state do not change, and evaluation uses the network as it is.
     """
     if settings.activation_checkpointing and settings.compile != "none":
         raise InputError("trainer.activation_checkpointing: cannot be used with trainer.compile.")
@@ -109,10 +108,7 @@ class Compiled:
 
 
 def recompute_activations(network: nn.Module) -> None:
-    """Compute activations of the modules in `Record.recomputed` again in the backward pass.
-
-    They draw nothing, so no generator has to be restored. InputError: there is no such module.
-    """
+    """Compute activations of the modules in `Record.recomputed`, which draw nothing, again."""
     patterns = [re.escape(each).replace(r"\*", "[^.]*") for each in record_of(network).recomputed]
     pattern = re.compile("|".join(patterns))
     modules = [each for name, each in network.named_modules() if name and pattern.fullmatch(name)]
@@ -146,10 +142,7 @@ class Recomputed:
 
 
 class KeptStatistics(AbstractContextManager[None]):
-    """Within it, buffers are copies, so that running statistics are updated in the forward alone.
-
-    It is entered again in each backward pass through the same graph.
-    """
+    """Within it, buffers are copies: running statistics are updated in the forward alone."""
 
     def __init__(self, module: nn.Module) -> None:
         self.module = module

@@ -31,9 +31,8 @@ def class_maps(model: nn.Module, batch: Batch, *how: Any, **settings: Any) -> Te
 def probabilities(model: nn.Module, batch: Batch, *how: Any, **settings: Any) -> Tensor:
     """(B, K, H', W') float32: probabilities of the classes; arguments as in `label_scores`.
 
-    Of class scores this is their softmax. Those of networks that return masks of queries are sums
-    over queries of probabilities of classes and masks (Mask2Former, semantic inference), whose
-    softmax would hardly differ between classes. Here each is divided by the sum over classes.
+    That is their softmax. Scores of networks that return masks are sums over queries (Mask2Former,
+    semantic inference), whose softmax would hardly differ; each is divided by the sum over classes.
     """
     return _shares(label_scores(model, batch, *how, **settings), model)
 

@@ -9,6 +9,7 @@ base rate that a schedule reads; one with `constant` keeps that rate.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import chain
 from typing import Annotated, Any, Literal
 
 import torch
@@ -77,9 +78,8 @@ class SGD:
         # On a GPU the default makes a copy of all gradients to add the decay; the fused one none.
         # On a CPU it would change the last bits of published runs.
         fused = True if any(p.is_cuda for group in groups for p in group["params"]) else None
-        return torch.optim.SGD(
-            groups, momentum=self.momentum, weight_decay=self.weight_decay, fused=fused
-        )
+        decay = self.weight_decay
+        return torch.optim.SGD(groups, momentum=self.momentum, weight_decay=decay, fused=fused)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,7 +91,8 @@ class RMSprop:
     eps: Epsilon
 
     def __call__(self, model: nn.Module, without: tuple[str, ...] = ()) -> torch.optim.Optimizer:
-        groups = _one_group(model, without, self.lr)
+        parameters = chain(*parameter_groups(model, (), without).values())
+        groups = [_group([*parameters], self.lr)]
         return torch.optim.RMSprop(groups, alpha=self.alpha, eps=self.eps)
 
 
@@ -108,19 +109,13 @@ class Adam:
     eps: Epsilon
 
     def __call__(self, model: nn.Module, without: tuple[str, ...] = ()) -> torch.optim.Optimizer:
-        groups = _one_group(model, without, self.lr)
-        return torch.optim.Adam(
-            groups, betas=self.betas, weight_decay=self.weight_decay, eps=self.eps, fused=True
-        )
+        parameters = chain(*parameter_groups(model, (), without).values())
+        groups = [_group([*parameters], self.lr) | {"weight_decay": self.weight_decay}]
+        return torch.optim.Adam(groups, betas=self.betas, eps=self.eps, fused=True)
 
 
 def _group(parameters: list[nn.Parameter], lr: float) -> dict[str, Any]:
     return {"params": parameters, "lr": lr, "base_lr": lr}
-
-
-def _one_group(model: nn.Module, without: tuple[str, ...], lr: float) -> list[dict[str, Any]]:
-    groups = parameter_groups(model, (), without)
-    return [_group([each for group in groups.values() for each in group], lr)]
 
 
 def parameter_groups(
@@ -130,7 +125,6 @@ def parameter_groups(
 
     Source: CRM release. Mask tokens and raw level embeddings are decayed; affine parameters of
     normalisations, `nn.Embedding` weights and `undecayed_names` (last words of names) are not.
-
     `without` are beginnings of names that are left out ("heads.target."); ValueError: no such name.
     """
     groups: dict[tuple[bool, bool], list[nn.Parameter]] = {}

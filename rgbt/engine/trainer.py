@@ -285,9 +285,9 @@ class Trainer:
 def average_gradients(parameters: Sequence[nn.Parameter]) -> None:
     """Replace each gradient by its mean over the processes, after the last pass of a phase.
 
-    There is no wrapper like DistributedDataParallel: a step may have several forward passes, heads
-    that one domain alone uses, and parameters that two optimizers step. What a parameter kept from
-    an earlier phase is the mean already. No gradient is 0 where another process has one.
+    A step may have several forward passes, heads that one domain alone uses, and parameters that
+    two optimizers step, unlike in DistributedDataParallel. What a parameter kept from an earlier
+    phase is the mean already. No gradient is 0 where another process has one.
     """
     if num_processes() == 1:
         return

@@ -116,8 +116,8 @@ class Counts:
         return cls(counts=arrays["counts"], night=night, **given)
 
     def _take(self, indices: list[int]) -> Counts:
-        night = None if self.night is None else tuple(self.night[index] for index in indices)
         names = tuple(self.names[index] for index in indices)
+        night = self.night and tuple(self.night[index] for index in indices)
         return replace(self, counts=self.counts[indices], names=names, night=night)
 
 

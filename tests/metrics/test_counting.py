@@ -18,7 +18,7 @@ from rgbt.metrics.counting import (
     outlined,
     pair_counts,
 )
-from rgbt.metrics.details import DEFAULTS, OF_SCENES, DetailKind, Details
+from rgbt.metrics.details import Details
 from rgbt.metrics.metric import Regions
 from rgbt.metrics.scores import boundary_iou, ece, object_recall
 
@@ -221,19 +221,3 @@ def test_counts_by_size_by_hand() -> None:
     # An object has the same size in every region: 8 pixels in each half, 16 in all.
     halves = counted(Details("size", (9.0,)), ZEROS, ZEROS, ZEROS + 1, classes=1, regions=HALVES)
     assert halves[:, 0, 0].tolist() == [0, 8, 0, 0, 8, 0]
-
-
-@pytest.mark.parametrize("kind", ["boundary", "calibration", "distance", "size"])
-def test_details_add_over_regions_and_scenes_to_the_usual_counts(kind: DetailKind) -> None:
-    rng = np.random.default_rng(0)
-    label, prediction = (rng.integers(0, 3, (12, 16)) for _ in range(2))
-    label[:2] = 255
-    scene = {"calibration": rng.random((12, 16)), "size": rng.integers(0, 30, (12, 16))}
-    scene["distance"] = np.where(scene["size"] == 0, math.inf, scene["size"])
-    details = Details(kind, (6.0, 7.0) if kind in OF_SCENES else DEFAULTS[kind])
-    given = (label, prediction, *([scene[kind]] if kind in scene else []))
-    halves = counted(details, *given, classes=3, regions=HALVES)
-    by_half = halves.reshape(2, -1, *halves.shape[1:])
-    assert np.array_equal(by_half.sum(0), counted(details, *given, classes=3))
-    if details.bins:
-        assert np.array_equal(by_half.sum(1), RegionCounter(3, HALVES)(label, prediction))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +13,6 @@ import pytest
 from rgbt.checks import InputError
 from rgbt.metrics.archive import Archive
 from rgbt.metrics.counts import Counts, check_same_means, convention
-from tests.damage import damaged
 
 
 def example(night: tuple[bool, ...] | None = (False, True, True), **changes: Any) -> Counts:
@@ -97,24 +95,6 @@ def test_counts_of_other_means_or_conventions_are_not_compared() -> None:
     assert convention(both[1:]) == "exclude"
     with pytest.raises(InputError, match="Choose absent=released or absent=exclude"):
         convention(both)
-
-
-def test_damaged_files_are_refused_or_whole(tmp_path: Path) -> None:
-    path, draw = tmp_path / "counts.npz", random.Random(3)
-    example().save(path)
-    whole, refused = path.read_bytes(), 0
-    changed = [each for _, each in damaged(whole, 100)]
-    for _ in range(100):
-        content = bytearray(whole)
-        content[draw.randrange(len(whole))] ^= 1 << draw.randrange(8)
-        changed.append(bytes(content))
-    for content in changed:
-        path.write_bytes(content)
-        try:
-            assert repr(Counts.load(path)) == repr(example())
-        except InputError:
-            refused += 1
-    assert refused > 100
 
 
 def test_other_files_are_refused_and_nothing_in_them_runs(tmp_path: Path) -> None:

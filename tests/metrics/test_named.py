@@ -67,6 +67,7 @@ CALIBRATED = of_details("calibration", (2.0,), [LOW, HIGH, [[0, 0]] * 3, HIGH])
         # whole image [[7, 1], [2, 6]]: IoU 7/10 and 6/9
         (counts_of(), "mIoU", "released", (7 / 10 + 6 / 9) / 2),
         (counts_of(), "class/car", "released", 6 / 9),
+        (counts_of(), "class/car/acc", "released", 6 / 8),
         # rings [[4, 0], [2, 2]]: 4/6 and 2/4; [[3, 1], [0, 4]]: 3/4 and 4/5
         (counts_of(), "region/1", "released", (4 / 6 + 2 / 4) / 2),
         (counts_of(), "region/2", "released", 0.775),

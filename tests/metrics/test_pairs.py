@@ -122,10 +122,3 @@ def test_flicker_by_hand() -> None:
     # Pixels 0 and 3 change and change back; pixel 4 changes twice; pixel 5 does not count.
     assert part.tolist() == [1, 1, 0]
     assert every.tolist() == [2, 2, 1]
-
-
-def test_only_labelled_pixels_are_known_by_their_row() -> None:
-    both = np.array([[0, 1, 1]])
-    for label, expected in ([0, 1, 255], 2), ([255] * 3, np.nan):
-        found = pairs.only_labelled(pair_counts(both, both, np.array([label]), 2))
-        assert found.sum() == pytest.approx(expected, nan_ok=True)
