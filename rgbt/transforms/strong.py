@@ -63,6 +63,7 @@ class StrongAugmentation:
             thermal: (B, 1, H, W) float32 in [0, 1].
             generator: of any device; the number of draws is always the same.
         """
+
         def draw(count: int) -> Tensor:
             names = len(CHANGES) + len(OF_THERMAL) + 1
             drawn = torch.rand(count, names, generator=generator, device=generator.device)
