@@ -25,6 +25,7 @@ from rgbt.checks import InputError
 from rgbt.data.domains import GIVEN, NONE, Domain
 from rgbt.data.loaders import Batches, PairedBatches, steps_per_epoch, train_batches
 from rgbt.dataset import LabelledDataset
+from rgbt.engine.batch_norm import check_batch_norm_parts, synchronise_batch_norm
 from rgbt.engine.device import prepare_training
 from rgbt.engine.fabric import open_fabric
 from rgbt.engine.schedules import Schedule
@@ -225,12 +226,9 @@ def _labelled(session: Session, name: str, domain: Domain, names: Lists) -> Labe
 
 def _share_batch_norm(network: nn.Module, trainer: TrainerSettings) -> None:
     """Let the processes of a run normalise their batch together, unless each has its own part."""
-    if num_processes() == 1:
-        return
-    from rgbt.engine.batch_norm import check_batch_norm_parts, synchronise_batch_norm
-
-    check_batch_norm_parts(trainer.batch_norm_parts, num_processes())
-    if trainer.batch_norm_parts == 1:
+    number = num_processes()
+    check_batch_norm_parts(trainer.batch_norm_parts, number)
+    if number > 1 and trainer.batch_norm_parts == 1:
         synchronise_batch_norm(network)
 
 

@@ -265,11 +265,9 @@ def is_plain(value: object) -> bool:
 
 
 def misfits(own: Mapping[str, Tensor], stored: Mapping[str, Any]) -> list[str]:
-    """What keeps the tensors of a checkpoint from their places, in words; none: nothing.
+    """What keeps `stored` tensors of a checkpoint from the places of a network, in words.
 
-    Args:
-        own: entries of the network or optimizer, with their shapes and types.
-        stored: those of the file; torch itself compares no types.
+    torch itself compares no types.
     """
     found = [f"{name} is missing" for name in own.keys() - stored.keys()]
     found += [f"{name} is unknown" for name in stored.keys() - own.keys()]

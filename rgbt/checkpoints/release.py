@@ -45,17 +45,10 @@ def convention_of(layout: str, family: str) -> tuple[str, ...]:
 
 
 def save(path: Path, layout: str, family: str, state: Mapping[str, Tensor], note: Note) -> None:
-    """Write weights under a temporary name and rename it.
+    """Write the weights of a network, "" for the `family` of one from elsewhere, to a new file.
 
-    Args:
-        path: of the new file.
-        layout: one of `FORMATS`.
-        family: of the network, "" for one from elsewhere.
-        state: its entries.
-        note: the note of the file, stored if the format has a place for it.
-
-    Raises:
-        InputError: the file exists, the format is unknown or does not fit the network.
+    `layout` is one of `FORMATS`; the `note` is stored if it has a place for it. InputError: the
+    file exists, the format is unknown or does not fit the network.
     """
     check_choice("format", layout, FORMATS)
     if path.exists():
@@ -97,13 +90,9 @@ def _released_name(family: str, entry: str) -> str:
 
 
 def position_index(rows: int) -> Tensor:
-    """Row of Swin's bias table for every pair of tokens of a window.
+    """Row of Swin's bias table, of (2 w - 1)^2 rows, for every pair of tokens of a window.
 
-    Args:
-        rows: of the table, (2 w - 1)^2 for windows of w x w tokens.
-
-    Returns:
-        (w^2, w^2) int64: (dy + w - 1) (2 w - 1) + dx + w - 1, first token less second.
+    (w^2, w^2) int64: (dy + w - 1) (2 w - 1) + dx + w - 1, first token less second.
     """
     span = round(rows**0.5)
     side = (span + 1) // 2

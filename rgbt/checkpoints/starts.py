@@ -46,10 +46,7 @@ RECIPES: tuple[Recipe, ...] = TypeAdapter(tuple[Recipe, ...]).validate_python(_T
 def start_lines(file: str, digest: str, experiments: Collection[str]) -> Iterator[tuple[str, str]]:
     """Which published file a file is, and what starts from it, as lines of (word, text).
 
-    Args:
-        file: its name.
-        digest: its SHA-256 in hexadecimal.
-        experiments: names of all experiments.
+    `digest` is its SHA-256 in hexadecimal; `experiments` are the names of all of them.
     """
     for start in STARTS:
         is_same = bool(start.digest) and digest.startswith(start.digest)

@@ -24,7 +24,7 @@ from rgbt.engine.batch_norm import check_batch_norm_parts
 from rgbt.engine.fabric import open_fabric
 from rgbt.engine.settings import TrainerSettings
 from rgbt.files.plain_files import check_links
-from rgbt.processes import agreed, alone, num_processes, rank
+from rgbt.processes import agreed, num_processes, rank
 from rgbt.runs.provenance import other_code
 from rgbt.runs.run_spec import RunSpec
 from rgbt.runtime.group import Group, group_from_environment
@@ -157,16 +157,15 @@ def run_pipeline(run: RunSpec, extra_tags: Mapping[str, str]) -> None:
                 "fresh=true."
             )
     specs: tuple[RunSpec, ...] = agreed(run.pending)
-    if run.dependencies and rank() == 0 and (len(specs) > 1 or run.missing_labels):
-        with alone():
-            for spec in specs:
-                with _naming(spec, run):
-                    Training(spec).validate()
+    is_incomplete = len(specs) > 1 or bool(run.dependencies and run.missing_labels)
+    for spec in specs if is_incomplete and rank() == 0 else ():
+        with _naming(spec, run):
+            Training(spec).validate()
     for spec in specs:
         with _naming(spec, run):
+            if spec.dependencies and rank() == 0:
+                Training(spec).predict_labels()
             if spec.dependencies:
-                if rank() == 0:
-                    Training(spec).predict_labels()
                 agreed(None)  # process 0 has written the labels
             if spec.key == run.key:
                 Training(spec, extra_tags).complete()

@@ -95,6 +95,7 @@ class Training:
         self._is_first = True
         self._selected: dict[str, Counts] = {}  # of the last evaluation during the training
 
+    @alone()
     def validate(self) -> None:
         """Build everything once; InputError as of `rgbt.assembly.training_setup.validate`."""
         validate(self.spec)
@@ -256,7 +257,8 @@ class Training:
         """The batches, with unreadable files noted in `state` before a checkpoint is written."""
         batches = self.setup.batches(steps)
         for batch in batches:
-            state.skip(batches.skipped)
+            if batches.skipped:
+                state.skip(batches.skipped)
             yield batch
 
     def _evaluate(

@@ -59,7 +59,7 @@ def test_key_of_the_start_does_not_depend_on_the_arm(typed: str) -> None:
 def test_start_shares_what_does_not_change_its_result() -> None:
     typed = ["runs_dir=/elsewhere", "trainer.accelerator=cpu", "data.num_workers=1"]
     start = start_of("baseline", *typed, "dataset.cache_dir=/cache", "tracking=none")
-    assert (start.runs_dir, start.trainer.accelerator) == ("/elsewhere", "cpu")
+    assert (start.plain["runs_dir"], start.trainer.accelerator) == ("/elsewhere", "cpu")
     assert (start.data.num_workers, start.dataset.plain["cache_dir"]) == (1, "/cache")
     assert start.key == start_of("baseline").key
     for changed in ("model.embed_dim=16", "scale.max_steps=9"):
