@@ -31,10 +31,7 @@ class CachedDataset(DatasetWrapper):
 
     The name of a file is a hash of the sample, the settings of its decoding, and path, length and
     times of its files, so that a changed file is decoded again. Files of former states are kept.
-
-    Args:
-        dataset: is decoded; its samples must not carry confidences.
-        folder: holds the files; "auto": $XDG_CACHE_HOME/rgbt/decoded or ~/.cache/rgbt/decoded.
+    The folder "auto" is $XDG_CACHE_HOME/rgbt/decoded or ~/.cache/rgbt/decoded.
     """
 
     def __init__(self, dataset: LabelledDataset, folder: str) -> None:

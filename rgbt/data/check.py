@@ -2,8 +2,7 @@
 
     rgbt check dataset=mfnet dataset.root=...
 
-Every listed sample is read once, in threads. Progress goes to stderr, the report to stdout. Exit
-code 0: no problem, 1: problems, 2: wrong input.
+Progress goes to stderr, the report to stdout. Exit code 0: no problem, 1: problems, 2: wrong input.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 from omegaconf import DictConfig
@@ -125,10 +123,11 @@ def check_dataset(
 
     every = tuple(dict.fromkeys(name for names in lists.values() for name in names))
     contents: dict[str, tuple[tuple[int, ...], PixelCounts | None]] = {}
-    shown: dict[str, Any] = {"console": Console(stderr=True), "disable": not is_shown}
+    console = Console(stderr=True)
     with ThreadPoolExecutor(num_threads) as pool:
-        results = track(pool.map(read, every), "reading", len(every), **shown)
-        for name, found in zip(every, results, strict=True):
+        results = pool.map(read, every)
+        shown = track(results, "reading", len(every), console=console, disable=not is_shown)
+        for name, found in zip(every, shown, strict=True):
             if isinstance(found, str):
                 problems.append(found)
             else:

@@ -61,8 +61,7 @@ class Domains:
     """The domains of a run, and which head predicts which image in evaluation.
 
     conf/domains/one.yaml describes each setting. The target is that of its view (RGB to thermal) or
-    of the night (day to night). The thesis' day-to-night scripts score the night images with the
-    head for the day (`tested_head` "source"). InputError: heads that cannot be distinguished.
+    of the night (day to night). InputError: heads that cannot be distinguished.
     """
 
     source: Domain

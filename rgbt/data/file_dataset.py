@@ -190,8 +190,6 @@ class FileDataset:
         """See `hash_of_files`; splits that are not there are empty."""
         return hash_of_files({split: self.listed(split) for split in self.splits}, self.files)
 
-    # Members for `rgbt check`.
-
     def repeats(self, split: str) -> bool:
         """Whether a split only repeats images of other splits, and need not exist."""
         return split.endswith(("_day", "_night"))

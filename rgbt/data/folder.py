@@ -25,11 +25,6 @@ from rgbt.data.patterns import NAME, SEQUENCE, SPLIT, Frame, find_frames, in_ord
 from rgbt.randomness import numpy_generator
 from rgbt.ranges import Colour, Names, NumClasses, Seed, Share, Text
 
-FOLDERS = {split: split for split in ("train", "val", "test")}
-"""Default values of {split}."""
-
-Frames = Mapping[str, Frame]
-
 
 class Folder(FileDataset):
     """RGB-thermal pairs in any folder whose paths follow patterns.
@@ -77,33 +72,7 @@ class Folder(FileDataset):
         self.codes = label_codes(classes, ids, colours, ignored)
         self.follow(rgb, thermal, label, thermal_range)
         self.frames = find_frames(self.root, self.patterns)
-        in_path = SPLIT in self.patterns.rgb.words
-        given = {
-            f"{{{SPLIT}}} in dataset.rgb": in_path or folders is not None,
-            "dataset.lists": lists is not None,
-            "dataset.shares": shares is not None,
-        }
-        if sum(given.values()) != 1 or (folders is not None and not in_path):
-            raise InputError(
-                f"dataset: exactly one of {', '.join(given)} must define the splits, got "
-                f"{' and '.join(key for key, each in given.items() if each) or 'none'}."
-            )
-        if shares is None and (shares_seed, block) != (0, None):
-            raise InputError("dataset.shares_seed and dataset.block require dataset.shares.")
-        self._divided: SplitNames = {}
-        if lists is not None:
-            self.splits, self.splits_key = lists, "dataset.lists"
-        elif shares is not None:
-            self.splits = {split: f"{share:g} of the frames" for split, share in shares.items()}
-            self._divided = draw_shares(self.frames, shares, shares_seed, block)
-        else:
-            words = FOLDERS if folders is None else folders
-            self.splits = {split: rgb.replace(f"{{{SPLIT}}}", words[split]) for split in words}
-            found = [(name, frame.values[SPLIT]) for name, frame in self.frames.items()]
-            self._divided = {
-                split: tuple(name for name, folder in found if folder == word)
-                for split, word in words.items()
-            }
+        self._divided: SplitNames = self._divide(folders, lists, shares, (shares_seed, block))
         for split in unlabelled:
             check_choice("dataset.unlabelled", split, self.splits)
         is_new = set(self.splits) <= set(unlabelled)  # perhaps of the day alone
@@ -123,6 +92,37 @@ class Folder(FileDataset):
                 f"'{next(iter(self.frames))}'."
             )
         return names
+
+    def _divide(
+        self,
+        folders: dict[str, str] | None,
+        lists: dict[str, str] | None,
+        shares: dict[str, float] | None,
+        draw: tuple[int, int | None],
+    ) -> SplitNames:
+        """Set `splits`, and return the names of each; of lists, which are read later, nothing."""
+        pattern = self.patterns.rgb
+        given = {
+            f"{{{SPLIT}}} in dataset.rgb": SPLIT in pattern.words or folders is not None,
+            "dataset.lists": lists is not None,
+            "dataset.shares": shares is not None,
+        }
+        if sum(given.values()) != 1 or (folders is not None and SPLIT not in pattern.words):
+            raise InputError(
+                f"dataset: exactly one of {', '.join(given)} must define the splits, got "
+                f"{' and '.join(key for key, each in given.items() if each) or 'none'}."
+            )
+        if lists is not None:
+            self.splits, self.splits_key = lists, "dataset.lists"
+            return {}
+        if shares is not None:
+            self.splits = {split: f"{share:g} of the frames" for split, share in shares.items()}
+            return draw_shares(self.frames, shares, *draw)
+        words = {split: split for split in ("train", "val", "test")} if folders is None else folders
+        text = pattern.text
+        self.splits = {split: text.replace(f"{{{SPLIT}}}", word) for split, word in words.items()}
+        found = [(name, frame.values[SPLIT]) for name, frame in self.frames.items()]
+        return {s: tuple(name for name, f in found if f == word) for s, word in words.items()}
 
     def frame(self, name: str) -> Frame:
         """The files of `name`, without a label in splits that have none."""
@@ -156,9 +156,9 @@ class Folder(FileDataset):
 
     def own_notes(self, lists: SplitNames) -> list[str]:
         """Frames of no split."""
-        others = [name for name in self.frames if name not in set().union(*lists.values())]
-        first = others[:1]
-        return [f"{len(others)} frames are in no split; the first is '{name}'." for name in first]
+        listed = set().union(*lists.values())
+        others = [name for name in self.frames if name not in listed]
+        return [f"{len(others)} frames are in no split; the first is '{n}'." for n in others[:1]]
 
     @cached_property
     def _without_labels(self) -> frozenset[str]:
@@ -183,7 +183,7 @@ class Folder(FileDataset):
 
 
 def draw_shares(
-    frames: Frames, shares: Mapping[str, float], seed: int, block: int | None
+    frames: Mapping[str, Frame], shares: Mapping[str, float], seed: int, block: int | None
 ) -> dict[str, tuple[str, ...]]:
     """Divide frames at random into splits: split -> its names, in the order of all frames.
 

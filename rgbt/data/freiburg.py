@@ -123,7 +123,6 @@ class Freiburg(FileDataset):
             crop=crop,
             advice="use the original file, which holds the counts of dataset.thermal_range",
         )
-
         self.splits = SPLITS
         self._frames: dict[str, Frame] = {}
         self._partners: list[Path] = []

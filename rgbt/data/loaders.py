@@ -38,7 +38,6 @@ LOG = logging.getLogger(__name__)
 
 CROP_ADVICE = "; choose a transform.crop_hw that fits into every resized image"
 EVAL_ADVICE = "; set data.eval_batch_size=1"
-
 DEAD_WORKER = re.compile(r"DataLoader worker .*(exited unexpectedly|killed by signal)")
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -48,7 +47,6 @@ LOOK_S = 2.0
 """Interval at which a worker checks that its main process exists."""
 
 Kind = TypeVar("Kind", bound=Loadable)
-
 MakeExample = Callable[[Any, dict[str, str]], Any]
 """(key, skipped) -> example, or None if it is left out; adds unreadable names to `skipped`."""
 

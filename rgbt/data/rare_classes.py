@@ -1,8 +1,7 @@
 """Rare class sampling: training images drawn by a class that they show, rare classes more often.
 
-It replaces the permutation of the split in every epoch (`data.sampling=rare_classes`), for the
-labelled images of any training. Each sample has draws of its own (seed, purpose, epoch, number), so
-that batches depend neither on loader processes nor on where a run resumes.
+It replaces the permutation of the split in every epoch (`data.sampling=rare_classes`). Each sample
+has draws of its own (seed, purpose, epoch, number).
 """
 
 from __future__ import annotations

@@ -35,8 +35,7 @@ Gaps = Literal["refuse", "split"]
 
 Sequences = tuple[tuple[str, ...], ...]
 
-VIDEO = "video"
-"""The word of the patterns that names a video."""
+VIDEO = "video"  # the word of the patterns that names one
 
 CLASSES = (
     *("background", "car", "bus", "motorcycle", "bicycle", "pedestrian", "motorcyclist"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -56,8 +56,6 @@ def write_any(path: Path, image: np.ndarray) -> None:
         assert cv2.imwrite(str(path), image)
 
 
-# A layout of somebody's own.
-
 HW = (6, 8)
 CLASSES = ("background", "person", "car")
 RANGE = (20000, 24000)
@@ -78,11 +76,11 @@ def write_frame(root: Path, split: str, name: str) -> None:
     write_png(root / split / "mask" / f"{name}.png", label)
 
 
-def write_folder(root: Path, frames: Mapping[str, int] | None = None) -> Path:
+def write_folder(root: Path) -> Path:
     """Frames 1, 2, ... of every split, in folders by split."""
-    for split, number in (frames or {"train": 3, "val": 1, "test": 2}).items():
-        for index in range(1, number + 1):
-            write_frame(root, split, str(index))
+    for split, number in {"train": 3, "val": 1, "test": 2}.items():
+        for index in range(number):
+            write_frame(root, split, str(index + 1))
     return root
 
 
@@ -98,15 +96,12 @@ def listed(root: Path, *lines: str, **keys: Any) -> Folder:
     return folder(root, **{**PLAIN, "lists": {"train": "list.txt", "val": "val.txt"}, **keys})
 
 
-# Freiburg Thermal.
-
 FREIBURG_HW = (13, 26)
 CROP = (1, 12, 5, 23)
 SEQUENCES = {"seq_00_day/00": 2, "seq_00_day/01": 1, "seq_04_day/00": 2, "seq_00_night/00": 3}
 FOLDERS = ("ImagesRGB", "ImagesIR", "SegmentationClass")
-of_freiburg = partial(
-    contents, hw=FREIBURG_HW, num_classes=14, levels=(21000, 25000), dtype=np.uint16
-)
+COUNTS: dict[str, Any] = {"levels": (21000, 25000), "dtype": np.uint16}
+of_freiburg = partial(contents, hw=FREIBURG_HW, num_classes=14, **COUNTS)
 
 
 def write_training(root: Path, piece: str, stamp: str) -> None:
@@ -142,13 +137,10 @@ def freiburg(root: Path, **keys: Any) -> Freiburg:
     return Freiburg(str(root), **{"crop": CROP, "val_sequences": ("seq_04_day",), **keys})
 
 
-# KP.
-
 KP_HW = (16, 24)
 TRAIN = ("set00_V000_I00050", "set02_V004_I01640", "set03_V001_I00117")
 VAL = ("set06_V000_I00253", "set10_V001_I00130")
 TEST = ("set07_V000_I00050", "set08_V002_I02488", "set09_V000_I00184", "set11_V001_I01512")
-KP_LISTS = {"train": TRAIN, "val": VAL, "test": TEST}
 
 
 def of_kp(name: str) -> Images:
@@ -181,16 +173,12 @@ def write_kp(root: Path, names: Iterable[str] = (*TRAIN, *VAL, *TEST)) -> Path:
     return root
 
 
-def write_lists(
-    root: Path, lists: Mapping[str, Iterable[str]] = KP_LISTS, ending: str = ".png"
-) -> Path:
+def write_lists(root: Path) -> Path:
     """Lists alone, with the ending that the CRM release has in them."""
-    for split, names in lists.items():
-        (root / f"{split}.txt").write_text("".join(f"{name}{ending}\n" for name in names))
+    for split, names in {"train": TRAIN, "val": VAL, "test": TEST}.items():
+        (root / f"{split}.txt").write_text("".join(f"{name}.png\n" for name in names))
     return root
 
-
-# PST900.
 
 BAGS = ("10_bag1_rect_rgb_frame0000000001", "11_bag1_rect_rgb_frame0000000009", "7_bag12_rect_f1")
 BAGS_TEST = ("58_bag21_rect_rgb_frame0000000440", "3_bag25_rect_rgb_frame0000000002")
@@ -203,19 +191,15 @@ def write_triple(folder: Path, name: str) -> None:
         write_png(folder / kind / f"{name}.png", image)
 
 
-def write_pst900(
-    root: Path, train: tuple[str, ...] = BAGS, test: tuple[str, ...] = BAGS_TEST
-) -> Path:
+def write_pst900(root: Path) -> Path:
     """The archive: train and test in folders, and what else it holds of one image."""
-    for part, names in (("train", train), ("test", test)):
+    for part, names in (("train", BAGS), ("test", BAGS_TEST)):
         for name in names:
             write_triple(root / part, name)
     for kind in ("thermal_raw", "depth"):
         write_png(root / "train" / kind / f"{BAGS[0]}.png", np.full((9, 16), 30000, np.uint16))
     return root
 
-
-# Videos.
 
 MVSEG = {"train": ("a", "b"), "val": ("c",), "test": ("d", "n"), "test_night": ("n",)}
 of_mvseg = partial(contents, hw=(32, 48), num_classes=26)
@@ -259,19 +243,13 @@ def video(root: Path, **keys: Any) -> Video:
     return Video(str(root), **(settings | keys))
 
 
-# Every reader.
-
-
 class Kind(NamedTuple):
-    """A data set: its reader, what writes it, whether folders say which frames there are.
-
-    And whether frames may lack their label.
-    """
+    """A data set: its reader, and what writes it."""
 
     make: Callable[[Path], FileDataset]
     write: Callable[[Path], Path]
-    is_listed: bool = False
-    is_sparse: bool = False
+    is_listed: bool = False  # whether folders say which frames there are
+    is_sparse: bool = False  # whether frames may lack their label
 
 
 def _mfnet(root: Path, layout: str) -> Path:

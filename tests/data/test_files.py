@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import struct
 import zlib
 from collections.abc import Callable
@@ -92,14 +91,10 @@ def test_png_is_read_whole_or_refused(path: Path) -> None:
     for size in (len(whole) // 2, len(whole) - 12, len(whole) - 1):
         path.write_bytes(whole[:size])
         assert "cannot be decoded" in refused(path)
-    text = chunk(b"tEXt", b"Comment\0a")
-    path.write_bytes(whole[:33] + text.replace(b"\0a", b"\0b") + whole[33:])  # a wrong checksum
-    assert "cannot be decoded" in refused(path)
     # A wrong checksum of the pixels, which decoders pass over.
     path.write_bytes(whole[:-13] + bytes([whole[-13] ^ 1]) + whole[-12:])
     assert "cannot be decoded" in refused(path)
-    # With a comment, and as a card reader leaves it.
-    path.write_bytes(whole[:33] + text + whole[33:] + b"\0" * 5000)
+    path.write_bytes(whole + b"\0" * 5000)  # as a card reader leaves it
     np.testing.assert_array_equal(decode(path), image)
 
 
@@ -112,57 +107,34 @@ def test_jpeg_is_read_whole_or_refused(path: Path, thumbnail: bool) -> None:
     for size in (3, 30, len(whole) - 500, len(whole) - 2, len(whole) - 1):
         path.write_bytes(whole[:size])
         assert "cannot be decoded" in refused(path)
-    if not thumbnail:
-        path.write_bytes(whole[:-2] + b"\0" * 99)
-        assert "its end is missing" in refused(path)
+    path.write_bytes(whole[:-2] + b"\0" * 99)
+    assert thumbnail or "its end is missing" in refused(path)
     path.write_bytes(whole + b"\0\0 and what a camera appends")
     np.testing.assert_array_equal(decode(path), cv2.imread(str(path))[..., ::-1])
 
 
-@pytest.mark.parametrize("kind", [".png", ".tif", ".bmp"])
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
-def test_values_are_those_of_the_file(tmp_path: Path, kind: str, dtype: type) -> None:
-    if (kind, dtype) in ((".png", np.float32), (".bmp", np.float32), (".bmp", np.uint16)):
-        pytest.skip("no such format")
-    path = tmp_path / f"x{kind}"
+@pytest.mark.parametrize("name", ["8.png", "16.png", "8.bmp", "8.tif", "16.tif", "32.tif"])
+def test_values_are_those_of_the_file(tmp_path: Path, name: str) -> None:
+    dtype = {"8": np.uint8, "16": np.uint16, "32": np.float32}[name.split(".")[0]]
     image = np.random.default_rng(0).integers(0, 256, (40, 50)).astype(dtype)
-    assert cv2.imwrite(str(path), image)
-    found = decode(path)
+    assert cv2.imwrite(str(tmp_path / name), image)
+    found = decode(tmp_path / name)
     assert found.dtype == dtype
     np.testing.assert_array_equal(found, image)
-    whole = path.read_bytes()
+    whole = (tmp_path / name).read_bytes()
     for size in (len(whole) // 2, len(whole) - 5):
-        path.write_bytes(whole[:size])
-        assert "cannot be decoded" in refused(path)
+        (tmp_path / name).write_bytes(whole[:size])
+        assert "cannot be decoded" in refused(tmp_path / name)
 
 
-def test_what_is_no_file(path: Path, tmp_path: Path) -> None:
-    assert refused(path).startswith(f"{path} is missing; ")
-    path.mkdir()
-    assert "is not a regular file" in refused(path)
-    path.rmdir()
-    os.mkfifo(path)  # opening it would wait for ever
-    assert "is not a regular file" in refused(path)
-    path.unlink()
+def test_what_is_no_image(path: Path) -> None:
     bomb = png_bytes(2**30, 2**30, depth=8, colours=0)
-    for content in (b"", b"no image", bomb, b"\x89PNG\r\n\x1a\n" + chunk(b"IEND", b"")):
+    for content in (bomb, b"\x89PNG\r\n\x1a\n" + chunk(b"IEND", b"")):
         path.write_bytes(content)
         assert "cannot be decoded" in refused(path)
     path.unlink()
-    path.symlink_to(tmp_path / "gone" / "y.png")
-    assert f"{path} is missing (a link to {tmp_path / 'gone' / 'y.png'});" in refused(path)
-    path.unlink()
     path.symlink_to(path)
     assert "cannot be read (Too many levels of symbolic links)" in refused(path)
-
-
-def test_file_without_permission_is_refused(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def deny(*_: object) -> bytes:
-        raise PermissionError(13, "Permission denied")
-
-    path.write_bytes(b"secret")
-    monkeypatch.setattr(Path, "read_bytes", deny)
-    assert "cannot be read (Permission denied)" in refused(path)
 
 
 def test_indices_of_a_palette(path: Path) -> None:
@@ -194,19 +166,6 @@ def test_labels_whose_values_would_change(path: Path) -> None:
     rows = bytes([0, *range(1, 7)])
     path.write_bytes(png_bytes(1, 1, depth=16, colours=2, rows=rows))
     assert "16 bits per channel" in refused(path)
-
-
-def test_colours(path: Path) -> None:
-    colours = np.array([[[220, 20, 60], [0, 0, 142]]], np.uint8)
-    opaque = np.dstack([colours[..., ::-1], np.full((1, 2), 255, np.uint8)])
-    for written in (colours[..., ::-1], opaque):
-        cv2.imwrite(str(path), written)
-        np.testing.assert_array_equal(read_colours(path), colours)
-    opaque[0, 0, 3] = 254
-    cv2.imwrite(str(path), opaque)
-    assert "transparent" in refused(path, read_colours)
-    cv2.imwrite(str(path), colours[..., 0])
-    assert "got PNG of mode L" in refused(path, read_colours)
 
 
 def test_number_of_channels(path: Path) -> None:

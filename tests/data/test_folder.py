@@ -14,7 +14,6 @@ from rgbt.config.component import build
 from rgbt.data.check import check_dataset
 from rgbt.data.folder import draw_shares
 from rgbt.data.images import grey
-from rgbt.data.labels import painted
 from rgbt.data.patterns import Frame, Pattern, in_order
 from tests.conftest import write_png
 from tests.data.layouts import (
@@ -29,7 +28,6 @@ from tests.data.layouts import (
     refused,
     write_any,
     write_folder,
-    write_frame,
 )
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -44,9 +42,6 @@ def root(tmp_path: Path) -> Path:
 def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same for tests that write nothing."""
     return write_folder(tmp_path_factory.mktemp("sound") / "mine")
-
-
-# Images
 
 
 def test_reads_what_the_patterns_name(sound: Path) -> None:
@@ -97,12 +92,10 @@ def test_thermal_of_eight_bits(root: Path) -> None:
 def test_thermal_of_real_numbers(root: Path) -> None:
     path = root / "train" / "ir" / "1_ir.tif"
     celsius = np.full(HW, 25.0, np.float32)
-    write_any(path, celsius)
-    dataset = folder(root, thermal_range=(20, 30))
-    assert (dataset.read("train_1").thermal == 128).all()
     celsius[2, 3:5] = (np.nan, np.inf)
     write_any(path, celsius)
-    assert f"{path}: 2 thermal values are NaN" in refused(lambda: dataset.read("train_1"))
+    said = refused(lambda: folder(root, thermal_range=(20, 30)).read("train_1"))
+    assert f"{path}: 2 thermal values are NaN" in said
 
 
 def test_packed_files(tmp_path: Path) -> None:
@@ -134,13 +127,8 @@ def test_thermal_and_labels_as_arrays(root: Path) -> None:
     assert (dataset.read("train_1").thermal == 0).all()
     assert (dataset.read("val_1").thermal == 255).all()
     assert set(dataset.read("val_1").label.flat) == {2}
-    for wrong in (np.zeros(HW, complex), np.zeros(48), np.zeros(HW, bool)):
-        np.save(root / "train/ir/2.npy", wrong)
-        said = refused(lambda: dataset.read("train_2"))
-        assert "expected thermal values of shape (rows, columns)" in said
-
-
-# Labels
+    np.save(root / "train/ir/2.npy", np.zeros(48))
+    assert "expected thermal values of shape (" in refused(lambda: dataset.read("train_2"))
 
 
 def test_label_values(root: Path) -> None:
@@ -150,16 +138,14 @@ def test_label_values(root: Path) -> None:
     write_png(path, label)
     ids = {0: "background", 24: "person", 26: "car", 400: "car"}
     dataset = folder(root, ids=ids, ignored=(7,))
-    found = dataset.label("train_1")
-    assert found[0].tolist() == [255, 1, 2, 2, 255, 0, 0, 0]
-    assert not found[1:].any()
+    assert dataset.label("train_1")[0].tolist() == [255, 1, 2, 2, 255, 0, 0, 0]
+    # 255 may be a class if the configuration says so.
+    whole = folder(root, ids={**ids, 255: "person"}, ignored=(7,))
+    assert whole.label("train_1")[0, 4] == 1
     label[1, :3] = (9, 9, 30)
     write_png(path, label)
     said = refused(lambda: dataset.label("train_1"))
     assert "label value 9 (2 pixels; one of 2 unknown values) has no class in dataset.ids" in said
-    # 255 may be a class if the configuration says so.
-    whole = folder(root, ids={**ids, 255: "person", 9: "car", 30: "car"}, ignored=(7,))
-    assert whole.label("train_1")[0, 4] == 1
 
 
 def test_label_colours(root: Path) -> None:
@@ -177,15 +163,6 @@ def test_label_colours(root: Path) -> None:
     assert "colour [60, 20, 220] (2 pixels; one of 2 unknown values)" in said
 
 
-def test_generated_colours() -> None:
-    """By hand: bit 0 is red 128, bit 1 green 128, bit 2 blue 128, bit 3 red 64."""
-    assert painted(10) == (
-        *((0, 0, 0), (128, 0, 0), (0, 128, 0), (128, 128, 0), (0, 0, 128)),
-        *((128, 0, 128), (0, 128, 128), (128, 128, 128), (64, 0, 0), (192, 0, 0)),
-    )
-    assert len(set(painted(256))) == 256
-
-
 def test_unlabelled(root: Path) -> None:
     (root / "val" / "mask" / "1.png").unlink()
     dataset = folder(root, unlabelled=("val",))
@@ -196,14 +173,11 @@ def test_unlabelled(root: Path) -> None:
     assert folder(root, label=None).read("test_1").label is None
 
 
-# Patterns
-
-
 def test_words_of_a_pattern(tmp_path: Path) -> None:
-    for name in ("s1/rgb/a_b_7.png", "s1/rgb/a_b_x.jpg", "s1/rgb/._a_b_7.png", "s1/rgb/c.png"):
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).touch()
-    for name in (".hidden/rgb/a_9.png", "x+y (1)/s1_7.png", "x+y (1)/x+y (1)_8.png"):
+    for name in (
+        *("s1/rgb/a_b_7.png", "s1/rgb/a_b_x.jpg", "s1/rgb/._a_b_7.png", "s1/rgb/c.png"),
+        *(".hidden/rgb/a_9.png", "x+y (1)/s1_7.png", "x+y (1)/x+y (1)_8.png"),
+    ):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).touch()
     pattern = Pattern("{sequence}/rgb/{part}_{name}.png", "dataset.rgb")
@@ -255,7 +229,6 @@ def test_two_files_of_one_name_and_a_folder_without_permission(
 @pytest.mark.parametrize(
     ("keys", "said"),
     [
-        ({"unscored": ("cars",)}, "dataset.unscored: 'cars' is not a valid choice"),
         ({"unlabelled": ("vall",)}, "dataset.unlabelled: 'vall' is not a valid choice"),
         ({"classes": ("car", "person", "car")}, "dataset.classes: a name occurs twice"),
         ({"night": "*dark*"}, "dataset.night: '*dark*' matches no name"),
@@ -268,10 +241,8 @@ def test_two_files_of_one_name_and_a_folder_without_permission(
         ({"ignored": ((1, 2, 3),)}, "dataset.ignored: (1, 2, 3) is no value"),
         ({"colours": {}}, "expected the colour of every class, got none"),
         ({"rgb": "/rgb/{name}.png"}, "dataset.rgb: expected a path below dataset.root"),
-        ({"rgb": "../{name}.png"}, "dataset.rgb: expected a path below"),
         ({"rgb": "rgb/{name.png"}, "dataset.rgb: expected a path below dataset.root with words"),
         ({"rgb": "rgb/{sequence}{name}.png"}, "dataset.rgb: .* other text between them"),
-        ({"rgb": "rgb/1.png"}, "dataset.rgb: expected"),
         ({"rgb": "rgb/{frame}.png"}, "dataset.rgb: .* has no {name}"),
         ({"rgb": "{split}/rgb/{name}.jpg"}, "matches no file in .*, which holds test, train, val"),
         ({"thermal": "{split}/ir/{name}.tif"}, "dataset.thermal: .* but ir holds 1_ir.tif, 2_ir"),
@@ -280,12 +251,10 @@ def test_two_files_of_one_name_and_a_folder_without_permission(
         ({"lists": {"train": "a.txt"}}, "got {split} in dataset.rgb and dataset.lists"),
         (PLAIN, "must define the splits, got none"),
         ({"folders": {"train": "train"}, **PLAIN}, "exactly one of .* must define the splits"),
-        ({"shares_seed": 1}, "dataset.shares_seed and dataset.block require dataset.shares"),
         ({"shares": {"train": 0.5, "val": 0.4}, **PLAIN}, "dataset.shares: expected shares above"),
-        ({"shares": {"train": 1.5, "val": -0.5}, **PLAIN}, "dataset.shares: expected shares above"),
         (
-            {"shares": {"train": 0.9, "val": 0.1}, "block": 5, **PLAIN},
-            "split 'val' gets no frame, .* in 2 unit",
+            {"shares": {"train": 0.5, "val": 0.5}, **PLAIN},
+            "split 'val' gets no frame, .* in 1 unit",
         ),
     ],
 )
@@ -293,9 +262,6 @@ def test_wrong_descriptions_are_refused(sound: Path, keys: dict[str, Any], said:
     sentence = refused(lambda: folder(sound, **keys))
     wanted = re.escape(said).replace(r"\.\*", ".*")
     assert re.search(wanted, sentence), sentence
-
-
-# Splits
 
 
 def test_lines_of_a_list(root: Path, tmp_path: Path) -> None:
@@ -309,10 +275,7 @@ def test_lines_of_a_list(root: Path, tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("test_1\n")
     dataset = listed(root, "train_1", lists={"train": str(tmp_path / "mine.txt")})
     assert dataset.names("train") == ("test_1",)
-
-
-def test_bare_names_in_a_list(root: Path) -> None:
-    """{name} alone will do where it is the name of one frame; 1 is that of three."""
+    # {name} alone will do where it is the name of one frame; 1 is that of three.
     dataset = listed(root, "3", "1")
     assert dataset.names("train") == ("train_3", "1")
     assert "has no frame called '1': there is no such RGB" in refused(lambda: dataset.read("1"))
@@ -377,13 +340,8 @@ def test_splits_by_folder_and_by_shares_of_a_folder(sound: Path) -> None:
     assert (missing.has("train"), missing.has("test")) == (False, True)
     assert "expected training/rgb/{name}.png in" in refused(lambda: missing.names("train"))
     # Without the word {sequence} the whole folder is one.
-    shares = {"train": 0.5, "val": 0.5}
-    drawn = [folder(sound, **PLAIN, shares=shares, block=2, shares_seed=n) for n in range(8)]
-    assert {len(each.names("train")) for each in drawn} == {4}
-    assert len({each.names("val") for each in drawn}) > 1
-
-
-# The whole
+    drawn = folder(sound, **PLAIN, shares={"train": 0.5, "val": 0.5}, block=2)
+    assert len(drawn.names("train")) == 4
 
 
 def test_fingerprint_is_of_label_values_too(sound: Path) -> None:
@@ -402,15 +360,12 @@ def test_check_of_own_data(root: Path) -> None:
     assert report.problems == ()
     assert (report.splits["train"].day, report.splits["train"].night) == (2, 1)
     assert report.notes[-1].startswith("split val has no night images")
-    write_frame(root, "extra", "1")
     (root / "test" / "rgb" / "2.png").unlink()
-    (root / "val.txt").write_text("val_1\ntrain_2\n")
-    report = check_dataset(listed(root, "train_1", "train_1", "val_1", "lost_1"))
+    (root / "val.txt").write_text("val_1\n")
+    report = check_dataset(listed(root, "train_1", "lost_1"))
     assert list(report.problems) == [
         f"folder ({root}) has no frame called 'lost_1': there is no such RGB image "
         "(dataset.rgb='{part}/rgb/{name}.png').",
-        "split train lists 'train_1' 2 times.",
-        "splits train and val share 1 names; the first is 'val_1'.",
         f"2 files belong to no image of a split; the first is {root}/test/ir/2_ir.tif.",
     ]
-    assert report.notes[0] == "3 frames are in no split; the first is 'extra_1'."
+    assert report.notes[0] == "3 frames are in no split; the first is 'test_1'."

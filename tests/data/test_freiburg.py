@@ -100,8 +100,6 @@ def test_reads_what_lies_there(sound: Path, split: str) -> None:
     ("count", "thesis", "heatnet"),
     [
         # (c - 21800) 255 / 1900 and / 3200; 22750 is the middle of the first: 127.5, upwards.
-        (21800, 0, 0),
-        (21803, 0, 0),  # 0.403
         (21804, 1, 0),  # 0.537, 0.319
         (22750, 128, 76),  # 127.5, 75.70
         (23697, 255, 151),  # 254.597, 151.17
@@ -112,23 +110,20 @@ def test_counts_are_clipped_and_scaled(root: Path, count: int, thesis: int, heat
     write_png(freiburg(root).frame(DAY).thermal, np.full(FREIBURG_HW, count, np.uint16))
     assert set(freiburg(root).read(DAY).thermal.flat) == {thesis}
     assert set(freiburg(root, thermal_range=(21800, 25000)).read(DAY).thermal.flat) == {heatnet}
-
-
-def test_thermal_images_without_counts_are_refused(root: Path) -> None:
-    path = freiburg(root).frame(DAY).thermal
-    write_png(path, np.full(FREIBURG_HW, 85, np.uint8))
+    write_png(freiburg(root).frame(DAY).thermal, np.full(FREIBURG_HW, 85, np.uint8))
     assert "got 8 bits; use the original file" in refused(lambda: freiburg(root).read(DAY))
 
 
 @pytest.mark.parametrize(
     ("label", "said"),
     [
-        (np.full(FREIBURG_HW, 14), "label value 14 "),
         (np.full(FREIBURG_HW, -1), "label value -1 "),
         (np.full(FREIBURG_HW, 256 + 3), "label value 259 "),
         (np.zeros(FREIBURG_HW), "whole numbers of shape (rows, columns), got (13, 26) float64"),
-        (np.zeros((*FREIBURG_HW, 3), int), "got (13, 26, 3) int64"),
         (np.array({}), "cannot be read as an array"),
+        (np.zeros((26, 13), int), "has 26x13 pixels but its frame 13x26, which is another aspect"),
+        (np.zeros((13, 24), int), "another aspect ratio"),
+        (np.zeros((11, 26), int), "another aspect ratio"),
     ],
 )
 def test_label_arrays_without_classes_are_refused(root: Path, label: np.ndarray, said: str) -> None:
@@ -150,15 +145,6 @@ def test_label_of_other_size_is_resized(root: Path, hw: tuple[int, int]) -> None
     )
     for name in (DAY, TEST):
         assert np.array_equal(dataset.label(name), label[np.ix_(rows, columns)])
-
-
-@pytest.mark.parametrize("hw", [(26, 13), (13, 24), (11, 26)])
-def test_labels_of_another_shape_are_refused(root: Path, hw: tuple[int, int]) -> None:
-    path = freiburg(root).files(DAY)[-1]
-    write_png(path, np.zeros(hw, np.uint8))
-    assert refused(lambda: freiburg(root).read(DAY)) == (
-        f"{path} has {hw[0]}x{hw[1]} pixels but its frame 13x26, which is another aspect ratio."
-    )
 
 
 @pytest.mark.parametrize(
@@ -194,27 +180,23 @@ def test_sequences_that_are_held_out(sound: Path, tmp_path: Path) -> None:
     night = report.splits["train_night"]
     assert (night.read, night.unlabelled, night.day, night.night) == (3, 3, 0, 3)
     assert night.sizes == {(11, 18): 3}
-    for word in ("seq_40_day", "seq_00_night"):
-        held_out = freiburg(sound, val_sequences=(word,))
-        said = refused(lambda held_out=held_out: held_out.names("val"))
-        assert f"dataset.val_sequences: '{word}' is not a valid" in said
-        assert len(held_out.names("test")) == 4  # another archive
+    held_out = freiburg(sound, val_sequences=("seq_00_night",))
+    said = refused(lambda: held_out.names("val"))
+    assert "dataset.val_sequences: 'seq_00_night' is not a valid" in said
+    assert len(held_out.names("test")) == 4  # another archive
     write_training(tmp_path, "seq_04_day/00", "1_0")
     for split in ("train_night", "test", "train"):
         assert not freiburg(tmp_path).has(split)
 
 
-def test_folders_in_other_capitals_and_without_a_time(root: Path, tmp_path: Path) -> None:
-    for folders in (
-        ("ImagesRgb", "ImagesIr", "SegmentationClass"),
-        ("imagesrgb", "IMAGESIR", "segmentationclass"),
-    ):
-        write_test(tmp_path / folders[0], "night", "1570_120", folders=folders)
-        dataset = freiburg(tmp_path / folders[0])
-        assert dataset.names("test_night") == ("test_night_1570_120",)
-        assert dataset.read("test_night_1570_120").label is not None
-    write_training(root, "seq_05_dusk/00", "1_0")
-    assert "expected day or night in the name" in refused(lambda: freiburg(root))
+def test_folders_in_other_capitals_and_without_a_time(tmp_path: Path) -> None:
+    write_test(
+        tmp_path, "night", "1570_120", folders=("imagesrgb", "IMAGESIR", "Segmentationclass")
+    )
+    assert freiburg(tmp_path).names("test_night") == ("test_night_1570_120",)
+    assert freiburg(tmp_path).read("test_night_1570_120").label is not None
+    write_training(tmp_path, "seq_05_dusk/00", "1_0")
+    assert "expected day or night in the name" in refused(lambda: freiburg(tmp_path))
 
 
 @pytest.mark.parametrize(
@@ -230,11 +212,3 @@ def test_folders_in_other_capitals_and_without_a_time(root: Path, tmp_path: Path
 )
 def test_wrong_settings_are_named(sound: Path, wrong: dict[str, Any], said: str) -> None:
     assert said in refused(lambda: freiburg(sound, **wrong).read(DAY))
-
-
-def test_check_reports_files_of_no_frame(root: Path) -> None:
-    val = freiburg(root).frame("seq_04_day_00_1573_0030")
-    val.rgb.unlink()
-    assert list(check_dataset(freiburg(root)).problems) == [
-        f"2 files belong to no image of a split; the first is {val.thermal}."
-    ]

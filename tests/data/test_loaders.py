@@ -1,4 +1,4 @@
-"""Batches: the same whatever the workers and the first step, alone and in pairs of two streams."""
+"""Batches: the same whatever the workers and the first step, in pairs, and drawn by classes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,10 @@ import logging
 import multiprocessing
 import os
 import signal
-from collections.abc import Callable, Iterable
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -27,6 +30,13 @@ from rgbt.data.loaders import (
     train_batches,
 )
 from rgbt.data.mfnet import MFNet
+from rgbt.data.rare_classes import (
+    RareClasses,
+    RareClassExamples,
+    class_probabilities,
+    count_rare_classes,
+)
+from rgbt.randomness import numpy_generator
 from rgbt.transforms.crm import CrmTransform
 from rgbt.types import Batch, Sample
 from tests.data.layouts import refused
@@ -146,18 +156,8 @@ def test_sizes_that_differ(dataset: MFNet, expected_pair, png) -> None:
     assert "choose a transform.crop_hw" in refused(lambda: list(batches))
 
 
-@pytest.mark.parametrize("workers", [0, 2])
-def test_nothing_comes_after_close(dataset: MFNet, workers: int) -> None:
-    batches = trained(dataset, range(4), num_workers=workers)
-    next(batches)
-    batches.close()
-    assert list(batches) == []
-    assert multiprocessing.active_children() == []
-
-
 def test_steps_per_epoch(dataset: MFNet) -> None:
     assert steps_per_epoch(dataset, settings()) == 2
-    assert steps_per_epoch(dataset, settings(batch_size=10)) == 1
     assert steps_per_epoch(dataset, settings(batch_size=2), "val") == 2
     said = refused(lambda: trained(dataset, range(1), batch_size=11))
     assert "is 11 but split 'train' of mfnet has only 10 names; lower data.batch_size" in said
@@ -254,26 +254,138 @@ def test_killed_worker_is_reported(dataset: MFNet, monkeypatch: pytest.MonkeyPat
         next(trained(dataset, range(2), num_workers=1))
 
 
-@pytest.mark.parametrize(("workers", "ahead"), [(0, None), (2, 5)])
-@pytest.mark.parametrize("gpu", [False, True])
+@pytest.mark.parametrize(("workers", "ahead", "gpu"), [(0, None, False), (2, 5, True)])
 def test_batches_are_prefetched_and_pinned(
     dataset: MFNet, monkeypatch: pytest.MonkeyPatch, workers: int, ahead: int | None, gpu: bool
 ) -> None:
     """Batches ahead of the one that is used, and pinned where there is a GPU to copy them to."""
     batch = next(trained(dataset, range(1)))
     requested: dict[str, object] = {}
-
-    def loader(reader: object, **words: object) -> list[object]:
-        requested.update(words)
-        return []
-
+    loader = lambda reader, **words: requested.update(words) or []  # noqa: E731
     monkeypatch.setattr(loaders, "DataLoader", loader)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: gpu)
     assert not list(evaluated(dataset, num_workers=workers, prefetch=5))
-    assert (requested["num_workers"], requested["prefetch_factor"]) == (workers, ahead)
-    assert requested["pin_memory"] is gpu
+    keys = ("num_workers", "prefetch_factor", "pin_memory")
+    assert [requested[key] for key in keys] == [workers, ahead, gpu]
     locked: list[torch.Tensor] = []  # pages are locked on machines with a GPU alone
     monkeypatch.setattr(torch.Tensor, "pin_memory", lambda self: locked.append(self) or self)
     LoadedBatch(batch).pin_memory()
     assert len(locked) == sum(isinstance(each, torch.Tensor) for each in vars(batch).values())
     assert LoadedBatch(error="why").pin_memory().error == "why"
+
+
+# Rare classes.
+
+PIXELS = {"1D": (768, 0, 0), "2D": (668, 100, 0), "3D": (628, 100, 40), "4D": (708, 0, 60)}
+"""Pixels of the classes 0 to 2 in images of 24 x 32; 2772, 200 and 100 of 3072 in all."""
+
+
+@pytest.fixture
+def uneven(write_mfnet: Any, png: Callable[[Path, np.ndarray], None]) -> MFNet:
+    found = MFNet(str(write_mfnet({"train": list(PIXELS)})))
+    for name, counts in PIXELS.items():
+        png(found.files(name)[-1], np.repeat(np.arange(3, dtype=np.uint8), counts).reshape(24, 32))
+    return found
+
+
+def rare_settings(**changes: Any) -> LoaderSettings:
+    given = {"class_temperature": 0.5, "min_class_pixels": 50, **changes}
+    return settings(batch_size=2, sampling="rare_classes", **given)
+
+
+def counted(dataset: MFNet, **changes: Any) -> RareClasses:
+    return count_rare_classes(dataset, "train", rare_settings(**changes))
+
+
+def test_probability_by_hand() -> None:
+    """Shares 0.6, 0.3 and 0.1: exp(4), exp(7) and exp(9) at T = 0.1."""
+    weights = np.exp([4.0, 7.0, 9.0])
+    found = class_probabilities(np.array([60, 30, 10]), 0.1)
+    np.testing.assert_allclose(found, weights / weights.sum())
+    assert class_probabilities(np.array([1, 10**9]), 1e-6).tolist() == [1.0, 0.0]
+
+
+def test_images_are_drawn_with_the_frequencies_of_their_classes(uneven: MFNet) -> None:
+    rare = counted(uneven)
+    weights = np.exp((1 - np.array([2772, 200, 100]) / 3072) / 0.5)
+    p = weights / weights.sum()
+    # Image 3 has too few pixels of class 2, which occurs in image 4 alone.
+    expected = [p[0] / 4, p[0] / 4 + p[1] / 2, p[0] / 4 + p[1] / 2, p[0] / 4 + p[2]]
+    drawn = Counter(
+        int(rare.draw(numpy_generator(0, "rare class", 0, number))[1][0]) for number in range(2000)
+    )
+    for image, share in enumerate(expected):
+        assert drawn[image] / 2000 == pytest.approx(share, abs=4 * (share / 2000) ** 0.5)
+    assert rare.classes == (0, 1, 2)
+    assert rare.shares() == "person 0.473, car 0.444, unlabeled 0.083"
+
+
+def test_classes_without_a_score_or_an_image(uneven: MFNet) -> None:
+    said = refused(lambda: counted(uneven, min_class_pixels=60))
+    assert "pixels=60: no image of train of mfnet has more pixels of 'person'" in said
+    uneven.unscored = ("unlabeled",)
+    rare = counted(uneven, class_temperature=0.1)
+    weights = np.exp(np.array([1 / 3, 2 / 3]) / 0.1)
+    assert rare.classes == (1, 2)
+    np.testing.assert_allclose(rare.probabilities, weights / weights.sum())
+    uneven.unscored = uneven.classes
+    assert "'any class'" in refused(lambda: counted(uneven))
+
+
+@pytest.mark.parametrize(
+    ("least", "pixels", "ratio", "calls"),
+    [
+        *[(50, [9, 25, 26, 99], 0.5, 3), (50, [0] * 20, 0.5, 11)],
+        *[(50, [0, 99], 0.0, 1), (50, [26], 0.5, 1), (0, [0, 1], 0.5, 2), (0, [0], 0.0, 1)],
+    ],
+)
+def test_crop_is_drawn_again_until_it_shows_enough(
+    uneven: MFNet, least: int, pixels: list[int], ratio: float, calls: int
+) -> None:
+    """Half of 50 pixels, or one pixel, at most ten times again."""
+    rare = counted(uneven, min_class_pixels=least, min_crop_ratio=ratio)
+    left: Iterator[int] = iter(pixels)
+    seen = []
+
+    def make(sample: Any, rng: np.random.Generator) -> Any:
+        seen.append(rng.random())
+        return SimpleNamespace(label=np.repeat(sample, next(left)))
+
+    drawn, _ = rare.draw(numpy_generator(3, "rare class", 0, 5))
+    source: Any = SimpleNamespace(
+        names=list(PIXELS),
+        first_readable=lambda names, skipped: drawn,
+        transform=SimpleNamespace(train=make),
+        seed=3,
+    )
+    RareClassExamples(source, rare)((0, 5), {})
+    assert len(set(seen)) == len(seen) == calls
+    # The draws of the augmentation are those of (seed, "augment", epoch, number) alone, and not
+    # those that have chosen the class.
+    assert seen == numpy_generator(3, "augment", 0, 5).random(calls).tolist()
+
+
+def drawn(dataset: MFNet, steps: range, seed: int = 7, **changes: Any) -> list[Batch]:
+    given, rare = rare_settings(**changes), counted(dataset, **changes)
+    found: Any = train_batches(dataset, "train", crm(), given, seed, steps, rare)
+    return list(found)
+
+
+def test_same_draws_whatever_the_workers_and_the_first_step(uneven: MFNet) -> None:
+    """Two steps per epoch; a run that resumes at step 3 has the batches of one that did not."""
+    whole = drawn(uneven, range(6))
+    for workers in (0, 2):
+        assert_equal(drawn(uneven, range(3, 6), num_workers=workers), whole[3:])
+    names = [batch.name for batch in whole]
+    assert len(set(names)) > 1
+    assert names != [batch.name for batch in drawn(uneven, range(6), seed=8)]
+
+
+def test_unreadable_images_are_not_drawn(uneven: MFNet) -> None:
+    """Image 4 alone has class 2: without its label, images 2 and 3 are drawn."""
+    for path in (*uneven.files("2D"), *uneven.files("4D")):
+        path.write_bytes(b"damaged")
+    few = {"min_class_pixels": 30, "class_temperature": 0.01}
+    found = drawn(uneven, range(6), on_error="skip", **few)
+    assert {name for batch in found for name in batch.name} == {"3D"}
+    assert "cannot be" in refused(lambda: counted(uneven))

@@ -1,13 +1,16 @@
-"""New images of any folder: which files are pairs, by every data set's own patterns."""
+"""New images of any folder, and predicted label images of any method."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+import yaml
+from PIL import Image
 
 from rgbt.data.freiburg import LAYOUTS as FREIBURG
 from rgbt.data.images import PairReader
@@ -15,9 +18,10 @@ from rgbt.data.kp import KP
 from rgbt.data.mfnet import MFNet
 from rgbt.data.new_images import of_arrays, of_files, of_path, of_split
 from rgbt.data.patterns import Patterns
+from rgbt.data.predictions import Affixes, FormatOptions, PredictionReader, prediction_paths
 from rgbt.data.pst900 import PST900
 from rgbt.types import Sample
-from tests.conftest import WriteMFNet, write_png
+from tests.conftest import write_png
 from tests.data.layouts import folder, refused, write_any, write_folder, write_frame
 
 HW = (6, 8)
@@ -36,14 +40,13 @@ class Reading:
         raise NotImplementedError
 
 
-@pytest.mark.parametrize("dtype", [np.uint16, np.float32])
-def test_arrays_of_camera_values_are_read_like_files(tmp_path: Path, dtype: type) -> None:
+def test_arrays_of_camera_values_are_read_like_files(tmp_path: Path) -> None:
     rgb, thermal = tmp_path / "1.png", tmp_path / "1_ir.png"
     write_png(rgb, RGB)
     cv2.imwrite(str(thermal), COUNTS)
     dataset = Reading(*FREIBURG, crop=(1, 5, 2, 8), thermal_range=(21800, 23700))
     expected = dataset.images.read("1", rgb, thermal)
-    sample = of_arrays(dataset, RGB, COUNTS.astype(dtype))
+    sample = of_arrays(dataset, RGB, COUNTS)
     assert np.array_equal(sample.rgb, expected.rgb)
     assert np.array_equal(sample.thermal, expected.thermal)
     seen = of_arrays(dataset, sample.rgb, sample.thermal)
@@ -57,13 +60,6 @@ def test_arrays_of_unclear_or_wrong_values_are_refused() -> None:
     assert "expected rgb uint8 of shape" in refused(lambda: of_arrays(low, RGB, COUNTS[:3]))
     said = refused(lambda: of_arrays(SimpleNamespace(splits=("test",)), RGB, COUNTS))
     assert "does not declare how to read new images" in said
-
-
-def test_an_unlabelled_split_needs_nothing_else(tmp_path: Path) -> None:
-    write_frame(tmp_path, "sea", "1")
-    (tmp_path / "sea" / "mask" / "1.png").unlink()
-    changes = {"folders": {"new": "sea"}, "unlabelled": ("new",), "night": "*night*"}
-    assert folder(tmp_path, **changes).read("sea_1").label is None
 
 
 MINE = (Patterns.of("{sequence}/rgb/{name}.jpg", "{sequence}/ir/{name}_ir.tif"),)
@@ -125,8 +121,7 @@ def test_new_images_are_read_like_training_images(tmp_path: Path) -> None:
 
 
 def test_bad_new_images_raise_or_are_skipped(tmp_path: Path) -> None:
-    dataset = folder(write_folder(tmp_path / "known"))
-    new = tmp_path / "new"
+    dataset, new = folder(write_folder(tmp_path / "known")), tmp_path / "new"
     for name in "123":
         write_frame(new, "sea", name)
     (new / "sea/ir/3_ir.tif").unlink()
@@ -134,8 +129,7 @@ def test_bad_new_images_raise_or_are_skipped(tmp_path: Path) -> None:
     assert "1 RGB images have no thermal image: " in said
     write_any(new / "sea" / "ir" / "2_ir.tif", COUNTS[:3])
     chosen = of_path(dataset, str(new), "skip")
-    said = refused(lambda: list(chosen.samples("raise")))
-    assert "'sea_2': RGB is 6x8 pixels but thermal is 3x8" in said
+    assert "'sea_2': RGB is 6x8 pixels but" in refused(lambda: list(chosen.samples("raise")))
     assert [sample.name for sample in chosen.samples("skip")] == ["sea_1"]
     assert sorted(chosen.skipped) == [str(new / "sea/rgb/3.png"), "sea_2"]
     (new / "sea" / "rgb" / "1.png").write_bytes(b"")
@@ -143,16 +137,110 @@ def test_bad_new_images_raise_or_are_skipped(tmp_path: Path) -> None:
     assert "none of the 2 images can be read" in said
     for taken in (new, new / "sea" / "rgb", new / "sea" / "ir"):
         assert "holds the input images" in refused(lambda taken=taken: chosen.check_out(taken))
-    chosen.check_out(tmp_path / "out")
     write_png(tmp_path / "empty" / "1.bmp", RGB)
     said = refused(lambda: of_path(dataset, str(tmp_path / "empty"), "raise"))
     assert "holds no pair of images but 1.bmp; expected RGB {split}/rgb/" in said
-    said = refused(lambda: of_path(dataset, "nowhere", "raise"))
-    assert "neither a file, nor a folder, nor a split" in said
+    assert "neither a file, nor a folder" in refused(lambda: of_path(dataset, "nowhere", "raise"))
 
 
-def test_split_is_predicted_without_labels(write_mfnet: WriteMFNet) -> None:
-    root = write_mfnet({"new": ["00001D"]})
-    (root / "labels" / "00001D.png").unlink()
-    (sample,) = of_split(MFNet(str(root), splits={"new": "new.txt"}), "new").samples("raise")
-    assert sample.label is None
+def test_split_is_predicted_without_labels(tmp_path: Path) -> None:
+    root = write_folder(tmp_path)
+    (root / "test" / "mask" / "1.png").unlink()
+    assert [sample.label for sample in of_split(folder(root), "test").samples("raise")] == [
+        None
+    ] * 2
+
+
+# Predictions.
+
+CLASSES = ("ground", "car", "person")
+PALETTE = ((0, 0, 0), (64, 0, 128), (64, 64, 0))
+INDICES = np.array([[0, 1, 2], [2, 1, 0]], np.uint8)
+COLOURS = np.array(PALETTE, np.uint8)[INDICES]
+
+
+def read(path: Path, form: str = "index", **options: Any) -> np.ndarray:
+    stated = FormatOptions(form=form, **options)  # type: ignore[arg-type]
+    return PredictionReader(CLASSES, PALETTE, stated).read(path)
+
+
+def save(path: Path, values: object, palette: object = None) -> Path:
+    image = Image.fromarray(np.asarray(values))
+    if palette is not None:
+        image = Image.frombytes("P", image.size, image.tobytes())
+        image.putpalette(np.array(palette, np.uint8).ravel().tolist())
+    image.save(path)
+    return path
+
+
+def test_files_of_each_kind_give_equal_classes(tmp_path: Path) -> None:
+    opaque = np.dstack([COLOURS, np.full(INDICES.shape, 255, np.uint8)])
+    for form, values, palette in [
+        *(("index", INDICES, None), ("index", INDICES, PALETTE), ("colour", INDICES, PALETTE)),
+        *(("colour", COLOURS, None), ("colour", opaque, None)),
+    ]:
+        path = save(tmp_path / "x.png", values, palette)
+        np.testing.assert_array_equal(read(path, form), INDICES)
+
+
+def test_palette_of_other_classes_is_refused_as_indices(tmp_path: Path) -> None:
+    """The stored numbers are 0, 2, 1 where the colours say 0, 1, 2."""
+    shuffled = save(tmp_path / "p.png", INDICES, [PALETTE[0], PALETTE[2], PALETTE[1]])
+    assert "index 1 (car) is shown in the colour of person" in refused(lambda: read(shuffled))
+    np.testing.assert_array_equal(read(shuffled, "colour"), [[0, 2, 1], [1, 2, 0]])
+    # Colours of a palette of the method's own: the user names it, and its indices are read.
+    own = tmp_path / "own.yaml"
+    own.write_text(yaml.safe_dump({"palette": [[0, 0, 0], [64, 64, 0], [64, 0, 128]]}))
+    for form in ("index", "colour"):
+        np.testing.assert_array_equal(read(shuffled, form, palette=str(own)), INDICES)
+    strange = save(tmp_path / "s.png", INDICES, [(9, 9, 9), (8, 8, 8), (7, 7, 7)])
+    np.testing.assert_array_equal(read(strange), INDICES)
+
+
+@pytest.mark.parametrize(
+    ("form", "values", "said"),
+    [
+        ("index", np.array([[0, 3]], np.uint8), "label value 3 (1 pixels"),
+        ("index", np.array([[0, 255]], np.uint8), "label value 255 (1 pixels"),
+        ("index", COLOURS, "got PNG of mode RGB"),
+        ("index", np.array([[0, 1]], np.uint16), "one channel of 8 bits, got mode I;16"),
+        ("index", np.array([[True, False]]), "got PNG of mode 1"),
+        ("colour", INDICES, "got PNG of mode L"),
+        ("colour", [[[0, 0, 0], [64, 0, 127]]], "colour [64, 0, 127] (1 pixels"),
+        ("colour", np.zeros((1, 2, 4), np.uint8), "transparent"),
+        ("colour", [[[0, 0, 0, 255], [0, 0, 0, 254]]], "transparent"),
+    ],
+)
+def test_other_files_than_stated_are_refused(
+    tmp_path: Path, form: str, values: Any, said: str
+) -> None:
+    kept = values if isinstance(values, np.ndarray) else np.array(values, np.uint8)
+    told = refused(lambda: read(save(tmp_path / "bad.png", kept), form))
+    assert "bad.png: " in told
+    assert said in told
+    Image.fromarray(INDICES).save(tmp_path / "jpeg.png", format="JPEG")
+    assert "got JPEG" in refused(lambda: read(tmp_path / "jpeg.png", form))
+
+
+@pytest.mark.parametrize(
+    ("palette", "said"),
+    [
+        *(
+            ([[0, 0, 256]], "the key palette"),
+            ("red", "the key palette"),
+            (None, "the key palette"),
+        ),
+        ([[0, 0, 0], [1, 1, 1], [1, 1, 1]], "two classes have one colour"),
+        ([[0, 0, 0]], "colour [64, 0, 128] (2 pixels; one of 2 unknown values)"),
+    ],
+)
+def test_invalid_palettes_are_refused(tmp_path: Path, palette: object, said: str) -> None:
+    path, file = save(tmp_path / "x.png", COLOURS), tmp_path / "own.yaml"
+    file.write_text(yaml.safe_dump({"palette": palette}))
+    assert said in refused(lambda: read(path, "colour", palette=str(file)))
+
+
+def test_names_of_files(tmp_path: Path) -> None:
+    paths = prediction_paths(tmp_path, ["a", "b/c"], Affixes("Pred_", "_x"))
+    assert paths == {"a": tmp_path / "Pred_a_x.png", "b/c": tmp_path / "Pred_b/c_x.png"}
+    assert "format: 'colours' is not a valid choice" in refused(lambda: read(tmp_path, "colours"))

@@ -81,33 +81,35 @@ def test_reader_reaches_a_worker_and_refuses_other_splits(kind: str, tmp_path: P
         assert "no split 'tets'; did you mean 'test'" in refused(lambda ask=ask: ask("tets"))
 
 
-@pytest.mark.parametrize("name", READERS)
-def test_wrong_roots_and_numbers_are_refused(name: str, tmp_path: Path) -> None:
-    reader = READERS[name]
-    assert "dataset.root: no such folder: /nowhere" in refused(lambda: reader("/nowhere"))
-    assert "dataset.root" in refused(lambda: reader(str(tmp_path)))
-    root = str(KINDS["mfnet packed" if name == "mfnet" else name].write(tmp_path / "data"))
-    said = refused(lambda: reader(root, num_classes=3))
-    assert "num_classes is 3 but dataset.classes has" in said
-    said = refused(lambda: reader(root, num_classes=2, classes=("road", "car")))
-    assert "num_classes is 2 but dataset.palette has" in said
+def test_wrong_roots_and_numbers_are_refused(tmp_path: Path) -> None:
+    root = str(KINDS["kp"].write(tmp_path / "data"))
+    for place, keys, said in (
+        *(("/nowhere", {}, "no such folder: /nowhere"), (str(tmp_path), {}, "dataset.root")),
+        (root, {"num_classes": 3}, "num_classes is 3 but dataset.classes has"),
+        (root, {"palette": ((0, 0, 0),)}, "num_classes is 19 but dataset.palette has"),
+    ):
+        assert said in refused(lambda place=place, keys=keys: KP(place, **keys))
 
 
 # Bad files.
 
 
-def read(path: Path) -> np.ndarray:
-    """The array that a file holds."""
-    is_array = path.suffix == ".npy"
-    return np.asarray(np.load(path) if is_array else cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
+def to_other_depth(array: np.ndarray) -> np.ndarray:
+    other = {np.uint8: np.uint16, np.uint16: np.uint8}.get(array.dtype.type, np.float64)
+    return array.astype(other)
 
 
-def save(path: Path, array: np.ndarray) -> None:
+def change(path: Path, _: Path, *, by: Callable[[np.ndarray], np.ndarray] = to_other_depth) -> None:
     """In a format that keeps values, whatever the name ends in."""
     if path.suffix == ".npy":
-        np.save(path, array)
+        np.save(path, by(np.load(path)))
     else:
+        array = by(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
         path.write_bytes(cv2.imencode(".png", array)[1].tobytes())
+
+
+def cut(path: Path, _: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-20])
 
 
 def fill(path: Path, _: Path, *, content: bytes) -> None:
@@ -126,31 +128,22 @@ def replace(path: Path, _: Path, *, by: Callable[[Path], None]) -> None:
     by(path)
 
 
-def change_depth(path: Path, _: Path) -> None:
-    array = read(path)
-    other = {np.uint8: np.uint16, np.uint16: np.uint8}.get(array.dtype.type, np.float64)
-    save(path, array.astype(other))
-
-
 DAMAGES: dict[str, tuple[Callable[[Path, Path], None], str]] = {
     "missing": (move, "is missing"),
     "empty": (partial(fill, content=b""), "cannot be (decoded|read as an array)"),
-    "cut short": (
-        lambda path, _: path.write_bytes(path.read_bytes()[:-20]),
-        "cannot be (decoded|read as an array)",
-    ),
+    "cut short": (cut, "cannot be (decoded|read as an array)"),
     "no image": (partial(fill, content=b"<html>404</html>"), "cannot be (decoded|read as an arr)"),
     "a folder": (partial(replace, by=Path.mkdir), "is not a regular file"),
     "a pipe": (partial(replace, by=os.mkfifo), "is not a regular file"),
     "a link that leads out": (partial(move, link="kept"), "leads out of dataset.root, to .*kept."),
     "a link to nowhere": (partial(move, link="gone"), r"is missing \(a link to .*/gone\)"),
-    "another depth": (change_depth, "8 bits|whole numbers|got uint8"),
+    "another depth": (change, "8 bits|whole numbers|got uint8"),
     "another size": (
-        lambda path, _: save(path, read(path)[:-4, :-2]),
+        partial(change, by=lambda array: array[:-4, :-2]),
         r"is \d+x\d+ pixels but|which is another aspect ratio",
     ),
     "an unknown value": (
-        lambda path, _: save(path, np.full_like(read(path), 77)),
+        partial(change, by=lambda array: np.full_like(array, 77)),
         "label value 77 ",
     ),
 }
@@ -199,4 +192,3 @@ def test_check_reports_each_problem_in_one_line(kind: str, tmp_path: Path) -> No
         assert "\n" not in told
         done.add(what)
     assert done == set(DAMAGES)
-    assert check_dataset(make(root)).problems == sound

@@ -81,6 +81,8 @@ def test_mvseg_gap_begins_another_sequence_or_is_refused(mvseg: Path) -> None:
     assert runs[:2] == (("d_00236", "d_00237"), ("d_00239",))
     said = refused(lambda: MVSeg(str(mvseg), gaps="refuse").sequences("test"))
     assert "video 'd' lacks frame 238, which should follow 'd_00237'; restore it" in said
+    shutil.rmtree(mvseg / "data" / "d")
+    assert "lists.test: video 'd' has no frames" in refused(lambda: MVSeg(str(mvseg)).names("test"))
 
 
 @pytest.mark.parametrize("gone", ["visible/00239v.png", "infrared/00238i.png"])
@@ -111,14 +113,8 @@ def test_one_video_of_packed_images_without_labels(tmp_path: Path) -> None:
     assert "dataset.lists has no split 'train'; known: test" in said
 
 
-def test_missing_videos_of_mvseg_are_named(mvseg: Path) -> None:
-    shutil.rmtree(mvseg / "data" / "d")
-    assert "lists.test: video 'd' has no frames" in refused(lambda: MVSeg(str(mvseg)).names("test"))
-
-
 def test_videos_with_mistakes_are_refused(tmp_path: Path) -> None:
     root = write_videos(tmp_path / "data")
-    assert video(root).sequences("test")[0] == ("x_1", "x_2", "x_3")
     two, second, last = (root / "x" / "rgb" / f"{name}.png" for name in ("2", "02", "last"))
     shutil.copy(two, second)
     assert "two frames with the number 2" in refused(lambda: video(root))
@@ -129,10 +125,7 @@ def test_videos_with_mistakes_are_refused(tmp_path: Path) -> None:
     # Its other frames are two apart, those of the other video one.
     said = refused(lambda: video(root).sequences("test"))
     assert "video 'x' lacks frame 2, which should follow 'x_1'" in said
-    (root / "y" / "rgb" / "10.png").unlink()
-    assert f"{root}/y/ir/10.png has no RGB image." in check_dataset(video(root)).problems
-    write_png(root / "x" / "ir" / "1.png", np.full(HW, 30000, np.uint16))
-    assert "require dataset.thermal_range=[low" in refused(lambda: video(root).read("x_1"))
+    assert f"{root}/x/ir/2.png has no RGB image." in check_dataset(video(root)).problems
 
 
 # Sequences.
