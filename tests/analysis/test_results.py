@@ -11,13 +11,7 @@ import numpy as np
 import pytest
 
 from analysis.archive import add
-from analysis.results import (
-    COLUMNS,
-    finished_runs,
-    label_of,
-    open_counts,
-    results,
-)
+from analysis.results import COLUMNS, finished_runs, label_of, open_counts, results
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import parse, value
