@@ -197,9 +197,8 @@ def _unpack_counts(content: bytes, shared: Path) -> Counts:
     if "labelled" in arrays:
         classes = range(array.shape[-1])
         array[..., classes, classes] = arrays["labelled"] - array.sum(-1)
-    lists = {name: tuple(arrays[name].tolist()) for name in ("names", "classes", "unscored")}
-    night = tuple(arrays["night"].tolist()) or None
-    return Counts(**fields, **lists, counts=array, night=night)
+    fields |= {name: tuple(arrays[name].tolist()) for name in ("names", "classes", "unscored")}
+    return Counts(**fields, counts=array, night=tuple(arrays["night"].tolist()) or None)
 
 
 def _shared_arrays(shared: Path, name: str) -> dict[str, NDArray[Any]]:

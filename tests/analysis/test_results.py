@@ -170,6 +170,9 @@ def test_folder_and_archive_are_one(
     assert (err.count("warning"), "aaa2 is stored with other counts" in err) == (1, True)
     assert [run.key for run in finished_runs("none", archive)] == ["aaa0", "aaa1", "aaa2"]
     assert finished_runs("none", "none") == []
+    for text, seeds in ((CRM, [0, 1, 2]), ("aaa1", [1])):
+        opened = open_counts(text, "none", archive=archive)
+        assert [each.seed for each in opened] == seeds
     unpacked = finished_runs("none", archive)[0].folder
     (unpacked / "mark").touch()
     assert (finished_runs("none", archive)[0].folder / "mark").exists()  # unpacked once
