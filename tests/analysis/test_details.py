@@ -160,7 +160,7 @@ def test_file_of_pairs_is_shown_by_videos(call: Call, tmp_path: Path) -> None:
 
 def test_missing_details_are_named(call: Call, runs: Path) -> None:
     (runs / "plain1" / "evaluations" / "synth_test_thermal_ring1-calibration.npz").unlink()
-    with pytest.raises(InputError, match="condition=thermal of .* is not one of clean"):
+    with pytest.raises(InputError, match="condition=thermal is not counted .* has clean of"):
         open_counts("plain1", runs, condition="thermal")  # the rest are details
     for words, sentence in (
         (["run=bare"], "modality=all details=boundary"),

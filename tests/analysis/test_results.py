@@ -183,7 +183,11 @@ def test_frame_has_a_row_for_each_score(runs: Path, archive: Path) -> None:
     counts, pairs = replace(some(0), night=night, unscored=("cone",)), pairs_of(12, 0.5)
     folder = runs / "bbb0"
     (folder / "evaluations").mkdir()
-    for name, each in (("synth_test_thermal_ring2", counts), ("consistency_aligned_test", pairs)):
+    for name, each in (
+        ("synth_test_thermal_ring2", counts),
+        ("consistency_aligned_test", pairs),
+        ("consistency_aligned-0c_test", pairs),
+    ):
         each.save(folder / f"evaluations/{name}.npz")
     replace(counts, dataset="other").save(folder / "evaluations/kp_test_rgb_ring2_last.npz")
     for path in write_levels(folder / "evaluations/robustness/test", SCORES).glob("*.npz"):
@@ -205,7 +209,10 @@ def test_frame_has_a_row_for_each_score(runs: Path, archive: Path) -> None:
     region = Counts(**{**vars(counts), "counts": counts.counts[:, 1:], "partition": "ring1"})
     person = value("class/person", region, "released")
     assert found["bbb0", "thermal", "all", 2, "person", "IoU"] == person
-    assert found["bbb0", "clean", "all", 0, "", "TC"] == value("TC", pairs, "released")
+    for condition in ("clean", "clean 0c"):
+        assert found["bbb0", condition, "all", 0, "", "TC"] == value("TC", pairs, "released")
+    (aligned,) = open_counts("bbb0", runs, frames="aligned")
+    assert aligned.path.stem == "consistency_aligned_test"
     chosen = (frame["metric"] == "mIoU") & (frame["subset"] == "all") & (frame["region"] == 0)
     noise = frame[chosen & (frame["condition"] == "noise")]
     assert dict(zip(noise["severity"], noise["value"].round(2))) == {8.0: 60.0, 16.0: 40.0}
