@@ -5,9 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from analysis.results import CLEAN, ROBUSTNESS, RUNS, Evaluation, level_of, open_counts
+from analysis.results import (
+    CLEAN,
+    EVALUATIONS,
+    ROBUSTNESS,
+    RUNS,
+    Evaluation,
+    level_of,
+    open_counts,
+)
 from rgbt.checks import InputError, split_list
 from rgbt.metrics.counts import Counts
+
+Level = Evaluation
+"""One severity of one corruption."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +52,7 @@ def trainings(text: str, runs_dir: Path | str = "runs", split: str = "") -> list
             found.append((place.name, place))
             continue
         for named in open_counts(word, runs_dir, split):
-            place = named.path.parent / "evaluations" / ROBUSTNESS / named.counts.split
+            place = named.path.parent / EVALUATIONS / ROBUSTNESS / named.counts.split
             found.append((named.label, place))
     return [Training(label, place, levels_of(place)) for label, place in found]
 

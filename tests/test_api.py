@@ -135,13 +135,16 @@ def test_own_classes_are_refused_until_their_module_is_trusted(
     np.testing.assert_array_equal(trusted.predict(RGB, THERMAL), run.predict(RGB, THERMAL))
 
 
-def test_results_are_those_of_finished_runs(tmp_path: Path) -> None:
+def test_results_are_those_of_finished_runs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     runs = tmp_path / "runs"
     write_run(runs / "aaa", "crm", 0)
     write_run(runs / "bbb", "grbm", 1)
     write_run(runs / "ccc", "grbm", 2, finished=False)
     write_run(runs / "replaced" / "aaa-1", "crm", 0)
     frame = rgbt.results(runs, tmp_path)
+    assert capsys.readouterr().err == ""  # a run that still trains is no remark
     assert list(frame["run"].unique()) == ["aaa", "bbb"]
     means = frame[(frame["metric"] == "mIoU") & (frame["region"] == 0)]
     found = means.set_index(["experiment", "subset"])["value"]

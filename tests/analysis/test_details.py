@@ -11,6 +11,7 @@ import pytest
 
 from analysis.compare import metrics_of
 from analysis.details import entry
+from analysis.results import open_counts
 from analysis.uncertainty import Resampling, compare, estimate
 from analysis.uncertainty.same_images import in_order
 from rgbt.checks import InputError
@@ -159,6 +160,8 @@ def test_file_of_pairs_is_shown_by_videos(call: Call, tmp_path: Path) -> None:
 
 def test_missing_details_are_named(call: Call, runs: Path) -> None:
     (runs / "plain1" / "evaluations" / "synth_test_thermal_ring1-calibration.npz").unlink()
+    with pytest.raises(InputError, match="condition=thermal is not counted .* has clean of"):
+        open_counts("plain1", runs, condition="thermal")  # the rest are details
     for words, sentence in (
         (["run=bare"], "modality=all details=boundary"),
         (["run=plain"], "plain1 has no counts of calibration of split 'test'"),

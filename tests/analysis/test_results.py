@@ -11,13 +11,7 @@ import numpy as np
 import pytest
 
 from analysis.archive import add
-from analysis.results import (
-    COLUMNS,
-    finished_runs,
-    label_of,
-    open_counts,
-    results,
-)
+from analysis.results import COLUMNS, finished_runs, label_of, open_counts, results
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import parse, value
@@ -176,6 +170,9 @@ def test_folder_and_archive_are_one(
     assert (err.count("warning"), "aaa2 is stored with other counts" in err) == (1, True)
     assert [run.key for run in finished_runs("none", archive)] == ["aaa0", "aaa1", "aaa2"]
     assert finished_runs("none", "none") == []
+    for text, seeds in ((CRM, [0, 1, 2]), ("aaa1", [1])):
+        opened = open_counts(text, "none", archive=archive)
+        assert [each.seed for each in opened] == seeds
     unpacked = finished_runs("none", archive)[0].folder
     (unpacked / "mark").touch()
     assert (finished_runs("none", archive)[0].folder / "mark").exists()  # unpacked once
@@ -186,7 +183,11 @@ def test_frame_has_a_row_for_each_score(runs: Path, archive: Path) -> None:
     counts, pairs = replace(some(0), night=night, unscored=("cone",)), pairs_of(12, 0.5)
     folder = runs / "bbb0"
     (folder / "evaluations").mkdir()
-    for name, each in (("synth_test_thermal_ring2", counts), ("consistency_aligned_test", pairs)):
+    for name, each in (
+        ("synth_test_thermal_ring2", counts),
+        ("consistency_aligned_test", pairs),
+        ("consistency_aligned-0c_test", pairs),
+    ):
         each.save(folder / f"evaluations/{name}.npz")
     replace(counts, dataset="other").save(folder / "evaluations/kp_test_rgb_ring2_last.npz")
     for path in write_levels(folder / "evaluations/robustness/test", SCORES).glob("*.npz"):
@@ -208,7 +209,10 @@ def test_frame_has_a_row_for_each_score(runs: Path, archive: Path) -> None:
     region = Counts(**{**vars(counts), "counts": counts.counts[:, 1:], "partition": "ring1"})
     person = value("class/person", region, "released")
     assert found["bbb0", "thermal", "all", 2, "person", "IoU"] == person
-    assert found["bbb0", "clean", "all", 0, "", "TC"] == value("TC", pairs, "released")
+    for condition in ("clean", "clean 0c"):
+        assert found["bbb0", condition, "all", 0, "", "TC"] == value("TC", pairs, "released")
+    (aligned,) = open_counts("bbb0", runs, frames="aligned")
+    assert aligned.path.stem == "consistency_aligned_test"
     chosen = (frame["metric"] == "mIoU") & (frame["subset"] == "all") & (frame["region"] == 0)
     noise = frame[chosen & (frame["condition"] == "noise")]
     assert dict(zip(noise["severity"], noise["value"].round(2))) == {8.0: 60.0, 16.0: 40.0}

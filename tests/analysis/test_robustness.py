@@ -53,7 +53,7 @@ def test_same_trainings_on_corrupted_images(runs: Path, condition: str, miou: in
 @pytest.mark.parametrize("condition", ["nois 16", "noise 12", "noise"])
 def test_missing_condition_is_reported(runs: Path, condition: str) -> None:
     known = "clean, features-thermal 1, noise 16, noise 8, rgb_removed 1"
-    with pytest.raises(InputError, match=f"condition={condition} of .* is not one of {known}"):
+    with pytest.raises(InputError, match=f"condition={condition} is not counted .* has {known}"):
         open_counts("k0", runs, condition=condition)
 
 
