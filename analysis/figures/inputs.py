@@ -1,260 +1,251 @@
-"""The inputs of a figure from the command line, opened when the figure needs them."""
+"""All figures by name, the types of their options, and the files that these name."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property, partial
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import pandas as pd
+from annotated_types import Interval
+from matplotlib.figure import Figure
+
+from analysis.arguments import MOST, dataset_of
 from analysis.bar import progress
+from analysis.predictions.maps import PixelMaps
+from analysis.results import Frames, open_counts
+from analysis.statistics.collect import MeasurementSettings, SpatialStatistics, collect
 from rgbt.checks import InputError, nearest, split_list
 from rgbt.config.command import built
+from rgbt.config.options import Help
+from rgbt.metrics.counts import Counts, check_same_means
+from rgbt.metrics.metric import Regions
 
-if TYPE_CHECKING:  # the list of figures is there at once
-    from analysis.predictions.maps import PixelMaps
-    from analysis.results import Frames, NamedCounts
-    from analysis.robustness import Training
-    from analysis.statistics.data import SpatialStatistics
+if TYPE_CHECKING:
     from rgbt.dataset import LabelledDataset
-    from rgbt.metrics.counts import Counts
-    from rgbt.metrics.metric import Absent, Regions
 
-T = TypeVar("T")
-Labelled = TypeVar("Labelled", "NamedCounts", "Training")
+Drawn = tuple[Figure, pd.DataFrame]
+"""A figure, and the numbers that it shows."""
+
+Count = Annotated[int, Interval(ge=1, le=MOST)]
+Maps = Annotated[str, Help("output of rgbt score: folder or maps.npz")]
+Statistics = Annotated[
+    str,
+    Help(
+        "output of rgbt spatial: folder or statistics.npz; or dataset=... to measure the data set"
+    ),
+]
+Scored = Annotated[
+    str, Help("methods, label:folder,label:folder: output of rgbt score, or predicted label images")
+]
+Runs = Annotated[
+    str,
+    Help(
+        "runs, groups or files of counts, separated by commas; label:run,label:run sets their "
+        "labels; entries with the same label are seeds of one method"
+    ),
+]
+RunsDir = Annotated[str, Help("folder of runs (default: runs)")]
+Split = Annotated[
+    str, Help("split of the data set or the runs (default: test; of statistics: train)")
+]
+Part = Annotated[Literal["all", "day", "night"], Help("images: all, day or night")]
+Names = Annotated[str, Help("names of the images to show, separated by commas")]
+Pick = Annotated[
+    Literal["first", "largest_difference"],
+    Help("images that are shown: first, or largest_difference of the first and the last method"),
+]
+Rows = Annotated[Count, Help("number of images")]
+Layout = Annotated[
+    Literal["rows", "columns"], Help("one row or one column per image: rows or columns")
+]
+Form = Annotated[Literal["index", "colour"], Help("format of predictions: index or colour")]
+Palette = Annotated[str, Help("palette of coloured predictions, as in `rgbt score`")]
+Prefix = Annotated[str, Help("beginning of the file names of predictions")]
+Suffix = Annotated[str, Help("end of the file names of predictions, NAME<suffix>.png")]
+AbsentClasses = Annotated[
+    Literal["released", "exclude"] | None,
+    Help(
+        "class without pixels: released: it scores 0; exclude: it is in no mean; default: as the "
+        "counts say"
+    ),
+]
 
 
 @dataclass(frozen=True)
-class FigureInput:
-    """The arguments of one figure.
+class FigureSpec:
+    """One figure.
 
     Attributes:
-        values: options that were given, by key.
-        overrides: of the configuration: ``dataset=...``, ``metric=...``.
-        metric: the partition where no ``metric=`` is given, a file of ``conf/metric/``.
+        make: from a `Config` and options to a figure and its numbers.
+        groups: groups of the configuration that take effect.
+        metric: the partition unless ``metric=`` is given, a file of ``conf/metric/``.
     """
 
-    figure: str
-    values: Mapping[str, Any]
-    overrides: tuple[str, ...]
-    metric: str
-
-    def need(self, key: str, what: str) -> Any:
-        """The value of a key; without one, an InputError that describes the key by `what`."""
-        if key not in self.values:
-            raise InputError(f"figure={self.figure} needs {key}=..., {what}.")
-        return self.values[key]
-
-    def get(self, key: str, default: T) -> T:
-        """The value of a key, or `default`."""
-        return cast(T, self.values.get(key, default))
-
-    def absent(self, every: Iterable[Counts]) -> Absent:
-        """The convention for absent classes of ``absent=``; without it that of the counts.
-
-        Raises:
-            InputError: counts made with both.
-        """
-        from rgbt.metrics.counts import convention
-
-        return cast(
-            "Absent", self.values["absent"] if "absent" in self.values else convention(every)
-        )
-
-    def named(self, key: str, what: str) -> dict[str, str]:
-        """Label -> place, of ``label:place,label:place``; without a label the place's last name.
-
-        Raises:
-            InputError: not given, an empty entry, or a label twice.
-        """
-        found: dict[str, str] = {}
-        for entry in split_list(self.need(key, what), what):
-            label, colon, place = entry.partition(":")
-            place = place if colon else label
-            label = label if colon else Path(place).name
-            if not label or not place:
-                raise InputError(f"{key}={self.values[key]}: expected label:place, got '{entry}'.")
-            if label in found:
-                raise InputError(f"{key}: two entries are called '{label}'; give other labels.")
-            found[label] = place
-        return found
+    make: Callable[..., Drawn]
+    shows: str
+    groups: tuple[str, ...] = ()
+    metric: str = "ring5"
 
     @property
-    def has_dataset(self) -> bool:
-        """Whether a data set was chosen."""
-        return any(word.startswith("dataset=") for word in self.overrides)
+    def options(self) -> dict[str, inspect.Parameter]:
+        """The parameters of `make` after the configuration, by name."""
+        signature = inspect.signature(self.make, eval_str=True)
+        return dict([*signature.parameters.items()][1:])
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Names of the options without a default."""
+        return tuple(name for name, each in self.options.items() if each.default is each.empty)
+
+
+FIGURES: dict[str, FigureSpec] = {}
+
+
+def figure(name: str, shows: str, *groups: str, metric: str = "ring5") -> Any:
+    """Decorator that registers a figure; see `FigureSpec`."""
+
+    def register(make: Callable[..., Drawn]) -> Callable[..., Drawn]:
+        FIGURES[name] = FigureSpec(make, shows, groups, metric)
+        return make
+
+    return register
+
+
+@dataclass(frozen=True)
+class Config:
+    """What overrides such as ``dataset=mfnet`` and ``metric=ring9`` choose, built when needed."""
+
+    overrides: Sequence[str] = ()
+    defaults: Mapping[str, str] = field(default_factory=dict)
+
+    def chooses(self, group: str) -> bool:
+        """Whether a file of the group was chosen."""
+        return any(word.lstrip("+~").startswith(f"{group}=") for word in self.overrides)
 
     @cached_property
     def dataset(self) -> LabelledDataset:
         """The data set; InputError where none was chosen."""
-        if not self.has_dataset:
-            raise InputError(
-                f"figure={self.figure} needs dataset=..., for example dataset=mfnet "
-                "dataset.root=/data/MFNet."
-            )
-        made: LabelledDataset = self._built("dataset")
-        return made
+        return dataset_of([*self._defaults, *self.overrides])
 
     @cached_property
     def regions(self) -> Regions:
-        """The partition: of the figure unless another one was given."""
-        made: Regions = self._built("metric")
-        return made
+        """The partition of the image."""
+        regions: Regions = self.built("metric")
+        return regions
 
-    @cached_property
-    def consistency(self) -> Any:
-        """The virtual views (`rgbt.transforms.views.ViewSets`): published unless given."""
-        return self._built("consistency")
+    def built(self, node: str, *more: str) -> Any:
+        """The object of one node of the configuration."""
+        return built(node, [*self._defaults, *self.overrides, *more])
 
-    def _built(self, node: str) -> Any:
-        usual = {"metric": self.metric, "consistency": "views"}
-        given = {word.partition("=")[0] for word in self.overrides}
-        words = [f"{group}={name}" for group, name in usual.items() if group not in given]
-        return built(node, [*words, *self.overrides])
+    @property
+    def _defaults(self) -> list[str]:
+        return [f"{key}={name}" for key, name in self.defaults.items() if not self.chooses(key)]
 
-    def names(self, number: int) -> tuple[str, ...]:
-        """The images of ``names=``, or the first `number` of the split.
+    def names(self, names: str, split: str, number: int = 1) -> tuple[str, ...]:
+        """The named images of a split, else its first `number`.
 
         Raises:
             InputError: a name that the split lacks, or fewer images than requested.
         """
-        split = self.get("split", "test")
         listed = self.dataset.names(split)
-        if "names" not in self.values:
-            if len(listed) < number:
-                raise InputError(f"rows={number}, but split '{split}' has {len(listed)} images.")
-            return listed[:number]
-        chosen = tuple(split_list(self.values["names"], "names of images"))
+        chosen = tuple(split_list(names, "names")) if names else listed[:number]
         for name in chosen:
             if name not in listed:
                 near = nearest(name, listed[:20])
                 raise InputError(f"names: split '{split}' has no image '{name}'; {near}.")
+        if not names and len(chosen) < number:
+            raise InputError(f"rows={number}, but split '{split}' has {len(listed)} images.")
         return chosen
 
-    def name(self) -> str:
-        """The one image of ``names=``, or the first of the split; InputError for several."""
-        names = self.names(1)
-        if len(names) > 1:
-            raise InputError(f"names: figure={self.figure} shows one image, got {len(names)}.")
-        return names[0]
 
-    def refuse(self, keys: Sequence[str], without: str) -> None:
-        """Refuse keys that have an effect only together with a missing option.
+def labelled(text: str, what: str) -> dict[str, str]:
+    """Label -> place, of ``label:place,label:place``; without a label the place's last name.
 
-        Raises:
-            InputError: one of `keys` was given; `without` says what is missing.
-        """
-        words = [word.lstrip("+~").partition("=")[0] for word in self.overrides]
-        for key in keys:
-            if key in self.values or key in words:
-                raise InputError(
-                    f"'{key}' has no effect on figure={self.figure} without {without}; omit it, "
-                    "or give both."
-                )
+    Raises:
+        InputError: an empty entry, or a label twice.
+    """
+    found: dict[str, str] = {}
+    for entry in split_list(text, what):
+        label, colon, place = entry.partition(":")
+        label, place = (label, place) if colon else (Path(entry).name, entry)
+        if not label or not place or label in found:
+            raise InputError(f"{what}: expected label:place with different labels, got '{entry}'.")
+        found[label] = place
+    return found
 
-    def check_split(self, stored: str, source: object) -> None:
-        """Refuse a ``split=`` that is not the `stored` one of an opened file, `source`."""
-        if self.get("split", stored) != stored:
-            raise InputError(
-                f"split={self.values['split']}: {source} has split '{stored}'; omit split=, "
-                "or give a file of that split."
-            )
 
-    def maps(self) -> PixelMaps:
-        """The pixel maps of ``maps=``, a file or a folder of `analysis.score`."""
-        from analysis.predictions.maps import PixelMaps
+def open_maps(place: str, split: str) -> PixelMaps:
+    """A file of pixel maps or a folder of ``rgbt score``; InputError: of another split."""
+    maps = PixelMaps.load(_file(place, "maps.npz"))
+    _check_split(split, maps.split, place)
+    return maps
 
-        what = "the folder (or its maps.npz) that rgbt score wrote"
-        return PixelMaps.load(_file(self.need("maps", what), "maps.npz"))
 
-    def statistics(self, *, by_region: bool = False) -> SpatialStatistics:
-        """Those of ``statistics=``, a file or a folder of `analysis.spatial`, or of ``dataset=``.
+def open_statistics(
+    config: Config, place: str, split: str, *, by_region: bool = False
+) -> SpatialStatistics:
+    """A file of statistics or a folder of ``rgbt spatial``, or those of the chosen data set.
 
-        Args:
-            by_region: the figure shows the regions that were measured, so that a ``metric=`` that
-                was given must be these. (Heat maps are cut anew.)
+    Args:
+        config: chooses the data set and the regions.
+        place: "": measure the data set.
+        split: "": that of the file, or train.
+        by_region: the figure shows the regions that were measured, so that a ``metric=`` that was
+            given must be these. (Heat maps are cut anew.)
 
-        Raises:
-            InputError: neither or both were given, or a stored file of another split or partition
-                than requested.
-        """
-        from analysis.statistics.collect import MeasurementSettings, collect
-        from analysis.statistics.data import SpatialStatistics
+    Raises:
+        InputError: a file and a data set, or a file of another split or partition than requested.
+    """
+    if bool(place) == config.chooses("dataset"):
+        raise InputError(
+            "statistics: expected either statistics=..., the folder that rgbt spatial wrote, or "
+            "dataset=... to measure one now."
+        )
+    if not place:
+        split = split or "train"
+        settings = MeasurementSettings(regions=config.regions)
+        with progress("measuring", len(config.dataset.names(split))) as advance:
+            return collect(config.dataset, split, settings, advance)
+    path = _file(place, "statistics.npz")
+    stored = SpatialStatistics.load(path)
+    _check_split(split, stored.split, path)
+    if by_region and config.chooses("metric") and config.regions.name != stored.partition:
+        raise InputError(
+            f"metric: {path} was measured over {stored.partition}, not over {config.regions.name}; "
+            "omit metric=, or measure again with rgbt spatial partition=... regions=..."
+        )
+    return stored
 
-        if ("statistics" in self.values) == self.has_dataset:
-            raise InputError(
-                f"figure={self.figure} needs statistics=..., the folder that rgbt spatial "
-                "wrote, or dataset=... to measure one now (not both)."
-            )
-        if self.has_dataset:
-            split = self.get("split", "train")
-            settings = MeasurementSettings(regions=self.regions)
-            with progress("measuring", len(self.dataset.names(split))) as advance:
-                return collect(self.dataset, split, settings, advance)
-        path = _file(self.values["statistics"], "statistics.npz")
-        stored = SpatialStatistics.load(path)
-        self.check_split(stored.split, path)
-        has_metric = any(word.lstrip("+~").startswith("metric") for word in self.overrides)
-        if by_region and has_metric and self.regions.name != stored.partition:
-            raise InputError(
-                f"metric: {path} was measured over {stored.partition}, not over "
-                f"{self.regions.name}; omit metric=, or measure again with "
-                "rgbt spatial partition=... regions=..."
-            )
-        return stored
 
-    def runs(self, frames: Frames = "") -> dict[str, list[Counts]]:
-        """Label -> counts of its seeds, of ``runs=``; entries with one label are one method's.
+def open_runs(text: str, runs_dir: str, split: str, frames: Frames = "") -> dict[str, list[Counts]]:
+    """Label -> counts of its seeds, of ``runs=``; see `analysis.results.open_counts`.
 
-        Args:
-            frames: see `analysis.results.open_counts`.
+    Raises:
+        InputError: no such counts, or methods on different images.
+    """
+    found: dict[str, list[Counts]] = {}
+    for word in split_list(text, "runs"):
+        label, colon, place = word.partition(":")
+        for each in open_counts(place if colon else word, runs_dir, split, frames):
+            found.setdefault(label if colon else each.label, []).append(each.counts)
+    check_same_images(found)
+    return found
 
-        Raises:
-            InputError: not given, no such counts, or methods on different images.
-        """
-        from analysis.results import open_counts
 
-        what = "runs, groups or files of counts, with commas; label:run names one"
-        opened = self.opened_runs(what, partial(open_counts, frames=frames))
-        found = {label: [named.counts for named in each] for label, each in opened.items()}
-        check_same_images(found)
-        return found
+def open_scored(text: str, partition: str) -> dict[str, Counts]:
+    """Label -> counts over a partition, of folders of ``rgbt score`` or files.
 
-    def opened_runs(
-        self, what: str, open_runs: Callable[[str, Path, str], Iterable[Labelled]]
-    ) -> dict[str, list[Labelled]]:
-        """Label -> what `open_runs` gives for (run, folder of runs, split), of ``runs=``."""
-        runs_dir, split = _path(self.get("runs_dir", "runs")), self.get("split", "")
-        found: dict[str, list[Labelled]] = {}
-        for word in split_list(self.need("runs", what), what):
-            label, colon, path = word.partition(":")
-            for each in open_runs(path if colon else label, runs_dir, split):
-                found.setdefault(label if colon else each.label, []).append(each)
-        return found
-
-    def counts(self, key: str, partition: str) -> dict[str, Counts]:
-        """Label -> counts over a partition, of the folders or files that `key` names.
-
-        Raises:
-            InputError: there are none, or of different images.
-        """
-        from rgbt.metrics.counts import Counts
-
-        found = {}
-        what = "label:folder of what rgbt score wrote, with commas between methods"
-        for label, text in self.named(key, what).items():
-            place, path = _path(text), _file(text, f"counts_{partition}.npz")
-            if place.is_dir() and not path.is_file():
-                files = sorted(each.name for each in place.glob("counts*.npz"))
-                raise InputError(
-                    f"{place} does not contain {path.name} "
-                    f"(it contains {', '.join(files) or 'no counts'}); "
-                    "score the predictions over that partition with rgbt score."
-                )
-            found[label] = Counts.load(path)
-        check_same_images({label: [counts] for label, counts in found.items()})
-        return found
+    Raises:
+        InputError: there are none, or of different images.
+    """
+    places = labelled(text, "methods").items()
+    found = {label: Counts.load(_file(each, f"counts_{partition}.npz")) for label, each in places}
+    check_same_images({label: [counts] for label, counts in found.items()})
+    return found
 
 
 def check_same_images(methods: Mapping[str, Sequence[Counts]]) -> None:
@@ -264,8 +255,6 @@ def check_same_images(methods: Mapping[str, Sequence[Counts]]) -> None:
     Raises:
         InputError: naming the two.
     """
-    from rgbt.metrics.counts import check_same_means
-
     every = [(label, counts) for label, seeds in methods.items() for counts in seeds]
     (first, reference), *others = every
     for label, counts in others:
@@ -283,17 +272,17 @@ def check_one_dataset(statistics: SpatialStatistics, counts: Counts) -> None:
     """Refuse statistics of one data set beside scores on another; splits may differ."""
     if statistics.fingerprint != counts.dataset:
         raise InputError(
-            f"the statistics are of {statistics.dataset}, split '{statistics.split}', and the "
-            f"scores of another data set (images such as '{counts.names[0]}'); measure the data "
-            "set that was scored."
+            f"statistics: they are of {statistics.dataset}, split '{statistics.split}', but the "
+            f"scores of another data set (images such as '{counts.names[0]}')."
         )
+
+
+def _check_split(wanted: str, stored: str, source: object) -> None:
+    if wanted not in ("", stored):
+        raise InputError(f"split={wanted}: {source} has split '{stored}'; omit split=.")
 
 
 def _file(text: str, name: str) -> Path:
     """A file, or the one called `name` in a folder that the other commands wrote."""
-    path = _path(text)
+    path = Path(text).expanduser()
     return path / name if path.is_dir() else path
-
-
-def _path(text: str) -> Path:
-    return Path(text).expanduser()

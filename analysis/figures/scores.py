@@ -1,0 +1,525 @@
+"""Scores of methods: by region, under corruptions, by class of pairs of frames; and an equation."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import pandas as pd
+from annotated_types import Interval
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from analysis.arguments import Blocks, Resamples
+from analysis.figures import plots
+from analysis.figures.inputs import (
+    AbsentClasses,
+    Config,
+    Drawn,
+    Runs,
+    RunsDir,
+    Split,
+    check_same_images,
+    figure,
+    open_runs,
+)
+from analysis.robustness import CLEAN, Training, trainings
+from analysis.uncertainty import Resampling, estimate
+from rgbt.checks import InputError, nearest, split_list
+from rgbt.config.options import Help
+from rgbt.metrics import names
+from rgbt.metrics.counts import Counts, check_same_means, convention, scored_classes
+from rgbt.metrics.metric import Absent, Regions
+from rgbt.metrics.named import value
+from rgbt.metrics.pairs import HEADLINES, Protocol, protocol_of
+from rgbt.metrics.scores import class_mean, miou
+from rgbt.runs.naming import row_name
+from rgbt.tables import class_labels
+from rgbt.tracking.pictures import colour_limits
+
+TITLES: dict[Protocol, str] = {
+    "aligned": "virtual views, first frame warped into the second",
+    "released": "virtual views, frames not warped (as released)",
+    "next": "consecutive frames",
+}
+COLUMNS = 4
+HEIGHT, HEIGHT_BELOW = 1.55, 1.35
+"""Panels in a line of the figure of corruptions; inches of a line, and of the panel below them."""
+
+MISSING = "one image missing"
+"""Title of the panel of corruptions without a severity."""
+
+SPREAD = 0.3
+"""Regions over which bars of several methods stand side by side."""
+
+SHORTEST, LONGEST = 16, 4096
+"""Sides of a heat map of regions in pixels."""
+
+BANDS = {"images": "images", "seeds": "trainings", "both": "both"}
+"""``band=`` -> the interval of `analysis.uncertainty.Estimate`."""
+
+Frames = Annotated[
+    Literal["aligned", "released", "next"],
+    Help(
+        "pairs of frames, counted by rgbt consistency: aligned or released (virtual views), or "
+        "next (consecutive frames)"
+    ),
+]
+Corruptions = Annotated[
+    str, Help("corruptions to show, separated by commas: noise:rgb,frozen; default: all measured")
+]
+Size = Annotated[str, Help(f"size of the map, HEIGHTxWIDTH, {SHORTEST} to {LONGEST} pixels each")]
+Band = Annotated[
+    Literal["widest", "images", "seeds", "both"],
+    Help("interval over images, seeds or both; widest: both if possible"),
+]
+Level = Annotated[float, Interval(gt=0, lt=1), Help("confidence level of that interval")]
+
+
+@figure("temporal/fig5", "TC and CA of variants by class")
+def consistency(
+    config: Config,
+    runs: Runs,
+    frames: Frames = "aligned",
+    runs_dir: RunsDir = "runs",
+    split: Split = "",
+    absent: AbsentClasses = None,
+) -> Drawn:
+    """TC and CA by class, of counts of pairs of frames (rgbt consistency)."""
+    opened = open_runs(runs, runs_dir, split, frames)
+    chosen = absent or convention(counts for seeds in opened.values() for counts in seeds)
+    frame = class_consistency(opened, chosen)
+    return draw_consistency(frame), frame
+
+
+def class_consistency(methods: Mapping[str, Sequence[Counts]], absent: Absent) -> pd.DataFrame:
+    """The series of Temporal, Fig. 5.
+
+    Args:
+        methods: variant -> counts of pairs of frames of its seeds.
+        absent: how a class without pixels counts, see `rgbt.metrics.scores`.
+
+    Returns:
+        protocol, series, tick (class), value (TC), low (CA by the union of the protocol; never
+        above TC), mean over seeds in percent; mean_tc and mean_ca over the scored classes, the
+        cells of the paper's Table I.
+
+    Raises:
+        InputError: counts of single frames, or of different protocols, classes or scored classes.
+    """
+    every = [(label, counts) for label, seeds in methods.items() for counts in seeds]
+    (first, reference), *others = every
+    for label, counts in others:
+        if (counts.partition, counts.classes) != (reference.partition, reference.classes):
+            raise InputError(
+                f"runs: '{first}' was counted by {reference.partition} but '{label}' by "
+                f"{counts.partition}; give counts of one protocol and data set."
+            )
+        check_same_means(reference, counts)
+    protocol = protocol_of(reference.partition)
+    if protocol is None:
+        raise InputError(
+            f"runs: the counts of '{first}' ({reference.partition}) are of single frames; rgbt "
+            "consistency run=... counts the pairs of a run."
+        )
+    labels = class_labels(reference.classes, reference.unscored)
+    scored, rows = scored_classes(reference.classes, reference.unscored), []
+    for label, seeds in methods.items():
+        tc, ca = (
+            np.mean(
+                [
+                    [value(names.of_class(name, score), each, absent) for name in reference.classes]
+                    for each in seeds
+                ],
+                axis=0,
+            )
+            for score in HEADLINES[protocol]
+        )
+        means = float(class_mean(tc, scored)), float(class_mean(ca, scored))
+        rows += [(protocol, label, *cells, *means) for cells in zip(labels, tc, ca, strict=True)]
+    columns = ["protocol", "series", "tick", "value", "low", "mean_tc", "mean_ca"]
+    return pd.DataFrame(rows, columns=columns).assign(high=math.nan)
+
+
+@plots.styled
+def draw_consistency(frame: pd.DataFrame) -> Figure:
+    """TC as full and CA as open marker, joined by a line; variants side by side in each class."""
+    made = plots.new_figure(plots.PAGE, 2.6)
+    axes = made.subplots()
+    protocol: Protocol = frame["protocol"][0]
+    said = [
+        f"{name} (TC {tc:.1f}, CA {ca:.1f})"
+        for name, tc, ca in frame[["series", "mean_tc", "mean_ca"]].to_numpy()
+    ]
+    plots.dot_plot(axes, frame.assign(series=said), open_low=True)
+    axes.set_ylim(bottom=0)
+    union = " (released)" if HEADLINES[protocol][1] == names.CA_RELEASED else ""
+    axes.set_ylabel(f"percent: TC full,\nCA{union} open")
+    axes.set_title(TITLES[protocol], fontsize=plots.SMALL)
+    plots.series_legend(made, axes, columns=frame["series"].nunique())
+    return made
+
+
+@figure("robustness", "mIoU under corruptions, one panel per corruption, one line per method")
+def robustness(
+    config: Config,
+    runs: Runs,
+    corruptions: Corruptions = "",
+    runs_dir: RunsDir = "runs",
+    split: Split = "",
+    absent: AbsentClasses = None,
+    *,
+    relative: bool = False,
+) -> Drawn:
+    """Mean over trainings, band of one standard deviation, of runs after rgbt robustness."""
+    found: dict[str, list[Training]] = {}
+    for word in split_list(runs, "runs"):
+        label, colon, place = word.partition(":")
+        for each in trainings(place if colon else word, runs_dir, split):
+            found.setdefault(label if colon else each.label, []).append(each)
+    rows = split_list(corruptions, "corruptions") if corruptions else []
+    frame = corrupted(found, absent, rows)
+    return draw_robustness(frame, relative=relative), frame
+
+
+@figure("robustness/relative", "the same in percent of the mIoU on clean images")
+def robustness_relative(
+    config: Config,
+    runs: Runs,
+    corruptions: Corruptions = "",
+    runs_dir: RunsDir = "runs",
+    split: Split = "",
+    absent: AbsentClasses = None,
+) -> Drawn:
+    """Each training in percent of what it reaches on clean images."""
+    return robustness(config, runs, corruptions, runs_dir, split, absent, relative=True)
+
+
+def corrupted(
+    methods: Mapping[str, Sequence[Training]], absent: Absent | None, rows: Sequence[str] = ()
+) -> pd.DataFrame:
+    """Scores of methods under corruptions.
+
+    Args:
+        methods: label -> trainings.
+        absent: how a class without pixels counts; None: as the counts say.
+        rows: names of the corruptions to show; (): all.
+
+    Returns:
+        row (the corruption; "clean"), title, unit ("": no severities), severity, method, seeds,
+        and mIoU, sd, relative and relative_sd: mean and standard deviation (n - 1; NaN of one)
+        over trainings, in percent, and in percent of what each training reaches on clean images.
+
+    Raises:
+        InputError: methods on other images, or measured at different severities; a row that
+            was not measured; only clean images.
+    """
+    levels = [
+        (method, number, level)
+        for method, each in methods.items()
+        for number, training in enumerate(each)
+        for level in training.levels
+    ]
+    check_same_images({f"{m} {n} {each.mark}": [each.counts] for m, n, each in levels})
+    convened = absent or convention(level.counts for *_, level in levels)
+    cells = []
+    for method, number, level in levels:
+        score = 100 * miou(level.counts.whole(), convened, level.counts.scored)
+        about = level.row, level.title, level.unit, level.severity
+        cells.append((*about, method, number, float(score)))
+    names_ = ["row", "title", "unit", "severity", "method", "training", "mIoU"]
+    every = pd.DataFrame(cells, columns=names_)
+    known = [row for row in every["row"].unique() if row != CLEAN]
+    shown = [row_name(row) for row in rows] or known
+    for row in shown:
+        if row not in known:
+            raise InputError(f"corruptions: '{row}' was not measured; {nearest(row, known)}.")
+    if not known:
+        raise InputError("runs: only clean images were measured; rgbt robustness measures others.")
+    every = every[every["row"].isin([CLEAN, *shown])]
+    ladders = every[every["unit"] != ""].groupby(["row", "method", "training"])["severity"]
+    for row, each in ladders.agg(tuple).groupby("row"):
+        if each.nunique() > 1:
+            found = "; ".join(f"{each.index[n][1]}: {[*each.iloc[n]]}" for n in range(len(each)))
+            raise InputError(f"runs: {row} was measured at different severities: {found}.")
+    clean = every[every["row"] == CLEAN].set_index(["method", "training"])["mIoU"]
+    places = pd.MultiIndex.from_frame(every[["method", "training"]])
+    every["relative"] = 100 * every["mIoU"] / clean.reindex(places).to_numpy()
+    keys = ["row", "title", "unit", "severity", "method"]
+    return every.groupby(keys, sort=False, as_index=False).agg(
+        seeds=("training", "size"),
+        mIoU=("mIoU", "mean"),
+        sd=("mIoU", "std"),
+        relative=("relative", "mean"),
+        relative_sd=("relative", "std"),
+    )
+
+
+@plots.styled
+def draw_robustness(frame: pd.DataFrame, *, relative: bool) -> Figure:
+    """One panel per corruption; the dashed line is the score on clean images.
+
+    Corruptions without a severity, such as missing images, stand side by side below.
+    """
+    score, spread = ("relative", "relative_sd") if relative else ("mIoU", "sd")
+    seeds = frame["seeds"].astype(str) + " seed" + np.where(frame["seeds"] > 1, "s", "")
+    data = frame.assign(
+        series=frame["method"] + " (" + seeds + ")",
+        x=frame["severity"],
+        value=frame[score],
+        low=frame[score] - frame[spread],
+        high=frame[score] + frame[spread],
+        tick=frame["title"],
+    )
+    clean, others = data[data["row"] == CLEAN], data[data["row"] != CLEAN]
+    order = clean["series"].tolist()
+    curves, missing = [*others[others["unit"] != ""]["row"].unique()], others[others["unit"] == ""]
+    has_below = int(len(missing) > 0)
+    lines, columns = -(-len(curves) // COLUMNS), min(COLUMNS, max(1, len(curves)))
+    width = plots.PAGE * max(columns, 2 + has_below) / COLUMNS
+    made = plots.new_figure(width, HEIGHT * lines + HEIGHT_BELOW * has_below + 0.25)
+    heights = [*[HEIGHT] * lines, *[HEIGHT_BELOW] * has_below]
+    grid = made.add_gridspec(len(heights), columns, height_ratios=heights)
+    first: Axes | None = None
+    for index, row in enumerate([*curves, *[""] * has_below]):
+        line, column = divmod(index, COLUMNS) if row else (lines, 0)
+        axes = made.add_subplot(grid[line, column] if row else grid[line, :], sharey=first)
+        first = first or axes
+        panel = others[others["row"] == row] if row else missing
+        panel = pd.concat([clean, panel]).sort_values(
+            "series", key=lambda each: each.map(order.index), kind="stable"
+        )
+        for number, each in enumerate(clean["value"]):
+            colour = plots.series_style(number)["color"]
+            axes.axhline(each, color=colour, linestyle="--", linewidth=0.6, zorder=1)
+        if row:  # dashes are for clean images
+            plots.line_plot(axes, panel, {name: {"linestyle": "-"} for name in order})
+            axes.set_xticks(panel["x"].unique(), [f"{each:g}" for each in panel["x"].unique()])
+            axes.set_xlabel(panel["unit"].iloc[-1], fontsize=plots.SMALL)
+        else:
+            plots.dot_plot(axes, panel)
+        title = panel["title"].iloc[-1] if row else MISSING
+        room = width / columns if row else width
+        axes.set_title(plots.folded(title, room - 0.3), fontsize=plots.SMALL)
+        axes.tick_params(labelleft=column == 0)
+        if column == 0:
+            axes.set_ylabel("% of clean mIoU" if relative else "mIoU (%)")
+    assert first is not None, "a figure has a panel"
+    first.set_ylim(0, 1.08 * first.get_ylim()[1])
+    plots.series_legend(made, first, columns=4)
+    return made
+
+
+@figure("regions/heat", "mIoU of each region as a heat map, one per method")
+def region_heat(
+    config: Config,
+    runs: Runs,
+    size: Size = "480x640",
+    runs_dir: RunsDir = "runs",
+    split: Split = "",
+    absent: AbsentClasses = None,
+) -> Drawn:
+    """Regions painted by their mIoU."""
+    match = re.fullmatch(r"([0-9]{1,4})x([0-9]{1,4})", size)
+    hw = (int(match[1]), int(match[2])) if match else (0, 0)
+    if not SHORTEST <= min(hw) <= max(hw) <= LONGEST:
+        raise InputError(
+            f"size={size}: expected HEIGHTxWIDTH with {SHORTEST} to {LONGEST} pixels each."
+        )
+    frame = region_means(open_runs(runs, runs_dir, split), absent)
+    return draw_heat(frame, hw), frame
+
+
+@figure("regions/profile", "mIoU by region with intervals, one line per method")
+def region_profile(
+    config: Config,
+    runs: Runs,
+    band: Band = "widest",
+    resamples: Resamples = 10_000,
+    level: Level = 0.95,
+    blocks: Blocks = "auto",
+    runs_dir: RunsDir = "runs",
+    split: Split = "",
+    absent: AbsentClasses = None,
+) -> Drawn:
+    """MIoU over the regions with bands."""
+    settings = Resampling(resamples=resamples, level=level, blocks=blocks)
+    frame = region_means(open_runs(runs, runs_dir, split), absent, settings, band)
+    return draw_profiles(frame, level), frame
+
+
+def region_means(
+    methods: Mapping[str, Sequence[Counts]],
+    absent: Absent | None,
+    settings: Resampling | None = None,
+    band: str = "widest",
+) -> pd.DataFrame:
+    """MIoU by region of methods, mean over seeds, in percent.
+
+    Args:
+        methods: label -> counts of the same images, one per seed.
+        absent: how a class without pixels counts; None: as the counts say.
+        settings: of the intervals; None: none.
+        band: what the interval is over; "widest": both where there are several seeds, else images.
+
+    Returns:
+        series, partition, x (region from 1), value, low and high (NaN: no interval), mIoU (of the
+        image), seeds, images, covers ("images", "seeds", "images and seeds" or "nothing").
+
+    Raises:
+        InputError: an interval over seeds of a single seed, or counts that do not belong together.
+    """
+    every = [(label, counts) for label, seeds in methods.items() for counts in seeds]
+    (first, reference), rows = every[0], []
+    for label, counts in every:
+        if counts.partition != reference.partition:
+            raise InputError(
+                f"runs: '{first}' was counted over {reference.partition} but '{label}' over "
+                f"{counts.partition}; give counts with one partition."
+            )
+    convened = absent or convention(counts for _, counts in every)
+    regions = [names.region(region) for region in range(1, reference.counts.shape[1] + 1)]
+    for label, seeds in methods.items():
+        for counts in seeds:
+            check_same_means(reference, counts)
+        kind = ("both" if len(seeds) > 1 else "images") if band == "widest" else band
+        if len(seeds) == 1 and kind != "images":
+            raise InputError(f"band={band} needs at least two seeds, but '{label}' has one.")
+        means = [
+            np.mean([value(m, each, convened) for each in seeds]) for m in (*regions, names.MIOU)
+        ]
+        ends, covers = [(math.nan, math.nan)] * len(regions), "nothing"
+        if settings is not None:
+            made = Resampling(
+                resamples=settings.resamples,
+                level=settings.level,
+                blocks=settings.blocks,
+                absent=convened,
+            )
+            found = estimate(seeds, regions, made)
+            intervals = [getattr(found[name], BANDS[kind]) for name in regions]
+            if None not in intervals:
+                ends = [(each.low, each.high) for each in intervals]
+                covers = "images and seeds" if kind == "both" else kind
+        about = float(means[-1]), len(seeds), len(seeds[0].names), covers
+        for region, (mean, (low, high)) in enumerate(zip(means[:-1], ends, strict=True), 1):
+            rows.append((label, reference.partition, region, float(mean), low, high, *about))
+    columns = ["series", "partition", "x", "value", "low", "high"]
+    return pd.DataFrame(rows, columns=[*columns, "mIoU", "seeds", "images", "covers"])
+
+
+@plots.styled
+def draw_profiles(frame: pd.DataFrame, level: float) -> Figure:
+    """MIoU over the regions, one line per method, with the mIoU of the image in the legend.
+
+    Intervals of one or two methods are bands; those of more are bars side by side, because bands
+    would hide each other.
+    """
+    methods = frame.drop_duplicates("series")
+    made = plots.new_figure(plots.COLUMN, 2.4 + plots.LINE * len(methods))
+    axes = made.subplots()
+    styles = {
+        str(row.series): {"label": f"{row.series} (mIoU {row.mIoU:.1f})"}
+        for row in methods.itertuples()
+    }
+    is_crowded = len(methods) > 2
+    plots.line_plot(axes, frame, styles, bars=is_crowded, spread=SPREAD * is_crowded)
+    plots.region_axis(axes, frame["x"].max(), f"region ({frame['partition'][0]})")
+    axes.set_ylabel("mIoU (%)")
+    # For example "95 % intervals over images and seeds", and their numbers below.
+    numbers = [
+        f"{' or '.join(map(str, sorted(set(many))))} {word}{'' if set(many) == {1} else 's'}"
+        for word, many in (("seed", methods["seeds"]), ("image", methods["images"]))
+    ]
+    title = f"{100 * level:g} % intervals over {' or '.join(methods['covers'].unique())}"
+    axes.set_title(f"{title}\n{', '.join(numbers)}", fontsize=plots.SMALL)
+    plots.series_legend(made, axes, columns=1)
+    return made
+
+
+@plots.styled
+def draw_heat(frame: pd.DataFrame, image_hw: tuple[int, int]) -> Figure:
+    """One (H, W) map per method with the mIoU of each region written into it, in one scale."""
+    methods = [*frame.groupby("series", sort=False)]
+    low, high = colour_limits([each / 100 for each in frame["value"]])
+    region_map = map_of(frame["partition"][0], image_hw)
+    height, width = image_hw
+    columns = 2 if len(methods) == 4 else min(3, len(methods))
+    rows = -(-len(methods) // columns)
+    page = plots.COLUMN if columns == 1 else plots.PAGE
+    panel = (page - 0.6) / columns
+    titles = [
+        f"{plots.folded(str(name), panel - 0.2)}\nmIoU {each['mIoU'].iloc[0]:.1f}"
+        for name, each in methods
+    ]
+    lines = 1 + max(title.count("\n") for title in titles)
+    tall = rows * (panel * height / width + 0.06 + plots.LINE * lines)
+    made = plots.new_figure(page, tall + 0.05)
+    panels = made.subplots(rows, columns, squeeze=False).ravel()
+    for axes, (_, each), title in zip(panels, methods, titles, strict=False):
+        values = each["value"].to_numpy()
+        numbers = ["-" if math.isnan(number) else f"{number:.1f}" for number in values]
+        picture = values[region_map]
+        shown: Any = plots.heat(axes, picture, region_map, numbers, panel, vmin=low, vmax=high)
+        axes.set_title(title)
+    for axes in panels[len(methods) :]:
+        axes.set_axis_off()
+    label = "mIoU of the region (%)"
+    made.colorbar(shown, ax=[*panels], shrink=0.85, pad=0.015, label=label)  # type: ignore[arg-type]
+    return made
+
+
+def map_of(partition: str, image_hw: tuple[int, int]) -> NDArray[np.uint8]:
+    """The map of a partition by the name that counts carry ("ring5", "ring9_released_3_4").
+
+    Raises:
+        InputError: no such partition, or an image too small for it.
+    """
+    match = re.fullmatch(r"(ring|vertical|horizontal)(\d+)(_released_3_4)?", partition)
+    if match is None:
+        raise InputError(f"runs: '{partition}' is not a partition of the image, such as ring5.")
+    kind, number, released = match.groups()
+    aspect = ("released_3_4" if released else "image") if kind == "ring" else None
+    made = Regions(partition=kind, regions=int(number), aspect=aspect, absent="released")  # type: ignore[arg-type]
+    return made.map(image_hw)
+
+
+@figure("multihead/fig3", "gradients of entropy minimisation and maximum squares loss")
+@plots.styled
+def gradients(config: Config) -> Drawn:
+    """Both curves over the probability; analytic, without input."""
+    frame = gradient_curves()
+    made = plots.new_figure(plots.COLUMN, 2.3)
+    axes = made.subplots()
+    plots.line_plot(axes, frame, {name: {"marker": ""} for name in frame["series"].unique()})
+    axes.set(xlim=(0, 1), xlabel="predicted probability", ylabel="gradient magnitude")
+    axes.set_ylim(bottom=0, top=6)
+    axes.legend(loc="upper center")
+    return made, frame
+
+
+def gradient_curves(points: int = 999) -> pd.DataFrame:
+    """The two gradients of one pixel with two classes of probability p and 1 - p.
+
+        entropy          E = -(p log p + (1 - p) log(1 - p)) / log 2,  |dE/dp| = |log2(p / (1 - p))|
+        maximum squares  M = -(p^2 + (1 - p)^2) / 2,                   |dM/dp| = |2 p - 1|
+
+    Source: Multi-head, Eqs. (1) and (2) with C = 2 and one pixel, constants as printed there. The
+    paper that Fig. 3 is taken from (Chen et al., ICCV 2019) leaves out 1 / log 2 and 1 / 2, which
+    multiplies the curves by 0.69 and by 2; the forms, linear against unbounded, are the same.
+
+    Returns:
+        series, x (p, evenly inside (0, 1), because the entropy's gradient is infinite at the ends;
+        of an odd number of points 0.5, where both vanish, is one) and value.
+    """
+    p = np.arange(1, points + 1) / (points + 1)
+    curves = {
+        "entropy minimisation": np.abs(np.log2(p / (1 - p))),
+        "maximum squares": np.abs(2 * p - 1),
+    }
+    series = [pd.DataFrame({"series": name, "x": p, "value": v}) for name, v in curves.items()]
+    return pd.concat(series, ignore_index=True).assign(low=math.nan, high=math.nan)
