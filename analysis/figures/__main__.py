@@ -6,14 +6,14 @@ Without ``figure=`` it lists all figures and their options.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import make_dataclass
+from dataclasses import fields, make_dataclass
 from typing import Annotated, Any, get_args
 
 from analysis.figures import panels, scores, spatialseg  # noqa: F401 - they register their figures
 from analysis.figures.inputs import FIGURES, Config
 from analysis.tables import text_table, tidy_csv
 from rgbt.checks import InputError, check_choice, nearest
-from rgbt.config.options import Help
+from rgbt.config.options import Help, types_of
 from rgbt.config.plain_command import PlainCommand
 
 GROUPS = ("dataset", "metric", "consistency")
@@ -23,12 +23,8 @@ def _options() -> Iterator[tuple[str, Any, Any]]:
     """Name, type and default of `figure`, `out`, and the options of all figures."""
     yield "figure", Annotated[str, Help('name such as spatialseg/fig5; "list": all names')], "list"
     yield "out", Annotated[str, Help("output file: .pdf, .svg or .png (300 dots per inch)")], ""
-    found: dict[str, Any] = {}
-    for spec in FIGURES.values():
-        found |= {
-            name: each.annotation for name, each in spec.options.items() if name != "relative"
-        }
-    for name, annotation in found.items():
+    every = [types_of(spec.options) for spec in FIGURES.values()]
+    for name, annotation in {key: kind for each in every for key, kind in each.items()}.items():
         kind, *notes = get_args(annotation)
         yield name, Annotated[(kind | None, *notes)], None  # type: ignore[valid-type]
 
@@ -52,26 +48,24 @@ def main(options: Any, overrides: list[str]) -> int:
     name, out = given.pop("figure"), given.pop("out")
     if name == "list":
         rows = {
-            key: (each.shows, " ".join([*(f"{n}=..." for n in each.needs), *each.groups]))
+            key: (each.shows, " ".join([*(n.name for n in fields(each.options)), *each.groups]))
             for key, each in FIGURES.items()
         }
-        listed = pd.DataFrame.from_dict(rows, "index", columns=["shows", "needs"])
+        listed = pd.DataFrame.from_dict(rows, "index", columns=["shows", "options"])
         print_rich(rich_table(text_table("figures", listed.rename_axis("figure"))))
         return 0
     check_choice("figure", name, FIGURES)
     spec = FIGURES[name]
     groups = {word: word.lstrip("+~").partition("=")[0].split(".")[0] for word in overrides}
-    idle = [key for key in given if key not in spec.options]
+    known = [each.name for each in fields(spec.options)]
+    idle = [key for key in given if key not in known]
     idle += [group for group in groups.values() if group not in spec.groups]
     if idle:
-        known = nearest(idle[0], ["figure", "out", *spec.options, *spec.groups])
-        raise InputError(f"'{idle[0]}' has no effect on figure={name}; {known}.")
-    for key in spec.needs:
-        if key not in given:
-            raise InputError(f"figure={name} needs {key}=...: {Options.__annotations__[key]}")
+        near = nearest(idle[0], ["figure", "out", *known, *spec.groups])
+        raise InputError(f"'{idle[0]}' has no effect on figure={name}; {near}.")
     path = out_path(out)
     config = Config(tuple(overrides), {"metric": spec.metric, "consistency": "views"})
-    drawn, frame = spec.make(config, **given)
+    drawn, frame = spec(config, given)
     save(drawn, path)
     title = f"{name}: {spec.shows}"
     table = text_table(title, frame.set_index(frame.columns[0])).to_markdown()

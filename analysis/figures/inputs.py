@@ -1,13 +1,13 @@
-"""All figures by name, the types of their options, and the files that these name."""
+"""All figures by name, their options, and the files that these name."""
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import MISSING, dataclass, field, fields, make_dataclass
 from functools import cached_property
+from inspect import Parameter, signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
 
 import pandas as pd
 from annotated_types import Interval
@@ -15,11 +15,11 @@ from matplotlib.figure import Figure
 
 from analysis.arguments import MOST, dataset_of
 from analysis.bar import progress
-from analysis.predictions.maps import PixelMaps
-from analysis.results import Frames, open_counts
+from analysis.results import open_counts
 from analysis.statistics.collect import MeasurementSettings, SpatialStatistics, collect
 from rgbt.checks import InputError, nearest, split_list
 from rgbt.config.command import built
+from rgbt.config.common_options import RunsDir
 from rgbt.config.options import Help
 from rgbt.metrics.counts import Counts, check_same_means
 from rgbt.metrics.metric import Regions
@@ -31,48 +31,23 @@ Drawn = tuple[Figure, pd.DataFrame]
 """A figure, and the numbers that it shows."""
 
 Count = Annotated[int, Interval(ge=1, le=MOST)]
-Maps = Annotated[str, Help("output of rgbt score: folder or maps.npz")]
-Statistics = Annotated[
-    str,
-    Help(
-        "output of rgbt spatial: folder or statistics.npz; or dataset=... to measure the data set"
-    ),
-]
-Scored = Annotated[
-    str, Help("methods, label:folder,label:folder: output of rgbt score, or predicted label images")
-]
-Runs = Annotated[
-    str,
-    Help(
-        "runs, groups or files of counts, separated by commas; label:run,label:run sets their "
-        "labels; entries with the same label are seeds of one method"
-    ),
-]
-RunsDir = Annotated[str, Help("folder of runs (default: runs)")]
 Split = Annotated[
     str, Help("split of the data set or the runs (default: test; of statistics: train)")
 ]
 Part = Annotated[Literal["all", "day", "night"], Help("images: all, day or night")]
 Names = Annotated[str, Help("names of the images to show, separated by commas")]
-Pick = Annotated[
-    Literal["first", "largest_difference"],
-    Help("images that are shown: first, or largest_difference of the first and the last method"),
+Methods = Annotated[
+    str, Help("label:folder,label:folder: output of rgbt score, or predicted label images")
 ]
-Rows = Annotated[Count, Help("number of images")]
-Layout = Annotated[
-    Literal["rows", "columns"], Help("one row or one column per image: rows or columns")
-]
-Form = Annotated[Literal["index", "colour"], Help("format of predictions: index or colour")]
-Palette = Annotated[str, Help("palette of coloured predictions, as in `rgbt score`")]
-Prefix = Annotated[str, Help("beginning of the file names of predictions")]
-Suffix = Annotated[str, Help("end of the file names of predictions, NAME<suffix>.png")]
 AbsentClasses = Annotated[
     Literal["released", "exclude"] | None,
-    Help(
-        "class without pixels: released: it scores 0; exclude: it is in no mean; default: as the "
-        "counts say"
-    ),
+    Help("class without pixels: released: 0; exclude: in no mean; default: as the counts say"),
 ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoOptions:
+    """Of a figure that shares none with others."""
 
 
 @dataclass(frozen=True)
@@ -80,26 +55,42 @@ class FigureSpec:
     """One figure.
 
     Attributes:
-        make: from a `Config` and options to a figure and its numbers.
+        make: function of a `Config` and a dataclass of options, `given`, as far as it has these
+            parameters, and of its own options, which are keywords.
         groups: groups of the configuration that take effect.
         metric: the partition unless ``metric=`` is given, a file of ``conf/metric/``.
     """
 
     make: Callable[..., Drawn]
     shows: str
-    groups: tuple[str, ...] = ()
-    metric: str = "ring5"
+    groups: tuple[str, ...]
+    metric: str
+
+    @cached_property
+    def options(self) -> type[Any]:
+        """The dataclass of all options, by the signature of the function."""
+        hints = get_type_hints(self.make, include_extras=True)
+        own = [(each.name, hints[each.name], each.default) for each in self._keywords]
+        shared = hints.get("given", NoOptions)
+        return make_dataclass("Options", own, bases=(shared,), frozen=True, kw_only=True)
 
     @property
-    def options(self) -> dict[str, inspect.Parameter]:
-        """The parameters of `make` after the configuration, by name."""
-        signature = inspect.signature(self.make, eval_str=True)
-        return dict([*signature.parameters.items()][1:])
+    def _keywords(self) -> list[Parameter]:
+        every = signature(self.make).parameters.values()
+        return [each for each in every if each.kind is Parameter.KEYWORD_ONLY]
 
-    @property
-    def needs(self) -> tuple[str, ...]:
-        """Names of the options without a default."""
-        return tuple(name for name, each in self.options.items() if each.default is each.empty)
+    def __call__(self, config: Config, values: Mapping[str, Any]) -> Drawn:
+        """Draw with the values of options that were given; InputError where one is missing."""
+        for each in fields(self.options):
+            if each.default is MISSING and each.name not in values:
+                raise InputError(f"the figure needs {each.name}=...")
+        given = self.options(**values)
+        known = signature(self.make).parameters
+        shared = {"config": config, "given": given}
+        named = {name: value for name, value in shared.items() if name in known}
+        return self.make(
+            **named, **{each.name: getattr(given, each.name) for each in self._keywords}
+        )
 
 
 FIGURES: dict[str, FigureSpec] = {}
@@ -126,10 +117,15 @@ class Config:
         """Whether a file of the group was chosen."""
         return any(word.lstrip("+~").startswith(f"{group}=") for word in self.overrides)
 
+    def built(self, node: str, *more: str) -> Any:
+        """The object of one node of the configuration."""
+        usual = [f"{key}={name}" for key, name in self.defaults.items() if not self.chooses(key)]
+        return built(node, [*usual, *self.overrides, *more])
+
     @cached_property
     def dataset(self) -> LabelledDataset:
         """The data set; InputError where none was chosen."""
-        return dataset_of([*self._defaults, *self.overrides])
+        return dataset_of(self.overrides)
 
     @cached_property
     def regions(self) -> Regions:
@@ -137,124 +133,118 @@ class Config:
         regions: Regions = self.built("metric")
         return regions
 
-    def built(self, node: str, *more: str) -> Any:
-        """The object of one node of the configuration."""
-        return built(node, [*self._defaults, *self.overrides, *more])
+    def names(self, names: str, split: str, number: int = 1) -> list[str]:
+        """The named images of a split, else its first `number`; see `chosen_names`."""
+        return chosen_names(names, self.dataset.names(split or "test"), number)
 
-    @property
-    def _defaults(self) -> list[str]:
-        return [f"{key}={name}" for key, name in self.defaults.items() if not self.chooses(key)]
 
-    def names(self, names: str, split: str, number: int = 1) -> tuple[str, ...]:
-        """The named images of a split, else its first `number`.
+@dataclass(frozen=True, kw_only=True)
+class StatisticsOptions:
+    """Statistics of a data set, stored or measured now."""
+
+    statistics: Annotated[
+        str,
+        Help("output of rgbt spatial: folder or statistics.npz; or dataset=... to measure it now"),
+    ] = ""
+    split: Split = ""
+
+    def open(self, config: Config, *, by_region: bool = False) -> SpatialStatistics:
+        """The statistics.
 
         Raises:
-            InputError: a name that the split lacks, or fewer images than requested.
+            InputError: a file and a data set, or a file of another split than requested; or,
+                `by_region`, of other regions than requested. (Heat maps are cut anew.)
         """
-        listed = self.dataset.names(split)
-        chosen = tuple(split_list(names, "names")) if names else listed[:number]
-        for name in chosen:
-            if name not in listed:
-                near = nearest(name, listed[:20])
-                raise InputError(f"names: split '{split}' has no image '{name}'; {near}.")
-        if not names and len(chosen) < number:
-            raise InputError(f"rows={number}, but split '{split}' has {len(listed)} images.")
-        return chosen
+        if bool(self.statistics) == config.chooses("dataset"):
+            raise InputError(
+                "statistics: expected either statistics=..., the folder that rgbt spatial wrote, "
+                "or dataset=... to measure one now."
+            )
+        if not self.statistics:
+            split, settings = self.split or "train", MeasurementSettings(regions=config.regions)
+            with progress("measuring", len(config.dataset.names(split))) as advance:
+                return collect(config.dataset, split, settings, advance)
+        path = file_in(self.statistics, "statistics.npz")
+        stored = SpatialStatistics.load(path)
+        check_split(self.split, stored.split, path)
+        if by_region and config.chooses("metric") and config.regions.name != stored.partition:
+            raise InputError(f"metric: {path} was measured over {stored.partition}.")
+        return stored
 
 
-def labelled(text: str, what: str) -> dict[str, str]:
-    """Label -> place, of ``label:place,label:place``; without a label the place's last name.
+@dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """Counts of runs."""
+
+    runs: Annotated[
+        str,
+        Help(
+            "runs, groups or files of counts, separated by commas; label:run,label:run sets their "
+            "labels; entries with the same label are seeds of one method"
+        ),
+    ]
+    runs_dir: RunsDir = Path("runs")
+    split: Split = ""
+    absent: AbsentClasses = None
+
+    def open(self, opened: Callable[..., Any], *more: Any) -> dict[str, list[Any]]:
+        """Label -> what `opened` gives for (run, folder of runs, split), of each entry."""
+        found: dict[str, list[Any]] = {}
+        for word in split_list(self.runs, "runs"):
+            label, colon, place = word.partition(":")
+            for each in opened(place if colon else word, self.runs_dir, self.split, *more):
+                found.setdefault(label if colon else each.label, []).append(each)
+        return found
+
+    def counts(self, *frames: str) -> dict[str, list[Counts]]:
+        """Label -> counts of its seeds; InputError: methods on different images."""
+        opened = self.open(open_counts, *frames).items()
+        found = {label: [each.counts for each in named] for label, named in opened}
+        check_same_images(found)
+        return found
+
+
+def chosen_names(names: str, known: Sequence[str], number: int) -> list[str]:
+    """The names that a list with commas holds, else the first `number` of those that are known.
 
     Raises:
-        InputError: an empty entry, or a label twice.
+        InputError: an unknown name, or fewer images than requested.
     """
-    found: dict[str, str] = {}
-    for entry in split_list(text, what):
+    chosen = split_list(names, "names") if names else [*known[:number]]
+    for name in chosen:
+        if name not in known:
+            raise InputError(f"names: there is no image '{name}'; {nearest(name, known[:20])}.")
+    if not names and len(chosen) < number:
+        raise InputError(f"rows={number}, but there are {len(known)} images.")
+    return chosen
+
+
+def labelled(text: str) -> dict[str, Path]:
+    """Label -> place, of ``label:place,label:place``; InputError: an empty entry or label twice."""
+    found: dict[str, Path] = {}
+    for entry in split_list(text, "methods"):
         label, colon, place = entry.partition(":")
         label, place = (label, place) if colon else (Path(entry).name, entry)
         if not label or not place or label in found:
-            raise InputError(f"{what}: expected label:place with different labels, got '{entry}'.")
-        found[label] = place
+            raise InputError(f"methods: expected different label:folder, got '{entry}'.")
+        found[label] = Path(place).expanduser()
     return found
 
 
-def open_maps(place: str, split: str) -> PixelMaps:
-    """A file of pixel maps or a folder of ``rgbt score``; InputError: of another split."""
-    maps = PixelMaps.load(_file(place, "maps.npz"))
-    _check_split(split, maps.split, place)
-    return maps
-
-
-def open_statistics(
-    config: Config, place: str, split: str, *, by_region: bool = False
-) -> SpatialStatistics:
-    """A file of statistics or a folder of ``rgbt spatial``, or those of the chosen data set.
-
-    Args:
-        config: chooses the data set and the regions.
-        place: "": measure the data set.
-        split: "": that of the file, or train.
-        by_region: the figure shows the regions that were measured, so that a ``metric=`` that was
-            given must be these. (Heat maps are cut anew.)
-
-    Raises:
-        InputError: a file and a data set, or a file of another split or partition than requested.
-    """
-    if bool(place) == config.chooses("dataset"):
-        raise InputError(
-            "statistics: expected either statistics=..., the folder that rgbt spatial wrote, or "
-            "dataset=... to measure one now."
-        )
-    if not place:
-        split = split or "train"
-        settings = MeasurementSettings(regions=config.regions)
-        with progress("measuring", len(config.dataset.names(split))) as advance:
-            return collect(config.dataset, split, settings, advance)
-    path = _file(place, "statistics.npz")
-    stored = SpatialStatistics.load(path)
-    _check_split(split, stored.split, path)
-    if by_region and config.chooses("metric") and config.regions.name != stored.partition:
-        raise InputError(
-            f"metric: {path} was measured over {stored.partition}, not over {config.regions.name}; "
-            "omit metric=, or measure again with rgbt spatial partition=... regions=..."
-        )
-    return stored
-
-
-def open_runs(text: str, runs_dir: str, split: str, frames: Frames = "") -> dict[str, list[Counts]]:
-    """Label -> counts of its seeds, of ``runs=``; see `analysis.results.open_counts`.
-
-    Raises:
-        InputError: no such counts, or methods on different images.
-    """
-    found: dict[str, list[Counts]] = {}
-    for word in split_list(text, "runs"):
-        label, colon, place = word.partition(":")
-        for each in open_counts(place if colon else word, runs_dir, split, frames):
-            found.setdefault(label if colon else each.label, []).append(each.counts)
-    check_same_images(found)
-    return found
-
-
-def open_scored(text: str, partition: str) -> dict[str, Counts]:
+def open_scored(methods: str, partition: str) -> dict[str, Counts]:
     """Label -> counts over a partition, of folders of ``rgbt score`` or files.
 
     Raises:
         InputError: there are none, or of different images.
     """
-    places = labelled(text, "methods").items()
-    found = {label: Counts.load(_file(each, f"counts_{partition}.npz")) for label, each in places}
+    places = labelled(methods).items()
+    found = {label: Counts.load(file_in(each, f"counts_{partition}.npz")) for label, each in places}
     check_same_images({label: [counts] for label, counts in found.items()})
     return found
 
 
 def check_same_images(methods: Mapping[str, Sequence[Counts]]) -> None:
-    """Refuse a figure that would show methods on different images, or with means over different
-    classes, side by side.
-
-    Raises:
-        InputError: naming the two.
-    """
+    """Refuse methods on different images, or with means over different classes, side by side."""
     every = [(label, counts) for label, seeds in methods.items() for counts in seeds]
     (first, reference), *others = every
     for label, counts in others:
@@ -277,12 +267,13 @@ def check_one_dataset(statistics: SpatialStatistics, counts: Counts) -> None:
         )
 
 
-def _check_split(wanted: str, stored: str, source: object) -> None:
+def check_split(wanted: str, stored: str, source: object) -> None:
+    """Refuse a file of another split than the one that is named."""
     if wanted not in ("", stored):
         raise InputError(f"split={wanted}: {source} has split '{stored}'; omit split=.")
 
 
-def _file(text: str, name: str) -> Path:
+def file_in(place: Path | str, name: str) -> Path:
     """A file, or the one called `name` in a folder that the other commands wrote."""
-    path = Path(text).expanduser()
+    path = Path(place).expanduser()
     return path / name if path.is_dir() else path

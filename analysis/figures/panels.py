@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -27,21 +28,16 @@ from analysis.figures.inputs import (
     Config,
     Count,
     Drawn,
-    Form,
-    Layout,
+    Methods,
     Names,
-    Palette,
-    Pick,
-    Prefix,
-    Rows,
-    Scored,
     Split,
-    Suffix,
+    chosen_names,
     figure,
     labelled,
 )
 from analysis.predictions.scoring import ScoringOptions, score_folder
-from rgbt.checks import InputError, nearest, split_list
+from rgbt.checks import InputError
+from rgbt.config.common_options import PredictionFormatOptions
 from rgbt.config.options import Help
 from rgbt.data.files import decode, read_rgb
 from rgbt.data.mfnet import NextFrames
@@ -77,75 +73,73 @@ STRIDE = 32
 HIDDEN = (150, 190, 230)
 """Colour of a hidden pixel: a grey one would be lost in a thermal image."""
 
-Missing = Annotated[
-    str, Help("predictions of these methods without this image (rgbt predict corruption=removed:)")
+
+Rows = Annotated[Count, Help("number of images")]
+Layout = Annotated[
+    Literal["rows", "columns"], Help("one row or one column per image: rows or columns")
 ]
-Exported = Annotated[str, Help("folder of pairs of frames that rgbt consistency export=... wrote")]
-Patches = Annotated[tuple[Count, ...], Help("sides of the patches in pixels")]
-Seed = Annotated[Annotated[int, Interval(ge=0, le=MOST)], Help("seed of the masks")]
+Pick = Annotated[
+    Literal["first", "largest_difference"],
+    Help("images shown: first, or largest_difference of the first and the last method"),
+]
+Exported = Annotated[str, Help("pairs of frames: folder that rgbt consistency export=... wrote")]
+ViewSet = Annotated[Count, Help("set of virtual views of these pairs, from 1")]
 
 
-class Folder(NamedTuple):
-    """Predictions of a method: a label for the figure, and where they are."""
+@dataclass(frozen=True, kw_only=True)
+class PictureOptions(PredictionFormatOptions):
+    """Images and predictions of methods."""
 
-    label: str
-    path: Path
+    methods: Methods
+    names: Names = ""
+    rows: Rows = 4
+    split: Split = ""
+    layout: Layout = "rows"
 
-    def read(self, reader: PredictionReader, name: str, image_hw: tuple[int, ...]) -> Bytes:
-        """(H, W) class indices; InputError: no such file, or of another size than the image."""
-        path = self.path / f"{reader.options.affixes.file_stem(name)}.png"
-        if not path.is_file():
-            raise InputError(f"methods: there is no prediction {path}.")
-        found = reader.read(path)
-        if found.shape != image_hw:
-            sizes = ["x".join(map(str, shape)) for shape in (found.shape, image_hw)]
-            raise InputError(f"methods: {path} is {sizes[0]} pixels but its image is {sizes[1]}.")
-        return found
+    @property
+    def form(self) -> FormatOptions:
+        """The format of the files."""
+        affixes = Affixes(self.prefix, self.suffix)
+        return FormatOptions(form=self.format, palette=self.palette, affixes=affixes)
 
 
-def folders(text: str) -> list[Folder]:
-    """The methods of ``label:folder,label:folder``."""
-    places = labelled(text, "methods").items()
-    return [Folder(label, Path(place).expanduser()) for label, place in places]
+def read_prediction(
+    folder: Path, reader: PredictionReader, name: str, image_hw: tuple[int, ...]
+) -> Bytes:
+    """(H, W) class indices; InputError: no such file, or of another size than the image."""
+    path = folder / f"{reader.options.affixes.file_stem(name)}.png"
+    if not path.is_file():
+        raise InputError(f"methods: there is no prediction {path}.")
+    found = reader.read(path)
+    if found.shape != image_hw:
+        sizes = ["x".join(map(str, shape)) for shape in (found.shape, image_hw)]
+        raise InputError(f"methods: {path} is {sizes[0]} pixels but its image is {sizes[1]}.")
+    return found
 
 
 @figure("spatialseg/fig8", "qualitative results", "dataset", "metric")
 @figure("spatialseg/fig9", "qualitative results on another data set", "dataset", "metric")
 @figure("crm/fig4", "qualitative results", "dataset", "metric")
-def qualitative(
-    config: Config,
-    methods: Scored,
-    names: Names = "",
-    pick: Pick = "first",
-    rows: Rows = 4,
-    split: Split = "",
-    layout: Layout = "rows",
-    format: Form = "index",
-    palette: Palette = "dataset",
-    prefix: Prefix = "",
-    suffix: Suffix = "",
-) -> Drawn:
+def qualitative(config: Config, given: PictureOptions, *, pick: Pick = "first") -> Drawn:
     """RGB, thermal, ground truth and predictions, with a white box on the centre."""
-    form = FormatOptions(form=format, palette=palette, affixes=Affixes(prefix, suffix))
-    every, dataset = folders(methods), config.dataset
-    split = split or "test"
+    folders, dataset, names = labelled(given.methods), config.dataset, given.names
     if pick == "largest_difference" and not names:
-        options = ScoringOptions(partitions=("ring",), regions=1, format=form)
+        split = given.split or "test"
+        options = ScoringOptions(partitions=("ring",), regions=1, format=given.form)
         mious = {}
-        with progress("comparing", len(every) * len(dataset.names(split))) as advance:
-            for label, folder in every:
+        with progress("comparing", len(folders) * len(dataset.names(split))) as advance:
+            for label, folder in folders.items():
                 (counts,) = score_folder(folder, dataset, split, options, advance).counts
                 mious[label] = image_mious(counts)
-        names = ",".join(most_different(mious, rows))
-    shown = config.names(names, split, rows)
-    made, cells, frame = panel(dataset, every, shown, form, layout)
-    regions = config.regions
+        names = ",".join(most_different(mious, given.rows))
+    shown, regions = config.names(names, given.split, given.rows), config.regions
     if regions.aspect is None:
         raise InputError(f"metric: {regions.name} has no centre to put a box on; use rings.")
-    height, width = dataset.read(shown[0]).thermal.shape
-    box = ring_rectangle((height, width), regions.regions, 1, regions.aspect)
-    corner = (box[1].start - 0.5, box[0].start - 0.5)
-    size = (box[1].stop - box[1].start, box[0].stop - box[0].start)
+    made, cells, frame = panel(dataset, folders, shown, given.form, given.layout)
+    height, width = cells[0, 0].images[0].get_array().shape[:2]
+    rows, columns = ring_rectangle((height, width), regions.regions, 1, regions.aspect)
+    corner = (columns.start - 0.5, rows.start - 0.5)
+    size = (columns.stop - columns.start, rows.stop - rows.start)
     for axes in cells.flat:
         for colour, edge in (("black", 1.4), ("white", 0.8)):
             axes.add_patch(Rectangle(corner, *size, fill=False, edgecolor=colour, linewidth=edge))
@@ -155,71 +149,62 @@ def qualitative(
 @figure("crm/fig2", "predictions with both images, without RGB and without thermal", "dataset")
 def missing(
     config: Config,
-    methods: Scored,
-    without_rgb: Missing,
-    without_thermal: Missing,
-    names: Names = "",
+    given: PictureOptions,
+    *,
+    without_rgb: Annotated[
+        str, Help("predictions of these methods by rgbt predict corruption=removed:rgb")
+    ],
+    without_thermal: Annotated[str, Help("the same with corruption=removed:thermal")],
     rows: Rows = 2,
-    split: Split = "",
-    layout: Layout = "rows",
-    format: Form = "index",
-    palette: Palette = "dataset",
-    prefix: Prefix = "",
-    suffix: Suffix = "",
 ) -> Drawn:
     """CRM, Fig. 2, with the mIoU of every prediction; InputError: methods differ."""
-    form = FormatOptions(form=format, palette=palette, affixes=Affixes(prefix, suffix))
-    three = {"both": methods, "no RGB": without_rgb, "no thermal": without_thermal}
-    places = {kind: labelled(text, "methods") for kind, text in three.items()}
-    if any(set(each) != set(places["both"]) for each in places.values()):
+    three = {
+        "both": labelled(given.methods),
+        "no RGB": labelled(without_rgb),
+        "no thermal": labelled(without_thermal),
+    }
+    if any(set(each) != set(three["both"]) for each in three.values()):
         raise InputError("methods: name the same ones in methods, without_rgb and without_thermal.")
-    every = [
-        Folder(f"{label}\n{kind}", Path(places[kind][label]).expanduser())
-        for label in places["both"]
-        for kind in three
-    ]
-    shown = config.names(names, split or "test", rows)
-    made, cells, frame = panel(config.dataset, every, shown, form, layout)
-    scores = frame["mIoU"].to_numpy().reshape(len(shown), -1)
-    for axes, score in zip(cells[:, 3:].flat, scores.flat, strict=True):
+    every = {f"{label}\n{kind}": three[kind][label] for label in three["both"] for kind in three}
+    shown = config.names(given.names, given.split, rows)
+    made, cells, frame = panel(config.dataset, every, shown, given.form, given.layout)
+    for axes, score in zip(cells[:, 3:].flat, frame["mIoU"], strict=True):
         plots.in_corner(axes, f"{score:.1f}")
     return made, frame
 
 
 def panel(
     dataset: LabelledDataset,
-    every: Sequence[Folder],
+    folders: Mapping[str, Path],
     names: Sequence[str],
     form: FormatOptions,
-    layout: str,
+    layout: str = "rows",
 ) -> tuple[Figure, NDArray[Any], pd.DataFrame]:
-    """The pictures of a panel, one row per name.
+    """The pictures of a panel, one row per name: the figure, its axes, and the scores.
 
     Returns:
-        the figure; its axes; image, method and mIoU of this image alone, percent, over the scored
-        classes that label or prediction hold, because a single image lacks most classes.
+        image, method and mIoU of this image alone, percent, over the scored classes that label or
+        prediction hold, because a single image lacks most classes.
 
     Raises:
         InputError: images without label or that differ in size, or a prediction that is missing.
     """
     reader = PredictionReader(dataset.classes, dataset.palette, form)
-    table, pictures, numbers = np.array(dataset.palette, np.uint8), [], []
+    palette, pictures, numbers = np.array(dataset.palette, np.uint8), [], []
     scored = scored_classes(dataset.classes, dataset.unscored)
     whole = RegionCounter(len(scored), WHOLE)
     for name in names:
         sample, label = labelled_sample(dataset, name)
         painted = [label]
-        for folder in every:
-            found = folder.read(reader, name, label.shape)
-            score = 100 * miou(whole(label, found).sum(0), "exclude", scored)
-            numbers.append((name, folder.label.replace("\n", " "), float(score)))
-            painted.append(found)
+        for method, folder in folders.items():
+            painted.append(read_prediction(folder, reader, name, label.shape))
+            score = float(100 * miou(whole(label, painted[-1]).sum(0), "exclude", scored))
+            numbers.append((name, method.replace("\n", " "), score))
         thermal = np.repeat(sample.thermal[..., None], 3, axis=2)
-        pictures.append([sample.rgb, thermal, *(colours(each, table) for each in painted)])
+        pictures.append([sample.rgb, thermal, *(colours(each, palette) for each in painted)])
     check_one_size([row[0].shape for row in pictures])
-    titles = ["RGB", "thermal", "ground truth", *(folder.label for folder in every)]
-    legend = plots.Legend(dataset.classes, table)
-    made, cells = plots.picture_grid(pictures, names, titles, layout=layout, legend=legend)
+    titles, legend = ["RGB", "thermal", "ground truth", *folders], (dataset.classes, palette, [])
+    made, cells = plots.picture_grid(pictures, names, titles, layout, legend)
     return made, cells, pd.DataFrame(numbers, columns=["image", "method", "mIoU"])
 
 
@@ -244,17 +229,10 @@ def image_mious(counts: Counts) -> dict[str, float]:
 
 
 def most_different(scores: Mapping[str, Mapping[str, float]], number: int) -> tuple[str, ...]:
-    """Names of the images where the last method differs most from the first.
+    """Names of the images where the last method differs most from the first, that most first.
 
-    Args:
-        scores: method -> name -> score of that image; images with a NaN are left out.
-        number: how many.
-
-    Returns:
-        names by falling ``|last - first|``; equal ones in their order.
-
-    Raises:
-        InputError: fewer than two methods, or fewer images than requested.
+    `scores`: method -> name -> score of that image; images with a NaN are left out. InputError:
+    fewer than two methods, or fewer images than requested.
     """
     if len(scores) < 2:
         raise InputError("pick=largest_difference compares two methods; give two in methods=...")
@@ -302,31 +280,15 @@ class FramePair(NamedTuple):
 class Pairs:
     """The pairs of an export, with the predictions of methods; pixels count as in TC.
 
-    Args:
-        config: chooses the data set and the virtual views.
-        exported: folder that ``rgbt consistency export=...`` wrote.
-        methods: predictions of both frames.
-        form: of their files.
-        view_set: number of the set of virtual views, from 1.
-
     Raises:
         InputError: an export of other images or views, or an unfinished one.
     """
 
     def __init__(
-        self,
-        config: Config,
-        exported: str,
-        methods: Sequence[Folder],
-        form: FormatOptions,
-        view_set: int = 1,
+        self, config: Config, given: PictureOptions, exported: str, view_set: int = 1
     ) -> None:
-        self._folder, self._dataset, self.methods = (
-            Path(exported).expanduser(),
-            config.dataset,
-            methods,
-        )
-        listed = read_list(self._folder)
+        self._folder, self._dataset = Path(exported).expanduser(), config.dataset
+        self.methods, listed = labelled(given.methods), read_list(self._folder)
         self._after = NextFrames(self._dataset) if listed.frames == "next" else None
         self._views: Any = None if self._after else config.built("consistency")
         self.second = "next frame" if self._after else "synthesised"
@@ -342,7 +304,7 @@ class Pairs:
         self.listed = {each.first: each for each in listed.pairs if each.set == view_set}
         if not self.listed:
             raise InputError(f"view_set={view_set}: the export has no such set of views.")
-        self._reader = PredictionReader(self._dataset.classes, self._dataset.palette, form)
+        self._reader = PredictionReader(self._dataset.classes, self._dataset.palette, given.form)
 
     def read(self, name: str) -> FramePair:
         """The pair whose first frame is called `name`."""
@@ -352,9 +314,9 @@ class Pairs:
         rgb = read_rgb(self._folder / "rgb" / f"{pair.second}.png")
         thermal = np.asarray(decode(self._folder / "thermal" / f"{pair.second}.png"), np.uint8)
         predictions, differ = [], []
-        for folder in self.methods:
-            first = folder.read(self._reader, name, label.shape)
-            second = folder.read(self._reader, pair.second, label.shape)
+        for folder in self.methods.values():
+            first = read_prediction(folder, self._reader, name, label.shape)
+            second = read_prediction(folder, self._reader, pair.second, label.shape)
             predictions.append((first, second))
             differ.append((first[rows, columns] != second) & compared)
         frames = Frame(sample.rgb, sample.thermal, of_first), Frame(rgb, thermal, label)
@@ -383,63 +345,47 @@ class Pairs:
 @figure("temporal/fig1", "a real frame and its synthesised next one", "dataset", "consistency")
 def pair_rows(
     config: Config,
+    given: PictureOptions,
+    *,
     pairs: Exported,
-    methods: Scored,
-    view_set: Count = 1,
-    names: Names = "",
+    view_set: ViewSet = 1,
     pick: Pick = "first",
     rows: Rows = 1,
-    layout: Layout = "rows",
-    format: Form = "index",
-    palette: Palette = "dataset",
 ) -> Drawn:
     """Both frames, ground truth and predictions; pixels that lower TC are outlined."""
-    form = FormatOptions(form=format, palette=palette)
-    opened = Pairs(config, pairs, folders(methods), form, view_set)
-    chosen = tuple(split_list(names, "names")) if names else tuple(opened.listed)[:rows]
-    for name in chosen:
-        if name not in opened.listed:
-            near = nearest(name, [*opened.listed][:20])
-            raise InputError(f"names: the export has no image '{name}'; {near}.")
-    if not names and len(opened.listed) < rows:
-        raise InputError(f"rows={rows}, but the export has {len(opened.listed)} pairs.")
+    opened = Pairs(config, given, pairs, view_set)
+    methods, listed, names = [*opened.methods], [*opened.listed], given.names
     if pick == "largest_difference" and not names:
-        shares = {name: opened.read(name).shares for name in opened.listed}
+        shares = {name: opened.read(name).shares for name in listed}
         by_method = {
-            folder.label: {name: each[index] for name, each in shares.items()}
-            for index, folder in enumerate(opened.methods)
+            label: {name: each[index] for name, each in shares.items()}
+            for index, label in enumerate(methods)
         }
-        chosen = most_different(by_method, rows)
-    shown = [opened.read(name) for name in chosen]
+        names = ",".join(most_different(by_method, rows))
+    shown = [opened.read(name) for name in chosen_names(names, listed, rows)]
     check_one_size([pair.compared.shape for pair in shown])
-    labels, dataset = [folder.label for folder in opened.methods], config.dataset
-    palette_ = np.array(dataset.palette, np.uint8)
+    palette = np.array(config.dataset.palette, np.uint8)
     line = Line2D([], [], color=OUTLINE, linewidth=1.2, label=OUTLINED)
-    legend = plots.Legend(dataset.classes, palette_, [line])
-    rows_ = [
-        (pair.name, label, share)
-        for pair in shown
-        for label, share in zip(labels, pair.shares, strict=True)
-    ]
-    frame = pd.DataFrame(rows_, columns=["image", "method", "differing_percent"])
-    return draw_pairs(shown, labels, legend, opened.second, layout), frame
+    legend = config.dataset.classes, palette, [line]
+    cells = [(p.name, *each) for p in shown for each in zip(methods, p.shares, strict=True)]
+    frame = pd.DataFrame(cells, columns=["image", "method", "differing_percent"])
+    return draw_pairs(shown, methods, legend, opened.second, given.layout), frame
 
 
 @figure("temporal/fig6", "four pairs of frames, two columns each", "dataset", "consistency")
 def pair_columns(
     config: Config,
+    given: PictureOptions,
+    *,
     pairs: Exported,
-    methods: Scored,
-    view_set: Count = 1,
-    names: Names = "",
+    view_set: ViewSet = 1,
     pick: Pick = "first",
     rows: Rows = 4,
     layout: Layout = "columns",
-    format: Form = "index",
-    palette: Palette = "dataset",
 ) -> Drawn:
     """As `pair_rows`, with the number and the layout of the printed figure."""
-    return pair_rows(config, pairs, methods, view_set, names, pick, rows, layout, format, palette)
+    shown = replace(given, layout=layout)
+    return pair_rows(config, shown, pairs=pairs, view_set=view_set, pick=pick, rows=rows)
 
 
 @plots.styled
@@ -459,11 +405,11 @@ def draw_pairs(
             painted = [frame.label, *(both[index] for both in pair.predictions)]
             relative = ((frame.thermal.astype(float) - low) / max(high - low, 1)).clip(0, 1)
             thermal = (255 * colormaps[THERMAL_COLOURS](relative)[..., :3]).astype(np.uint8)
-            maps = [colours(each, legend.palette) for each in painted]
+            maps = [colours(each, legend[1]) for each in painted]
             pictures.append([frame.rgb, thermal, *maps])
         labels += [pair.name, second]
     titles = ("RGB", "thermal", "ground truth", *methods)
-    made, cells = plots.picture_grid(pictures, labels, titles, layout=layout, legend=legend)
+    made, cells = plots.picture_grid(pictures, labels, titles, layout, legend)
     for pair, of_pair in zip(pairs, cells[1::2], strict=True):
         for axes, differ, share in zip(of_pair[3:], pair.differ, pair.shares, strict=True):
             if differ.any():
@@ -491,23 +437,21 @@ class MaskExample(NamedTuple):
 @figure("crm/fig5", "masks on a pair of images: a square, and patches of four sizes", "dataset")
 def masks(
     config: Config,
+    *,
     names: Names = "",
     split: Split = "",
-    patches: Patches = PATCHES,
-    seed: Seed = 0,
+    patches: Annotated[tuple[Count, ...], Help("sides of the patches in pixels")] = PATCHES,
+    seed: Annotated[int, Interval(ge=0, le=MOST), Help("seed of the masks")] = 0,
 ) -> Drawn:
     """CRM, Fig. 5: RGB above, thermal below; what one image hides, the other shows."""
-    sample = config.dataset.read(config.names(names, split or "test")[0])
-    maskers = {
-        title: config.built("masker", *words) for title, words in masker_overrides(patches).items()
-    }
+    sample = config.dataset.read(config.names(names, split)[0])
+    chosen = masker_overrides(patches).items()
+    maskers = {title: config.built("masker", *words) for title, words in chosen}
     examples = mask_examples(sample, maskers, math.lcm(STRIDE, *patches), seed)
-    titles = [each.title for each in examples]
     pictures = [[each.rgb for each in examples], [each.thermal for each in examples]]
-    made, _ = plots.picture_grid(pictures, ("RGB", "thermal"), titles)
-    hidden = [(each.rgb_hidden.mean(), each.thermal_hidden.mean()) for each in examples]
-    frame = pd.DataFrame(hidden, columns=["rgb_hidden", "thermal_hidden"])
-    return made, frame.assign(mask=titles)[["mask", *frame.columns]]
+    made, _ = plots.picture_grid(pictures, ("RGB", "thermal"), [*maskers])
+    rows = [(e.title, e.rgb_hidden.mean(), e.thermal_hidden.mean()) for e in examples]
+    return made, pd.DataFrame(rows, columns=["mask", "rgb_hidden", "thermal_hidden"])
 
 
 def masker_overrides(patches: Sequence[int]) -> dict[str, tuple[str, ...]]:
@@ -522,18 +466,10 @@ def masker_overrides(patches: Sequence[int]) -> dict[str, tuple[str, ...]]:
 def mask_examples(
     sample: Sample, maskers: Mapping[str, AnyMasker], multiple: int, seed: int
 ) -> tuple[MaskExample, ...]:
-    """The pair under each mask.
+    """The pair under each mask, cut around its centre to whole cells: 64 does not divide 480.
 
-    The images are cut around their centre to whole cells: 64 pixels do not divide 480.
-
-    Args:
-        sample: a pair of the data set.
-        maskers: by title.
-        multiple: number of pixels that every cell divides.
-        seed: every mask is drawn from it and its place among the maskers.
-
-    Raises:
-        InputError: the images are smaller than one cell.
+    Every cell divides `multiple` pixels; a mask is drawn from the seed and its place among the
+    maskers. InputError: the images are smaller than one cell.
     """
     import torch
 

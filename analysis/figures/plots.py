@@ -10,7 +10,7 @@ import io
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -215,12 +215,8 @@ def staircase(region_map: NDArray[np.integer], step: int) -> list[tuple[int, int
     return places
 
 
-class Legend(NamedTuple):
-    """Classes below a grid of pictures: K names, (K, 3) uint8 colours, and further entries."""
-
-    names: Sequence[str]
-    palette: NDArray[np.uint8]
-    more: Sequence[Artist] = ()
+Legend = tuple[Sequence[str], NDArray[np.uint8], Sequence[Artist]]
+"""Classes below a grid of pictures: K names, (K, 3) uint8 colours, and further entries."""
 
 
 @styled
@@ -228,21 +224,13 @@ def picture_grid(
     rows: Sequence[Sequence[NDArray[Any]]],
     names: Sequence[str],
     titles: Sequence[str],
-    *,
     layout: str = "rows",
     legend: Legend | None = None,
 ) -> tuple[Figure, NDArray[Any]]:
-    """Pictures across a page, with a legend below.
+    """Pictures across a page, all of the same size, (H, W, 3) uint8, with a legend below.
 
-    Args:
-        rows: of every name, a picture per title, all of the same size: (H, W, 3) uint8.
-        names: of what is shown.
-        titles: of the ways in which each is shown.
-        layout: "rows": a row per name; "columns": a column per name.
-        legend: of the classes.
-
-    Returns:
-        the figure, and the axes of every name and title, whatever the layout.
+    A row per name and a column per title, or, with "columns", the other way round. Returns the
+    figure, and the axes of every name and title, whatever the layout.
     """
     is_columns = layout == "columns"
     across, down = (names, titles) if is_columns else (titles, names)
@@ -251,13 +239,12 @@ def picture_grid(
     tall = cell * height / width
     above = [folded(text, cell) for text in across]
     top = 0.2 + LINE * max(text.count("\n") for text in above)
-    patches: list[Artist] = []
-    if legend is not None:
-        patches = [
-            Patch(facecolor=colour / 255.0, edgecolor="black", linewidth=0.4, label=readable(name))
-            for name, colour in zip(legend.names, legend.palette, strict=True)
-        ]
-        patches += legend.more
+    classes, palette, more = legend or ((), (), ())
+    patches: list[Artist] = [
+        Patch(facecolor=colour / 255.0, edgecolor="black", linewidth=0.4, label=readable(name))
+        for name, colour in zip(classes, palette, strict=True)
+    ]
+    patches += more
     lines = -(-len(patches) // int(PAGE / LEGEND_ENTRY))
     figure = new_figure(PAGE, len(down) * (tall + 0.02) + top + 0.06 + 0.15 * lines)
     figure.set_layout_engine("compressed", w_pad=0.02, h_pad=0.02, wspace=0.0, hspace=0.0)

@@ -5,27 +5,22 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import pandas as pd
-from annotated_types import Interval
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from analysis.arguments import Blocks, Resamples
+from analysis.arguments import Blocks, Level, Resamples
 from analysis.figures import plots
 from analysis.figures.inputs import (
-    AbsentClasses,
-    Config,
     Drawn,
-    Runs,
-    RunsDir,
-    Split,
+    RunOptions,
     check_same_images,
     figure,
-    open_runs,
 )
 from analysis.robustness import CLEAN, Training, trainings
 from analysis.uncertainty import Resampling, estimate
@@ -62,46 +57,28 @@ SHORTEST, LONGEST = 16, 4096
 BANDS = {"images": "images", "seeds": "trainings", "both": "both"}
 """``band=`` -> the interval of `analysis.uncertainty.Estimate`."""
 
-Frames = Annotated[
-    Literal["aligned", "released", "next"],
-    Help(
-        "pairs of frames, counted by rgbt consistency: aligned or released (virtual views), or "
-        "next (consecutive frames)"
-    ),
-]
-Corruptions = Annotated[
-    str, Help("corruptions to show, separated by commas: noise:rgb,frozen; default: all measured")
-]
-Size = Annotated[str, Help(f"size of the map, HEIGHTxWIDTH, {SHORTEST} to {LONGEST} pixels each")]
-Band = Annotated[
-    Literal["widest", "images", "seeds", "both"],
-    Help("interval over images, seeds or both; widest: both if possible"),
-]
-Level = Annotated[float, Interval(gt=0, lt=1), Help("confidence level of that interval")]
-
 
 @figure("temporal/fig5", "TC and CA of variants by class")
 def consistency(
-    config: Config,
-    runs: Runs,
-    frames: Frames = "aligned",
-    runs_dir: RunsDir = "runs",
-    split: Split = "",
-    absent: AbsentClasses = None,
+    given: RunOptions,
+    *,
+    frames: Annotated[
+        Literal["aligned", "released", "next"],
+        Help(
+            "pairs of frames, counted by rgbt consistency: aligned or released (virtual views), or "
+            "next (consecutive frames)"
+        ),
+    ] = "aligned",
 ) -> Drawn:
     """TC and CA by class, of counts of pairs of frames (rgbt consistency)."""
-    opened = open_runs(runs, runs_dir, split, frames)
-    chosen = absent or convention(counts for seeds in opened.values() for counts in seeds)
-    frame = class_consistency(opened, chosen)
+    frame = class_consistency(given.counts(frames), given.absent)
     return draw_consistency(frame), frame
 
 
-def class_consistency(methods: Mapping[str, Sequence[Counts]], absent: Absent) -> pd.DataFrame:
-    """The series of Temporal, Fig. 5.
-
-    Args:
-        methods: variant -> counts of pairs of frames of its seeds.
-        absent: how a class without pixels counts, see `rgbt.metrics.scores`.
+def class_consistency(
+    methods: Mapping[str, Sequence[Counts]], absent: Absent | None
+) -> pd.DataFrame:
+    """The series of Temporal, Fig. 5, of counts of pairs of frames of the seeds of each variant.
 
     Returns:
         protocol, series, tick (class), value (TC), low (CA by the union of the protocol; never
@@ -111,34 +88,24 @@ def class_consistency(methods: Mapping[str, Sequence[Counts]], absent: Absent) -
     Raises:
         InputError: counts of single frames, or of different protocols, classes or scored classes.
     """
-    every = [(label, counts) for label, seeds in methods.items() for counts in seeds]
-    (first, reference), *others = every
-    for label, counts in others:
+    every = [counts for seeds in methods.values() for counts in seeds]
+    reference, convened = every[0], absent or convention(every)
+    for counts in every:
         if (counts.partition, counts.classes) != (reference.partition, reference.classes):
-            raise InputError(
-                f"runs: '{first}' was counted by {reference.partition} but '{label}' by "
-                f"{counts.partition}; give counts of one protocol and data set."
-            )
+            both = f"{reference.partition} and {counts.partition}"
+            raise InputError(f"runs: counts of different classes or protocols ({both}).")
         check_same_means(reference, counts)
     protocol = protocol_of(reference.partition)
     if protocol is None:
-        raise InputError(
-            f"runs: the counts of '{first}' ({reference.partition}) are of single frames; rgbt "
-            "consistency run=... counts the pairs of a run."
-        )
+        raise InputError(f"runs: {reference.partition} are counts of single frames.")
     labels = class_labels(reference.classes, reference.unscored)
     scored, rows = scored_classes(reference.classes, reference.unscored), []
     for label, seeds in methods.items():
-        tc, ca = (
-            np.mean(
-                [
-                    [value(names.of_class(name, score), each, absent) for name in reference.classes]
-                    for each in seeds
-                ],
-                axis=0,
-            )
-            for score in HEADLINES[protocol]
-        )
+        metrics = [
+            [names.of_class(k, each) for k in reference.classes] for each in HEADLINES[protocol]
+        ]
+        both_ = [[[value(m, each, convened) for m in of] for of in metrics] for each in seeds]
+        tc, ca = np.mean(both_, axis=0)
         means = float(class_mean(tc, scored)), float(class_mean(ca, scored))
         rows += [(protocol, label, *cells, *means) for cells in zip(labels, tc, ca, strict=True)]
     columns = ["protocol", "series", "tick", "value", "low", "mean_tc", "mean_ca"]
@@ -164,54 +131,34 @@ def draw_consistency(frame: pd.DataFrame) -> Figure:
     return made
 
 
+Corruptions = Annotated[
+    str, Help("corruptions to show, with commas: noise:rgb,frozen; default: all that were measured")
+]
+
+
 @figure("robustness", "mIoU under corruptions, one panel per corruption, one line per method")
-def robustness(
-    config: Config,
-    runs: Runs,
-    corruptions: Corruptions = "",
-    runs_dir: RunsDir = "runs",
-    split: Split = "",
-    absent: AbsentClasses = None,
-    *,
-    relative: bool = False,
-) -> Drawn:
+def robustness(given: RunOptions, *, corruptions: Corruptions = "") -> Drawn:
     """Mean over trainings, band of one standard deviation, of runs after rgbt robustness."""
-    found: dict[str, list[Training]] = {}
-    for word in split_list(runs, "runs"):
-        label, colon, place = word.partition(":")
-        for each in trainings(place if colon else word, runs_dir, split):
-            found.setdefault(label if colon else each.label, []).append(each)
     rows = split_list(corruptions, "corruptions") if corruptions else []
-    frame = corrupted(found, absent, rows)
-    return draw_robustness(frame, relative=relative), frame
+    frame = corrupted(given.open(trainings), given.absent, rows)
+    return draw_robustness(frame), frame
 
 
 @figure("robustness/relative", "the same in percent of the mIoU on clean images")
-def robustness_relative(
-    config: Config,
-    runs: Runs,
-    corruptions: Corruptions = "",
-    runs_dir: RunsDir = "runs",
-    split: Split = "",
-    absent: AbsentClasses = None,
-) -> Drawn:
+def robustness_relative(given: RunOptions, *, corruptions: Corruptions = "") -> Drawn:
     """Each training in percent of what it reaches on clean images."""
-    return robustness(config, runs, corruptions, runs_dir, split, absent, relative=True)
+    _, frame = robustness(given, corruptions=corruptions)
+    return draw_robustness(frame, "relative"), frame
 
 
 def corrupted(
     methods: Mapping[str, Sequence[Training]], absent: Absent | None, rows: Sequence[str] = ()
 ) -> pd.DataFrame:
-    """Scores of methods under corruptions.
-
-    Args:
-        methods: label -> trainings.
-        absent: how a class without pixels counts; None: as the counts say.
-        rows: names of the corruptions to show; (): all.
+    """Scores of the trainings of methods under corruptions, those called `rows`, or all.
 
     Returns:
         row (the corruption; "clean"), title, unit ("": no severities), severity, method, seeds,
-        and mIoU, sd, relative and relative_sd: mean and standard deviation (n - 1; NaN of one)
+        and mIoU, mIoU_sd, relative and relative_sd: mean and standard deviation (n - 1; NaN of one)
         over trainings, in percent, and in percent of what each training reaches on clean images.
 
     Raises:
@@ -235,16 +182,14 @@ def corrupted(
     every = pd.DataFrame(cells, columns=names_)
     known = [row for row in every["row"].unique() if row != CLEAN]
     shown = [row_name(row) for row in rows] or known
-    for row in shown:
+    for row in shown or [""]:
         if row not in known:
             raise InputError(f"corruptions: '{row}' was not measured; {nearest(row, known)}.")
-    if not known:
-        raise InputError("runs: only clean images were measured; rgbt robustness measures others.")
     every = every[every["row"].isin([CLEAN, *shown])]
     ladders = every[every["unit"] != ""].groupby(["row", "method", "training"])["severity"]
-    for row, each in ladders.agg(tuple).groupby("row"):
-        if each.nunique() > 1:
-            found = "; ".join(f"{each.index[n][1]}: {[*each.iloc[n]]}" for n in range(len(each)))
+    for row, each in ladders.agg(list).groupby("row"):
+        if each.map(str).nunique() > 1:
+            found = "; ".join(f"{key[1]} {severities}" for key, severities in each.items())
             raise InputError(f"runs: {row} was measured at different severities: {found}.")
     clean = every[every["row"] == CLEAN].set_index(["method", "training"])["mIoU"]
     places = pd.MultiIndex.from_frame(every[["method", "training"]])
@@ -253,26 +198,25 @@ def corrupted(
     return every.groupby(keys, sort=False, as_index=False).agg(
         seeds=("training", "size"),
         mIoU=("mIoU", "mean"),
-        sd=("mIoU", "std"),
+        mIoU_sd=("mIoU", "std"),
         relative=("relative", "mean"),
         relative_sd=("relative", "std"),
     )
 
 
 @plots.styled
-def draw_robustness(frame: pd.DataFrame, *, relative: bool) -> Figure:
+def draw_robustness(frame: pd.DataFrame, score: str = "mIoU") -> Figure:
     """One panel per corruption; the dashed line is the score on clean images.
 
     Corruptions without a severity, such as missing images, stand side by side below.
     """
-    score, spread = ("relative", "relative_sd") if relative else ("mIoU", "sd")
     seeds = frame["seeds"].astype(str) + " seed" + np.where(frame["seeds"] > 1, "s", "")
     data = frame.assign(
         series=frame["method"] + " (" + seeds + ")",
         x=frame["severity"],
         value=frame[score],
-        low=frame[score] - frame[spread],
-        high=frame[score] + frame[spread],
+        low=frame[score] - frame[f"{score}_sd"],
+        high=frame[score] + frame[f"{score}_sd"],
         tick=frame["title"],
     )
     clean, others = data[data["row"] == CLEAN], data[data["row"] != CLEAN]
@@ -307,7 +251,7 @@ def draw_robustness(frame: pd.DataFrame, *, relative: bool) -> Figure:
         axes.set_title(plots.folded(title, room - 0.3), fontsize=plots.SMALL)
         axes.tick_params(labelleft=column == 0)
         if column == 0:
-            axes.set_ylabel("% of clean mIoU" if relative else "mIoU (%)")
+            axes.set_ylabel("% of clean mIoU" if score == "relative" else "mIoU (%)")
     assert first is not None, "a figure has a panel"
     first.set_ylim(0, 1.08 * first.get_ylim()[1])
     plots.series_legend(made, first, columns=4)
@@ -316,39 +260,36 @@ def draw_robustness(frame: pd.DataFrame, *, relative: bool) -> Figure:
 
 @figure("regions/heat", "mIoU of each region as a heat map, one per method")
 def region_heat(
-    config: Config,
-    runs: Runs,
-    size: Size = "480x640",
-    runs_dir: RunsDir = "runs",
-    split: Split = "",
-    absent: AbsentClasses = None,
+    given: RunOptions,
+    *,
+    size: Annotated[
+        str, Help(f"size of the map, HEIGHTxWIDTH, {SHORTEST} to {LONGEST} pixels each")
+    ] = "480x640",
 ) -> Drawn:
     """Regions painted by their mIoU."""
     match = re.fullmatch(r"([0-9]{1,4})x([0-9]{1,4})", size)
     hw = (int(match[1]), int(match[2])) if match else (0, 0)
     if not SHORTEST <= min(hw) <= max(hw) <= LONGEST:
-        raise InputError(
-            f"size={size}: expected HEIGHTxWIDTH with {SHORTEST} to {LONGEST} pixels each."
-        )
-    frame = region_means(open_runs(runs, runs_dir, split), absent)
+        raise InputError(f"size={size}: expected HEIGHTxWIDTH, {SHORTEST} to {LONGEST} each.")
+    frame = region_means(given.counts(), given.absent)
     return draw_heat(frame, hw), frame
 
 
 @figure("regions/profile", "mIoU by region with intervals, one line per method")
 def region_profile(
-    config: Config,
-    runs: Runs,
-    band: Band = "widest",
+    given: RunOptions,
+    *,
+    band: Annotated[
+        Literal["widest", "images", "seeds", "both"],
+        Help("interval over images, seeds or both; widest: both if possible"),
+    ] = "widest",
     resamples: Resamples = 10_000,
     level: Level = 0.95,
     blocks: Blocks = "auto",
-    runs_dir: RunsDir = "runs",
-    split: Split = "",
-    absent: AbsentClasses = None,
 ) -> Drawn:
     """MIoU over the regions with bands."""
-    settings = Resampling(resamples=resamples, level=level, blocks=blocks)
-    frame = region_means(open_runs(runs, runs_dir, split), absent, settings, band)
+    drawn = Resampling(resamples=resamples, level=level, blocks=blocks)
+    frame = region_means(given.counts(), given.absent, drawn, band)
     return draw_profiles(frame, level), frame
 
 
@@ -358,13 +299,9 @@ def region_means(
     settings: Resampling | None = None,
     band: str = "widest",
 ) -> pd.DataFrame:
-    """MIoU by region of methods, mean over seeds, in percent.
+    """MIoU by region of methods, mean over seeds, in percent; without `settings` no intervals.
 
-    Args:
-        methods: label -> counts of the same images, one per seed.
-        absent: how a class without pixels counts; None: as the counts say.
-        settings: of the intervals; None: none.
-        band: what the interval is over; "widest": both where there are several seeds, else images.
+    `band`: what these are over; "widest": both where there are several seeds, else images.
 
     Returns:
         series, partition, x (region from 1), value, low and high (NaN: no interval), mIoU (of the
@@ -373,41 +310,30 @@ def region_means(
     Raises:
         InputError: an interval over seeds of a single seed, or counts that do not belong together.
     """
-    every = [(label, counts) for label, seeds in methods.items() for counts in seeds]
-    (first, reference), rows = every[0], []
-    for label, counts in every:
+    every = [counts for seeds in methods.values() for counts in seeds]
+    reference, convened, rows = every[0], absent or convention(every), []
+    for counts in every:
         if counts.partition != reference.partition:
-            raise InputError(
-                f"runs: '{first}' was counted over {reference.partition} but '{label}' over "
-                f"{counts.partition}; give counts with one partition."
-            )
-    convened = absent or convention(counts for _, counts in every)
+            both = f"{reference.partition} and {counts.partition}"
+            raise InputError(f"runs: {both}; give counts with one partition.")
+        check_same_means(reference, counts)
     regions = [names.region(region) for region in range(1, reference.counts.shape[1] + 1)]
     for label, seeds in methods.items():
-        for counts in seeds:
-            check_same_means(reference, counts)
         kind = ("both" if len(seeds) > 1 else "images") if band == "widest" else band
         if len(seeds) == 1 and kind != "images":
             raise InputError(f"band={band} needs at least two seeds, but '{label}' has one.")
-        means = [
-            np.mean([value(m, each, convened) for each in seeds]) for m in (*regions, names.MIOU)
-        ]
+        metrics = (*regions, names.MIOU)
+        means = [float(np.mean([value(m, each, convened) for each in seeds])) for m in metrics]
         ends, covers = [(math.nan, math.nan)] * len(regions), "nothing"
         if settings is not None:
-            made = Resampling(
-                resamples=settings.resamples,
-                level=settings.level,
-                blocks=settings.blocks,
-                absent=convened,
-            )
-            found = estimate(seeds, regions, made)
+            found = estimate(seeds, regions, replace(settings, absent=convened))
             intervals = [getattr(found[name], BANDS[kind]) for name in regions]
             if None not in intervals:
                 ends = [(each.low, each.high) for each in intervals]
                 covers = "images and seeds" if kind == "both" else kind
-        about = float(means[-1]), len(seeds), len(seeds[0].names), covers
-        for region, (mean, (low, high)) in enumerate(zip(means[:-1], ends, strict=True), 1):
-            rows.append((label, reference.partition, region, float(mean), low, high, *about))
+        about = means.pop(), len(seeds), len(seeds[0].names), covers
+        for region, (mean, bounds) in enumerate(zip(means, ends, strict=True), 1):
+            rows.append((label, reference.partition, region, mean, *bounds, *about))
     columns = ["series", "partition", "x", "value", "low", "high"]
     return pd.DataFrame(rows, columns=[*columns, "mIoU", "seeds", "images", "covers"])
 
@@ -490,7 +416,7 @@ def map_of(partition: str, image_hw: tuple[int, int]) -> NDArray[np.uint8]:
 
 @figure("multihead/fig3", "gradients of entropy minimisation and maximum squares loss")
 @plots.styled
-def gradients(config: Config) -> Drawn:
+def gradients() -> Drawn:
     """Both curves over the probability; analytic, without input."""
     frame = gradient_curves()
     made = plots.new_figure(plots.COLUMN, 2.3)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
@@ -19,24 +20,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 
-from analysis.figures import plots
-from analysis.figures.inputs import (
-    AbsentClasses,
-    Config,
-    Count,
-    Drawn,
-    Maps,
-    Names,
-    Part,
-    Scored,
-    Split,
-    Statistics,
-    check_one_dataset,
-    figure,
-    open_maps,
-    open_scored,
-    open_statistics,
-)
+from analysis.figures import inputs, plots
+from analysis.figures.inputs import Config, Drawn, StatisticsOptions, figure
 from analysis.predictions.maps import PixelMaps
 from analysis.statistics.collect import ALL, MODALITIES, SpatialStatistics
 from analysis.statistics.sample import (
@@ -70,13 +55,21 @@ SPREAD = 0.5
 FAR_APART = 5.0
 """A logarithmic axis where one modality's median is more than this many times the other's."""
 
-Estimator = Annotated[
-    Literal["immerkaer", "wavelet_mad", "std"],
-    Help("estimator of the noise: immerkaer, wavelet_mad or std"),
-]
-Average = Annotated[
-    Literal["pooled", "images"], Help("signal-to-noise ratio over images: pooled or images")
-]
+RESAMPLING = Resampling(resamples=2000)
+"""Of the bars of Figs. 5 and 6."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MapOptions(StatisticsOptions):
+    """Pixel maps, or statistics."""
+
+    maps: Annotated[str, Help("output of rgbt score: folder or maps.npz")] = ""
+
+    def open_maps(self, split: str) -> PixelMaps:
+        """The maps; InputError: of another split."""
+        maps = PixelMaps.load(inputs.file_in(self.maps, "maps.npz"))
+        inputs.check_split(split, maps.split, self.maps)
+        return maps
 
 
 class Heat(NamedTuple):
@@ -100,15 +93,9 @@ class Heat(NamedTuple):
 
 
 def iou_heat(maps: PixelMaps, regions: Regions, images: str = "") -> Heat:
-    """Pixel-level IoU, mean over classes (Fig. 1a); classes absent at a pixel are in no mean there.
+    """Pixel-level IoU, mean over classes (Fig. 1a), over rings; `images`: which, where it matters.
 
-    Args:
-        maps: intersections and unions of a method's predictions, all images together.
-        regions: a partition into rings, and how a class counts that a ring lacks.
-        images: which they are, where the map beside it is of others.
-
-    Raises:
-        InputError: a partition that has no centre.
+    The map excludes classes that never occur at a pixel; in a ring they count as `regions` says.
     """
     region_map = ring_map(regions, maps.intersection.shape[1:])
 
@@ -125,12 +112,7 @@ def iou_heat(maps: PixelMaps, regions: Regions, images: str = "") -> Heat:
 
 
 def occupancy_heat(stats: SpatialStatistics, regions: Regions, part: str = ALL) -> Heat:
-    """Sample occupancy rate (Fig. 1b; Eq. 1), with its mean over rings (Eq. 2).
-
-    Raises:
-        InputError: a partition that has no centre, a part that the data set does not hold, or a
-            data set without a background class.
-    """
+    """Sample occupancy rate of the images of a part (Fig. 1b; Eq. 1), over rings (Eq. 2)."""
     values = occupancy_map(stats, part)
     region_map = ring_map(regions, values.shape)
     by_region = 100 * occupancy_over(stats, region_map, part)
@@ -162,69 +144,54 @@ def ring_map(regions: Regions, image_hw: tuple[int, ...]) -> NDArray[np.uint8]:
     *("dataset", "metric"),
 )
 @plots.styled
-def heats(
-    config: Config,
-    maps: Maps = "",
-    statistics: Statistics = "",
-    split: Split = "",
-    part: Part = ALL,
-) -> Drawn:
+def heats(config: Config, given: MapOptions, *, part: inputs.Part = ALL) -> Drawn:
     """One panel per map with its three numbers, and one scale from 0 to 1 for all."""
-    has_statistics = bool(statistics) or config.chooses("dataset")
-    if not maps and not has_statistics:
-        raise InputError("maps: give maps=..., statistics=... or dataset=..., or two of them.")
-    if part != ALL and not has_statistics:
-        raise InputError(f"part={part}: maps=... are of all images.")
-    shown = []
-    if maps:
-        opened = open_maps(maps, "" if has_statistics else split)
-        shown.append(iou_heat(opened, config.regions, "" if part == ALL else "all images"))
+    shown, has_statistics = [], bool(given.statistics) or config.chooses("dataset")
+    if not has_statistics and (part != ALL or not given.maps):
+        raise InputError(f"statistics: needed for part={part} or without maps=...")
+    if given.maps:
+        maps = given.open_maps("" if has_statistics else given.split)
+        shown.append(iou_heat(maps, config.regions, "all images" if part != ALL else ""))
     if has_statistics:
-        stats = open_statistics(config, statistics, split)
-        shown.append(occupancy_heat(stats, config.regions, part))
-    is_wide = len(shown) > 1
+        shown.append(occupancy_heat(given.open(config), config.regions, part))
     height, width = shown[0].values.shape
-    panel = (plots.PAGE - 0.8) / len(shown) if is_wide else plots.COLUMN - 0.6
-    page = plots.PAGE if is_wide else plots.COLUMN
+    page = plots.PAGE if len(shown) > 1 else plots.COLUMN
+    panel = (page - (0.8 if len(shown) > 1 else 0.6)) / len(shown)
     made = plots.new_figure(page, panel * height / width + 0.62)
     panels = made.subplots(1, len(shown), squeeze=False)[0]
     for letter, axes, each in zip("ab", panels, shown, strict=False):
         # The borders of centre and edge alone: 0 centre, 1 between, 2 edge.
         is_edge = each.region_map == each.region_map.max()
         borders = (each.region_map > 0).astype(np.uint8) + is_edge
-        image = plots.heat(axes, each.values, borders, vmin=0, vmax=1)
-        axes.set_title(f"({letter}) {each.what}: {each.source}"[0 if is_wide else 4 :])
+        image: Any = plots.heat(axes, each.values, borders, vmin=0, vmax=1)
+        axes.set_title(f"({letter}) {each.what}: {each.source}"[0 if len(shown) > 1 else 4 :])
         numbers = ", ".join(f"{name} {getattr(each, name):.1f} %" for name in Heat._fields[-3:])
         where = f"centre, edge: inner and outer region of {config.regions.name}, pixels pooled"
         axes.set_xlabel(f"{each.measure}: {numbers}\n{where}", fontsize=plots.SMALL)
-    label: Any = " or ".join(each.what for each in shown)
-    made.colorbar(image, ax=[*panels], shrink=0.8, pad=0.015, label=label)  # type: ignore[arg-type]
-    frame = pd.DataFrame(shown)[["what", "source", "measure", *Heat._fields[-3:]]]
-    return made, frame
+    label = " or ".join(each.what for each in shown)
+    made.colorbar(image, ax=[*panels], shrink=0.8, pad=0.015, label=label)
+    return made, pd.DataFrame(shown)[["what", "source", "measure", *Heat._fields[-3:]]]
 
 
 @figure("spatialseg/fig2", "IoU, accuracy and occupancy over strips and rings", "dataset")
 def trends(
     config: Config,
-    methods: Scored,
-    statistics: Statistics = "",
-    split: Split = "",
-    regions: Annotated[Count, Help("number of regions of each partition")] = 5,
-    absent: AbsentClasses = None,
+    given: StatisticsOptions,
+    *,
+    methods: inputs.Methods,
+    regions: Annotated[inputs.Count, Help("number of regions of each partition")] = 5,
+    absent: inputs.AbsentClasses = None,
 ) -> Drawn:
     """How the scores change over three partitions."""
-    counts = {each: open_scored(methods, f"{each}{regions}") for each in TRENDS}
+    counts = {each: inputs.open_scored(methods, f"{each}{regions}") for each in TRENDS}
     convened = absent or convention(c for each in counts.values() for c in each.values())
-    stats = open_statistics(config, statistics, split)
-    first = next(iter(counts["ring"].values()))
-    check_one_dataset(stats, first)
-    frames = []
-    for partition, of_methods in counts.items():
+    stats, first = given.open(config), next(iter(counts["ring"].values()))
+    inputs.check_one_dataset(stats, first)
+    frames, (height, width) = [], stats.region_map.shape
+    for partition, scored in counts.items():
         chosen: Any = {"partition": partition, "aspect": "image" if partition == "ring" else None}
-        cut = Regions(regions=regions, absent=convened, **chosen)
-        hw = stats.region_map.shape
-        occupancy = occupancy_over(stats, cut.map((hw[0], hw[1])))
-        frames.append(trend(partition, occupancy, of_methods, convened))
+        cut = Regions(regions=regions, absent=convened, **chosen).map((height, width))
+        frames.append(trend(partition, occupancy_over(stats, cut), scored, convened))
     frame = pd.concat(frames, ignore_index=True)
     return draw_trends(frame, (stats.split, first.split)), frame
 
@@ -237,39 +204,30 @@ def trend(
     IoU and accuracy of a region are means over the scored classes, of the pixels of all images.
     Whether the paper counts the background is not stated; here it counts, as in its tables.
 
-    Args:
-        partition: a key of `TRENDS`.
-        occupancy: (R,) in 0..1.
-        methods: label -> counts; InputError if they are not over R regions of that partition.
-        absent: how a class without pixels counts, see `rgbt.metrics.scores`.
-
     Returns:
         partition, kind ("IoU", "Acc", "SOR"), series, x (region from 1), score (percent), and
         value: less that of region 1, as the figure shows it.
     """
-    series: list[tuple[str, str, Values]] = []
+    series = {("SOR", "SOR"): occupancy}
     for label, counts in methods.items():
         check_partition(label, counts, f"{partition}{len(occupancy)}")
-        series.append(("IoU", label, miou(counts.by_region(), absent, counts.scored)))
-    for label, counts in methods.items():
-        accuracy = class_mean(recall(counts.by_region(), absent), counts.scored)
-        series.append(("Acc", label, accuracy))
+        summed = counts.by_region()
+        series["IoU", f"IoU ({label})"] = miou(summed, absent, counts.scored)
+        series["Acc", f"Acc ({label})"] = class_mean(recall(summed, absent), counts.scored)
     rows = [
-        (partition, kind, f"{kind} ({label})" if label else kind, region, 100 * score)
-        for kind, label, scores in [*series, ("SOR", "", occupancy)]
-        for region, score in enumerate(scores.tolist(), 1)
+        (partition, *name, region, score, score - 100 * scores[0])
+        for name, scores in sorted(series.items(), key=lambda each: -"SAI".index(each[0][0][0]))
+        for region, score in enumerate(100 * scores, 1)
     ]
-    frame = pd.DataFrame(rows, columns=["partition", "kind", "series", "x", "score"])
-    first = frame.groupby("series")["score"].transform("first")
-    return frame.assign(value=frame["score"] - first, low=math.nan, high=math.nan)
+    columns = ["partition", "kind", "series", "x", "score", "value"]
+    return pd.DataFrame(rows, columns=columns).assign(low=math.nan, high=math.nan)
 
 
 def check_partition(label: str, counts: Counts, partition: str) -> None:
     """Refuse counts over other regions."""
-    if not counts.partition.startswith(partition):
+    if counts.partition not in (partition, f"{partition}_released_3_4"):
         raise InputError(
-            f"methods: '{label}' was counted over {counts.partition}, expected {partition}; score "
-            "it again with that partition."
+            f"methods: '{label}' was counted over {counts.partition}, expected {partition}."
         )
 
 
@@ -285,21 +243,19 @@ def draw_trends(frame: pd.DataFrame, splits: tuple[str, str]) -> Figure:
             face = how["color"] if kind == "IoU" else "white"
             styles[name] = {**how, "linestyle": line, "markerfacecolor": face}
     for axes, (partition, title) in zip(panels, TRENDS.items(), strict=True):
-        rows = frame[frame["partition"] == partition]
         axes.set_title(title)
         axes.axhline(0, color="grey", linewidth=0.6)
-        plots.line_plot(axes, rows, styles)
-        plots.region_axis(axes, rows["x"].max())
+        plots.line_plot(axes, frame[frame["partition"] == partition], styles)
+        plots.region_axis(axes, frame["x"].max())
     panels[0].set_ylabel("change from region 1\n(percent points)")
     plots.series_legend(made, panels[0], columns=5)
-    _note_splits(made, splits)
+    note_splits(made, *splits)
     return made
 
 
-def _note_splits(made: Figure, splits: tuple[str, str]) -> None:
+def note_splits(made: Figure, occupancy: str, scores: str) -> None:
     """A note above the figure where occupancy and scores are of different splits."""
-    occupancy, scores = splits
-    if scores and occupancy != scores:
+    if scores not in ("", occupancy):
         made.suptitle(f"SOR: split {occupancy}; scores: split {scores}", fontsize=plots.SMALL)
 
 
@@ -310,24 +266,24 @@ def _note_splits(made: Figure, splits: tuple[str, str]) -> None:
 )
 def classes(
     config: Config,
-    methods: Scored = "",
-    statistics: Statistics = "",
-    split: Split = "",
-    part: Part = ALL,
-    absent: AbsentClasses = None,
+    given: StatisticsOptions,
+    *,
+    methods: inputs.Methods = "",
+    part: inputs.Part = ALL,
+    absent: inputs.AbsentClasses = None,
 ) -> Drawn:
     """Where the samples of each class lie, beside the mIoU of each region."""
-    stats = open_statistics(config, statistics, split, by_region=True)
-    method = None
+    stats, method = given.open(config, by_region=True), None
     if methods:
-        method, *others = open_scored(methods, stats.partition).items()
+        method, *others = inputs.open_scored(methods, stats.partition).items()
         if others:
-            raise InputError(f"methods: the figure shows one method, got {1 + len(others)}.")
-        check_one_dataset(stats, method[1])
+            raise InputError("methods: the figure shows one method.")
+        inputs.check_one_dataset(stats, method[1])
     frame = class_regions(stats, part, method, absent)
-    splits = stats.split, method[1].split if method else ""
     images = "" if part == ALL else f"; images of the {part}"
-    return draw_classes(frame, f"region ({stats.partition}){images}", splits), frame
+    made = draw_classes(frame, f"region ({stats.partition}){images}")
+    note_splits(made, stats.split, method[1].split if method else "")
+    return made, frame
 
 
 def class_regions(
@@ -336,14 +292,9 @@ def class_regions(
     method: tuple[str, Counts] | None = None,
     absent: Absent | None = None,
 ) -> pd.DataFrame:
-    """The series of Fig. 3: share_kr = 100 SOR_kr / max_r SOR_kr, and the mIoU in percent.
+    """The series of Fig. 3: share_kr = 100 SOR_kr / max_r SOR_kr, and the mIoU of a method.
 
-    Args:
-        stats: of a data set; the paper cuts it into nine rings.
-        part: "all", "day" or "night", of the shares and of the mIoU.
-        method: label and counts of a method over the same regions. The mean is over all scored
-            classes with the background, which the paper does not state.
-        absent: how a class without pixels counts; None: as the counts say.
+    The mIoU is over all scored classes with the background, which the paper does not state.
 
     Returns:
         series (class, "mIoU (label)"), x (region from 1), value; NaN: a class that occurs nowhere.
@@ -363,33 +314,25 @@ def class_regions(
                 raise InputError(f"part={part}: the counts of '{label}' contain no such image.")
         scores = miou(counts.by_region(), absent or counts.absent, counts.scored)
         series[f"mIoU ({label})"] = 100 * scores
-    rows = [
-        (name, region, value)
-        for name, values in series.items()
-        for region, value in enumerate(values.tolist(), 1)
-    ]
+    rows = [(name, x, each) for name, values in series.items() for x, each in enumerate(values, 1)]
     return pd.DataFrame(rows, columns=["series", "x", "value"]).assign(low=math.nan, high=math.nan)
 
 
 @plots.styled
-def draw_classes(frame: pd.DataFrame, regions: str, splits: tuple[str, str]) -> Figure:
+def draw_classes(frame: pd.DataFrame, regions: str) -> Figure:
     """One line per class, and the mIoU as a thick black line, all in percent on one axis."""
     made = plots.new_figure(plots.PAGE, 2.8)
-    axes = made.subplots()
-    styles: dict[str, dict[str, Any]] = {}
+    axes, more, styles = made.subplots(), "", dict[str, dict[str, Any]]()
     for name, rows in frame.groupby("series"):
         missing = " (none)" if rows["value"].isna().all() else ""
         styles[str(name)] = {"label": plots.readable(str(name)) + missing}
         if str(name).startswith("mIoU ("):
-            look = {"linewidth": 2.2, "marker": "*", "markersize": 7, "linestyle": "-"}
-            styles[str(name)] = {"color": plots.APART, **look}
+            look = {"color": plots.APART, "marker": "*", "linestyle": "-"}
+            styles[str(name)], more = {**look, "linewidth": 2.2, "markersize": 7}, "; mIoU (%)"
     plots.line_plot(axes, frame, styles)
     plots.region_axis(axes, frame["x"].max(), regions)
-    axes.set(ylim=(0, 105))
-    more = "; mIoU (%)" if splits[1] else ""
-    axes.set_ylabel(f"SOR, percent of the class's\nlargest region{more}")
+    axes.set(ylim=(0, 105), ylabel=f"SOR, percent of the class's\nlargest region{more}")
     made.legend(*axes.get_legend_handles_labels(), loc="outside right center")
-    _note_splits(made, splits)
     return made
 
 
@@ -399,34 +342,27 @@ def draw_classes(frame: pd.DataFrame, regions: str, splits: tuple[str, str]) -> 
     metric="ring9",
 )
 @plots.styled
-def regions(
-    config: Config,
-    maps: Maps = "",
-    statistics: Statistics = "",
-    split: Split = "",
-    names: Names = "",
-) -> Drawn:
+def regions(config: Config, given: MapOptions, *, names: inputs.Names = "") -> Drawn:
     """The regions numbered from 1 over a picture."""
-    if sum([bool(maps), bool(statistics), config.chooses("dataset")]) != 1:
+    if sum([bool(given.maps), bool(given.statistics), config.chooses("dataset")]) != 1:
         raise InputError("maps: give one of maps=..., statistics=... and dataset=...")
     picture: NDArray[Any]
-    what = ""
-    if maps:
-        opened = open_maps(maps, split)
+    what, how = "", {"vmin": 0, "vmax": 1}
+    if given.maps:
+        opened = given.open_maps(given.split)
         picture, what = opened.iou(), f"IoU ({opened.name}, {opened.split})"
-    elif statistics:
-        stats = open_statistics(config, statistics, split)
+    elif given.statistics:
+        stats = given.open(config)
         picture, what = occupancy_map(stats), f"sample occupancy ({stats.split})"
     else:
-        picture = config.dataset.read(config.names(names, split or "test")[0]).rgb
+        picture = config.dataset.read(config.names(names, given.split)[0]).rgb
     region_map = config.regions.map((picture.shape[0], picture.shape[1]))
-    height, width = region_map.shape
     panel = plots.COLUMN - (0.5 if what else 0.1)
+    height, width = region_map.shape
     made = plots.new_figure(plots.COLUMN, panel * height / width + 0.1)
     axes = made.subplots()
     numbers = [str(region + 1) for region in range(region_map.max() + 1)]
-    how = {"vmin": 0, "vmax": 1} if what else {}
-    shown: Any = plots.heat(axes, picture, region_map, numbers, panel, **how)
+    shown: Any = plots.heat(axes, picture, region_map, numbers, panel, **(how if what else {}))
     if what:
         made.colorbar(shown, ax=axes, shrink=0.9, pad=0.02, label=what)
     pixels = np.bincount(region_map.ravel())
@@ -438,9 +374,9 @@ def regions(
     *("dataset", "metric"),
     metric="ring9",
 )
-def laplacian(config: Config, statistics: Statistics = "", split: Split = "") -> Drawn:
+def laplacian(config: Config, given: StatisticsOptions) -> Drawn:
     """Laplacian variance by region (Eq. 3), mean over images."""
-    sample = Sample(open_statistics(config, statistics, split, by_region=True), RESAMPLING)
+    sample = Sample(given.open(config, by_region=True), RESAMPLING)
     frame = by_region(sample, "laplacian")
     return draw_by_region(frame, sample, "Laplacian variance\n(squared grey levels)"), frame
 
@@ -452,20 +388,20 @@ def laplacian(config: Config, statistics: Statistics = "", split: Split = "") ->
 )
 def snr(
     config: Config,
-    statistics: Statistics = "",
-    split: Split = "",
-    estimator: Estimator = "immerkaer",
-    average: Average = "pooled",
+    given: StatisticsOptions,
+    *,
+    estimator: Annotated[
+        Literal["immerkaer", "wavelet_mad", "std"],
+        Help("estimator of the noise: immerkaer, wavelet_mad or std"),
+    ] = "immerkaer",
+    average: Annotated[
+        Literal["pooled", "images"], Help("signal-to-noise ratio over images: pooled or images")
+    ] = "pooled",
 ) -> Drawn:
     """Signal-to-noise ratio by region (Eq. 4)."""
-    stats = open_statistics(config, statistics, split, by_region=True)
-    sample = Sample(stats, RESAMPLING, (estimator, average))
+    sample = Sample(given.open(config, by_region=True), RESAMPLING, (estimator, average))
     frame = by_region(sample, "snr")
     return draw_by_region(frame, sample, f"signal-to-noise ratio ({estimator})"), frame
-
-
-RESAMPLING = Resampling(resamples=2000)
-"""Of the bars of Figs. 5 and 6."""
 
 
 def by_region(sample: Sample, quantity: str) -> pd.DataFrame:
@@ -478,10 +414,10 @@ def by_region(sample: Sample, quantity: str) -> pd.DataFrame:
     for index, modality in enumerate(MODALITIES):
         for part in sample.stats.subsets():
             images = int(sample.stats.chosen(part).sum())
-            about = f"{NAMES[modality]}, {part}", modality, part, images
             values = getattr(sample, quantity)(part)[:, index]
             for region, of_region in enumerate(values.T, 1):
-                rows.append((*about, region, *sample.bounded(of_region, part)))
+                about = f"{NAMES[modality]}, {part}", modality, part, images, region
+                rows.append((*about, *sample.bounded(of_region, part)))
     names = ["series", "modality", "part", "images", "x", "value", "low", "high"]
     return pd.DataFrame(rows, columns=names)
 
@@ -490,8 +426,7 @@ def by_region(sample: Sample, quantity: str) -> pd.DataFrame:
 def draw_by_region(frame: pd.DataFrame, sample: Sample, measure: str) -> Figure:
     """Six lines with intervals: modality by colour, part by marker and line."""
     made = plots.new_figure(plots.COLUMN, 3.1)
-    axes = made.subplots()
-    styles = {}
+    axes, styles = made.subplots(), {}
     for name, modality, part in frame[["series", "modality", "part"]].drop_duplicates().to_numpy():
         colour, (marker, line) = plots.COLOURS[MODALITIES.index(modality)], MARKS[part]
         look: dict[str, Any] = {"color": colour, "marker": marker, "linestyle": line}
