@@ -87,7 +87,7 @@ def main(options: Options, overrides: list[str]) -> int:
     from analysis.uncertainty import Resampling
     from rgbt.files.atomic import write_atomic
     from rgbt.metrics.metric import Regions
-    from rgbt.terminal import info, path_lines, plain_text, print_rich, rich_table
+    from rgbt.terminal import path_lines, plain_text, print_rich, rich_table
 
     out, way = options.out, (options.estimator, options.average)
     check_out(out)
@@ -111,8 +111,6 @@ def main(options: Options, overrides: list[str]) -> int:
         stats = collect(dataset, options.split, settings, advance, left_out.add)
     remarks = [f"left out: {sentence}" for sentence in sorted(left_out)]
     remarks += [] if stats.background else [samples.no_background(stats)]
-    for each in remarks:
-        info(each)
     sample = samples.Sample(stats, drawn, way)
     frame, found = samples.quantities(stats), judged(sample)
     # Of the statements about noise those of the chosen estimator and average.
@@ -120,11 +118,10 @@ def main(options: Options, overrides: list[str]) -> int:
     after = [tables.statement_table(found[is_shown], options.level), tables.estimator_table(found)]
     if reference is not None:
         other = samples.Sample(reference, drawn, way)
-        of_other = judged(other)
-        after += tables.comparison_tables((sample, other), (found[is_shown], of_other))
+        after += tables.comparison_tables((sample, other), (found[is_shown], judged(other)))
     heading = f"{tables.heading(stats)}; intervals over {sample.blocks.said}"
     shown = [*tables.region_tables(frame, stats, way), *after]
-    print_rich(Group(plain_text(heading), *map(rich_table, shown)))
+    print_rich(Group(plain_text("\n".join([heading, *remarks])), *map(rich_table, shown)))
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         every = [*tables.region_tables(frame, stats), *after]

@@ -63,7 +63,8 @@ ROOMS = {
     },
     **{"sweeps.table": {"sweeps.worker"}, "sweeps.verdicts": {"sweeps.table", "sweeps.worker"}},
     "sweeps.rendering": {f"sweeps.{each}" for each in ("table", "worker", "report", "verdicts")},
-    **{"analysis.statistics": set(), "analysis.predictions": set(), "analysis.uncertainty": set()},
+    **{"analysis.predictions": set(), "analysis.uncertainty": set()},
+    "analysis.statistics": {"analysis.uncertainty"},
     "analysis.figures": {f"analysis.{e}" for e in ("statistics", "predictions", "uncertainty")},
     "analysis.report": {"analysis.uncertainty", "analysis.figures"},
 }

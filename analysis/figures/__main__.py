@@ -26,7 +26,7 @@ def _options() -> Iterator[tuple[str, Any, Any]]:
     every = [types_of(spec.options) for spec in FIGURES.values()]
     for name, annotation in {key: kind for each in every for key, kind in each.items()}.items():
         kind, *notes = get_args(annotation)
-        yield name, Annotated[(kind | None, *notes)], None  # type: ignore[valid-type]
+        yield name, Annotated[(kind | None, *notes)], None
 
 
 Options: Any = make_dataclass("Options", _options(), frozen=True)

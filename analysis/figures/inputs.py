@@ -7,7 +7,7 @@ from dataclasses import MISSING, dataclass, field, fields, make_dataclass
 from functools import cached_property
 from inspect import Parameter, signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_type_hints
 
 import pandas as pd
 from annotated_types import Interval
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 Drawn = tuple[Figure, pd.DataFrame]
 """A figure, and the numbers that it shows."""
+
+Make = TypeVar("Make", bound=Callable[..., Drawn])
 
 Count = Annotated[int, Interval(ge=1, le=MOST)]
 Split = Annotated[
@@ -70,7 +72,10 @@ class FigureSpec:
     def options(self) -> type[Any]:
         """The dataclass of all options, by the signature of the function."""
         hints = get_type_hints(self.make, include_extras=True)
-        own = [(each.name, hints[each.name], each.default) for each in self._keywords]
+        own = [
+            (p.name, hints[p.name], MISSING if p.default is p.empty else p.default)
+            for p in self._keywords
+        ]
         shared = hints.get("given", NoOptions)
         return make_dataclass("Options", own, bases=(shared,), frozen=True, kw_only=True)
 
@@ -96,10 +101,10 @@ class FigureSpec:
 FIGURES: dict[str, FigureSpec] = {}
 
 
-def figure(name: str, shows: str, *groups: str, metric: str = "ring5") -> Any:
+def figure(name: str, shows: str, *groups: str, metric: str = "ring5") -> Callable[[Make], Make]:
     """Decorator that registers a figure; see `FigureSpec`."""
 
-    def register(make: Callable[..., Drawn]) -> Callable[..., Drawn]:
+    def register(make: Make) -> Make:
         FIGURES[name] = FigureSpec(make, shows, groups, metric)
         return make
 

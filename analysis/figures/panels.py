@@ -82,8 +82,6 @@ Pick = Annotated[
     Literal["first", "largest_difference"],
     Help("images shown: first, or largest_difference of the first and the last method"),
 ]
-Exported = Annotated[str, Help("pairs of frames: folder that rgbt consistency export=... wrote")]
-ViewSet = Annotated[Count, Help("set of virtual views of these pairs, from 1")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,6 +99,14 @@ class PictureOptions(PredictionFormatOptions):
         """The format of the files."""
         affixes = Affixes(self.prefix, self.suffix)
         return FormatOptions(form=self.format, palette=self.palette, affixes=affixes)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairOptions(PictureOptions):
+    """Pairs of frames."""
+
+    pairs: Annotated[str, Help("folder that rgbt consistency export=... wrote")]
+    view_set: Annotated[Count, Help("set of virtual views of these pairs, from 1")] = 1
 
 
 def read_prediction(
@@ -203,7 +209,8 @@ def panel(
         thermal = np.repeat(sample.thermal[..., None], 3, axis=2)
         pictures.append([sample.rgb, thermal, *(colours(each, palette) for each in painted)])
     check_one_size([row[0].shape for row in pictures])
-    titles, legend = ["RGB", "thermal", "ground truth", *folders], (dataset.classes, palette, [])
+    titles = ["RGB", "thermal", "ground truth", *folders]
+    legend: plots.Legend = (dataset.classes, palette, ())
     made, cells = plots.picture_grid(pictures, names, titles, layout, legend)
     return made, cells, pd.DataFrame(numbers, columns=["image", "method", "mIoU"])
 
@@ -284,26 +291,25 @@ class Pairs:
         InputError: an export of other images or views, or an unfinished one.
     """
 
-    def __init__(
-        self, config: Config, given: PictureOptions, exported: str, view_set: int = 1
-    ) -> None:
-        self._folder, self._dataset = Path(exported).expanduser(), config.dataset
+    def __init__(self, config: Config, given: PairOptions) -> None:
+        self._folder, self._dataset = Path(given.pairs).expanduser(), config.dataset
         self.methods, listed = labelled(given.methods), read_list(self._folder)
         self._after = NextFrames(self._dataset) if listed.frames == "next" else None
-        self._views: Any = None if self._after else config.built("consistency")
-        self.second = "next frame" if self._after else "synthesised"
-        made_of = self._after.dataset.fingerprint()[:6] if self._after else self._views.mark
+        self.second, self._views = "synthesised", config.built("consistency")
+        made_of = self._views.mark or "published"
+        if self._after is not None:
+            self.second, made_of = "next frame", self._after.dataset.fingerprint()[:6]
         if not listed.complete:
-            raise InputError(f"pairs: the export {exported} was interrupted; rerun its command.")
-        if (listed.dataset, listed.views) != (self._dataset.fingerprint(), made_of or "published"):
+            raise InputError(f"pairs: the export {given.pairs} was interrupted; rerun its command.")
+        if (listed.dataset, listed.views) != (self._dataset.fingerprint(), made_of):
             raise InputError(
-                f"pairs: {exported} was exported from other images or other second frames "
+                f"pairs: {given.pairs} was exported from other images or other second frames "
                 f"({listed.name}, {listed.views}); give the data set and the consistency settings "
                 "of the export."
             )
-        self.listed = {each.first: each for each in listed.pairs if each.set == view_set}
+        self.listed = {each.first: each for each in listed.pairs if each.set == given.view_set}
         if not self.listed:
-            raise InputError(f"view_set={view_set}: the export has no such set of views.")
+            raise InputError(f"view_set={given.view_set}: the export has no such set of views.")
         self._reader = PredictionReader(self._dataset.classes, self._dataset.palette, given.form)
 
     def read(self, name: str) -> FramePair:
@@ -345,15 +351,13 @@ class Pairs:
 @figure("temporal/fig1", "a real frame and its synthesised next one", "dataset", "consistency")
 def pair_rows(
     config: Config,
-    given: PictureOptions,
+    given: PairOptions,
     *,
-    pairs: Exported,
-    view_set: ViewSet = 1,
     pick: Pick = "first",
     rows: Rows = 1,
 ) -> Drawn:
     """Both frames, ground truth and predictions; pixels that lower TC are outlined."""
-    opened = Pairs(config, given, pairs, view_set)
+    opened = Pairs(config, given)
     methods, listed, names = [*opened.methods], [*opened.listed], given.names
     if pick == "largest_difference" and not names:
         shares = {name: opened.read(name).shares for name in listed}
@@ -375,17 +379,14 @@ def pair_rows(
 @figure("temporal/fig6", "four pairs of frames, two columns each", "dataset", "consistency")
 def pair_columns(
     config: Config,
-    given: PictureOptions,
+    given: PairOptions,
     *,
-    pairs: Exported,
-    view_set: ViewSet = 1,
     pick: Pick = "first",
     rows: Rows = 4,
     layout: Layout = "columns",
 ) -> Drawn:
     """As `pair_rows`, with the number and the layout of the printed figure."""
-    shown = replace(given, layout=layout)
-    return pair_rows(config, shown, pairs=pairs, view_set=view_set, pick=pick, rows=rows)
+    return pair_rows(config, replace(given, layout=layout), pick=pick, rows=rows)
 
 
 @plots.styled
@@ -487,10 +488,11 @@ def mask_examples(
     examples = []
     for index, (title, masker) in enumerate(maskers.items()):
         pair = masker((height, width), centre, torch_generator(seed, "figure masks", index))
-        shown, hidden = [rgb.copy(), np.repeat(thermal[..., None], 3, axis=2)], []
+        shown = [rgb.copy(), np.repeat(thermal[..., None], 3, axis=2)]
+        hidden: list[Mask] = []
         for image, cells in zip(shown, (pair.rgb[0].numpy(), pair.thermal[0].numpy()), strict=True):
             size = height // cells.shape[0], width // cells.shape[1]
             hidden.append(np.kron(cells, np.ones(size, bool)))
             image[hidden[-1]] = HIDDEN
-        examples.append(MaskExample(title, *shown, *hidden))
+        examples.append(MaskExample(title, shown[0], shown[1], hidden[0], hidden[1]))
     return tuple(examples)

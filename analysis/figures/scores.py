@@ -22,7 +22,8 @@ from analysis.figures.inputs import (
     check_same_images,
     figure,
 )
-from analysis.robustness import CLEAN, Training, trainings
+from analysis.results import CLEAN
+from analysis.robustness import Training, trainings
 from analysis.uncertainty import Resampling, estimate
 from rgbt.checks import InputError, nearest, split_list
 from rgbt.config.options import Help
@@ -171,7 +172,7 @@ def corrupted(
         for number, training in enumerate(each)
         for level in training.levels
     ]
-    check_same_images({f"{m} {n} {each.mark}": [each.counts] for m, n, each in levels})
+    check_same_images({f"{m} {n} {each.path.stem}": [each.counts] for m, n, each in levels})
     convened = absent or convention(level.counts for *_, level in levels)
     cells = []
     for method, number, level in levels:
@@ -395,7 +396,7 @@ def draw_heat(frame: pd.DataFrame, image_hw: tuple[int, int]) -> Figure:
     for axes in panels[len(methods) :]:
         axes.set_axis_off()
     label = "mIoU of the region (%)"
-    made.colorbar(shown, ax=[*panels], shrink=0.85, pad=0.015, label=label)  # type: ignore[arg-type]
+    made.colorbar(shown, ax=[*panels], shrink=0.85, pad=0.015, label=label)
     return made
 
 

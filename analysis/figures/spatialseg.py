@@ -144,7 +144,7 @@ def ring_map(regions: Regions, image_hw: tuple[int, ...]) -> NDArray[np.uint8]:
     *("dataset", "metric"),
 )
 @plots.styled
-def heats(config: Config, given: MapOptions, *, part: inputs.Part = ALL) -> Drawn:
+def heats(config: Config, given: MapOptions, *, part: inputs.Part = "all") -> Drawn:
     """One panel per map with its three numbers, and one scale from 0 to 1 for all."""
     shown, has_statistics = [], bool(given.statistics) or config.chooses("dataset")
     if not has_statistics and (part != ALL or not given.maps):
@@ -269,7 +269,7 @@ def classes(
     given: StatisticsOptions,
     *,
     methods: inputs.Methods = "",
-    part: inputs.Part = ALL,
+    part: inputs.Part = "all",
     absent: inputs.AbsentClasses = None,
 ) -> Drawn:
     """Where the samples of each class lie, beside the mIoU of each region."""

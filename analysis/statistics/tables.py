@@ -14,6 +14,8 @@ from analysis.tables import text_table
 from rgbt.checks import InputError
 from rgbt.tables import ABSENT, TextTable
 
+VALUE = ["value", "low", "high"]
+
 WIDEST = 12
 """More regions than this become rows."""
 
@@ -126,39 +128,30 @@ def comparison_tables(
     if one.region_map.shape != other.region_map.shape:
         sizes = f"{one.region_map.shape} and {other.region_map.shape}"
         raise InputError(f"against: the image sizes differ: {sizes}; set short_edge for both.")
-    columns = ["value", "low", "high"]
     names = [f"{each.dataset}, {each.split}" for each in (one, other)]
-    levels = [
-        pd.DataFrame(_levels(each), columns=["mean over regions", *columns]) for each in samples
-    ]
-    both = levels[0].merge(levels[1], on="mean over regions", suffixes=("", "_2"))
-    second = both[["value_2", "low_2", "high_2"]].set_axis(columns, axis=1)
-    ratio = both["value"] / second["value"]
-    reach = np.hypot(
-        np.log(both["high"] / both["low"]) / 2, np.log(second["high"] / second["low"]) / 2
-    )
-    ratios = pd.DataFrame(
-        {"value": ratio, "low": ratio * np.exp(-reach), "high": ratio * np.exp(reach)}
-    )
-    shown = dict(zip([*names, "ratio"], map(_bounded, (both, second, ratios)), strict=True))
+    levels = [pd.DataFrame(_levels(each), columns=["what", *VALUE]) for each in samples]
+    both = levels[0].merge(levels[1], on="what", suffixes=("", "_2"))
+    first, second = both[VALUE], both[[f"{each}_2" for each in VALUE]].set_axis(VALUE, axis=1)
+    reaches = [np.log(each["high"] / each["low"]) / 2 for each in (first, second)]
+    ratio, factor = first["value"] / second["value"], np.exp(np.hypot(*reaches))
+    ratios = pd.DataFrame({"value": ratio, "low": ratio / factor, "high": ratio * factor})
+    shown = pd.concat([*map(_bounded, (first, second, ratios))], axis=1)
+    shown = shown.set_axis([*names, "ratio"], axis=1)
+    shown.index = pd.Index(both["what"], name="mean over regions")
     key = ["statement", "estimator", "average", "contrast", "wanted"]
     premises = judged[0].merge(judged[1], on=key, suffixes=("", "_2"))
-    second = premises[["value_2", "low_2", "high_2"]].set_axis(columns, axis=1)
-    verdicts = {
-        "stated": premises["wanted"],
-        names[0]: _bounded(premises) + " " + premises["finding"],
-        names[1] + " ": _bounded(second) + " " + premises["finding_2"],
-    }
-    index = pd.Index(premises["statement"] + ": " + premises["contrast"], name="statement")
-    return [
-        text_table(
-            "levels of both data sets",
-            pd.DataFrame(shown, both.set_index(["mean over regions"]).index),
-        ),
-        text_table(
-            "statements of SpatialSeg, Sec. III, on both", pd.DataFrame(verdicts).set_index(index)
-        ),
-    ]
+    second = premises[[f"{each}_2" for each in VALUE]].set_axis(VALUE, axis=1)
+    verdicts = pd.concat(
+        [
+            premises["wanted"],
+            _bounded(premises) + " " + premises["finding"],
+            _bounded(second) + " " + premises["finding_2"],
+        ],
+        axis=1,
+    ).set_axis(["stated", *names], axis=1)
+    verdicts.index = pd.Index(premises["statement"] + ": " + premises["contrast"], name="statement")
+    title = "statements of SpatialSeg, Sec. III, on both data sets"
+    return [text_table("levels of both data sets", shown), text_table(title, verdicts)]
 
 
 def _levels(sample: Sample) -> Iterator[tuple[object, ...]]:
