@@ -1,29 +1,233 @@
-"""Counts of runs and of scored predictions, opened by their names."""
+"""Finished runs of a folder and of an archive, their scores as one frame, and counts by name."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+import re
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from analysis.archive.files import ArchivedRun, archived, counts_of
 from rgbt.checks import InputError, nearest, split_list
+from rgbt.files.plain_files import read_json
+from rgbt.metrics import names
 from rgbt.metrics.counts import Counts
+from rgbt.metrics.details import KINDS, details_of, regions_of
+from rgbt.metrics.metric import Absent
+from rgbt.metrics.named import parse, value
 from rgbt.metrics.pairs import file_name, protocol_of
-from rgbt.runs.folder import GROUP, Description, counts_name, find_run, runs_in
+from rgbt.metrics.score_grid import score_grid
+from rgbt.metrics.scores import MEANS, iou, miou, recall, variance
+from rgbt.runs.folder import (
+    GROUP,
+    Description,
+    RunFolder,
+    counts_name,
+    find_run,
+    is_finished,
+    runs_in,
+)
 from rgbt.runs.result import RunResult
-from rgbt.terminal import info
+from rgbt.terminal import info, warn
+from rgbt.types import VIEWS
 
-SEED = "rgbt.seed"
+if TYPE_CHECKING:
+    import pandas as pd
+
+SEED, EXPERIMENT = "rgbt.seed", "rgbt.experiment"
+
+CLEAN, ALL = "clean", "all"
+"""Condition of images as they are, as the run is made for; subset of all images of a split."""
+
+SCORE_COLUMNS = ("subset", "region", "class", "metric", "value")
+COLUMNS = (
+    *("run", "experiment", "group", "seed", "split", "condition", "severity", "partition"),
+    *SCORE_COLUMNS,
+)
+"""Columns of `score_frame` and `results`."""
 
 RUNS = "runs, files of counts or a group"
 """What a list may contain, for messages."""
 
 Frames = Literal["", "aligned", "released", "next", "flow", "triples"]
 """Counts of single frames, or of pairs of frames by one protocol."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """A file of counts of a run.
+
+    Attributes:
+        path: of the file.
+        condition: `CLEAN`, an input ("rgb"), or a corruption ("noise"), each followed by what else
+            was changed: another head, checkpoint, data set or statistics of batch normalisation.
+        severity: of the corruption; NaN for others.
+        title: of the corruption, as shown; "" for others.
+        unit: of the severity; "" where there is one alone.
+    """
+
+    path: Path
+    counts: Counts
+    condition: str = CLEAN
+    severity: float = math.nan
+    title: str = ""
+    unit: str = ""
+
+
+def finished_runs(runs: Path | str = "runs", archive: Path | str = "results") -> list[RunResult]:
+    """All finished runs of a folder of runs and of an archive, by key.
+
+    A missing folder or archive is empty. A damaged run is left out with a warning. Of a key with
+    other counts in both, the run of the folder is taken, and a warning names the key. Archived runs
+    are unpacked once, into the cache of the user.
+    """
+    root, found, differing = Path(runs), dict[str, RunResult](), set[str]()
+    folders = runs_in(root) if root.is_dir() else []
+    finished = [each for each in folders if is_finished(each.path)]
+    sources: list[RunFolder | ArchivedRun] = [*finished, *archived(Path(archive))]
+    for source in sources:
+        try:
+            run = RunResult(source.path) if isinstance(source, RunFolder) else source.unpack()
+            _ = run.result, run.description  # they can be read
+            if not _equal_counts(found.setdefault(run.key, run), run):
+                differing.add(run.key)
+        except InputError as error:
+            warn(f"{source.path} is left out: {error}")
+    for key in sorted(differing):
+        warn(f"{key} is stored with other counts, too; those of {found[key].folder} are used.")
+    return [found[key] for key in sorted(found)]
+
+
+def _equal_counts(first: RunResult, other: RunResult) -> bool:
+    """Whether what both runs have counted is equal."""
+    if first is other:
+        return True
+    paths = {path.relative_to(first.folder) for path in counts_of(first.folder)}
+    shared = sorted(paths & {path.relative_to(other.folder) for path in counts_of(other.folder)})
+    pairs = ([Counts.load(run.folder / each) for run in (first, other)] for each in shared)
+    return all(np.array_equal(one.counts, two.counts) for one, two in pairs)
+
+
+def evaluations_of(run: RunResult, split: str = "test") -> Iterator[Evaluation]:
+    """Counts of a run of one split: as it ended, then other inputs, pairs of frames, corruptions.
+
+    A damaged file is left out with a warning.
+    """
+    for path in counts_of(run.folder):
+        try:
+            found = _evaluation(run, path)
+        except (InputError, KeyError, TypeError, ValueError) as error:
+            warn(f"{path} is left out: {error}")
+            continue
+        if found and found.counts.split == split:
+            yield found
+
+
+def _evaluation(run: RunResult, path: Path) -> Evaluation | None:
+    """What a file is of; its name and the description beside it say so. None: again clean."""
+    counts = run.counts(path.relative_to(run.folder).as_posix())
+    if path.parent == run.folder:
+        return Evaluation(path, counts)
+    other = [] if counts.dataset == run.fingerprint else [f"dataset {counts.dataset[:8]}"]
+    if (made_file := path.with_suffix(".json")).is_file():
+        made = read_json(made_file, dict[str, Any], "rgbt robustness makes it again")
+        rest = path.parent.name.removeprefix(counts.split).strip("_")
+        condition = " ".join(filter(None, [str(made["row"]), rest, *other]))
+        if condition == CLEAN:  # as the run ended
+            return None
+        severity, title, unit = float(made["severity"]), str(made["title"]), str(made["unit"])
+        return Evaluation(path, counts, condition, severity, title, unit)
+    if protocol_of(counts.partition):
+        rest = path.stem.rpartition(f"_{counts.split}")[2].strip("_")
+        return Evaluation(path, counts, " ".join(filter(None, [CLEAN, rest, *other])))
+    after = f"({'|'.join(VIEWS)})_{regions_of(counts.partition)}(.*?)(-({'|'.join(KINDS)}))?"
+    match = re.fullmatch(f".*_{re.escape(counts.split)}_{after}", path.stem)
+    words = [match[1], match[2].strip("_")] if match else [path.stem]
+    return Evaluation(path, counts, " ".join(filter(None, [*words, *other])))
+
+
+def score_frame(counts: Counts, absent: Absent | None = None) -> pd.DataFrame:
+    """Every score of counts, one a row.
+
+    Args:
+        counts: of single frames, of pairs of frames, or of details.
+        absent: how a class without pixels scores (`rgbt.metrics.scores`); None: as the counts say.
+
+    Returns:
+        the columns `SCORE_COLUMNS`: subset ("all", "day", "night"), region (0: the whole image),
+        class ("": all scored classes), metric and value in percent; Var in squared points, NaN:
+        nothing to score.
+    """
+    import pandas as pd
+
+    absent = absent or counts.absent
+    rows: list[tuple[str, int, str, str, float]] = []
+    if details_of(counts.partition) or protocol_of(counts.partition):
+        for name in dict.fromkeys(score_grid(counts).metrics):
+            of = parse(name)
+            score = "/".join(filter(None, (of.score, of.bin)))
+            place = of.part or ALL, of.region or 0, of.class_name or "", score
+            rows.append((*place, value(name, counts, absent)))
+        return pd.DataFrame(rows, columns=SCORE_COLUMNS)
+    for subset, part in {ALL: counts, **counts.parts()}.items():
+        by_region = part.by_region()
+        matrices = np.concatenate([by_region.sum(0, keepdims=True), by_region])
+        for metric, mean in MEANS.items():
+            values = 100 * mean(matrices, absent, counts.scored)
+            rows += [(subset, region, "", metric, float(v)) for region, v in enumerate(values)]
+        of_regions = miou(by_region, absent, counts.scored)
+        rows.append((subset, 0, "", names.VAR, float(variance(of_regions))))
+        for metric, by_class in (("IoU", iou), ("acc", recall)):
+            for region, values in enumerate(100 * by_class(matrices, absent)):
+                pairs = zip(counts.classes, values.tolist(), strict=True)
+                rows += [(subset, region, name, metric, each) for name, each in pairs]
+    return pd.DataFrame(rows, columns=SCORE_COLUMNS)
+
+
+def results(
+    runs: Path | str = "runs",
+    archive: Path | str = "results",
+    split: str = "test",
+    *,
+    absent: Absent | None = None,
+    evaluations: bool = True,
+) -> pd.DataFrame:
+    """Scores of all finished runs (`finished_runs`) as one frame: one score a row.
+
+    Args:
+        runs: folder of runs.
+        archive: folder of archived runs.
+        split: of the counts.
+        absent: see `score_frame`.
+        evaluations: whether to read counts of other inputs, corruptions, details and pairs of
+            frames, too, and not only those that a run ended with.
+
+    Returns:
+        the columns `COLUMNS`: run (its key), experiment, group (name that its seeds share), seed,
+        split, condition and severity (see `Evaluation`), partition of the image into regions, and
+        those of `score_frame`.
+    """
+    import pandas as pd
+
+    frames = []
+    for run in finished_runs(runs, archive):
+        tags = run.tags
+        texts = run.key, tags.get(EXPERIMENT, ""), tags.get(GROUP, "")
+        seed = int(tags[SEED]) if tags.get(SEED, "").lstrip("-").isdecimal() else pd.NA
+        for each in evaluations_of(run, split):
+            if not evaluations and each.path.parent != run.folder:
+                continue
+            found = (*texts, seed, split, each.condition, each.severity, each.counts.partition)
+            of_file = dict(zip(COLUMNS, found, strict=False))
+            frames.append(score_frame(each.counts, absent).assign(**of_file))
+    if not frames:
+        return pd.DataFrame(columns=COLUMNS)
+    return pd.concat(frames, ignore_index=True)[[*COLUMNS]].astype({"seed": "Int64"})
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ import hashlib
 import io
 import json
 import lzma
+import os
 import tempfile
 import zipfile
 import zlib
@@ -33,8 +34,8 @@ from rgbt.metrics.pairs import protocol_of
 from rgbt.runs.result import RunResult
 
 SHARED = "shared"
-COUNTS = ("counts_*.npz", "evaluations/*.npz")
-TEXTS = ("config.yaml", "run.json", "result.json")
+COUNTS = ("counts_*.npz", "evaluations/*.npz", "evaluations/robustness/*/*.npz")
+TEXTS = ("config.yaml", "run.json", "result.json", "evaluations/robustness/*/*.json")
 """Files of a run folder that are archived: its counts, and what is kept as it is."""
 
 PROVENANCE = (
@@ -66,13 +67,14 @@ class ArchivedRun:
         """Key of the run."""
         return self.path.stem.partition("-")[0]
 
-    def unpack(self, folder: Path) -> RunResult:
-        """The run as ``<name of the file>/<key>`` in `folder`; one that exists is taken as it is.
+    def unpack(self, folder: Path | None = None) -> RunResult:
+        """The run as ``<digest of the file>/<key>`` in `folder` (None: the user's cache), once.
 
         Raises:
             InputError: a damaged file, or one that belongs to another run.
         """
-        target = folder / self.path.stem / self.key
+        folder = folder or cache_folder()
+        target = folder / hashlib.sha256(self.path.read_bytes()).hexdigest()[:16] / self.key
         if target.is_dir():
             return RunResult(target)
         folder.mkdir(parents=True, exist_ok=True)
@@ -85,8 +87,12 @@ class ArchivedRun:
             result = RunResult(unpacked).result
             if result.get("key", self.key) != self.key:
                 raise InputError(f"{self.path} holds the run {result['key']}; rename the file.")
-            target.parent.mkdir()
-            unpacked.rename(target)
+            target.parent.mkdir(exist_ok=True)
+            try:
+                unpacked.rename(target)
+            except OSError:
+                if not target.is_dir():  # another process was not faster
+                    raise
         return RunResult(target)
 
     def _write(self, folder: Path) -> None:
@@ -101,6 +107,12 @@ class ArchivedRun:
                     _unpack_counts(archive.read(entry), self.path.parent / SHARED).save(path)
                 else:
                     write_atomic(path, archive.read(entry))
+
+
+def cache_folder() -> Path:
+    """Where archived runs are unpacked for reading."""
+    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(home, "rgbt", "archive")
 
 
 def archived(folder: Path) -> list[ArchivedRun]:
@@ -136,7 +148,8 @@ def _packed(run: RunResult, shared: Path) -> bytes:
     if not run.is_finished:
         raise InputError(f"{run.folder} is not finished; rerun its command.")
     shared.mkdir(parents=True, exist_ok=True)
-    members = {name: (run.folder / name).read_bytes() for name in TEXTS}
+    texts = [path for name in TEXTS for path in sorted(run.folder.glob(name))]
+    members = {path.relative_to(run.folder).as_posix(): path.read_bytes() for path in texts}
     entries = [
         {name: entry.get(name) for name in PROVENANCE}
         | {"packages": {name: entry.get("packages", {}).get(name) for name in PACKAGES}}

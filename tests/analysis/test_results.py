@@ -10,11 +10,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.results import groups_in, label_of, open_counts
+from analysis.archive.files import add
+from analysis.results import (
+    COLUMNS,
+    finished_runs,
+    groups_in,
+    label_of,
+    open_counts,
+    results,
+)
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
+from rgbt.metrics.named import parse, value
 from rgbt.runs.folder import Description, RunFolder, counts_name
-from tests.analysis.uncertainty.simulated import Population, counts_of
+from rgbt.runs.result import RunResult
+from tests.analysis.robust_runs import SCORES, write_levels
+from tests.analysis.uncertainty.simulated import Population, counts_of, pairs_of
 
 CRM, COMMAS = "crm scale=demo", "grbm scale=demo sizes=[1,2]"
 LONG = "grbm " + " ".join(f"a_long_key_of_the_configuration_{n}=0.123" for n in range(10))
@@ -34,7 +45,7 @@ def make_run(runs: Path, key: str, group: str, seed: int, *, finished: bool = Tr
     replace(some(seed + 100), split="val").save(run.path / counts_name("val"))
     (run.path / "mlflow.json").write_text(json.dumps({"run_id": f"mlflow-{key}"}))
     if finished:
-        run.finish({"mIoU": 0.5})
+        run.finish({"dataset": "simulated", "test": {"mIoU": 0.5}})
     return run.path
 
 
@@ -161,3 +172,77 @@ def test_damaged_run_stops_nothing_else(runs: Path, capsys: pytest.CaptureFixtur
         open_counts("mlflow-nobody", runs)
     open_counts("aaa9", runs)
     assert "is not finished" in capsys.readouterr().err
+
+
+# One frame of a folder of runs and an archive.
+
+
+@pytest.fixture
+def archive(runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The runs of `CRM`, two of them no longer in the folder, and one with other counts."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    folder = tmp_path / "results"
+    for key in ("aaa0", "aaa1", "aaa2"):
+        add(RunResult(runs / key), folder)
+    for key in ("aaa0", "aaa1"):
+        shutil.rmtree(runs / key)
+    some(50).save(runs / "aaa2" / "counts_test.npz")
+    return folder
+
+
+def test_folder_and_archive_are_one(
+    runs: Path, archive: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = finished_runs(runs, archive)
+    keys = " ".join(run.key for run in found)
+    assert keys == "aaa0 aaa1 aaa2 bbb0 bbb1 bbb2 ccc0 ddd0 eee0"
+    np.testing.assert_array_equal(found[1].counts().counts, some(1).counts)
+    np.testing.assert_array_equal(found[2].counts().counts, some(50).counts)
+    err = capsys.readouterr().err
+    assert (err.count("warning"), "aaa2 is stored with other counts" in err) == (1, True)
+    assert [run.key for run in finished_runs("none", archive)] == ["aaa0", "aaa1", "aaa2"]
+    assert finished_runs("none", "none") == []
+    unpacked = finished_runs("none", archive)[0].folder
+    (unpacked / "mark").touch()
+    assert (finished_runs("none", archive)[0].folder / "mark").exists()  # unpacked once
+
+
+def test_frame_has_a_row_for_each_score(runs: Path, archive: Path) -> None:
+    counts = replace(some(0), night=tuple(place < 4 for place in range(12)))
+    folder = runs / "bbb0"
+    (folder / "evaluations").mkdir()
+    counts.save(folder / "evaluations/synth_test_thermal_ring2.npz")
+    pairs_of(12, 0.5).save(folder / "evaluations/consistency_aligned_test.npz")
+    write_levels(folder / "evaluations/robustness/test", SCORES)
+    frame = results(runs, archive)
+    at = ["run", "condition", "severity", "partition", "subset", "region", "class", "metric"]
+    assert not frame.duplicated(at).any()
+    assert tuple(frame.columns) == COLUMNS
+    values = frame.set_index(["run", "condition", "subset", "region", "class", "metric"])["value"]
+    assert values["bbb0", "clean", "all", 0, "", "mIoU"] == value("mIoU", some(0), "released")
+    assert values["aaa1", "clean", "all", 2, "", "mIoU"] == value("region/2", some(1), "released")
+    assert values["aaa1", "clean", "all", 0, "", "Var"] == value("Var", some(1), "released")
+    thermal = values["bbb0", "thermal"]
+    for name in ("night/class/car", "day/Var", "day/class/cone/acc", "night/mIoU"):
+        of = parse(name)
+        key = of.part, 0, of.class_name or "", of.score
+        assert thermal[key] == value(name, counts, "released")
+    region = Counts(**{**vars(counts), "counts": counts.counts[:, 1:], "partition": "ring1"})
+    assert thermal["all", 2, "person", "IoU"] == value("class/person", region, "released")
+    assert values["bbb0", "clean", "all", 0, "", "TC"] == value("TC", pairs_of(12, 0.5), "released")
+    noise = frame[(frame["condition"] == "noise dataset fingerpr") & (frame["metric"] == "mIoU")]
+    whole = noise[(noise["subset"] == "all") & (noise["region"] == 0)]
+    assert dict(zip(whole["severity"], whole["value"].round(2))) == {8.0: 60.0, 16.0: 40.0}
+    seeds = frame[frame["group"] == COMMAS].groupby("run")["seed"].first()
+    assert dict(seeds) == {"bbb0": 0, "bbb1": 1, "bbb2": 2}
+    assert set(results(runs, archive, evaluations=False)["condition"]) == {"clean"}
+    assert len(results("none", "none")) == 0
+
+
+@pytest.mark.parametrize("name", ["result.json", "run.json", "counts_test.npz"])
+def test_damaged_run_is_a_remark(runs: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
+    (runs / "bbb1" / name).write_text("{")
+    keys = set(results(runs, "none")["run"])
+    assert "bbb1" not in keys
+    assert {"bbb0", "aaa1"} <= keys
+    assert capsys.readouterr().err.count("warning") == 1
