@@ -16,9 +16,10 @@ from typing import Literal
 
 import numpy as np
 
+from analysis.uncertainty.blocks import Values
 from analysis.uncertainty.contrasts import Evidence, combine
 from analysis.uncertainty.estimates import Estimate, estimate_of
-from analysis.uncertainty.intervals import Spread, Values, holm
+from analysis.uncertainty.intervals import Spread, holm
 
 Noise = Literal["cells", "effects"]
 """Whose spread over seeds is the error: "cells", what is left of all cells after their means and

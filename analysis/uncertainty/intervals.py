@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Values = NDArray[np.float64]
+from analysis.uncertainty.blocks import Values
 
 
 @dataclass(frozen=True)
@@ -36,7 +35,7 @@ class Spread:
     freedom: float
 
 
-def over_images(drawn: Values, blocks: int) -> Spread | None:
+def over_images(drawn: Values, *blocks: int) -> Spread | None:
     """Standard error of a score over the draw of the images.
 
     Drawing B blocks from B blocks gives their mean ``sqrt((B - 1) / B)`` of its standard error. The
@@ -45,15 +44,16 @@ def over_images(drawn: Values, blocks: int) -> Spread | None:
 
     Args:
         drawn: (resamples,) scores with B blocks drawn anew; NaN (nothing to score) is left out.
-        blocks: B.
+        blocks: B of each stratum of images; the smallest decides.
 
     Returns:
-        None where there is nothing to score.
+        None where there is nothing to score, or a stratum has one block.
     """
-    known = drawn[~np.isnan(drawn)]
-    if not known.size:
+    known, least = drawn[~np.isnan(drawn)], min(blocks)
+    if not known.size or least < 2:
         return None
-    return Spread(float(known.std()) * math.sqrt(blocks / (blocks - 1)), blocks - 1)
+    error = float(known.std()) * math.sqrt(least / (least - 1))
+    return Spread(error, sum(blocks) - len(blocks))
 
 
 def over_seeds(*methods: Values) -> Spread | None:

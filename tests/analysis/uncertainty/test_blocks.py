@@ -9,7 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.uncertainty.blocks import FEWEST, ImageBlocks, block_length, make_blocks
+from analysis.uncertainty.blocks import (
+    FEWEST,
+    ImageBlocks,
+    Resampling,
+    block_length,
+    make_blocks,
+)
 from rgbt.checks import InputError
 
 NOTHING = np.empty((0, 0))
@@ -212,6 +218,25 @@ def test_auto_explains_single_images():
         assert blocks.count == len(names)
         assert "each image is drawn alone, as if it were independent evidence" in blocks.reason
     assert make_blocks(mfnet(12), "none", NOTHING).reason == ""
+
+
+@pytest.mark.parametrize("choice", ["auto", 5, "none"])
+def test_no_block_holds_images_of_two_strata(choice):
+    """Days and nights in one sequence; every resample keeps the number of blocks of both."""
+    names = numbered(*((100 * k, 100 * k + 10) for k in range(1, 13)))
+    night = np.array([place % 20 >= 10 for place in range(120)])
+    night[0] = True  # one frame of a day
+    blocks = make_blocks(names, choice, strata=night)
+    assert all(len(set(night[blocks.index == number])) == 1 for number in range(blocks.count))
+    at_night = [bool(night[blocks.index == number][0]) for number in range(blocks.count)]
+    assert at_night == sorted(at_night)
+    assert blocks.sizes == (at_night.count(False), at_night.count(True))
+    drawn = next(blocks.draws(Resampling(resamples=100)))
+    assert (drawn[:, : blocks.sizes[0]].sum(1) == blocks.sizes[0]).all()
+    assert (drawn[:, blocks.sizes[0] :].sum(1) == blocks.sizes[1]).all()
+    np.testing.assert_array_equal(
+        blocks.summed(night), np.bincount(blocks.index, weights=night, minlength=blocks.count)
+    )
 
 
 @pytest.mark.skipif(not LISTS.is_dir(), reason="the lists of names are not there")

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from analysis.uncertainty import Resampling, compare
+from analysis.uncertainty.blocks import ImageBlocks
 from analysis.uncertainty.contrasts import FIXED, Evidence, Resampler, Term
-from analysis.uncertainty.scores import RunScores
 from analysis.uncertainty.verdicts import FixedSeeds, decide
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
@@ -198,13 +198,13 @@ def test_evidence_does_not_depend_on_the_order_of_images_or_on_other_contrasts()
 
 def test_evidence_again_draws_no_images(monkeypatch: pytest.MonkeyPatch) -> None:
     rows, resampler, calls = rows_of(), Resampler(SETTINGS), []
-    draw = RunScores._weights
+    draw = ImageBlocks.draws
 
-    def counted(self: RunScores, blocks: int) -> object:
-        calls.append(blocks)
-        return draw(self, blocks)
+    def counted(self: ImageBlocks, settings: Resampling) -> object:
+        calls.append(self.count)
+        return draw(self, settings)
 
-    monkeypatch.setattr(RunScores, "_weights", counted)
+    monkeypatch.setattr(ImageBlocks, "draws", counted)
     less = [{seed: row[seed] for seed in (0, 1)} for row in rows]
     first = resampler.evidence(difference(less))
     more = resampler.evidence(difference(rows))

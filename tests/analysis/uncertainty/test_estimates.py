@@ -153,7 +153,7 @@ def test_night_is_scored_on_its_own_images() -> None:
         *(({"resamples": value}, "resamples must be between") for value in (99, 10**9)),
         ({"absent": "zero"}, "absent: 'zero' is not a valid choice"),
         ({"blocks": 0}, "blocks must be between"),
-        ({"blocks": "abc"}, "expected auto, none, sequence or a number of images"),
+        ({"blocks": "abc"}, "'abc' is not a valid choice"),
     ],
 )
 def test_settings_out_of_range_are_refused(changes: Any, word: str) -> None:

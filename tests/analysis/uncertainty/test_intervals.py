@@ -28,6 +28,9 @@ def test_spread_over_images_omits_nan() -> None:
     assert found == Spread(pytest.approx(math.sqrt(10 / 9)), 9)
     assert over_images(np.full(3, np.nan), 10) is None
     assert over_images(np.empty(0), 10) is None
+    # Of two strata the smaller one decides, and each costs a degree of freedom.
+    assert over_images(np.array([1.0, 3.0]), 10, 30) == Spread(pytest.approx(found.error), 38)
+    assert over_images(np.array([1.0, 3.0]), 1, 30) is None
 
 
 def test_variance_interval_has_no_bias_and_holds_the_value() -> None:

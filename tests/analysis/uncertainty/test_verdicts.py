@@ -13,7 +13,15 @@ from scipy import stats
 from analysis.uncertainty.contrasts import Evidence
 from analysis.uncertainty.intervals import Spread
 from analysis.uncertainty.sequence import half_width
-from analysis.uncertainty.verdicts import AnyTime, FixedSeeds, Verdict, decide
+from analysis.uncertainty.verdicts import (
+    FAR_FROM_NORMAL,
+    ONE_START,
+    AnyTime,
+    FixedSeeds,
+    Verdict,
+    decide,
+    similar,
+)
 from tests.analysis.uncertainty.simulated_claims import any_wrong, rates, until_decided, with_seeds
 
 HIGHER, LOWER = (0.0, math.inf), (-math.inf, 0.0)
@@ -239,3 +247,86 @@ def test_rates_of_looking_at_fixed_intervals_after_every_seed() -> None:
 
 def test_rates_of_ten_claims_in_one_table_are_not_corrected() -> None:
     assert any_wrong(20, 10, 0.0, ANY) <= 0.25 + 3 * math.sqrt(0.25 * 0.75 / 20)
+
+
+# What a verdict rests on.
+
+
+@pytest.mark.parametrize(
+    ("combine", "values", "kind"),
+    [
+        ("all", (9.0, 9.0), "undecided"),
+        ("all", (9.0, -9.0), "contradicted"),
+        ("any", (-9.0, -9.0), "undecided"),
+        ("any", (9.0, -9.0), "holds"),
+        ("most", (-9.0, -9.0, -9.0), "undecided"),
+        ("most", (9.0, 9.0, 9.0), "undecided"),
+    ],
+)
+def test_rows_that_were_not_run_may_be_as_claimed_or_not(
+    combine: str, values: tuple[float, ...], kind: str
+) -> None:
+    found = decide(
+        [as_trained(v) for v in values], HIGHER, FIXED, combine, missing="B was not run."
+    )
+    assert found.kind == kind
+    if kind == "undecided":
+        assert found.reason == "B was not run."
+        assert math.isnan(found.seeds_needed)
+
+
+def test_verdict_on_one_start_has_its_warning() -> None:
+    values = evidence(1.0, 2.0, 3.0)
+    warnings = {
+        starts: decide([values], HIGHER, FIXED, "all", starts=starts).warning
+        for starts in (None, 1, 2, 3)
+    }
+    assert warnings == {None: "", 1: ONE_START, 2: "", 3: ""}
+    assert decide([as_trained(3.0)], HIGHER, FIXED, "all", starts=1).warning == ""
+
+
+def test_does_as_well_as_needs_an_interval_inside_the_margin() -> None:
+    """Half width of the interval: 1.96."""
+    for margin, value, kind in (
+        (2.5, 0.5, "holds"),
+        (2.4, 0.5, "undecided"),  # no difference is shown either
+        (2.5, -0.6, "undecided"),
+        (2.5, 4.5, "contradicted"),
+        (2.5, -4.4, "undecided"),
+    ):
+        assert decide([as_trained(value)], similar(margin), FIXED, "all").kind == kind
+    for margin in (0.0, -1.0, math.nan, math.inf):
+        with pytest.raises(ValueError, match="largest difference that counts as none"):
+            similar(margin)
+
+
+def simulated(draw: object, seeds: int, wanted: tuple[float, float] = HIGHER) -> list[float]:
+    """Shares that hold and are contradicted of 2,000 claims about `seeds` drawn values."""
+    rng = np.random.default_rng(seeds)
+    found = [
+        decide([evidence(*draw(rng, seeds), error=0.0)], wanted, FIXED, "all").kind
+        for _ in range(2000)
+    ]
+    return [found.count(kind) / 2000 for kind in ("holds", "contradicted")]
+
+
+@pytest.mark.parametrize(("seeds", "wrong"), [(3, 0.16), (5, 0.18), (10, 0.16)])
+def test_rates_of_seeds_far_from_normal(seeds: int, wrong: float) -> None:
+    """Lognormal scores: their mean is sqrt(e). `FAR_FROM_NORMAL` has the range."""
+    rates = simulated(lambda rng, n: rng.lognormal(0, 1, n) - math.exp(0.5), seeds)
+    assert sum(rates) == pytest.approx(wrong, abs=0.025)
+    assert "14 to 18 %" in FAR_FROM_NORMAL
+
+
+@pytest.mark.parametrize(("seeds", "wrong"), [(3, 0.18), (5, 0.29)])
+def test_rates_of_one_start(seeds: int, wrong: float) -> None:
+    """A start that shifts all seeds, by two of their standard deviations on average."""
+    rates = simulated(lambda rng, n: 2 * rng.normal() + rng.normal(size=n), seeds)
+    assert rates == pytest.approx([wrong, wrong], abs=0.03)
+    assert f"{100 * wrong:.0f} %" in ONE_START
+
+
+def test_rates_of_equivalence_at_its_margin() -> None:
+    """A true difference as large as the margin is called none in at most 2.5 %."""
+    holds, _ = simulated(lambda rng, n: 1.0 + 0.2 * rng.normal(size=n), 5, similar(1.0))
+    assert 0.015 < holds < 0.036
