@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from statistics import fmean
 
 from analysis.uncertainty import Interval, Resampling
@@ -20,7 +21,15 @@ from rgbt.config.stored_config import read_settings
 from rgbt.metrics.counts import Counts
 from rgbt.runs.result import RunResult
 from sweeps.point import Outcome
-from sweeps.table.cells import CellId, counts_path, is_counted, metric_of, published
+from sweeps.table.cells import (
+    CellId,
+    ScoredTable,
+    TableCell,
+    counts_path,
+    is_counted,
+    metric_of,
+    published,
+)
 from sweeps.table.claim import HIGHER, LOWER, Claim
 from sweeps.table.request import UNTIL_DECIDED
 from sweeps.table.table import Column, Row, Table
@@ -34,13 +43,29 @@ CellRunId = tuple[str, int]
 UNKNOWN = "unknown"
 
 
-class LoadedCounts:
-    """Counts by the key of the run and their path in its folder, each file read once."""
+@dataclass(frozen=True)
+class Basis:
+    """What a verdict is about, beside its numbers.
+
+    Attributes:
+        images: "synthetic", "real" or "unknown".
+        scale: of the runs.
+        one_start: whether all seeds begin with the same trained weights.
+    """
+
+    images: str = UNKNOWN
+    scale: str = UNKNOWN
+    one_start: bool = False
+
+
+class StoredRuns:
+    """Counts and settings of finished runs, each file read once."""
 
     def __init__(self) -> None:
         self._counts: dict[tuple[str, str], Counts] = {}
+        self._bases: dict[str, Basis] = {}
 
-    def of(self, run: RunResult, path: str) -> Counts:
+    def counts(self, run: RunResult, path: str) -> Counts:
         """Counts of a run; InputError where they are missing, damaged or cannot be read."""
         if (run.key, path) not in self._counts:
             try:
@@ -48,6 +73,31 @@ class LoadedCounts:
             except OSError as error:
                 raise InputError(f"run {run.key}: {error}") from error
         return self._counts[run.key, path]
+
+    def basis(self, runs: Iterable[RunResult]) -> Basis:
+        """What runs are about, by their stored settings; of several kinds of runs, all kinds."""
+        each = []
+        for run in runs:
+            if run.key not in self._bases:
+                self._bases[run.key] = _basis_of(run.folder / "config.yaml")
+            each.append(self._bases[run.key])
+        images, scale = (
+            " and ".join(sorted({getattr(one, name) for one in each})) or UNKNOWN
+            for name in ("images", "scale")
+        )
+        return Basis(images, scale, any(one.one_start for one in each))
+
+
+def _basis_of(config: Path) -> Basis:
+    if not config.is_file():
+        return Basis()
+    settings = read_settings(config)
+    target = str(settings.get("dataset", {}).get("_target_", ""))
+    start = str(settings.get("pretrained") or settings.get("model", {}).get("weights") or "")
+    is_common = start.startswith("common:") and settings["seeds"]["start"] == "common"
+    is_file = bool(start) and not start.startswith(("common:", "experiment:"))
+    images = "synthetic" if ".synth" in target else "real"
+    return Basis(images, str(settings["scale"]["name"]), is_common or is_file)
 
 
 @dataclass(frozen=True)
@@ -140,44 +190,6 @@ def as_claimed(claim: Claim, contrasts: Sequence[float | None]) -> bool | None:
     return inside >= least
 
 
-@dataclass(frozen=True)
-class Basis:
-    """What a verdict is about, beside its numbers.
-
-    Attributes:
-        images: "synthetic", "real" or "unknown".
-        scale: of the runs.
-        one_start: whether all seeds begin with the same trained weights.
-    """
-
-    images: str = UNKNOWN
-    scale: str = UNKNOWN
-    one_start: bool = False
-
-    @classmethod
-    def of(cls, runs: Iterable[RunResult]) -> Basis:
-        """By the stored settings of runs; of several kinds of runs, all of them."""
-        each = [cls._of_run(run) for run in {run.key: run for run in runs}.values()]
-        words = (
-            " and ".join(sorted({getattr(one, name) for one in each})) or UNKNOWN
-            for name in ("images", "scale")
-        )
-        return cls(*words, any(one.one_start for one in each))
-
-    @classmethod
-    def _of_run(cls, run: RunResult) -> Basis:
-        if not (run.folder / "config.yaml").is_file():
-            return cls()
-        settings = read_settings(run.folder / "config.yaml")
-        target = str(settings.get("dataset", {}).get("_target_", ""))
-        start = str(settings.get("pretrained") or settings.get("model", {}).get("weights") or "")
-        is_common = start.startswith("common:") and settings["seeds"]["start"] == "common"
-        is_file = bool(start) and not start.startswith(("common:", "experiment:"))
-        scale = str(settings.get("scale", {}).get("name", UNKNOWN))
-        images = "synthetic" if ".synth" in target else "real"
-        return cls(images, scale, is_common or is_file)
-
-
 @dataclass(frozen=True, kw_only=True)
 class JudgedClaim:
     """A claim with its verdict.
@@ -220,21 +232,19 @@ class TableJudge:
         rule: when a claim is decided.
         resamples: of the images.
         sizes: exact values of cells that are counted without a run.
-        counts: of all runs that were read.
+        stored: the runs that were read.
     """
 
     name: str
     table: Table
     rule: Rule = field(default_factory=FixedSeeds)
     resamples: int = RESAMPLES
-    sizes: Mapping[CellId, float] = field(default_factory=dict)
-    counts: LoadedCounts = field(default_factory=LoadedCounts)
+    sizes: Mapping[CellId, TableCell] = field(default_factory=dict)
+    stored: StoredRuns = field(default_factory=StoredRuns)
 
     def __post_init__(self) -> None:
         self._rows = {row.label: row for row in self.table.rows}
-        self._resampler = Resampler(
-            Resampling(resamples=self.resamples, absent=self.table.absent)
-        )
+        self._resampler = Resampler(Resampling(resamples=self.resamples, absent=self.table.absent))
 
     def claims(self, runs: Mapping[CellRunId, Outcome]) -> list[JudgedClaim]:
         """Every claim about rows of the table, judged by the finished ones of `runs`."""
@@ -246,7 +256,7 @@ class TableJudge:
         printed = [printed_value(each, self.table) for each in contrasts]
         rows = {label for each in contrasts for label in each.rows}
         finished = {label: finished_runs_of(label, runs) for label in self._rows if label in rows}
-        basis = Basis.of(run for each in finished.values() for run in each.values())
+        basis = self.stored.basis(run for each in finished.values() for run in each.values())
         judged = partial(
             JudgedClaim,
             table=self.name,
@@ -274,10 +284,15 @@ class TableJudge:
         if not evidences:
             shown = _mean(printed) if mean else printed[0]
             return judged(contrast=contrasts[0].label, printed=shown, reason=reasons[0])
-        verdict = decide(list(evidences.values()), claim.range, self.rule, claim.combine)
+        verdict = decide(
+            list(evidences.values()),
+            claim.range,
+            self.rule,
+            claim.combine,
+            starts=1 if basis.one_start else None,
+            missing=f"Some rows have no score: {reasons[0]}" if reasons else "",
+        )
         index = list(evidences)[verdict.decisive]
-        if reasons:
-            verdict = _of_a_part(verdict, claim, reasons[0])
         return judged(
             contrast=f"mean of {len(contrasts)} contrasts" if mean else contrasts[index].label,
             printed=_mean(printed) if mean else printed[index],
@@ -290,7 +305,7 @@ class TableJudge:
     def _exact(self, contrast: Contrast) -> float | None:
         """The value of a contrast of exact cells; None where one of them is not."""
         cells = [(weight, self.sizes.get((row, name))) for weight, row, name in contrast.cells()]
-        known = [weight * value for weight, value in cells if value is not None]
+        known = [weight * cell.mean for weight, cell in cells if cell is not None]
         return sum(known) if len(known) == len(cells) else None
 
     def evidence(
@@ -315,44 +330,45 @@ class TableJudge:
         ]
         return self._resampler.evidence(terms)
 
-    def marks(self, runs: Mapping[CellRunId, Outcome]) -> dict[CellId, int]:
+    def marks(self, scored: ScoredTable, runs: Mapping[CellRunId, Outcome]) -> dict[CellId, int]:
         """Rank 1 of a row that is shown to be better than all others of a column; 2 the next.
 
         A row is shown to be better where the interval of its difference to each other row excludes
-        0. Rows of the same runs share a mark. Nothing is marked with fewer than two seeds.
+        0; a row without a score may be better than all others. Rows of the same runs share a mark.
+        Nothing is marked with fewer than two seeds.
         """
         marks: dict[CellId, int] = {}
-        present = dict.fromkeys(label for label, _ in runs)
-        of_row = {each: self.table.columns_of(self._rows[each]) for each in present}
+        present = {label for label, _ in runs}
         for column in self.table.columns:
             if column.best == "none" or not (is_counted(column) or column.sources):
                 continue
-            left = [label for label in present if column in of_row[label]]
+            cells = {
+                label: cell
+                for (label, name), cell in scored.cells.items()
+                if name == column.name and label in present
+            }
+            left = {label: cell.mean for label, cell in cells.items()}
+            if any(map(math.isnan, left.values())) or any(cell.reason for cell in cells.values()):
+                continue
             for rank in (1, 2):
-                best = self._best(column.name, column.best == "highest", left, runs)
+                best = self._best(column, left, runs)
                 if not best:
                     break
                 marks |= {(label, column.name): rank for label in best}
-                left = [label for label in left if label not in best]
+                left = {label: mean for label, mean in left.items() if label not in best}
         return marks
 
     def _best(
-        self, column: str, highest: bool, labels: Sequence[str], runs: Mapping[CellRunId, Outcome]
+        self, column: Column, means: Mapping[str, float], runs: Mapping[CellRunId, Outcome]
     ) -> list[str]:
-        """The row, and others of the same runs, that is shown to be better than all of `labels`.
-
-        A row without a score may be better than all others.
-        """
+        """The row, and others of the same runs, that is shown to be better than all others."""
+        if len(means) < 2:
+            return []
+        highest = column.best == "highest"
+        best = (max if highest else min)(means, key=lambda label: means[label])
+        same = [each for each in means if self._is_same(Contrast(best, each, column.name), runs)]
+        others = [Contrast(best, label, column.name) for label in means if label not in same]
         try:
-            means = {
-                label: fmean(self.evidence([(1.0, Contrast(label, None, column))], runs).values)
-                for label in labels
-            }
-            if len(means) < 2:
-                return []
-            best = (max if highest else min)(means, key=lambda label: means[label])
-            same = [each for each in means if self._is_same(Contrast(best, each, column), runs)]
-            others = [Contrast(best, label, column) for label in means if label not in same]
             shown = [self.evidence([(1.0, each)], runs) for each in others]
         except InputError:
             return []
@@ -396,7 +412,7 @@ class TableJudge:
             yield Term(
                 weight=weight * part,
                 metric=metric_of(column, row),
-                counts={seed: self.counts.of(run, path) for seed, run in finished.items()},
+                counts={seed: self.stored.counts(run, path) for seed, run in finished.items()},
                 keys={seed: f"{run.key}/{path}" for seed, run in finished.items()},
             )
 
@@ -436,15 +452,3 @@ def _exact_verdict(value: float, *, is_so: bool) -> Verdict:
 def _mean(values: Sequence[float | None]) -> float | None:
     known = [value for value in values if value is not None]
     return fmean(known) if len(known) == len(values) else None
-
-
-def _of_a_part(verdict: Verdict, claim: Claim, reason: str) -> Verdict:
-    """The verdict of a claim of which some contrasts have no scores.
-
-    "all" cannot hold and "any" cannot be contradicted without them; "most" stays open.
-    """
-    stands = {"all": "contradicted", "any": "holds"}.get(claim.combine)
-    if verdict.kind == stands:
-        return verdict
-    reason = f"Some rows have no score: {reason}"
-    return replace(verdict, kind="undecided", seeds_needed=math.nan, reason=reason)

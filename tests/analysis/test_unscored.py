@@ -14,17 +14,12 @@ from analysis.figures import classes, consistency, inputs, maps, panels, profile
 from analysis.predictions.maps import PixelMaps, iou_map
 from analysis.predictions.table import ScoreKey, score_table
 from analysis.predictions.text import convention_line, region_grid, tidy_csv
-from analysis.report.runs import open_run
 from analysis.uncertainty import Resampling, compare, estimate
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
-from rgbt.runs.folder import counts_name
 from tests.analysis import counts as makes
 from tests.analysis.figures.drawn import statistics, strips
-from tests.analysis.report.stores import counts_of as stored_counts
-from tests.analysis.report.stores import files_of, write_run
-from tests.analysis.report.test_collect_parts import stored
 
 CLASSES = ("road", "car", "person", "void")
 LEFT = [[6, 1, 0, 1], [1, 3, 0, 0], [0, 0, 0, 0], [2, 0, 0, 5]]
@@ -204,30 +199,11 @@ def test_pixel_maps_exclude_the_class(tmp_path: Path) -> None:
         replace(made, unscored=("sky",))
 
 
-# The report.
-
-
-def test_report_shows_means_of_the_scored_classes(tmp_path: Path) -> None:
-    run = write_run(tmp_path, "aa0", "grbm", 0)
-    counts = replace(stored_counts(0), unscored=("car",))
-    counts.save(run.path / counts_name("test"))
-    entry = open_run(stored(files_of(run.path)), []).entry
-    (road, over), (miss, _) = counts.counts.sum((0, 1)).tolist()
-    expected = 100 * road / (road + over + miss)
-    assert entry.scores["mIoU"] == entry.scores["class/road"] == pytest.approx(expected)
-    assert entry.region_ious == entry.class_region_ious[0]
-    assert (entry.classes, entry.unscored) == (("road", "car"), ("car",))
-
-
-def test_report_and_comparison_name_absent_classes(tmp_path: Path) -> None:
-    """By the convention of the counts: the stored configuration of this run has none."""
-    run = write_run(tmp_path, "aa0", "grbm", 0)
-    array = stored_counts(0).counts.copy()
+def test_comparison_names_absent_classes() -> None:
+    """By the convention of the counts."""
+    array = random_counts(1).counts[..., :2, :2].copy()
     array[:, :, 1] = array[..., 1] = 0
-    counts = replace(stored_counts(0), counts=array, absent="exclude")
-    counts.save(run.path / counts_name("test"))
-    entry = open_run(stored(files_of(run.path)), []).entry
-    assert entry.notes[0].startswith("absent from the test split: car (")
+    counts = counts_of(array.tolist(), classes=("road", "car"), unscored=(), absent="exclude")
     assert absent_classes([counts, counts], None) == (
         "absent from the test split: car (left out of the mean)",
     )

@@ -17,9 +17,8 @@ from optuna.distributions import CategoricalDistribution, FloatDistribution
 from optuna.trial import TrialState, create_trial
 
 from sweeps import attributes
-from sweeps.report import tables
-from sweeps.report.figures import StudyFigure, draw
-from sweeps.report.study_data import importances, pruning_savings, read
+from sweeps.report import study as tables
+from sweeps.report.study import StudyData, draw, importances
 
 ALPHA = FloatDistribution(0, 1)
 SIZES = CategoricalDistribution(("${px:64}", "${px:8}"))
@@ -61,7 +60,7 @@ def test_trials_grid_sorts_by_objective_direction() -> None:
     add(study, [8.0], params=first, results=results, seconds=61.6, runs=["a1"])
     for value in (*range(12, 22), 4.0):
         add(study, [float(value)], params={"masker.alpha": 0.25})
-    grid = tables.trials_grid(read(study))
+    grid = tables.trials_grid(StudyData.read(study))
     assert grid.title == "Best trials: lowest val/Var"
     assert grid.header == (
         *("trial", "alpha", "optimizer.lr", "head.lr", "val/Var", "test/Var", "val/mIoU"),
@@ -78,7 +77,7 @@ def test_trials_grid_shows_pixels(notes: dict[str, float], shown: str) -> None:
     study = new_study("maximize")
     add(study, [8.0], params={"masker.patch_size": "${px:64}"}, **notes)
     add(study, [math.inf], **notes)
-    assert [row[:2] for row in tables.trials_grid(read(study)).rows] == [("0", shown)]
+    assert [row[:2] for row in tables.trials_grid(StudyData.read(study)).rows] == [("0", shown)]
 
 
 def test_pareto_front_of_five_points() -> None:
@@ -87,7 +86,7 @@ def test_pareto_front_of_five_points() -> None:
     add(study, state="FAIL")  # so that numbers are not places in a list
     for values in ((50.0, 9.0), (55.0, 8.0), (60.0, 12.0), (54.0, 10.0), (40.0, 2.0)):
         add(study, values, params={"x": 0.5})
-    data = read(study)
+    data = StudyData.read(study)
     assert [trial.number for trial in data.front] == [3, 2, 5]
     values = [("60.00", "12.00"), ("55.00", "8.00"), ("40.00", "2.00")]
     assert [row[2:4] for row in tables.trials_grid(data).rows] == values
@@ -101,7 +100,7 @@ def test_tables_of_list_keep_point_order_and_last_trials() -> None:
     add(study, [52.0], label="Ny/2 seed=1", key="k2", runs=["k2"])
     add(study, state="RUNNING", label="Ny seed=1", key="k3")
     add(study, state="FAIL", params={"a.x": 0.5}, reason="by\nsignal | 9", runs=["r1", "r2"])
-    data = read(study)
+    data = StudyData.read(study)
     grid = tables.trials_grid(data)
     assert grid.header[:4] == ("trial", "point", "state", "val/mIoU")
     assert [row[:4] for row in grid.rows[:3]] == [
@@ -112,7 +111,7 @@ def test_tables_of_list_keep_point_order_and_last_trials() -> None:
     failed = tables.failed_grid(data)
     assert failed.title == "Failed trials (1 more were retried)"
     assert failed.rows[0] == ("by signal | 9", "4", "x=0.5", "r1 r2", "-")
-    assert "by signal \\| 9 | 4" in tables.markdown_table(failed)
+    assert "by signal \\| 9 | 4" in failed.to_markdown()
     assert len(tables.tables(data, importances(data))) == 3
 
 
@@ -121,26 +120,11 @@ def test_trials_csv_has_all_trials_with_full_numbers() -> None:
     add(study, [100 / 3], params={"a.x": 0.1}, results={"test/mIoU": 31.0}, seconds=2.5, runs=["r"])
     reported = {10: 1.0, 20: 2.0}
     add(study, state="PRUNED", params={"a.x": 0.2}, reported=reported, reason="at 20, low")
-    first, second = csv.DictReader(io.StringIO(tables.trials_csv(read(study))))
+    first, second = csv.DictReader(io.StringIO(tables.trials_csv(StudyData.read(study))))
     assert float(first["val/mIoU"]) == 100 / 3
     assert list(first.values())[5:] == ["31.0", "2.5", "", "r", ""]
     assert list(second.values())[3:] == ["0.2", "", "", "", "20", "", "at 20, low"]
     assert (second["state"], second["label"]) == ("pruned", "x=0.2")
-
-
-def test_pruning_savings_count_steps_and_unstarted_seeds() -> None:
-    # Complete: 100 steps each; pruned after 20 and, of three seeds, 50: of 600 steps 330 are saved.
-    study = new_study("maximize")
-    add(study, state="PRUNED", reported={20: 1.0})
-    add(study, state="PRUNED", reported={50: 1.0}, runs=["d", "e", "f"])
-    add(study, state="PRUNED")  # reported nothing: not told
-    assert pruning_savings(read(study)) is None
-    for _ in range(2):
-        add(study, [1.0], reported={10: 0.5, 100: 1.0})
-    saved = pruning_savings(read(study))
-    assert saved is not None
-    assert (saved.trials, saved.share) == (2, pytest.approx(330 / 600))
-    assert tables.counts_grid(read(study)).rows == (("5", "2", "3", "0", "0", "0", "55%"),)
 
 
 def test_importances_name_the_deciding_parameter() -> None:
@@ -150,14 +134,14 @@ def test_importances_name_the_deciding_parameter() -> None:
         big, small = index / 40, (index * 7 % 40) / 40
         params = {"small": small, "big": big, "same": 0.5}
         add(study, [10 * big + 0.01 * small, 5 * small + 0.001 * big], params=params)
-    found = importances(read(study))
+    found = importances(StudyData.read(study))
     assert list(found.shares) == ["big", "small"]
     assert found.shares["big"][0] > 0.8
     assert found.shares["small"][1] > 0.8
     for index in (0, 1):
         assert sum(shares[index] for shares in found.shares.values()) == pytest.approx(1.0)
     assert "same: one value only" in found.remark
-    assert tables.importance_grid(read(study), found).rows[0][0] == "big"
+    assert tables.tables(StudyData.read(study), found)[-1].rows[0][0] == "big"
 
 
 def test_importances_missing_have_a_reason() -> None:
@@ -165,19 +149,19 @@ def test_importances_missing_have_a_reason() -> None:
     for index in range(12):
         add(fixed, [float(index)], params={"x": 0.5})
         add(few, [float(index)] if index < 9 else [math.inf], params={"x": index / 20})
-    found = [importances(read(study)) for study in (few, fixed)]
+    found = [importances(StudyData.read(study)) for study in (few, fixed)]
     assert [each.shares for each in found] == [{}, {}]
     assert found[0].remark == "they need 10 complete trials, and there are 9."
     assert found[1].remark.startswith("no parameter took two")
 
 
-def drawn(study: optuna.Study, folder: Path) -> dict[str, StudyFigure]:
-    """Pictures by name."""
-    data = read(study)
-    return {picture.name: picture for picture in draw(data, importances(data), folder)}
+def drawn(study: optuna.Study, folder: Path) -> list[str]:
+    """Names of the pictures."""
+    data = StudyData.read(study)
+    return [name for name, _ in draw(data, importances(data), folder)]
 
 
-ONE = ["history", "importances", "slices", "contour", "intermediate", "parallel"]
+ONE = ["history", "slices", "importances", "contour", "intermediate", "parallel"]
 
 
 @pytest.mark.slow
@@ -193,27 +177,26 @@ def test_draw_one_objective_all_figures(tmp_path: Path) -> None:
         trial.report(-1, 10)
         state = {1: TrialState.FAIL, 2: TrialState.PRUNED}.get(index % 6)
         study.tell(trial, None if state else math.log10(rate) - size / 100, state)
-    found = drawn(study, tmp_path)
-    assert list(found) == ONE
+    assert drawn(study, tmp_path) == ONE
     for name in ONE:
-        assert found[name].path == tmp_path / f"{name}.png"
-        image = cv2.imread(str(found[name].path))
-        assert np.unique(image).size > 10, name
+        assert np.unique(cv2.imread(str(tmp_path / f"{name}.png"))).size > 10, name
+    study.set_user_attr(attributes.KIND, "grid")
+    assert drawn(study, tmp_path) == [*ONE[1:4], "parallel"]
+    study.set_user_attr(attributes.KIND, "list")
+    assert drawn(study, tmp_path) == []
 
 
-def test_draw_without_complete_trials_has_reasons(tmp_path: Path) -> None:
-    stale = tmp_path / "history.png"
-    stale.write_bytes(b"of a study of the same name that was deleted")
+def test_draw_without_complete_trials_is_empty(tmp_path: Path) -> None:
     study = new_study("maximize")
     trial = study.ask()
     trial.suggest_float("x", 0, 1)
     study.tell(trial, state=TrialState.FAIL)
-    study.ask()
-    found = drawn(study, tmp_path)
-    assert list(found) == ONE
-    assert all(picture.path is None and picture.reason for picture in found.values())
-    assert not stale.exists()
-    study.set_user_attr(attributes.KIND, "grid")
-    assert list(drawn(study, tmp_path)) == [*ONE[1:4], "parallel"]
-    study.set_user_attr(attributes.KIND, "list")
-    assert drawn(study, tmp_path) == {}
+    assert drawn(study, tmp_path) == []
+
+
+def test_odd_records_of_a_trial_are_shown() -> None:
+    """What somebody wrote into the storage by hand."""
+    study = new_study("maximize", metrics=["val/mIoU"])
+    size = {"masker.patch_size": "${px:64}"}
+    add(study, [8.0], params=size, pixels="text", seconds=2.0**63, results={"test/mIoU": None})
+    assert tables.trials_grid(StudyData.read(study)).rows[0][1] == "64px"
