@@ -5,15 +5,16 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from analysis.archive.files import ArchivedRun, archived, counts_of
-from rgbt.checks import InputError, nearest, split_list
+from analysis.archive import ArchivedRun, archived, counts_of
+from rgbt.checks import InputError, nearest, one_line, split_list
 from rgbt.files.plain_files import read_json
 from rgbt.metrics import names
 from rgbt.metrics.counts import Counts
@@ -23,15 +24,8 @@ from rgbt.metrics.named import parse, value
 from rgbt.metrics.pairs import file_name, protocol_of
 from rgbt.metrics.score_grid import score_grid
 from rgbt.metrics.scores import MEANS, iou, miou, recall, variance
-from rgbt.runs.folder import (
-    GROUP,
-    Description,
-    RunFolder,
-    counts_name,
-    find_run,
-    is_finished,
-    runs_in,
-)
+from rgbt.runs.folder import GROUP, RunFolder, counts_name, find_run, is_finished, runs_in
+from rgbt.runs.naming import row_name
 from rgbt.runs.result import RunResult
 from rgbt.terminal import info, warn
 from rgbt.types import VIEWS
@@ -40,6 +34,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 SEED, EXPERIMENT = "rgbt.seed", "rgbt.experiment"
+ROBUSTNESS = "robustness"
+"""Tags of runs, and the folder below ``evaluations`` with counts of corrupted images."""
 
 CLEAN, ALL = "clean", "all"
 """Condition of images as they are, as the run is made for; subset of all images of a split."""
@@ -60,14 +56,15 @@ Frames = Literal["", "aligned", "released", "next", "flow", "triples"]
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A file of counts of a run.
+    """A file of counts.
 
     Attributes:
         path: of the file.
         condition: `CLEAN`, an input ("rgb"), or a corruption ("noise"), each followed by what else
             was changed: another head, checkpoint, data set or statistics of batch normalisation.
-        severity: of the corruption; NaN for others.
-        title: of the corruption, as shown; "" for others.
+        severity: of the corruption, 0 is the clean image; NaN for others.
+        row: the corruption alone: "noise", "rgb_removed", "features-thermal"; "" for others.
+        title: of the corruption, as shown.
         unit: of the severity; "" where there is one alone.
     """
 
@@ -75,8 +72,31 @@ class Evaluation:
     counts: Counts
     condition: str = CLEAN
     severity: float = math.nan
+    row: str = ""
     title: str = ""
     unit: str = ""
+
+    @property
+    def said(self) -> str:
+        """Condition and severity: "noise 16"."""
+        severity = "" if math.isnan(self.severity) else f" {self.severity:g}"
+        return f"{self.condition}{severity}"
+
+
+def level_of(path: Path) -> Evaluation:
+    """A file of ``rgbt robustness``, which has a description beside it.
+
+    Raises:
+        InputError: a damaged file, or one of another command.
+    """
+    file, advice = path.with_suffix(".json"), "remove it, and rgbt robustness makes it again"
+    made = read_json(file, dict[str, Any], advice)
+    try:
+        row, title, unit = (str(made[key]) for key in ("row", "title", "unit"))
+        severity = float(made["severity"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{file} is not of rgbt robustness ({one_line(error)}).") from error
+    return Evaluation(path, Counts.load(path), row, severity, row, title, unit)
 
 
 def finished_runs(runs: Path | str = "runs", archive: Path | str = "results") -> list[RunResult]:
@@ -121,34 +141,30 @@ def evaluations_of(run: RunResult, split: str = "test") -> Iterator[Evaluation]:
     for path in counts_of(run.folder):
         try:
             found = _evaluation(run, path)
-        except (InputError, KeyError, TypeError, ValueError) as error:
+        except InputError as error:
             warn(f"{path} is left out: {error}")
             continue
-        if found and found.counts.split == split:
+        # Clean images once more, with their corruptions, are those that the run ended with.
+        is_again = found.row == found.condition == CLEAN
+        if found.counts.split == split and not is_again:
             yield found
 
 
-def _evaluation(run: RunResult, path: Path) -> Evaluation | None:
-    """What a file is of; its name and the description beside it say so. None: again clean."""
+def _evaluation(run: RunResult, path: Path) -> Evaluation:
+    """What a file is of; its name and the description beside it say so."""
     counts = run.counts(path.relative_to(run.folder).as_posix())
     if path.parent == run.folder:
         return Evaluation(path, counts)
-    other = [] if counts.dataset == run.fingerprint else [f"dataset {counts.dataset[:8]}"]
-    if (made_file := path.with_suffix(".json")).is_file():
-        made = read_json(made_file, dict[str, Any], "rgbt robustness makes it again")
-        rest = path.parent.name.removeprefix(counts.split).strip("_")
-        condition = " ".join(filter(None, [str(made["row"]), rest, *other]))
-        if condition == CLEAN:  # as the run ended
-            return None
-        severity, title, unit = float(made["severity"]), str(made["title"]), str(made["unit"])
-        return Evaluation(path, counts, condition, severity, title, unit)
-    if protocol_of(counts.partition):
-        rest = path.stem.rpartition(f"_{counts.split}")[2].strip("_")
-        return Evaluation(path, counts, " ".join(filter(None, [CLEAN, rest, *other])))
-    after = f"({'|'.join(VIEWS)})_{regions_of(counts.partition)}(.*?)(-({'|'.join(KINDS)}))?"
-    match = re.fullmatch(f".*_{re.escape(counts.split)}_{after}", path.stem)
-    words = [match[1], match[2].strip("_")] if match else [path.stem]
-    return Evaluation(path, counts, " ".join(filter(None, [*words, *other])))
+    other = "" if counts.dataset == run.fingerprint else f"dataset {counts.dataset[:8]}"
+    if path.parent.parent.name == ROBUSTNESS:
+        level, rest = level_of(path), path.parent.name.removeprefix(counts.split).strip("_")
+        return replace(level, condition=" ".join(filter(None, (level.row, rest, other))))
+    words = [CLEAN, path.stem.rpartition(f"_{counts.split}")[2].strip("_")]
+    if protocol_of(counts.partition) is None:
+        after = f"({'|'.join(VIEWS)})_{regions_of(counts.partition)}(.*?)(-({'|'.join(KINDS)}))?"
+        match = re.fullmatch(f".*_{re.escape(counts.split)}_{after}", path.stem)
+        words = [match[1], match[2].strip("_")] if match else [path.stem]
+    return Evaluation(path, counts, " ".join(filter(None, [*words, other])))
 
 
 def score_frame(counts: Counts, absent: Absent | None = None) -> pd.DataFrame:
@@ -167,7 +183,7 @@ def score_frame(counts: Counts, absent: Absent | None = None) -> pd.DataFrame:
 
     absent = absent or counts.absent
     rows: list[tuple[str, int, str, str, float]] = []
-    if details_of(counts.partition) or protocol_of(counts.partition):
+    if not _is_plain(counts):
         for name in dict.fromkeys(score_grid(counts).metrics):
             of = parse(name)
             score = "/".join(filter(None, (of.score, of.bin)))
@@ -216,9 +232,8 @@ def results(
 
     frames = []
     for run in finished_runs(runs, archive):
-        tags = run.tags
+        tags, seed = run.tags, _seed_of(run)
         texts = run.key, tags.get(EXPERIMENT, ""), tags.get(GROUP, "")
-        seed = int(tags[SEED]) if tags.get(SEED, "").lstrip("-").isdecimal() else pd.NA
         for each in evaluations_of(run, split):
             if not evaluations and each.path.parent != run.folder:
                 continue
@@ -232,13 +247,7 @@ def results(
 
 @dataclass(frozen=True)
 class NamedCounts:
-    """Counts of a run or of a file, under the name that tables show.
-
-    Attributes:
-        label: of the method.
-        run: that they are of; None for a file.
-        seed: of the run; None for a file.
-    """
+    """Counts under the name of their method; of a run with a seed, or of a file without both."""
 
     label: str
     path: Path
@@ -253,74 +262,67 @@ class NamedCounts:
 
 
 def open_counts(
-    text: str, runs_dir: Path | str = "runs", split: str = "", frames: Frames = ""
+    text: str,
+    runs_dir: Path | str = "runs",
+    split: str = "",
+    frames: Frames = "",
+    condition: str = "",
+    archive: Path | str = "results",
 ) -> tuple[NamedCounts, ...]:
     """The counts that `text` names, the seeds of one method one after the other.
 
     Args:
         text: a run (folder, config key or MLflow run id), a file of counts (.npz), the name of a
-            group ("grbm sigma_div=2": all its seeds in `runs_dir`), or several of these with commas
-            between them.
+            group ("grbm sigma_div=2": all its seeds), or several of these with commas between them.
         runs_dir: where runs lie.
         split: "": the test split of runs, and whatever a file holds.
         frames: of runs, counts of single frames, or of pairs of frames by one protocol
             (`rgbt.metrics.pairs`); "": single frames of runs, and whatever a file holds.
+        condition: of runs, counts of another input or of corrupted images (`Evaluation`):
+            "thermal", "noise 16", "removed:rgb"; "": as the runs ended.
+        archive: where archived runs lie, which have keys and groups as those of `runs_dir`.
 
     Raises:
-        InputError: there is no such thing, a run has no counts of the split or of pairs, or a file
-            is of others.
+        InputError: there is no such thing, a run lacks what is requested, or a file is of others.
     """
-    root = Path(runs_dir)
-    # A group's name may hold commas itself: "crm train_sizes=[240,480]".
-    is_whole = Path(text).suffix != ".npz" and bool(_of_group(text, root))
-    words = [text] if is_whole else split_list(text, RUNS)
-    found = [each for word in words for each in _open(word, root, split, frames)]
-    for named in found:
-        counts = named.counts
+    found: list[NamedCounts] = []
+    for word in split_list(text, RUNS):
+        for source in _named(word, Path(runs_dir), archive):
+            if isinstance(source, Path):
+                found.append(_of_file(source))
+            else:
+                found.append(_of_run(source, split or "test", frames, condition))
+    for path, counts in ((each.path, each.counts) for each in found):
         if split and counts.split != split:
-            raise InputError(
-                f"{named.path} is of split '{counts.split}', not of split={split}; omit split=, "
-                "or name counts of that split."
-            )
+            raise InputError(f"{path} is of split '{counts.split}', not of split={split}.")
         if frames and protocol_of(counts.partition) != frames:
-            raise InputError(
-                f"{named.path} is by {counts.partition}, not frames={frames}; omit frames=, "
-                "or name a run or what rgbt consistency run=... counted so."
-            )
+            raise InputError(f"{path} is by {counts.partition}, not frames={frames}.")
     _check_trainings_differ(text, found)
-    labels = dict.fromkeys(each.label for each in found)
-    if len(labels) > 1:
-        info(
-            f"{' and '.join(labels)} are treated as seeds of one method, because they "
-            "were listed together."
-        )
+    if len(labels := dict.fromkeys(each.label for each in found)) > 1:
+        info(f"{' and '.join(labels)}, listed together, are treated as seeds of one method.")
     return tuple(found)
 
 
 def _check_trainings_differ(text: str, found: Sequence[NamedCounts]) -> None:
     """Refuse a seed twice or equal counts: they are one training and would narrow the interval."""
     for first, second in combinations(found, 2):
-        if first.path == second.path:
-            raise InputError(f"'{text}' names {first.path} twice; one training counts once.")
+        is_one = first.label == second.label or not (first.run and second.run)
+        if is_one and np.array_equal(first.counts.counts, second.counts.counts):
+            raise InputError(
+                f"'{text}' names the same counts twice ({first.path} and {second.path}); one "
+                "training counts once."
+            )
         is_again = (first.label, first.seed) == (second.label, second.seed)
         if is_again and first.seed is not None:
             raise InputError(
                 f"'{text}' names seed {first.seed} of '{first.label}' twice ({first.key} and "
-                f"{second.key}, which differ in settings other than their overrides); name the "
-                "runs."
-            )
-        is_one = first.label == second.label or not (first.run and second.run)
-        if is_one and np.array_equal(first.counts.counts, second.counts.counts):
-            raise InputError(
-                f"'{text}': {first.path} and {second.path} hold the same counts; one training "
-                "counts once."
+                f"{second.key}, which differ in settings other than their overrides)."
             )
 
 
-def groups_in(runs_dir: Path | str) -> list[str]:
-    """Names of all groups with finished runs in a folder."""
-    runs = [run for run in _runs(Path(runs_dir)) if run.is_finished]
-    return sorted({_description(run).tags.get(GROUP, "") for run in runs} - {""})
+def groups_in(runs_dir: Path | str, archive: Path | str = "results") -> list[str]:
+    """Names of all groups of finished runs."""
+    return sorted({run.tags.get(GROUP, "") for run in finished_runs(runs_dir, archive)} - {""})
 
 
 def label_of(counts: Sequence[NamedCounts]) -> str:
@@ -328,47 +330,31 @@ def label_of(counts: Sequence[NamedCounts]) -> str:
     return " + ".join(dict.fromkeys(each.label for each in counts))
 
 
-def _open(word: str, runs_dir: Path, split: str, frames: Frames) -> list[NamedCounts]:
+def _named(word: str, runs_dir: Path, archive: Path | str) -> Sequence[RunResult | Path]:
+    """The runs, or the file of counts, that a word names."""
     path = Path(word).expanduser()
     if path.suffix == ".npz":
-        return [_of_file(path)]
-    grouped = _of_group(word, runs_dir)
-    if grouped:
-        return [_of_run(folder, split, frames) for folder in grouped]
-    if _is_folder(path) and not (path / "config.yaml").is_file():
-        return [_of_scores(path)]
+        return [path]
     try:
-        folder = find_run(word, runs_dir)
-    except (InputError, OSError) as error:  # OSError: longer than a file's name may be
-        groups = groups_in(runs_dir)
-        known = f" or a group of {runs_dir} ({nearest(word, groups)})" if groups else ""
-        raise InputError(
-            f"'{word}' is not a run folder, config key or MLflow run id in {runs_dir}, nor a file "
-            f"of counts (.npz){known}."
-        ) from error
-    return [_of_run(RunResult(folder), split, frames)]
-
-
-def _is_folder(path: Path) -> bool:
-    try:
-        return path.is_dir()
-    except OSError:  # longer than a file's name may be
-        return False
-
-
-def _of_scores(folder: Path) -> NamedCounts:
-    """The counts in a folder that `analysis.score` wrote: by rings, as the papers' tables are."""
-    files = sorted(folder.glob("counts_ring*.npz")) or sorted(folder.glob("counts_*.npz"))
+        return [RunResult(find_run(word, runs_dir))]
+    except (InputError, OSError):  # OSError: longer than a file's name may be
+        finished = finished_runs(runs_dir, archive)
+    if chosen := [run for run in finished if word in (run.key, run.tags.get(GROUP))]:
+        return chosen
+    # A folder that `analysis.score` wrote has counts by rings, as the papers' tables are, and more.
+    files = []
+    with suppress(OSError):
+        files = sorted(path.glob("counts_ring*.npz")) or sorted(path.glob("counts_*.npz"))
+    if len(files) > 1:
+        raise InputError(f"{path} has {', '.join(f.name for f in files)}; name one of these.")
+    groups = {run.tags.get(GROUP, "") for run in finished} - {""}
+    known = f" or a group of {runs_dir} ({nearest(word, groups)})" if groups else ""
     if not files:
         raise InputError(
-            f"{folder} contains neither a run (config.yaml) nor counts (counts_*.npz); to count "
-            "label images of a method: rgbt score predictions=... dataset=..."
+            f"'{word}' is not a run (folder, config key or MLflow run id in {runs_dir}), nor counts"
+            f" (.npz, or a folder of rgbt score){known}."
         )
-    if len(files) > 1:
-        raise InputError(
-            f"{folder} contains {', '.join(file.name for file in files)}; name one of these files."
-        )
-    return _of_file(files[0])
+    return files
 
 
 def _of_file(path: Path) -> NamedCounts:
@@ -379,40 +365,38 @@ def _of_file(path: Path) -> NamedCounts:
     return NamedCounts(label, path, Counts.load(path))
 
 
-def _of_group(word: str, runs_dir: Path) -> list[RunResult]:
-    runs = _runs(runs_dir) if word else []  # "" is no group, but that of runs without one
-    return [r for r in runs if word == _description(r).tags.get(GROUP) and r.is_finished]
-
-
-def _runs(runs_dir: Path) -> list[RunResult]:
-    return [RunResult(run.path) for run in runs_in(runs_dir)] if runs_dir.is_dir() else []
-
-
-def _of_run(run: RunResult, split: str, frames: Frames) -> NamedCounts:
-    split = split or "test"
-    path = run.folder / file_name(frames, split) if frames else run.folder / counts_name(split)
-    if frames and not path.is_file():
-        views = {"next": "next", "flow": "video", "triples": "video"}.get(frames, "virtual")
-        raise InputError(
-            f"{run.folder} has no counts of pairs of frames {path.relative_to(run.folder)}; "
-            f"rgbt consistency run={run.folder} split={split} frames={views} makes them once it is "
-            "finished."
-        )
+def _of_run(run: RunResult, split: str, frames: Frames, condition: str) -> NamedCounts:
+    label, seed = run.tags.get(GROUP) or run.key, _seed_of(run)
     if not run.is_finished:
         info(f"{run.folder} is not finished; its counts are those of its last evaluation.")
-    description = _description(run)
-    seed = description.tags.get(SEED, "")
-    return NamedCounts(
-        label=description.tags.get(GROUP) or run.key,
-        path=path,
-        counts=Counts.load(path) if frames else run.counts(split),
-        run=run,
-        seed=int(seed) if seed else None,
-    )
+    if condition:
+        known = [each for each in evaluations_of(run, split) if _is_plain(each.counts)]
+        name, *severity = condition.split(" ", 1)
+        wanted = " ".join((row_name(name), *severity))
+        chosen = [each for each in known if wanted in (each.condition, each.said)]
+        if len(chosen) != 1:
+            said = ", ".join(each.said for each in known)
+            raise InputError(
+                f"condition={condition} of {run.folder} is not one of {said} (rgbt evaluate and "
+                "rgbt robustness make more)."
+            )
+        return NamedCounts(label, chosen[0].path, chosen[0].counts, run, seed)
+    name = file_name(frames, split) if frames else counts_name(split)
+    if frames and not (run.folder / name).is_file():
+        views = {"next": "next", "flow": "video", "triples": "video"}.get(frames, "virtual")
+        raise InputError(
+            f"{run.folder} has no counts of pairs of frames {name}; rgbt consistency "
+            f"run={run.folder} split={split} frames={views} makes them once it is finished."
+        )
+    counts = run.counts(name if frames else split)
+    return NamedCounts(label, run.folder / name, counts, run, seed)
 
 
-def _description(run: RunResult) -> Description:
-    try:
-        return run.description
-    except (InputError, TypeError):  # a damaged run.json of some run is no reason to stop
-        return Description("", {}, {})
+def _is_plain(counts: Counts) -> bool:
+    """Whether they are of single frames, without details."""
+    return details_of(counts.partition) is None and protocol_of(counts.partition) is None
+
+
+def _seed_of(run: RunResult) -> int | None:
+    text = run.tags.get(SEED, "")
+    return int(text) if text.isdecimal() else None

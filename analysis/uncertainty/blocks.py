@@ -41,7 +41,7 @@ BAND = 1.96
 
 @dataclass(frozen=True, kw_only=True)
 class Resampling:
-    """Settings of intervals and tests.
+    """Settings of intervals and tests; InputError: a value out of range.
 
     Attributes:
         resamples: number of resamples, 100..`MOST`.
@@ -51,11 +51,7 @@ class Resampling:
             that are equal but for one number); "auto": runs of consecutively numbered frames, cut
             where one is too long for that at the distance over which the scores of the images are
             correlated (Politis and White, 2004).
-        absent: how a class without pixels scores, see `rgbt.metrics.scores`; None: as the counts
-            say (`rgbt.metrics.counts.Counts.absent`).
-
-    Raises:
-        InputError: a value out of range.
+        absent: how a class without pixels scores (`rgbt.metrics.scores`); None: as counted.
     """
 
     resamples: int = 10_000
@@ -117,33 +113,26 @@ def make_blocks(
     series: Values | None = None,
     strata: ArrayLike | None = None,
 ) -> ImageBlocks:
-    """The blocks that `choice` asks for (see `Resampling.blocks`).
+    """The blocks of N images, of whose names those of one sequence differ in one number alone.
 
-    Args:
-        names: of N images; frames of one sequence differ in one number alone.
-        choice: see `Resampling.blocks`.
-        series: (L, N), influence of every image on each of L scores; read by "auto" alone, which
-            takes the longest of their block lengths.
-        strata: (N,) number of the stratum of each image, such as day and night: no block holds
-            images of two of them. None: there is one.
+    `choice` is that of `Resampling.blocks`. "auto" alone reads `series`, (L, N), the influence of
+    every image on each of L scores, and takes the longest of their block lengths. No block holds
+    images of two `strata`, (N,), such as day and night; None: there is one.
 
     Raises:
-        InputError: fewer than `FEWEST` blocks, or names without a number where frames are asked
-            for.
+        InputError: fewer than `FEWEST` blocks, or names without the number of a frame.
     """
     parts = np.zeros(len(names), np.int64) if strata is None else np.asarray(strata, np.int64)
-    singles, said, reason = [*np.arange(len(names))[:, None]], f"{len(names)} single images", ""
+    singles, said = [*np.arange(len(names))[:, None]], f"{len(names)} single images"
     if choice in ("none", 1):
         return _joined(singles, parts, said)
     sequences = _sequences(names, parts)
-    if not sequences and choice == "auto":
-        reason = f"Names such as '{names[0]}' have no consecutive frame numbers; {ALONE}."
-        return _joined(singles, parts, f"{said} (their names show no neighbours)", reason)
     if not sequences:
-        raise InputError(
-            f"blocks={choice}: names such as '{names[0]}' show no neighbouring frames (names that "
-            "differ in one number only); use blocks=none."
-        )
+        such = f"names such as '{names[0]}' show no neighbouring frames (that differ in one number)"
+        if choice != "auto":
+            raise InputError(f"blocks={choice}: {such}; use blocks=none.")
+        said, reason = f"{said} (their names show no neighbours)", f"N{such[1:]}; {ALONE}."
+        return _joined(singles, parts, said, reason)
     if choice == "auto":
         none = np.empty((0, len(names)))
         pieces, sizes, reason = _automatic(sequences, none if series is None else series)
@@ -176,12 +165,8 @@ def block_length(series: Values, sequences: Sequence[Places]) -> int:
     Politis and White (2009). Their rule for the window looks at any lag, with a bound that at 100
     images passes over correlations of 0.28; this one is for frames.
 
-    Args:
-        series: (N,) a value of every image.
-        sequences: places of the images of each sequence, in the order of their frames.
-
-    Returns:
-        at least 1.
+    Of an (N,) series of values of the images, and the places of the images of each sequence in the
+    order of their frames; at least 1.
     """
     count = len(series)
     centred = series - series.mean()
@@ -192,7 +177,7 @@ def block_length(series: Values, sequences: Sequence[Places]) -> int:
         long = [centred[each] for each in sequences if len(each) > lag]
         return float(sum(each[: len(each) - lag] @ each[lag:] for each in long)) / count
 
-    lags = np.array([autocovariance(lag) for lag in range(covered + 1)])
+    lags = np.array([*map(autocovariance, range(covered + 1))])
     above = lags[1:] > BAND / math.sqrt(count) * lags[0]
     last = len(above) if above.all() else int(np.argmin(above))
     if lags[0] <= 0 or last == 0:

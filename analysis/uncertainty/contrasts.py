@@ -34,15 +34,11 @@ FIXED = -1
 
 @dataclass(frozen=True, kw_only=True)
 class Term:
-    """One score in a linear contrast.
+    """One score (`rgbt.metrics.named`) in a linear contrast.
 
     Attributes:
-        metric: see `rgbt.metrics.named`.
         counts: by seed; the same images in all terms. `{FIXED: counts}` for a method without seeds.
         keys: by seed, identity of the counts: equal keys, equal counts.
-
-    Raises:
-        ValueError: no counts, other seeds in `keys`, or `FIXED` beside seeds.
     """
 
     weight: float
@@ -51,10 +47,9 @@ class Term:
     keys: Mapping[int, str]
 
     def __post_init__(self) -> None:
-        if not self.counts or set(self.counts) != set(self.keys):
-            raise ValueError("term: expected counts of one seed or more, and a key for each.")
-        if FIXED in self.counts and len(self.counts) > 1:
-            raise ValueError("term: expected either counts by seed or fixed counts, got both.")
+        is_mixed = FIXED in self.counts and len(self.counts) > 1
+        if is_mixed or not self.counts or set(self.counts) != set(self.keys):
+            raise ValueError("term: expected counts and keys of one seed or more, or fixed ones.")
 
     @property
     def fixed(self) -> bool:
@@ -67,14 +62,12 @@ class Evidence:
     """What the data say about one contrast.
 
     Attributes:
-        values: contrast of each seed that all terms with seeds have; of fixed terms alone, and of
-            methods whose seeds are not paired, one value. Percent points; of the variance squared.
+        values: contrast of each seed that all terms with seeds have; one value of fixed terms
+            alone, and of methods whose seeds are not paired. Percent points; of Var squared.
         seeds: of `values`; () where all terms are fixed or not paired.
-        error: standard error, over the draw of the images, of the mean of `values`; NaN with too
-            few blocks for it.
+        error: standard error of their mean over the draw of the images; NaN with too few blocks.
         blocks: number of blocks of images that hold images of the metric.
-        said: what was drawn, e.g. "40 blocks of up to 10 neighbouring frames".
-        reason: why so, see `analysis.uncertainty.blocks.ImageBlocks.reason`.
+        said: what was drawn, and why, see `analysis.uncertainty.blocks.ImageBlocks`.
         drawn: (resamples,) contrasts with blocks drawn anew; () with too few.
         trainings: error over seeds; None for a single seed.
     """
@@ -95,11 +88,7 @@ class Evidence:
 
 
 def combine(weights: Sequence[float], parts: Sequence[Evidence]) -> Evidence:
-    """The evidence about a weighted sum of contrasts with the same seeds and draws of images.
-
-    Raises:
-        ValueError: other seeds or blocks.
-    """
+    """The evidence about a weighted sum of contrasts with the same seeds and draws of images."""
     first = parts[0]
     if any((each.seeds, each.blocks) != (first.seeds, first.blocks) for each in parts):
         raise ValueError("combine: expected the same seeds and images in all parts.")
@@ -122,9 +111,7 @@ class Resampler:
     ``blocks=auto`` the length of the blocks is that of each contrast (see
     `analysis.uncertainty.blocks.make_blocks`).
 
-    Args:
-        settings: of the resampling; `level` has no effect here.
-        alike: what the counts must have in common beside images and classes.
+    `alike` is what the counts must have in common beside images and classes.
     """
 
     def __init__(self, settings: Resampling, alike: Alike = "labels") -> None:
@@ -158,10 +145,7 @@ class Resampler:
 
         Raises:
             InputError: other images, classes or labels; no common seed; blocks that cannot be made.
-            ValueError: no terms.
         """
-        if not terms:
-            raise ValueError("contrast: expected one term or more.")
         seeds = _common_seeds(terms) if paired else ()
         every = [counts for term in terms for counts in term.counts.values()]
         absent = self._settings.absent or convention(every)
@@ -248,10 +232,9 @@ class Resampler:
 
 
 def watched(like: Counts) -> tuple[ParsedMetric, ...]:
-    """Scores that tell how far neighbouring images are alike, whatever is requested.
+    """Scores that tell how far neighbouring images are alike, whatever is requested: the main ones.
 
-    Of single frames the one that counts, and the one that shows likeness most clearly; of pairs of
-    frames and of details their main scores.
+    Of single frames also pixel accuracy, which shows likeness most clearly.
     """
     if details_of(like.partition) is not None:
         return tuple(map(parse, headlines(like)))

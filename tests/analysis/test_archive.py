@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from analysis.archive.__main__ import entry
-from analysis.archive.files import add, archived
+from analysis.archive import add, archived, entry
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.runs.folder import RunFolder

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.archive.files import add
+from analysis.archive import add
 from analysis.results import (
     COLUMNS,
     finished_runs,
@@ -121,31 +121,31 @@ def test_ambiguous_folder_of_scores_is_refused(tmp_path: Path, names: tuple[str,
     for name in names:
         some().save(tmp_path / f"counts_{name}.npz")
     files = ", ".join(f"counts_{name}.npz" for name in names)
-    with pytest.raises(InputError, match=f"{files}; name one"):
+    with pytest.raises(InputError, match=f"{files}; name one of these"):
         open_counts(str(tmp_path), tmp_path)
 
 
 @pytest.mark.parametrize(
     ("text", "options", "word"),
     [
-        ("aab0", {}, "'aab0' is not a run folder.*crm scale=demo"),
-        ("/no/such/folder", {}, "is not a run folder"),
-        ("mlflow-none", {}, "is not a run folder"),
+        ("aab0", {}, "'aab0' is not a run.*crm scale=demo"),
+        ("/no/such/folder", {}, "is not a run"),
+        ("mlflow-none", {}, "is not a run"),
         ("crm scale=dem", {}, "did you mean 'crm scale=demo'"),
-        (f"{LONG}1", {}, "is not a run folder"),
-        ("abc", {"runs_dir": "none"}, "'abc' is not a run folder"),
-        ("crm", {"runs_dir": "none"}, r"neither a run \(config.yaml\) nor counts .*rgbt score"),
+        (f"{LONG}1", {}, "is not a run"),
+        ("abc", {"runs_dir": "none"}, "'abc' is not a run"),
+        ("crm", {"runs_dir": "none"}, "is not a run .* nor counts"),
         ("none.npz", {}, "the file of counts"),
         ("images.npz", {}, "is not a readable file of counts"),
         ("", {}, "expected runs, files of counts or a group"),
         ("aaa0,,aaa1", {}, "expected runs, files of counts or a group"),
         ("aaa0", {"split": "all"}, "no counts of the split 'all'.*rgbt.evaluate"),
         ("other method.npz", {"split": "val"}, "is of split 'test', not of split=val"),
-        ("aaa0,mlflow-aaa0", {}, "twice; one training counts once"),
-        (f"{CRM},aaa1", {}, "twice; one training counts once"),
+        ("aaa0,mlflow-aaa0", {}, "names the same counts twice"),
+        (f"{CRM},aaa1", {}, "names the same counts twice"),
         ("aaa0,runs/aaa0/counts_test.npz", {}, "twice"),
         ("aaa0,link.npz", {}, "twice"),
-        ("other method.npz,copy.npz", {}, "hold the same counts; one training"),
+        ("other method.npz,copy.npz", {}, "names the same counts twice"),
         ("aaa0,ggg0", {}, f"names seed 0 of '{CRM}' twice"),  # same overrides, another default
     ],
 )
@@ -156,7 +156,7 @@ def test_other_inputs_and_repeated_runs_are_refused(
     some(7).save(runs.parent / "copy.npz")
     np.savez(runs.parent / "images.npz", x=np.zeros(3))
     if "ggg0" in text:
-        make_run(runs, "ggg0", CRM, 0)
+        some(77).save(make_run(runs, "ggg0", CRM, 0) / "counts_test.npz")
     with pytest.raises(InputError, match=word):
         open_counts(text, **{"runs_dir": runs, **options})
 
@@ -168,7 +168,7 @@ def test_damaged_run_stops_nothing_else(runs: Path, capsys: pytest.CaptureFixtur
         (broken / name).write_text(text)
     assert len(open_counts("other method.npz", runs)) == 1
     assert CRM in groups_in(runs)
-    with pytest.raises(InputError, match="is not a run folder"):
+    with pytest.raises(InputError, match="is not a run"):
         open_counts("mlflow-nobody", runs)
     open_counts("aaa9", runs)
     assert "is not finished" in capsys.readouterr().err

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
 
 from analysis.compare import entry
 from analysis.results import open_counts
-from analysis.robustness import levels_of, trainings, under
+from analysis.robustness import levels_of, trainings
 from rgbt.checks import InputError
-from rgbt.evaluation.robustness import CLEAN, FOLDER, FORMAT
+from rgbt.evaluation.robustness import CLEAN, FOLDER
 from rgbt.metrics.named import value
 from tests.analysis.robust_runs import SCORES, less, write_levels, write_run
 from tests.commands import Call
@@ -26,15 +25,14 @@ def runs(tmp_path: Path) -> Path:
 
 
 def test_is_read_as_the_command_writes_it() -> None:
-    from analysis import robustness
+    from analysis import results
 
-    assert (robustness.CLEAN, robustness.FORMAT) == (CLEAN, FORMAT)
-    assert robustness.FOLDER.name == FOLDER
+    assert (results.CLEAN, results.ROBUSTNESS) == (CLEAN, FOLDER)
 
 
 def test_levels_by_title_and_rising_severity(runs: Path) -> None:
     found = levels_of(runs / "k0" / "evaluations" / "robustness" / "test")
-    assert [(level.mark, level.severity) for level in found] == [
+    assert [(level.path.stem, level.severity) for level in found] == [
         ("clean", 0.0),
         ("rgb_removed-1", 1.0),
         ("features-thermal", 1.0),
@@ -56,67 +54,49 @@ def test_runs_groups_and_folders_are_trainings(runs: Path) -> None:
 
 
 def test_same_trainings_on_corrupted_images(runs: Path) -> None:
-    stored = open_counts("crm", runs)
-    noisy = under(stored, "noise", "16")
+    noisy = open_counts("crm", runs, condition="noise 16")
     assert [value("mIoU", each.counts, "released") for each in noisy] == pytest.approx(
         [40, 30], abs=1e-3
     )
     assert [each.seed for each in noisy] == [0, 1]
     assert noisy[0].path.name == "noise-16.npz"
-    (black, _) = under(stored, "rgb_removed", "")
-    assert value("mIoU", black.counts, "released") == pytest.approx(20, abs=1e-3)
+    for text in ("rgb_removed", "rgb_removed 1"):
+        (black, _) = open_counts("crm", runs, condition=text)
+        assert value("mIoU", black.counts, "released") == pytest.approx(20, abs=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("corruption", "severity", "sentence"),
-    [
-        ("nois", "16", r"'?nois'? was not measured in .*did you mean 'noise'"),
-        ("noise", "12", r"severity=12: .* has noise at 8, 16; give one of these"),
-        ("noise", "", r"severity=: .* has noise at 8, 16"),
-    ],
-)
-def test_missing_measurement_is_reported(
-    runs: Path, corruption: str, severity: str, sentence: str
-) -> None:
-    with pytest.raises(InputError, match=sentence):
-        under(open_counts("k0", runs), corruption, severity)
+@pytest.mark.parametrize("condition", ["nois 16", "noise 12", "noise"])
+def test_missing_condition_is_reported(runs: Path, condition: str) -> None:
+    known = "clean, features-thermal 1, noise 16, noise 8, rgb_removed 1"
+    with pytest.raises(InputError, match=f"condition={condition} of .* is not one of {known}"):
+        open_counts("k0", runs, condition=condition)
 
 
 def test_inputs_without_measurements_are_reported(runs: Path) -> None:
     place = runs / "k0" / "evaluations" / "robustness"
-    with pytest.raises(InputError, match=r"counts_test.npz is no run; .*robustness run=\.\.\."):
-        under(open_counts(str(runs / "k0" / "counts_test.npz")), "noise", "8")
     (place / "test" / "noise-8.npz").write_bytes(b"x")
     with pytest.raises(InputError, match=r"noise-8.npz' is not a readable file of counts"):
         trainings("k0", runs)
     (place / "test" / "noise-8.json").write_text("{}")
-    with pytest.raises(InputError, match=r"noise-8.json was not written by rgbt robustness"):
+    with pytest.raises(InputError, match=r"noise-8.json is not of rgbt robustness \('row'\)"):
         trainings("k0", runs)
     (place / "test" / "noise-8.json").write_text("{")
     with pytest.raises(InputError, match=r"noise-8.json is damaged"):
         trainings("k0", runs)
-    (place / "test" / "noise-8.json").write_text(json.dumps({"format": FORMAT}))
-    with pytest.raises(
-        InputError, match=r"noise-8.json does not describe what was measured \('row'\)"
-    ):
-        trainings("k0", runs)
     (place / "test" / "noise-8.json").unlink()
     (place / "test" / "clean.json").unlink()
-    with pytest.raises(InputError, match=r"contains no counts of clean images"):
-        trainings("k0", runs)
-    place.rename(place.with_name("gone"))
-    with pytest.raises(InputError, match=r"robustness/test is not there; rgbt robustness run="):
+    with pytest.raises(InputError, match=r"has no counts of clean images"):
         trainings("k0", runs)
 
 
 def test_compare_takes_corrupted_images(call: Call, runs: Path) -> None:
     where = (f"runs_dir={runs}", "metrics=mIoU", "resamples=100", "blocks=none")
-    code, out, err = call(entry, "a=k2", "b=k0", "corruption=noise", "severity=16", *where)
+    code, out, err = call(entry, "a=k2", "b=k0", "condition=noise 16", *where)
     assert code == 0, err
     # 40 against 35 on noisy images (80 against 75 on clean ones).
     assert "crm (noise 16) minus none (noise 16)" in out
     assert "35.00" in out
     assert "40.00" in out
-    code, out, err = call(entry, "a=k2", "b=k0", "corruption=rgb_removed", *where)
+    code, out, err = call(entry, "a=k2", "b=k0", "condition=rgb_removed", *where)
     assert code == 0, err
     assert "15.00" in out

@@ -244,7 +244,7 @@ def test_evidence_refuses_what_cannot_be_compared() -> None:
     foreign = {
         seed: replace(each, names=tuple(f"x{n}" for n in range(30))) for seed, each in row.items()
     }
-    with pytest.raises(InputError, match="the counts are of different images"):
+    with pytest.raises(InputError, match="the counts are not of the same images"):
         Resampler(SETTINGS).evidence(difference([row, foreign]))
     relabelled = {seed: replace(each, counts=each.counts * 2) for seed, each in row.items()}
     with pytest.raises(InputError, match="has different labels in the two counts"):

@@ -1,15 +1,16 @@
-"""Scores along an estimated flow against those along the exact one, from stored counts."""
+"""Two measurements of one training, such as along an estimated and along the exact flow."""
 
 from __future__ import annotations
 
+import csv
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from analysis.compare import entry
 from analysis.details import entry as details_entry
-from analysis.flow_error import compare_flows, entry, read_measured
 from analysis.uncertainty import Resampling, compare
 from rgbt.checks import InputError
 from rgbt.metrics.counting import pair_counts
@@ -17,7 +18,6 @@ from rgbt.metrics.counts import Counts
 from tests.commands import Call, assert_one_sentence
 
 PAIRS = 24
-HEADER = "name,used,displacement_px,end_point_error_px,hidden"
 
 
 def pairs(partition: str, wrong: int, left_out: int = 0) -> Counts:
@@ -44,49 +44,30 @@ def pairs(partition: str, wrong: int, left_out: int = 0) -> Counts:
 def measured(tmp_path: Path) -> Path:
     folder = tmp_path / "rgb"
     folder.mkdir()
-    exact = pairs("next1-abcdef", 4)
-    exact.save(folder / "consistency_next_test.npz")
+    pairs("next1-abcdef", 4).save(folder / "consistency_next_test.npz")
     pairs("flow1-123456", 6, left_out=20).save(folder / "consistency_flow-123456_test.npz")
-    lines = [f"{name},0.8,3.5,{1 + (index % 2)},0.05" for index, name in enumerate(exact.names)]
-    (folder / "flow-123456_test.csv").write_text("\n".join([HEADER, *lines, ""]))
     return folder
 
 
-def test_differences_by_hand(measured: Path) -> None:
-    comparison = compare_flows(
-        read_measured(measured, "test"), Resampling(resamples=500, blocks="none")
-    )
-    found = {each.metric: each for each in comparison.differences}
-    error = found["warping_error"]
-    # 4, 5 or 6 of 100 pixels against 6, 7 or 8 of 80.
-    assert error.a.value == pytest.approx(5)
-    assert error.b.value == pytest.approx(100 * 7 / 80)
-    assert error.value == pytest.approx(100 * 7 / 80 - 5)
-    assert error.interval is not None
-    assert error.interval.low < error.value < error.interval.high
-    assert {"day/TC", "night/warning"} - set(found) == {"night/warning"}
-    assert found["TC"].value < 0
-
-
-def test_command_shows_differences_and_records(call: Call, measured: Path) -> None:
-    code, shown, err = call(entry, f"folder={measured}", "resamples=200")
+def test_two_measurements_of_a_training_are_compared(
+    call: Call, measured: Path, tmp_path: Path
+) -> None:
+    """They count other pixels of the same pairs."""
+    files = [measured / f"consistency_{each}_test.npz" for each in ("next", "flow-123456")]
+    words = [f"{side}={file}" for side, file in zip("ab", files, strict=True)]
+    words += ["metrics=warping_error,TC,day/TC", "resamples=200", f"out={tmp_path / 'out'}"]
+    code, _, err = call(entry, *words)
+    assert code == 2
+    assert_one_sentence(err, "counts by next1-abcdef cannot be compared with counts by flow1")
+    code, out, err = call(entry, *words, "paired=true")
     assert code == 0, err
-    text = " ".join(shown.split())
-    assert "warping error 5.00 8.75 +3.75 [" in text
-    assert "all 80.0 5.0 1.50 3.50" in text
-    assert "day 80.0 5.0 1.00 3.50" in text
-
-
-def test_other_folders_are_refused(call: Call, measured: Path, tmp_path: Path) -> None:
-    def refused(sentence: str, *words: str) -> None:
-        code, _, err = call(entry, *words)
-        assert code == 2
-        assert_one_sentence(err, sentence)
-
-    refused("'folder' has no value")
-    refused("has 0 files consistency_flow-*_test.npz, expected one", f"folder={tmp_path}")
-    (measured / "flow-123456_test.csv").unlink()
-    refused("flow-123456_test.csv does not exist", f"folder={measured}")
+    assert "seeds in pairs" in out
+    error, whole, _ = csv.DictReader((tmp_path / "out" / "comparison.csv").open())
+    # 4, 5 or 6 of 100 pixels against 6, 7 or 8 of 80.
+    assert float(error["a"]) == pytest.approx(5)
+    assert float(error["b"]) == pytest.approx(100 * 7 / 80)
+    assert float(error["images_low"]) < 100 * 7 / 80 - 5 < float(error["images_high"])
+    assert float(whole["difference"]) < 0
 
 
 def test_whole_videos_are_resampled_where_there_are_many(call: Call, measured: Path) -> None:
