@@ -266,7 +266,7 @@ class Report:
             time = duration(statistics.median(times)) if times else ABSENT
             seeds = ", ".join(sorted((row["seed"] for row in each), key=lambda seed: seed.zfill(9)))
             tables = "; ".join(dict.fromkeys(name for row in each for name in row["tables"]))
-            rows.append((f"`{group}`", images, scale, seeds, *cells, time, tables))
+            rows.append((group, images, scale, seeds, *cells, time, tables))
         header = ("method", "images", "scale", "seeds", *metrics, "time", "rows of")
         facts = [(name, ", ".join(sorted(each)) or ABSENT) for name, each in origin.items()]
         counts: dict[str, int] = {}
@@ -405,12 +405,13 @@ class Report:
                 row = found.iloc[0]
                 command = f" (`rgbt reproduce table={words[0]} scale=bench seeds=4`)"
                 return statement(row) + command * (row["verdict"] == "not run")
-        if kind == "effects" and views:
+        if kind == "effects" and views and views[0].result.effects is not None:
             grids = [grid for grid in views[0].grids if f"Effects on {words[1]}," in grid]
             rows = "rows=tested scale=bench seeds=3"
             empty = f"No run yet: `rgbt reproduce table={words[0]} {rows}`."
             picture = f"![{views[0].title}]({views[0].figure})" if views[0].figure else ""
-            return "\n\n" + "\n\n".join(filter(None, [picture, *grids]) or [empty]) + "\n\n"
+            texts = [picture, *grids] if picture else grids
+            return "\n\n" + "\n\n".join(texts or [empty]) + "\n\n"
         raise InputError(f"<!-- results:{mark} --> names no claim, design or number.")
 
 

@@ -187,7 +187,7 @@ class DesignJudge:
             claim.range,
             self.rule,
             claim.combine,
-            starts=1 if basis.one_start else None,
+            starts=basis.starts,
             missing=f"Some methods have no score: {reasons[0]}" if reasons else "",
         )
         return JudgedClaim(

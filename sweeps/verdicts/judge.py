@@ -50,12 +50,12 @@ class Basis:
     Attributes:
         images: "synthetic", "real" or "unknown".
         scale: of the runs.
-        one_start: whether all seeds begin with the same trained weights.
+        starts: number of different initial weights of the runs.
     """
 
-    images: str = UNKNOWN
-    scale: str = UNKNOWN
-    one_start: bool = False
+    images: str
+    scale: str
+    starts: int
 
 
 class StoredRuns:
@@ -63,7 +63,7 @@ class StoredRuns:
 
     def __init__(self) -> None:
         self._counts: dict[tuple[str, str], Counts] = {}
-        self._bases: dict[str, Basis] = {}
+        self._settings: dict[str, tuple[str, str, str]] = {}
 
     def counts(self, run: RunResult, path: str) -> Counts:
         """Counts of a run; InputError where they are missing, damaged or cannot be read."""
@@ -78,26 +78,25 @@ class StoredRuns:
         """What runs are about, by their stored settings; of several kinds of runs, all kinds."""
         each = []
         for run in runs:
-            if run.key not in self._bases:
-                self._bases[run.key] = _basis_of(run.folder / "config.yaml")
-            each.append(self._bases[run.key])
-        images, scale = (
-            " and ".join(sorted({getattr(one, name) for one in each})) or UNKNOWN
-            for name in ("images", "scale")
-        )
-        return Basis(images, scale, any(one.one_start for one in each))
+            if run.key not in self._settings:
+                self._settings[run.key] = _settings_of(run)
+            each.append(self._settings[run.key])
+        images, scales, starts = (set(values) for values in zip(*each, strict=True))
+        return Basis(" and ".join(sorted(images)), " and ".join(sorted(scales)), len(starts))
 
 
-def _basis_of(config: Path) -> Basis:
+def _settings_of(run: RunResult) -> tuple[str, str, str]:
+    """Kind of images, scale and initial weights of a run."""
+    config = run.folder / "config.yaml"
     if not config.is_file():
-        return Basis()
+        return UNKNOWN, UNKNOWN, run.key
     settings = read_settings(config)
-    target = str(settings.get("dataset", {}).get("_target_", ""))
-    start = str(settings.get("pretrained") or settings.get("model", {}).get("weights") or "")
+    seed, scale = str(settings["seed"]), str(settings["scale"]["name"])
+    images = "synthetic" if ".synth" in str(settings["dataset"]["_target_"]) else "real"
+    start = str(settings.get("pretrained") or settings["model"].get("weights") or "")
     is_common = start.startswith("common:") and settings["seeds"]["start"] == "common"
     is_file = bool(start) and not start.startswith(("common:", "experiment:"))
-    images = "synthetic" if ".synth" in target else "real"
-    return Basis(images, str(settings["scale"]["name"]), is_common or is_file)
+    return images, scale, "0" if is_common or is_file else seed
 
 
 @dataclass(frozen=True)
@@ -256,7 +255,6 @@ class TableJudge:
         printed = [printed_value(each, self.table) for each in contrasts]
         rows = {label for each in contrasts for label in each.rows}
         finished = {label: finished_runs_of(label, runs) for label in self._rows if label in rows}
-        basis = self.stored.basis(run for each in finished.values() for run in each.values())
         judged = partial(
             JudgedClaim,
             table=self.name,
@@ -284,12 +282,13 @@ class TableJudge:
         if not evidences:
             shown = _mean(printed) if mean else printed[0]
             return judged(contrast=contrasts[0].label, printed=shown, reason=reasons[0])
+        basis = self.stored.basis(run for each in finished.values() for run in each.values())
         verdict = decide(
             list(evidences.values()),
             claim.range,
             self.rule,
             claim.combine,
-            starts=1 if basis.one_start else None,
+            starts=basis.starts,
             missing=f"Some rows have no score: {reasons[0]}" if reasons else "",
         )
         index = list(evidences)[verdict.decisive]
