@@ -25,6 +25,9 @@ NOTES = (
 IMAGES = "images alone"
 """In the column of seeds: the difference of two evaluations without seeds."""
 
+FIRST = ["table", "paper", "claim", "verdict", "as_printed", "seeds", "covers"]
+"""Columns of a frame without a claim, beside `BASIS`."""
+
 BASIS = ["images", "scale", "start", "how"]
 """Claims that differ in one of these are never in one grid."""
 
@@ -74,7 +77,7 @@ def claims_frame(judged: Sequence[JudgedClaim], how: str = "") -> pd.DataFrame:
                 "reason": each.reason,
             }
         )
-    columns = list(rows[0]) if rows else ["table", "paper", "verdict", "as_printed", *BASIS]
+    columns = list(rows[0]) if rows else [*FIRST, *BASIS]
     return pd.DataFrame(rows, columns=columns).astype({"as_printed": object})
 
 

@@ -6,10 +6,7 @@ import base64
 import hashlib
 import re
 import shlex
-import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,13 +32,11 @@ from sweeps.table.cells import OWN_COUNTS
 from sweeps.table.efficiency import million_parameters
 from sweeps.table.load_table import PUBLISHED
 from sweeps.table.request import TAG
-from sweeps.verdicts.judge import StoredRuns
 from sweeps.verdicts.stored import TableResult, TableResults
 from sweeps.worker.progress import duration
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.figure import Figure
 
 TEMPLATES = Path(__file__).with_name("templates")
 STUDIES = "studies"
@@ -58,117 +53,72 @@ MARKED = re.compile(r"(<!-- results:(.+?) -->).*?(<!-- /results -->)", re.DOTALL
 """Numbers in a page written by hand, between two comments."""
 
 FOLDED = re.compile(r'^(<details markdown="1"><summary>[^<]*</summary>|</details>)$', re.MULTILINE)
+OF_RUN = ["method", "images", "scale", "dataset"]
 PACKAGES = ("torch", "numpy", "hydra-core", "lightning-fabric", "opencv-python-headless")
 ODD = (InputError, OSError, KeyError, ValueError, TypeError, AttributeError)
 """What a record that somebody has edited may raise."""
 
 
-@dataclass(frozen=True)
 class TableView:
-    """A table as a section of a page; texts are Markdown."""
+    """A table as a section of a page; texts are Markdown.
 
-    result: TableResult
-    claims_frame: pd.DataFrame
-    figures: dict[str, Figure] = field(repr=False)
+    Attributes:
+        name: of its page: the folder of its file; all studies of ours have one.
+        how: scale, form and overrides of every row.
+        drawn: its figure, and `figure` the name of its file; None, and "", without one.
+    """
 
-    @property
-    def is_run(self) -> bool:
-        """Whether it has a run."""
-        return bool(self.result.runs)
-
-    @property
-    def name(self) -> str:
-        """Of its page: the folder of its file; all studies of ours have one."""
-        folder, slash, _ = self.result.request.name.partition("/")
-        return folder if slash else STUDIES
-
-    @property
-    def how(self) -> str:
-        """Scale, form and overrides of every row."""
-        request = self.result.request
+    def __init__(self, result: TableResult) -> None:
+        request, seeds = result.request, result.scored.seeds
+        folder, slash, _ = request.name.partition("/")
+        self.result, self.is_run = result, bool(result.runs)
+        self.name = folder if slash else STUDIES
         form = "released form" if request.form == "released" else ""
-        return ", ".join(filter(None, (f"scale={request.scale}", form, " ".join(request.extra))))
-
-    @property
-    def title(self) -> str:
-        """Number, and how it was run."""
-        table = self.result.request.table
-        name = table.number if self.name != STUDIES else self.result.request.name
-        return f"{name} ({self.how})" if self.is_run else name
-
-    @property
-    def caption(self) -> str:
-        """What it shows, in a sentence."""
-        return self.result.request.table.caption.rstrip(".") + "."
-
-    @cached_property
-    def grid(self) -> str:
-        """Ours beside the printed values."""
-        grid = grid_of(self.result, MARKDOWN)
-        return TextTable("", grid.header, grid.rows, grid.notes).to_markdown().rstrip()
-
-    @cached_property
-    def grids(self) -> list[str]:
-        """Effects of a design."""
-        return [grid.to_markdown().rstrip() for grid in grids_of(self.result)]
-
-    @cached_property
-    def figure(self) -> str:
-        """File name of the figure of a table with runs; "" without one."""
-        drawn = drawn_of(self.result) if self.is_run else None
-        request = self.result.request
+        words = " ".join(request.extra)
+        self.how = ", ".join(filter(None, (f"scale={request.scale}", form, words)))
+        title = request.table.number if slash else request.name
+        self.title = f"{title} ({self.how})" if self.is_run else title
+        self.caption = request.table.caption.rstrip(".") + "."
+        self.frame = claims_frame(result.claims, ", ".join(filter(None, (form, words))))
+        self.counted = counted(self.frame)
+        self.claims = "\n".join(claim_lines(self.frame))
+        grid = grid_of(result, MARKDOWN)
+        self.grid = markdown(TextTable("", grid.header, grid.rows, grid.notes))
+        self.grids = list(map(markdown, grids_of(result)))
+        self.drawn = drawn_of(result) if self.is_run else None
         file = f"{request.name.replace('/', '-')}_{request.variant}.svg"
-        if drawn is not None:
-            self.figures[file] = drawn
-        return "" if drawn is None else file
-
-    @property
-    def counted(self) -> str:
-        """How many claims there are by verdict."""
-        return counted(self.claims_frame)
-
-    @cached_property
-    def claims(self) -> str:
-        """The claims of the paper about it."""
-        return "\n".join(claim_lines(self.claims_frame)) if len(self.claims_frame) else ""
-
-    @property
-    def command(self) -> str:
-        """What runs the missing rows."""
-        request, seeds = self.result.request, self.result.scored.seeds
+        self.figure = file if self.drawn is not None else ""
         count = str(len(seeds)) if seeds == tuple(range(len(seeds))) else ",".join(map(str, seeds))
-        words = [f"table={request.name}", f"seeds={count if seeds else 3}"]
-        words += [] if request.scale == "demo" else [f"scale={request.scale}"]
-        words += [] if request.form == "paper" else [f"form={request.form}"]
-        return shlex.join(["rgbt", "reproduce", *words, *request.extra])
+        typed = [f"table={request.name}", f"seeds={count if seeds else 3}"]
+        typed += [] if request.scale == "demo" else [f"scale={request.scale}"]
+        typed += [] if request.form == "paper" else [f"form={request.form}"]
+        self.command = shlex.join(["rgbt", "reproduce", *typed, *request.extra])
 
 
-@dataclass(frozen=True)
 class PaperView:
     """A page of tables: those of a paper, of ours, or of the user."""
 
-    name: str
-    title: str
-    reference: str
-    views: Sequence[TableView]
-    claims: pd.DataFrame
+    def __init__(self, name: str, title: str, reference: str, views: Sequence[TableView]) -> None:
+        self.name, self.title, self.reference = name, title, reference
+        self.views = [view for view in views if view.name == name]
+        frame = claims_of(self.views)
+        is_run = frame["verdict"] != "not run"
+        self.counted = counted(frame)
+        self.judged = list(map(markdown, claim_grids(frame[is_run])))
+        self.not_run = "\n".join(claim_lines(frame[~is_run]))
 
-    @property
-    def counted(self) -> str:
-        """How many claims there are by verdict."""
-        return counted(self.claims)
 
-    @property
-    def judged(self) -> list[str]:
-        """Claims with a verdict."""
-        frame = self.claims[self.claims["verdict"] != "not run"]
-        return [grid.to_markdown().rstrip() for grid in claim_grids(frame)]
+def markdown(grid: TextTable) -> str:
+    """A grid in Markdown; "" for one without rows."""
+    return grid.to_markdown().rstrip() if grid.rows else ""
 
-    @property
-    def not_run(self) -> str:
-        """Claims without a verdict."""
-        frame = self.claims[self.claims["verdict"] == "not run"]
-        return "\n".join(claim_lines(frame))
+
+def claims_of(views: Sequence[TableView]) -> pd.DataFrame:
+    """The claims of all these tables, once for every way that they were run."""
+    import pandas as pd
+
+    frames = [view.frame for view in views if len(view.frame)]
+    return pd.concat(frames, ignore_index=True) if frames else claims_frame(())
 
 
 class Report:
@@ -188,114 +138,84 @@ class Report:
         studies: Mapping[str, str],
         track: Callable[[Iterable[Any]], Iterable[Any]] = iter,
     ) -> None:
+        self.texts = read_yaml(TEMPLATES / "pages.yaml")
+        self.source, self.runs, self.studies = source, runs, studies.items()
+        self.views = [TableView(result) for result in track(source)]
+        self.every = claims_of(self.views)
+        # Of a claim the verdict by the most seeds at the largest scale counts.
+        ranks = self.every["scale"].map({scale: rank for rank, scale in enumerate(SCALES)})
+        order = self.every.assign(rank=ranks.fillna(-1)).sort_values(
+            ["rank", "seeds"], kind="stable"
+        )
+        self.claims = order.drop_duplicates(["table", "claim"], keep="last").sort_index()
+        self.remarks = source.remarks
+        self.data = self._of_runs()
+        known = {name: tuple(each.values()) for name, each in self.texts["papers"].items()}
+        known[STUDIES] = ("Studies", "Tables of this project that no paper prints.")
+        known |= {
+            v.name: (v.name, "Tables of the user.") for v in self.views if v.name not in known
+        }
+        self.papers = [PaperView(name, *each, self.views) for name, each in known.items()]
+
+    def _of_runs(self) -> dict[str, Any]:
+        """Runs by method, what they are about, and where they come from, as Markdown."""
         import pandas as pd
 
-        self.figures: dict[str, Figure] = {}
-        self.texts = read_yaml(TEMPLATES / "pages.yaml")
-        self.source, self._runs, self.studies = source, runs, studies.items()
-        self.views: list[TableView] = []
-        for result in track(source):
-            view = TableView(result, claims_frame(()), self.figures)
-            frame = claims_frame(result.claims, view.how.partition(", ")[2])
-            self.views.append(TableView(result, frame, self.figures))
-        frames = [view.claims_frame for view in self.views if len(view.claims_frame)]
-        every = pd.concat(frames, ignore_index=True) if frames else claims_frame(())
-        ranks = every["scale"].map({scale: place for place, scale in enumerate(SCALES)}).fillna(-1)
-        order = every.assign(rank=ranks, run=every["verdict"] != "not run")
-        keys = ["run", "rank", "seeds"] if frames else ["rank"]
-        best = order.sort_values(keys, ascending=False, kind="stable").drop_duplicates(
-            ["table", "claim"] if frames else ["table"]
-        )
-        self.claims = best.sort_index().drop(columns=["rank", "run"])
-        self._all = every
-        self._stored = StoredRuns()
-        self.remarks = source.remarks
-        self.runs_grid, self.origin_grid, self.bases = self._of_runs()
-
-    @property
-    def papers(self) -> list[PaperView]:
-        """The papers, our studies, and folders of the user's tables, in this order."""
-        known = {
-            name: (each["title"], each["reference"]) for name, each in self.texts["papers"].items()
-        }
-        known[STUDIES] = ("Studies", "Tables of this project that no paper prints.")
-        for view in self.views:
-            known.setdefault(view.name, (view.name, "Tables of the user."))
-        of_view = self._all["table"].map(lambda name: name.rpartition("/")[0] or STUDIES)
-        return [
-            PaperView(
-                *(name, title, reference),
-                [view for view in self.views if view.name == name],
-                self._all[of_view == name],
-            )
-            for name, (title, reference) in known.items()
-        ]
-
-    def _of_runs(self) -> tuple[str, str, list[str]]:
-        """Runs by method, where they come from, and what they are about."""
-        groups: dict[tuple[str, ...], list[dict[str, Any]]] = {}
-        origin: dict[str, set[str]] = {}
-        for run in self._runs:
+        rows, facts = [], []
+        for run in self.runs:
             try:
-                row = self._row(run)
+                rows.append(self._scores(run))
                 first = next(iter(run.provenance), {})
-                packages = first.get("packages") or {}
-                cpu = f"{first.get('cpu')}, {first.get('cpu_usable')} cores"
-                facts = {
-                    "git commits": commit_of(first),
-                    "Python": first.get("python"),
-                    **{name: packages.get(name) for name in PACKAGES},
-                    "hardware": ", ".join(first.get("gpus") or []) or (first.get("cpu") and cpu),
-                }
-                for name, fact in facts.items():
-                    origin.setdefault(name, set()).update(filter(None, [fact]))
-                groups.setdefault(row.pop("key"), []).append(row)
+                packages, gpus = first.get("packages") or {}, ", ".join(first.get("gpus") or [])
+                machine = gpus or f"{first['cpu']}, {first['cpu_usable']} cores"
+                versions = {name: packages.get(name) for name in PACKAGES}
+                commit = {"git commit": commit_of(first), "Python": first.get("python")}
+                facts.append({**commit, **versions, "hardware": machine})
             except ODD as error:
                 self.remarks.append(f"Run {run.key} is left out: {one_line(error)}.")
-        metrics = list(
-            dict.fromkeys(name for each in groups.values() for name in each[0]["scores"])
-        )
-        rows = []
-        for (group, images, scale, _), each in sorted(groups.items()):
-            cells = []
-            for metric in metrics:
-                values = [row["scores"][metric] for row in each if metric in row["scores"]]
-                spread = f" ± {number(statistics.stdev(values))}" if len(values) > 1 else ""
-                cells.append(f"{number(statistics.fmean(values))}{spread}" if values else ABSENT)
-            times = [row["seconds"] for row in each if row["seconds"] is not None]
-            time = duration(statistics.median(times)) if times else ABSENT
-            seeds = ", ".join(sorted((row["seed"] for row in each), key=lambda seed: seed.zfill(9)))
-            tables = "; ".join(dict.fromkeys(name for row in each for name in row["tables"]))
-            rows.append((group, images, scale, seeds, *cells, time, tables))
-        header = ("method", "images", "scale", "seeds", *metrics, "time", "rows of")
-        facts = [(name, ", ".join(sorted(each)) or ABSENT) for name, each in origin.items()]
-        counts: dict[str, int] = {}
-        for (_, images, scale, _), each in sorted(groups.items()):
-            name = f"{images} images, scale={scale}"
-            counts[name] = counts.get(name, 0) + len(each)
-        grids = (TextTable("", header, tuple(rows)), TextTable("", ("what", "value"), tuple(facts)))
-        texts = [grid.to_markdown().rstrip() if grid.rows else "" for grid in grids]
-        return texts[0], texts[1], [f"{count} on {name}" for name, count in counts.items()]
+        if not rows:
+            return {"runs": "", "origin": "", "bases": []}
+        frame, lines = pd.DataFrame(rows), []
+        metrics = [name for name in frame if name not in (*OF_RUN, "seed", "time", "tables")]
+        for key, each in frame.groupby(OF_RUN):
+            cells = [
+                f"{number(each[name].mean())}{f' ± {number(each[name].std())}' * (len(each) > 1)}"
+                for name in metrics
+            ]
+            seeds = ", ".join(map(str, sorted(each["seed"])))
+            tables = "; ".join(dict.fromkeys("; ".join(each["tables"]).split("; ")))
+            lines.append((*key[:3], seeds, *cells, duration(each["time"].median()), tables))
+        header = (*OF_RUN[:3], "seeds", *metrics, "time", "rows of")
+        known = pd.DataFrame(facts)
+        texts = {name: sorted(set(known[name].dropna()) - {""}) for name in known}
+        origin = tuple((name, ", ".join(each) or ABSENT) for name, each in texts.items())
+        counts = frame.groupby(OF_RUN[1:3]).size()
+        return {
+            "runs": markdown(TextTable("", header, tuple(lines))),
+            "origin": markdown(TextTable("", ("what", "value"), origin)),
+            "bases": [f"{n} on {images} images, scale={s}" for (images, s), n in counts.items()],
+        }
 
-    def _row(self, run: RunResult) -> dict[str, Any]:
-        tags, basis = run.tags, self._stored.basis([run])
-        counts = self._stored.counts(run, OWN_COUNTS)
+    def _scores(self, run: RunResult) -> dict[str, Any]:
+        """Of a run: the keys `OF_RUN`, seed, scores, time and tables."""
+        tags, stored = run.tags, self.source.stored
+        counts, basis = stored.counts(run, OWN_COUNTS), stored.basis([run])
+        group = (tags.get(GROUP, run.key), basis.images, basis.scale, counts.dataset)
         regions = [names.region(place + 1) for place in range(counts.counts.shape[1])]
         metrics = (names.MIOU, names.VAR, *regions)
         return {
-            "key": (tags.get(GROUP, run.key), basis.images, basis.scale, counts.dataset),
-            "seed": tags.get("rgbt.seed", ABSENT),
-            "scores": {name: value(name, counts, counts.absent) for name in metrics},
-            "seconds": run.result.get("seconds_of_last_process"),
-            "tables": [tag.removeprefix(TAG) for tag in sorted(tags) if tag.startswith(TAG)],
+            **dict(zip(OF_RUN, group, strict=True)),
+            "seed": int(tags["rgbt.seed"]),
+            **{name: value(name, counts, counts.absent) for name in metrics},
+            "time": float(run.result["seconds_of_last_process"]),
+            "tables": "; ".join(sorted(t.removeprefix(TAG) for t in tags if t.startswith(TAG))),
         }
 
     @property
     def limits(self) -> list[str]:
         """What the verdicts do not say, one sentence or two each."""
-        judged = self._all[self._all["verdict"] != "not run"]
-        said = []
-        if "paper" not in set(judged.get("scale", ())):
+        judged, said = self.every[self.every["verdict"] != "not run"], []
+        if "paper" not in set(judged["scale"]):
             said.append(
                 "**Networks:** no verdict is at paper scale. Small networks on small images say "
                 "something about a method at that scale, and neither confirm nor refute a number."
@@ -305,11 +225,10 @@ class Report:
             ("start", "one start for all seeds", "is from one start, see the warning beside it"),
             ("covers", "images", "is of one training: other trainings are not covered"),
         ):
-            if count := int((judged.get(column, judged["verdict"]) == word).sum()):
+            if count := int((judged[column] == word).sum()):
                 said.append(f"**{column.capitalize()}:** the verdict of {count} claims {text}.")
         chance = f"**Chance:** of {len(judged)} claims without any effect, up to"
-        said.append(f"{chance} {0.025 * len(judged):.1f} would be called holding.")
-        return said
+        return [*said, f"{chance} {0.025 * len(judged):.1f} would be called holding."]
 
     def page(self, name: str) -> str:
         """A page as Markdown: "index", "claims", "networks", "all" or the name of a paper."""
@@ -322,17 +241,14 @@ class Report:
             trim_blocks=True,
             lstrip_blocks=True,
         )
-        papers = self.papers
         own = [view for view in self.views if view.is_run or view.name not in self.texts["papers"]]
         data = {
-            "num_runs": len(self._runs),
-            "bases": self.bases,
-            "at_paper_scale": any("scale=paper" in each for each in self.bases),
-            "runs": self.runs_grid,
-            "origin": self.origin_grid,
+            **self.data,
+            "num_runs": len(self.runs),
+            "at_paper_scale": any("scale=paper" in each for each in self.data["bases"]),
             "remarks": self.remarks,
-            "counts": counts_grid(self.claims).to_markdown().rstrip(),
-            "papers": papers,
+            "counts": markdown(counts_grid(self.claims)),
+            "papers": self.papers,
             "limits": self.limits,
             "own": [view for view in own if view.is_run or view.name != STUDIES],
             "papers_tables": [view for view in self.views if view not in own],
@@ -340,7 +256,7 @@ class Report:
             "any_verdict": bool((self.claims["verdict"] != "not run").any()),
             **(_networks(self.texts["networks"]) if name == "networks" else {}),
         }
-        paper = next((each for each in papers if each.name == name), None)
+        paper = next((each for each in self.papers if each.name == name), None)
         text = environment.get_template("pages.md.j2").render(data=data, page=name, paper=paper)
         text = re.sub(r"\n{3,}", "\n\n", text).strip() + "\n"
         return MARKUP.sub("&lt;", ABSOLUTE.sub(r".../\1", without_passwords(text)))
@@ -378,8 +294,9 @@ class Report:
 
         with tempfile.TemporaryDirectory() as folder:
             return {
-                name: write_figure(figure, Path(folder, name)).read_bytes()
-                for name, figure in sorted(self.figures.items())
+                view.figure: write_figure(view.drawn, Path(folder, view.figure)).read_bytes()
+                for view in self.views
+                if view.drawn is not None
             }
 
     def filled(self, text: str) -> str:
@@ -433,7 +350,7 @@ def _networks(networks: Sequence[Mapping[str, Any]]) -> dict[str, str]:
         "weights": TextTable("", headers[1], tuple(weights)),
         "tests": TextTable("", ("network", "test"), tuple(tests)),
     }
-    return {name: grid.to_markdown().rstrip() for name, grid in grids.items()}
+    return {name: markdown(grid) for name, grid in grids.items()}
 
 
 PAPERS = tuple(sorted(path.name for path in PUBLISHED.iterdir()))

@@ -153,7 +153,7 @@ class TableResults:
 
     def __post_init__(self) -> None:
         self.tables: dict[str, Table] = {}
-        self._stored = StoredRuns()
+        self.stored = StoredRuns()
         self.remarks += self.finished.remarks
         for name in dict.fromkeys([*table_names(self.own), *study_names()]):
             try:
@@ -212,7 +212,7 @@ class TableResults:
             rule_of(result for run in runs.values() for result in run.results),
             self.resamples,
             sizes,
-            self._stored,
+            self.stored,
         )
         return TableResult.of(request, runs, judge, sizes)
 

@@ -140,7 +140,7 @@ def test_index_has_runs_with_seeds_spread_and_time(report: Report) -> None:
     assert cells[2:5] == ["synthetic", "demo", "0, 1, 2"]
     assert re.fullmatch(r"\d+\.\d\d ± \d+\.\d\d", cells[5])
     assert cells[-3:-1] == ["61 s", "my/planted"]
-    assert "| git commits | 0123456789 |" in text
+    assert "| git commit | 0123456789 |" in text
     assert "desk" not in text
 
 
