@@ -79,7 +79,8 @@ OUTSIDE = {
     "analysis": {f"rgbt.{each}" for each in READING - {"geometry"}},
     "hydra_plugins": {"rgbt", "sweeps"},
 }
-"""Package or room -> what it may import of the other packages; the analysis sees no network."""
+"""Package or room -> what it may import of the other packages, in the order rgbt <- analysis <-
+sweeps; the analysis sees no network."""
 
 
 @cache
