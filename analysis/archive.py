@@ -76,8 +76,7 @@ class ArchivedRun:
     def unpack(self, folder: Path | None = None) -> RunResult:
         """The run as ``<digest of the file>/<key>`` in `folder` (None: the user's cache), once.
 
-        Raises:
-            InputError: a damaged file, or one that belongs to another run.
+        InputError: a damaged file, or one that belongs to another run.
         """
         cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
         folder = folder or Path(cache, "rgbt", "archive")
@@ -130,9 +129,7 @@ def add(run: RunResult, folder: Path) -> ArchivedRun:
     """Put a finished run into the archive `folder`; the same results are written once.
 
     Other results of the same key, from another machine, are kept beside as ``<key>-<digest>.zip``.
-
-    Raises:
-        InputError: the run is not finished, or one of its files is damaged.
+    InputError: the run is not finished, or one of its files is damaged.
     """
     if not run.is_finished:
         raise InputError(f"{run.folder} is not finished; rerun its command.")
@@ -200,9 +197,8 @@ def _unpack_counts(content: bytes, shared: Path) -> Counts:
     if "labelled" in arrays:
         classes = range(array.shape[-1])
         array[..., classes, classes] = arrays["labelled"] - array.sum(-1)
-    lists = {name: tuple(arrays[name].tolist()) for name in ("names", "classes", "unscored")}
-    night = tuple(arrays["night"].tolist()) or None
-    return Counts(**fields, **lists, counts=array, night=night)
+    fields |= {name: tuple(arrays[name].tolist()) for name in ("names", "classes", "unscored")}
+    return Counts(**fields, counts=array, night=tuple(arrays["night"].tolist()) or None)
 
 
 def _shared_arrays(shared: Path, name: str) -> dict[str, NDArray[Any]]:

@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 import numpy as np
 
 from analysis.arguments import Archive, Blocks, Draws, Level, Resamples, check_out, write_tables
-from analysis.results import NamedCounts, groups_in, label_of, open_counts
+from analysis.results import Evaluation, groups_in, label_of, open_counts
 from analysis.uncertainty import Comparison, Interval, Resampling, compare
 from analysis.uncertainty.blocks import FEWEST
 from analysis.uncertainty.same_images import common
@@ -126,11 +126,9 @@ def main(options: Options, _: list[str]) -> int:
 
 
 def metrics_of(text: str, every: Sequence[Counts], settings: Resampling) -> list[str]:
-    """The requested metrics; "auto": the usual scores of the counts, also by day and by night.
+    """The requested metrics; "auto": the usual scores of the counts.
 
-    Of single frames mIoU (by day, by night) and Var and every region; of pairs of frames the two
-    of their protocol (by day, by night). Day and night where all counts distinguish them and have
-    enough images of them for `settings`.
+    Means also by day and by night, where all counts have enough images of both for `settings`.
     """
     partition = every[0].partition
     if text != "auto":
@@ -201,7 +199,7 @@ def absent_classes(every: Sequence[Counts], absent: Absent | None) -> tuple[str,
     return absent_notes(summed, first.classes, first.scored, first.split, used)
 
 
-def _opened(options: Options) -> list[tuple[NamedCounts, ...]]:
+def _opened(options: Options) -> list[tuple[Evaluation, ...]]:
     """The trainings of both methods."""
     if options.condition and options.frames:
         raise InputError(f"condition={options.condition} is of single frames; omit frames=.")
@@ -217,7 +215,7 @@ def _opened(options: Options) -> list[tuple[NamedCounts, ...]]:
 
 
 def _counts(
-    opened: Sequence[tuple[NamedCounts, ...]], missing: str
+    opened: Sequence[tuple[Evaluation, ...]], missing: str
 ) -> tuple[list[Counts], list[Counts]]:
     methods = [[named.counts for named in each] for each in opened]
     shared = {each.path for each in opened[0]} & {each.path for each in opened[1]}
@@ -232,7 +230,7 @@ def _counts(
     return methods[0], methods[1]
 
 
-def _labels(opened: Sequence[tuple[NamedCounts, ...]]) -> list[str]:
+def _labels(opened: Sequence[tuple[Evaluation, ...]]) -> list[str]:
     """Labels that differ: the names of the methods, with their seeds where these are equal."""
     plain = labels = [label_of(each) for each in opened]
     if plain[0] == plain[1]:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Annotated
 
 from analysis.arguments import Archive, Blocks, Draws, Level, Resamples, check_out, write_tables
-from analysis.results import Evaluation, NamedCounts, evaluations_of, label_of, open_counts
+from analysis.results import Evaluation, evaluations_of, label_of, open_counts
 from analysis.uncertainty import Estimate, Resampling, estimate
 from rgbt.checks import InputError
 from rgbt.config.common_options import RunsDir
@@ -81,12 +81,12 @@ def main(options: Options, _: list[str]) -> int:
     return 0
 
 
-def _stored(opened: Sequence[NamedCounts], split: str) -> dict[Key, list[Counts]]:
+def _stored(opened: Sequence[Evaluation], split: str) -> dict[Key, list[Counts]]:
     """The counts of a method by what they are of, one for each training."""
     stored = [
         [each for each in evaluations_of(named.run, split) if each.condition in VIEWS]
         if named.run
-        else [Evaluation(named.path, named.counts, "")]
+        else [named]
         for named in opened
     ]
     every = [{(e.condition, e.counts.partition): e.counts for e in found} for found in stored]

@@ -21,7 +21,7 @@ from rgbt.metrics.counts import Counts
 from rgbt.metrics.details import KINDS, details_of, regions_of
 from rgbt.metrics.metric import Absent
 from rgbt.metrics.named import parse, value
-from rgbt.metrics.pairs import file_name, protocol_of
+from rgbt.metrics.pairs import protocol_of
 from rgbt.metrics.score_grid import score_grid
 from rgbt.metrics.scores import MEANS, iou, miou, recall, variance
 from rgbt.runs.folder import GROUP, RunFolder, counts_name, find_run, is_finished, runs_in
@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 SEED, EXPERIMENT = "rgbt.seed", "rgbt.experiment"
-ROBUSTNESS = "robustness"
-"""Tags of runs, and the folder below ``evaluations`` with counts of corrupted images."""
+EVALUATIONS, ROBUSTNESS = "evaluations", "robustness"
+"""Tags of runs; folder of their evaluations, and the one below it of corrupted images."""
 
 CLEAN, ALL = "clean", "all"
 """Condition of images as they are, as the run is made for; subset of all images of a split."""
@@ -56,12 +56,12 @@ Frames = Literal["", "aligned", "released", "next", "flow", "triples"]
 
 @dataclass(frozen=True)
 class Evaluation:
-    """A file of counts.
+    """A file of counts, of a run or of another method.
 
     Attributes:
-        path: of the file.
+        run: that was evaluated; None: the file says nothing about one.
         condition: `CLEAN`, an input ("rgb"), or a corruption ("noise"), each followed by what else
-            was changed: another head, checkpoint, data set or statistics of batch normalisation.
+            was changed: another head, checkpoint, data set, views or statistics of batches.
         severity: of the corruption, 0 is the clean image; NaN for others.
         row: the corruption alone: "noise", "rgb_removed", "features-thermal"; "" for others.
         title: of the corruption, as shown.
@@ -70,7 +70,8 @@ class Evaluation:
 
     path: Path
     counts: Counts
-    condition: str = CLEAN
+    run: RunResult | None = None
+    condition: str = ""
     severity: float = math.nan
     row: str = ""
     title: str = ""
@@ -82,13 +83,30 @@ class Evaluation:
         severity = "" if math.isnan(self.severity) else f" {self.severity:g}"
         return f"{self.condition}{severity}"
 
+    @property
+    def key(self) -> str:
+        """Config key of the run; "" for a file."""
+        return "" if self.run is None else self.run.key
+
+    @property
+    def label(self) -> str:
+        """Name of the method in tables: the group of the run, or the name of file or folder."""
+        if self.run is not None:
+            return self.run.tags.get(GROUP) or self.run.key
+        folder = self.path.parent
+        folder = folder.parent if folder.name == EVALUATIONS else folder
+        is_generic = self.path.stem.startswith(("counts_", "consistency_"))
+        return folder.name if is_generic else self.path.stem
+
+    @property
+    def seed(self) -> int | None:
+        """Of the run; None for a file."""
+        text = "" if self.run is None else self.run.tags.get(SEED, "")
+        return int(text) if text.isdecimal() else None
+
 
 def level_of(path: Path) -> Evaluation:
-    """A file of ``rgbt robustness``, which has a description beside it.
-
-    Raises:
-        InputError: a damaged file, or one of another command.
-    """
+    """A file of ``rgbt robustness``, with the description beside it; InputError if damaged."""
     file, advice = path.with_suffix(".json"), "remove it, and rgbt robustness makes it again"
     made = read_json(file, dict[str, Any], advice)
     try:
@@ -96,7 +114,7 @@ def level_of(path: Path) -> Evaluation:
         severity = float(made["severity"])
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{file} is not of rgbt robustness ({one_line(error)}).") from error
-    return Evaluation(path, Counts.load(path), row, severity, row, title, unit)
+    return Evaluation(path, Counts.load(path), None, row, severity, row, title, unit)
 
 
 def finished_runs(runs: Path | str = "runs", archive: Path | str = "results") -> list[RunResult]:
@@ -114,23 +132,17 @@ def finished_runs(runs: Path | str = "runs", archive: Path | str = "results") ->
         try:
             run = RunResult(source.path) if isinstance(source, RunFolder) else source.unpack()
             _ = run.result, run.description  # they can be read
-            if not _equal_counts(found.setdefault(run.key, run), run):
-                differing.add(run.key)
+            first = found.setdefault(run.key, run)
+            shared = {each.relative_to(run.folder) for each in counts_of(run.folder)}
+            shared &= {each.relative_to(first.folder) for each in counts_of(first.folder)}
+            for name in shared if first is not run else ():
+                one, two = (Counts.load(each.folder / name) for each in (first, run))
+                differing |= set() if np.array_equal(one.counts, two.counts) else {run.key}
         except InputError as error:
             warn(f"{source.path} is left out: {error}")
     for key in sorted(differing):
         warn(f"{key} is stored with other counts, too; those of {found[key].folder} are used.")
     return [found[key] for key in sorted(found)]
-
-
-def _equal_counts(first: RunResult, other: RunResult) -> bool:
-    """Whether what both runs have counted is equal."""
-    if first is other:
-        return True
-    paths = {path.relative_to(first.folder) for path in counts_of(first.folder)}
-    shared = sorted(paths & {path.relative_to(other.folder) for path in counts_of(other.folder)})
-    pairs = ([Counts.load(run.folder / each) for run in (first, other)] for each in shared)
-    return all(np.array_equal(one.counts, two.counts) for one, two in pairs)
 
 
 def evaluations_of(run: RunResult, split: str = "test") -> Iterator[Evaluation]:
@@ -154,25 +166,27 @@ def _evaluation(run: RunResult, path: Path) -> Evaluation:
     """What a file is of; its name and the description beside it say so."""
     counts = run.counts(path.relative_to(run.folder).as_posix())
     if path.parent == run.folder:
-        return Evaluation(path, counts)
+        return Evaluation(path, counts, run, CLEAN)
     other = "" if counts.dataset == run.fingerprint else f"dataset {counts.dataset[:8]}"
     if path.parent.parent.name == ROBUSTNESS:
         level, rest = level_of(path), path.parent.name.removeprefix(counts.split).strip("_")
-        return replace(level, condition=" ".join(filter(None, (level.row, rest, other))))
-    words = [CLEAN, path.stem.rpartition(f"_{counts.split}")[2].strip("_")]
-    if protocol_of(counts.partition) is None:
-        after = f"({'|'.join(VIEWS)})_{regions_of(counts.partition)}(.*?)(-({'|'.join(KINDS)}))?"
-        match = re.fullmatch(f".*_{re.escape(counts.split)}_{after}", path.stem)
-        words = [match[1], match[2].strip("_")] if match else [path.stem]
-    return Evaluation(path, counts, " ".join(filter(None, [*words, other])))
+        words = [level.row, rest, other]
+        return replace(level, run=run, condition=" ".join(filter(None, words)))
+    split, partition = re.escape(counts.split), regions_of(counts.partition)
+    after = f"({'|'.join(VIEWS)})_{partition}(.*?)(-({'|'.join(KINDS)}))?"
+    if match := re.fullmatch(f"consistency_[a-z]+(.*)_{split}(.*)", path.stem):
+        words = [CLEAN, *match.groups(), other]
+    elif match := re.fullmatch(f".*_{split}_{after}", path.stem):
+        words = [match[1], match[2], other]
+    else:
+        words = [path.stem, other]
+    return Evaluation(path, counts, run, " ".join(filter(None, (w.strip("_-") for w in words))))
 
 
 def score_frame(counts: Counts, absent: Absent | None = None) -> pd.DataFrame:
-    """Every score of counts, one a row.
+    """Every score of counts of single frames, of pairs of frames, or of details, one a row.
 
-    Args:
-        counts: of single frames, of pairs of frames, or of details.
-        absent: how a class without pixels scores (`rgbt.metrics.scores`); None: as the counts say.
+    `absent`: how a class without pixels scores (`rgbt.metrics.scores`); None: as counted.
 
     Returns:
         the columns `SCORE_COLUMNS`: subset ("all", "day", "night"), region (0: the whole image),
@@ -215,13 +229,8 @@ def results(
 ) -> pd.DataFrame:
     """Scores of all finished runs (`finished_runs`) as one frame: one score a row.
 
-    Args:
-        runs: folder of runs.
-        archive: folder of archived runs.
-        split: of the counts.
-        absent: see `score_frame`.
-        evaluations: whether to read counts of other inputs, corruptions, details and pairs of
-            frames, too, and not only those that a run ended with.
+    `absent` is that of `score_frame`. Without `evaluations`, only the counts that a run ended with
+    are read, and none of other inputs, corruptions, details and pairs of frames.
 
     Returns:
         the columns `COLUMNS`: run (its key), experiment, group (name that its seeds share), seed,
@@ -232,33 +241,16 @@ def results(
 
     frames = []
     for run in finished_runs(runs, archive):
-        tags, seed = run.tags, _seed_of(run)
-        texts = run.key, tags.get(EXPERIMENT, ""), tags.get(GROUP, "")
+        texts = run.key, run.tags.get(EXPERIMENT, ""), run.tags.get(GROUP, "")
         for each in evaluations_of(run, split):
             if not evaluations and each.path.parent != run.folder:
                 continue
-            found = (*texts, seed, split, each.condition, each.severity, each.counts.partition)
+            found = (*texts, each.seed, split, each.condition, each.severity, each.counts.partition)
             of_file = dict(zip(COLUMNS, found, strict=False))
             frames.append(score_frame(each.counts, absent).assign(**of_file))
     if not frames:
         return pd.DataFrame(columns=COLUMNS)
     return pd.concat(frames, ignore_index=True)[[*COLUMNS]].astype({"seed": "Int64"})
-
-
-@dataclass(frozen=True)
-class NamedCounts:
-    """Counts under the name of their method; of a run with a seed, or of a file without both."""
-
-    label: str
-    path: Path
-    counts: Counts
-    run: RunResult | None = None
-    seed: int | None = None
-
-    @property
-    def key(self) -> str:
-        """Config key of the run; "" for a file."""
-        return "" if self.run is None else self.run.key
 
 
 def open_counts(
@@ -268,7 +260,7 @@ def open_counts(
     frames: Frames = "",
     condition: str = "",
     archive: Path | str = "results",
-) -> tuple[NamedCounts, ...]:
+) -> tuple[Evaluation, ...]:
     """The counts that `text` names, the seeds of one method one after the other.
 
     Args:
@@ -285,13 +277,14 @@ def open_counts(
     Raises:
         InputError: there is no such thing, a run lacks what is requested, or a file is of others.
     """
-    found: list[NamedCounts] = []
+    found: list[Evaluation] = []
     for word in split_list(text, RUNS):
         for source in _named(word, Path(runs_dir), archive):
-            if isinstance(source, Path):
-                found.append(_of_file(source))
-            else:
+            if isinstance(source, RunResult):
                 found.append(_of_run(source, split or "test", frames, condition))
+            else:
+                path = source.resolve()
+                found.append(Evaluation(path, Counts.load(path)))
     for path, counts in ((each.path, each.counts) for each in found):
         if split and counts.split != split:
             raise InputError(f"{path} is of split '{counts.split}', not of split={split}.")
@@ -303,7 +296,7 @@ def open_counts(
     return tuple(found)
 
 
-def _check_trainings_differ(text: str, found: Sequence[NamedCounts]) -> None:
+def _check_trainings_differ(text: str, found: Sequence[Evaluation]) -> None:
     """Refuse a seed twice or equal counts: they are one training and would narrow the interval."""
     for first, second in combinations(found, 2):
         is_one = first.label == second.label or not (first.run and second.run)
@@ -325,7 +318,7 @@ def groups_in(runs_dir: Path | str, archive: Path | str = "results") -> list[str
     return sorted({run.tags.get(GROUP, "") for run in finished_runs(runs_dir, archive)} - {""})
 
 
-def label_of(counts: Sequence[NamedCounts]) -> str:
+def label_of(counts: Sequence[Evaluation]) -> str:
     """Name of a method: its group, or the names of all its counts."""
     return " + ".join(dict.fromkeys(each.label for each in counts))
 
@@ -357,46 +350,29 @@ def _named(word: str, runs_dir: Path, archive: Path | str) -> Sequence[RunResult
     return files
 
 
-def _of_file(path: Path) -> NamedCounts:
-    """A file of counts, named after its folder where its file name is generic."""
-    path = path.resolve()
-    folder = path.parent.parent if path.parent.name == "evaluations" else path.parent
-    label = folder.name if path.stem.startswith(("counts_", "consistency_")) else path.stem
-    return NamedCounts(label, path, Counts.load(path))
-
-
-def _of_run(run: RunResult, split: str, frames: Frames, condition: str) -> NamedCounts:
-    label, seed = run.tags.get(GROUP) or run.key, _seed_of(run)
+def _of_run(run: RunResult, split: str, frames: Frames, condition: str) -> Evaluation:
     if not run.is_finished:
         info(f"{run.folder} is not finished; its counts are those of its last evaluation.")
-    if condition:
-        known = [each for each in evaluations_of(run, split) if _is_plain(each.counts)]
-        name, *severity = condition.split(" ", 1)
-        wanted = " ".join((row_name(name), *severity))
-        chosen = [each for each in known if wanted in (each.condition, each.said)]
-        if len(chosen) != 1:
-            said = ", ".join(each.said for each in known)
-            raise InputError(
-                f"condition={condition} of {run.folder} is not one of {said} (rgbt evaluate and "
-                "rgbt robustness make more)."
-            )
-        return NamedCounts(label, chosen[0].path, chosen[0].counts, run, seed)
-    name = file_name(frames, split) if frames else counts_name(split)
-    if frames and not (run.folder / name).is_file():
-        views = {"next": "next", "flow": "video", "triples": "video"}.get(frames, "virtual")
+    if not (frames or condition):
+        return Evaluation(run.folder / counts_name(split), run.counts(split), run, CLEAN)
+    known = [
+        each
+        for each in evaluations_of(run, split)
+        if (protocol_of(each.counts.partition) == frames if frames else _is_plain(each.counts))
+    ]
+    name, *severity = (condition or CLEAN).split(" ", 1)
+    wanted = " ".join((row_name(name), *severity))
+    chosen = [each for each in known if wanted in (each.condition, each.said)]
+    if len(chosen) != 1:
+        said = ", ".join(each.said for each in known) or "none"
+        what = f"condition={condition}" if condition else f"frames={frames}"
         raise InputError(
-            f"{run.folder} has no counts of pairs of frames {name}; rgbt consistency "
-            f"run={run.folder} split={split} frames={views} makes them once it is finished."
+            f"{what} is not counted in {run.folder}, which has {said} of split '{split}'; rgbt "
+            "consistency, robustness and evaluate make counts."
         )
-    counts = run.counts(name if frames else split)
-    return NamedCounts(label, run.folder / name, counts, run, seed)
+    return chosen[0]
 
 
 def _is_plain(counts: Counts) -> bool:
     """Whether they are of single frames, without details."""
     return details_of(counts.partition) is None and protocol_of(counts.partition) is None
-
-
-def _seed_of(run: RunResult) -> int | None:
-    text = run.tags.get(SEED, "")
-    return int(text) if text.isdecimal() else None

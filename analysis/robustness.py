@@ -5,7 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from analysis.results import CLEAN, ROBUSTNESS, RUNS, Evaluation, level_of, open_counts
+from analysis.results import (
+    CLEAN,
+    EVALUATIONS,
+    ROBUSTNESS,
+    RUNS,
+    Evaluation,
+    level_of,
+    open_counts,
+)
 from rgbt.checks import InputError, split_list
 from rgbt.metrics.counts import Counts
 
@@ -29,16 +37,10 @@ class Training:
 
 
 def trainings(text: str, runs_dir: Path | str = "runs", split: str = "") -> list[Training]:
-    """The trainings that `text` names, with all their levels.
+    """The trainings that `text` names, with all their levels; InputError: not measured.
 
-    Args:
-        text: runs or groups (see `analysis.results.open_counts`), or folders that
-            ``rgbt robustness out=...`` wrote, with commas.
-        runs_dir: where runs lie.
-        split: "": test.
-
-    Raises:
-        InputError: there is no such thing, or it was not measured.
+    `text`: runs or groups (see `analysis.results.open_counts`), or folders that
+    ``rgbt robustness out=...`` wrote, with commas.
     """
     found: list[tuple[str, Path]] = []
     for word in split_list(text, RUNS):
@@ -47,17 +49,13 @@ def trainings(text: str, runs_dir: Path | str = "runs", split: str = "") -> list
             found.append((place.name, place))
             continue
         for named in open_counts(word, runs_dir, split):
-            place = named.path.parent / "evaluations" / ROBUSTNESS / named.counts.split
+            place = named.path.parent / EVALUATIONS / ROBUSTNESS / named.counts.split
             found.append((named.label, place))
     return [Training(label, place, levels_of(place)) for label, place in found]
 
 
 def levels_of(folder: Path) -> tuple[Evaluation, ...]:
-    """Every level in a folder: clean first, then what has no severity, then by title.
-
-    Raises:
-        InputError: no clean images, or a file that is damaged or of another kind.
-    """
+    """Every level in a folder: clean first, then what has no severity, then by title."""
     found = [level_of(path.with_suffix(".npz")) for path in sorted(folder.glob("*.json"))]
     if CLEAN not in {level.row for level in found}:
         raise InputError(f"{folder} has no counts of clean images; rgbt robustness makes them.")

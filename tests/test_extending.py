@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +14,7 @@ from rgbt.randomness import numpy_generator
 from rgbt.run import main
 from tests.commands import SPLITS, Call, assert_one_sentence, losses, only_run, short, train
 from tests.conftest import write_data
-from tests.docs.blocks import ROOT, Page
-from tests.docs.reader_folder import reading_in, write_titled
+from tests.docs.pages import ROOT, Page, write
 
 VIEW = '''
 from dataclasses import replace
@@ -73,18 +73,20 @@ SMOKE = ("+debug=smoke", "tracking=none", "trainer.accelerator=cpu", "trainer.th
 
 
 @pytest.fixture
-def lab(tmp_path: Path) -> Iterator[Callable[[str], Path]]:
+def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Path]:
     """Writes the files of a tutorial to an empty folder, which is searched for them."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv("RGBT_CONF", str(tmp_path / "conf"))
+    monkeypatch.delitem(sys.modules, "my_lab", raising=False)
 
-    def write(name: str) -> Path:
+    def written(name: str) -> Path:
         for block in Page.read(ROOT / "docs" / "tutorials" / name).blocks:
             if block.title:
-                write_titled(block, tmp_path)
+                write(block, tmp_path)
         return tmp_path
 
-    with reading_in(tmp_path) as variables:
-        variables.setenv("RGBT_CONF", str(tmp_path / "conf"))
-        yield write
+    return written
 
 
 @pytest.mark.parametrize(

@@ -82,9 +82,10 @@ class Command:
 
 
 def assert_same_run(folder: Path, other: Path) -> None:
-    """The loss of every step to 1e-5, and equal counts.
+    """The loss of every step to 1e-5, and counts that are equal in all but one pixel of 1,000.
 
-    Its parts agree to 1e-4, as another point of nearly equal uncertainty may be sampled.
+    Its parts agree to 1e-4, as another point of nearly equal uncertainty may be sampled. Two
+    classes with nearly equal scores may change places.
     """
     steps, others = losses(folder), losses(other)
     assert len(steps) == len(others) > 0
@@ -94,7 +95,8 @@ def assert_same_run(folder: Path, other: Path) -> None:
     for split in ("val", "test"):
         one, two = (Counts.load(each / f"counts_{split}.npz") for each in (folder, other))
         assert one.names == two.names
-        assert np.array_equal(one.counts, two.counts), split
+        differing = np.abs(one.counts.astype(int) - two.counts).sum() / 2
+        assert differing <= 1e-3 * two.counts.sum(), split
 
 
 @pytest.mark.parametrize("rank", ["0", "1"])

@@ -152,7 +152,11 @@ class Resampler:
         runs = [self._runs(terms[0], term, seeds) for term in terms]
         first = next(iter(runs[0].values()))
         blocks = make_blocks(first.names, self._settings.blocks, self._series(terms, runs, absent))
-        used = min(_blocks_used(term, each, blocks) for term, each in zip(terms, runs, strict=True))
+        held = [
+            images_of(parse(term.metric), next(iter(each.values()))).names
+            for term, each in zip(terms, runs, strict=True)
+        ]
+        used = min(len(np.unique(blocks.index[np.isin(first.names, each)])) for each in held)
         parts, drawn = [], np.zeros(self._settings.resamples if used >= FEWEST else 0)
         for term, each in zip(terms, runs, strict=True):
             points = [value(term.metric, counts, absent) for counts in each.values()]
@@ -261,13 +265,6 @@ def _columns(metric: ParsedMetric, counts: Counts) -> tuple[NDArray[np.integer],
             array = array[:, metric.region - 1 : metric.region]
             metric = replace(metric, region=1)
     return array, metric
-
-
-def _blocks_used(term: Term, runs: Mapping[str, Counts], blocks: ImageBlocks) -> int:
-    """Number of blocks with images of the metric."""
-    counts = next(iter(runs.values()))
-    kept = images_of(parse(term.metric), counts).names
-    return len(np.unique(blocks.index[np.isin(counts.names, kept)]))
 
 
 def _common_seeds(terms: Sequence[Term]) -> tuple[int, ...]:

@@ -210,13 +210,14 @@ def pasted_pixels(label: Tensor, generator: torch.Generator) -> Tensor:
 
     Args:
         label: (B, H, W) int64, 0..255.
-        generator: on the device of `label`.
+        generator: of any device.
     """
     present = torch.zeros(NUM_VALUES, device=label.device)
     present = mean_count(present.index_fill(0, label.flatten(), 1.0)) > 0
 
     def draw(count: int) -> Tensor:
-        return torch.rand(count, NUM_VALUES, generator=generator, device=label.device)
+        drawn = torch.rand(count, NUM_VALUES, generator=generator, device=generator.device)
+        return drawn.to(label.device)
 
     # The present values come first, in random order; the number of draws does not depend on them.
     order = (own_draw(draw, len(label)) + ~present).argsort(1)

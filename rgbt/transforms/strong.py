@@ -61,15 +61,14 @@ class StrongAugmentation:
         Args:
             rgb: (B, 3, H, W) float32 in [0, 1].
             thermal: (B, 1, H, W) float32 in [0, 1].
-            generator: on the device of the images; the number of draws is always the same.
+            generator: of any device; the number of draws is always the same.
         """
-        device = rgb.device
-
         def draw(count: int) -> Tensor:
             names = len(CHANGES) + len(OF_THERMAL) + 1
-            return torch.rand(count, names, generator=generator, device=device)
+            drawn = torch.rand(count, names, generator=generator, device=generator.device)
+            return drawn.to(rgb.device)
 
-        whole = torch.rand(2 + len(CHANGES), generator=generator, device=device)
+        whole = torch.rand(2 + len(CHANGES), generator=generator, device=generator.device)
         *changes, blur = own_draw(draw, len(rgb)).unbind(1)
         by = {
             name: (self.jitter_strength * (2 * each - 1)).view(-1, 1, 1, 1)

@@ -11,14 +11,7 @@ import numpy as np
 import pytest
 
 from analysis.archive import add
-from analysis.results import (
-    COLUMNS,
-    finished_runs,
-    groups_in,
-    label_of,
-    open_counts,
-    results,
-)
+from analysis.results import COLUMNS, finished_runs, label_of, open_counts, results
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import parse, value
@@ -107,21 +100,15 @@ def test_split_and_home_folder_take_effect(runs: Path, monkeypatch: pytest.Monke
     np.testing.assert_array_equal(found.counts.counts, some(7).counts)
 
 
-def test_folder_of_scores_is_opened_by_rings(tmp_path: Path):
+def test_folder_of_scores_is_opened_by_rings(tmp_path: Path) -> None:
     """As `analysis.score` leaves it: rings and strips."""
-    for seed, name in enumerate(("horizontal5", "ring5", "vertical5")):
-        some(seed).save(tmp_path / f"counts_{name}.npz")
+    for name in ("horizontal5", "ring5"):
+        some().save(tmp_path / f"counts_{name}.npz")
     (found,) = open_counts(str(tmp_path), tmp_path)
     assert (found.label, found.key, found.seed) == (tmp_path.name, "", None)
     assert found.path.name == "counts_ring5.npz"
-
-
-@pytest.mark.parametrize("names", [("ring5", "ring9"), ("horizontal5", "vertical5")])
-def test_ambiguous_folder_of_scores_is_refused(tmp_path: Path, names: tuple[str, str]):
-    for name in names:
-        some().save(tmp_path / f"counts_{name}.npz")
-    files = ", ".join(f"counts_{name}.npz" for name in names)
-    with pytest.raises(InputError, match=f"{files}; name one of these"):
+    some().save(tmp_path / "counts_ring9.npz")
+    with pytest.raises(InputError, match=r"counts_ring5.npz, counts_ring9.npz; name one of these"):
         open_counts(str(tmp_path), tmp_path)
 
 
@@ -129,22 +116,17 @@ def test_ambiguous_folder_of_scores_is_refused(tmp_path: Path, names: tuple[str,
     ("text", "options", "word"),
     [
         ("aab0", {}, "'aab0' is not a run.*crm scale=demo"),
-        ("/no/such/folder", {}, "is not a run"),
-        ("mlflow-none", {}, "is not a run"),
         ("crm scale=dem", {}, "did you mean 'crm scale=demo'"),
         (f"{LONG}1", {}, "is not a run"),
         ("abc", {"runs_dir": "none"}, "'abc' is not a run"),
         ("crm", {"runs_dir": "none"}, "is not a run .* nor counts"),
         ("none.npz", {}, "the file of counts"),
         ("images.npz", {}, "is not a readable file of counts"),
-        ("", {}, "expected runs, files of counts or a group"),
         ("aaa0,,aaa1", {}, "expected runs, files of counts or a group"),
         ("aaa0", {"split": "all"}, "no counts of the split 'all'.*rgbt.evaluate"),
         ("other method.npz", {"split": "val"}, "is of split 'test', not of split=val"),
         ("aaa0,mlflow-aaa0", {}, "names the same counts twice"),
         (f"{CRM},aaa1", {}, "names the same counts twice"),
-        ("aaa0,runs/aaa0/counts_test.npz", {}, "twice"),
-        ("aaa0,link.npz", {}, "twice"),
         ("other method.npz,copy.npz", {}, "names the same counts twice"),
         ("aaa0,ggg0", {}, f"names seed 0 of '{CRM}' twice"),  # same overrides, another default
     ],
@@ -152,26 +134,12 @@ def test_ambiguous_folder_of_scores_is_refused(tmp_path: Path, names: tuple[str,
 def test_other_inputs_and_repeated_runs_are_refused(
     runs: Path, text: str, options: dict[str, str], word: str
 ):
-    (runs.parent / "link.npz").symlink_to(runs / "aaa0" / "counts_test.npz")
     some(7).save(runs.parent / "copy.npz")
     np.savez(runs.parent / "images.npz", x=np.zeros(3))
     if "ggg0" in text:
         some(77).save(make_run(runs, "ggg0", CRM, 0) / "counts_test.npz")
     with pytest.raises(InputError, match=word):
         open_counts(text, **{"runs_dir": runs, **options})
-
-
-@pytest.mark.parametrize("text", ["{", "{}", "[]"])
-def test_damaged_run_stops_nothing_else(runs: Path, capsys: pytest.CaptureFixture[str], text: str):
-    broken = make_run(runs, "hhh0", CRM, 9)
-    for name in ("run.json", "mlflow.json"):
-        (broken / name).write_text(text)
-    assert len(open_counts("other method.npz", runs)) == 1
-    assert CRM in groups_in(runs)
-    with pytest.raises(InputError, match="is not a run"):
-        open_counts("mlflow-nobody", runs)
-    open_counts("aaa9", runs)
-    assert "is not finished" in capsys.readouterr().err
 
 
 # One frame of a folder of runs and an archive.
@@ -202,37 +170,52 @@ def test_folder_and_archive_are_one(
     assert (err.count("warning"), "aaa2 is stored with other counts" in err) == (1, True)
     assert [run.key for run in finished_runs("none", archive)] == ["aaa0", "aaa1", "aaa2"]
     assert finished_runs("none", "none") == []
+    for text, seeds in ((CRM, [0, 1, 2]), ("aaa1", [1])):
+        opened = open_counts(text, "none", archive=archive)
+        assert [each.seed for each in opened] == seeds
     unpacked = finished_runs("none", archive)[0].folder
     (unpacked / "mark").touch()
     assert (finished_runs("none", archive)[0].folder / "mark").exists()  # unpacked once
 
 
 def test_frame_has_a_row_for_each_score(runs: Path, archive: Path) -> None:
-    counts = replace(some(0), night=tuple(place < 4 for place in range(12)))
+    night = tuple(place < 4 for place in range(12))
+    counts, pairs = replace(some(0), night=night, unscored=("cone",)), pairs_of(12, 0.5)
     folder = runs / "bbb0"
     (folder / "evaluations").mkdir()
-    counts.save(folder / "evaluations/synth_test_thermal_ring2.npz")
-    pairs_of(12, 0.5).save(folder / "evaluations/consistency_aligned_test.npz")
-    write_levels(folder / "evaluations/robustness/test", SCORES)
+    for name, each in (
+        ("synth_test_thermal_ring2", counts),
+        ("consistency_aligned_test", pairs),
+        ("consistency_aligned-0c_test", pairs),
+    ):
+        each.save(folder / f"evaluations/{name}.npz")
+    replace(counts, dataset="other").save(folder / "evaluations/kp_test_rgb_ring2_last.npz")
+    for path in write_levels(folder / "evaluations/robustness/test", SCORES).glob("*.npz"):
+        replace(Counts.load(path), dataset="simulated").save(path)
     frame = results(runs, archive)
     at = ["run", "condition", "severity", "partition", "subset", "region", "class", "metric"]
     assert not frame.duplicated(at).any()
     assert tuple(frame.columns) == COLUMNS
-    values = frame.set_index(["run", "condition", "subset", "region", "class", "metric"])["value"]
-    assert values["bbb0", "clean", "all", 0, "", "mIoU"] == value("mIoU", some(0), "released")
-    assert values["aaa1", "clean", "all", 2, "", "mIoU"] == value("region/2", some(1), "released")
-    assert values["aaa1", "clean", "all", 0, "", "Var"] == value("Var", some(1), "released")
-    thermal = values["bbb0", "thermal"]
-    for name in ("night/class/car", "day/Var", "day/class/cone/acc", "night/mIoU"):
-        of = parse(name)
-        key = of.part, 0, of.class_name or "", of.score
-        assert thermal[key] == value(name, counts, "released")
+    found = frame.set_index(["run", "condition", "subset", "region", "class", "metric"])["value"]
+    for run, condition, of in (
+        *(("bbb0", "clean", some(0)), ("aaa1", "clean", some(1)), ("bbb0", "thermal", counts)),
+        ("bbb0", "rgb last dataset other", counts),
+    ):
+        for name in ("mIoU", "Var", "region/2", "class/car", "class/cone/acc", "pixel_accuracy"):
+            for prefix in ("", "night/")[: 1 + (of is counts)]:
+                each = parse(f"{prefix}{name}")
+                key = each.part or "all", each.region or 0, each.class_name or "", each.score
+                assert found[run, condition, *key] == value(f"{prefix}{name}", of, "released")
     region = Counts(**{**vars(counts), "counts": counts.counts[:, 1:], "partition": "ring1"})
-    assert thermal["all", 2, "person", "IoU"] == value("class/person", region, "released")
-    assert values["bbb0", "clean", "all", 0, "", "TC"] == value("TC", pairs_of(12, 0.5), "released")
-    noise = frame[(frame["condition"] == "noise dataset fingerpr") & (frame["metric"] == "mIoU")]
-    whole = noise[(noise["subset"] == "all") & (noise["region"] == 0)]
-    assert dict(zip(whole["severity"], whole["value"].round(2))) == {8.0: 60.0, 16.0: 40.0}
+    person = value("class/person", region, "released")
+    assert found["bbb0", "thermal", "all", 2, "person", "IoU"] == person
+    for condition in ("clean", "clean 0c"):
+        assert found["bbb0", condition, "all", 0, "", "TC"] == value("TC", pairs, "released")
+    (aligned,) = open_counts("bbb0", runs, frames="aligned")
+    assert aligned.path.stem == "consistency_aligned_test"
+    chosen = (frame["metric"] == "mIoU") & (frame["subset"] == "all") & (frame["region"] == 0)
+    noise = frame[chosen & (frame["condition"] == "noise")]
+    assert dict(zip(noise["severity"], noise["value"].round(2))) == {8.0: 60.0, 16.0: 40.0}
     seeds = frame[frame["group"] == COMMAS].groupby("run")["seed"].first()
     assert dict(seeds) == {"bbb0": 0, "bbb1": 1, "bbb2": 2}
     assert set(results(runs, archive, evaluations=False)["condition"]) == {"clean"}

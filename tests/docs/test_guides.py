@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from rgbt.config.plain_command import COMMANDS
-from tests.docs.blocks import ROOT
+from tests.docs.pages import ROOT
 
 GUIDES = ROOT / "docs" / "guides.yaml"
 PLACE = "docs/guides.yaml"

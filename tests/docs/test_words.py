@@ -14,10 +14,12 @@ import yaml
 
 from rgbt.config.options import help_text
 from rgbt.config.plain_command import COMMANDS, CommandGroup, PlainCommand
-from tests.docs.blocks import INLINE_CODE, ROOT, Page, pages
-from tests.docs.command_lines import OF_HYDRA
+from tests.docs.pages import INLINE_CODE, ROOT, Page, pages
 
 pytestmark = pytest.mark.docs
+
+OF_HYDRA = ("run", "check", "masks")
+"""Commands whose arguments are all overrides."""
 
 LINK_TARGET = re.compile(r"\]\([^)]*\)|<[^<>]+>|https?://\S+")
 
@@ -53,7 +55,7 @@ def problems_of(lines: Iterator[tuple[str, str]], *, page: bool) -> list[str]:
 
 def of_page(page: Page) -> Iterator[tuple[str, str]]:
     """Lines of prose, without code, targets of links and tags."""
-    for number, line in page.prose():
+    for number, line in page.prose.items():
         if line.startswith(":::"):  # a name of the Python API
             continue
         yield f"{page.name}:{number}", LINK_TARGET.sub("]", INLINE_CODE.sub("", line))
@@ -115,14 +117,10 @@ def test_configuration_uses_the_words_of_the_field() -> None:
     ],
 )
 def test_word_that_is_not_used_is_named(line: str, found: str) -> None:
-    page = Page("page.md", f"# Title\n\n{line}\n")
-    assert any(
-        each.startswith(f"page.md:3: {found}") for each in problems_of(of_page(page), page=True)
-    )
+    page = Page(Path("page.md"), prose={3: line})
+    assert any(f"page.md:3: {found}" in each for each in problems_of(of_page(page), page=True))
 
 
 def test_code_and_links_are_no_prose() -> None:
-    page = Page(
-        "page.md", "`dataset=mfnet`, [data](dataset.md)\n\n```bash\nrgbt run dataset=mfnet\n```\n"
-    )
+    page = Page(Path("page.md"), prose={1: "`dataset=mfnet`, [data](dataset.md)"})
     assert problems_of(of_page(page), page=True) == []

@@ -11,9 +11,9 @@ from rgbt.config.compose import available
 from rgbt.engine.trainer import Trainer
 from rgbt.metrics.counts import Counts
 from rgbt.runtime.signals import Stopped
-from tests.benchmarks.gpu.step_equality import compare
 from tests.commands import Call, losses, only_run, short, train
 from tests.on_device.places import NAME, ON_DEVICE, device, exact
+from tests.on_device.steps import compare
 
 __all__ = ["exact"]  # a fixture
 
