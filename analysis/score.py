@@ -63,9 +63,6 @@ class FolderOptions(PredictionFormatOptions):
         ),
     ] = "refuse"
     name: Annotated[str, Help("name of the method in tables; default: name of the folder")] = ""
-    threads: Annotated[
-        int, Interval(ge=0, le=256), Help("threads that read and count; 0: one per core")
-    ] = 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,20 +122,18 @@ def main(options: Options, overrides: list[str]) -> int:
     if bool(options.predictions) == bool(options.counts):
         raise InputError("predictions: expected either predictions=folder or counts=run.")
     out, settings = options.out, None
-    check_out(out)
-    _check_same_source(out, options.source)
+    _make_room(out, options.source)
     if options.resamples:
         settings = Resampling(
             resamples=options.resamples, level=options.level, blocks=options.blocks
         )
-    remarks: list[str] = []
     if options.counts:
-        counted = _stored_counts(options, overrides)
+        counted, remarks = _stored_counts(options, overrides), []
     else:
         scored = _scored(options, overrides)
         counted, remarks = [(scored.name, each) for each in scored.counts], scored.remarks()
         if out is not None:
-            write_counts(scored, out)
+            scored.save(out)
     frames, tables = [], []
     with progress("scoring", len(counted)) as advance:
         for name, counts in counted:
@@ -162,10 +157,9 @@ def main(options: Options, overrides: list[str]) -> int:
 
 
 def scores(name: str, counts: Counts) -> pd.DataFrame:
-    """Every score of the counts of a method under both conventions for absent classes.
+    """Every score of counts under both conventions for absent classes, one a row: `COLUMNS`.
 
-    Returns:
-        `COLUMNS`, one score a row; see `analysis.results.score_frame`. low and high are NaN.
+    See `analysis.results.score_frame`; low and high are NaN.
     """
     import pandas as pd
 
@@ -266,29 +260,22 @@ def _about_absent(frame: pd.DataFrame, counts: Counts) -> str:
     )
 
 
-def write_counts(scored: FolderScores, out: Path) -> None:
-    """Write ``counts_<partition>.npz`` of each partition, and ``maps.npz`` where there is one."""
-    out.mkdir(parents=True, exist_ok=True)
-    # The predictions may be other ones than at the last time: earlier counts and maps would pass
-    # for ones of these.
-    for kind in ("ring", "vertical", "horizontal"):
-        for path in out.glob(f"counts_{kind}*.npz"):
-            path.unlink()
-    (out / "maps.npz").unlink(missing_ok=True)
-    for counts in scored.counts:
-        counts.save(out / f"counts_{counts.partition}.npz")
-    if scored.maps is not None:
-        scored.maps.save(out / "maps.npz")
+def _make_room(out: Path | None, source: str) -> None:
+    """Remove what an earlier call counted, because it would pass for a part of this one.
 
-
-def _check_same_source(out: Path | None, source: str) -> None:
-    """Refuse a folder with other scores, because files of both would be mixed."""
+    Raises:
+        InputError: the folder holds the scores of something else.
+    """
+    check_out(out)
     if out is None or not (out / "scores.csv").is_file():
         return
     noted = out / SOURCE
     earlier = noted.read_text(errors="replace").strip() if noted.is_file() else "another call"
     if earlier != source:
         raise InputError(f"out={out} holds the scores of {earlier}; give {source} its own folder.")
+    for kind in ("counts_ring*", "counts_vertical*", "counts_horizontal*", "maps"):
+        for path in out.glob(f"{kind}.npz"):
+            path.unlink()
 
 
 def _scored(options: Options, overrides: list[str]) -> FolderScores:
@@ -304,7 +291,6 @@ def _scored(options: Options, overrides: list[str]) -> FolderScores:
         missing=options.missing,
         resize=options.resize,
         name=options.name,
-        threads=options.threads,
         absent=built("metric", overrides).absent,
     )
     folder, split = Path(options.predictions), options.split or "test"

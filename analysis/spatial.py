@@ -56,10 +56,6 @@ class Options:
     resamples: Resamples = 2000
     level: Level = 0.95
     seed: Annotated[int, Interval(ge=0, le=MOST), Help("seed of the resampling")] = 0
-    against: Annotated[
-        Path | None,
-        Help("statistics.npz of another data set; the last tables compare both"),
-    ] = None
     out: Annotated[
         Path | None,
         Help(
@@ -81,7 +77,7 @@ def main(options: Options, overrides: list[str]) -> int:
 
     from analysis.statistics import sample as samples
     from analysis.statistics import tables
-    from analysis.statistics.collect import MeasurementSettings, SpatialStatistics, collect
+    from analysis.statistics.collect import MeasurementSettings, collect
     from analysis.statistics.statements import judged
     from analysis.tables import tidy_csv
     from analysis.uncertainty import Resampling
@@ -94,7 +90,6 @@ def main(options: Options, overrides: list[str]) -> int:
     drawn = Resampling(
         resamples=options.resamples, level=options.level, blocks=options.blocks, seed=options.seed
     )
-    reference = None if options.against is None else SpatialStatistics.load(options.against)
     settings = MeasurementSettings(
         regions=Regions(
             partition=options.partition,
@@ -116,9 +111,6 @@ def main(options: Options, overrides: list[str]) -> int:
     # Of the statements about noise those of the chosen estimator and average.
     is_shown = (found["estimator"] == "") | (found[["estimator", "average"]] == way).all(axis=1)
     after = [tables.statement_table(found[is_shown], options.level), tables.estimator_table(found)]
-    if reference is not None:
-        other = samples.Sample(reference, drawn, way)
-        after += tables.comparison_tables((sample, other), (found[is_shown], judged(other)))
     heading = f"{tables.heading(stats)}; intervals over {sample.blocks.said}"
     shown = [*tables.region_tables(frame, stats, way), *after]
     print_rich(Group(plain_text("\n".join([heading, *remarks])), *map(rich_table, shown)))

@@ -56,11 +56,9 @@ class NoOptions:
 class FigureSpec:
     """One figure.
 
-    Attributes:
-        make: function of a `Config` and a dataclass of options, `given`, as far as it has these
-            parameters, and of its own options, which are keywords.
-        groups: groups of the configuration that take effect.
-        metric: the partition unless ``metric=`` is given, a file of ``conf/metric/``.
+    `make` takes a `Config` and a dataclass of options, `given`, as far as it has these parameters,
+    and its own options as keywords. `groups` of the configuration take effect; `metric` is the
+    partition unless ``metric=`` is given.
     """
 
     make: Callable[..., Drawn]

@@ -186,14 +186,10 @@ def panel(
     form: FormatOptions,
     layout: str = "rows",
 ) -> tuple[Figure, NDArray[Any], pd.DataFrame]:
-    """The pictures of a panel, one row per name: the figure, its axes, and the scores.
+    """The pictures of a panel, one row per name: the figure, its axes, and the mIoU of each image.
 
-    Returns:
-        image, method and mIoU of this image alone, percent, over the scored classes that label or
-        prediction hold, because a single image lacks most classes.
-
-    Raises:
-        InputError: images without label or that differ in size, or a prediction that is missing.
+    In percent, over the scored classes that label or prediction hold, because a single image lacks
+    most classes. InputError: images without label or of several sizes, or a missing prediction.
     """
     reader = PredictionReader(dataset.classes, dataset.palette, form)
     palette, pictures, numbers = np.array(dataset.palette, np.uint8), [], []
@@ -262,13 +258,8 @@ class Frame(NamedTuple):
 class FramePair(NamedTuple):
     """A pair of frames and the predictions of M methods.
 
-    Attributes:
-        name: of the first frame.
-        frames: both.
-        predictions: (H, W) class indices, of both frames, for each method.
-        differ: (H, W) for each method, pixels of the second frame whose two predictions differ; of
-            `compared` alone.
-        compared: (H, W), pixels that count: seen in the first frame, labelled in the second.
+    All are (H, W): `compared` are pixels of the second frame that count, which are seen in the
+    first one and labelled; `differ`, for each method, those whose two predictions differ.
     """
 
     name: str

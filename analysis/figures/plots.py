@@ -110,14 +110,10 @@ def line_plot(
     bars: bool = False,
     spread: float = 0.0,
 ) -> None:
-    """A line for each series, with an interval where its ends are known.
+    """A line for each series of (series, x, value, low, high), with an interval where it is known.
 
-    Args:
-        axes: to draw on.
-        frame: columns series, x, value, low and high.
-        styles: of a series, what differs from `series_style`.
-        bars: intervals as bars; else as bands.
-        spread: the series are drawn side by side over this part of x, so that no bars overlap.
+    `styles` differ from `series_style`. Intervals are bars or bands; `spread`: series stand side
+    by side over this part of x, so that no bars overlap.
     """
     groups = [*frame.groupby("series", sort=False)]
     for index, (name, rows) in enumerate(groups):
@@ -135,12 +131,9 @@ def line_plot(
 
 
 def dot_plot(axes: Axes, frame: pd.DataFrame, *, open_low: bool = False) -> None:
-    """Points with bars over words, series side by side.
+    """Points over words, of (series, tick, value, low, high), with a bar between known ends.
 
-    Args:
-        axes: to draw on.
-        frame: columns series, tick, value, low and high; a bar between those that are known.
-        open_low: the low end has an open marker.
+    Series stand side by side; with `open_low` the low end has an open marker.
     """
     ticks, series = [*dict.fromkeys(frame["tick"])], [*dict.fromkeys(frame["series"])]
     step = min(0.15, 0.7 / len(series))
@@ -166,15 +159,10 @@ def heat(
     inches: float = COLUMN,
     **how: Any,
 ) -> Artist:
-    """A heat map or an image without ticks and frame.
+    """A heat map (H, W), or an image (H, W, 3) uint8, without ticks and frame.
 
-    Args:
-        axes: to draw on.
-        picture: (H, W) values, or (H, W, 3) uint8.
-        borders: (H, W) regions; lines between them, dark below bright, show on any picture.
-        numbers: a text for each of these regions, on a white ground.
-        inches: width of the picture.
-        how: goes to ``imshow``.
+    `borders`: (H, W) regions; lines between them, dark below bright, show on any picture, and
+    `numbers`, a text for each, on a white ground. `inches`: width of the picture.
     """
     shown = axes.imshow(picture, **how)
     axes.set(xticks=[], yticks=[])

@@ -79,15 +79,10 @@ def consistency(
 def class_consistency(
     methods: Mapping[str, Sequence[Counts]], absent: Absent | None
 ) -> pd.DataFrame:
-    """The series of Temporal, Fig. 5, of counts of pairs of frames of the seeds of each variant.
+    """TC (value) and CA (low, by the union of the protocol) of variants by class, mean over seeds.
 
-    Returns:
-        protocol, series, tick (class), value (TC), low (CA by the union of the protocol; never
-        above TC), mean over seeds in percent; mean_tc and mean_ca over the scored classes, the
-        cells of the paper's Table I.
-
-    Raises:
-        InputError: counts of single frames, or of different protocols, classes or scored classes.
+    In percent; CA is never above TC. mean_tc and mean_ca are over the scored classes, the cells of
+    the paper's Table I. InputError: counts of single frames, or of different kinds.
     """
     every = [counts for seeds in methods.values() for counts in seeds]
     reference, convened = every[0], absent or convention(every)
@@ -157,14 +152,9 @@ def corrupted(
 ) -> pd.DataFrame:
     """Scores of the trainings of methods under corruptions, those called `rows`, or all.
 
-    Returns:
-        row (the corruption; "clean"), title, unit ("": no severities), severity, method, seeds,
-        and mIoU, mIoU_sd, relative and relative_sd: mean and standard deviation (n - 1; NaN of one)
-        over trainings, in percent, and in percent of what each training reaches on clean images.
-
-    Raises:
-        InputError: methods on other images, or measured at different severities; a row that
-            was not measured; only clean images.
+    mIoU and relative are means over trainings, in percent, and in percent of what each training
+    reaches on clean images; mIoU_sd and relative_sd standard deviations (n - 1; NaN of one).
+    InputError: methods on other images or at different severities, or a row not measured.
     """
     levels = [
         (method, number, level)
@@ -300,16 +290,11 @@ def region_means(
     settings: Resampling | None = None,
     band: str = "widest",
 ) -> pd.DataFrame:
-    """MIoU by region of methods, mean over seeds, in percent; without `settings` no intervals.
+    """MIoU by region (value) and of the image of methods, mean over seeds, in percent.
 
-    `band`: what these are over; "widest": both where there are several seeds, else images.
-
-    Returns:
-        series, partition, x (region from 1), value, low and high (NaN: no interval), mIoU (of the
-        image), seeds, images, covers ("images", "seeds", "images and seeds" or "nothing").
-
-    Raises:
-        InputError: an interval over seeds of a single seed, or counts that do not belong together.
+    `band`: what the intervals are over; "widest": both where there are several seeds, else images;
+    without `settings` there are none. InputError: an interval over seeds of a single seed, or
+    counts that do not belong together.
     """
     every = [counts for seeds in methods.values() for counts in seeds]
     reference, convened, rows = every[0], absent or convention(every), []

@@ -75,11 +75,8 @@ class MapOptions(StatisticsOptions):
 class Heat(NamedTuple):
     """A value at every pixel position, 0..1, and the three numbers of Fig. 1, percent.
 
-    Attributes:
-        source: what it is of: a method or a data set, its split, and which images of it.
-        measure: what the numbers are.
-        values: (H, W); NaN: nothing to score at that position.
-        region_map: (H, W) region of every pixel.
+    `source` is a method or a data set, its split, and which images of it; `measure` what the
+    numbers are; `values` and `region_map` are (H, W), NaN where there is nothing to score.
     """
 
     what: str
@@ -203,10 +200,7 @@ def trend(
 
     IoU and accuracy of a region are means over the scored classes, of the pixels of all images.
     Whether the paper counts the background is not stated; here it counts, as in its tables.
-
-    Returns:
-        partition, kind ("IoU", "Acc", "SOR"), series, x (region from 1), score (percent), and
-        value: less that of region 1, as the figure shows it.
+    Scores are in percent; value is less that of region 1, as the figure shows it.
     """
     series = {("SOR", "SOR"): occupancy}
     for label, counts in methods.items():
@@ -294,13 +288,8 @@ def class_regions(
 ) -> pd.DataFrame:
     """The series of Fig. 3: share_kr = 100 SOR_kr / max_r SOR_kr, and the mIoU of a method.
 
-    The mIoU is over all scored classes with the background, which the paper does not state.
-
-    Returns:
-        series (class, "mIoU (label)"), x (region from 1), value; NaN: a class that occurs nowhere.
-
-    Raises:
-        InputError: counts over other regions, or a part without images in data set or counts.
+    The mIoU is over all scored classes with the background, which the paper does not state. NaN: a
+    class that occurs nowhere. InputError: counts over other regions, or a part without images.
     """
     shares = 100 * normalised(Sample(stats).classes(part)[0])
     series = {stats.classes[index]: shares[index] for index in stats.objects}
@@ -405,11 +394,7 @@ def snr(
 
 
 def by_region(sample: Sample, quantity: str) -> pd.DataFrame:
-    """A quantity of the images by region, with 95 % intervals over blocks of images.
-
-    Returns:
-        series, modality, part, images, x (region from 1), value, low and high (NaN: too few).
-    """
+    """A quantity of the images by region, with 95 % intervals over blocks of images (NaN: few)."""
     rows = []
     for index, modality in enumerate(MODALITIES):
         for part in sample.stats.subsets():

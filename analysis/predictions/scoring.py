@@ -80,6 +80,14 @@ class FolderScores:
     extra: tuple[str, ...]
     resized: dict[str, str]
 
+    def save(self, folder: Path) -> None:
+        """Write ``counts_<partition>.npz`` of each partition, and ``maps.npz``."""
+        folder.mkdir(parents=True, exist_ok=True)
+        for counts in self.counts:
+            counts.save(folder / f"counts_{counts.partition}.npz")
+        if self.maps is not None:
+            self.maps.save(folder / "maps.npz")
+
     def remarks(self) -> list[str]:
         """Remarks about the folder that a reader of the numbers needs, one sentence each."""
         remarks, counted = [], len(self.counts[0].names)

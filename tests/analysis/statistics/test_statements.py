@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 import pytest
 
-from analysis.spatial import entry
 from analysis.statistics.sample import Sample
 from analysis.statistics.statements import STATEMENTS, judged, thirds
-from analysis.statistics.tables import comparison_tables
 from analysis.uncertainty import Resampling
 from rgbt.checks import InputError
 from tests.analysis.statistics.scenes import made
-from tests.commands import Call
 
 IMAGES = 120
 NIGHT = np.arange(IMAGES) >= IMAGES // 2
@@ -168,67 +163,3 @@ def test_without_background_no_claim_is_about_occupancy() -> None:
     assert frame.loc["entropy/centre"]["contrast"] == "label entropy: centre - edge, bits"
     names = [each.partition(":")[0] for each in frame.loc["classes/central"]["contrast"]]
     assert names == ["road", "car", "curve"]
-
-
-# Two data sets.
-
-
-def compared(first: dict, second: dict) -> list:
-    drawn = Resampling(resamples=200, blocks=2)
-    both = Sample(made(**first), drawn), Sample(made(**second), drawn)
-    return comparison_tables(both, (judged(both[0]), judged(both[1])))
-
-
-def test_levels_and_their_ratio_by_hand() -> None:
-    labels = np.full((40, 3, 4), 100, np.int64)
-    labels[..., 1] = 50  # of 350 pixels
-    given = {"labels": labels, "laplacian": np.full((40, 2, 3), 30.0)}
-    levels, premises = compared(given, {})
-    rows = {row[0]: row[1:] for row in levels.rows}
-    # All images are alike, so the intervals have no width.
-    car = ("14.29 [14.29, 14.29]", "25.00 [25.00, 25.00]", "0.571 [0.571, 0.571]")
-    assert rows["car, % of the pixels"] == car
-    assert rows["Laplacian variance, thermal, night"][2].startswith("3.000")
-    assert rows["occupancy, %"][0].startswith("71.43")
-    assert rows["car, % of the images"][:2] == ("100.00 [100.00, 100.00]",) * 2
-    assert "undecided" in premises.rows[-1][-1]
-
-
-def test_interval_of_a_ratio_combines_both() -> None:
-    """Relative half widths add up as squares, on the logarithmic scale."""
-    laplacian = 10 * spread((40, 2, 3), seed=1) ** 4
-    levels, _ = compared({"laplacian": laplacian}, {"laplacian": 2 * laplacian[::-1]})
-    (row,) = (each for each in levels.rows if each[0] == "Laplacian variance, rgb, day")
-    (a, b), (c, d), (e, f) = (
-        [float(word) for word in cell.partition("[")[2].rstrip("]").split(", ")] for cell in row[1:]
-    )
-    reach = np.hypot(np.log(b / a) / 2, np.log(d / c) / 2)
-    assert np.log(f / e) / 2 == pytest.approx(reach, rel=0.02)
-
-
-@pytest.mark.parametrize(
-    ("changed", "said"),
-    [
-        ({"classes": ("unlabeled", "car", "curve", "cat")}, "classes differ"),
-        ({"background": ()}, "background differ"),
-        ({"regions": 5}, "partition differ: ring3 and ring5"),
-    ],
-)
-def test_data_sets_that_cannot_be_compared(changed: dict, said: str) -> None:
-    with pytest.raises(InputError, match=said):
-        compared({}, changed)
-
-
-def test_command_compares(call: Call, data: Path, tmp_path: Path) -> None:
-    words = ("dataset=mfnet", f"dataset.root={data}", "regions=3", "resamples=100")
-    assert call(entry, *words, "short_edge=24", f"out={tmp_path / 'a'}")[0] == 0
-    stored = tmp_path / "a" / "statistics.npz"
-    code, out, err = call(
-        entry, *words, "short_edge=24", f"against={stored}", f"out={tmp_path / 'b'}"
-    )
-    assert code == 0, err
-    assert "levels of both data sets" in out
-    assert "Sec. III, on both data sets" in (tmp_path / "b" / "statistics.md").read_text()
-    code, _, err = call(entry, *words, f"against={stored}")
-    assert code == 2
-    assert "against: the image sizes differ: (48, 64) and (24, 32)" in err
