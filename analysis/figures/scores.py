@@ -186,13 +186,15 @@ def corrupted(
     places = pd.MultiIndex.from_frame(every[["method", "training"]])
     every["relative"] = 100 * every["mIoU"] / clean.reindex(places).to_numpy()
     keys = ["row", "title", "unit", "severity", "method"]
-    return every.groupby(keys, sort=False, as_index=False).agg(
+    found = every.groupby(keys, sort=False, as_index=False).agg(
         seeds=("training", "size"),
         mIoU=("mIoU", "mean"),
         mIoU_sd=("mIoU", "std"),
         relative=("relative", "mean"),
         relative_sd=("relative", "std"),
     )
+    # What only some trainings of a method were measured at is not shown.
+    return found[found["seeds"] == found["method"].map(clean.groupby("method").size())]
 
 
 @plots.styled

@@ -4,8 +4,6 @@ import csv
 import json
 import os
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -270,23 +268,6 @@ def test_arguments_that_make_no_sense_are_refused(
     code, _, err = call(entry, *folder, *arguments)
     assert code == 2
     assert_one_sentence(err, word)
-
-
-@pytest.mark.slow
-def test_real_weights_scored_from_their_images_give_the_known_counts(tmp_path: Path) -> None:
-    """The authors' network on 100 real pairs, through PNG files: the counts known beforehand."""
-    if not (REAL / "mfnet_weights" / "final.pth").is_file():
-        pytest.skip("needs the MFNet authors' weights and real pairs")
-    place = f"dataset.root={REAL / 'mfnet200'}"
-    weights = f"model.weights={REAL / 'mfnet_weights' / 'final.pth'}"
-    command = [sys.executable, "-m", "rgbt.predict", "model=mfnet", weights, place]
-    folders = ["input=val", f"out={tmp_path / 'p'}", f"runs_dir={tmp_path}"]
-    subprocess.run([*command, *folders], cwd=ROOT, check=True, capture_output=True)
-    known = json.loads((REAL / "mfnet_weights" / "expected_confusions.json").read_text())
-    expected = known["MFNet_final_pth/val"]["confusion"]
-    scored = score_folder(tmp_path / "p", MFNet(str(REAL / "mfnet200")), "val")
-    for counts in scored.counts:
-        np.testing.assert_array_equal(counts.whole(), expected)
 
 
 @pytest.mark.parametrize("kind", ["index", "rgb", "palette", "larger"])

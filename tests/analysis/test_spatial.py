@@ -4,14 +4,11 @@ import csv
 import os
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from analysis.spatial import entry
 from analysis.statistics.collect import SpatialStatistics
-from analysis.statistics.sample import Sample, occupancy_map
-from analysis.statistics.statements import judged
-from analysis.uncertainty import Resampling
+from analysis.statistics.sample import Sample
 from tests.commands import Call
 from tests.data.kp_files import write_kp
 
@@ -120,22 +117,3 @@ def test_bad_input_is_one_sentence(
     assert said.count("\n") == 1
     assert printed == ""
     assert not out.exists()
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not REAL.is_dir(), reason="needs the real pairs")
-def test_real_pairs(call: Call, tmp_path: Path) -> None:
-    """What is beyond doubt on 100 real pairs, against a plain computation of it."""
-    out = tmp_path / "out"
-    arguments = ("dataset=mfnet", f"dataset.root={REAL}", f"out={out}")
-    code, _, said = call(entry, *arguments)
-    assert code == 0, said
-    stats = SpatialStatistics.load(out / "statistics.npz")
-    assert len(stats.names) == 100
-    assert int(stats.night.sum()) == 50
-    found = judged(Sample(stats, Resampling(resamples=2000))).set_index("key")["verdict"]
-    assert found["laplacian/modality"] == found["laplacian/day_rgb"] == "holds"
-    map_ = occupancy_map(stats)
-    np.testing.assert_allclose(
-        Sample(stats).occupancy()[0], [map_[stats.region_map == r].mean() for r in range(9)]
-    )

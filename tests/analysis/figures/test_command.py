@@ -259,18 +259,6 @@ def test_maps_of_another_split_are_refused(call: Call, made: Path, figure: str) 
     assert "has split 'test'" in " ".join(err.split())
 
 
-def test_commas_in_brackets_belong_to_the_name(call: Call, made: Path, tmp_path: Path) -> None:
-    """Groups are called so: "crm train_sizes=[240,480]"."""
-    folder = tmp_path / "crm sizes=[240,480]"
-    folder.mkdir()
-    (folder / "counts_ring5.npz").write_bytes((made / "a" / "counts_ring5.npz").read_bytes())
-    out, other = tmp_path / "f.svg", made / "b" / "counts_ring5.npz"
-    runs = f"CRM [1,2]:{folder}, {other}"
-    code, _, err = call(entry, "figure=regions/heat", f"out={out}", f"runs={runs}")
-    assert code == 0, err
-    assert "CRM [1,2]" in out.read_text()
-
-
 def test_entries_with_one_label_are_seeds_of_one_method(call: Call, tmp_path: Path) -> None:
     for name in ("s0", "s1"):
         rng = np.random.default_rng(len(name))
@@ -298,14 +286,6 @@ def test_methods_on_other_images_are_not_shown_together(
     assert code == 2
     assert "'A' was scored on 12 images of split 'test', such as " in err
     assert "'B' on 11 of 'val'" in err
-
-
-def test_file_instead_of_a_folder_is_refused_before_drawing(call: Call, tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    out = tmp_path / "file" / "f.pdf"
-    code, _, err = call(entry, "figure=multihead/fig3", f"out={out}")
-    assert code == 2
-    assert "is a file; choose a folder" in err
 
 
 @pytest.mark.parametrize("figure", ["spatialseg/fig2", "spatialseg/fig3"])

@@ -24,11 +24,9 @@ from analysis.robustness import Training, levels_of
 from analysis.uncertainty import Resampling
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
-from rgbt.metrics.named import value
 from tests.analysis.counts import counts_of
 from tests.analysis.figures.drawn import letters, strips, texts
 from tests.analysis.robust_runs import SCORES, less, write_levels
-from tests.analysis.uncertainty.simulated import CLASSES, pairs_of
 
 FAST = Resampling(resamples=200, blocks="none")
 
@@ -87,15 +85,6 @@ def test_ca_is_by_the_union_of_the_protocol(
     found = texts(draw_consistency(frame), tmp_path)
     assert title in found
     assert any(text.endswith(axis) for text in found)
-
-
-def test_value_equals_the_metric() -> None:
-    seeds = [pairs_of(10, 0.6, seed) for seed in range(2)]
-    frame = class_consistency({"ours": seeds}, "released")
-    for row, name in zip(frame.itertuples(), CLASSES, strict=True):
-        for found, score in ((row.value, "TC"), (row.low, "CA")):
-            metric = f"class/{name}/{score}"
-            assert found == pytest.approx(np.mean([value(metric, s, "released") for s in seeds]))
 
 
 @pytest.mark.parametrize(
@@ -246,6 +235,8 @@ def test_a_method_that_was_not_measured_keeps_its_colour(training) -> None:
     lines = {line.get_label(): line for line in figure.axes[0].lines}
     assert len(lines["few (1 seed)"].get_ydata()) == 1
     assert lines["all (1 seed)"].get_color() == "#D55E00"
+    partly = corrupted({"ours": [training("c", few), training("d", SCORES)]}, None)
+    assert [*partly["row"]] == ["clean", "rgb_removed"]
 
 
 def test_incompatible_inputs_are_refused(training, methods) -> None:
