@@ -1,6 +1,6 @@
 """Report of a study: ``rgbt study name=search/grbm``, also while it runs.
 
-Tables in the terminal; ``runs/studies/<name>/`` gets them as Markdown and CSV with the figures.
+Tables in the terminal; ``runs/studies/<name>/`` gets them as Markdown and CSV.
 """
 
 from __future__ import annotations
