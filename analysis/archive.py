@@ -62,62 +62,56 @@ DAMAGED = (
 )
 
 
-@dataclass(frozen=True)
-class ArchivedRun:
-    """A run in the archive: ``<key>.zip``, or ``<key>-<digest>.zip`` for other results of a key."""
+def archived(folder: Path) -> list[Path]:
+    """All runs of an archive, by key: ``<key>.zip``, ``<key>-<digest>.zip`` with other results."""
+    return sorted(folder.glob("*.zip"))
 
-    path: Path
 
-    @property
-    def key(self) -> str:
-        """Key of the run."""
-        return self.path.stem.partition("-")[0]
+def key_of(path: Path) -> str:
+    """Key of an archived run."""
+    return path.stem.partition("-")[0]
 
-    def unpack(self, folder: Path | None = None) -> RunResult:
-        """The run as ``<digest of the file>/<key>`` in `folder` (None: the user's cache), once.
 
-        InputError: a damaged file, or one that belongs to another run.
-        """
-        cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-        folder = folder or Path(cache, "rgbt", "archive")
-        target = folder / _digest(self.path.read_bytes()) / self.key
-        if target.is_dir():
-            return RunResult(target)
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder) as scratch:
-            unpacked = Path(scratch, "run")
-            try:
-                self._write(unpacked)
-            except DAMAGED as error:
-                raise InputError(f"{self.path} is damaged ({one_line(error)}).") from error
-            result = RunResult(unpacked).result
-            if result.get("key", self.key) != self.key:
-                raise InputError(f"{self.path} holds the run {result['key']}; rename the file.")
-            target.parent.mkdir(exist_ok=True)
-            try:
-                unpacked.rename(target)
-            except OSError:
-                if not target.is_dir():  # another process was not faster
-                    raise
+def unpack(path: Path, folder: Path | None = None) -> RunResult:
+    """An archived run as ``<digest of the file>/<key>`` in `folder` (None: the user's cache), once.
+
+    InputError: a damaged file, or one that belongs to another run.
+    """
+    cache, key = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", key_of(path)
+    folder = folder or Path(cache, "rgbt", "archive")
+    target = folder / _digest(path.read_bytes()) / key
+    if target.is_dir():
         return RunResult(target)
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder) as scratch:
+        unpacked = Path(scratch, "run")
+        try:
+            _write_members(path, unpacked)
+        except DAMAGED as error:
+            raise InputError(f"{path} is damaged ({one_line(error)}).") from error
+        result = RunResult(unpacked).result
+        if result.get("key", key) != key:
+            raise InputError(f"{path} holds the run {result['key']}; rename the file.")
+        target.parent.mkdir(exist_ok=True)
+        try:
+            unpacked.rename(target)
+        except OSError:
+            if not target.is_dir():  # another process was not faster
+                raise
+    return RunResult(target)
 
-    def _write(self, folder: Path) -> None:
-        """Write every member as a file in `folder`."""
-        with zipfile.ZipFile(self.path) as archive:
-            for entry in archive.namelist():
-                path = folder / entry.removesuffix(".xz")
-                if not path.resolve().is_relative_to(folder.resolve()):
-                    raise ValueError(f"'{entry}' leads out of the folder")
-                path.parent.mkdir(parents=True, exist_ok=True)
-                if entry.endswith(".npz.xz"):
-                    _unpack_counts(archive.read(entry), self.path.parent / SHARED).save(path)
-                else:
-                    write_atomic(path, archive.read(entry))
 
-
-def archived(folder: Path) -> list[ArchivedRun]:
-    """All runs of an archive, by key."""
-    return [ArchivedRun(path) for path in sorted(folder.glob("*.zip"))]
+def _write_members(path: Path, folder: Path) -> None:
+    with zipfile.ZipFile(path) as archive:
+        for entry in archive.namelist():
+            file = folder / entry.removesuffix(".xz")
+            if not file.resolve().is_relative_to(folder.resolve()):
+                raise ValueError(f"'{entry}' leads out of the folder")
+            file.parent.mkdir(parents=True, exist_ok=True)
+            if entry.endswith(".npz.xz"):
+                _unpack_counts(archive.read(entry), path.parent / SHARED).save(file)
+            else:
+                write_atomic(file, archive.read(entry))
 
 
 def counts_of(folder: Path) -> list[Path]:
@@ -125,7 +119,7 @@ def counts_of(folder: Path) -> list[Path]:
     return sorted(each for pattern in COUNTS for each in folder.glob(pattern))
 
 
-def add(run: RunResult, folder: Path) -> ArchivedRun:
+def add(run: RunResult, folder: Path) -> Path:
     """Put a finished run into the archive `folder`; the same results are written once.
 
     Other results of the same key, from another machine, are kept beside as ``<key>-<digest>.zip``.
@@ -139,7 +133,7 @@ def add(run: RunResult, folder: Path) -> ArchivedRun:
         path = folder / f"{run.key}-{_digest(content)[:8]}.zip"
     if not path.exists():
         write_atomic(path, content)
-    return ArchivedRun(path)
+    return path
 
 
 def _packed(run: RunResult, shared: Path) -> bytes:
@@ -242,16 +236,16 @@ def add_runs(options: AddOptions, _: list[str]) -> int:
         folders = [find_run(options.run, options.runs_dir)]
     for folder in folders:
         added = add(RunResult(folder), options.archive)
-        print_rich(plain_text(f"{added.path}  {added.path.stat().st_size} bytes"))
-        if added.path.stem != added.key:
-            warn(f"{options.archive / added.key}.zip has other results; both are kept.")
+        print_rich(plain_text(f"{added}  {added.stat().st_size} bytes"))
+        if added.stem != key_of(added):
+            warn(f"{options.archive / key_of(added)}.zip has other results; both are kept.")
     return 0
 
 
 def check(options: ArchiveOptions, _: list[str]) -> int:
     """Compose the command of every archived run again, and report whose key has changed."""
     found = list(_compared(options.archive))
-    rows = [(each.run.path.stem, each.state, each.reason) for each in found if each.state != "same"]
+    rows = [(each.path.stem, each.state, each.reason) for each in found if each.state != "same"]
     if rows:
         print_rich(rich_table(TextTable("archive", ("run", "state", "reason"), tuple(rows))))
     print_rich(f"{len(found)} runs, {len(found) - len(rows)} have the key of their command.")
@@ -269,7 +263,7 @@ def rekey(options: ArchiveOptions, _: list[str]) -> int:
 
     for each in [each for each in _compared(options.archive) if each.state == "added"]:
         with tempfile.TemporaryDirectory() as scratch:
-            folder = each.run.unpack(Path(scratch)).folder
+            folder = unpack(each.path, Path(scratch)).folder
             settings = OmegaConf.to_yaml(OmegaConf.create(dict(each.settings)))
             (folder / "config.yaml").write_text(settings)
             write_json(folder / "result.json", {**(read_result(folder) or {}), "key": each.key})
@@ -277,9 +271,9 @@ def rekey(options: ArchiveOptions, _: list[str]) -> int:
                 counts = Counts.load(path)
                 replace(counts, run=each.key if counts.run else "").save(path)
             new = folder.rename(folder.with_name(each.key))
-            path = add(RunResult(new), options.archive).path
-        each.run.path.unlink()
-        print_rich(plain_text(f"{each.run.path}  ->  {path}"))
+            path = add(RunResult(new), options.archive)
+        each.path.unlink()
+        print_rich(plain_text(f"{each.path}  ->  {path}"))
     return 0
 
 
@@ -290,7 +284,7 @@ class Compared(NamedTuple):
     "changed" (other settings); or "damaged", if the command does not compose any more, too.
     """
 
-    run: ArchivedRun
+    path: Path
     state: str
     reason: str = ""
     key: str = ""
@@ -302,14 +296,14 @@ def _compared(archive: Path) -> Iterator[Compared]:
     from omegaconf.errors import OmegaConfBaseException
 
     with tempfile.TemporaryDirectory() as scratch:
-        for run in archived(archive):
+        for path in archived(archive):
             try:
-                yield _compare(run, run.unpack(Path(scratch)))
+                yield _compare(path, unpack(path, Path(scratch)))
             except (InputError, HydraException, OmegaConfBaseException) as error:
-                yield Compared(run, "damaged", str(error))
+                yield Compared(path, "damaged", str(error))
 
 
-def _compare(run: ArchivedRun, stored: RunResult) -> Compared:
+def _compare(path: Path, stored: RunResult) -> Compared:
     from rgbt.config.compose import compose, flatten
     from rgbt.config.stored_config import read_settings
     from rgbt.runs.run_spec import NOT_IN_KEY
@@ -317,8 +311,8 @@ def _compare(run: ArchivedRun, stored: RunResult) -> Compared:
 
     words = stored.description.overrides
     spec = requested_run(compose(words), words)
-    if spec.key == run.key:
-        return Compared(run, "same")
+    if spec.key == stored.key:
+        return Compared(path, "same")
     before = flatten(read_settings(stored.folder / "config.yaml"))
     now, none = flatten(spec.plain), object()
     differing = [
@@ -330,7 +324,7 @@ def _compare(run: ArchivedRun, stored: RunResult) -> Compared:
     # Nothing says how an upstream run differs.
     is_added = bool(differing) and all(key not in before for key in differing)
     reason = ", ".join(differing) or "a run that it depends on"
-    return Compared(run, "added" if is_added else "changed", reason, spec.key, spec.plain)
+    return Compared(path, "added" if is_added else "changed", reason, spec.key, spec.plain)
 
 
 entry = CommandGroup(

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from analysis.archive import ArchivedRun, archived, counts_of
+from analysis.archive import archived, counts_of, unpack
 from rgbt.checks import InputError, nearest, one_line, split_list
 from rgbt.files.plain_files import read_json
 from rgbt.metrics import names
@@ -24,7 +24,7 @@ from rgbt.metrics.named import parse, value
 from rgbt.metrics.pairs import protocol_of
 from rgbt.metrics.score_grid import score_grid
 from rgbt.metrics.scores import MEANS, iou, miou, recall, variance
-from rgbt.runs.folder import GROUP, RunFolder, counts_name, find_run, is_finished, runs_in
+from rgbt.runs.folder import GROUP, counts_name, find_run, is_finished, runs_in
 from rgbt.runs.naming import row_name
 from rgbt.runs.result import RunResult
 from rgbt.terminal import info, warn
@@ -125,12 +125,10 @@ def finished_runs(runs: Path | str = "runs", archive: Path | str = "results") ->
     are unpacked once, into the cache of the user.
     """
     root, found, differing = Path(runs), dict[str, RunResult](), set[str]()
-    folders = runs_in(root) if root.is_dir() else []
-    finished = [each for each in folders if is_finished(each.path)]
-    sources: list[RunFolder | ArchivedRun] = [*finished, *archived(Path(archive))]
-    for source in sources:
+    folders = [each.path for each in runs_in(root)] if root.is_dir() else []
+    for path in (*filter(is_finished, folders), *archived(Path(archive))):
         try:
-            run = RunResult(source.path) if isinstance(source, RunFolder) else source.unpack()
+            run = unpack(path) if path.suffix == ".zip" else RunResult(path)
             _ = run.result, run.description  # they can be read
             first = found.setdefault(run.key, run)
             shared = {each.relative_to(run.folder) for each in counts_of(run.folder)}
@@ -139,7 +137,7 @@ def finished_runs(runs: Path | str = "runs", archive: Path | str = "results") ->
                 one, two = (Counts.load(each.folder / name) for each in (first, run))
                 differing |= set() if np.array_equal(one.counts, two.counts) else {run.key}
         except InputError as error:
-            warn(f"{source.path} is left out: {error}")
+            warn(f"{path} is left out: {error}")
     for key in sorted(differing):
         warn(f"{key} is stored with other counts, too; those of {found[key].folder} are used.")
     return [found[key] for key in sorted(found)]

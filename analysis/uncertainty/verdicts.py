@@ -156,24 +156,24 @@ def decide(
     if not evidences or (combine == "mean" and len(evidences) > 1):
         expected = "one evidence, of the mean contrast" if combine == "mean" else "evidence"
         raise ValueError(f"{combine}: expected {expected}, got {len(evidences)}.")
-    contrasts = tuple(_contrast(each, *wanted) for each in evidences)
-    needed = {"all": len(contrasts), "most": len(contrasts) // 2 + 1, "any": 1, "mean": 1}[combine]
-    claim = _Claim(contrasts, rule, needed)
+    count = len(evidences)
+    needed = {"all": count, "most": count // 2 + 1, "any": 1, "mean": 1}[combine]
+    claim = _Claim(evidences, wanted, rule, needed)
     kind = claim.kind()
     decisive = claim.decisive(kind)
-    shown = contrasts[decisive]
-    half = claim.halves(kind)[decisive]
-    if shown.seeds == 1 and shown.images is not None:
+    shown, estimate = evidences[decisive], float(claim.estimates[decisive])
+    half, seeds = float(claim.halves(kind)[decisive]), len(shown.seeds)
+    if seeds == 1 and shown.images is not None:
         half = student(0.0, shown.images, claim.level(kind)).half
     known = math.isfinite(half)
-    seeds_needed = claim.seeds_needed() if kind == "undecided" else float(shown.seeds)
+    seeds_needed = claim.seeds_needed() if kind == "undecided" else float(seeds)
     verdict = Verdict(
         kind=kind,
-        estimate=shown.estimate,
-        interval=Interval(shown.estimate - half, shown.estimate + half) if known else None,
-        covers="none" if not known else "images and seeds" if shown.seeds > 1 else "images",
+        estimate=estimate,
+        interval=Interval(estimate - half, estimate + half) if known else None,
+        covers="none" if not known else "images and seeds" if seeds > 1 else "images",
         smallest=half if known else math.nan,
-        seeds=shown.seeds,
+        seeds=seeds,
         seeds_needed=seeds_needed,
         decisive=decisive,
         reason=_reason(kind, shown, half, seeds_needed),
@@ -184,39 +184,21 @@ def decide(
     return verdict
 
 
-@dataclass(frozen=True)
-class _Contrast:
-    """One contrast in the numbers that decide; its margin is negative outside of the range."""
-
-    estimate: float
-    margin: float
-    sd: float  # over seeds (n - 1); NaN for fewer than two
-    seeds: int  # 0 where all terms are fixed
-    images: Spread | None
-
-    def half(self, rule: Rule, level: float, seeds: int) -> float:
-        """Half of the width of its interval with `seeds` seeds; inf or NaN where there is none."""
-        if self.images is None:
-            return math.nan
-        if self.seeds == 0:
-            return student(0.0, self.images, level).half
-        if math.isnan(self.sd):
-            return math.inf
-        return rule.half(Spread(self.sd / math.sqrt(seeds), seeds - 1), self.images, level)
-
-
-@dataclass(frozen=True)
 class _Claim:
     """Contrasts of which at least `needed` must be as claimed."""
 
-    contrasts: tuple[_Contrast, ...]
-    rule: Rule
-    needed: int
-
-    @property
-    def against(self) -> int:
-        """Number of contrasts outside the range that contradict the claim."""
-        return len(self.contrasts) - self.needed + 1
+    def __init__(
+        self,
+        evidences: Sequence[Evidence],
+        wanted: tuple[float, float],
+        rule: Rule,
+        needed: int,
+    ) -> None:
+        self.evidences, self.rule, self.needed = evidences, rule, needed
+        self.estimates = np.array([np.mean(each.values) for each in evidences])
+        self.margins = np.minimum(self.estimates - wanted[0], wanted[1] - self.estimates)
+        self.sds = [np.std(e.values, ddof=1) if len(e.values) > 1 else math.nan for e in evidences]
+        self.against = len(evidences) - needed + 1  # outside the range, they contradict the claim
 
     def level(self, kind: Kind) -> float:
         """Level of each interval; of an open claim that with which it would hold."""
@@ -224,18 +206,31 @@ class _Claim:
         return 1.0 - (1.0 - self.rule.level) / others
 
     def halves(self, kind: Kind, seeds: int = 0) -> list[float]:
-        """Half widths of the intervals that give `kind`, with `seeds` seeds where they are more."""
-        level = self.level(kind)
-        return [each.half(self.rule, level, max(each.seeds, seeds)) for each in self.contrasts]
+        """Half widths of the intervals that give `kind`, with `seeds` seeds where they are more.
+
+        Infinite or NaN where there is no interval.
+        """
+        level, found = self.level(kind), []
+        for each, sd in zip(self.evidences, self.sds, strict=True):
+            count = max(len(each.seeds), seeds)
+            if each.images is None:
+                found.append(math.nan)
+            elif not each.seeds:  # all terms are fixed
+                found.append(student(0.0, each.images, level).half)
+            elif math.isnan(sd):
+                found.append(math.inf)
+            else:
+                trainings = Spread(float(sd) / math.sqrt(count), count - 1)
+                found.append(self.rule.half(trainings, each.images, level))
+        return found
 
     def standings(self, kind: Kind, seeds: int = 0) -> Values:
         """Margins in half widths, above 1 inside the range ("contradicted": outside).
 
         0 where there is no interval, or neither a margin nor a width.
         """
-        margins = np.array([each.margin for each in self.contrasts])
         with np.errstate(divide="ignore", invalid="ignore"):
-            found = margins / np.array(self.halves(kind, seeds))
+            found = self.margins / np.array(self.halves(kind, seeds))
         return np.where(np.isnan(found), 0.0, -found if kind == "contradicted" else found)
 
     def kind(self, seeds: int = 0) -> Kind:
@@ -257,29 +252,19 @@ class _Claim:
             counts = range(2, MOST_SEEDS)
             found = bisect_left(counts, True, key=lambda seeds: self.kind(seeds) != "undecided")
             return float(2 + found)
-        unknown = any(
-            each.images is None or (each.seeds and math.isnan(each.sd)) for each in self.contrasts
-        )
+        unknown = any(each.images is None or len(each.seeds) == 1 for each in self.evidences)
         return math.nan if unknown else math.inf
 
 
-def _contrast(evidence: Evidence, low: float, high: float) -> _Contrast:
-    values = np.array(evidence.values)
-    estimate = float(values.mean())
-    sd = float(values.std(ddof=1)) if len(values) > 1 else math.nan
-    margin = min(estimate - low, high - estimate)
-    return _Contrast(estimate, margin, sd, len(evidence.seeds), evidence.images)
-
-
-def _reason(kind: Kind, shown: _Contrast, half: float, seeds_needed: float) -> str:
+def _reason(kind: Kind, shown: Evidence, half: float, seeds_needed: float) -> str:
     if kind != "undecided":
         return "" if shown.seeds else "As trained: other trainings are not covered."
     if shown.images is None:
         return "There are too few images for an interval."
-    if shown.seeds == 1:
+    if len(shown.seeds) == 1:
         return "It needs two seeds or more."
     if not math.isfinite(half):
-        return f"{shown.seeds} seeds are too few for an interval that is valid at any time."
+        return f"{len(shown.seeds)} seeds are too few for an interval that is valid at any time."
     if half == 0:
         return "The estimate is the limit of the claimed range, on every draw of the images."
     if math.isinf(seeds_needed):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from analysis.archive import add, archived, entry
+from analysis.archive import add, archived, entry, key_of, unpack
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.runs.folder import RunFolder
@@ -49,7 +49,7 @@ def run(tmp_path: Path) -> RunResult:
 
 
 def test_unpacked_run_has_equal_counts(run: RunResult, tmp_path: Path) -> None:
-    unpacked = add(run, tmp_path / "results").unpack(tmp_path / "unpacked")
+    unpacked = unpack(add(run, tmp_path / "results"), tmp_path / "unpacked")
     paths = [path for end in ("npz", "json") for path in sorted(run.folder.rglob(f"*.{end}"))]
     names = {path.relative_to(run.folder).as_posix() for path in paths}
     assert names == {
@@ -74,9 +74,9 @@ def test_same_results_are_one_file_and_others_are_kept(run: RunResult, tmp_path:
     assert add(run, archive) == add(run, archive)
     some(2, run=run.key).save(run.folder / "counts_test.npz")
     other = add(run, archive)
-    assert other.key == run.key
-    assert other.unpack(tmp_path / "unpacked").counts().run == run.key
-    assert [each.path for each in archived(archive)] == [other.path, archive / f"{run.key}.zip"]
+    assert key_of(other) == run.key
+    assert unpack(other, tmp_path / "unpacked").counts().run == run.key
+    assert archived(archive) == [other, archive / f"{run.key}.zip"]
 
 
 def test_images_are_stored_once_for_all_runs(run: RunResult, tmp_path: Path) -> None:
@@ -92,29 +92,29 @@ def test_images_are_stored_once_for_all_runs(run: RunResult, tmp_path: Path) -> 
 
 @pytest.mark.parametrize("damage", [0.3, 0.6, "shared", "/tmp/outside.txt", "../outside.txt"])
 def test_damaged_archive_is_refused(run: RunResult, tmp_path: Path, damage: float | str) -> None:
-    archived_run = add(run, tmp_path / "results")
+    path = add(run, tmp_path / "results")
     shared, other = sorted((tmp_path / "results/shared").iterdir())[:2]
     if isinstance(damage, float):
-        content = bytearray(archived_run.path.read_bytes())
+        content = bytearray(path.read_bytes())
         content[int(damage * len(content))] ^= 0xFF
-        archived_run.path.write_bytes(content)
+        path.write_bytes(content)
     elif damage == "shared":  # arrays of other images
         shared.write_bytes(other.read_bytes())
     else:
-        with zipfile.ZipFile(archived_run.path, "a") as archive:
+        with zipfile.ZipFile(path, "a") as archive:
             archive.writestr(damage, "x")
     word = "damaged .*does not match its digest" if damage == "shared" else "damaged"
     with pytest.raises(InputError, match=word):
-        archived_run.unpack(tmp_path / "unpacked")
+        unpack(path, tmp_path / "unpacked")
     assert list((tmp_path / "unpacked").iterdir()) == []
     assert not (tmp_path / "outside.txt").exists()
 
 
 def test_archive_of_another_run_is_refused(run: RunResult, tmp_path: Path) -> None:
-    path = add(run, tmp_path / "results").path
+    path = add(run, tmp_path / "results")
     path.rename(path.with_name("0123456789ab.zip"))
     with pytest.raises(InputError, match=f"holds the run {run.key}"):
-        archived(tmp_path / "results")[0].unpack(tmp_path / "unpacked")
+        unpack(path.with_name("0123456789ab.zip"), tmp_path / "unpacked")
     (run.folder / "result.json").unlink()
     with pytest.raises(InputError, match="is not finished"):
         add(run, tmp_path / "results")
@@ -152,8 +152,8 @@ def test_check_reports_changed_keys(
     assert reason in out
     assert call(entry, "rekey", f"archive={archive}")[0] == 0
     (only,) = archived(archive)
-    assert only.path.stem == (run.key if state == "added" else "0123456789ab")
-    assert only.unpack(tmp_path / "unpacked").counts().run == only.key
+    assert only.stem == (run.key if state == "added" else "0123456789ab")
+    assert unpack(only, tmp_path / "unpacked").counts().run == only.stem
     assert call(entry, "check", f"archive={archive}")[0] == (0 if state == "added" else 1)
 
 
@@ -161,7 +161,7 @@ def test_command_adds_all_finished_runs(call: Call, run: RunResult, tmp_path: Pa
     archive = tmp_path / "results"
     words = (f"runs_dir={run.folder.parent}", f"archive={archive}")
     assert call(entry, "add", "run=all", *words)[0] == 0
-    assert [each.key for each in archived(archive)] == [run.key]
+    assert [each.stem for each in archived(archive)] == [run.key]
     code, out, err = call(entry, "check", f"archive={archive}")
     assert (code, err) == (0, "")
     assert "1 runs, 1 have the key of their command" in out

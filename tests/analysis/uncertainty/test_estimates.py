@@ -139,17 +139,6 @@ def test_nothing_to_score_is_nan() -> None:
     assert some.p_corrected == some.difference.p
 
 
-def test_correlated_neighbours_make_wider_intervals() -> None:
-    """Ten frames of each scene are nearly one piece of evidence."""
-    seeds = drawn(300, block=10, noise_sd=0.0, image_sd=1.0)
-    halves = {
-        blocks: estimate(seeds, ["mIoU"], replace(SETTINGS, blocks=blocks))["mIoU"].images.half
-        for blocks in ("none", "auto", 10)
-    }
-    assert halves[10] > 2 * halves["none"]
-    assert halves["auto"] > 1.7 * halves["none"]
-
-
 def test_night_is_scored_on_its_own_images() -> None:
     (counts,) = drawn()
     counts = replace(counts, night=tuple(place % 2 == 0 for place in range(40)))

@@ -110,44 +110,54 @@ def test_verdict_says_what_it_covers_and_needs(
 
 
 @pytest.mark.parametrize(
-    ("value", "kind"),
+    ("wanted", "combine", "values", "kind", "decisive"),
     [
-        *((4.0, "holds"), (2.9, "undecided"), (5.1, "undecided")),
-        *((-1.0, "contradicted"), (9.0, "contradicted"), (-0.9, "undecided"), (8.9, "undecided")),
-    ],
-)
-def test_ranges_hold_inside_and_are_contradicted_outside(value: float, kind: str) -> None:
-    """A half width of 1.96 in a range of 6."""
-    assert decide([as_trained(value)], (1.0, 7.0), FIXED, "all").kind == kind
-
-
-@pytest.mark.parametrize(
-    ("combine", "values", "kind", "decisive"),
-    [
+        # A half width of 1.96 in a range of 6, and in "does as well as".
+        *(((1.0, 7.0), "all", (value,), "undecided", 0) for value in (2.9, 5.1, -0.9, 8.9)),
+        *(((1.0, 7.0), "all", (value,), "contradicted", 0) for value in (-1.0, 9.0)),
+        ((1.0, 7.0), "all", (4.0,), "holds", 0),
+        (similar(2.5), "all", (0.5,), "holds", 0),
+        (similar(2.4), "all", (0.5,), "undecided", 0),  # no difference is shown either
+        *((similar(2.5), "all", (value,), "undecided", 0) for value in (-0.6, -4.4)),
+        (similar(2.5), "all", (4.5,), "contradicted", 0),
         # One-sided quantiles: 1.960 alone, 2.241 for two, 2.394 for three contrasts.
-        ("all", (3.0, 2.0, 4.0), "holds", 1),
-        ("all", (3.0, 1.9, 4.0), "undecided", 1),
-        ("all", (3.0, -2.3, 4.0), "undecided", 1),
-        ("all", (3.0, -2.5, 4.0), "contradicted", 1),
-        ("any", (0.0, 2.5, -9.0), "holds", 1),
-        ("any", (0.0, 2.3, -9.0), "undecided", 1),
-        ("any", (-2.0, -3.0, -4.0), "contradicted", 0),
-        ("any", (-1.9, -3.0, -4.0), "undecided", 0),
-        ("most", (2.3, 9.0, -9.0), "holds", 0),
-        ("most", (2.1, 9.0, -9.0), "undecided", 0),
-        ("most", (-2.3, 9.0, -9.0), "contradicted", 0),
-        ("most", (-2.1, 9.0, -9.0), "undecided", 0),
-        ("most", (9.0, 9.0, 0.0, 0.0), "undecided", 2),  # half of them are not most
+        (HIGHER, "all", (3.0, 2.0, 4.0), "holds", 1),
+        (HIGHER, "all", (3.0, 1.9, 4.0), "undecided", 1),
+        (HIGHER, "all", (3.0, -2.3, 4.0), "undecided", 1),
+        (HIGHER, "all", (3.0, -2.5, 4.0), "contradicted", 1),
+        (HIGHER, "any", (0.0, 2.5, -9.0), "holds", 1),
+        (HIGHER, "any", (0.0, 2.3, -9.0), "undecided", 1),
+        (HIGHER, "any", (-2.0, -3.0, -4.0), "contradicted", 0),
+        (HIGHER, "any", (-1.9, -3.0, -4.0), "undecided", 0),
+        (HIGHER, "most", (2.3, 9.0, -9.0), "holds", 0),
+        (HIGHER, "most", (2.1, 9.0, -9.0), "undecided", 0),
+        (HIGHER, "most", (-2.3, 9.0, -9.0), "contradicted", 0),
+        (HIGHER, "most", (-2.1, 9.0, -9.0), "undecided", 0),
+        (HIGHER, "most", (9.0, 9.0, 0.0, 0.0), "undecided", 2),  # half of them are not most
     ],
 )
-def test_several_contrasts(
-    combine: str, values: tuple[float, ...], kind: str, decisive: int
+def test_decision(
+    wanted: tuple[float, float],
+    combine: str,
+    values: tuple[float, ...],
+    kind: str,
+    decisive: int,
 ) -> None:
-    found = decide([as_trained(value) for value in values], HIGHER, FIXED, combine)
+    found = decide([as_trained(value) for value in values], wanted, FIXED, combine)
     assert (found.kind, found.decisive) == (kind, decisive)
     assert found.estimate == values[decisive]
-    mirrored = decide([as_trained(-value) for value in values], LOWER, FIXED, combine)
-    assert (mirrored.kind, mirrored.decisive) == (kind, decisive)
+    mirrored = (-wanted[1], -wanted[0])
+    found = decide([as_trained(-value) for value in values], mirrored, FIXED, combine)
+    assert (found.kind, found.decisive) == (kind, decisive)
+    # Rows that were not run may be as claimed or not.
+    stands = {"all": "contradicted", "any": "holds"}.get(combine) == kind
+    found = decide(
+        [as_trained(value) for value in values], wanted, FIXED, combine, missing="B was not run."
+    )
+    assert (found.kind, found.reason == "B was not run.") == (
+        kind if stands else "undecided",
+        not stands,
+    )
 
 
 def test_intervals_of_several_contrasts_have_the_level_that_decides() -> None:
@@ -167,14 +177,6 @@ def test_seeds_needed_is_the_first_number_that_decides(rule, mean: float, error:
     before = decide([spread(int(needed) - 1, mean, 1.0, error)], HIGHER, rule, "all")
     assert (before.kind, before.seeds_needed) == ("undecided", needed)
     assert decide([spread(int(needed), mean, 1.0, error)], HIGHER, rule, "all").kind == "holds"
-
-
-def test_seeds_needed_of_all_is_that_of_the_weakest() -> None:
-    both = [spread(4, 1.2, 1.0), spread(4, 0.8, 1.0)]
-    alone = [decide([each], HIGHER, FIXED, "all").seeds_needed for each in both]
-    assert alone[0] < alone[1]
-    assert decide(both, HIGHER, FIXED, "all").seeds_needed == alone[1]
-    assert decide(both, HIGHER, FIXED, "all").decisive == 1
 
 
 def test_more_seeds_never_widen_an_interval() -> None:
@@ -212,56 +214,16 @@ def test_rates_of_looking_at_fixed_intervals_after_every_seed() -> None:
 # What a verdict rests on.
 
 
-@pytest.mark.parametrize(
-    ("combine", "values", "kind"),
-    [
-        ("all", (9.0, 9.0), "undecided"),
-        ("all", (9.0, -9.0), "contradicted"),
-        ("any", (-9.0, -9.0), "undecided"),
-        ("any", (9.0, -9.0), "holds"),
-        ("most", (-9.0, -9.0, -9.0), "undecided"),
-        ("most", (9.0, 9.0, 9.0), "undecided"),
-    ],
-)
-def test_rows_that_were_not_run_may_be_as_claimed_or_not(
-    combine: str, values: tuple[float, ...], kind: str
-) -> None:
-    found = decide(
-        [as_trained(v) for v in values], HIGHER, FIXED, combine, missing="B was not run."
-    )
-    assert found.kind == kind
-    if kind == "undecided":
-        assert found.reason == "B was not run."
-        assert math.isnan(found.seeds_needed)
-
-
 def test_verdict_on_one_start_has_its_warning() -> None:
     values = evidence(1.0, 2.0, 3.0)
-    warnings = {
-        starts: decide([values], HIGHER, FIXED, "all", starts=starts).warning
-        for starts in (None, 1, 2, 3)
-    }
-    assert warnings == {None: "", 1: ONE_START, 2: "", 3: ""}
-    assert decide([as_trained(3.0)], HIGHER, FIXED, "all", starts=1).warning == ""
-
-
-@pytest.mark.parametrize(
-    ("margin", "value", "kind"),
-    [
-        (2.5, 0.5, "holds"),
-        (2.4, 0.5, "undecided"),  # no difference is shown either
-        (2.5, -0.6, "undecided"),
-        (2.5, 4.5, "contradicted"),
-        (2.5, -4.4, "undecided"),
-    ],
-)
-def test_does_as_well_as_needs_an_interval_inside_the_margin(
-    margin: float, value: float, kind: str
-) -> None:
-    """Half width of the interval: 1.96."""
-    assert decide([as_trained(value)], similar(margin), FIXED, "all").kind == kind
-    with pytest.raises(ValueError, match="largest difference that is none"):
-        similar(-margin)
+    for starts, given, warning in (
+        *((None, values, ""), (1, values, ONE_START), (2, values, "")),
+        (1, as_trained(3.0), ""),
+    ):
+        assert decide([given], HIGHER, FIXED, "all", starts=starts).warning == warning
+    for margin in (0.0, -1.0, math.inf):
+        with pytest.raises(ValueError, match="largest difference that is none"):
+            similar(margin)
 
 
 def simulated(draw: object, seeds: int, wanted: tuple[float, float] = HIGHER) -> list[float]:
