@@ -1,6 +1,6 @@
 """Report of a study: ``rgbt study name=search/grbm``, also while it runs.
 
-Tables in the terminal; ``runs/studies/<name>/`` gets them as Markdown and CSV with the figures.
+Tables in the terminal; ``runs/studies/<name>/`` gets them as Markdown and CSV.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Options:
 
 
 def main(options: Options, overrides: list[str]) -> int:
-    """Show the results of a study: best trials, failures, importances, figures."""
+    """Show the results of a study: best trials, failures, importances."""
     del overrides  # none is heeded
     from sweeps.report.study import publish_study, study_folder
     from sweeps.worker.storage import load_study, open_storage, storage_file, storage_url

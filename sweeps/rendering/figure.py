@@ -1,7 +1,6 @@
 """The figure of a computed table: ours with error bars over seeds, published values hollow beside.
 
-Three forms: over the factor that the rows vary; rows below each other, one panel per column; or,
-for tables of regions or classes without a mean, one panel per row over the columns.
+Two forms: over the factor that the rows vary; or rows below each other, one panel per column.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ FAR_APART = 2.0
 """Two sets of values get an axis each where the gap between them is this many times their range."""
 
 MAX_PANELS, MAX_HEADLINES = 4, 5
-"""Columns without headlines up to which each has a panel; headlines that are shown."""
+"""Columns of a table without headlines, and headlines, that are shown."""
 
 SHIFT = 0.13
 """Shift of published markers beside ours, in rows or columns."""
@@ -65,9 +64,7 @@ def figure_of(scored: ScoredTable) -> Figure | None:
     if not columns:
         return None
     shown = headline_columns(columns)[:MAX_HEADLINES]
-    shown = shown or (columns if len(columns) <= MAX_PANELS else [])
-    if not shown:
-        return _profiles(scored)
+    shown = shown or columns[:MAX_PANELS]
     with_x = [row for row in rows if row.x is not None]
     return _over_factor(scored, shown) if len(with_x) > 1 else _by_row(scored, shown)
 
@@ -125,28 +122,6 @@ def _by_row(scored: ScoredTable, columns: Sequence[Column]) -> Figure:
         axes.grid(axis="y", alpha=0.25)
     panels[0].set_yticks(range(len(rows)), [row.label for row in rows])
     panels[0].set_ylim(len(rows) - 0.5, -0.5)
-    return _finished(figure, scored)
-
-
-def _profiles(scored: ScoredTable) -> Figure:
-    from matplotlib.figure import Figure
-
-    columns = scored.table.columns
-    rows = [row for row in scored.table.rows if any(row.values) or row.experiment is not None]
-    abreast = min(4, len(rows))
-    height, width = math.ceil(len(rows) / abreast), max(2.6, 0.28 * len(columns))
-    figure = Figure(figsize=(0.6 + width * abreast, 1 + 2.1 * height), layout="constrained")
-    panels = figure.subplots(height, abreast, sharex=True, squeeze=False).ravel()
-    rotation = 0 if max(len(column.name) for column in columns) <= 2 else 90
-    for axes, row in zip(panels, rows, strict=False):
-        positions = range(len(columns))
-        series = _series(scored, [(row, column) for column in columns], positions)
-        _draw_pair(axes, *series, across=False, joined=True)
-        axes.set_title(row.label, fontsize=9)
-        axes.set_xticks(positions, [column.name for column in columns], rotation=rotation)
-        axes.tick_params(labelsize=7)
-    for axes in panels[len(rows) :]:
-        axes.set_visible(False)
     return _finished(figure, scored)
 
 

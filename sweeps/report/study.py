@@ -1,4 +1,4 @@
-"""The report of a study: tables in the terminal, Markdown, CSV, and the figures of Optuna."""
+"""The report of a study: tables in the terminal, Markdown and CSV; `optuna-dashboard` draws it."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import math
 import re
 import warnings
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from rich.console import Group
@@ -44,9 +44,6 @@ WORDS = {
 MIN_TRIALS, ADVISED = 10, 50
 """Complete trials below which importances would be noise, because PED-ANOVA looks at the best
 tenth; and from which that tenth has the five trials that its authors ask for."""
-
-MIN_CONTOUR_TRIALS = 4
-"""Fewest trials with both parameters from which a surface is drawn."""
 
 TOP, POINTS = 10, 50
 """Rows of the tables of best trials, and of points of a grid or list; the CSV has all."""
@@ -120,11 +117,12 @@ class StudyData:
     @cached_property
     def front(self) -> list[FrozenTrial]:
         """The Pareto front, best first objective first; with one objective its best trials."""
-        if not self.complete:
-            return []
-        # The complete trials come first in the copy: its numbers are indices of our list.
-        best = self.in_memory().best_trials
-        return sorted((self.complete[each.number] for each in best), key=self.rank)
+        signs = np.where(self.maximize, 1.0, -1.0)
+        points = np.array([trial.values for trial in self.complete]).reshape(-1, len(signs)) * signs
+        as_good = (points[:, None] >= points).all(-1)
+        beaten = np.any(as_good & (points[:, None] > points).any(-1), axis=0)
+        found = [trial for trial, each in zip(self.complete, beaten, strict=True) if not each]
+        return sorted(found, key=self.rank)
 
     @cached_property
     def latest(self) -> list[FrozenTrial]:
@@ -136,45 +134,17 @@ class StudyData:
         """Sorts complete trials by their first objective, best first, then by number."""
         return (-1.0 if self.maximize[0] else 1.0) * trial.values[0], trial.number
 
-    def in_memory(self) -> optuna.Study:
-        """The complete trials, then the pruned ones, in memory and numbered anew."""
+    def of_objective(self, index: int) -> optuna.Study:
+        """The complete trials in memory with one objective."""
         import optuna
-
-        ways = (optuna.study.StudyDirection.MINIMIZE, optuna.study.StudyDirection.MAXIMIZE)
-        study = optuna.create_study(directions=[ways[up] for up in self.maximize])
-        study.add_trials([*self.complete, *self.of_state("PRUNED")])
-        return study
-
-    def of_objective(self, index: int, *, with_others: bool = False) -> optuna.Study:
-        """The complete trials in memory with one objective and parameters as shown.
-
-        Args:
-            index: of the objective.
-            with_others: the other objectives are parameters.
-        """
-        import optuna
-        from optuna.distributions import CategoricalDistribution, FloatDistribution
 
         study = optuna.create_study(direction="maximize" if self.maximize[index] else "minimize")
-        others = [i for i in range(len(self.metrics)) if with_others and i != index]
         for trial in self.complete:
-            params, kinds = dict(trial.params), dict(trial.distributions)
-            for name, kind in trial.distributions.items():
-                if isinstance(kind, CategoricalDistribution):
-                    params[name] = self.shown(params[name])
-                    kinds[name] = CategoricalDistribution(tuple(map(self.shown, kind.choices)))
-            for other in others:
-                column = [each.values[other] for each in self.complete]
-                params[self.metrics[other]] = trial.values[other]
-                kinds[self.metrics[other]] = FloatDistribution(min(column), max(column))
-            value = trial.values[index]
-            made = optuna.trial.create_trial(value=value, params=params, distributions=kinds)
+            made = optuna.trial.create_trial(
+                value=trial.values[index], params=trial.params, distributions=trial.distributions
+            )
             study.add_trial(made)
         return study
-
-    def direction(self, index: int) -> str:
-        """An objective as the title of an axis."""
-        return f"{self.metrics[index]} ({'higher' if self.maximize[index] else 'lower'} is better)"
 
     def shown(self, value: object) -> str:
         """A parameter's value: four significant digits; ``${px:64}`` in pixels of the trials."""
@@ -354,83 +324,12 @@ def _runs(trial: FrozenTrial) -> str:
     return " ".join(trial.user_attrs.get(attributes.RUNS, ())) or ABSENT
 
 
-def draw(data: StudyData, shares: Importances, folder: Path) -> list[tuple[str, str]]:
-    """Write ``<name>.png`` of every figure that this study allows; their names and titles.
-
-    The points of a list have no parameters, hence no figures; a grid has those that do not show
-    the course of a search.
-    """
-    import optuna
-    from matplotlib import pyplot
-
-    # Optuna draws with pyplot, which would open a window, and changes its style for good.
-    pyplot.switch_backend("agg")
-    drawn = []
-    for name, title, plot, study, options in _figures(data, shares):
-        size = (5.4, 3.4) if plot == "plot_slice" else (8.0, 5.0)  # of a slice
-        style: Any = {"figure.figsize": size, "figure.dpi": 110}
-        style["figure.constrained_layout.use"] = True
-        with pyplot.rc_context(style), warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the remarks of the report say how uncertain it is
-            axis = np.ravel(getattr(optuna.visualization.matplotlib, plot)(study, **options))[0]
-            axis.set_title("")
-            axis.set_title("", loc="left")
-            if plot == "plot_intermediate_values":  # a line for each of all trials
-                axis.get_legend().remove()
-            axis.figure.suptitle(f"{data.name}: {title}", fontsize=10)
-            axis.figure.savefig(folder / f"{name}.png")
-            pyplot.close(axis.figure)
-        drawn.append((name, title))
-    return drawn
-
-
-def _figures(
-    data: StudyData, shares: Importances
-) -> Iterator[tuple[str, str, str, optuna.Study, dict[str, Any]]]:
-    """File name, title, function of Optuna, study and options of every figure."""
-    if data.kind == "list" or not data.complete:
-        return
-    several, is_search = len(data.metrics) > 1, data.kind == "search"
-    for index, metric in enumerate(data.metrics):
-        end = "_" + re.sub(r"\W+", "_", metric) if several else ""
-        study, target = data.of_objective(index), {"target_name": data.direction(index)}
-        names = sorted(shares.shares, key=lambda name: -np.nan_to_num(shares.shares[name][index]))
-        title = f"{metric} by complete trial"
-        if is_search:
-            yield f"history{end}", title, "plot_optimization_history", study, target
-        if data.distributions:
-            title = f"{metric} over each parameter"
-            yield f"slices{end}", title, "plot_slice", study, target
-        if names and len({trial.values[index] for trial in data.complete}) > 1:
-            title, options = f"Importance of the parameters for {metric}", {"params": names}
-            yield f"importances{end}", title, "plot_param_importances", study, target | options
-        pair = names[:2]
-        both = [trial.params for trial in data.complete if set(pair) <= set(trial.params)]
-        is_varied = all(len({params[name] for params in both}) > 1 for name in pair)
-        if len(pair) == 2 and len(both) >= MIN_CONTOUR_TRIALS and is_varied:
-            title, options = f"{metric} over two parameters", {"params": pair}
-            yield f"contour{end}", title, "plot_contour", study, target | options
-    if several and len(data.metrics) < 4:  # Optuna draws up to three objectives
-        ways = {"target_names": [data.direction(index) for index in range(len(data.metrics))]}
-        yield "pareto", "Pareto front", "plot_pareto_front", data.in_memory(), ways
-    if is_search and not several and any(trial.intermediate_values for trial in data.trials):
-        title, plot = "Validation during training", "plot_intermediate_values"
-        yield "intermediate", title, plot, data.in_memory(), {}
-    if data.distributions:
-        title, plot = "Parallel coordinates, dark lines are best", "plot_parallel_coordinate"
-        study = data.of_objective(0, with_others=True)
-        yield "parallel", title, plot, study, {"target_name": data.direction(0)}
-
-
 def publish_study(study: optuna.Study, out: Path, url: str) -> None:
     """Print the tables of a study in the storage `url`, and write its files into `out`."""
     data = StudyData.read(study)
     shares = importances(data)
     grids = tables(data, shares)
     out.mkdir(parents=True, exist_ok=True)
-    for stale in out.glob("*.png"):  # of an earlier call
-        stale.unlink()
-    drawn = draw(data, shares, out)
     way = ["highest" if up else "lowest" for up in data.maximize]
     objectives = ", ".join(f"{w} {metric}" for w, metric in zip(way, data.metrics, strict=True))
     remarks = [f"Importances: {shares.remark}"] if shares.remark else []
@@ -439,14 +338,12 @@ def publish_study(study: optuna.Study, out: Path, url: str) -> None:
         *([f"Created by `{without_passwords(data.command)}`."] if data.command else []),
         *(grid.to_markdown() for grid in grids),
         *remarks,
-        *(f"## {title}\n\n![{title}]({name}.png)" for name, title in drawn),
     ]
     write_atomic(out / "study.md", "\n\n".join([*text, ""]).encode())
     write_atomic(out / "trials.csv", trials_csv(data).encode())
     print_rich(Group(*map(rich_table, grids), Text("\n".join(remarks))))
-    files = [("report", str(out / "study.md")), ("figures", f"{len(drawn)} in {out}")]
     command = f"optuna-dashboard {without_passwords(url)}"
-    print_rich(path_lines([*files, ("dashboard", command)]))
+    print_rich(path_lines([("report", str(out / "study.md")), ("figures", command)]))
 
 
 def study_folder(runs_dir: Path, name: str) -> Path:

@@ -12,7 +12,7 @@ from sweeps.report.study import study_folder
 from sweeps.study import entry
 from tests.commands import Call, assert_one_sentence
 
-FILES = {"study.md", "trials.csv", "history.png", "slices.png", "parallel.png"}
+FILES = {"study.md", "trials.csv"}
 
 
 def make_study(runs_dir: Path, name: str = "search/grbm", kind: str = "search") -> None:
@@ -46,7 +46,6 @@ def test_study_of_search_is_shown_and_written(call: Call, tmp_path: Path) -> Non
     assert f"optuna-dashboard sqlite:///{tmp_path}/studies.db" in out
     assert {path.name for path in folder.iterdir()} == FILES
     text = (folder / "study.md").read_text()
-    assert "](history.png)" in text
     assert "postgresql://u:***@h/db" in text
     assert "| 50.75 |" in text
 

@@ -6,11 +6,8 @@ import csv
 import io
 import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
 import optuna
 import pytest
 from optuna.distributions import CategoricalDistribution, FloatDistribution
@@ -18,7 +15,7 @@ from optuna.trial import TrialState, create_trial
 
 from sweeps import attributes
 from sweeps.report import study as tables
-from sweeps.report.study import StudyData, draw, importances
+from sweeps.report.study import StudyData, importances
 
 ALPHA = FloatDistribution(0, 1)
 SIZES = CategoricalDistribution(("${px:64}", "${px:8}"))
@@ -153,45 +150,6 @@ def test_importances_missing_have_a_reason() -> None:
     assert [each.shares for each in found] == [{}, {}]
     assert found[0].remark == "they need 10 complete trials, and there are 9."
     assert found[1].remark.startswith("no parameter took two")
-
-
-def drawn(study: optuna.Study, folder: Path) -> list[str]:
-    """Names of the pictures."""
-    data = StudyData.read(study)
-    return [name for name, _ in draw(data, importances(data), folder)]
-
-
-ONE = ["history", "slices", "importances", "contour", "intermediate", "parallel"]
-
-
-@pytest.mark.slow
-def test_draw_one_objective_all_figures(tmp_path: Path) -> None:
-    """Float, log, int and categorical parameters that not all trials have; pruned, failed."""
-    study = new_study("maximize")
-    for index in range(24):
-        trial = study.ask()
-        rate = trial.suggest_float("optimizer.lr", 1e-5, 1e-1, log=True)
-        size = trial.suggest_int("masker.patch_size", 8, 64, step=8)
-        if trial.suggest_categorical("masker", ["grbm", "none"]) == "grbm":
-            trial.suggest_float("masker.sigma_div", 0.5, 8.0, log=True)
-        trial.report(-1, 10)
-        state = {1: TrialState.FAIL, 2: TrialState.PRUNED}.get(index % 6)
-        study.tell(trial, None if state else math.log10(rate) - size / 100, state)
-    assert drawn(study, tmp_path) == ONE
-    for name in ONE:
-        assert np.unique(cv2.imread(str(tmp_path / f"{name}.png"))).size > 10, name
-    study.set_user_attr(attributes.KIND, "grid")
-    assert drawn(study, tmp_path) == [*ONE[1:4], "parallel"]
-    study.set_user_attr(attributes.KIND, "list")
-    assert drawn(study, tmp_path) == []
-
-
-def test_draw_without_complete_trials_is_empty(tmp_path: Path) -> None:
-    study = new_study("maximize")
-    trial = study.ask()
-    trial.suggest_float("x", 0, 1)
-    study.tell(trial, state=TrialState.FAIL)
-    assert drawn(study, tmp_path) == []
 
 
 def test_odd_records_of_a_trial_are_shown() -> None:

@@ -88,6 +88,18 @@ def test_best_of_all_needs_every_other_row() -> None:
     assert (refuted.word, refuted.missing) == ("contradicted", ("same",))
 
 
+def test_most_with_rows_not_run_is_never_contradicted() -> None:
+    """The rows that were not run may all be as claimed: three of five would be most."""
+    rows = ("low", "same", "first", "second", "third")
+    most = claim(rows=rows, against=("high",), combine="most")
+    shares = {"low": (50.0, 51.0, 49.0), "same": (55.0, 56.0, 54.0), "high": (90.0, 91.0, 89.5)}
+    made = TableJudge("own/t", of(most, rows=("high", *rows)), resamples=200)
+    found = made.judge(most, planted(shares))  # type: ignore[arg-type]
+    assert (found.word, found.missing) == ("undecided", ("first", "second", "third"))
+    every = planted({**dict.fromkeys(rows, shares["low"]), "high": shares["high"]})
+    assert made.judge(most, every).word == "contradicted"  # type: ignore[arg-type]
+
+
 def test_claim_without_runs_is_not_run() -> None:
     found = judge(claim(rows=("high",), against=("low",)), {})
     assert (found.word, found.verdict, found.printed) == ("not run", None, -1.0)
