@@ -65,10 +65,10 @@ def test_heatnet_target_keeps_blocks_and_thermal(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(training_setup, "PairedBatches", lambda *_, **__: None)
     spec = specified(("+experiment=heatnet_original",))
     named = {"domains": spec.domains, "loading": spec.data, "trainer": spec.trainer}
-    session: Any = SimpleNamespace(spec=spec, transform=full, **named)
-    datasets, none = {"source": None, "target": None}, None
-    setup = TrainingSetup(session, none, {}, datasets, none, {}, {}, None, none, none)  # type: ignore[arg-type]
-    setup.batches(range(1))
+    session: Any = SimpleNamespace(spec=spec, transform=full, drawn=spec.seeds, **named)
+    setup: Any = SimpleNamespace(session=session, datasets=dict.fromkeys(("source", "target")))
+    setup.rare = None
+    TrainingSetup.batches(setup, range(1))
     assert taken == [full, target]
 
 
