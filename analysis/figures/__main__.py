@@ -48,8 +48,8 @@ def main(options: Any, overrides: list[str]) -> int:
     name, out = given.pop("figure"), given.pop("out")
     if name == "list":
         rows = {
-            key: (each.shows, " ".join([*(n.name for n in fields(each.options)), *each.groups]))
-            for key, each in FIGURES.items()
+            key: (each.shows, " ".join([*each.words, *each.groups]))
+            for key, each in sorted(FIGURES.items())
         }
         listed = pd.DataFrame.from_dict(rows, "index", columns=["shows", "options"])
         print_rich(rich_table(text_table("figures", listed.rename_axis("figure"))))

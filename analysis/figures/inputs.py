@@ -78,15 +78,21 @@ class FigureSpec:
         return make_dataclass("Options", own, bases=(shared,), frozen=True, kw_only=True)
 
     @property
+    def words(self) -> list[str]:
+        """Names of the options; those without a default are followed by "=..."."""
+        every = fields(self.options)
+        return [f"{each.name}{'=...' * (each.default is MISSING)}" for each in every]
+
+    @property
     def _keywords(self) -> list[Parameter]:
         every = signature(self.make).parameters.values()
         return [each for each in every if each.kind is Parameter.KEYWORD_ONLY]
 
     def __call__(self, config: Config, values: Mapping[str, Any]) -> Drawn:
         """Draw with the values of options that were given; InputError where one is missing."""
-        for each in fields(self.options):
-            if each.default is MISSING and each.name not in values:
-                raise InputError(f"the figure needs {each.name}=...")
+        for word in self.words:
+            if word.endswith("=...") and word[:-4] not in values:
+                raise InputError(f"the figure needs {word}")
         given = self.options(**values)
         known = signature(self.make).parameters
         shared = {"config": config, "given": given}

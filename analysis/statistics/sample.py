@@ -63,7 +63,8 @@ class Sample:
         night = np.zeros(len(stats.names), bool) if stats.night is None else stats.night
         # What tells how far neighbours are alike: objects, sharpness and brightness of an image.
         measured = np.concatenate([stats.laplacian.mean(2), stats.mean.mean(2)], axis=1).T
-        share = stats.labels[..., list(stats.objects)].sum((1, 2)) / stats.labels.sum((1, 2))
+        objects = stats.labels[..., ~stats.is_background].sum((1, 2))
+        share = _ratio(objects, stats.labels.sum((1, 2)))
         series = np.nan_to_num(np.vstack([measured, share]))
         choice = settings.blocks if settings else "none"
         self.blocks = make_blocks(stats.names, choice, series, night)
