@@ -1,8 +1,7 @@
 """The record in which a component declares what it provides and what it requires of others.
 
 The attribute `record` of a network, loss, scheme, ...; `check_requirements` compares them before
-anything is trained. A class that takes long to build has a static method `record_from`, which makes
-the record of an object from its settings.
+anything is trained.
 """
 
 from __future__ import annotations

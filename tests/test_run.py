@@ -17,7 +17,7 @@ import pytest
 import torch
 
 from rgbt import evaluate, predict
-from rgbt.checkpoints.torch_files import save
+from rgbt.checkpoints.files import save
 from rgbt.config.component import build
 from rgbt.config.compose import compose
 from rgbt.engine.checkpoint import load_checkpoint

@@ -10,7 +10,6 @@ from annotated_types import Len
 from torch import Tensor
 from torch.nn import functional as F
 
-from rgbt.checks import InputError, check_shape
 from rgbt.processes import mean_count
 from rgbt.ranges import NonNegative
 from rgbt.requirements import Record, Requirement, record_of
@@ -18,23 +17,25 @@ from rgbt.types import IGNORE, Batch, Loss, Output
 
 ClassWeights = Annotated[tuple[NonNegative, ...], Len(1, 255)]
 
+TINY = torch.finfo(torch.float32).tiny  # divisor where nothing counts, of a sum that is 0
+
 
 class CrossEntropy:
     """Mean over labelled pixels of ``-q c_y log softmax(s)_y``, divided by the mean of ``c_y``.
 
     q is the confidence of the label, 1 where labels carry none; it does not enter the mean that is
     divided by, so that labels of which the teacher is not sure cost little (HeatNet's release,
-    weight_ir_sup). Pixels labelled 255 are left out; a batch without a labelled pixel
-    costs 0.
-
-    Args:
-        class_weights: c, one value >= 0 per class; null weighs all classes alike.
+    weight_ir_sup). Pixels labelled 255 are left out; a batch without a labelled pixel costs 0.
+    `class_weights` are c, one value per class; None weighs all classes alike.
     """
-
-    record = Record(requires=(Requirement("model", "outputs", "scores"),), weighs_confidence=True)
 
     def __init__(self, *, class_weights: ClassWeights | None) -> None:
         self.class_weights = class_weights
+        required = [Requirement("model", "outputs", "scores")]
+        if class_weights is not None:
+            setting = f"loss.class_weights={list(class_weights)}"
+            required.append(Requirement("dataset", "num_classes", len(class_weights), setting))
+        self.record = Record(requires=tuple(required), weighs_confidence=True)
 
     def __call__(
         self,
@@ -44,50 +45,23 @@ class CrossEntropy:
     ) -> dict[str, Tensor]:
         """The part "cross_entropy": one value, shape (1,), float32.
 
-        Of `logits` (B, K, H, W), `label` (B, H, W) and `confidence` (B, H, W) or None; nothing is
-        drawn.
-
-        Raises:
-            InputError: class weights of another number.
-            ValueError: label or confidence, and scores, of different size.
+        Of `logits` (B, K, H, W), `label` (B, H, W) and `confidence` (B, H, W) or None.
         """
         assert output.logits is not None, "the record requires scores"
-        sizes = check_shape("logits", output.logits, "B K H W")
-        check_shape("label", batch.label, "B H W", **{k: sizes[k] for k in "BHW"})
-        weights = self._weights(sizes["K"], output.logits.device)
-        logits = output.logits.float()
-        if batch.confidence is None:
-            total = F.cross_entropy(
-                logits, batch.label, weights, ignore_index=IGNORE, reduction="sum"
-            )
-        else:
-            check_shape("confidence", batch.confidence, "B H W", **{k: sizes[k] for k in "BHW"})
-            costs = F.cross_entropy(
-                logits, batch.label, weights, ignore_index=IGNORE, reduction="none"
-            )
-            total = (batch.confidence * costs).sum()
-        # The smallest float only matters where nothing is labelled and the sum is 0.
-        normaliser = mean_count(_sum_of_weights(batch.label, weights))
-        normaliser = normaliser.clamp(min=torch.finfo(torch.float32).tiny)
-        return {"cross_entropy": (total / normaliser).reshape(1)}
-
-    def _weights(self, num_classes: int, device: torch.device) -> Tensor | None:
-        if self.class_weights is None:
-            return None
-        if len(self.class_weights) != num_classes:
-            raise InputError(
-                f"loss.class_weights has {len(self.class_weights)} numbers, but the network has "
-                f"{num_classes} classes; give one number per class."
-            )
-        return torch.tensor(self.class_weights, device=device)
-
-
-def _sum_of_weights(label: Tensor, weights: Tensor | None) -> Tensor:
-    """() float32: the sum of the class weights of the labelled pixels, or their number."""
-    labelled = label != IGNORE
-    if weights is None:  # without a wait for the number of pixels, as a selection has
-        return labelled.sum().float()
-    return weights[label[labelled]].sum()
+        weights, label = None, batch.label
+        labelled = label != IGNORE
+        count = labelled.sum().float()
+        if self.class_weights is not None:
+            weights = torch.tensor(self.class_weights, device=label.device)
+            count = weights[label[labelled]].sum()
+        # Reduced by torch where it can, because a map of costs takes memory and time.
+        reduction = "sum" if batch.confidence is None else "none"
+        total = F.cross_entropy(
+            output.logits.float(), label, weights, ignore_index=IGNORE, reduction=reduction
+        )
+        if batch.confidence is not None:
+            total = (batch.confidence * total).sum()
+        return {"cross_entropy": (total / mean_count(count).clamp(min=TINY)).reshape(1)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,10 +70,6 @@ class WithAuxiliary:
 
     Source: PSPNet (0.4); AdaptSegNet, Eq. 5, and MaxSquareLoss (0.1); thesis (J. Sun), code (0.1
     with maximum squares).
-
-    Attributes:
-        loss: of class scores.
-        weight: finite, >= 0.
     """
 
     loss: Loss
@@ -115,10 +85,7 @@ class WithAuxiliary:
     def __call__(
         self, output: Output, batch: Batch, generator: torch.Generator
     ) -> dict[str, Tensor]:
-        """The weighted parts of `loss`, and those of `aux["aux_logits"]` as <part>_aux.
-
-        `generator` is drawn from for the scores first; shapes as those of `loss`.
-        """
+        """The weighted parts of `loss`, and those of `aux["aux_logits"]` as <part>_aux."""
         parts = self.loss(output, batch, generator)
         auxiliary = self.loss(Output(output.aux["aux_logits"], {}), batch, generator)
         return {**parts, **{f"{name}_aux": self.weight * part for name, part in auxiliary.items()}}

@@ -14,7 +14,8 @@ from annotated_types import Interval, Len
 from torch import Tensor
 from torch.nn import functional as F
 
-from rgbt.checks import InputError, check_shape, nearest
+from rgbt.checks import InputError, nearest
+from rgbt.losses.cross_entropy import TINY
 from rgbt.processes import mean_count
 from rgbt.ranges import Names, Positive
 from rgbt.requirements import Requirement
@@ -28,20 +29,12 @@ def sdc(teacher: Tensor, student: Tensor) -> Tensor:
     the no-object column, teacher without gradient.
 
     (B, Q, K+1) class logits of the clean and of the masked RGB-T pass -> () float32.
-
-    Raises:
-        ValueError: the shapes differ.
     """
-    sizes = check_shape("teacher", teacher, "B Q C")
-    check_shape("student", student, "B Q C", **sizes)
     return (teacher.detach().float() - student.float()).abs().mean()
 
 
 def sdn(teacher: Tensor, rgb: Tensor, thermal: Tensor) -> Tensor:
-    """Self-distillation of non-local representations: `sdc` of `rgb` plus `sdc` of `thermal`.
-
-    Source: CRM, Eq. (3). `rgb` and `thermal`: the masked pass predicted from one image alone.
-    """
+    """Self-distillation of non-local representations (CRM, Eq. 3), of R' and T' to F."""
     return sdc(teacher, rgb) + sdc(teacher, thermal)
 
 
@@ -50,16 +43,11 @@ def thing_cells(
 ) -> Tensor:
     """(B, h, w) bool: cells of which one thing class has at least `min_share` of the pixels.
 
-    A cell has ceil(H / h) x ceil(W / w) pixels; what lies outside the label is of no class.
+    A cell of a label (B, H, W) has ceil(H / h) x ceil(W / w) pixels; what lies outside the label is
+    of no class. With a share above 0.5, no second class has as many pixels.
 
     Released: lhoyer/DAFormer (e6f6e04), mmseg/utils/utils.py, downscale_label_ratio, whose cells
     divide the label.
-
-    Args:
-        label: (B, H, W) int64, 255 = ignore.
-        feature_hw: (h, w).
-        things: indices of the thing classes.
-        min_share: above 0.5 to 1, so that no second class has as many pixels.
     """
     kernel = [-(-side // cells) for side, cells in zip(label.shape[1:], feature_hw, strict=True)]
     rows, columns = (
@@ -72,28 +60,16 @@ def thing_cells(
 
 
 def feature_distance(features: Tensor, initial: Tensor, cells: Tensor) -> Tensor:
-    """Mean Euclidean distance between two feature maps over the `cells`; 0 without a cell.
-
-        sum_n cells_n ||F_n - F'_n||_2 / sum_n cells_n
+    """Mean of ``||F_n - F'_n||_2`` over the `cells` n of two feature maps; 0 without a cell.
 
     Source: DAFormer (Hoyer et al., CVPR 2022), Sec. 3.3.   Released: lhoyer/DAFormer (e6f6e04),
     mmseg/models/uda/dacs.py, masked_feat_dist.
 
-    Args:
-        features: (B, C, h, w) F.
-        initial: (B, C, h, w) F', without gradient.
-        cells: (B, h, w) bool.
-
-    Returns:
-        (), float32.
+    F and F' (B, C, h, w), the latter without gradient, and (B, h, w) bool -> () float32.
     """
-    sizes = check_shape("features", features, "B C H W")
-    check_shape("initial features", initial, "B C H W", **sizes)
     distance = torch.linalg.vector_norm(features.float() - initial.float(), dim=1)
-    # The smallest float only matters where there is no cell and the sum is 0.
-    number = mean_count(cells.sum().float()).clamp(min=torch.finfo(torch.float32).tiny)
-    found: Tensor = distance.masked_fill(~cells, 0.0).sum() / number
-    return found
+    number = mean_count(cells.sum().float()).clamp(min=TINY)
+    return torch.sum(distance.masked_fill(~cells, 0.0)) / number
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,54 +78,35 @@ class FeatureDistance:
 
     Released: configs/_base_/uda/dacs_a999_fdthings.py of lhoyer/DAFormer, with the ten classes of
     Cityscapes from traffic light, traffic sign and person to bicycle.
-
-    Attributes:
-        weight: of the distance in the loss; released: 0.005.
-        things: names of the thing classes in the data set.
-        min_share: see `thing_cells`; released: 0.75.
     """
 
-    weight: Positive
-    things: Annotated[Names, Len(1, 255)]
-    min_share: Annotated[float, Interval(gt=0.5, le=1)]
+    weight: Positive  # of the distance in the loss; released: 0.005
+    things: Annotated[Names, Len(1, 255)]  # names of the thing classes in the data set
+    min_share: Annotated[float, Interval(gt=0.5, le=1)]  # see `thing_cells`; released: 0.75
 
     @property
     def requires(self) -> tuple[Requirement, ...]:
         """Features of the network, and weights that it starts from."""
         setting = "scheme.feature_distance"
+        advice = "name a file of weights with pretrained=FILE or model.weights=FILE"
         return (
             Requirement("model", "features", True, setting),
-            Requirement(
-                *("model.weights", "pretrained", True, setting),
-                advice="name a file of weights with pretrained=FILE or model.weights=FILE",
-            ),
+            Requirement("model.weights", "pretrained", True, setting, advice),
         )
 
     def __call__(
         self, features: Tensor, initial: Tensor, label: Tensor, classes: tuple[str, ...]
     ) -> Tensor:
-        """The weighted distance, (): of `features` and `initial` (B, C, h, w) for a label.
-
-        Args:
-            features: of the network.
-            initial: of the initial network.
-            label: (B, H, W) int64, 255 = ignore.
-            classes: of the data set, in the order of their indices.
-        """
+        """The weighted distance, () float32, of two maps (B, C, h, w) for a label (B, H, W)."""
         hw = (features.shape[2], features.shape[3])
         cells = thing_cells(label, hw, self.indices(classes), self.min_share)
         return self.weight * feature_distance(features, initial, cells)
 
     def indices(self, classes: tuple[str, ...]) -> tuple[int, ...]:
-        """The indices of `things`.
-
-        Raises:
-            InputError: one is no class of the data set.
-        """
-        for name in self.things:
-            if name not in classes:
-                raise InputError(
-                    f"scheme.feature_distance.things: the data set has no class '{name}'; "
-                    f"{nearest(name, classes)}."
-                )
+        """The indices of `things`; InputError where one is no class of the data set."""
+        if unknown := [name for name in self.things if name not in classes]:
+            raise InputError(
+                f"scheme.feature_distance.things: the data set has no class '{unknown[0]}'; "
+                f"{nearest(unknown[0], classes)}."
+            )
         return tuple(classes.index(name) for name in self.things)

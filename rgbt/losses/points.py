@@ -19,7 +19,6 @@ from rgbt.processes import num_processes, rank
 from rgbt.types import IGNORE
 
 EVERY = slice(None)
-"""All of them."""
 
 
 class Points:
@@ -30,14 +29,13 @@ class Points:
     requests the matcher's points of all (layer, pass) pairs, then for the loss points of all pairs;
     within a loss set, the points of one mask are its candidates followed by its random remainder.
 
-    A coordinate takes the 2^15 centres of a regular grid (a step is 0.02 pixels of a 640-pixel
-    image): four coordinates come from one random integer, in half the time of four floats.
+    A coordinate is one of 2^15 centres of a regular grid: four come from one random integer, in
+    half the time of four floats.
     """
 
     def __init__(self, generator: torch.Generator, *, device: torch.device) -> None:
         self.generator = generator
         self.device = device
-        self._num_processes, self._rank = num_processes(), rank()
 
     def loss(
         self, num_sets: int, num_masks: int, num_points: int, kept: Tensor | slice = EVERY
@@ -57,17 +55,14 @@ class Points:
 
     def matcher(self, num_sets: int, num_images: int, num_points: int) -> Tensor:
         """(num_sets, num_images, num_points, 2): the next sets for the matching costs."""
-        own_images = slice(self._rank, None, self._num_processes)
-        return self.loss(num_sets, num_images * self._num_processes, num_points, own_images)
+        of_all = num_processes()
+        return self.loss(num_sets, num_images * of_all, num_points, slice(rank(), None, of_all))
 
 
 def sample(maps: Tensor, points: Tensor, outside: Literal["zeros", "border"] = "zeros") -> Tensor:
-    """Bilinear values of maps at points.
+    """Bilinear values (R, C, S, N) of maps (R, C, h, w) at points (R, S, N, 2).
 
-    Source: Mask2Former, point_features.py (PointRend), align_corners False.
-
-    Every channel of the maps (R, C, h, w) is read at points (R, S, N, 2), (x, y) in [-1, 1];
-    `outside` lies beyond the outermost pixel centres. -> (R, C, S, N), dtype of `maps`.
+    `outside` lies beyond the outermost pixel centres (Mask2Former, point_features.py).
     """
     return F.grid_sample(maps, points, mode="bilinear", padding_mode=outside, align_corners=False)
 
@@ -76,9 +71,7 @@ def class_shares(label: Tensor, points: Tensor, num_classes: int) -> Tensor:
     """Bilinear values of the binary masks of all classes at points, without making the masks.
 
     The same as `sample` of the one-hot label, in a fraction of the time: the four labels around a
-    point are read once, not once per class. (B, H, W) int64, of which 255 is no class, at points
-    (S, B, N, 2) -> (S, B, K, N) float32; what is missing to a sum of 1 over K is ignored or
-    outside.
+    point are read once. (B, H, W) int64, of which 255 is no class, at (S, B, N, 2) -> (S, B, K, N).
     """
     height, width = label.shape[1:]
     sets, images, count = points.shape[:3]
@@ -103,9 +96,8 @@ def class_shares(label: Tensor, points: Tensor, num_classes: int) -> Tensor:
 def most_uncertain(logits: Tensor, points: Tensor, keep: int) -> Tensor:
     """The `keep` points of each mask whose logits are nearest to 0, in no particular order.
 
-    Source: Mask2Former, point_features.py, with uncertainty ``-|logit|``.
-
     (R, N) float32 logits, finite and overwritten, and (R, N, 2) -> (R, keep, 2).
+    Source: Mask2Former, point_features.py, with uncertainty ``-|logit|``.
     """
     # Non-negative floats are ordered like their bits, and integers are selected much faster.
     magnitude = logits.abs_().view(torch.int32)

@@ -1,45 +1,36 @@
 """The set criterion of Mask2Former with SpatialSeg's weights, for all layers and passes at once.
 
-Not here: how passes are weighted against each other (`rgbt.schemes`).
+All (layer, pass, image) problems of a step are matched together: their costs are computed where the
+predictions are and reach the CPU in one transfer. Not here: how passes are weighted against each
+other (`rgbt.schemes`).
 Letters beyond `rgbt.types`: ``S`` sets, one per (layer, pass), layer-major; ``N`` points; ``G``
-targets of the batch: one per class present in an image, by image, then by class; ``R`` = S x G.
+targets of the batch: one per class present in an image, by image, then by class.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from itertools import product
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import torch
 from annotated_types import Interval
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
 
-from rgbt.checks import check_shape
-from rgbt.losses import matcher
-from rgbt.losses.matcher import Matcher, Matches, Targets, targets_of
-from rgbt.losses.points import Points, most_uncertain, sample
+from rgbt.checks import RunError
+from rgbt.geometry.padding import pad_to
+from rgbt.losses.points import EVERY, Points, class_shares, most_uncertain, sample
 from rgbt.losses.spatial import PLAIN, PointWeights, SpatialMap, SpatialWeight
-from rgbt.processes import mean_count, num_processes
+from rgbt.processes import mean_count, num_processes, rank, whole
 from rgbt.ranges import NonNegative, NumClasses, NumPoints, Share
 from rgbt.requirements import Record, Requirement
-from rgbt.types import Batch, Output
+from rgbt.types import IGNORE, Batch, Output
 
-
-@dataclass(frozen=True, kw_only=True)
-class Sampling:
-    """How the points of a mask are drawn (PointRend, Sec. 3.2; Mask2Former, Sec. 3.3).
-
-    Attributes:
-        candidates: uniform points drawn.
-        kept: of them, how many are kept: those where the prediction is least certain.
-        fresh: uniform points added.
-    """
-
-    candidates: int
-    kept: int
-    fresh: int
+CHUNK_BYTES = 16 * 2**20
+"""About what the largest temporary of a step may take. Larger ones leave the processor's cache."""
 
 
 @dataclass(kw_only=True, eq=False)
@@ -56,39 +47,28 @@ class SetCriterion:
     Source: Mask2Former, Sec. 3.3 and 4.1; CRM, Eq. (4); `spatial`: SpatialSeg, Eqs. (14) to (17).
     Paper: CRM gives 2.0 and 0.1 as two class coefficients.   Released: 0.1 is a class weight inside
     the term that 2.0 multiplies, as here.
-
-    Attributes:
-        num_classes: K.
-        num_points: N, for matching and for the losses.
-        oversample_ratio: >= 1.
-        importance_ratio: in [0, 1].
-        class_weight: a.
-        mask_weight: b.
-        dice_weight: d.
-        no_object_weight: >= 0.
-        deep_supervision: whether the auxiliary layers count, or the last one alone.
-        spatial: weights of the pixels in BCE and dice.
     """
 
     num_classes: NumClasses
-    num_points: NumPoints
+    num_points: NumPoints  # N, for matching and for the losses
     oversample_ratio: Annotated[float, Interval(ge=1, le=100)]
     importance_ratio: Share
-    class_weight: NonNegative
-    mask_weight: NonNegative
-    dice_weight: NonNegative
+    class_weight: NonNegative  # a
+    mask_weight: NonNegative  # b
+    dice_weight: NonNegative  # d
     no_object_weight: NonNegative
-    deep_supervision: bool
-    spatial: SpatialWeight = PLAIN
+    deep_supervision: bool  # whether the auxiliary layers count, or the last one alone
+    spatial: SpatialWeight = PLAIN  # weights of the pixels in BCE and dice
 
     def __post_init__(self) -> None:
-        kept = int(self.num_points * self.importance_ratio)
-        candidates = int(self.num_points * self.oversample_ratio)
-        self.sampling = Sampling(candidates=candidates, kept=kept, fresh=self.num_points - kept)
-        costs = {"class": self.class_weight, "mask": self.mask_weight, "dice": self.dice_weight}
-        self.part_weights = costs
-        named = {f"{name}_weight": weight for name, weight in costs.items()}
-        self.matcher = Matcher(num_points=self.num_points, **named)
+        self.num_candidates = int(self.num_points * self.oversample_ratio)
+        self.num_kept = int(self.num_points * self.importance_ratio)
+        self.num_drawn = self.num_candidates + self.num_points - self.num_kept
+        self.part_weights = {
+            "class": self.class_weight,
+            "mask": self.mask_weight,
+            "dice": self.dice_weight,
+        }
 
     @property
     def record(self) -> Record:
@@ -104,17 +84,11 @@ class SetCriterion:
     def __call__(
         self, output: Output, batch: Batch, generator: torch.Generator
     ) -> dict[str, Tensor]:
-        """The parts "class", "mask" and "dice", weighted and summed over the layers.
+        """The parts "class", "mask" and "dice", (P,) float32, weighted and summed over the layers.
 
-        Args:
-            output: `aux` holds "class_logits" (L, P, B, Q, K+1) and "mask_logits"
-                (L, P, B, Q, h, w) of P passes over the same B images; the last of the L layers is
-                the prediction.
-            batch: with `label` (B, H, W), H <= 4h and W <= 4w; some weights read `position`.
-            generator: draws the points (order: `rgbt.losses.points.Points`).
-
-        Returns:
-            name -> (P,) float32.
+        `output.aux` holds "class_logits" (L, P, B, Q, K+1) and "mask_logits" (L, P, B, Q, h, w) of
+        P passes over the same B images; the last of the L layers is the prediction. The label is
+        (B, H, W), H <= 4h and W <= 4w. The generator draws the points.
 
         Raises:
             InputError: positions missing for the weighted loss.
@@ -129,40 +103,66 @@ class SetCriterion:
         return {name: weight * layers[name].sum(0) for name, weight in self.part_weights.items()}
 
     def layers(self, output: Output, batch: Batch, points: Points) -> dict[str, Tensor]:
-        """The parts of every layer, not weighted.
-
-        Returns:
-            name -> (L, P) float32; L = 1 without deep supervision.
-        """
-        class_logits, mask_logits = self._predictions(output, batch)
-        passes = class_logits.shape[1]
-        padded_hw = (4 * mask_logits.shape[-2], 4 * mask_logits.shape[-1])
+        """The parts of every layer, not weighted, (L, P); L = 1 without deep supervision."""
+        class_logits, mask_logits = output.aux["class_logits"], output.aux["mask_logits"]
+        (_, passes, images, _, channels), (*of_masks, h, w) = class_logits.shape, mask_logits.shape
+        num_labels, height, width = batch.label.shape
+        # Larger labels would be cut without an error.
+        fits = channels == self.num_classes + 1 and of_masks == [*class_logits.shape[:4]]
+        if not fits or num_labels != images or height > 4 * h or width > 4 * w:
+            shapes = [tuple(each.shape) for each in (class_logits, mask_logits, batch.label)]
+            raise ValueError(f"class_logits, mask_logits and label do not fit: {shapes}.")
+        padded_hw = (4 * h, 4 * w)
+        if not self.deep_supervision:  # not `[0:]`: its backward would copy all gradients
+            class_logits, mask_logits = class_logits[-1:], mask_logits[-1:]
         # Costs and sums over thousands of points are kept in float32 under autocast too.
         with torch.autocast(mask_logits.device.type, enabled=False):
             spatial = None
             if self.spatial.active:
                 spatial = SpatialMap(batch, padded_hw, settings=self.spatial, num_passes=passes)
             targets = targets_of(batch.label, padded_hw, self.num_classes, spatial)
-            matches = self.matcher(class_logits, mask_logits, targets, points)
-            mask, dice = mask_losses(mask_logits, targets, matches, points, self.sampling)
+            matches = self.match(class_logits, mask_logits, targets, points)
+            mask, dice = self._mask_losses(mask_logits, targets, matches, points)
             # At least 1 target, averaged over the processes as the losses are.
             count = max(matches.num_targets, 1) / num_processes()
             parts = {"mask": mask / count, "dice": dice / count}
             parts["class"] = self._class_loss(class_logits, matches)
         return {name: values.reshape(-1, passes) for name, values in parts.items()}
 
-    def _predictions(self, output: Output, batch: Batch) -> tuple[Tensor, Tensor]:
-        class_logits, mask_logits = output.aux["class_logits"], output.aux["mask_logits"]
-        sizes = check_shape("class_logits", class_logits, "L P B Q C", C=self.num_classes + 1)
-        sizes = {letter: sizes[letter] for letter in "LPBQ"}
-        sizes = check_shape("mask_logits", mask_logits, "L P B Q h w", **sizes)
-        label = check_shape("label", batch.label, "B H W", B=sizes["B"])
-        if label["H"] > 4 * sizes["h"] or label["W"] > 4 * sizes["w"]:
-            raise ValueError(f"label: {label} does not fit into four times the masks, {sizes}.")
-        # Not `[0:]`: its backward would copy the gradient of all masks.
-        if self.deep_supervision:
-            return class_logits, mask_logits
-        return class_logits[-1:], mask_logits[-1:]
+    @torch.no_grad()
+    def match(
+        self, class_logits: Tensor, mask_logits: Tensor, targets: Targets, points: Points
+    ) -> Matches:
+        """Hungarian matching on class, mask and dice costs at random points.
+
+            cost = -a softmax(class)[c] + b BCE + d (1 - (2 sum(s t) + e) / (sum(s) + sum(t) + e))
+
+        with s the sigmoid of the mask logits and e = 1. BCE is the mean over points of
+        ``softplus(x) - x t``. One set of points per image, shared by its queries and targets, is
+        drawn for every layer and pass.   Source: Mask2Former, Sec. 3.3 and matcher.py.
+
+        (L, P, B, Q, K+1) class and (L, P, B, Q, h, w) mask logits against the targets of the B
+        images. Errors as of `assign`.
+        """
+        layers, passes, images, queries = class_logits.shape[:4]
+        step = max(1, CHUNK_BYTES // (4 * images * queries * self.num_points))
+        costs = []
+        for layer, start in product(range(layers), range(0, passes, step)):
+            block = slice(start, start + step)
+            probability = class_logits[layer, block].float().softmax(-1)[..., :-1]
+            masks = mask_logits[layer, block]
+            drawn = points.matcher(len(masks), images, self.num_points)
+            x = sample(masks.flatten(0, 1).float(), drawn.flatten(0, 1)[:, None])[:, :, 0]
+            t = class_shares(targets.label, drawn, targets.present.shape[1]).flatten(0, 1)
+            weights = None
+            if targets.spatial is not None and self.spatial.match == "weighted":
+                every = torch.arange(images, device=drawn.device)
+                weights = targets.spatial.at(drawn, every, layer * passes + start)
+                weights = PointWeights(*(part.flatten(0, 1) for part in weights))
+                t = t * weights.values[:, None]
+            cost = pairwise_costs(x, t, weights, self.mask_weight, self.dice_weight)
+            costs.append(cost.reshape(probability.shape) - self.class_weight * probability)
+        return assign(torch.cat(costs), targets)
 
     def _class_loss(self, logits_LPBQC: Tensor, matches: Matches) -> Tensor:
         """(S,): cross-entropy of all queries, divided by the sum of their weights."""
@@ -177,42 +177,127 @@ class SetCriterion:
         each = F.cross_entropy(logits.transpose(1, 2), label_SQ, weights, reduction="none")
         return each.sum(1) / mean_count(weights[label_SQ].sum(1))
 
+    def _mask_losses(
+        self, logits_LPBQhw: Tensor, targets: Targets, matches: Matches, points: Points
+    ) -> tuple[Tensor, Tensor]:
+        """Cross-entropy and dice, each a sum over the matched masks of a set: two of (S,)."""
+        device = logits_LPBQhw.device
+        image, label, query = (torch.from_numpy(each).to(device) for each in matches[:3])
+        masks = (targets.label[image] == label[:, None, None])[:, None].float()
+        step = max(1, CHUNK_BYTES // max(1, 8 * len(image) * self.num_drawn))
 
-def mask_losses(
-    logits_LPBQhw: Tensor, targets: Targets, matches: Matches, points: Points, sampling: Sampling
-) -> tuple[Tensor, Tensor]:
-    """Cross-entropy and dice, each a sum over the matched masks of a set: two of (S,) float32."""
-    device = logits_LPBQhw.device
-    image, label, query = (torch.from_numpy(each).to(device) for each in matches[:3])
-    masks = (targets.label[image] == label[:, None, None])[:, None].float()
-    num_drawn = sampling.candidates + sampling.fresh
-    bytes_per_set = 8 * len(image) * num_drawn
-    step = max(1, matcher.CHUNK_BYTES // max(1, bytes_per_set))
+        # (S, G, h, w) float32 mask logits of the matched queries.
+        layers, passes = logits_LPBQhw.shape[:2]
+        layer = torch.arange(layers, device=device)[:, None, None]
+        stacked = torch.arange(passes, device=device)[:, None]
+        index = query.clamp(min=0).reshape(layers, passes, -1)
+        matched_SGhw = logits_LPBQhw[layer, stacked, image, index].flatten(0, 1).float()
+        parts, first = [], 0
+        for logits in torch.split(matched_SGhw, step):
+            # (S, G, kept + fresh, 2) points: the least certain candidates, then fresh ones.
+            drawn = points.loss(len(logits), matches.num_targets, self.num_drawn, matches.place)
+            candidates, fresh = drawn.tensor_split([self.num_candidates], dim=2)
+            with torch.no_grad():
+                values = _read(logits, candidates).flatten(0, 1)
+                kept = most_uncertain(values, candidates.flatten(0, 1), self.num_kept)
+            drawn = torch.cat([kept.reshape(*fresh.shape[:2], self.num_kept, 2), fresh], dim=2)
+            t = sample(masks, drawn.transpose(0, 1))[:, 0].transpose(0, 1)
+            x = _read(logits, drawn)
+            weights = None if targets.spatial is None else targets.spatial.at(drawn, image, first)
+            parts.append(torch.stack(mask_and_dice(x, t, weights)))
+            first += len(logits)
+        matched = query >= 0  # where targets outnumber queries, some are matched to none
+        mask, dice = torch.cat(parts, 1).where(matched, 0.0).sum(-1)
+        return mask, dice
 
-    parts = []
-    first = 0
-    # (S, G, h, w) float32 mask logits of the matched queries.
-    layers, passes = logits_LPBQhw.shape[:2]
-    layer = torch.arange(layers, device=device)[:, None, None]
-    stacked = torch.arange(passes, device=device)[:, None]
-    index = query.clamp(min=0).reshape(layers, passes, -1)
-    matched_SGhw = logits_LPBQhw[layer, stacked, image, index].flatten(0, 1).float()
-    for logits in torch.split(matched_SGhw, step):
-        # (S, G, kept + fresh, 2) points: the least certain candidates, then fresh ones.
-        drawn = points.loss(len(logits), matches.num_targets, num_drawn, matches.place)
-        candidates, fresh = torch.split(drawn, [sampling.candidates, sampling.fresh], dim=2)
-        with torch.no_grad():
-            values = _read(logits, candidates).flatten(0, 1)
-            kept = most_uncertain(values, candidates.flatten(0, 1), sampling.kept)
-        drawn = torch.cat([kept.reshape(*fresh.shape[:2], sampling.kept, 2), fresh], dim=2)
-        t = sample(masks, drawn.transpose(0, 1))[:, 0].transpose(0, 1)
-        x = _read(logits, drawn)
-        weights = None if targets.spatial is None else targets.spatial.at(drawn, image, first)
-        parts.append(torch.stack(mask_and_dice(x, t, weights)))
-        first += len(logits)
-    matched = query >= 0  # where targets outnumber queries, some are matched to none
-    mask, dice = torch.cat(parts, 1).where(matched, 0.0).sum(-1)
-    return mask, dice
+
+class Targets(NamedTuple):
+    """The targets of one batch. Padded and ignored pixels are negatives of every mask."""
+
+    label: Tensor  # (B, H, W) int64, padded with 255
+    present: Tensor  # (B, K) bool, classes that occur
+    unknown: Tensor  # () bool, whether a label is neither a class nor 255
+    spatial: SpatialMap | None  # weights of the pixels; None for the plain loss
+
+
+class Matches(NamedTuple):
+    """The assignment, on the CPU."""
+
+    image: NDArray[np.int64]  # (G,), image of each target
+    label: NDArray[np.int64]  # (G,), class of each target
+    query: NDArray[np.int64]  # (S, G), matched to each target; -1: targets outnumber queries
+    place: Tensor | slice  # which of the targets of all processes these are
+    num_targets: int  # of all processes
+
+
+def targets_of(
+    label: Tensor, padded_hw: tuple[int, int], num_classes: int, spatial: SpatialMap | None
+) -> Targets:
+    """Targets of labels (B, H, W) int64, padded at the bottom and right to `padded_hw`."""
+    # One column per label value -1 (anything below 0) to 256 (anything above 255).
+    seen = torch.zeros(len(label), IGNORE + 3, dtype=torch.bool, device=label.device)
+    seen.scatter_(1, label.flatten(1).clamp(-1, IGNORE + 1) + 1, True)
+    present = seen[:, 1 : num_classes + 1].clone()
+    seen[:, 1 : num_classes + 1] = False
+    seen[:, IGNORE + 1] = False
+    return Targets(pad_to(label, padded_hw, IGNORE), present, seen.any(), spatial)
+
+
+def pairwise_costs(
+    x: Tensor, t: Tensor, weights: PointWeights | None, mask_weight: float, dice_weight: float
+) -> Tensor:
+    """(R, Q, K): mask and dice cost of every query against every target, see `SetCriterion.match`.
+
+    x (R, Q, N) are mask logits, overwritten, and t (R, K, N) targets, already weighted.
+    """
+    total: Tensor | float = x.shape[-1]
+    smoothing: Tensor | float = 1.0
+    if weights is not None:
+        total, smoothing = weights.total[:, None, None], weights.smoothing[:, None, None]
+
+    def over_points(values: Tensor) -> Tensor:
+        if weights is None:
+            return values.sum(-1, keepdim=True)
+        return values @ weights.values[..., None]
+
+    bce = (over_points(F.softplus(x)) - x @ t.mT) / total
+    s = x.sigmoid_()
+    dice = (2 * (s @ t.mT) + smoothing) / (over_points(s) + t.sum(-1)[:, None] + smoothing)
+    return mask_weight * bce + dice_weight * (1 - dice)
+
+
+def assign(cost: Tensor, targets: Targets) -> Matches:
+    """Cheapest assignment of queries to the classes present, for (S, B, Q, K) float32 costs."""
+    parts = [cost.flatten(), whole(targets.present).flatten(), targets.unknown.reshape(1)]
+    numbers = torch.cat([part.float() for part in parts]).cpu().numpy()
+    cost_SBQK = numbers[: cost.numel()].reshape(cost.shape)
+    # Of the images of all processes.
+    present_BK = numbers[cost.numel() : -1].reshape(-1, targets.present.shape[1]) > 0
+    if numbers[-1]:
+        raise ValueError(
+            f"label: expected 0 to {present_BK.shape[1] - 1} or {IGNORE}, got another value."
+        )
+    if not np.isfinite(cost_SBQK).all():
+        raise RunError(
+            "the matching cost is not finite, because the predictions hold NaN or infinity."
+        )
+
+    image, label = np.nonzero(present_BK)
+    num_targets = len(image)
+    place: Tensor | slice = EVERY
+    if num_processes() > 1:
+        own_targets = np.flatnonzero(image % num_processes() == rank())
+        image, label = image[own_targets] // num_processes(), label[own_targets]
+        place = torch.from_numpy(own_targets).to(cost.device)
+    from scipy.optimize import linear_sum_assignment  # half a second, and only training matches
+
+    query = np.full((len(cost_SBQK), len(image)), -1)
+    for one_image in np.unique(image):
+        columns = np.flatnonzero(image == one_image)
+        for one_set, cost_QK in enumerate(cost_SBQK[:, one_image]):
+            rows, chosen = linear_sum_assignment(cost_QK[:, label[columns]])
+            query[one_set, columns[chosen]] = rows
+    return Matches(image, label, query, place, num_targets)
 
 
 def mask_and_dice(x: Tensor, t: Tensor, weights: PointWeights | None) -> tuple[Tensor, Tensor]:

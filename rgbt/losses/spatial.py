@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from rgbt.checks import InputError, check_shape
+from rgbt.checks import InputError
 from rgbt.geometry.padding import pad_to
 from rgbt.losses.points import sample
 from rgbt.ranges import NonNegative
@@ -24,7 +24,7 @@ from rgbt.types import IGNORE, Batch
 
 @dataclass(frozen=True, kw_only=True)
 class SpatialWeight:
-    """Settings of the spatial-weighted mask losses.
+    """Settings of the spatial-weighted mask losses; by default it is the plain loss.
 
         w = 1 + alpha d / d_max            focus "edge"    (Eqs. 14, 15)
         w = 1 + alpha (1 - d / d_max)      focus "center"  (Table VI, reversed)
@@ -34,35 +34,21 @@ class SpatialWeight:
     ("conventional"), and prints neither formula nor numbers. It reads no position: `centre` and
     `d_max` have no effect.
 
-    d is the distance in pixels of the original image. Paper: everything below `focus` is open; the
-    first choice of each is the one nearest to the text or to Mask2Former.
-    With ``alpha: 0`` or ``focus: none`` the loss is the plain one whatever the other settings.
-
-    Attributes:
-        alpha: >= 0. Paper: 2.
-        focus: where the weight is largest: at the edge of the image, in its centre, or on the
-            boundaries of objects.
-        centre: distance from pixel (rows // 2, columns // 2) of the original image, followed
-            through resizing, cropping and flipping ("tracked"), or of the crop ("crop").
-        d_max: largest distance within the original image or within the crop.
-        padding: weight of the padded rows and columns: as the farthest pixel ("map"; without a
-            boundary), 1, or 0.
-        normaliser: the weighted cross-entropy is divided by the number of points (Eq. 16: W x H) or
-            by the sum of their weights.
-        dice_smoothing: 1 in numerator and denominator, as in the unweighted loss, or none (Eq. 17).
-        match: whether the matching costs are weighted too.
-        passes: which predictions are weighted: all, or those from RGB-T (clean and masked) alone.
+    d is the distance in pixels of the original image from pixel (rows // 2, columns // 2) of it,
+    followed through resizing, cropping and flipping, or of the crop. Paper: alpha is 2, everything
+    below `focus` is open; the default of each is the choice nearest to the text or to Mask2Former.
+    With ``alpha: 0`` or ``focus: none`` the loss is the plain one whatever the other settings are.
     """
 
-    alpha: NonNegative
-    focus: Literal["none", "edge", "center", "boundary"]
-    centre: Literal["tracked", "crop"]
-    d_max: Literal["original", "crop"]
-    padding: Literal["map", "one", "zero"]
-    normaliser: Literal["points", "weights"]
-    dice_smoothing: Literal["one", "none"]
-    match: Literal["unweighted", "weighted"]
-    passes: Literal["all", "fused"]
+    alpha: NonNegative = 0.0
+    focus: Literal["none", "edge", "center", "boundary"] = "none"
+    centre: Literal["tracked", "crop"] = "tracked"
+    d_max: Literal["original", "crop"] = "original"
+    padding: Literal["map", "one", "zero"] = "map"
+    normaliser: Literal["points", "weights"] = "points"  # Eq. 16 divides by W x H
+    dice_smoothing: Literal["one", "none"] = "one"  # Eq. 17 has none
+    match: Literal["unweighted", "weighted"] = "unweighted"
+    passes: Literal["all", "fused"] = "all"
 
     @property
     def active(self) -> bool:
@@ -70,32 +56,15 @@ class SpatialWeight:
         return self.alpha > 0 and self.focus != "none"
 
 
-PLAIN = SpatialWeight(
-    alpha=0.0,
-    focus="none",
-    centre="tracked",
-    d_max="original",
-    padding="map",
-    normaliser="points",
-    dice_smoothing="one",
-    match="unweighted",
-    passes="all",
-)
-"""No weighting."""
+PLAIN = SpatialWeight()
 
 
 class PointWeights(NamedTuple):
-    """What the weighted mask losses of R masks need.
+    """Weights of the points of some masks, and what the weighted mask losses need beside them."""
 
-    Attributes:
-        values: (..., N) weight of every point.
-        total: (...) what the weighted cross-entropy is divided by.
-        smoothing: (...) what is added to numerator and denominator of the dice term.
-    """
-
-    values: Tensor
-    total: Tensor
-    smoothing: Tensor
+    values: Tensor  # (..., N)
+    total: Tensor  # (...), what the weighted cross-entropy is divided by
+    smoothing: Tensor  # (...), added to numerator and denominator of the dice term
 
 
 def weight_map(batch: Batch, padded_hw: tuple[int, int], settings: SpatialWeight) -> Tensor:
@@ -106,21 +75,36 @@ def weight_map(batch: Batch, padded_hw: tuple[int, int], settings: SpatialWeight
     Raises:
         InputError: the batch does not say where its pixels come from.
     """
-    is_boundary = settings.focus == "boundary"
-    relative = boundaries(batch.label).float() if is_boundary else _distances(batch, settings)
+    if settings.focus == "boundary":
+        relative = boundaries(batch.label).float()
+    elif batch.position is None:
+        raise InputError(
+            "loss.spatial weights pixels by their position in the original image, which this "
+            "transform does not track. Set transform.track_position=true or loss.spatial.alpha=0."
+        )
+    else:
+        original = batch.original_hw.to(batch.position)
+        centre = torch.div(original, 2, rounding_mode="floor")
+        if settings.centre == "crop":
+            height, width = batch.position.shape[2:]
+            centre = batch.position[:, :, height // 2, width // 2]
+        distance = torch.linalg.vector_norm(batch.position - centre[:, :, None, None], dim=1)
+        farthest = torch.maximum(centre, original - 1 - centre).norm(dim=1)
+        if settings.d_max == "crop":
+            farthest = distance.amax((1, 2))
+        relative = distance / farthest[:, None, None]
+        if settings.focus == "center":
+            relative = 1 - relative
     far = 1.0 + settings.alpha if settings.focus == "edge" else 1.0
     padding = {"map": far, "one": 1.0, "zero": 0.0}[settings.padding]
     return pad_to(1 + settings.alpha * relative, padded_hw, padding)[:, None]
 
 
 def boundaries(label: Tensor) -> Tensor:
-    """(B, H, W) bool: labelled pixels with another class among their eight neighbours.
+    """(B, H, W) bool: labelled pixels of (B, H, W) int64 with another class beside them.
 
-    Both sides of a boundary count, so it is two pixels wide. The border of the image and pixels
-    without a label (255) make no boundary.
-
-    Args:
-        label: (B, H, W) int64.
+    Eight neighbours count. Both sides of a boundary do, so it is two pixels wide. The border of the
+    image and pixels without a label (255) make no boundary.
     """
     known = label != IGNORE
     # Where nothing is known, the largest neighbour is below and the smallest above every class.
@@ -130,28 +114,6 @@ def boundaries(label: Tensor) -> Tensor:
     largest = F.max_pool2d(high, 3, stride=1, padding=1)[:, 0]
     smallest = -F.max_pool2d(-low, 3, stride=1, padding=1)[:, 0]
     return known & (largest > smallest)
-
-
-def _distances(batch: Batch, settings: SpatialWeight) -> Tensor:
-    """(B, H, W) float32: distance from the focus, relative to the largest."""
-    if batch.position is None:
-        raise InputError(
-            "loss.spatial weights pixels by their position in the original image, which this "
-            "transform does not track. Set transform.track_position=true or loss.spatial.alpha=0."
-        )
-    sizes = check_shape("position", batch.position, "B 2 H W", **{"2": 2})
-    original = batch.original_hw.to(batch.position)
-    centre = torch.div(original, 2, rounding_mode="floor")
-    if settings.centre == "crop":
-        centre = batch.position[:, :, sizes["H"] // 2, sizes["W"] // 2]
-
-    distance = torch.linalg.vector_norm(batch.position - centre[:, :, None, None], dim=1)
-    farthest = torch.maximum(centre, original - 1 - centre).norm(dim=1)
-    if settings.d_max == "crop":
-        farthest = distance.amax((1, 2))
-
-    relative: Tensor = distance / farthest[:, None, None]
-    return 1 - relative if settings.focus == "center" else relative
 
 
 class SpatialMap:
@@ -166,11 +128,11 @@ class SpatialMap:
     ) -> None:
         self.map_B1HW = weight_map(batch, padded_hw, settings)
         self.settings = settings
-        self.weighted_P = torch.ones(num_passes, dtype=torch.bool)
+        weighted_P = torch.ones(num_passes, dtype=torch.bool)
         if settings.passes == "fused":
-            self.weighted_P[1:] = False
-            self.weighted_P[-1] = num_passes % 2 == 0 or num_passes == 1
-        self.weighted_P = self.weighted_P.to(self.map_B1HW.device)
+            weighted_P[1:] = False
+            weighted_P[-1] = num_passes % 2 == 0 or num_passes == 1
+        self.weighted_P = weighted_P.to(self.map_B1HW.device)
 
     def at(self, points: Tensor, image: Tensor, first_set: int) -> PointWeights:
         """Weights at points (S, G, N, 2), see `rgbt.losses.points`.

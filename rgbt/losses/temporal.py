@@ -1,8 +1,7 @@
 """The loss of two frames of a scene (Temporal, Eqs. 2 to 4), and the soft overlaps that it is of.
 
 The caller makes the second frame and warps the first prediction to it. A ratio is one of sums over
-the batch, so that the sums are those of all processes. Not here: the dice term of matched queries
-(`rgbt.losses.set_criterion`).
+the batch, so that the sums are those of all processes.
 """
 
 from __future__ import annotations
@@ -14,19 +13,17 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from rgbt.checks import InputError, check_shape
-from rgbt.geometry.halving import halved_label, halved_mean
+from rgbt.checks import InputError
+from rgbt.geometry.warp import halved_label, halved_mean
 from rgbt.losses.cross_entropy import single
 from rgbt.processes import total
 from rgbt.ranges import NonNegative
 from rgbt.requirements import Record, Requirement, record_of
 from rgbt.types import IGNORE, Frame, Loss
 
-Form = Literal["paper", "released"]
-"""Which of two printed sets of choices: those of Temporal's paper, or those of its release."""
+Form = Literal["paper", "released"]  # the choices of Temporal's paper, or of its release
 
-SIGMA = 1e-7
-"""Keeps denominators above 0 (Temporal, Eq. 2; release)."""
+SIGMA = 1e-7  # keeps denominators above 0 (Temporal, Eq. 2; release)
 
 OWN = ("dice", "con", "con_acc")
 
@@ -39,24 +36,13 @@ class TemporalLoss:
 
     Source: Temporal, Eq. (4) with X = con; Table I for the other X, and for what is left out.
     Released: alpha = beta = 1; X is dice, con or con_acc.
-
-    Attributes:
-        segmentation: seg, of each frame by itself. Paper and released: cross-entropy.
-        alpha: finite, >= 0; with 0, the Dice loss of the first frame is not computed.
-        beta: finite, >= 0; 0 if and only if `second` is "none".
-        second: X: Dice loss of the second frame (`dice`), or the first prediction
-            against the second (there).
-        form: of the Dice and the consistency losses, see there.
-
-    Raises:
-        InputError: a beta without a loss, a loss without a beta.
     """
 
-    segmentation: Loss
-    alpha: NonNegative
-    beta: NonNegative
-    second: Literal["none", "dice", "con", "con_acc"]
-    form: Form
+    segmentation: Loss  # of each frame by itself; paper and released: cross-entropy
+    alpha: NonNegative  # with 0, the Dice loss of the first frame is not computed
+    beta: NonNegative  # 0 if and only if `second` is "none"
+    second: Literal["none", "dice", "con", "con_acc"]  # X: of the second frame, or of both
+    form: Form  # of dice, con and con_acc
 
     def __post_init__(self) -> None:
         if (self.second == "none") == bool(self.beta):
@@ -67,11 +53,9 @@ class TemporalLoss:
 
     @property
     def record(self) -> Record:
-        """The requirements of the loss of each frame, and a scheme of two frames.
-
-        As released, Dice and con_acc leave out class 0.
-        """
+        """The requirements of the loss of each frame, and a scheme of two frames."""
         own = [Requirement("scheme", "frames", 2)]
+        # As released, Dice and con_acc leave out class 0.
         if self.form == "released" and (self.alpha or self.second in ("dice", "con_acc")):
             own += [Requirement.of_background("loss.form=released")]
         compares = self.second in ("con", "con_acc")
@@ -93,23 +77,19 @@ class TemporalLoss:
         """The weighted parts, which add up to L.
 
         Args:
-            first: frame 1: logits (B, K, H, W), label (B, H, W) int64 with 255 = ignore.
+            first: frame 1.
             second: frame 2, of the same sizes.
             warped: (B, K, H, W) probabilities of frame 1, warped to frame 2; only where the record
-                says `reads_warped`. Whether a gradient goes through it is for the caller to decide.
-                Or (B, K, ceil(H / 2), ceil(W / 2)): frame 2 is compared at half the size, by its
-                scores averaged over 2x2 pixels, and by the label on which these pixels agree.
-            valid: (B, H, W) bool, pixels of frame 2 that frame 1 shows; others do not count in
-                "con" and "con_acc". Of the size of `warped`.
+                says `reads_warped`. Or (B, K, ceil(H / 2), ceil(W / 2)): frame 2 is compared at
+                half the size, by its scores averaged over 2x2 pixels, and by the label on which
+                these pixels agree.
+            valid: (B, H, W) bool of the size of `warped`, pixels of frame 2 that frame 1 shows;
+                others do not count in "con" and "con_acc".
             generator: of the segmentation loss, frame 1 first.
 
         Returns:
             name -> () float32: the parts of the segmentation loss, passes summed, as <part>_1 and
-            <part>_2 (seg_dice_1 where it has a dice of its own); "dice_1"; "dice_2", "con" or
-            "con_acc".
-
-        Raises:
-            ValueError: shapes that do not fit.
+            <part>_2 (seg_dice_1 where it has a dice of its own); "dice_1"; `second`.
         """
         parts = {}
         for number, frame in ((1, first), (2, second)):
@@ -123,12 +103,11 @@ class TemporalLoss:
         elif self.second != "none":
             assert warped is not None, "the record requires it"
             half = warped.shape[2:] != second.logits.shape[2:]
-            scores = single(second.logits)
+            scores, label = single(second.logits), second.batch.label
             p = (halved_mean(scores) if half else scores).softmax(1)
             if self.second == "con":
                 value = con(warped, p, valid, self.form)
             else:
-                label = second.batch.label
                 label = halved_label(label) if half else label
                 value = con_acc(warped, p, label.where(valid, IGNORE), self.form)
             parts[self.second] = self.beta * value
@@ -136,21 +115,6 @@ class TemporalLoss:
 
     def _dice(self, frame: Frame) -> Tensor:
         return dice(single(frame.logits).softmax(1), frame.batch.label, self.form)
-
-
-@dataclass(frozen=True)
-class Target:
-    """A label as the sums below read it.
-
-    Attributes:
-        label: (B, H, W) int64, the class of a pixel that counts, 0 elsewhere.
-        weight: (B, H, W) float, 1 where a pixel counts, 0 elsewhere.
-        count: (K,) float, pixels of all processes that count, by class.
-    """
-
-    label: Tensor
-    weight: Tensor
-    count: Tensor
 
 
 def dice(probabilities: Tensor, label: Tensor, form: Form) -> Tensor:
@@ -164,18 +128,14 @@ def dice(probabilities: Tensor, label: Tensor, form: Form) -> Tensor:
     gradient, so that agreement costs the share of absent classes.   Released: pixels labelled 0
     are left out, yet K still divides: the range ends at the share of foreground classes present.
 
-    p (B, K, H, W) in [0, 1] sums to 1 over K, any float dtype; y (B, H, W) int64, 255 is left
-    out. () in [0, 1], float32 for half precision too. Where no pixel counts: 1 (paper), 0
-    (released), with a gradient of 0. ValueError: shapes that do not fit.
+    p (B, K, H, W), y (B, H, W) int64, 255 is left out -> () in [0, 1], float32 for half precision
+    too. Where no pixel counts: 1 (paper), 0 (released), with a gradient of 0.
     """
-    sizes = check_shape("probabilities", probabilities, "B K H W")
-    check_shape("label", label, "B H W", **{letter: sizes[letter] for letter in "BHW"})
     probabilities = single(probabilities)
-    target = target_of(label, probabilities, form)
-    overlap = sum_by_class(at_label(probabilities, target), target.label, sizes["K"])
-    size = sum_of_counted(probabilities.square() if form == "paper" else probabilities, target)
-    cost = 1 - 2 * overlap / (size + target.count).clamp(min=SIGMA)
-    return averaged(cost, target, form)
+    target = _Target(label, probabilities, form)
+    overlap = target.by_class(target.labelled(probabilities))
+    size = target.counted(probabilities.square() if form == "paper" else probabilities)
+    return target.averaged(1 - 2 * overlap / (size + target.pixels).clamp(min=SIGMA))
 
 
 def con(warped: Tensor, second: Tensor, valid: Tensor, form: Form) -> Tensor:
@@ -190,10 +150,8 @@ def con(warped: Tensor, second: Tensor, valid: Tensor, form: Form) -> Tensor:
 
     p and q (B, K, H, W): probabilities of the first frame, warped to the second, and of the
     second; `valid` (B, H, W) bool: pixels that count, labelled or not. () in [0, 1], float32 for
-    half precision too; 1, with a gradient of 0, where no pixel is valid. It can be differentiated
-    once. ValueError: shapes that do not fit.
+    half precision too; 1, with a gradient of 0, where no pixel is valid. Differentiable once.
     """
-    _check(second, valid=valid, warped=warped)
     pairs = single(warped), single(second), valid
     sums: tuple[Tensor, Tensor] = _PairSums.apply(*pairs)  # type: ignore[no-untyped-call]
     overlap, size = (total(each) for each in sums)
@@ -212,64 +170,47 @@ def con_acc(warped: Tensor, second: Tensor, label: Tensor, form: Form) -> Tensor
     Paper: f = 2, so that full agreement costs 1/3; a class without a pixel costs 1.   Released:
     f = 3; pixels labelled 0 are left out, a class without a pixel costs 0, K still divides.
 
-    p and q as in `con`; y (B, H, W) int64 of the second frame, 255 is left out. () float32 for
-    half precision too, in [1/3, 1] (paper) or [0, 1] (released). Where no pixel counts: 1 (paper),
-    0 (released), with a gradient of 0. ValueError: shapes that do not fit.
+    p and q as in `con`; y (B, H, W) int64 of the second frame, 255 is left out. In [1/3, 1] (paper)
+    or [0, 1] (released). Where no pixel counts: 1 (paper), 0 (released), with a gradient of 0.
     """
-    num_classes = _check(second, label=label, warped=warped)
     warped, second = single(warped), single(second)
-    target = target_of(label, second, form)
-    overlap = at_label(warped, target) * at_label(second, target)
-    size = sum_of_counted(warped + second, target) + target.count
+    target = _Target(label, second, form)
+    overlap = target.labelled(warped) * target.labelled(second)
+    size = target.counted(warped + second) + target.pixels
     if form == "paper":
         size = size + SIGMA * total(target.weight.sum())
     factor = 2 if form == "paper" else 3
-    score = factor * sum_by_class(overlap, target.label, num_classes) / size.clamp(min=SIGMA)
-    return averaged(1 - score, target, form)
+    return target.averaged(1 - factor * target.by_class(overlap) / size.clamp(min=SIGMA))
 
 
-def _check(second: Tensor, *, warped: Tensor, **of_pixels: Tensor) -> int:
-    """The number of classes."""
-    sizes = check_shape("second", second, "B K H W")
-    check_shape("warped", warped, "B K H W", **sizes)
-    for name, each in of_pixels.items():
-        check_shape(name, each, "B H W", **{letter: sizes[letter] for letter in "BHW"})
-    return sizes["K"]
+class _Target:
+    """Which pixels count, and as what: all labelled ones; as released, none of the background."""
 
+    def __init__(self, label: Tensor, probabilities: Tensor, form: Form) -> None:
+        counted = label != IGNORE
+        if form == "released":
+            counted &= label != 0
+        self.form, self.num_classes = form, probabilities.shape[1]
+        self.label = label.where(counted, 0)
+        self.weight = counted.to(probabilities.dtype)
+        self.pixels = self.by_class(self.weight)
 
-def averaged(cost: Tensor, target: Target, form: Form) -> Tensor:
-    """Mean of K costs; as released, classes without a pixel cost 0."""
-    return cost.mean() if form == "paper" else cost.where(target.count > 0, 0.0).mean()
+    def labelled(self, probabilities: Tensor) -> Tensor:
+        """(B, H, W): the probability of the labelled class, 0 where a pixel does not count."""
+        return probabilities.gather(1, self.label[:, None])[:, 0] * self.weight
 
+    def by_class(self, values: Tensor) -> Tensor:
+        """(K,): sums of (B, H, W) values over the pixels of each class, of all processes."""
+        rows = values.new_zeros(*values.shape[:2], self.num_classes)
+        return total(rows.scatter_add(2, self.label, values).sum((0, 1)))
 
-def target_of(label: Tensor, probabilities: Tensor, form: Form) -> Target:
-    """Which pixels count, and as what: all labelled ones; as released, none of the background.
+    def counted(self, values: Tensor) -> Tensor:
+        """(K,): sums of (B, K, H, W) values over the pixels that count, of all processes."""
+        return total((values * self.weight[:, None]).sum((0, 2, 3)))
 
-    (B, H, W) int64, 255 = ignore; `probabilities` (B, K, H, W) give the number of classes and
-    dtype.
-    """
-    counted = label != IGNORE
-    if form == "released":
-        counted &= label != 0
-    weight = counted.to(probabilities.dtype)
-    label = label.where(counted, 0)
-    return Target(label, weight, sum_by_class(weight, label, probabilities.shape[1]))
-
-
-def at_label(probabilities: Tensor, target: Target) -> Tensor:
-    """(B, H, W): the probability of the labelled class, 0 where a pixel does not count."""
-    return probabilities.gather(1, target.label[:, None])[:, 0] * target.weight
-
-
-def sum_by_class(values: Tensor, label: Tensor, num_classes: int) -> Tensor:
-    """(K,): sums of (B, H, W) values over the pixels of each class, of all processes."""
-    rows = values.new_zeros(*values.shape[:2], num_classes)
-    return total(rows.scatter_add(2, label, values).sum((0, 1)))
-
-
-def sum_of_counted(values: Tensor, target: Target) -> Tensor:
-    """(K,): sums of (B, K, H, W) values over the pixels that count, of all processes."""
-    return total((values * target.weight[:, None]).sum((0, 2, 3)))
+    def averaged(self, cost: Tensor) -> Tensor:
+        """Mean of K costs; as released, classes without a pixel cost 0."""
+        return cost.mean() if self.form == "paper" else cost.where(self.pixels > 0, 0.0).mean()
 
 
 class _PairSums(torch.autograd.Function):
@@ -285,7 +226,7 @@ class _PairSums(torch.autograd.Function):
         weight = counted.to(first.dtype)
         products, sums = [], []
         for p, q in zip(first.unbind(1), second.unbind(1), strict=True):
-            p = p * weight  # noqa: PLW2901
+            p = p * weight
             products.append((p * q).sum())
             sums.append((p + q * weight).sum())
         return torch.stack(products), torch.stack(sums)

@@ -1,13 +1,13 @@
 """Losses without labels, and labels that are made of predictions.
 
 Losses that reward confident predictions, those of a discriminator's verdicts with the maps that it
-judges, and the labels that a teacher or two heads predict in the step.
+judges, and the labels that a teacher or two heads predict in the step. All take any float dtype and
+compute in float32 at least.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -15,17 +15,13 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from rgbt.checks import check_shape
 from rgbt.class_scores import best_of, classes_of
 from rgbt.losses.cross_entropy import single
 from rgbt.processes import mean_count
 from rgbt.ranges import NonNegative, Share
 from rgbt.types import IGNORE
 
-Normalisation = Literal["pixels", "entries"]
-
-LEAST = 1e-30
-"""Smallest probability that a logarithm is taken of (ADVENT release)."""
+LEAST = 1e-30  # the smallest probability that a logarithm is taken of (ADVENT release)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,25 +37,18 @@ class MaxSquares:
         w_n = 1 / max(h^r H^(1 - r), 1)
 
     so that small classes count for more; with "entries", the 1/2 is then left out, as released.
+    Without a ratio all pixels weigh alike.
 
     Source: MaxSquareLoss; thesis (J. Sun), Eq. 2: "pixels".   Released: "entries", by both. The
     released weights belong to it: 0.1 (both), and 0.09 with r = 0.2 (MaxSquareLoss, K = 19).
-
-    Attributes:
-        weight: factor of the loss, >= 0.
-        normalisation: see above.
-        image_wise_ratio: r in [0, 1]; null weighs all pixels alike.
     """
 
     weight: NonNegative
-    normalisation: Normalisation
+    normalisation: Literal["pixels", "entries"]
     image_wise_ratio: Share | None
 
     def __call__(self, probabilities: Tensor) -> dict[str, Tensor]:
-        """The part "max_squares", () <= 0, float32 for half precision too.
-
-        `probabilities` (B, K, H, W) in [0, 1] sum to 1 over K; any float dtype.
-        """
+        """The part "max_squares", () <= 0, of (B, K, H, W) in [0, 1] that sum to 1 over K."""
         probabilities = single(probabilities)
         squares = probabilities.square().sum(1)
         entries = self.normalisation == "entries"
@@ -83,22 +72,20 @@ class Entropy:
 
     Source: ADVENT, Eqs. 2 and 3; thesis (J. Sun), Eq. 1, which does not print the mean.
     Released: ADVENT, with weight 0.001.
-
-    Attributes:
-        weight: factor of the loss, >= 0.
     """
 
     weight: NonNegative
 
     def __call__(self, probabilities: Tensor) -> dict[str, Tensor]:
-        """The part "entropy", () float32 for half precision too; the gradient is finite at 0 too.
-
-        `probabilities` (B, K, H, W) in [0, 1] sum to 1 over K; any float dtype.
-        """
+        """The part "entropy", (), of (B, K, H, W) in [0, 1] that sum to 1 over K."""
         probabilities = single(probabilities)
         surprise = -probabilities * probabilities.clamp(min=LEAST).log()
-        highest = math.log(max(probabilities.shape[1], 2))  # of one class, the entropy is 0
-        return {"entropy": self.weight * surprise.sum(1).mean() / highest}
+        return {"entropy": self.weight * surprise.sum(1).mean() / _most(probabilities)}
+
+
+def _most(scores: Tensor) -> float:
+    """Logarithm of K, the highest entropy of K classes; of one class, the entropy is 0."""
+    return math.log(max(scores.shape[1], 2))
 
 
 def guidance(probabilities: Tensor, aux_probabilities: Tensor, threshold: float) -> Tensor:
@@ -110,35 +97,22 @@ def guidance(probabilities: Tensor, aux_probabilities: Tensor, threshold: float)
 
     p and q, (B, K, H, W), are those of the main and of the auxiliary head, t in [0, 1] is
     `threshold`; (B, H, W) int64, through which no gradient goes.
-
-    Raises:
-        ValueError: the shapes differ.
     """
-    sizes = check_shape("probabilities", probabilities, "B K H W")
-    check_shape("aux_probabilities", aux_probabilities, "B K H W", **sizes)
     p, q = probabilities.detach(), aux_probabilities.detach()
     sure = (p.amax(1) > threshold) | (q.amax(1) > threshold)
     return classes_of(p + q).where(sure, IGNORE)
 
 
 WeightedBy = Literal["batch", "image"]
-"""The images whose share of confident pixels weighs a pixel: all of the batch, or its own."""
 
 
 class PseudoLabels(NamedTuple):
-    """Labels of a batch.
+    """Labels of a batch, and what is logged of them; float32 in [0, 1]."""
 
-    Attributes:
-        label: (B, H, W) int64, every pixel has a class.
-        weight: (B, H, W) float32 in [0, 1].
-        confident: () float32, share of the confident pixels of the batch, in [0, 1].
-        confidence: () float32, mean of the highest probabilities of the batch, in [0, 1].
-    """
-
-    label: Tensor
-    weight: Tensor
-    confident: Tensor
-    confidence: Tensor
+    label: Tensor  # (B, H, W) int64, every pixel has a class
+    weight: Tensor  # (B, H, W)
+    confident: Tensor  # (), share of the confident pixels of the batch
+    confidence: Tensor  # (), mean of the highest probabilities of the batch
 
 
 def pseudo_labels(
@@ -153,17 +127,14 @@ def pseudo_labels(
 
     Source: DACS; DAFormer, Sec. 3.1 (of each image).   Released: of the batch.
 
-    Args:
-        scores: (B, K, H, W), any float dtype; no gradient passes.
-        threshold: in [0, 1]; 0.968 in the releases of DACS, DAFormer, HRDA and MIC.
-        weighted_by: see above.
-        ignored: shares of the rows at the top and at the bottom, in [0, 1], rounded to rows.
+    Of scores (B, K, H, W), through which no gradient goes. `threshold` is 0.968 in the releases of
+    DACS, DAFormer, HRDA and MIC; `ignored` are the shares of the rows at the top and bottom.
     """
-    height = check_shape("scores", scores, "B K H W")["H"]
     confidence, label = best_of(single(scores.detach()).softmax(1))
     of_image = (confidence >= threshold).float().mean((1, 2))
     of_batch = mean_count(of_image.mean())
     weight = of_image if weighted_by == "image" else of_batch.expand_as(of_image)
+    height = scores.shape[2]
     rows = torch.arange(height, device=scores.device)
     top, bottom = (round(share * height) for share in ignored)
     counted = (rows >= top) & (rows < height - bottom)
@@ -176,7 +147,7 @@ Judged = Literal["probabilities", "logits", "self_information"]
 
 
 def least_squares(verdicts: Tensor, value: float) -> Tensor:
-    """Mean of ``(value - D)^2`` over verdicts D of any shape and float dtype; () float32.
+    """Mean of ``(value - D)^2`` over verdicts D of any shape; ().
 
     Source: LSGAN; thesis (J. Sun), Eqs. 5 and 6 (source 0, target 1); HeatNet (day 1, night 0).
     """
@@ -187,18 +158,12 @@ def logistic(verdicts: Tensor, value: float) -> Tensor:
     """Mean of ``-value log s(D) - (1 - value) log (1 - s(D))`` with the logistic function s.
 
     Source: AdaptSegNet, Eqs. 2 and 4; ADVENT (releases of both: source 0, target 1).
-
-    As `least_squares`, verdicts not squashed and `value` in [0, 1]; finite for finite verdicts.
     """
     verdicts = single(verdicts)
     return F.binary_cross_entropy_with_logits(verdicts, torch.full_like(verdicts, value))
 
 
-VERDICT_LOSSES: dict[str, Callable[[Tensor, float], Tensor]] = {
-    "least_squares": least_squares,
-    "cross_entropy": logistic,
-}
-"""By their names in the configuration."""
+VERDICT_LOSSES = {"least_squares": least_squares, "cross_entropy": logistic}
 
 
 def judged(logits: Tensor, how: Judged) -> Tensor:
@@ -210,11 +175,10 @@ def judged(logits: Tensor, how: Judged) -> Tensor:
 
     (B, K, H, W) class scores, any float dtype -> the same shape, float32 for half precision too.
     """
-    sizes = check_shape("logits", logits, "B K H W")
     logits = single(logits)
     if how == "logits":
         return logits
     if how == "probabilities":
         return logits.softmax(1)
     log_p = logits.log_softmax(1)  # finite where p is too small to differ from 0
-    return -log_p.exp() * log_p / math.log(max(sizes["K"], 2))  # of one class: 0
+    return -log_p.exp() * log_p / _most(logits)

@@ -1,7 +1,6 @@
-"""Maskers: which cells of RGB and of thermal are hidden. Every file of conf/masker/ configures one.
+"""Maskers: which cells of RGB and of thermal are hidden; conf/masker/ configures them.
 
-A mask is (B, h, w) bool, True = taken. Functions draw a whole batch on the device of their
-arguments.
+A mask is (B, h, w) bool, True = taken. A whole batch is drawn on the device of the arguments.
 """
 
 from __future__ import annotations
@@ -14,28 +13,23 @@ import torch
 from annotated_types import Interval, MultipleOf, doc
 from torch import Tensor
 
-from rgbt.checks import InputError, check_members, check_shape, described
+from rgbt.checks import InputError, check_members, described
 from rgbt.geometry.padding import STRIDE, padded_hw
 from rgbt.ranges import Pixels, Share
 from rgbt.requirements import Record
 from rgbt.types import MaskPair
 
 Sampler = Literal["none", "uniform", "bernoulli", "square", "gaussian_count", "gaussian_bernoulli"]
-TOKEN = 4
-"""Pixels per token side of the networks; a cell holds whole tokens."""
 
-PatchSize = Annotated[int, Interval(ge=TOKEN, le=8192), MultipleOf(TOKEN), doc("pixels")]
-
-THIRDS = (1 / 3, 1 / 3, 1 / 3)
-"""The three patterns of `rand_comp` are equally likely in both releases."""
+PatchSize = Annotated[int, Interval(ge=4, le=8192), MultipleOf(4), doc("pixels, whole tokens")]
 
 CELLS = {"patch_size", "pairing"}
-GAUSSIAN = {"sigma_div", "anchor", "cell_position"}
+GAUSSIAN = CELLS | {"sigma_div", "anchor", "cell_position"}
 NEEDED: dict[str, set[str]] = {
     "none": set(),
     **dict.fromkeys(("uniform", "bernoulli", "square"), CELLS | {"ratio"}),
-    "gaussian_count": CELLS | GAUSSIAN | {"ratio"},
-    "gaussian_bernoulli": CELLS | GAUSSIAN,
+    "gaussian_count": GAUSSIAN | {"ratio"},
+    "gaussian_bernoulli": GAUSSIAN,
 }
 
 
@@ -44,8 +38,6 @@ class Masker:
     """Draws which cells of a crop are hidden in RGB and in thermal.
 
     The crop is padded to multiples of 32 pixels as the networks do, and cut into square cells.
-    One draw per sample, on the device of the batch, from a passed generator.
-
     The position of the Gaussian, where paper and release of SpatialSeg differ:
         Paper: grid centre (N_y / 2, N_x / 2); cell i lies at i, so the weight leans by half a cell
             to the bottom and right (`anchor: grid`, `cell_position: index`).
@@ -55,28 +47,17 @@ class Masker:
     Its width: ``sigma_p = N_y / sigma_div`` cells. Whether N_y counts the rows of the image or of
     the crop is open in the paper; the release takes the padded crop (`sigma_height: null`).
 
+    The settings are the keys of ``conf/masker/grbm_released.yaml``.
+
     Attributes:
         sampler: "none" hides nothing; "uniform" a fixed number of cells (CRM); "square" one
             rectangle (CRM, Fig. 5); "gaussian_count" a fixed number, likelier near the anchor
-            (SpatialSeg as released); "gaussian_bernoulli" each cell independently with the
-            Gaussian as its probability (SpatialSeg, Eq. 9); "bernoulli" each cell independently
-            with probability `ratio` (MIC).
-        patch_size: side of a cell in pixels, multiple of 4; must divide the padded crop.
-        ratio: share of the cells that a mask takes, 0..1; for "bernoulli" their probability, and
-            for "square" the share of each side.
-        sigma_div: M_div, > 0.
-        sigma_height: height in pixels that N_y is counted on, ``floor(sigma_height / patch_size)``;
-            None: the padded crop.
-        anchor: "grid" the middle of the padded crop; "tracked" `centre_yx` of the batch.
-        cell_position: "index" or "centre", see above.
-        pairing: "comp" RGB hides the mask, thermal its complement; "rand_comp" that, or one of
-            the two alone (see `pattern_probabilities`); "indiv" two independent masks; "same" one
-            mask for both (MIC has one image).
-        pattern_probabilities: of only thermal, only RGB, both hidden, for "rand_comp" alone; None:
-            1/3 each.
-
-    Raises:
-        InputError: a required setting is None, or one without effect is not.
+            (SpatialSeg as released); "gaussian_bernoulli" each cell with the probability of the
+            Gaussian (SpatialSeg, Eq. 9); "bernoulli" each with the probability `ratio` (MIC).
+        pairing: "comp" RGB hides the mask, thermal its complement (CRM, Sec. 3.2; SpatialSeg,
+            Eqs. 6 and 10); "rand_comp" one of three patterns per sample, (M_rgb, M_th) =
+            (0, 1 - m), (m, 0) or (m, 1 - m) (SpatialSeg, Eq. 11; in both releases each with 1/3);
+            "indiv" two independent masks; "same" one mask for both (MIC has one image).
     """
 
     sampler: Sampler
@@ -95,18 +76,16 @@ class Masker:
         return Record(hides_cells=self.sampler != "none")
 
     def __post_init__(self) -> None:
-        needed = NEEDED[self.sampler]
+        needed = NEEDED[self.sampler] | {"sampler"}
         optional = {"sigma_height"} if "sigma_div" in needed else set()
-        if self.pairing == "rand_comp":
-            optional.add("pattern_probabilities")
+        optional |= {"pattern_probabilities"} if self.pairing == "rand_comp" else set()
         for name, value in vars(self).items():
-            if name == "sampler" or name in optional or (name in needed) == (value is not None):
-                continue
-            effect = " requires a value" if name in needed else f"={value} has no effect"
-            raise InputError(
-                f"masker.{name}{effect} with masker.sampler={self.sampler} and masker.pairing="
-                f"{self.pairing}."
-            )
+            if name not in optional and (name in needed) == (value is None):
+                effect = " requires a value" if name in needed else f"={value} has no effect"
+                raise InputError(
+                    f"masker.{name}{effect} with masker.sampler={self.sampler} and masker.pairing="
+                    f"{self.pairing}."
+                )
         if self.sigma_height is not None and self.sigma_height < (self.patch_size or 1):
             raise InputError(f"masker.sigma_height={self.sigma_height} is less than one cell.")
         shares = self.pattern_probabilities
@@ -118,15 +97,9 @@ class Masker:
     ) -> MaskPair:
         """(B, h, w) bool cells of the padded crop, True = hidden, one independent draw per sample.
 
-        Args:
-            image_hw: size of the crop in pixels, before padding.
-            centre_yx: (B, 2), pixel of the crop nearest to the centre of the original image.
-            generator: on the device of `centre_yx`.
-
-        Raises:
-            InputError: the patch size does not divide the padded crop.
+        `image_hw` is the size of the crop in pixels, before padding, and `centre_yx` (B, 2) the
+        pixel of the crop nearest to the centre of the original image, on the generator's device.
         """
-        check_shape("centre_yx", centre_yx, "B yx", yx=2)
         grid_hw = self.grid_hw(image_hw)
         if self.sampler == "none":
             nothing = centre_yx.new_zeros((len(centre_yx), *grid_hw), dtype=torch.bool)
@@ -137,8 +110,11 @@ class Masker:
         if self.pairing == "same":
             return MaskPair(taken, taken.clone())
         if self.pairing == "comp":
-            return complementary(taken)
-        return random_complementary(taken, self.pattern_probabilities or THIRDS, generator)
+            return MaskPair(rgb=taken, thermal=~taken)
+        shares = torch.tensor(self.pattern_probabilities or (1 / 3,) * 3, device=taken.device)
+        pattern = torch.multinomial(shares, len(taken), replacement=True, generator=generator)
+        pattern = pattern[:, None, None]
+        return MaskPair(rgb=taken & (pattern != 0), thermal=~taken & (pattern != 1))
 
     def grid_hw(self, image_hw: tuple[int, int]) -> tuple[int, int]:
         """(h, w) cells of a crop of `image_hw` pixels; InputError if they are no whole cells."""
@@ -155,22 +131,30 @@ class Masker:
         self, grid_hw: tuple[int, int], centre_yx: Tensor, generator: torch.Generator
     ) -> Tensor:
         """(B, h, w) bool, the cells that one mask takes."""
-        batch = len(centre_yx)
         if self.ratio is None:
             return bernoulli(self._log_weight(grid_hw, centre_yx), generator)
         if self.sampler == "square":
-            return square(batch, grid_hw, self.ratio, generator)
-        same = centre_yx.new_zeros((batch, *grid_hw), dtype=torch.float32)
+            return square(len(centre_yx), grid_hw, self.ratio, generator)
+        same = centre_yx.new_zeros((len(centre_yx), *grid_hw), dtype=torch.float32)
         if self.sampler == "bernoulli":
             return bernoulli((same + self.ratio).log(), generator)
         weight = same if self.sampler == "uniform" else self._log_weight(grid_hw, centre_yx)
         return fixed_count(weight, num_taken(grid_hw, self.ratio), generator)
 
     def _log_weight(self, grid_hw: tuple[int, int], centre_yx: Tensor) -> Tensor:
+        """Logarithm (B, h, w) of a Gaussian of the distance in cells from a centre, 0 there.
+
+            log W(y, x) = -((y + o - c_y)^2 + (x + o - c_x)^2) / (2 sigma^2)
+
+        Source: SpatialSeg, Sec. IV-B, Eq. 8 (o = 0). o is 0 at the index of a cell, 0.5 in its
+        middle.
+        """
         assert self.patch_size, "the constructor requires it"
         assert self.sigma_div, "the constructor requires it"
         rows = grid_hw[0] if self.sigma_height is None else self.sigma_height // self.patch_size
+        sigma_cells = rows / self.sigma_div
         by_index = self.cell_position == "index"
+        offset = 0.0 if by_index else 0.5
         if self.anchor == "grid":
             middle = centre_yx.new_tensor(grid_hw, dtype=torch.float32) / 2
             centre = middle.expand(len(centre_yx), 2)
@@ -178,33 +162,14 @@ class Masker:
             centre = (centre_yx // self.patch_size).float()
         else:
             centre = (centre_yx + 0.5) / self.patch_size
-        offset = 0.0 if by_index else 0.5
-        return gaussian_log_weight(grid_hw, centre, rows / self.sigma_div, offset)
+        y, x = (torch.arange(side, device=centre.device) + offset for side in grid_hw)
+        squared_y, squared_x = (y - centre[:, :1]) ** 2, (x - centre[:, 1:]) ** 2
+        return -(squared_y[:, :, None] + squared_x[:, None, :]) / (2 * sigma_cells**2)
 
 
 def num_taken(grid_hw: tuple[int, int], ratio: float) -> int:
-    """How many cells a mask takes: ``ceil(h w ratio)`` (CRM release, mask generator)."""
-    # 20 * 0.55 is 11.000000000000002 in binary; that excess must not cost a cell.
+    """``ceil(h w ratio)`` cells (CRM release); 20 * 0.55 = 11.000000000000002 are eleven."""
     return math.ceil(grid_hw[0] * grid_hw[1] * ratio - 1e-9)
-
-
-def gaussian_log_weight(
-    grid_hw: tuple[int, int], centre_yx: Tensor, sigma_cells: float, cell_offset: float
-) -> Tensor:
-    """Logarithm of a Gaussian of the distance between each cell and a centre.
-
-        log W(y, x) = -((y + o - c_y)^2 + (x + o - c_x)^2) / (2 sigma^2)
-
-    Source: SpatialSeg, Sec. IV-B, Eq. 8 (o = 0).
-
-    Centres (B, 2) float and sigma > 0 are in cells; `cell_offset` o says where in a cell its
-    position is measured: 0 its index, 0.5 its middle. (B, h, w) float32, 0 at the centre, negative
-    elsewhere.
-    """
-    y, x = (torch.arange(side, device=centre_yx.device) + cell_offset for side in grid_hw)
-    squared_y = (y - centre_yx[:, :1]) ** 2
-    squared_x = (x - centre_yx[:, 1:]) ** 2
-    return -(squared_y[:, :, None] + squared_x[:, None, :]) / (2 * sigma_cells**2)
 
 
 def fixed_count(log_weight: Tensor, count: int, generator: torch.Generator) -> Tensor:
@@ -212,9 +177,7 @@ def fixed_count(log_weight: Tensor, count: int, generator: torch.Generator) -> T
 
     Each draw takes a cell with probability proportional to its weight among the cells still there.
     The same distribution in one step (Efraimidis and Spirakis, Information Processing Letters 97,
-    2006): take the `count` largest of ``log w - log e`` with independent exponential e.
-
-    (B, h, w) float, all zero to draw uniformly -> (B, h, w) bool.
+    2006): the `count` largest of ``log w - log e`` with independent exponential e, (B, h, w).
     """
     waiting = torch.empty_like(log_weight).exponential_(generator=generator)
     keys = (log_weight - waiting.log()).flatten(1)
@@ -224,10 +187,7 @@ def fixed_count(log_weight: Tensor, count: int, generator: torch.Generator) -> T
 
 
 def bernoulli(log_probability: Tensor, generator: torch.Generator) -> Tensor:
-    """Every cell of (B, h, w), <= 0, independently with its own probability; their number varies.
-
-    Source: SpatialSeg, Sec. IV-B, Eq. 9.
-    """
+    """Every cell of (B, h, w) independently with its own probability (SpatialSeg, Eq. 9)."""
     uniform = torch.rand(log_probability.shape, generator=generator, device=log_probability.device)
     return uniform < log_probability.exp()
 
@@ -237,59 +197,22 @@ def square(
 ) -> Tensor:
     """One rectangle per mask at a uniformly drawn position, `ratio` of the height and of the width.
 
-    Paper: CRM, Fig. 5 (half the height and half the width, so a quarter of the area).
-    Released: rows and columns of the slice are exchanged and the mask is in pixels where tokens are
-    expected, so the released square mask stops with a size mismatch.
-
-    Sides are rounded to whole cells; (B, h, w) bool on the device of `generator`.
+    Sides are rounded to whole cells; (B, h, w) bool. Paper: CRM, Fig. 5 (half of both sides).
+    Released: the square mask stops with a size mismatch (rows and columns of the slice are
+    exchanged, and the mask is in pixels where tokens are expected).
     """
-    inside = [_interval(batch, length, round(length * ratio), generator) for length in grid_hw]
+    inside, device = [], generator.device
+    for length in grid_hw:
+        extent = round(length * ratio)
+        last = length - extent
+        start = torch.randint(last + 1, size=[batch, 1], generator=generator, device=device)
+        position = torch.arange(length, device=device)
+        inside.append((position >= start) & (position < start + extent))
     return inside[0][:, :, None] & inside[1][:, None, :]
 
 
-def _interval(batch: int, length: int, extent: int, generator: torch.Generator) -> Tensor:
-    """(B, length) bool: `extent` neighbours, every position equally likely."""
-    device = generator.device
-    start = torch.randint(length - extent + 1, size=[batch, 1], generator=generator, device=device)
-    position = torch.arange(length, device=device)
-    return (position >= start) & (position < start + extent)
-
-
-def complementary(taken: Tensor) -> MaskPair:
-    """RGB hides the taken cells (B, h, w), thermal all others.
-
-    Source: CRM, Sec. 3.2 (there 1 keeps a cell; here True hides it); SpatialSeg, Eqs 6 and 10.
-    """
-    return MaskPair(rgb=taken, thermal=~taken)
-
-
-def random_complementary(
-    taken: Tensor, probabilities: tuple[float, float, float], generator: torch.Generator
-) -> MaskPair:
-    """One of three patterns per sample: only thermal hidden, only RGB hidden, both complementary.
-
-        (M_rgb, M_th) = (0, 1 - m), (m, 0) or (m, 1 - m)
-
-    Source: SpatialSeg, Eq. 11, and the default of both releases (`rand_comp`), each pattern with
-    probability 1/3. The CRM paper describes the third alone (`complementary`).
-
-    `taken` m is (B, h, w) bool; the probabilities, in this order, sum to 1.
-    """
-    batch = len(taken)
-    weights = torch.tensor(probabilities, device=taken.device)
-    pattern = torch.multinomial(weights, batch, replacement=True, generator=generator)
-    pattern = pattern[:, None, None]
-    return MaskPair(rgb=taken & (pattern != 0), thermal=~taken & (pattern != 1))
-
-
 def check_masker(masker: object, image_hw: tuple[int, int], generator: torch.Generator) -> None:
-    """Draw one mask of a user's own masker, and refuse one that does not fit the crop.
-
-    The networks would read other cells than were meant.
-
-    Raises:
-        InputError: naming its class, what it returned and what was expected.
-    """
+    """Draw one mask of a user's own masker; InputError if it does not fit the crop."""
     check_members("masker", masker, (), {"__call__": ("image_hw", "centre_yx", "generator")})
     found = masker(image_hw, torch.zeros(1, 2, dtype=torch.int64), generator)  # type: ignore[operator]
     height, width = padded_hw(image_hw)

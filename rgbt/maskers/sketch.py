@@ -1,7 +1,7 @@
 """Draw examples of a masker: ``rgbt masks +experiment=grbm out=masks.png``.
 
-One column per training sample, augmented as in training: RGB and thermal with their hidden cells
-greyed out; last column: how often each cell is hidden. A picture to look at, not a measurement.
+One column per training sample, augmented as in training: RGB and thermal, hidden cells in grey;
+last column: how often each cell is hidden.
 """
 
 from __future__ import annotations
@@ -21,11 +21,9 @@ from rgbt.config.component import build
 from rgbt.geometry.padding import padded_hw
 from rgbt.maskers.masker import check_masker
 from rgbt.randomness import numpy_generator, torch_generator
-from rgbt.types import AnyMasker, Example, MaskPair
+from rgbt.types import AnyMasker, Example
 
-SAMPLES = 5
-DRAWS = 2000
-GREY = 127
+SAMPLES, DRAWS, GREY = 5, 2000, 127
 
 
 def greyed(image: NDArray[np.generic], hidden: torch.Tensor) -> NDArray[np.uint8]:
@@ -38,14 +36,6 @@ def greyed(image: NDArray[np.generic], hidden: torch.Tensor) -> NDArray[np.uint8
     return padded
 
 
-def frequencies(masker: AnyMasker, example: Example, seed: int, draws: int = DRAWS) -> MaskPair:
-    """(h, w) float64 each: the share of draws in which a cell of this example is hidden."""
-    centre = torch.tensor([example.centre_yx]).expand(draws, 2)
-    generator = torch_generator(seed, "sketch frequency")
-    many = masker(example.rgb.shape[:2], centre, generator)
-    return MaskPair(*(each.double().mean(0) for each in many))
-
-
 def draw(masker: AnyMasker, examples: Sequence[Example], seed: int, title: str) -> Figure:
     """The picture; every mask is derived from `seed`."""
     columns = len(examples) + 1
@@ -54,24 +44,22 @@ def draw(masker: AnyMasker, examples: Sequence[Example], seed: int, title: str) 
     for number, example in enumerate(examples):
         centre, generator = example.centre_yx, torch_generator(seed, "sketch", number)
         pair = masker(example.rgb.shape[:2], torch.tensor([centre]), generator)
-        for axis, image, mask in zip(
-            axes[:, number], (example.rgb, example.thermal), pair, strict=True
-        ):
+        images = (example.rgb, example.thermal)
+        for axis, image, mask in zip(axes[:, number], images, pair, strict=True):
             axis.imshow(greyed(image, mask[0]), cmap="gray", vmin=0, vmax=255)
             axis.plot(centre[1], centre[0], "+", color="red")
-            axis.set_axis_off()
         axes[0, number].set_title(example.name, fontsize=8)
-    height, width = padded_hw(examples[0].rgb.shape[:2])
-    found = frequencies(masker, examples[0], seed)
-    for axis, share, name in zip(axes[:, -1], found, ("RGB", "thermal"), strict=True):
+    hw, first = examples[0].rgb.shape[:2], torch.tensor([examples[0].centre_yx])
+    height, width = padded_hw(hw)
+    drawn = masker(hw, first.expand(DRAWS, 2), torch_generator(seed, "sketch frequency"))
+    for axis, hidden, name in zip(axes[:, -1], drawn, ("RGB", "thermal"), strict=True):
+        share = hidden.double().mean(0)
         axis.imshow(share.numpy(), vmin=0, vmax=1, extent=(0, width, height, 0), cmap="viridis")
         axis.set_title(f"{name} hidden, mean {share.mean():.3f}", fontsize=8)
+    for axis in axes.flat:
         axis.set_axis_off()
-    cells = tuple(found.rgb.shape)
-    figure.suptitle(
-        f"{title}: {type(masker).__name__}, {cells[0]} x {cells[1]} cells of "
-        f"{height // cells[0]} x {width // cells[1]} px"
-    )
+    h, w = drawn.rgb.shape[1:]
+    figure.suptitle(f"{title}: {h} x {w} cells of {height // h} x {width // w} px")
     return figure
 
 

@@ -1,6 +1,6 @@
 """Networks, which map two images and an optional pair of masks to `Output(logits, aux)`.
 
-One folder per family. A network never computes a loss, reads no file and draws no random number
+One module per family. A network never computes a loss, reads no file and draws no random number
 except from the generator it is handed. All are called alike; each `forward` says what it adds:
 
     rgb        (N, 3, H, W) float in [0, 1]

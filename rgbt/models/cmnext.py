@@ -2,7 +2,7 @@
 
 The rest is CMX's: what lies between the streams, and the decoder. Not here: the self-query hub,
 which exists from three modalities on. Maps are (N, H, W, C) between the blocks, as in
-`rgbt.models.cmx.mit`, and (N, C, H, W) inside those of the parallel pooling mixer (PPX).
+`rgbt.models.cmx.parts`, and (N, C, H, W) inside those of the parallel pooling mixer (PPX).
 """
 
 from __future__ import annotations
@@ -17,23 +17,26 @@ from annotated_types import Interval, Len, Predicate, doc
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.models.cmx.mit import NORM_EPS, initialise, mit_blocks
-from rgbt.models.cmx.model import Reductions, drop_rates
-from rgbt.models.cmx.network import CmxEncoder, CmxNetwork, MlpDecoder, Stream
+from rgbt.models.cmx.model import (
+    CmxEncoder,
+    CmxNetwork,
+    MlpDecoder,
+    Reductions,
+    Stream,
+    drop_rates,
+)
+from rgbt.models.cmx.parts import NORM_EPS, initialise, mit_blocks
 from rgbt.models.inputs import Inputs
 from rgbt.models.parts import ALL_KEPT, Keep, add_residual
 from rgbt.ranges import Channels, Depths, Epsilon, MlpRatio, NumClasses, ShareBelowOne, Widths
 
-MAP_NORM_EPS = 1e-6
-"""Of the layer normalisations in patch embeddings and after a stage; the RGB stream's are 1e-5."""
+MAP_NORM_EPS = 1e-6  # of the thermal patch embeddings and after its stages; the RGB stream's: 1e-5
 
 
 class PoolingGate(nn.Module):
-    """Gate of a map from its means over windows of several sizes.
+    """Gate of a map from its means over windows of several sizes (CMNeXt release).
 
-        sigmoid(conv1x1(c + sum_k mean_k(c))) x + x,   c = depthwise 7x7 of x
-
-    Source: CMNeXt release.
+    sigmoid(conv1x1(c + sum_k mean_k(c))) x + x,   c = depthwise 7x7 of x
     """
 
     def __init__(self, dim: int, windows: tuple[int, ...]) -> None:
@@ -52,13 +55,8 @@ class PoolingGate(nn.Module):
 
 
 def window_mean(x: Tensor, window: int) -> Tensor:
-    """Mean over the window around every position, of the positions inside the map alone.
-
-    It is the mean over columns of means over rows, because every row has as many positions: 2 k
-    additions instead of k^2.
-
-    `x` is (N, C, H, W); `window` is odd.
-    """
+    """Mean of (N, C, H, W) over the odd window around every position, inside the map alone."""
+    # The mean over columns of means over rows: every row has as many positions.
     for kernel, padding in (((window, 1), (window // 2, 0)), ((1, window), (0, window // 2))):
         x = F.avg_pool2d(x, kernel, 1, padding, count_include_pad=False)
     return x
@@ -76,17 +74,14 @@ class ConvFfn(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, C, H, W) -> the same."""
-        out: Tensor = self.fc2(F.gelu(self.dwconv(self.fc1(x))))
-        return out
+        return self.fc2(F.gelu(self.dwconv(self.fc1(x))))
 
 
 class PpxBlock(nn.Module):
     """Gated pooling and a feed-forward network; the channels of what passes by are weighted.
 
-        y = x + l1 gate(norm(x))        w = sigmoid(conv over channels of the means of y)
-        w y + l2 ffn(norm(y))           l1, l2: a learned factor per channel
-
-    Source: CMNeXt release.
+    y = x + l1 gate(norm(x))        w = sigmoid(conv over channels of the means of y)
+    w y + l2 ffn(norm(y))           l1, l2: a learned factor per channel
     """
 
     def __init__(
@@ -111,11 +106,7 @@ class PpxBlock(nn.Module):
         return add_residual(weights * y, residual, second).permute(0, 2, 3, 1)
 
 
-def _is_odd(number: int) -> bool:
-    return number % 2 == 1
-
-
-Window = Annotated[int, Interval(ge=1, le=99), Predicate(_is_odd), doc("positions, odd")]
+Window = Annotated[int, Interval(ge=1, le=99), Predicate(lambda n: n % 2), doc("positions, odd")]
 
 
 class CMNeXt(CmxNetwork):
@@ -160,7 +151,7 @@ class CMNeXt(CmxNetwork):
             Stream(3, rgb, NORM_EPS, NORM_EPS),
             Stream(inputs.thermal_channels, thermal, MAP_NORM_EPS, MAP_NORM_EPS),
         )
-        rates = drop_rates(depths, drop_path_rate) if drop_path_rate else None
+        rates = drop_rates(depths, drop_path_rate)
         backbone = CmxEncoder(streams, embed_dims, depths, num_heads, drop_rates=rates)
         decode_head = MlpDecoder(
             embed_dims,
@@ -170,5 +161,5 @@ class CMNeXt(CmxNetwork):
             norm_eps=(decoder_norm_eps, decoder_norm_eps),
             mix_bias=False,
         )
-        super().__init__(backbone, decode_head, inputs, sr_ratios)
+        super().__init__(backbone, decode_head, inputs)
         self.apply(partial(initialise, divide_groups=False))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from functools import partial
+from functools import partial, reduce
+from itertools import pairwise
 from typing import Annotated, Literal
 
 import torch
@@ -11,21 +12,15 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.checks import InputError, check_choice
-from rgbt.geometry.padding import padded_hw
-from rgbt.models.inputs import Inputs, as_rgb, only_view
-from rgbt.models.parts import DropRates, UpBlock, enlarge
-from rgbt.models.resnet import bottleneck_stage
+from rgbt.models.inputs import Images, Inputs, Network, as_rgb
+from rgbt.models.parts import DropRates, UpBlock, bottleneck_stage, enlarge
 from rgbt.ranges import BaseWidth, Depths, Names, NumClasses
 from rgbt.requirements import Record, Requirement
-from rgbt.types import MaskPair, Output, View
-
-STRIDE = 8
-"""Of the backbone; the modified decoders double the size three times."""
+from rgbt.types import Output, View
 
 TrainNorm = Literal["all", "statistics"]
 Decoder = Literal["basic", "modified_heatnet", "modified_thesis"]
 Rates = Annotated[tuple[Annotated[int, Interval(ge=1, le=1024)], ...], Len(1, 64)]
-"""Dilations."""
 
 
 class Backbone(nn.Module):
@@ -35,8 +30,6 @@ class Backbone(nn.Module):
     sits on the 3x3 convolution.
 
     Source: DeepLab v2, Sec. 3.1.   Released: AdaptSegNet, ADVENT, MaxSquareLoss, thesis.
-
-    Arguments: see `DeepLabV2`; `width` is its base_width.
     """
 
     def __init__(
@@ -56,10 +49,7 @@ class Backbone(nn.Module):
                 module.requires_grad_(train_norm == "all")
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """(N, 3, H, W) -> layer3 (N, 16 w, h, w) and layer4 (N, 32 w, h, w).
-
-        h = H / 8, one more where the pooling rounded up.
-        """
+        """(N, 3, H, W) -> layer3 (N, 16 w, h, w) and layer4 (N, 32 w, h, w), h = H / 8 or more."""
         x = self.pool(F.relu(self.bn1(self.conv1(image))))
         layer3 = self.layer3(self.layer2(self.layer1(x)))
         return layer3, self.layer4(layer3)
@@ -84,15 +74,11 @@ class AtrousPyramid(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, in, h, w) -> (N, out, h, w)."""
-        first, *others = self.summed
-        result: Tensor = self.conv2d_list[first](x)
-        for index in others:
-            result = result + self.conv2d_list[index](x)
-        return result
+        return reduce(torch.add, (self.conv2d_list[index](x) for index in self.summed))
 
 
 class DeepLabHead(nn.Module):
-    """A pyramid, and in the modified decoders three up blocks, between maps of `widths` channels.
+    """A pyramid, and in the modified decoders three up blocks.
 
     Source: thesis, Sec. III-B and Fig. 5: a modified decoder keeps the number of channels.
     Released: the training scripts import the network without up blocks. A file that no script
@@ -100,31 +86,21 @@ class DeepLabHead(nn.Module):
     """
 
     def __init__(
-        self,
-        aspp: AtrousPyramid,
-        widths: tuple[int, ...],
-        final: int | None,
-        *,
-        dropout: DropRates,
-        align_corners: bool,
+        self, aspp: AtrousPyramid, ups: list[UpBlock], final: nn.Module, dropout: DropRates
     ) -> None:
         super().__init__()
         self.dropout = dropout
         self.aspp = aspp
-        self.ups = nn.ModuleList(
-            UpBlock(before, after, align_corners=align_corners)
-            for before, after in zip(widths, widths[1:], strict=False)
-        )
-        self.final = nn.Identity() if final is None else nn.Conv2d(widths[-1], final, 1)
+        self.ups = nn.ModuleList(ups)
+        self.final = final
 
     def forward(self, x: Tensor, generator: torch.Generator | None) -> Tensor:
         """(N, in, h, w) -> (N, K, h, w), or (N, K, 8 h, 8 w) from a modified decoder."""
         rates = self.dropout if self.training else (0.0, 0.0)
-        result: Tensor = self.final(enlarge(self.aspp(x), self.ups, rates, generator))
-        return result
+        return self.final(enlarge(self.aspp(x), self.ups, rates, generator))
 
 
-class DeepLabV2(nn.Module):
+class DeepLabV2(Network):
     """DeepLab v2 with a backbone that all domains share and one head, or one per domain.
 
     Sees the RGB image or the thermal image, never both. Weights of convolutions are drawn from
@@ -134,9 +110,6 @@ class DeepLabV2(nn.Module):
     MaxSquareLoss (one head, with or without the auxiliary one); the thesis' code (two heads).
 
     The arguments are the keys of ``conf/model/deeplabv2.yaml``.
-
-    Raises:
-        InputError: `ceil_mode` with a modified decoder, or names that no module can have.
     """
 
     def __init__(  # noqa: PLR0913 - each is a key of conf/model/*.yaml
@@ -159,45 +132,9 @@ class DeepLabV2(nn.Module):
         super().__init__()
         if not set(summed_rates) <= set(rates):
             raise InputError(f"model.summed_rates must be some of {rates}, got {summed_rates}.")
-        if not all(name.isidentifier() and not hasattr(nn.ModuleDict, name) for name in heads):
-            raise InputError(f"model.heads must be names such as source, got {list(heads)}.")
         if ceil_mode and decoder != "basic":
             raise InputError(f"model.ceil_mode must be false with model.decoder={decoder}.")
-        self.record = self.record_from(heads=heads, auxiliary=auxiliary)
-        self.num_classes = num_classes
-        self.align_corners = align_corners
-        # Scores that are interpolated fit images of any size.
-        self.multiple = 1 if decoder == "basic" else STRIDE
-        self.backbone = Backbone(depths, base_width, ceil_mode=ceil_mode, train_norm=train_norm)
-        channels = 32 * base_width
-        widths: dict[str, tuple[int, ...]] = {
-            "basic": (num_classes,),
-            "modified_heatnet": tuple(channels // each for each in (2, 8, 32, 32)),
-            "modified_thesis": (num_classes,) * 4,
-        }
-        pyramid = partial(AtrousPyramid, rates=rates, summed_rates=summed_rates)
-        self.heads = nn.ModuleDict(
-            {
-                name: DeepLabHead(
-                    pyramid(channels, widths[decoder][0]),
-                    widths[decoder],
-                    num_classes if decoder == "modified_heatnet" else None,
-                    dropout=dropout,
-                    align_corners=align_corners,
-                )
-                for name in heads
-            }
-        )
-        self.auxiliary = pyramid(16 * base_width, num_classes) if auxiliary else None
-        for module in self.modules():
-            if isinstance(module, nn.Conv2d):
-                nn.init.normal_(module.weight, 0.0, 0.01)
-        self.inputs = inputs
-
-    @staticmethod
-    def record_from(*, heads: tuple[str, ...], auxiliary: bool, **_: object) -> Record:
-        """Output, views and heads; of several heads, the domains train each."""
-        return Record(
+        self.record = Record(
             requires=(Requirement("domains", "heads", heads),) if len(heads) > 1 else (),
             views=("rgb", "thermal"),
             heads=heads,
@@ -206,43 +143,48 @@ class DeepLabV2(nn.Module):
             pretrained_parts=("backbone.",),
             recomputed=("backbone.layer*.*",),
         )
+        self.num_classes = num_classes
+        self.align_corners = align_corners
+        # The modified decoders double the size three times; scores of the basic one are enlarged.
+        self.multiple = 1 if decoder == "basic" else 8
+        self.backbone = Backbone(depths, base_width, ceil_mode=ceil_mode, train_norm=train_norm)
+        channels = 32 * base_width
+        sizes = {
+            "basic": (num_classes,),
+            "modified_heatnet": tuple(channels // each for each in (2, 8, 32, 32)),
+            "modified_thesis": (num_classes,) * 4,
+        }[decoder]
+        pyramid = partial(AtrousPyramid, rates=rates, summed_rates=summed_rates)
+        self.heads = nn.ModuleDict()
+        for name in heads:
+            aspp = pyramid(channels, sizes[0])
+            ups = [UpBlock(*pair, align_corners=align_corners) for pair in pairwise(sizes)]
+            is_wide = decoder == "modified_heatnet"
+            final = nn.Conv2d(sizes[-1], num_classes, 1) if is_wide else nn.Identity()
+            self.heads[name] = DeepLabHead(aspp, ups, final, dropout)
+        self.auxiliary = pyramid(16 * base_width, num_classes) if auxiliary else None
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.normal_(module.weight, 0.0, 0.01)
+        self.inputs = inputs
 
-    def forward(  # noqa: PLR0913 - what every network takes, and the head
-        self,
-        rgb: Tensor,
-        thermal: Tensor,
-        masks: MaskPair | None = None,
-        *,
-        views: tuple[View, ...] = (),
-        head: str | None = None,
-        generator: torch.Generator | None = None,
+    def predict(
+        self, images: Images, view: View, generator: torch.Generator | None, head: str | None = None
     ) -> Output:
-        """Class scores from one image by one head, as `rgbt.models` says.
+        """Class scores from one image by one head.
 
         Of several heads, `head` names the one (InputError: there is none); None: the first.
-
-        Returns:
-            logits: (N, K, H, W).
-            aux: "features" (N, 32 w, h, w) of the fourth stage; "aux_logits" (N, K, H, W) of the
-                auxiliary head, where there is one.
+        In aux: "features" (N, 32 w, h, w) of the fourth stage; "aux_logits" (N, K, H, W) of the
+        auxiliary head, where there is one.
         """
-        view = only_view(views, self.record.views, "DeepLabV2")
         name = next(iter(self.heads)) if head is None else head
         check_choice("head", name, self.heads)
-        images = self.inputs(rgb, thermal, masks, multiple=self.multiple)
         layer3, layer4 = self.backbone(images.rgb if view == "rgb" else as_rgb(images.thermal))
-        image_hw = rgb.shape[2], rgb.shape[3]
-        aux = {"features": layer4}
+        found = {"logits": self.heads[name](layer4, generator)}
         if self.auxiliary is not None:
-            aux["aux_logits"] = self._at_image(self.auxiliary(layer3), image_hw)
-        scores = self.heads[name](layer4, generator)
-        return Output(self._at_image(scores, image_hw), aux)
-
-    def _at_image(self, scores: Tensor, image_hw: tuple[int, int]) -> Tensor:
-        """Scores enlarged to the padded image where they are smaller, less the padding."""
-        full = padded_hw(image_hw, self.multiple)
-        if scores.shape[2:] != full:
-            scores = F.interpolate(
-                scores, size=full, mode="bilinear", align_corners=self.align_corners
-            )
-        return scores[..., : image_hw[0], : image_hw[1]]
+            found["aux_logits"] = self.auxiliary(layer3)
+        size, corners = images.rgb.shape[2:], self.align_corners
+        for key, each in found.items():
+            if each.shape[2:] != size:
+                found[key] = F.interpolate(each, size, mode="bilinear", align_corners=corners)
+        return Output(found.pop("logits"), {"features": layer4, **found})

@@ -1,4 +1,4 @@
-"""Prepare the inputs of a network: channel order, normalisation, padding and hidden pixels.
+"""Inputs of a network: channel order, normalisation, padding, hidden pixels, the view it is shown.
 
 Weights require the convention of their training: with other inputs, a released network gives other
 results. `conf/model/inputs/` has one file per release.
@@ -6,16 +6,18 @@ results. `conf/model/inputs/` has one file per release.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
 from annotated_types import Interval, Len
 from torch import Tensor, nn
+from torch.nn import functional as F
 
-from rgbt.checks import InputError, check_shape
-from rgbt.geometry.padding import pad_to, padded_hw
+from rgbt.checks import InputError
+from rgbt.geometry.padding import padded_hw
 from rgbt.ranges import GreyLevel
-from rgbt.types import MaskPair, View
+from rgbt.requirements import Record
+from rgbt.types import MaskPair, Output, View
 
 
 class Images(NamedTuple):
@@ -31,9 +33,9 @@ Deviation = Annotated[float, Interval(ge=0.001, le=10_000)]
 class Inputs(nn.Module):
     """Images in [0, 1] to what a network was trained on: ``(255 x - mean) / std`` per channel.
 
-    The arguments are the keys of ``conf/model/inputs/crm.yaml``. "gray" is the luma 0.299 R +
-    0.587 G + 0.114 B (ITU-R BT.601) in all three channels. A single thermal channel is repeated
-    for three values. With "image_max", an image of zeros stays one.
+    The arguments are the keys of ``conf/model/inputs/crm.yaml``. "gray" is the luma in all three
+    channels. A single thermal channel is repeated for three values. With "image_max", an image of
+    zeros stays one.
 
     Raises:
         InputError: not 1 or 3 thermal channels; lists of different length.
@@ -73,13 +75,14 @@ class Inputs(nn.Module):
         Arguments and errors as `rgbt.models` says; sides are padded at the bottom and right to
         multiples of `multiple`.
         """
-        sizes = check_shape("rgb", rgb, "N C H W", C=3)
-        check_shape("thermal", thermal, "N C H W", **{**sizes, "C": 1})
+        count, _, height, width = rgb.shape
+        if rgb.shape[1] != 3 or thermal.shape != (count, 1, height, width):
+            shapes = tuple(rgb.shape), tuple(thermal.shape)
+            raise ValueError(f"rgb and thermal: expected (N, 3, H, W), (N, 1, H, W), got {shapes}.")
         if self.rgb_order == "bgr":
             rgb = rgb.flip(1)
         elif self.rgb_order == "gray":
-            luma = rgb.new_tensor([0.299, 0.587, 0.114]).view(1, 3, 1, 1)
-            rgb = (rgb * luma).sum(1, keepdim=True).expand_as(rgb)
+            rgb = luma_of(rgb).expand_as(rgb)
         if self.thermal_scale == "image_max":
             # The smallest float only matters where the whole image is 0.
             brightest = thermal.amax((1, 2, 3), keepdim=True)
@@ -88,15 +91,59 @@ class Inputs(nn.Module):
             (rgb - self.rgb_mean) / self.rgb_std,
             (thermal - self.thermal_mean) / self.thermal_std,
         ]
-        hw = sizes["H"], sizes["W"]
         if masks is not None:
-            cells = expand_cells(masks, sizes["N"], padded_hw(hw))
+            cells = expand_cells(masks, count, padded_hw((height, width)))
             images = [
-                image.masked_fill(hidden[:, None, : hw[0], : hw[1]], 0.0)
+                image.masked_fill(hidden[:, None, :height, :width], 0.0)
                 for image, hidden in zip(images, cells, strict=True)
             ]
-        whole_hw = padded_hw(hw, multiple)
-        return Images(*(pad_to(image, whole_hw) for image in images))
+        return Images(*(padded(image, multiple) for image in images))
+
+
+class Network(nn.Module):
+    """What networks of dense class scores share: one view, normalised images, no padded scores.
+
+    `multiple` divides the sides of the padded images. Each network has a method
+    `predict(images, view, generator)`, whose docstring says what it adds to `rgbt.models`.
+    """
+
+    record: Record
+    inputs: Inputs
+    multiple = 1
+    predict: Any
+
+    def forward(
+        self,
+        rgb: Tensor,
+        thermal: Tensor,
+        masks: MaskPair | None = None,
+        *,
+        views: tuple[View, ...] = (),
+        generator: torch.Generator | None = None,
+        **options: Any,
+    ) -> Output:
+        """As `rgbt.models` says; `options` are further arguments of `predict`."""
+        view = only_view(views, self.record.views, type(self).__name__)
+        images = self.inputs(rgb, thermal, masks, multiple=self.multiple)
+        logits, aux = self.predict(images, view, generator, **options)
+        if self.multiple > 1:
+            height, width = rgb.shape[2:]
+            logits = logits[..., :height, :width]
+            if "aux_logits" in aux:
+                aux["aux_logits"] = aux["aux_logits"][..., :height, :width]
+        return Output(logits, aux)
+
+
+def padded(image: Tensor, multiple: int) -> Tensor:
+    """(N, C, H, W) padded with 0 at the bottom and right to sides that `multiple` divides."""
+    below, right = (-side % multiple for side in image.shape[2:])
+    return F.pad(image, (0, right, 0, below)) if below or right else image
+
+
+def luma_of(rgb: Tensor) -> Tensor:
+    """(N, 3, H, W) -> (N, 1, H, W): 0.299 R + 0.587 G + 0.114 B (ITU-R BT.601)."""
+    weights = rgb.new_tensor([0.299, 0.587, 0.114]).view(1, 3, 1, 1)
+    return (rgb * weights).sum(1, keepdim=True)
 
 
 def as_rgb(thermal: Tensor) -> Tensor:
@@ -111,19 +158,16 @@ def expand_cells(masks: MaskPair, count: int, image_hw: tuple[int, int], unit: i
     tokens of a Swin.
 
     Raises:
-        InputError: cells that are not squares of a multiple of `unit` pixels.
-        ValueError: another N.
+        InputError: another N, or cells that are not squares of a multiple of `unit` pixels.
     """
-    height, width = image_hw
     found = []
-    for name, mask in zip(MaskPair._fields, masks, strict=True):
-        sizes = check_shape(f"masks.{name}", mask, "N h w", N=count)
-        h, w = sizes["h"], sizes["w"]
-        cell = height // h
-        if cell % unit or (h * cell, w * cell) != image_hw:
+    for mask in masks:
+        cells, h, w = mask.shape
+        cell = image_hw[0] // h
+        if cells != count or cell % unit or (h * cell, w * cell) != image_hw:
             raise InputError(
-                f"masker.patch_size: {h} x {w} cells do not divide the padded image of "
-                f"{height} x {width} pixels into squares of a multiple of {unit} pixels."
+                f"masker.patch_size: {cells} masks of {h} x {w} cells do not divide {count} padded "
+                f"images of {image_hw} pixels into squares of a multiple of {unit} pixels."
             )
         found.append(mask.repeat_interleave(cell // unit, 1).repeat_interleave(cell // unit, 2))
     return MaskPair(*found)

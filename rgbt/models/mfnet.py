@@ -12,16 +12,10 @@ from annotated_types import MultipleOf
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.models.inputs import Inputs, only_view
+from rgbt.models.inputs import Images, Inputs, Network
 from rgbt.ranges import Channels, NumClasses
 from rgbt.requirements import Record
-from rgbt.types import MaskPair, Output, View
-
-STRIDE = 16
-"""Four halvings, which the decoder undoes exactly."""
-
-LEAKY_SLOPE = 0.2
-"""Of every leaky ReLU, as released."""
+from rgbt.types import Output, View
 
 Widths = tuple[Channels, Channels, Channels, Annotated[Channels, MultipleOf(2)]]
 
@@ -39,15 +33,12 @@ class ConvUnit(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, in, H, W) -> (N, out, H, W)."""
-        y: Tensor = self.bn(self.conv(x))
-        return F.leaky_relu(y, LEAKY_SLOPE) if self.activation else y
+        y = self.bn(self.conv(x))
+        return F.leaky_relu(y, 0.2) if self.activation else y
 
 
 class MiniInception(nn.Module):
-    """Three levels of a plain and a dilated unit side by side, each half of the channels.
-
-    Source: MFNet, mini-inception block.
-    """
+    """Three levels of a plain and a dilated unit side by side, each half of the channels."""
 
     def __init__(self, in_channels: int, out_channels: int) -> None:
         super().__init__()
@@ -64,7 +55,7 @@ class MiniInception(nn.Module):
         return x
 
 
-class MFNet(nn.Module):
+class MFNet(Network):
     """Multi-spectral fusion network of Ha et al.
 
     Source: MFNet (Ha et al., IROS 2017).   Released: haqishen/MFNet-pytorch.
@@ -73,6 +64,7 @@ class MFNet(nn.Module):
     since the decoder adds the two. `final_activation` does not change the class of any pixel.
     """
 
+    multiple = 16  # four halvings, which the decoder undoes exactly
     record = Record(views=("rgbt",), recomputed=("conv*", "decode*"))
 
     def __init__(
@@ -97,25 +89,14 @@ class MFNet(nn.Module):
         self.decode1 = ConvUnit(decoder_width, num_classes, activation=final_activation)
         self.inputs = inputs
 
-    def forward(
-        self,
-        rgb: Tensor,
-        thermal: Tensor,
-        masks: MaskPair | None = None,
-        *,
-        views: tuple[View, ...] = (),
-        generator: torch.Generator | None = None,  # noqa: ARG002 - nothing is dropped at random
-    ) -> Output:
-        """Class scores from both images, as `rgbt.models` says; `aux` is empty."""
-        only_view(views, self.record.views, "MFNet")
-        images = self.inputs(rgb, thermal, masks, multiple=STRIDE)
+    def predict(self, images: Images, view: View, generator: torch.Generator | None) -> Output:  # noqa: ARG002
+        """Class scores from both images; `aux` is empty."""
         encoded = (self._encode("rgb", images.rgb), self._encode("inf", images.thermal))
         half, quarter, eighth, x = (torch.cat(pair, 1) for pair in zip(*encoded, strict=True))
         x = self.decode4(doubled(x) + eighth)
         x = self.decode3(doubled(x) + quarter)
         x = self.decode2(doubled(x) + half)
-        x = self.decode1(doubled(x))
-        return Output(x[..., : rgb.shape[2], : rgb.shape[3]], {})
+        return Output(self.decode1(doubled(x)), {})
 
     def _add_encoder(self, suffix: str, channels: int, widths: tuple[int, int, int, int]) -> None:
         full, half, quarter, eighth = widths
@@ -139,5 +120,5 @@ class MFNet(nn.Module):
 
 
 def doubled(x: Tensor) -> Tensor:
-    """Every pixel four times: (N, C, H, W) -> (N, C, 2 H, 2 W)."""
+    """(N, C, H, W) -> (N, C, 2 H, 2 W)."""
     return F.interpolate(x, scale_factor=2.0, mode="nearest")

@@ -1,8 +1,13 @@
-"""Parts that networks share: random drops from a given generator, the MLP, and up blocks."""
+"""Parts that networks share: random drops from a given generator, transformer and residual blocks.
+
+Published residual networks differ in the position of a block's stride and dilation; every such
+choice is an argument. Their parameters have torchvision's names.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -13,12 +18,13 @@ from rgbt.processes import num_processes, own
 from rgbt.ranges import ShareBelowOne
 
 DropRates = tuple[ShareBelowOne, ShareBelowOne]
-"""Channel dropout before the first block, and after every block; each in [0, 1)."""
+"""Channel dropout before the first block, and after every block."""
 
 Keep = Tensor | tuple[None, None]
 """Factors of the two residuals of a block, (2, N, 1, 1, 1); None where nothing is dropped."""
 
 ALL_KEPT = (None, None)
+StrideAt = Literal["1x1", "3x3"]
 
 
 def keep_factors(
@@ -36,9 +42,6 @@ def keep_factors(
     `rates` are (n,) probabilities of being dropped, in [0, 1); `shape` is that of the draws for
     each of them, such as (samples,), and `dim` the dimension of the samples in it. Returns
     (n, *shape) float32 on `device`. Each process draws for the samples of all processes.
-
-    Raises:
-        ValueError: no generator.
     """
     if generator is None:
         raise ValueError("training with random drops requires `generator`, got None.")
@@ -59,7 +62,7 @@ def stochastic_depth(
     """
     if rates is None:
         return [[ALL_KEPT] * depth for depth in depths]
-    drawn = keep_factors(rates, (2, len(x), 1, 1, 1), generator, x.device, dim=1)
+    drawn = keep_factors(rates.flatten(), (2, len(x), 1, 1, 1), generator, x.device, dim=1)
     return [stage.unbind() for stage in torch.split(drawn, list(depths))]
 
 
@@ -90,8 +93,7 @@ class Mlp(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(..., C) -> (..., C)."""
-        out: Tensor = self.fc2(F.gelu(self.fc1(x)))
-        return out
+        return self.fc2(F.gelu(self.fc1(x)))
 
 
 class ResidualBlock(nn.Module):
@@ -113,11 +115,14 @@ class ResidualBlock(nn.Module):
         return add_residual(x, self.mlp(self.norm2(x)), second)
 
 
-class UpBlock(nn.Module):
-    """Twice the size (bilinear), 3x3 convolution, normalisation, PReLU with one slope.
+def check_heads(key: str, heads: Sequence[int], widths: Sequence[int]) -> None:
+    """InputError unless the heads of every stage, settings of `key`, divide its channels."""
+    if any(width % number for width, number in zip(widths, heads, strict=True)):
+        raise InputError(f"{key}: {list(heads)} must divide the channels {list(widths)}.")
 
-    Source: HeatNet release, PSPNet decoder; thesis, Fig. 5.
-    """
+
+class UpBlock(nn.Module):
+    """Twice the size, 3x3 convolution, normalisation, PReLU with one slope (HeatNet; thesis)."""
 
     def __init__(self, in_channels: int, out_channels: int, *, align_corners: bool) -> None:
         super().__init__()
@@ -131,17 +136,13 @@ class UpBlock(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """(N, in, H, W) -> (N, out, 2 H, 2 W)."""
         larger = F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=self.align_corners)
-        result: Tensor = self.conv(larger)
-        return result
+        return self.conv(larger)
 
 
 def enlarge(
     x: Tensor, blocks: Iterable[nn.Module], rates: DropRates, generator: torch.Generator | None
 ) -> Tensor:
-    """`x` (N, C, H, W) through the blocks, with channels dropped before the first and after each.
-
-    Rates (0, 0) drop nothing and need no generator, as in evaluation.
-    """
+    """`x` (N, C, H, W) through the blocks; channels are dropped before the first and after each."""
     first, later = rates
     x = drop_channels(x, first, generator)
     for block in blocks:
@@ -149,7 +150,84 @@ def enlarge(
     return x
 
 
-def check_heads(key: str, heads: Sequence[int], widths: Sequence[int]) -> None:
-    """InputError unless the heads of every stage, settings of `key`, divide its channels."""
-    if any(width % number for width, number in zip(widths, heads, strict=True)):
-        raise InputError(f"{key}: {list(heads)} must divide the channels {list(widths)}.")
+class BasicBlock(nn.Module):
+    """Two 3x3 convolutions and a shortcut (ResNet-18 and -34; He et al., Fig. 5 left)."""
+
+    def __init__(self, in_channels: int, width: int, *, stride: int = 1) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(in_channels, width, 3, stride=stride, padding=1, bias=False)
+        self.bn1 = nn.BatchNorm2d(width)
+        self.conv2 = nn.Conv2d(width, width, 3, padding=1, bias=False)
+        self.bn2 = nn.BatchNorm2d(width)
+        self.downsample = _shortcut(in_channels, width, stride)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, in, H, W) -> (N, width, H / stride, W / stride)."""
+        y = F.relu(self.bn1(self.conv1(x)))
+        return F.relu(self.bn2(self.conv2(y)) + self.downsample(x))
+
+
+class Bottleneck(nn.Module):
+    """1x1, 3x3 and 1x1 convolution and a shortcut (ResNet-50 and deeper; He et al., Fig. 5 right).
+
+    `width` is that of the 3x3 convolution, which is dilated; four times as many channels leave the
+    block. Its stride is at the "3x3" as torchvision has it, or the "1x1" as in Caffe (DeepLab v2).
+    """
+
+    def __init__(
+        self,
+        in_channels: int,
+        width: int,
+        *,
+        stride: int = 1,
+        dilation: int = 1,
+        stride_at: StrideAt = "3x3",
+    ) -> None:
+        super().__init__()
+        first, second = (stride, 1) if stride_at == "1x1" else (1, stride)
+        self.conv1 = nn.Conv2d(in_channels, width, 1, stride=first, bias=False)
+        self.bn1 = nn.BatchNorm2d(width)
+        self.conv2 = nn.Conv2d(
+            width, width, 3, stride=second, padding=dilation, dilation=dilation, bias=False
+        )
+        self.bn2 = nn.BatchNorm2d(width)
+        self.conv3 = nn.Conv2d(width, 4 * width, 1, bias=False)
+        self.bn3 = nn.BatchNorm2d(4 * width)
+        self.downsample = _shortcut(in_channels, 4 * width, stride)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(N, in, H, W) -> (N, 4 width, H / stride, W / stride)."""
+        y = F.relu(self.bn1(self.conv1(x)))
+        y = F.relu(self.bn2(self.conv2(y)))
+        return F.relu(self.bn3(self.conv3(y)) + self.downsample(x))
+
+
+def _shortcut(in_channels: int, out_channels: int, stride: int) -> nn.Module:
+    """Identity where shapes allow it, else a strided 1x1 convolution with normalisation."""
+    if stride == 1 and in_channels == out_channels:
+        return nn.Identity()
+    convolution = nn.Conv2d(in_channels, out_channels, 1, stride=stride, bias=False)
+    return nn.Sequential(convolution, nn.BatchNorm2d(out_channels))
+
+
+def bottleneck_stage(
+    in_channels: int,
+    width: int,
+    blocks: int,
+    *,
+    stride: int = 1,
+    dilations: tuple[int, int] = (1, 1),
+    stride_at: StrideAt = "3x3",
+) -> nn.Sequential:
+    """Bottlenecks, the first strided; dilations are those of the first block and the others."""
+    first, others = dilations
+    made = [Bottleneck(in_channels, width, stride=stride, dilation=first, stride_at=stride_at)]
+    for _ in range(blocks - 1):
+        made.append(Bottleneck(4 * width, width, dilation=others, stride_at=stride_at))
+    return nn.Sequential(*made)
+
+
+def basic_stage(in_channels: int, width: int, blocks: int, *, stride: int = 1) -> nn.Sequential:
+    """Basic blocks of one width, the first strided."""
+    first = BasicBlock(in_channels, width, stride=stride)
+    return nn.Sequential(first, *(BasicBlock(width, width) for _ in range(blocks - 1)))

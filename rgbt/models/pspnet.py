@@ -8,26 +8,20 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.models.inputs import Inputs, only_view
-from rgbt.models.parts import DropRates, UpBlock, enlarge
-from rgbt.models.resnet import bottleneck_stage
+from rgbt.models.inputs import Images, Inputs, Network
+from rgbt.models.parts import DropRates, UpBlock, bottleneck_stage, enlarge
 from rgbt.ranges import BaseWidth, Channels, Depths, NumClasses
 from rgbt.requirements import Record
-from rgbt.types import MaskPair, Output, View
+from rgbt.types import Output, View
 
-STRIDE = 8
-"""Of the encoder; the decoder doubles the size three times."""
-
-BINS = (1, 2, 3, 6)
-"""Cells per side of the pooled maps (PSPNet, Sec. 3.2)."""
+BINS = (1, 2, 3, 6)  # cells per side of the pooled maps (PSPNet, Sec. 3.2)
 
 Modalities = Literal["late_fusion", "early_fusion", "rgb", "thermal"]
 
-BRANCHES = ("", "_2")
-"""What the released names of the first and second branch end with."""
+BRANCHES = ("", "_2")  # what the released names of the first and second branch end with
 
 
-class PSPNet(nn.Module):
+class PSPNet(Network):
     """PSPNet with ResNet-50 and without auxiliary head.
 
     Two branches are concatenated at 1/8 of the size, before the third stage. Weights are drawn as
@@ -39,6 +33,8 @@ class PSPNet(nn.Module):
 
     The arguments are the keys of ``conf/model/heatnet.yaml``.
     """
+
+    multiple = 8  # of the encoder; the decoder doubles the size three times
 
     def __init__(  # noqa: PLR0913 - each is a key of conf/model/*.yaml
         self,
@@ -54,7 +50,13 @@ class PSPNet(nn.Module):
     ) -> None:
         super().__init__()
         self.num_classes = num_classes
-        self.record = self.record_from(modalities=modalities)
+        fused = modalities in ("late_fusion", "early_fusion")
+        self.record = Record(
+            views=("rgbt",) if fused else ("rgb",) if modalities == "rgb" else ("thermal",),
+            features=True,
+            pretrained_parts=("feats.",),
+            recomputed=("feats.layer*.*", "up_*"),
+        )
         self.modalities = modalities
         self.dropout = dropout
         thermal = inputs.thermal_channels
@@ -74,56 +76,31 @@ class PSPNet(nn.Module):
                 nn.init.zeros_(module.bias)
         self.inputs = inputs
 
-    @staticmethod
-    def record_from(*, modalities: Modalities, **_: object) -> Record:
-        """Output and views."""
-        fused = modalities in ("late_fusion", "early_fusion")
-        return Record(
-            views=("rgbt",) if fused else ("rgb",) if modalities == "rgb" else ("thermal",),
-            features=True,
-            pretrained_parts=("feats.",),
-            recomputed=("feats.layer*.*", "up_*"),
-        )
+    def predict(self, images: Images, view: View, generator: torch.Generator | None) -> Output:
+        """Class scores of one image or both.
 
-    def forward(
-        self,
-        rgb: Tensor,
-        thermal: Tensor,
-        masks: MaskPair | None = None,
-        *,
-        views: tuple[View, ...] = (),
-        generator: torch.Generator | None = None,
-    ) -> Output:
-        """Class scores at the size of the image, as `rgbt.models` says.
-
-        Returns:
-            logits: (N, K, H, W).
-            aux: maps of the encoder. With w = base_width, branches concatenated, sides H and W
-                rounded up to multiples of 8 and then divided by s: "features" (32 w, s = 8),
-                "layer3" (16 w, s = 8), "layer2" (8 w per branch, s = 8), "layer1" (4 w per branch,
-                s = 4), "stem" (w per branch, s = 4).
+        In aux: maps of the encoder. With w = base_width, branches concatenated, sides H and W
+        rounded up to multiples of 8 and then divided by s: "features" (32 w, s = 8), "layer3"
+        (16 w, s = 8), "layer2" (8 w per branch, s = 8), "layer1" (4 w per branch, s = 4), "stem"
+        (w per branch, s = 4).
         """
-        only_view(views, self.record.views, "PSPNet")
-        images = self.inputs(rgb, thermal, masks, multiple=STRIDE)
         seen: tuple[Tensor, ...] = images
         if self.modalities == "early_fusion":
             seen = (torch.cat(images, 1),)
-        elif self.modalities != "late_fusion":
-            seen = (images.rgb if self.modalities == "rgb" else images.thermal,)
+        elif view != "rgbt":
+            seen = (images.rgb if view == "rgb" else images.thermal,)
         features = self.feats(seen)
         rates = self.dropout if self.training else (0.0, 0.0)
         x = self.psp(features["features"])
         x = enlarge(x, (self.up_1, self.up_2, self.up_3), rates, generator)
-        logits = self.final(x)[..., : rgb.shape[2], : rgb.shape[3]]
-        return Output(logits, features)
+        return Output(self.final(x), features)
 
 
 class PSPNetEncoder(nn.Module):
     """ResNet whose last two stages are dilated instead of strided.
 
-    Stem and first two stages exist once per image of so many `channels`. The first block of a
-    dilated stage is not dilated; after two branches the third stage keeps its width and has no
-    projection.
+    Stem and first two stages exist once per image. The first block of a dilated stage is not
+    dilated; after two branches the third stage keeps its width and has no projection.
     """
 
     def __init__(
@@ -143,7 +120,7 @@ class PSPNetEncoder(nn.Module):
         self.layer4 = bottleneck_stage(16 * width, 8 * width, depths[3], dilations=(1, 4))
 
     def forward(self, images: tuple[Tensor, ...]) -> dict[str, Tensor]:
-        """Features by the name of their stage, see `PSPNet.forward`."""
+        """Features by the name of their stage, see `PSPNet.predict`."""
         branches = []
         for end, image in zip(self.branches, images, strict=True):
             conv1, bn1, layer1, layer2 = (
@@ -163,9 +140,8 @@ class PSPNetEncoder(nn.Module):
 class PyramidPooling(nn.Module):
     """Means over 1, 4, 9 and 36 cells, projected, enlarged, and joined with the map.
 
-    There is neither normalisation nor activation inside the four branches.
-
-    Source: PSPNet, Fig. 3.   Released: HeatNet, whose branches keep all channels.
+    Source: PSPNet, Fig. 3.   Released: HeatNet, whose four branches keep all channels and have
+    neither normalisation nor activation.
     """
 
     def __init__(self, channels: int, out_channels: int, *, align_corners: bool) -> None:
@@ -180,8 +156,7 @@ class PyramidPooling(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, C, h, w) -> (N, out, h, w), >= 0."""
-        # A 1x1 convolution of joined, enlarged maps is the sum of the enlarged 1x1 convolutions of
-        # the small ones; a fifth of the multiplications remains.
+        # A convolution of joined, enlarged maps is the sum of the enlarged ones of the small maps.
         *shares, own = torch.split(self.bottleneck.weight, x.shape[1], dim=1)
         result = F.conv2d(x, own, self.bottleneck.bias)
         for stage, share in zip(self.stages, shares, strict=True):

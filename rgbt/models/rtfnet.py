@@ -12,14 +12,11 @@ from annotated_types import MultipleOf
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.models.inputs import Inputs, only_view
-from rgbt.models.resnet import basic_stage, bottleneck_stage
+from rgbt.models.inputs import Images, Inputs, Network
+from rgbt.models.parts import basic_stage, bottleneck_stage
 from rgbt.ranges import BaseWidth, NumClasses
 from rgbt.requirements import Record
-from rgbt.types import MaskPair, Output, View
-
-STRIDE = 32
-"""Five halvings, which the decoder undoes exactly."""
+from rgbt.types import Output, View
 
 BLOCKS = {
     18: (2, 2, 2, 2),
@@ -30,15 +27,14 @@ BLOCKS = {
 }
 """Depth of a ResNet -> blocks of its stages (He et al., Table 1)."""
 
-BASIC = (18, 34)
-"""Depths of basic blocks; the others have bottlenecks, which end in four times as many channels."""
+BASIC = (18, 34)  # the others have bottlenecks, which end in four times as many channels
 
 
 class Upception(nn.Module):
     """1x1, 3x3 and a third convolution, added to a shortcut, then a ReLU unless `relu` is false.
 
-    Source: RTFNet, Upception block A (3x3 convolution, identity) and block B (`up`: transposed
-    convolution, transposed shortcut: twice the size).
+    Block A has a 3x3 convolution and the identity, block B (`up`) a transposed convolution and a
+    transposed shortcut: twice the size.
     """
 
     def __init__(self, in_channels: int, channels: int, *, up: bool, relu: bool = True) -> None:
@@ -66,7 +62,7 @@ class Upception(nn.Module):
         return F.relu(y) if self.relu else y
 
 
-class RTFNet(nn.Module):
+class RTFNet(Network):
     """RGB-thermal fusion network of Sun et al.
 
     The thermal features are added to the RGB features after the stem and after each of the four
@@ -77,6 +73,8 @@ class RTFNet(nn.Module):
     The arguments are the keys of ``conf/model/rtfnet_50.yaml``. A thermal stem of three channels
     starts as a copy of RGB's instead of its mean; `thermal_stem` holds for ImageNet's weights too.
     """
+
+    multiple = 32  # five halvings, which the decoder undoes exactly
 
     def __init__(
         self,
@@ -90,7 +88,15 @@ class RTFNet(nn.Module):
     ) -> None:
         super().__init__()
         self.num_classes = num_classes
-        self.record = self.record_from(thermal_stem=thermal_stem)
+        # Parameters of the stem that ImageNet weights do not cover.
+        anew = {"encoder_thermal_conv1.": "drawn anew with model.thermal_stem=xavier"}
+        self.record = Record(
+            views=("rgbt",),
+            features=True,
+            pretrained_parts=("encoder_",),
+            recomputed=("encoder_*_layer*.*", "deconv*.*"),
+            drawn_anew=anew if thermal_stem == "xavier" else {},
+        )
         stage, expansion = (basic_stage, 1) if depth in BASIC else (bottleneck_stage, 4)
         for part, image_channels in (("rgb", 3), ("thermal", inputs.thermal_channels)):
             stem = nn.Conv2d(image_channels, base_width, 7, stride=2, padding=3, bias=False)
@@ -123,48 +129,20 @@ class RTFNet(nn.Module):
             rgb = self.get_parameter("encoder_rgb_conv1.weight").detach()
             thermal.data.copy_(rgb if rgb.shape == thermal.shape else rgb.mean(1, keepdim=True))
 
-    @staticmethod
-    def record_from(*, thermal_stem: str, **_: object) -> Record:
-        """Output, views, and the parameters that ImageNet weights do not cover."""
-        reason = "drawn anew with model.thermal_stem=xavier"
-        return Record(
-            views=("rgbt",),
-            features=True,
-            pretrained_parts=("encoder_",),
-            recomputed=("encoder_*_layer*.*", "deconv*.*"),
-            drawn_anew={"encoder_thermal_conv1.": reason} if thermal_stem == "xavier" else {},
-        )
+    def predict(self, images: Images, view: View, generator: torch.Generator | None) -> Output:  # noqa: ARG002
+        """Class scores from both images, >= 0 where `final_relu`.
 
-    def forward(
-        self,
-        rgb: Tensor,
-        thermal: Tensor,
-        masks: MaskPair | None = None,
-        *,
-        views: tuple[View, ...] = (),
-        generator: torch.Generator | None = None,  # noqa: ARG002 - nothing is dropped at random
-    ) -> Output:
-        """Class scores from both images, as `rgbt.models` says.
-
-        Returns:
-            logits: (N, K, H, W), >= 0 where `final_relu`.
-            aux: "features" (N, C, h, w) of the fourth stage of the RGB encoder, with those of the
-                thermal one added.
+        In aux: "features" (N, C, h, w) of the fourth stage of the RGB encoder, with those of the
+        thermal one added.
         """
-        only_view(views, self.record.views, "RTFNet")
-        images = self.inputs(rgb, thermal, masks, multiple=STRIDE)
-
-        def unit(name: str, x: Tensor) -> Tensor:
-            result: Tensor = self.get_submodule(f"encoder_{name}")(x)
-            return result
-
-        x = F.relu(unit("rgb_bn1", unit("rgb_conv1", images.rgb)))
-        y = F.relu(unit("thermal_bn1", unit("thermal_conv1", images.thermal)))
-        x, y = unit("rgb_maxpool", x + y), unit("thermal_maxpool", y)
+        unit = {name.removeprefix("encoder_"): each for name, each in self.named_children()}
+        x = F.relu(unit["rgb_bn1"](unit["rgb_conv1"](images.rgb)))
+        y = F.relu(unit["thermal_bn1"](unit["thermal_conv1"](images.thermal)))
+        x, y = unit["rgb_maxpool"](x + y), unit["thermal_maxpool"](y)
         for number in range(1, 5):
-            y = unit(f"thermal_layer{number}", y)
-            x = unit(f"rgb_layer{number}", x) + y
+            y = unit[f"thermal_layer{number}"](y)
+            x = unit[f"rgb_layer{number}"](x) + y
         features = x
         for number in range(1, 6):
-            x = self.get_submodule(f"deconv{number}")(x)
-        return Output(x[..., : rgb.shape[2], : rgb.shape[3]], {"features": features})
+            x = unit[f"deconv{number}"](x)
+        return Output(x, {"features": features})

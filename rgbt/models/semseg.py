@@ -9,22 +9,20 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.models.inputs import Inputs, as_rgb, only_view
-from rgbt.models.parts import drop_channels
+from rgbt.models.inputs import Images, Inputs, Network, as_rgb
+from rgbt.models.parts import bottleneck_stage, drop_channels
 from rgbt.models.pspnet import BINS
-from rgbt.models.resnet import bottleneck_stage
 from rgbt.ranges import BaseWidth, Depths, NumClasses, ShareBelowOne
 from rgbt.requirements import Record
-from rgbt.types import MaskPair, Output, View
+from rgbt.types import Output, View
 
 
-class SemsegPSPNet(nn.Module):
+class SemsegPSPNet(Network):
     """PSPNet with ResNet-50 as semseg has it: the teachers of the thesis.
 
-    It sees the RGB image or the thermal image, never both. Scores are enlarged to the image with
-    aligned corners; with sides of 8 n + 1 pixels, as semseg requires, that is exactly 8 times.
-    Convolutions of the backbone are drawn as semseg draws them (He et al., fan out); the others
-    keep torch's initialisation.
+    It sees the RGB image or the thermal image. Scores are enlarged to the image with aligned
+    corners; with sides of 8 n + 1 pixels, as semseg requires, that is exactly 8 times. Convolutions
+    of the backbone are drawn as in semseg (He et al., fan out), the others as in torch.
 
     Source: PSPNet, Fig. 3; thesis (J. Sun), Sec. V-C.   Released: hszhao/semseg; the names of the
     weights are its own.
@@ -44,8 +42,13 @@ class SemsegPSPNet(nn.Module):
     ) -> None:
         super().__init__()
         self.num_classes = num_classes
-        self.record = self.record_from(modalities=modalities)
-        self.modalities = modalities
+        self.record = Record(
+            views=(modalities,),
+            auxiliary=True,
+            features=True,
+            pretrained_parts=("layer",),
+            recomputed=("layer1.*", "layer2.*", "layer3.*", "layer4.*"),
+        )
         self.drop_rate = dropout
         width = base_width
         self.layer0 = nn.Sequential(
@@ -65,36 +68,13 @@ class SemsegPSPNet(nn.Module):
         self.aux = _head(16 * width, 4 * width, num_classes)
         self.inputs = inputs
 
-    @staticmethod
-    def record_from(*, modalities: View, **_: object) -> Record:
-        """Output, view and auxiliary head."""
-        return Record(
-            views=(modalities,),
-            auxiliary=True,
-            features=True,
-            pretrained_parts=("layer",),
-            recomputed=("layer1.*", "layer2.*", "layer3.*", "layer4.*"),
-        )
+    def predict(self, images: Images, view: View, generator: torch.Generator | None) -> Output:
+        """Class scores of one image.
 
-    def forward(
-        self,
-        rgb: Tensor,
-        thermal: Tensor,
-        masks: MaskPair | None = None,
-        *,
-        views: tuple[View, ...] = (),
-        generator: torch.Generator | None = None,
-    ) -> Output:
-        """Class scores at the size of the image, as `rgbt.models` says.
-
-        Returns:
-            logits: (N, K, H, W).
-            aux: "features" (N, 32 w, h, w) of the fourth stage, with w = base_width; "aux_logits"
-                (N, K, H, W) of the third stage.
+        In aux: "features" (N, 32 w, h, w) of the fourth stage, with w = base_width; "aux_logits"
+        (N, K, H, W) of the third stage.
         """
-        only_view(views, self.record.views, "SemsegPSPNet")
-        images = self.inputs(rgb, thermal, masks)
-        image = images.rgb if self.modalities == "rgb" else as_rgb(images.thermal)
+        image = images.rgb if view == "rgb" else as_rgb(images.thermal)
         x = F.max_pool2d(self.layer0(image), 3, stride=2, padding=1)
         layer3 = self.layer3(self.layer2(self.layer1(x)))
         layer4 = self.layer4(layer3)
@@ -102,15 +82,12 @@ class SemsegPSPNet(nn.Module):
         found = []
         for head, features in ((self.cls, self.ppm(layer4)), (self.aux, layer3)):
             narrow = drop_channels(head[:-1](features), rate, generator)
-            found.append(_enlarged(head[-1](narrow), rgb.shape[2:]))
+            found.append(_enlarged(head[-1](narrow), image.shape[2:]))
         return Output(found[0], {"features": layer4, "aux_logits": found[1]})
 
 
 class SemsegPooling(nn.Module):
-    """Means over 1, 4, 9 and 36 cells, narrowed, normalised, enlarged, and joined with the map.
-
-    Source: PSPNet, Fig. 3.   Released: hszhao/semseg.
-    """
+    """Means over 1, 4, 9 and 36 cells, narrowed, normalised, enlarged, and joined with the map."""
 
     def __init__(self, channels: int, narrow: int) -> None:
         super().__init__()

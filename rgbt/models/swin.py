@@ -1,8 +1,7 @@
 """Swin Transformer branch that can replace tokens by a learned mask token after its embedding.
 
-Maps are (N, H, W, C) throughout. Sizes need not be multiples of the window: a map is padded
-before it is rolled, and neither window nor shift shrinks on small maps, as in the detection code
-of Swin and in the CRM and SpatialSeg releases, and unlike the ImageNet classifier.
+Maps are (N, H, W, C) throughout. A map is padded before it is rolled, and neither window nor shift
+shrinks on small maps, as in the CRM and SpatialSeg releases, and unlike the ImageNet classifier.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ PATCH = 4
 
 @dataclass(frozen=True)
 class SwinShape:
-    """Sizes of one branch; see `Mask2Former` for their meaning."""
+    """Sizes of one branch; keys of ``conf/model/mask2former_swin_t.yaml``."""
 
     embed_dim: int
     depths: tuple[int, int, int, int]
@@ -39,29 +38,26 @@ class SwinShape:
 
 
 def relative_index(window: int) -> Tensor:
-    """Row of the bias table for each (query, key) pair of a window.
+    """Row of the bias table for each (query, key) pair of a window of so many tokens a side.
 
         index = (dy + window - 1) * (2 window - 1) + (dx + window - 1)
 
-    Source: Swin Transformer, Sec. 3.2, "Relative position bias".
-
-    `window` is the side in tokens; (window^2, window^2) int64, dy, dx = query minus key position.
+    (window^2, window^2) int64, dy, dx = query minus key position.   Source: Swin Transformer,
+    Sec. 3.2, "Relative position bias".
     """
     axis = torch.arange(window)
     yx = torch.stack(torch.meshgrid(axis, axis, indexing="ij")).flatten(1)
-    dy, dx = yx[:, :, None] - yx[:, None, :] + window - 1
-    index: Tensor = dy * (2 * window - 1) + dx
-    return index
+    dy, dx = (yx[:, :, None] - yx[:, None, :] + window - 1).unbind()
+    return dy * (2 * window - 1) + dx
 
 
 @lru_cache(maxsize=64)
 def shift_mask(hw: tuple[int, int], window: int, shift: int, device: torch.device) -> Tensor:
     """Mask added to attention scores to separate tokens that the roll made neighbours.
 
-    Source: Swin Transformer, Sec. 3.2, "Efficient batch computation for shifted configuration".
-
     For a map of `hw` tokens, multiples of `window`, that was rolled by 0 < `shift` < window:
     (windows, 1, window^2, window^2) float32, 0 within a region, -100 across regions. Kept per size.
+    Source: Swin Transformer, Sec. 3.2, "Efficient batch computation for shifted configuration".
     """
     with torch.inference_mode(False):
         # 0 before the last window, 1 in it, 2 in the tokens that the roll brought from the front.
@@ -91,8 +87,7 @@ class SwinPatchEmbed(nn.Module):
         patches = image.view(n, c, height // PATCH, PATCH, width // PATCH, PATCH)
         patches = patches.permute(0, 2, 4, 1, 3, 5).flatten(3)
         tokens = F.linear(patches, self.proj.weight.flatten(1), self.proj.bias)
-        normed: Tensor = self.norm(tokens)
-        return normed
+        return self.norm(tokens)
 
 
 class WindowAttention(nn.Module):
@@ -128,10 +123,8 @@ class WindowAttention(nn.Module):
         rows, columns = height // side, width // side
         # Windows and heads are cut out of the projected map in one copy.
         qkv = self.qkv(x).view(n, rows, side, columns, side, 3, self.heads, -1)
-        qkv = qkv.permute(5, 0, 1, 3, 6, 2, 4, 7).reshape(
-            3, n, rows * columns, self.heads, side * side, -1
-        )
-        q, k, v = qkv.unbind(0)
+        shape = 3, n, rows * columns, self.heads, side * side, -1
+        q, k, v = qkv.permute(5, 0, 1, 3, 6, 2, 4, 7).reshape(shape).unbind(0)
 
         # (heads, t, t) or, for shifted windows, (windows, heads, t, t) with t = window^2.
         bias = F.embedding(self.relative_position_index, self.relative_position_bias_table)
@@ -145,8 +138,7 @@ class WindowAttention(nn.Module):
         out = out.permute(0, 1, 4, 2, 5, 3, 6).reshape(n, height, width, dim)
         if shift:
             out = out.roll((shift, shift), (1, 2))
-        projected: Tensor = self.proj(out[:, : hw[0], : hw[1]])
-        return projected
+        return self.proj(out[:, : hw[0], : hw[1]])
 
 
 class PatchMerging(nn.Module):
@@ -165,8 +157,7 @@ class PatchMerging(nn.Module):
         x = x.view(n, (height + 1) // 2, 2, (width + 1) // 2, 2, dim)
         # Released order of the four: the row changes fastest.
         x = x.permute(0, 1, 3, 4, 2, 5).flatten(3)
-        out: Tensor = self.reduction(self.norm(x))
-        return out
+        return self.reduction(self.norm(x))
 
 
 class Stage(nn.Module):
@@ -212,10 +203,8 @@ class Swin(nn.Module):
     ) -> list[Tensor]:
         """Normalised maps of the four stages, (N, C_s, H/s, W/s), channels last in memory.
 
-        Args:
-            image: (N, c, H, W) normalised, sides multiples of 32.
-            hidden: (N, H/4, W/4) bool, True = the token is replaced by the mask token; None: none.
-            generator: draws stochastic depth; only read in training mode with a rate above 0.
+        Of a normalised image (N, c, H, W), sides multiples of 32; where `hidden` (N, H/4, W/4) is
+        true, the token is replaced by the mask token.
         """
         x = self.patch_embed(image)
         if hidden is not None:

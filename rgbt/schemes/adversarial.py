@@ -20,8 +20,6 @@ from rgbt.schemes.domains import Gradients, Passes, SourceAndTarget, scores
 from rgbt.types import GeneratorOf, Loss, Phase, TwoDomains
 
 DomainValue = Annotated[float, Interval(ge=-10, le=10)]
-"""Verdicts and the number they should be -> scalar (see `rgbt.losses.unlabelled`)."""
-
 CRITIC = "critic"
 
 
@@ -32,44 +30,18 @@ class Adversarial:
         segmentation    L_s(source) [+ L_s(target)] + weight w A
         discriminator   C = d(D(source), y_s) + d(D(target), y_t), halved on request
 
-    with D the discriminator, d the verdict loss, y_s and y_t the domains' numbers, and
+    with L_s the loss of one domain, D the discriminator (`critic`), d the verdict loss, y_s and y_t
+    the numbers of the domains, and
 
         A = d(D(target), y_s) [+ d(D(source), y_t) with `both_ways`]
 
-    w is 1, or the mean over pixels of 1 - c, c being the confidence of the target's labels.
+    w is 1, or the mean over pixels of 1 - c, c being the confidence of the target's labels. The
+    settings are the keys of ``conf/scheme/adversarial_heatnet.yaml``.
 
     Source: thesis (J. Sun), Eqs. 4 to 6; HeatNet, Sec. III; AdaptSegNet, Eqs. 1 to 3; ADVENT.
-
-    Attributes:
-        model: the network.
-        loss: L_s, of one domain.
-        domains: source and target.
-        critic: D (see `rgbt.models.critic.Critic`).
-        critic_optimizer: builder of its optimiser, named "critic" in phases.
-        judged: input of the discriminator: class probabilities (thesis, AdaptSegNet), raw
-            scores (HeatNet), or weighted self-information (ADVENT).
-        verdict_loss: d: "least_squares" (thesis, HeatNet), or "cross_entropy" with logits
-            (AdaptSegNet, ADVENT).
-        source_value: y_s. Thesis, AdaptSegNet, ADVENT: 0; HeatNet: 1.
-        target_value: y_t. The other one.
-        weight: of A. Thesis' code and HeatNet's best command: 0.01; AdaptSegNet, ADVENT: 0.001.
-        both_ways: whether the source is also trained to be classified as the target (HeatNet).
-        weighed_by_confidence: whether w is not 1 (HeatNet); needs labels with confidence.
-        halved: whether C is halved (AdaptSegNet, ADVENT).
-        supervise_target: whether L_s of the target is computed. Thesis, Eq. 4: no; the code of its
-            basic network and HeatNet: yes.
-        alternates: whether steps alternate between the two phases, the discriminator's first
-            (HeatNet); false: both in every step.
-        gradients: see `rgbt.schemes.domains.Gradients`. Released (thesis): "together"; the code of
-            its basic network: "kept".
-        idle_steps: what the optimiser of one phase does in a step of the other, where the steps
-            alternate. "none": nothing. "released" (HeatNet, thesis' port): it steps with gradients
-            of 0, because the release has one optimiser for both networks and torch 1.7. For
-            RMSprop this halves the memory of the mean of squared gradients; with a constant
-            gradient every step is sqrt(1 + alpha) = 1.41 times as long.
-
-    Raises:
-        InputError: numbers that the verdict loss does not take, idle steps without alternation.
+    Released, HeatNet and the thesis' port: one optimiser for both networks, with torch 1.7, which
+    also steps the network of the other phase with gradients of 0 (`idle_steps`). RMSprop's mean of
+    squares then decays, and every step is sqrt(1 + alpha) = 1.41 times as long.
     """
 
     model: nn.Module
@@ -91,7 +63,7 @@ class Adversarial:
     idle_steps: Literal["none", "released"] = "none"
 
     def __post_init__(self) -> None:
-        values = {"source": self.source_value, "target": self.target_value}
+        self.values = values = {"source": self.source_value, "target": self.target_value}
         setting = f"scheme.source_value={self.source_value:g}, target_value={self.target_value:g}"
         if self.source_value == self.target_value:
             raise InputError(f"{setting}: the discriminator requires two different numbers.")
@@ -99,25 +71,20 @@ class Adversarial:
             raise InputError(f"{setting}: cross_entropy requires numbers between 0 and 1.")
         if self.idle_steps == "released" and not self.alternates:
             raise InputError("scheme.idle_steps=released requires scheme.alternates=true.")
-        self.passes = Passes(
-            model=self.model, loss=self.loss, domains=self.domains, gradients=self.gradients
-        )
+        self.passes = Passes(self.model, self.loss, self.domains, self.gradients)
         # Fabric's wrapper takes the place of the network here.
         self.others: dict[str, nn.Module] = {CRITIC: self.critic}
         self.cost_of = VERDICT_LOSSES[self.verdict_loss]
-        self.values = values
 
     @property
     def record(self) -> Record:
         """Labels of the target where they are read, confidence where it weighs."""
         labels = self.supervise_target
         setting = f"scheme.supervise_target={str(labels).lower()}"
-        required = [Requirement("domains", "target_labels", labels, setting)]
-        if self.weighed_by_confidence:
-            setting = "scheme.weighed_by_confidence=true"
-            required.append(Requirement("domains", "target_confidence", True, setting))
+        weighed = ("domains", "target_confidence", True, "scheme.weighed_by_confidence=true")
         return self.passes.record_with(
-            *required,
+            Requirement("domains", "target_labels", labels, setting),
+            *((Requirement(*weighed),) if self.weighed_by_confidence else ()),
             *record_of(self.others[CRITIC]).requires,
             networks=self.others,
             builders={CRITIC: self.critic_optimizer},
@@ -136,10 +103,7 @@ class Adversarial:
             yield self._discriminator_phase(seen)._replace(idle=idle)
             return
         self.others[CRITIC].requires_grad_(False)
-        phases = self.passes.phases(
-            lambda: self._domain("source", batch, generator_of, seen),
-            lambda: self._domain("target", batch, generator_of, seen),
-        )
+        phases = self.passes.phases(lambda name: self._domain(name, batch, generator_of, seen))
         idle = (CRITIC,) if released else ()
         for number, phase in enumerate(phases):  # one step of the discriminator's optimiser
             yield phase._replace(idle=() if number else idle)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -25,7 +26,8 @@ class CRM:
 
     F, R, T are the predictions of the clean pass from RGB-T, RGB alone and thermal alone; primes
     mark the masked pass. SDC is the mean absolute difference of the final class logits of F' to
-    those of F, which are the fixed teacher; SDN the same for R' and T', summed.
+    those of F, which are the fixed teacher; SDN the same for R' and T', summed. The weights are
+    those of the modality, the complementary and the nonlocal term, 1 in the release.
 
     No loss reads the masks of R' and T', so the network does not predict them. With w_n = 0 nothing
     reads R' and T', and they are not predicted at all.
@@ -33,14 +35,7 @@ class CRM:
     With a masker that hides nothing there is no masked pass (the rows without masking of CRM
     Table 3a, which the release cannot run); the distillation weights must then be 0.
 
-    Attributes:
-        model: network with the arguments `passes`, `num_predictions` and `num_masks` of
-            `rgbt.models.mask2former`.
-        loss: criterion that returns one value per stacked pass.
-        masker: draws the masks of the masked pass.
-        modality_weight: w_m. 1 in the release.
-        complementary_weight: w_c. 1 in the release.
-        nonlocal_weight: w_n. 1 in the release.
+    The loss returns one value per stacked pass.
     """
 
     model: nn.Module
@@ -58,10 +53,8 @@ class CRM:
     @property
     def record(self) -> Record:
         """A network of all views in one pass; where something is distilled, a masked pass."""
-        weights = {
-            "complementary_weight": self.complementary_weight,
-            "nonlocal_weight": self.nonlocal_weight,
-        }
+        distilled = ("complementary_weight", "nonlocal_weight")
+        weights = {name: getattr(self, name) for name in distilled}
         return Record(
             requires=(
                 Requirement("model", "views", VIEWS),
@@ -80,16 +73,24 @@ class CRM:
         yield Phase(("main",), self._parts(batch, generator_of))
 
     def _parts(self, batch: Batch, generator_of: GeneratorOf) -> dict[str, Tensor]:
-        """Weighted parts of the loss."""
-        passes = 2 if self.hides_cells else 1
-        # Stacked pass by pass, F R T F' R' T': the supervised ones are the first len(weights).
+        """Weighted parts of the loss, from passes stacked in the order F R T F' R' T'."""
         modality = [self.modality_weight] * (len(self.views) - 1)
-        weights = torch.tensor([1.0, *modality, *[1.0] * (passes - 1)]).to(batch.rgb.device)
-        output = self._forward(batch, generator_of, supervised=len(weights))
-        supervised = {name: tensor[:, : len(weights)] for name, tensor in output.aux.items()}
-        parts = self.loss(Output(None, supervised), batch, generator_of("loss"))
+        weights = torch.tensor([1.0, *modality, *[1.0] * self.hides_cells]).to(batch.rgb.device)
+        supervised = len(weights)  # the first ones
+        generator, masks = generator_of("stochastic depth"), None
+        images, stacked = (batch.rgb, batch.thermal), dict[str, Any]()
+        if self.hides_cells:
+            masks = draw_masks(self.masker, batch, generator_of("mask"))
+            masks = MaskPair(*(torch.cat([torch.zeros_like(m), m]) for m in masks))
+            images = (batch.rgb.repeat(2, 1, 1, 1), batch.thermal.repeat(2, 1, 1, 1))
+            # SDN reads the class logits of R' and T'; without it, nothing reads them.
+            others = len(self.views) - 1 if self.nonlocal_weight else 0
+            stacked = {"passes": 2, "num_predictions": supervised + others, "num_masks": supervised}
+        output = self.model(*images, masks, views=self.views, generator=generator, **stacked)
+        read = {name: tensor[:, :supervised] for name, tensor in output.aux.items()}
+        parts = self.loss(Output(None, read), batch, generator_of("loss"))
         weighted = {name: (values * weights).sum() for name, values in parts.items()}
-        if passes == 2:
+        if self.hides_cells:
             teacher, *others = output.aux["class_logits"][-1]
             student, *singles = others[len(self.views) - 1 :]
             if self.complementary_weight:
@@ -97,25 +98,3 @@ class CRM:
             if self.nonlocal_weight:
                 weighted["sdn"] = self.nonlocal_weight * sdn(teacher, *singles)
         return weighted
-
-    def _forward(self, batch: Batch, generator_of: GeneratorOf, *, supervised: int) -> Output:
-        """What the network returns; it has masks of the first `supervised` predictions alone."""
-        generator = generator_of("stochastic depth")
-        output: Output
-        if not self.hides_cells:
-            output = self.model(batch.rgb, batch.thermal, views=self.views, generator=generator)
-            return output
-        masks = draw_masks(self.masker, batch, generator_of("mask"))
-        # SDN reads the class logits of R' and T'; without it, nothing reads them.
-        distilled = len(self.views) - 1 if self.nonlocal_weight else 0
-        output = self.model(
-            batch.rgb.repeat(2, 1, 1, 1),
-            batch.thermal.repeat(2, 1, 1, 1),
-            MaskPair(*(torch.cat([torch.zeros_like(m), m]) for m in masks)),
-            passes=2,
-            views=self.views,
-            num_predictions=supervised + distilled,
-            num_masks=supervised,
-            generator=generator,
-        )
-        return output

@@ -1,26 +1,27 @@
 """Self-training: a teacher, which is an average of the network, labels the target in every step.
 
-No run of a teacher is needed before (`domains.target.labels=experiment:...` has one). Class mixing
-pastes the pixels of some classes of a source image on a target image.
+Class mixing pastes the pixels of some classes of a source image on a target image.
 """
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Literal, Protocol
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
+from torch.nn.modules.batchnorm import _BatchNorm
 
+from rgbt.averaging import AveragedNetwork
 from rgbt.checks import InputError
 from rgbt.losses.distances import FeatureDistance
-from rgbt.losses.unlabelled import PseudoLabels, WeightedBy, pseudo_labels
+from rgbt.losses.unlabelled import WeightedBy, pseudo_labels
 from rgbt.processes import mean_count, own_draw
 from rgbt.ranges import NonNegative, Share
 from rgbt.requirements import Record, Requirement
 from rgbt.schemes.domains import Passes, SourceAndTarget, draw_masks, scores
-from rgbt.schemes.teacher import Normalisation, Teacher, frozen_copy
 from rgbt.types import AnyMasker, Batch, GeneratorOf, Loss, Phase, TwoDomains, View
 
 TEACHER = "teacher"
@@ -28,21 +29,43 @@ CONFIDENT_SHARE, CONFIDENCE = "teacher/confident_share", "teacher/confidence"
 """Names in the log: share of the target's pixels whose highest probability reaches the threshold,
 and the mean of the highest probabilities."""
 
-NUM_VALUES = 256
-"""Values of a label: the classes and 255, which is pasted like a class."""
-
-LUMA = (0.299, 0.587, 0.114)
-"""Of red, green and blue (ITU-R BT.601)."""
+NUM_VALUES = 256  # of a label: the classes and 255, which is pasted like a class
+LUMA = (0.299, 0.587, 0.114)  # of red, green and blue (ITU-R BT.601)
+Normalisation = Literal["batch", "running"]
 
 
-class DatasetClasses(Protocol):
-    """What is read of a data set (`rgbt.dataset.LabelledDataset`)."""
+class Teacher:
+    """The moving average w' of the parameters w of a network, before the update of step t.
 
-    classes: tuple[str, ...]
+        w' <- a w' + (1 - a) w,   a = min(1 - 1 / (t + 1), decay),   t = 0, 1, ...
 
+    Buffers are not averaged. With the normalisation "batch" it is in training mode without dropout,
+    stochastic depth and changes of statistics; with "running" in evaluation mode. `average` is w'.
+    Source: Tarvainen and Valpola, "Mean teachers are better role models".   Released: "batch".
+    """
 
-Augmentation = Callable[[Tensor, Tensor, torch.Generator], tuple[Tensor, Tensor]]
-"""RGB and thermal -> images of the same shapes (`rgbt.transforms.strong`)."""
+    def __init__(self, network: nn.Module, *, decay: float, normalisation: Normalisation) -> None:
+        self.average = AveragedNetwork(network, buffers=False)
+        self._student = (network,)  # of which it is no part
+        self._decay, self._normalisation = decay, normalisation
+        self._step: int | None = None
+
+    def update(self, step: int) -> None:
+        """Average the parameters before `step`; a second call in the same step does nothing."""
+        if step != self._step:
+            self._step = step
+            self.average.update(self._student[0], max(1 / (step + 1), 1 - self._decay))
+
+    def network(self) -> nn.Module:
+        """The teacher, ready to predict; normalisations that the student froze stay frozen."""
+        teacher = self.average.module.eval()
+        if self._normalisation == "batch":
+            both = zip(teacher.modules(), self._student[0].modules(), strict=True)
+            for norm, own in both:
+                if isinstance(norm, _BatchNorm) and own.training:
+                    norm.train()
+                    norm.track_running_stats = False
+        return teacher
 
 
 @dataclass(kw_only=True, eq=False)
@@ -54,49 +77,26 @@ class SelfTraining:
     The teacher predicts labels of the unchanged target. The mix is the target, with half of the
     classes of the source pasted on it, after strong augmentation. Its labels are those of the
     source where it is pasted, with weight 1, and those of the teacher elsewhere, with the weight q
-    of `rgbt.losses.unlabelled`. The masked images hide cells of the target, and are trained with
-    the labels of the teacher.
+    of `rgbt.losses.unlabelled`. The masked images hide cells of the target (MIC; from day to night
+    of both), and have the labels of the teacher. Of an RGB-thermal pair, both images are pasted
+    with the same pixels, and masked with the cells that `masker.pairing` gives each. A domain that
+    sees one image pastes what it sees (`seen_as`).
 
-    Of an RGB-thermal pair, both images are pasted with the same pixels, and masked with the cells
-    that `masker.pairing` gives each. A domain that sees one image pastes what it sees
-    (`seen_as`).
-
-    The feature distance (`rgbt.losses.distances`) compares the last stage of the encoder, of
-    the unchanged source, with that of the network as it was when training started: with the weights
-    and running statistics of `model.weights`, in evaluation mode.
+    The feature distance (`rgbt.losses.distances`) compares the last stage of the encoder, of the
+    unchanged source, with that of the network that training started from, in evaluation mode.
 
     Source: DACS; DAFormer, Sec. 3.1 and 3.3 (rare class sampling: `rgbt.data.rare_classes`); MIC.
     Paper: q is a share of each image (DAFormer).   Released: of the batch.
 
-    Attributes:
-        model: the network.
-        loss: L_s, of one domain; it weighs pixels by their confidence.
-        masker: draws the hidden cells of the masked images.
-        domains: a labelled source and a target whose labels are "none".
-        augmentation: of the mix, and of masked images of the target.
-        decay: of the teacher (`rgbt.schemes.teacher.Teacher`).
-        teacher_norm: see there.
-        threshold: probability from which a pixel of the teacher is confident.
-        weighted_by: see `rgbt.losses.unlabelled`.
-        ignored_top: share of the rows at the top without a pseudo-label.
-        ignored_bottom: the same at the bottom.
-        mixing: "classes", or "none": the target alone, augmented.
-        masked_weight: of the loss of masked images, MIC: 1; 0: there are none.
-        masked_images: "target": the images of the target, augmented; "both": those of the source,
-            with its labels, and of the target, not augmented, each with half of the weight. MIC:
-            "target"; from day to night "both" (mask_mode separate, with one image of each).
-        feature_distance: its settings; None: there is none.
-        dataset: names the classes for the feature distance.
-
-    Raises:
-        InputError: no row is left for pseudo-labels; an unknown thing class.
+    The settings are the keys of ``conf/scheme/self_training.yaml``. `augmentation` maps RGB and
+    thermal to images of the same shapes (`rgbt.transforms.strong`), `dataset` names the classes.
     """
 
     model: nn.Module
     loss: Loss
     masker: AnyMasker
     domains: SourceAndTarget
-    augmentation: Augmentation
+    augmentation: Callable[[Tensor, Tensor, torch.Generator], tuple[Tensor, Tensor]]
     decay: Share
     teacher_norm: Normalisation
     threshold: Share
@@ -107,20 +107,17 @@ class SelfTraining:
     masked_weight: NonNegative
     masked_images: Literal["target", "both"]
     feature_distance: FeatureDistance | None = None
-    dataset: DatasetClasses | None = None
+    dataset: Any = None
 
     def __post_init__(self) -> None:
         if self.ignored_top + self.ignored_bottom >= 1:
             raise InputError("scheme.ignored_top + scheme.ignored_bottom must be below 1.")
-        self.passes = Passes(
-            model=self.model, loss=self.loss, domains=self.domains, gradients="apart"
-        )
+        self.passes = Passes(self.model, self.loss, self.domains, "apart")
         self.teacher = Teacher(self.model, decay=self.decay, normalisation=self.teacher_norm)
         self.initial: nn.Module | None = None
         if self.feature_distance is not None:
-            assert self.dataset is not None, "a run has a data set"
             self.feature_distance.indices(self.dataset.classes)
-            self.initial = frozen_copy(self.model)
+            self.initial = copy.deepcopy(self.model).eval().requires_grad_(False)
 
     @property
     def record(self) -> Record:
@@ -136,40 +133,34 @@ class SelfTraining:
         )
 
     def phases(self, batch: TwoDomains, generator_of: GeneratorOf) -> Iterator[Phase]:
-        """One phase, or one per optimiser, of images in [0, 1]; see `LabelledDomains.phases`."""
+        """One phase, or one per optimiser, of images in [0, 1]."""
         self.teacher.update(batch.step)
-        labels = self._labels(batch.target, generator_of)
-        target = replace(batch.target, label=labels.label, confidence=labels.weight)
-        logged = {CONFIDENT_SHARE: labels.confident, CONFIDENCE: labels.confidence}
-        phases = self.passes.phases(
-            lambda: self._source(batch.source, generator_of),
-            lambda: self._target(batch.source, target, generator_of),
-        )
-        for number, phase in enumerate(phases):
-            yield phase._replace(logged={} if number else logged)
-
-    def _labels(self, target: Batch, generator_of: GeneratorOf) -> PseudoLabels:
         with torch.no_grad():
             network = self.teacher.network()
-            output = self.passes.output("target", target, generator_of, network=network)
+            output = self.passes.output("target", batch.target, generator_of, network=network)
         ignored = (self.ignored_top, self.ignored_bottom)
-        return pseudo_labels(scores(output), self.threshold, self.weighted_by, ignored)
+        labels = pseudo_labels(scores(output), self.threshold, self.weighted_by, ignored)
+        target = replace(batch.target, label=labels.label, confidence=labels.weight)
+        logged = {CONFIDENT_SHARE: labels.confident, CONFIDENCE: labels.confidence}
+
+        def cost(name: str) -> dict[str, Tensor]:
+            if name == "source":
+                return self._source(batch.source, generator_of)
+            return self._target(batch.source, target, generator_of)
+
+        for number, phase in enumerate(self.passes.phases(cost)):
+            yield phase._replace(logged={} if number else logged)
 
     def _source(self, source: Batch, generator_of: GeneratorOf) -> dict[str, Tensor]:
         output, parts = self.passes.supervised("source", source, generator_of)
         if self.masked_weight and self.masked_images == "both":
             parts |= self._masked("source", source, generator_of)
-        if self.initial is not None:
-            assert self.feature_distance is not None
-            assert self.dataset is not None
+        if self.feature_distance is not None:
             with torch.no_grad():
                 initial = self.passes.output("source", source, generator_of, network=self.initial)
-            parts["source/feature_distance"] = self.feature_distance(
-                output.aux["features"],
-                initial.aux["features"],
-                source.label,
-                self.dataset.classes,
-            )
+            now, start = output.aux["features"], initial.aux["features"]
+            distance = self.feature_distance(now, start, source.label, self.dataset.classes)
+            parts["source/feature_distance"] = distance
         return parts
 
     def _target(self, source: Batch, target: Batch, generator_of: GeneratorOf) -> dict[str, Tensor]:
@@ -202,15 +193,9 @@ class SelfTraining:
 def pasted_pixels(label: Tensor, generator: torch.Generator) -> Tensor:
     """(B, H, W) bool: the pixels of half of the classes, drawn for every image.
 
-    With n values in the labels of the batch, ceil(n / 2) of them are drawn for each image, without
-    replacement. A drawn value that the image does not have pastes nothing.
-
-    Source: ClassMix; DACS.   Released: DACS, DAFormer, HRDA and MIC, whose values are those of the
-    batch and include 255.
-
-    Args:
-        label: (B, H, W) int64, 0..255.
-        generator: of any device.
+    With n values in the labels of the batch, 255 among them, ceil(n / 2) are drawn for each image,
+    without replacement. A drawn value that the image does not have pastes nothing.
+    Source: ClassMix; DACS, DAFormer, HRDA and MIC as released.
     """
     present = torch.zeros(NUM_VALUES, device=label.device)
     present = mean_count(present.index_fill(0, label.flatten(), 1.0)) > 0
@@ -228,10 +213,7 @@ def pasted_pixels(label: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def mixed(source: Batch, target: Batch, pasted: Tensor) -> Batch:
-    """The target with the pixels `pasted` (B, H, W) of the source in both images and the label.
-
-    Pasted pixels have weight 1; the others keep the confidence of the target, which it must have.
-    """
+    """The target with the pixels `pasted` (B, H, W) of the source, which have weight 1."""
     assert target.confidence is not None, "pseudo-labels have a weight"
     return replace(
         target,
@@ -245,9 +227,7 @@ def mixed(source: Batch, target: Batch, pasted: Tensor) -> Batch:
 def seen_as(batch: Batch, own: View | None, other: View | None) -> Batch:
     """The batch with what its domain sees, in the channels that another domain sees.
 
-    RGB becomes thermal as its luma; thermal becomes RGB as grey. A domain that sees RGB alone has
-    no thermal images to paste. Domains with the same view, or with both images, paste what they
-    have.
+    RGB becomes thermal as its luma; thermal becomes RGB as grey; else it stays as it is.
     """
     if {own, other} != {"rgb", "thermal"}:
         return batch

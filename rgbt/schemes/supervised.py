@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import ClassVar
 
 from torch import nn
 
@@ -11,34 +13,24 @@ from rgbt.schemes.domains import SourceAndTarget, draw_masks, options_of
 from rgbt.types import AnyMasker, Batch, GeneratorOf, Loss, Phase
 
 
+@dataclass(kw_only=True, eq=False)
 class Supervised:
-    """Train on the labels with one pass; a masker that hides something masks that pass.
+    """Train on the labels with one pass; a masker that hides something masks that pass."""
 
-    Args:
-        model: the network.
-        loss: of its output and the labels.
-        masker: draws the hidden cells.
-        domains: view and head of the source.
-    """
-
-    record = Record(shows_views=True)
-
-    def __init__(
-        self, *, model: nn.Module, loss: Loss, masker: AnyMasker, domains: SourceAndTarget
-    ) -> None:
-        self.model = model
-        self.loss = loss
-        self.masker = masker
-        self.hides_cells = record_of(masker).hides_cells
-        self.options = options_of(domains.source)
+    model: nn.Module
+    loss: Loss
+    masker: AnyMasker
+    domains: SourceAndTarget
+    record: ClassVar[Record] = Record(shows_views=True)
 
     def phases(self, batch: Batch, generator_of: GeneratorOf) -> Iterator[Phase]:
         """One phase with the parts of the loss."""
         masks = None
-        if self.hides_cells:
+        if record_of(self.masker).hides_cells:
             masks = draw_masks(self.masker, batch, generator_of("mask"))
+        options = options_of(self.domains.source)
         generator = generator_of("stochastic depth")
-        output = self.model(batch.rgb, batch.thermal, masks, generator=generator, **self.options)
+        output = self.model(batch.rgb, batch.thermal, masks, generator=generator, **options)
         parts = self.loss(output, batch, generator_of("loss"))
         del output  # the loop holds this frame until all accumulated batches are done
         yield Phase(("main",), {name: values.sum() for name, values in parts.items()})

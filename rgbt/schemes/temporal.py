@@ -8,26 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol, cast
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
-from rgbt.geometry.halving import halved_all, halved_mean
-from rgbt.geometry.warp import Warp
+from rgbt.geometry.warp import Warp, halved_all, halved_mean
 from rgbt.processes import own_draw
 from rgbt.requirements import Record, Requirement, record_of
 from rgbt.types import Batch, Frame, GeneratorOf, Output, Phase
-
-
-class VirtualViews(Protocol):
-    """What is called of a view, which draws the second frame (`rgbt.transforms.views`)."""
-
-    def draw(self, count: int, generator: torch.Generator) -> Tensor: ...  # noqa: D102
-    def warp(self, angles: Tensor, image_hw: tuple[int, int]) -> Warp: ...  # noqa: D102
-    def batch(self, batch: Batch, warp: Warp) -> Batch: ...  # noqa: D102
-    def valid(self, warp: Warp) -> Tensor: ...  # noqa: D102
 
 
 @dataclass(kw_only=True, eq=False)
@@ -38,23 +28,17 @@ class Temporal:
     one after the other, as released; else as one batch, which is the same function and faster.
 
     Paper: the first prediction ("segmentation map") is warped to the second frame; whether its
-        gradient stops is left open.
-    Released: scores are warped and normalised afterwards, and no gradient passes.
+    gradient stops is open.   Released: scores are warped, then normalised; no gradient passes.
 
-    Attributes:
-        model: any network; one that returns masks of queries needs `dense_logits`.
-        loss: loss of two frames (see `rgbt.losses.temporal.TemporalLoss`).
-        view: draws virtual views and applies them.
-        warps: "logits": scores are interpolated, then normalised; "probabilities": the reverse.
-        detach: whether the first prediction is a fixed teacher of the second.
-        resolution: of the loss between the predictions. "full" compares pixels. "half" is faster:
-            it averages the scores of both frames over 2x2 pixels and compares these means. A
-            mean counts where all of its pixels do. Paper and released: full.
+    The loss is one of two frames (`rgbt.losses.temporal.TemporalLoss`), the view draws and applies
+    virtual views (`rgbt.transforms.views.VirtualView`). At the resolution "half", the scores of
+    both frames are averaged over 2x2 pixels and these means are compared. A mean counts where all
+    of its pixels do. The settings are the keys of ``conf/scheme/temporal_paper.yaml``.
     """
 
     model: nn.Module
     loss: Any
-    view: VirtualViews
+    view: Any
     warps: Literal["logits", "probabilities"]
     detach: bool
     resolution: Literal["full", "half"] = "full"
@@ -106,31 +90,32 @@ class Temporal:
             return warp.bilinear(scores.softmax(1))
         return warp.bilinear(scores).softmax(1)
 
-    def _frames(
-        self, first: Batch, second: Batch, generator_of: GeneratorOf
-    ) -> tuple[Frame, Frame]:
+    def _frames(self, first: Batch, second: Batch, generator_of: GeneratorOf) -> list[Frame]:
         generator = generator_of("stochastic depth")
+        batches = (first, second)
         if self.apart and not self.stacks:
-            one, two = (self.model(x.rgb, x.thermal, generator=generator) for x in (first, second))
-            return self._frame(one, first), self._frame(two, second)
-        rgb = torch.cat([first.rgb, second.rgb])
-        thermal = torch.cat([first.thermal, second.thermal])
-        passes = {"passes": 2} if self.stacks else {}
-        output = self.model(rgb, thermal, generator=generator, **passes)
+            outputs = [self.model(x.rgb, x.thermal, generator=generator) for x in batches]
+        else:
+            rgb, thermal = (
+                torch.cat([getattr(x, name) for x in batches]) for name in ("rgb", "thermal")
+            )
+            passes = {"passes": 2} if self.stacks else {}
+            output = self.model(rgb, thermal, generator=generator, **passes)
+            outputs = [self._part(output, number, len(first.name)) for number in (0, 1)]
         frames = []
-        for number, batch in enumerate((first, second)):
-            if self.stacks:  # (L, P = 2, B, ...)
-                one_pass = slice(number, number + 1)
-                own = Output(None, {k: v[:, one_pass] for k, v in output.aux.items()})
-            else:  # scores, and what networks return beside, have the batch first
-                part = slice(number * len(batch.name), (number + 1) * len(batch.name))
-                own = Output(output.logits[part], {k: v[part] for k, v in output.aux.items()})
-            frames.append(self._frame(own, batch))
-        return frames[0], frames[1]
+        for output, batch in zip(outputs, batches, strict=True):
+            logits = output.logits
+            if logits is None:  # masks of queries
+                model: Any = self.model
+                logits = model.dense_logits(output, (batch.rgb.shape[2], batch.rgb.shape[3]))
+            frames.append(Frame(output, batch, logits))
+        return frames
 
-    def _frame(self, output: Output, batch: Batch) -> Frame:
-        logits = output.logits
-        if logits is None:  # masks of queries
-            hw = (batch.rgb.shape[2], batch.rgb.shape[3])
-            logits = cast(Tensor, cast(Any, self.model).dense_logits(output, hw))
-        return Frame(output, batch, logits)
+    def _part(self, output: Output, number: int, count: int) -> Output:
+        """What is of one of two frames."""
+        if self.stacks:  # (L, P = 2, B, ...)
+            one_pass = slice(number, number + 1)
+            return Output(None, {name: each[:, one_pass] for name, each in output.aux.items()})
+        part = slice(number * count, (number + 1) * count)
+        assert output.logits is not None, "a network that does not stack passes has scores"
+        return Output(output.logits[part], {name: each[part] for name, each in output.aux.items()})

@@ -15,21 +15,13 @@ from rgbt.requirements import Record, Requirement
 from rgbt.schemes.domains import Gradients, Passes, SourceAndTarget, scores
 from rgbt.types import IGNORE, GeneratorOf, Loss, Phase, TwoDomains
 
-UnlabelledLoss = Callable[[Tensor], dict[str, Tensor]]
-"""(B, K, H, W) probabilities -> named, weighted scalars (see `rgbt.losses.unlabelled`)."""
-
 
 @dataclass(kw_only=True, eq=False)
 class LabelledDomains:
-    """Segmentation of both domains with the labels of each.
+    """Segmentation of both domains with the labels of each; `loss` is that of one domain.
 
     Source: thesis (J. Sun), Sec. III-B, first stage; also HeatNet's students and first stage.
-
-    Attributes:
-        model: the network.
-        loss: of one domain.
-        domains: source and target, both with labels.
-        gradients: see `rgbt.schemes.domains.Gradients`. Released (thesis): "kept".
+    Released (thesis): the gradients "kept".
     """
 
     model: nn.Module
@@ -47,9 +39,9 @@ class LabelledDomains:
 
     def phases(self, batch: TwoDomains, generator_of: GeneratorOf) -> Iterator[Phase]:
         """One phase, or one per optimiser."""
+        batches = {"source": batch.source, "target": batch.target}
         yield from self.passes.phases(
-            lambda: self.passes.supervised("source", batch.source, generator_of)[1],
-            lambda: self.passes.supervised("target", batch.target, generator_of)[1],
+            lambda name: self.passes.supervised(name, batches[name], generator_of)[1]
         )
 
 
@@ -57,30 +49,21 @@ class LabelledDomains:
 class UnlabelledTarget:
     """Segmentation of the source, and a loss without labels on the target.
 
-    Source: MaxSquareLoss; ADVENT (direct entropy minimisation); thesis (J. Sun), Sec. III-A.
+    `unlabelled` maps the probabilities (B, K, H, W) of the target to named, weighted scalars; the
+    auxiliary head may also be trained with the guidance of both heads (`guidance`).
 
-    Attributes:
-        model: the network.
-        loss: of the source.
-        domains: a labelled source and a target whose labels are "none".
-        unlabelled: loss of the target's probabilities (`rgbt.losses.unlabelled`).
-        guidance_weight: of the cross-entropy of the auxiliary head with the guidance of both heads
-            (`rgbt.losses.unlabelled.guidance`); 0 for none. Released: 0.01, the product of 0.1 and
-            0.1.
-        guidance_threshold: probability above which a head is sure. Released: 0.95.
+    Source: MaxSquareLoss; ADVENT (direct entropy minimisation); thesis (J. Sun), Sec. III-A.
     """
 
     model: nn.Module
     loss: Loss
     domains: SourceAndTarget
-    unlabelled: UnlabelledLoss
+    unlabelled: Callable[[Tensor], dict[str, Tensor]]
     guidance_weight: NonNegative
     guidance_threshold: Share
 
     def __post_init__(self) -> None:
-        self.passes = Passes(
-            model=self.model, loss=self.loss, domains=self.domains, gradients="apart"
-        )
+        self.passes = Passes(self.model, self.loss, self.domains, "apart")
 
     @property
     def record(self) -> Record:
@@ -90,13 +73,12 @@ class UnlabelledTarget:
         return self.passes.record_with(Requirement("domains", "target_labels", False), *guided)
 
     def phases(self, batch: TwoDomains, generator_of: GeneratorOf) -> Iterator[Phase]:
-        """One phase, or one per optimiser; see `LabelledDomains.phases`."""
-        yield from self.passes.phases(
-            lambda: self.passes.supervised("source", batch.source, generator_of)[1],
-            lambda: self._target(batch, generator_of),
-        )
+        """One phase, or one per optimiser."""
+        yield from self.passes.phases(lambda name: self._cost(name, batch, generator_of))
 
-    def _target(self, batch: TwoDomains, generator_of: GeneratorOf) -> dict[str, Tensor]:
+    def _cost(self, name: str, batch: TwoDomains, generator_of: GeneratorOf) -> dict[str, Tensor]:
+        if name == "source":
+            return self.passes.supervised("source", batch.source, generator_of)[1]
         output = self.passes.output("target", batch.target, generator_of)
         probabilities = scores(output).float().softmax(1)
         parts = dict(self.unlabelled(probabilities))

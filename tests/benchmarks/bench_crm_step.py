@@ -94,9 +94,9 @@ def points(criterion: SetCriterion, network: Mask2Former, batch: Batch, layers: 
     """The same draws for both: 4 supervised passes of all layers."""
     sets = 4 * layers
     masks = sum(len(label.unique()) for label in batch.label)
-    number = criterion.sampling.candidates + criterion.sampling.fresh
+    number = criterion.num_drawn
     generator = torch.Generator().manual_seed(2)
-    shape = (sets, len(batch.label), criterion.matcher.num_points, 2)
+    shape = (sets, len(batch.label), criterion.num_points, 2)
     matcher = 2 * torch.rand(shape, generator=generator) - 1
     return Replayed(matcher, 2 * torch.rand((sets, masks, number, 2), generator=generator) - 1, 4)
 

@@ -36,9 +36,9 @@ from torch.utils._pytree import tree_leaves
 
 from rgbt.config.component import build
 from rgbt.config.compose import compose
-from rgbt.engine.network_settings import recompute_activations
+from rgbt.engine.device import recompute_activations
 from rgbt.geometry.padding import padded_hw
-from rgbt.losses import matcher
+from rgbt.losses import set_criterion
 from rgbt.schemes.crm import CRM
 from rgbt.types import Batch, MaskPair
 
@@ -168,13 +168,14 @@ def hide(image_hw: tuple[int, int], centre_yx: Tensor, _: torch.Generator) -> Ma
 def without_numbers() -> Iterator[None]:
     """Matching reads no numbers: the first queries are matched to the first classes."""
 
-    def assign(costs: Tensor, _: Any) -> matcher.Matches:
+    def assign(costs: Tensor, _: Any) -> set_criterion.Matches:
         sets, images = costs.shape[:2]
         image = np.repeat(np.arange(images), TARGETS)
         query = np.tile(np.arange(TARGETS), images)
-        return matcher.Matches(image, query.copy(), np.tile(query, (sets, 1)))
+        queries = np.tile(query, (sets, 1))
+        return set_criterion.Matches(image, query.copy(), queries, slice(None), len(image))
 
-    with mock.patch.object(matcher, "assign", assign):
+    with mock.patch.object(set_criterion, "assign", assign):
         yield
 
 

@@ -193,10 +193,10 @@ def _costs(
 
 @torch.no_grad()
 def _loss_points(criterion: SetCriterion, logits_Mhw: Tensor, drawn: Tensor) -> Tensor:
-    sampling = criterion.sampling
-    candidates, fresh = drawn[:, : sampling.candidates], drawn[:, sampling.candidates :]
+    number = criterion.num_candidates
+    candidates, fresh = drawn[:, :number], drawn[:, number:]
     uncertainty = -_at(logits_Mhw[:, None], candidates)[:, 0].abs()
-    index = uncertainty.topk(sampling.kept, dim=1).indices
+    index = uncertainty.topk(criterion.num_kept, dim=1).indices
     kept = torch.stack([row[i] for row, i in zip(candidates, index, strict=True)])
     return torch.cat([kept, fresh], dim=1)
 

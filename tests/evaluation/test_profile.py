@@ -183,7 +183,6 @@ def test_command_counts_without_measurement(call: Call, tmp_path: Path) -> None:
         (("models=cmx_b0,mfnte",), "did you mean 'mfnet"),
         (("model=mfnet", "image_hw=480"), "image_hw"),
         (("model=mfnet", "masker=grbm_paper"), "masker"),
-        (("model=cmx_tiny", "image_hw=3,3", "measure=false", *CPU), "model.sr_ratios"),
         (("run=nothing",), "nothing"),
         (("networks=nothing.yaml",), "nothing.yaml"),
     ],

@@ -1,7 +1,8 @@
-"""The loss of two frames: by its parts, against the release, and as the configuration builds it."""
+"""The loss of two frames and its soft overlaps: by hand, class by class, against the release."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,20 +12,155 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from rgbt.checks import InputError
-from rgbt.geometry.halving import halved_label
+from rgbt.geometry.warp import halved_label
 from rgbt.losses.cross_entropy import CrossEntropy
-from rgbt.losses.temporal import TemporalLoss, con, con_acc, dice
-from rgbt.requirements import Requirement
+from rgbt.losses.temporal import SIGMA, Form, TemporalLoss, con, con_acc, dice
 from rgbt.types import Frame, Output
 from tests.losses.problems import (
     NOTHING,
     batch_of,
-    criterion_of,
-    problem_of,
     recorded_losses,
     seeded,
 )
 from tests.models.golden import requires_golden
+
+# ---- overlaps ----
+FORMS: tuple[Form, ...] = ("paper", "released")
+BY_FORM = pytest.mark.parametrize("form", FORMS)
+OVERLAPS: dict[str, Callable[..., Tensor]] = {
+    "dice": lambda p, q, label, form: dice(q, label, form),
+    "con": lambda p, q, label, form: con(p, q, label != 255, form),
+    "con_acc": con_acc,
+}
+BY_LOSS = pytest.mark.parametrize("loss", OVERLAPS.values(), ids=OVERLAPS)
+
+
+def random_problem(*sizes: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
+    """Two logits (B, K, H, W) in double precision and a label without 3, a sixth of it ignored."""
+    batch, classes, height, width = sizes
+    generator = seeded(seed)
+    first, second = torch.randn(2, *sizes, generator=generator, dtype=torch.float64)
+    label = torch.randint(0, classes, (batch, height, width), generator=generator)
+    ignored = torch.rand(label.shape, generator=generator) < 1 / 6
+    return first, second, label.masked_fill(ignored | (label == 3), 255)
+
+
+def one_hot(label: Tensor, classes: int) -> Tensor:
+    return torch.stack([label == c for c in range(classes)], 1).double()
+
+
+def as_printed(name: str, p: Tensor, q: Tensor, label: Tensor, form: Form) -> Tensor:
+    """The equations class by class; the release's factors, clamp, mask and absent classes."""
+    y, costs = one_hot(label, p.shape[1]), []
+    counted = label != 255
+    if form == "released" and name != "con":
+        counted &= label != 0
+    for c in range(p.shape[1]):
+        p_c, q_c, y_c = (values[:, c][counted] for values in (p, q, y))
+        if name == "con":
+            size = (p_c + q_c + SIGMA * (form == "paper")).sum()
+            costs.append(1 - 2 * (p_c * q_c).sum() / size.clamp(min=SIGMA))
+        elif form == "released" and not y_c.any():
+            costs.append(p.new_zeros(()))
+        elif name == "dice":
+            squared = q_c**2 if form == "paper" else q_c
+            costs.append(1 - 2 * (q_c * y_c).sum() / (squared + y_c).sum())
+        else:
+            sigma, factor = (SIGMA, 2) if form == "paper" else (0, 3)
+            costs.append(1 - factor * (p_c * q_c * y_c).sum() / (p_c + q_c + y_c + sigma).sum())
+    return torch.stack(costs).mean()
+
+
+def two_classes(*of_class_0: float) -> Tensor:
+    """(1, 2, 2, 2) probabilities of two classes at four pixels."""
+    p = torch.tensor(of_class_0).view(1, 1, 2, 2)
+    return torch.cat([p, 1 - p], 1)
+
+
+P, Q = two_classes(1, 0.5, 0, 0.25), two_classes(0.5, 0.5, 0.25, 1)
+
+
+def test_dice_by_hand() -> None:
+    # Classes down, pixels across; the fourth pixel is ignored.
+    p = torch.tensor([[0.5, 0.25, 0.0, 1.0], [0.25, 0.5, 0.5, 0.0], [0.25, 0.25, 0.5, 0.0]])
+    label = torch.tensor([[[0, 1], [2, 255]]])
+    # Sums of squares 5/16, 9/16, 3/8; every class has one pixel, predicted with 1/2.
+    paper = 1 - (1 / (21 / 16) + 1 / (25 / 16) + 1 / (11 / 8)) / 3
+    # Pixels of classes 1 and 2 count: 1 - 1 / (1 + 1) and 1 - 1 / (3/4 + 1), background 0.
+    released = (1 / 2 + 3 / 7 + 0) / 3
+    for form, expected in (("paper", paper), ("released", released)):
+        assert dice(p.view(1, 3, 2, 2), label, form).item() == pytest.approx(expected)
+
+
+def test_con_acc_by_hand() -> None:
+    label = torch.tensor([[[0, 0], [1, 255]]])
+    # Three pixels. Class 0: products 1/2 + 1/4, sums 3/2 + 5/4 + 2; class 1: 3/4, 3/2 + 7/4 + 1.
+    paper = 1 - (2 * 0.75 / 4.75 + 2 * 0.75 / 4.25) / 2
+    # The pixel of class 1 alone: 1 - 3 * 3/4 / (1 + 3/4 + 1), halved by the background's 0.
+    released = (1 - 9 / 11) / 2
+    assert con_acc(P, Q, label, "paper").item() == pytest.approx(paper, abs=1e-6)
+    assert con_acc(P, Q, label, "released").item() == pytest.approx(released, abs=1e-6)
+
+
+def test_sigma_is_added_per_pixel_that_counts_or_a_floor() -> None:
+    p = torch.full((1, 1, 2, 4), 1e-6, dtype=torch.float64)  # one class, eight pixels, three valid
+    valid = torch.tensor([[[True, False, False, True], [False, True, False, False]]])
+    # 2 * 3 p^2 over 3 (2 p + sigma).
+    assert 1 - con(p, p, valid, "paper").item() == pytest.approx(2e-12 / 2.1e-6, abs=1e-13)
+    assert 1 - con(p, p, valid, "released").item() == pytest.approx(2e-12 / 2e-6, abs=1e-13)
+    faint = torch.full_like(p, 1e-9)  # 6 p^2 over sigma, not over 6 p
+    assert 1 - con(faint, faint, valid, "released").item() == pytest.approx(6e-11, abs=1e-13)
+    p[..., 0, 0] = 1
+    label = torch.where(valid, 0, 255)
+    # Three labelled pixels: products 1 + 2 p^2, sums of p, q and y 3 + 2 (2 p + 1), 3 sigma.
+    expected = 1 - 2 * (1 + 2e-12) / (3 + 2 * (2e-6 + 1) + 3 * SIGMA)
+    assert con_acc(p, p, label, "paper").item() == pytest.approx(expected, abs=1e-12, rel=0)
+
+
+@BY_FORM
+@pytest.mark.parametrize("name", OVERLAPS)
+def test_values_equal_the_loop_over_classes(name: str, form: Form) -> None:
+    first, second, label = random_problem(2, 5, 6, 7)
+    p, q = first.softmax(1), second.softmax(1)
+    found, expected = OVERLAPS[name](p, q, label, form), as_printed(name, p, q, label, form)
+    torch.testing.assert_close(found, expected, atol=1e-12, rtol=0)
+
+
+@BY_FORM
+@BY_LOSS
+def test_gradients(loss: Any, form: Form) -> None:
+    first, second, label = random_problem(2, 4, 2, 3)
+    both = first.requires_grad_(), second.requires_grad_()
+    assert torch.autograd.gradcheck(
+        lambda p, q: loss(p.softmax(1), q.softmax(1), label, form), both
+    )
+    # The same where the first frame has none.
+    q = second.detach().softmax(1).requires_grad_()
+    (alone,) = torch.autograd.grad(loss(first.detach().softmax(1), q, label, form), q)
+    p = first.detach().softmax(1).requires_grad_()
+    assert torch.equal(torch.autograd.grad(loss(p, q, label, form), q)[0], alone)
+
+
+@pytest.mark.parametrize(
+    ("name", "form", "label", "expected"),
+    [
+        *((name, "paper", 255, 1.0) for name in OVERLAPS),
+        *((name, "released", 255, 1.0 if name == "con" else 0.0) for name in OVERLAPS),
+        *((name, "released", 0, 0.0) for name in ("dice", "con_acc")),  # background alone
+    ],
+)
+def test_nothing_to_compare_has_no_gradient(
+    name: str, form: Form, label: int, expected: float
+) -> None:
+    first, second = torch.ones(2, 2, 3, 2, 2, requires_grad=True)
+    both = first.softmax(1), second.softmax(1)
+    found = OVERLAPS[name](*both, torch.full((2, 2, 2), label), form)
+    assert found == expected
+    gradients = torch.autograd.grad(found, (first, second), allow_unused=True)
+    assert not any(each is not None and each.any() for each in gradients)
+
+
+# ---- two frames ----
 
 
 def loss_of(**changes: Any) -> TemporalLoss:
@@ -52,35 +188,6 @@ def frames() -> tuple[Frame, Frame, Tensor, Tensor]:
 
     valid = torch.rand(2, 6, 7, generator=generator) < 0.8
     return frame(0), frame(1), logits[2].softmax(1), valid
-
-
-TABLE_1 = {  # Temporal, Table I: alpha, beta, second -> parts beside the two cross-entropies
-    "B": (0, 0, "none", []),
-    "C": (0, 1, "dice", ["dice_2"]),
-    "D": (0, 1, "con", ["con"]),
-    "E": (0, 1, "con_acc", ["con_acc"]),
-    "F": (1, 0, "none", ["dice_1"]),
-    "G": (1, 1, "dice", ["dice_1", "dice_2"]),
-    "H": (1, 1, "con", ["dice_1", "con"]),
-    "I": (1, 1, "con_acc", ["dice_1", "con_acc"]),
-}
-
-
-@pytest.mark.parametrize("variant", TABLE_1)
-def test_the_variants_of_table_1(variant: str, frames: Any) -> None:
-    alpha, beta, second, names = TABLE_1[variant]
-    loss = loss_of(alpha=alpha, beta=beta, second=second)
-    assert loss.record.reads_warped == (second in ("con", "con_acc"))
-    first, other, warped, valid = frames
-    parts = loss(first, other, warped if loss.record.reads_warped else None, valid, NOTHING)
-    assert list(parts) == ["cross_entropy_1", "cross_entropy_2", *names]
-    for part in parts.values():
-        assert part.shape == ()
-        assert part > 0
-    torch.stack(list(parts.values())).sum().backward()
-    for frame in (first, other):
-        assert frame.logits.grad is not None
-        assert frame.logits.grad.any()
 
 
 @pytest.mark.parametrize("form", ["paper", "released"])
@@ -121,29 +228,6 @@ def test_means_of_two_by_two_pixels_are_compared_where_so_many_are_given(
     forms = {"con": lambda: con(warped, p, valid, "paper")}
     forms["con_acc"] = lambda: con_acc(warped, p, label, "paper")
     torch.testing.assert_close(parts[second], forms[second]())
-    with pytest.raises(ValueError, match="warped: expected shape"):
-        loss_of(second=second)(first, other, warped[..., :3], valid, NOTHING)
-
-
-def test_masks_of_queries() -> None:
-    criterion, generator = criterion_of(), seeded(3)
-    frames = []
-    for seed in (0, 1):
-        output, batch = problem_of(3, 1, 2, seed=seed)
-        logits = torch.randn(2, 5, *batch.label.shape[1:], generator=generator)
-        frames.append(Frame(output, batch, logits))
-    valid = torch.ones_like(frames[0].batch.label, dtype=torch.bool)
-    loss = loss_of(segmentation=criterion)
-    assert Requirement("model", "outputs", "masks") in loss.record.requires
-    warped = frames[0].logits.softmax(1)
-    parts = loss(*frames, warped, valid, seeded(5))
-    # The set criterion has a dice of its own.
-    segmentation = ["class_1", "mask_1", "seg_dice_1", "class_2", "mask_2", "seg_dice_2"]
-    assert list(parts) == [*segmentation, "dice_1", "con"]
-    generator = seeded(5)
-    alone = [criterion(frame.output, frame.batch, generator) for frame in frames]
-    expected = [values.sum() for each in alone for values in each.values()]
-    assert torch.equal(torch.stack([parts[name] for name in segmentation]), torch.stack(expected))
 
 
 @pytest.mark.parametrize(
@@ -208,19 +292,3 @@ def test_released_values_and_gradients(name: str) -> None:
         part, frame = ("dice_1", first) if which == "dice" else (which, second)
         (gradient,) = torch.autograd.grad(parts[part], frame.logits)
         assert case.deviation(f"grad.{part.replace('_1', '1')}", gradient) <= 5e-10
-
-
-@pytest.mark.parametrize(
-    ("changes", "requires"),
-    [
-        ({}, False),
-        ({"form": "released", "alpha": 0.0}, False),  # con reads no label
-        ({"form": "released", "alpha": 0.0, "second": "con_acc"}, True),
-        ({"form": "released"}, True),
-    ],
-)
-def test_released_sums_require_class_0_to_be_the_background(
-    changes: dict[str, Any], requires: bool
-) -> None:
-    keys = [each.key for each in loss_of(**changes).record.requires]
-    assert ("first_class" in keys) == requires

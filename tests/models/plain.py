@@ -22,6 +22,9 @@ from rgbt.models.rtfnet import RTFNet
 from rgbt.models.semseg import SemsegPSPNet
 from rgbt.types import MaskPair
 
+HEAD = {"hidden_dim": 32, "num_queries": 5, "encoder_layers": 1, "encoder_ffn_dim": 16,
+        "decoder_layers": 3, "decoder_ffn_dim": 16, "attention_heads": 2,
+        "pixel_decoder_fp32": True}  # fmt: skip
 NANO: dict[str, tuple[Any, dict[str, Any]]] = {
     "mfnet": (MFNet, {"num_classes": 3, "rgb_widths": (2, 3, 4, 6), "thermal_widths": (3, 2, 3, 4),
                       "decoder_width": 5, "final_activation": True}),
@@ -50,20 +53,14 @@ NANO: dict[str, tuple[Any, dict[str, Any]]] = {
     "mask2former": (Mask2Former, {"num_classes": 4, "embed_dim": 8, "depths": (1, 1, 2, 1),
                                   "num_heads": (1, 1, 2, 2), "window_size": 3, "mlp_ratio": 2.0,
                                   "drop_path_rate": 0.0, "share_start": 4, "fusion": "max",
-                                  "hidden_dim": 32, "num_queries": 5, "encoder_layers": 1,
-                                  "encoder_ffn_dim": 16, "decoder_layers": 3,
-                                  "decoder_ffn_dim": 16, "attention_heads": 2,
-                                  "pixel_decoder_fp32": True}),
+                                  **HEAD}),
     "dinov2": (DinoMask2Former, {"num_classes": 4, "patch": 4, "embed_dim": 8, "depth": 4,
                                  "num_heads": 2, "mlp_ratio": 2.0, "num_registers": 2,
                                  "position_grid": 5, "position_resize": "size", "token_px": 8,
                                  "layers": (4,), "tuning": "full", "lora_rank": 2,
                                  "lora_alpha": 4.0, "lora_parts": ("q", "v"),
                                  "lora_per_modality": True, "thermal_embedding": True,
-                                 "fusion": "max", "hidden_dim": 32, "num_queries": 5,
-                                 "encoder_layers": 1, "encoder_ffn_dim": 16, "decoder_layers": 3,
-                                 "decoder_ffn_dim": 16, "attention_heads": 2,
-                                 "pixel_decoder_fp32": True}),
+                                 "fusion": "max", **HEAD}),
     "critic": (Critic, {"in_channels": 2, "base_width": 2, "upsample": False,
                         "align_corners": False}),
 }  # fmt: skip

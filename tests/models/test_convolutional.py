@@ -1,4 +1,4 @@
-"""Convolutional networks: second computations where no record exists, what is seen, starts."""
+"""Inputs and convolutional networks: by hand, by second computations, what is seen, starts."""
 
 from __future__ import annotations
 
@@ -11,9 +11,169 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.checks import InputError
-from tests.models.plain import Plain, count, generator, half, images, nano, randomise
-from tests.models.test_contract import LITERAL, MODIFIED
+from rgbt.config.component import build
+from rgbt.models.inputs import Inputs, expand_cells
+from rgbt.models.parts import (
+    BasicBlock,
+    Bottleneck,
+    bottleneck_stage,
+    drop_channels,
+    enlarge,
+    keep_factors,
+)
+from rgbt.types import MaskPair
+from tests.models.golden import compose
+from tests.models.plain import Plain, generator, half, images, nano, normal, randomise
+from tests.models.test_contract import CASES, LITERAL, MODIFIED
 
+# ---- inputs ----
+
+
+def inputs(**changes: Any) -> Inputs:
+    values: dict[str, Any] = {
+        **{"rgb_order": "rgb", "rgb_mean": (0.0, 51.0, 102.0), "rgb_std": (255.0, 51.0, 25.5)},
+        **{"thermal_mean": (0.0,), "thermal_std": (255.0,), "thermal_scale": "fixed"},
+    }
+    return Inputs(**{**values, **changes})
+
+
+def ones(height: int = 32, width: int = 32, count: int = 1) -> tuple[torch.Tensor, torch.Tensor]:
+    return torch.ones(count, 3, height, width), torch.full((count, 1, height, width), 0.5)
+
+
+def test_bgr_swaps_the_images_channels_and_not_the_means() -> None:
+    red = torch.tensor([1.0, 0.0, 0.0]).view(1, 3, 1, 1).expand(1, 3, 32, 32)
+    rgb, _ = inputs(rgb_order="bgr")(red, ones()[1])
+    assert rgb[0, :, 0, 0].tolist() == pytest.approx([0.0, -1.0, 6.0])
+
+
+def test_gray_is_the_luma_in_all_three_channels() -> None:
+    image = torch.tensor([1.0, 0.5, 0.25]).view(1, 3, 1, 1).expand(1, 3, 32, 32)
+    rgb, _ = inputs(rgb_order="gray")(image, ones()[1])
+    grey = 255 * (0.299 + 0.587 / 2 + 0.114 / 4)  # ITU-R BT.601
+    expected = [grey / 255, (grey - 51) / 51, (grey - 102) / 25.5]
+    assert rgb[0, :, 5, 7].tolist() == pytest.approx(expected, rel=1e-5)
+
+
+def test_every_thermal_image_is_divided_by_its_own_maximum() -> None:
+    rgb, thermal = ones(count=3)
+    thermal[0, 0, 0, 0], thermal[1], thermal[2] = 0.25, 0.125, 0.0
+    _, scaled = inputs(thermal_scale="image_max")(rgb, thermal)
+    assert [each.unique().tolist() for each in scaled] == [[0.5, 1.0], [1.0], [0.0]]
+
+
+def test_padding_and_hidden_pixels_are_the_mean() -> None:
+    rgb, thermal = ones(40, 60)
+    hidden = torch.zeros(1, 2, 2, dtype=torch.bool)
+    hidden[0, 1, 1] = True
+    images = inputs()(rgb, thermal, MaskPair(hidden, ~hidden), multiple=32)
+    assert images.rgb.shape[-2:] == images.thermal.shape[-2:] == (64, 64)
+    assert images.rgb[..., 40:, :].abs().sum() == images.rgb[..., 60:].abs().sum() == 0
+    # Cells are 32 x 32 of the padded image: rows 32..39 and columns 32..59 are hidden in RGB.
+    assert (images.rgb[0, 0, :40, :60] == 0).sum() == 8 * 28
+    assert (images.thermal[0, 0, :40, :60] != 0).sum() == 8 * 28
+
+
+def test_cells_become_squares_of_units() -> None:
+    hidden = torch.tensor([[[True, False]]])
+    pixels = expand_cells(MaskPair(hidden, hidden), 1, (32, 64))
+    assert pixels.rgb.shape == (1, 32, 64)
+    assert pixels.rgb[0, :, :32].all()
+    assert not pixels.rgb[0, :, 32:].any()
+    assert expand_cells(MaskPair(hidden, hidden), 1, (32, 64), 4).thermal.shape == (1, 8, 16)
+    for grid, unit in (((3, 2), 1), ((1, 1), 1), ((16, 32), 4)):
+        hidden = torch.zeros(1, *grid, dtype=torch.bool)
+        with pytest.raises(InputError, match=r"masker.patch_size"):
+            expand_cells(MaskPair(hidden, hidden), 1, (32, 64), unit)
+
+
+@pytest.mark.parametrize(
+    ("option", "rgb", "thermal"),
+    [
+        # White and mid-grey thermal in each release's convention, by hand.
+        ("crm", [2.248908, 2.428571, 2.640000], [(127.5 - 127) / 60]),
+        ("unit", [1.0] * 3, [0.5]),
+        ("half_three", [1.0] * 3, [0.0] * 3),
+        ("gray_three", [(1 - 0.369) / 0.321] * 3, [0.0] * 3),
+        ("temporal", [1.0] * 3, [1.0] * 3),
+        ("cmx", [2.248908, 2.428571, 2.640000], [0.065502, 0.196429, 0.417778]),
+        ("cmx_released", [2.248908, 2.428571, 2.640000], [0.065502, 0.196429, 0.417778]),
+        ("caffe", [255 - 104.007, 255 - 116.669, 255 - 122.679],
+         [127.5 - 104.007, 127.5 - 116.669, 127.5 - 122.679]),
+    ],
+)  # fmt: skip
+def test_conventions_of_the_releases(option: str, rgb: list[float], thermal: list[float]) -> None:
+    found = build(compose(f"model/inputs={option}").model.inputs)(*ones())
+    for image, expected in zip(found, (rgb, thermal), strict=True):
+        assert image[0, :, 0, 0].tolist() == pytest.approx(expected, rel=1e-6, abs=1e-5)
+
+
+# ---- parts and the discriminator ----
+
+
+@pytest.mark.parametrize(
+    ("stage", "strides", "dilations"),
+    [
+        (nn.Sequential(BasicBlock(6, 6)), (1, 1), (1, 1)),
+        (nn.Sequential(BasicBlock(6, 6, stride=2)), (2, 1), (1, 1)),
+        (nn.Sequential(Bottleneck(8, 2, stride=2, dilation=3)), (1, 2), (3, 1)),
+        (bottleneck_stage(3, 2, 3, dilations=(2, 4)), (1, 1), (2, 4)),
+        (bottleneck_stage(3, 2, 3, stride=2, dilations=(1, 2), stride_at="1x1"), (2, 1), (1, 2)),
+    ],
+)
+def test_residual_blocks_by_their_weights(
+    stage: Any, strides: tuple[int, int], dilations: tuple[int, int]
+) -> None:
+    plain = Plain(randomise(nn.ModuleDict({"a": stage}).eval()))
+    x = normal(2, stage[0].conv1.in_channels, 9, 12)
+    expected = plain.stage("a", x, strides=strides, dilations=dilations)
+    assert (expected > 0).float().mean() > 0.2
+    torch.testing.assert_close(stage(x), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_factors_are_zero_or_the_inverse_of_the_probability() -> None:
+    factors = keep_factors(torch.tensor([0.0, 0.2]), (2, 5000), generator(), torch.device("cpu"))
+    assert factors.shape == (2, 2, 5000)
+    assert factors[0].unique().tolist() == [1.0]
+    assert factors[1].unique().tolist() == [0.0, 1.25]
+    # 10,000 draws: standard error 0.005.
+    assert factors[1].mean().item() == pytest.approx(1.0, abs=0.02)
+
+
+def test_whole_channels_are_dropped_before_the_first_block_and_after_every_one() -> None:
+    x, seen = torch.ones(4, 500, 2, 2), []
+    blocks = [nn.Identity(), nn.Identity()]
+    for block in blocks:
+        block.register_forward_pre_hook(lambda _m, args: seen.append(args[0]))
+    result = enlarge(x, blocks, (0.5, 0.2), generator())
+    for found, values, dropped in zip(
+        (*seen, result),
+        ({0.0, 2.0}, {0.0, 2.5}, {0.0, 3.125}),
+        (0.5, 1 - 0.5 * 0.8, 1 - 0.5 * 0.8**2),
+        strict=True,
+    ):
+        assert torch.equal(found.amin((2, 3)), found.amax((2, 3)))
+        assert set(found.unique().tolist()) == values
+        # 2,000 draws: standard error 0.011
+        assert (found == 0).float().mean().item() == pytest.approx(dropped, abs=0.05)
+    assert torch.equal(enlarge(x, blocks, (0.0, 0.0), None), x)
+    with pytest.raises(ValueError, match="generator"):
+        drop_channels(x, 0.5, None)
+
+
+@pytest.mark.parametrize("align_corners", [False, True])
+@torch.no_grad()
+def test_critic_verdicts_are_enlarged_between_their_centres(align_corners: bool) -> None:
+    small, large = nano("critic"), nano("critic", upsample=True, align_corners=align_corners)
+    large.load_state_dict(randomise(small))
+    x, rows = normal(1, 2, 64, 32), torch.arange(64)
+    top, bottom = small(x)[0, 0, :, 0]
+    share = rows / 63 if align_corners else ((rows + 0.5) / 32 - 0.5).clamp(0, 1)
+    expected = top + share * (bottom - top)
+    torch.testing.assert_close(large(x)[0, 0], expected[:, None].expand(64, 32))
+
+
+# ---- networks ----
 Found = dict[str, Tensor]
 
 
@@ -24,7 +184,7 @@ def bilinear(x: Tensor, size: Any, *, corners: bool) -> Tensor:
 def semseg(net: Any, rgb: Tensor, thermal: Tensor) -> Found:
     """Sides of 8 n + 1 pixels."""
     plain = Plain(net.state_dict())
-    x = rgb if net.modalities == "rgb" else thermal.expand(-1, 3, -1, -1)
+    x = rgb if net.record.views == ("rgb",) else thermal.expand(-1, 3, -1, -1)
     for number, stride in ((0, 2), (3, 1), (6, 1)):
         x = plain.normed(f"layer0.{number}", f"layer0.{number + 1}", x, stride=stride).relu()
     x = plain.stage("layer1", F.max_pool2d(x, 3, 2, 1))
@@ -90,9 +250,7 @@ def test_values_of_semseg_equal_a_second_computation(modalities: str) -> None:
 
 
 @pytest.mark.parametrize("changes", [{}, MODIFIED, LITERAL])
-@pytest.mark.parametrize(
-    ("rates", "size"), [((2, 4, 6, 8), (96, 120)), ((2, 4), (96, 120)), ((2, 4), (61, 83))]
-)
+@pytest.mark.parametrize(("rates", "size"), [((2, 4, 6, 8), (96, 120)), ((2, 4), (61, 83))])
 @torch.no_grad()
 def test_values_of_deeplab_equal_a_second_computation(
     changes: dict[str, Any], rates: tuple[int, ...], size: tuple[int, int]
@@ -102,29 +260,17 @@ def test_values_of_deeplab_equal_a_second_computation(
     rgb, thermal = images(2, *size)
     for view, head in (("rgb", "source"), ("thermal", "target")):
         image = rgb if view == "rgb" else thermal.expand_as(rgb)
-        check(
-            net(rgb, thermal, views=(view,), head=head), deeplabv2(net, 2 * image - 1, head, rates)
-        )
+        found = net(rgb, thermal, views=(view,), head=head)
+        check(found, deeplabv2(net, 2 * image - 1, head, rates))
 
 
-@pytest.mark.parametrize(
-    ("name", "changes", "view"),
-    [
-        *(("pspnet", {"modalities": m}, "rgbt") for m in ("late_fusion", "early_fusion")),
-        *(
-            (name, {"modalities": m}, m)
-            for name in ("pspnet", "semseg")
-            for m in ("rgb", "thermal")
-        ),
-        ("mfnet", {}, "rgbt"),
-        ("rtfnet", {}, "rgbt"),
-        ("deeplabv2", {}, "rgb"),
-    ],
-)
+@pytest.mark.parametrize(("name", "changes"), CASES)
 @torch.no_grad()
-def test_what_is_seen(name: str, changes: dict[str, Any], view: str) -> None:
+def test_the_images_of_the_first_view_are_seen(name: str, changes: dict[str, Any]) -> None:
     net, (rgb, thermal) = nano(name, **changes).eval(), images(1, 61, 83)
     randomise(net)
+    view = changes.get("modalities", "rgb" if name in ("semseg", "deeplabv2") else "rgbt")
+    view = "rgbt" if "fusion" in view else view
     assert net.record.views[0] == view
     before = net(rgb, thermal).logits
     sees_rgb = not torch.equal(before, net(1 - rgb, thermal).logits)
@@ -141,20 +287,6 @@ def test_thermal_encoder_of_rtfnet_never_sees_the_rgb_image() -> None:
     assert torch.equal(*seen)
 
 
-@pytest.mark.parametrize("name", ["deeplabv2", "semseg", "mfnet", "rtfnet"])
-@torch.no_grad()
-def test_thermal_images_of_one_and_three_channels(name: str) -> None:
-    """One backbone for RGB and thermal repeats the channel; a stem of its own has as many."""
-    one, three = (nano(name, inputs=half(channels)).eval() for channels in (1, 3))
-    if name in ("deeplabv2", "semseg"):
-        three.load_state_dict(one.state_dict())
-        views = one.record.views[-1:]
-        assert torch.equal(*(net(*images(1), views=views).logits for net in (one, three)))
-    else:
-        assert count(three) > count(one)
-        assert three(*images(1)).logits.shape == one(*images(1)).logits.shape
-
-
 @pytest.mark.parametrize(
     ("name", "setting", "slope"), [("mfnet", "final_activation", 0.2), ("rtfnet", "final_relu", 0)]
 )
@@ -166,26 +298,6 @@ def test_last_activation_bends_the_same_logits(name: str, setting: str, slope: f
     torch.testing.assert_close(with_it, torch.where(without >= 0, without, without * slope))
 
 
-@pytest.mark.parametrize(
-    ("name", "others"),
-    [
-        ("rtfnet", {"deconv"}),
-        ("semseg", {"ppm", "cls", "aux"}),
-        ("deeplabv2", {"heads", "auxiliary"}),
-        ("pspnet", {"psp", "up_", "final"}),
-    ],
-)
-def test_new_modules_have_the_larger_rate(name: str, others: set[str]) -> None:
-    net = nano(name)
-    names = [each for each, _ in net.named_parameters()]
-    new = [each for each in names if not each.startswith(net.record.pretrained_parts)]
-    assert {each.split(".")[0].rstrip("12345") for each in new} == others
-    assert len(new) < len(names)
-
-
-# ---- DeepLab v2 ----------------------------------------------------------------------------------
-
-
 def test_first_head_and_rgb_are_the_defaults() -> None:
     net, pair = nano("deeplabv2").eval(), images(1, 32, 32)
     with torch.no_grad():
@@ -194,16 +306,6 @@ def test_first_head_and_rgb_are_the_defaults() -> None:
         assert not torch.equal(first, net(*pair, head="target").logits)
     with pytest.raises(InputError, match="did you mean 'target'"):
         net(*pair, head="targe")
-
-
-def test_one_head_is_trained_alone_and_rates_that_do_not_count_are_parameters() -> None:
-    net = nano("deeplabv2", auxiliary=False, summed_rates=(2, 4))
-    assert count(net) == count(nano("deeplabv2", auxiliary=False))
-    net(*images(2), head="target").logits.square().mean().backward()
-    trained = {name for name, p in net.named_parameters() if p.grad is not None}
-    counted = [f"heads.target.aspp.conv2d_list.{i}.{p}" for i in (0, 1) for p in ("weight", "bias")]
-    backbone = [name for name, _ in net.named_parameters() if name.startswith("backbone.")]
-    assert trained == {*backbone, *counted}
 
 
 def test_statistics_move_where_norms_are_not_trained() -> None:
@@ -219,28 +321,6 @@ def test_statistics_move_where_norms_are_not_trained() -> None:
     assert not torch.equal(before, net.backbone.bn1.running_mean)
 
 
-# ---- initial weights -----------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("name", "changes", "deviation"),
-    [("deeplabv2", {"base_width": 8, **MODIFIED}, 0.01), ("pspnet", {"base_width": 16}, 0.02)],
-)
-def test_convolutions_are_drawn_as_released(
-    name: str, changes: dict[str, Any], deviation: float
-) -> None:
-    net = nano(name, **changes)
-    drawn = torch.cat([m.weight.flatten() for m in net.modules() if isinstance(m, nn.Conv2d)])
-    assert drawn.mean().item() == pytest.approx(0, abs=1e-4)
-    assert drawn.std().item() == pytest.approx(deviation, rel=0.01)
-    norms = [m for m in net.modules() if isinstance(m, nn.BatchNorm2d)]
-    scales = torch.cat([m.weight for m in norms])
-    assert scales.mean().item() == pytest.approx(1, abs=2e-3)
-    expected = 0.02 if name == "pspnet" else 0.0
-    assert scales.std().item() == pytest.approx(expected, rel=0.1)
-    assert all((m.bias == 0).all() for m in norms)
-
-
 def test_thermal_stem_of_rtfnet_starts_as_the_mean_of_the_rgb_stem_or_anew() -> None:
     mean, anew = nano("rtfnet"), nano("rtfnet", thermal_stem="xavier")
     weight = mean.encoder_rgb_conv1.weight
@@ -252,21 +332,3 @@ def test_thermal_stem_of_rtfnet_starts_as_the_mean_of_the_rgb_stem_or_anew() -> 
     assert list(anew.record.drawn_anew) == ["encoder_thermal_conv1."]
     three = nano("rtfnet", inputs=half(3))
     assert torch.equal(three.encoder_thermal_conv1.weight, three.encoder_rgb_conv1.weight)
-
-
-def test_encoders_start_by_fan_out_and_the_decoder_of_rtfnet_by_both_fans() -> None:
-    """Normal, variance 2 / fan_out; decoder: uniform within sqrt(6 / both fans)."""
-    net, other = nano("rtfnet", base_width=32), nano("semseg", base_width=64, depths=(1, 1, 1, 1))
-    for weight, fan in (
-        (net.encoder_thermal_layer3[1].conv2.weight, 9 * 128),
-        (other.layer4[0].conv2.weight, 9 * 512),
-    ):
-        assert weight.std().item() == pytest.approx(math.sqrt(2 / fan), rel=0.02)
-    for weight, fans in (
-        (net.deconv1[0].conv2.weight, 9 * (256 + 256)),
-        (net.deconv1[1].conv1.weight, 256 + 128),
-        (net.deconv1[1].upsample[0].weight, 4 * (256 + 128)),
-    ):
-        bound = math.sqrt(6 / fans)
-        assert 0.99 * bound < weight.abs().max().item() <= bound
-        assert weight.std().item() == pytest.approx(bound / math.sqrt(3), rel=0.02)

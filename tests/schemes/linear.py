@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,6 @@ from torch.nn import functional as F
 
 from rgbt.data.domains import Domain, Domains
 from rgbt.data.loaders import LoadedPair
-from rgbt.engine.checkpoint import State
 from rgbt.engine.optimizers import SGD
 from rgbt.engine.settings import TrainerSettings
 from rgbt.engine.trainer import Trainer
@@ -142,15 +141,6 @@ def trainer(scheme: Any, model: nn.Module, folder: Path, steps: int, **changes: 
     return made
 
 
-def trained(
-    scheme: Any, model: nn.Module, folder: Path, steps: int, confidence: bool = False
-) -> list[dict[str, float]]:
-    """The model after these steps, in place; what was recorded of each."""
-    made = trainer(scheme, model, folder, steps)
-    made.fit(pairs(confidence=confidence), State(seed=0))
-    return list(made.log)  # type: ignore[attr-defined]
-
-
 # ---- the same, by matrices in float64 -------------------------------------------------------
 
 
@@ -161,9 +151,9 @@ def values_of(module: nn.Module) -> Values:
 
 
 def pixels(batch: Batch, view: str) -> tuple[Tensor, Tensor]:
-    """(N, 3) float64 in [0, 1] and (N,) labels."""
+    """(N, 3) float64 of images in [0, 1], and (N,) labels."""
     image = batch.rgb if view == "rgb" else batch.thermal.expand(-1, 3, -1, -1)
-    return image.permute(0, 2, 3, 1).reshape(-1, 3).double() / 255, batch.label.reshape(-1)
+    return image.permute(0, 2, 3, 1).reshape(-1, 3).double(), batch.label.reshape(-1)
 
 
 def scores(values: Values, x: Tensor, head: str) -> Tensor:
@@ -173,68 +163,6 @@ def scores(values: Values, x: Tensor, head: str) -> Tensor:
 def nats(z: Tensor, y: Tensor) -> Tensor:
     """Mean cross-entropy by its definition."""
     return (z.exp().sum(1).log() - z[range(len(y)), y]).mean()
-
-
-@dataclass
-class Momentum:
-    """SGD with momentum of some parameters, with buffers of its own."""
-
-    names: tuple[str, ...]
-    rate: float = LR
-    momentum: float = MOMENTUM
-    buffers: Values = field(default_factory=dict)
-
-    def step(self, values: Values, gradient: Values) -> None:
-        for name in self.names:
-            before = self.buffers.get(name, torch.zeros_like(values[name]))
-            self.buffers[name] = self.momentum * before + gradient[name]
-            values[name] = values[name] - self.rate * self.buffers[name]
-
-
-def gradient(cost: Callable[[Values], Tensor], values: Values) -> Values:
-    """Of a cost by every value; 0 where it does not depend on it."""
-    leaves = {name: value.clone().requires_grad_() for name, value in values.items()}
-    found = torch.autograd.grad(cost(leaves), list(leaves.values()), allow_unused=True)
-    pairs = zip(values.items(), found, strict=True)
-    return {name: torch.zeros_like(v) if g is None else g for (name, v), g in pairs}
-
-
-def total(*gradients: Values) -> Values:
-    return {name: sum((each[name] for each in gradients), torch.zeros(())) for name in gradients[0]}
-
-
-Cost = Callable[[Values], Tensor]
-
-
-def written_out(
-    values: Values,
-    mode: str,
-    day: Momentum,
-    dark: Momentum | None,
-    source: Cost,
-    target: Cost,
-) -> tuple[Values, Values]:
-    """One step of the network, `values` in place; values at which either domain was predicted."""
-    start = dict(values)
-    if dark is None or mode == "together":
-        both = total(gradient(source, values), gradient(target, values))
-        for optimizer in (day, dark):
-            if optimizer is not None:
-                optimizer.step(values, both)
-        return start, start
-    first = gradient(source, values)
-    day.step(values, first)
-    between = dict(values)
-    second = gradient(target, values)
-    dark.step(values, second if mode == "apart" else total(first, second))
-    return start, between
-
-
-def assert_same(model: nn.Module, expected: Values) -> None:
-    found = values_of(model)
-    assert found.keys() == expected.keys()
-    for name in found:
-        torch.testing.assert_close(found[name], expected[name], atol=2e-6, rtol=2e-5)
 
 
 def generator_of(purpose: str) -> torch.Generator:

@@ -9,7 +9,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from rgbt.data.domains import Domain, Domains
 from rgbt.engine.batch_norm import synchronise_batch_norm
 from rgbt.geometry.camera import Camera
 from rgbt.losses.cross_entropy import CrossEntropy, WithAuxiliary
@@ -21,18 +20,15 @@ from rgbt.models.critic import Critic
 from rgbt.processes import num_processes, own, total
 from rgbt.randomness import torch_generator
 from rgbt.requirements import record_of
-from rgbt.schemes.adversarial import Adversarial
 from rgbt.schemes.crm import CRM
-from rgbt.schemes.self_training import SelfTraining
 from rgbt.schemes.supervised import Supervised
-from rgbt.schemes.temporal import Temporal
-from rgbt.schemes.two_domains import LabelledDomains, UnlabelledTarget
-from rgbt.transforms.strong import StrongAugmentation
-from rgbt.transforms.views import VirtualView
 from rgbt.types import IGNORE, Batch, TwoDomains
 from tests.losses.problems import batch_of, criterion_of, whole_image
 from tests.models.plain import nano
-from tests.schemes.linear import Nothing, domains, network
+from tests.schemes import test_domains, test_self_training
+from tests.schemes import test_temporal as frames
+from tests.schemes.linear import Nothing, network
+from tests.schemes.test_schemes import ONE
 from tests.schemes.test_self_training import DISTANCE
 
 B, K = 4, 4
@@ -88,80 +84,54 @@ def in_float64(name: str, **changes: Any) -> Any:
 
 # ---- cases ----------------------------------------------------------------------------------
 
-MASKER = {
-    **{"patch_size": 16, "sigma_height": None, "anchor": "tracked", "cell_position": "index"},
-    **{"pairing": "rand_comp", "pattern_probabilities": None, "ratio": 0.5, "sigma_div": 2.0},
-}
+GAUSSIAN = Masker(
+    **{"sampler": "gaussian_count", "patch_size": 16, "ratio": 0.5, "sigma_div": 2.0},
+    **{"sigma_height": None, "anchor": "tracked", "cell_position": "index"},
+    **{"pairing": "rand_comp", "pattern_probabilities": None},
+)
+NOT_USED = dict.fromkeys(("sigma_div", "anchor", "cell_position"))
+INDEPENDENT = replace(GAUSSIAN, sampler="uniform", pairing="indiv", **NOT_USED)
 SPATIAL = replace(
     PLAIN, alpha=2.0, focus="edge", match="weighted", normaliser="weights", passes="fused"
 )
 SHALLOW = criterion_of(
     num_classes=K, deep_supervision=False, spatial=replace(SPATIAL, passes="all")
 )
-INDEPENDENT = Masker(
-    **{"sampler": "uniform", "patch_size": 16, "ratio": 0.5, "pairing": "indiv"},
-    **dict.fromkeys(("sigma_div", "sigma_height", "anchor", "cell_position"), None),
-    pattern_probabilities=None,
-)
 WEIGHTED = CrossEntropy(class_weights=(0.2, 1.0, 2.0, 3.0))
 THREE = CrossEntropy(class_weights=(0.5, 1.0, 2.0))
 
 
-def crm(**criterion: Any) -> Case:
+def crm() -> Case:
     net = in_float64("mask2former", drop_path_rate=0.3)
-    scheme = CRM(
-        model=net,
-        loss=criterion_of(num_classes=K, **criterion),
-        masker=Masker(sampler="gaussian_count", **MASKER),
-        modality_weight=0.5,
-        complementary_weight=2.0,
-        nonlocal_weight=3.0,
-    )
+    loss = criterion_of(num_classes=K, spatial=SPATIAL)
+    weights = {"modality_weight": 0.5, "complementary_weight": 2.0, "nonlocal_weight": 3.0}
+    scheme = CRM(model=net, loss=loss, masker=GAUSSIAN, **weights)
     return Case(scheme, {"model": net}, doubled(batch()))
 
 
-def supervised(name: str, loss: Any, masker: Any = None, **changes: Any) -> Case:
-    net = in_float64(name, **{"num_classes": K, **changes})
-    head = "source" if name == "deeplabv2" else None
-    one = Domains(
-        source=Domain(split="train", view="rgb" if head else None, head=head, labels="given"),
-        **{"target": None, "target_is": None, "tested_head": "own"},
-    )
-    scheme = Supervised(model=net, loss=loss, masker=masker or Nothing(), domains=one)
+def supervised(name: str, loss: Any, masker: Any = None) -> Case:
+    net = in_float64(name, num_classes=K)
+    scheme = Supervised(model=net, loss=loss, masker=masker or Nothing(), domains=ONE)
     return Case(scheme, {"model": net}, doubled(batch()))
 
 
-def temporal(name: str, second: str, form: str, **changes: Any) -> Case:
-    net = network(False) if name == "linear" else in_float64(name, num_classes=K, **changes)
-    data = batch(3) if name == "linear" else doubled(batch())
-    losses = {"mask2former": criterion_of(num_classes=K), "linear": THREE}
-    loss = TemporalLoss(
-        segmentation=losses.get(name, WEIGHTED),
-        alpha=0.5,
-        beta=2.0,
-        second=second,  # type: ignore[arg-type]
-        form=form,  # type: ignore[arg-type]
-    )
-    view = VirtualView(
-        **{"camera": CAMERA, "order": "zyx", "yaw": (-8.0, 8.0), "pitch": (-8.0, 8.0)},
-        **{"roll": (-4.0, 4.0), "angles": "uniform", "mode": "both", "rectangle": "largest"},
-        **{"resampling": "once", "outside": "ignore"},
-    )
-    scheme = Temporal(model=net, loss=loss, view=view, warps="probabilities", detach=False)
+def temporal(name: str, second: Any, form: Any) -> Case:
+    net, loss, data = network(False), THREE, batch(3)
+    if name == "mask2former":
+        net = in_float64(name, num_classes=K, drop_path_rate=0.3)
+        loss, data = criterion_of(num_classes=K), doubled(batch())
+    both = TemporalLoss(segmentation=loss, alpha=0.5, beta=2.0, second=second, form=form)
+    scheme = frames.scheme(net, loss=both, view=frames.view(camera=CAMERA))
     return Case(scheme, {"model": net}, data)
 
 
-def two_domains(
-    kind: Any, *, heads: bool, step: int = 0, labels: str = "none", **given: Any
-) -> Case:
+def two_domains(make: Any, *given: Any, heads: bool = False, step: int = 0, **more: Any) -> Case:
+    """A scheme of `make` for a network of one or two heads, with a loss of weighted classes."""
     net = network(heads, auxiliary=True)
-    pseudo = given.get("weighed_by_confidence", False)
-    scheme = kind(
-        model=net,
-        loss=given.pop("loss", THREE),
-        domains=domains(heads, labels=labels, confidence=pseudo),
-        **given,
-    )
+    scheme = make(net, heads, *given, **more)
+    if "loss" not in more:
+        scheme = replace(scheme, loss=THREE)
+    pseudo = more.get("weighed_by_confidence", False)
     data = TwoDomains(batch(3, "source"), batch(3, "target", confidence=pseudo), step)
     record = record_of(scheme)
     trained = {name: record.networks[name] for name in record.builders}
@@ -170,53 +140,26 @@ def two_domains(
 
 def adversarial(*, heads: bool = False, step: int = 1, **changes: Any) -> Case:
     torch.manual_seed(5)
-    settings: dict[str, Any] = {
-        **{"judged": "probabilities", "verdict_loss": "least_squares", "source_value": 0.0},
-        **{"target_value": 1.0, "weight": 0.4, "both_ways": False, "halved": False},
-        **{"weighed_by_confidence": False, "supervise_target": False, "alternates": False},
-        **{"gradients": "apart", **changes},
-    }
-    return two_domains(
-        Adversarial,
-        heads=heads,
-        step=step,
-        labels="/pseudo" if settings["supervise_target"] else "none",
-        critic=Critic(in_channels=3, base_width=2, upsample=False, align_corners=False),
-        critic_optimizer=torch.optim.SGD,
-        **settings,
-    )
+    critic = Critic(in_channels=3, base_width=2, upsample=False, align_corners=False)
+    given = {"critic": critic, "critic_optimizer": torch.optim.SGD, **changes}
+    return two_domains(test_domains.scheme_of, heads=heads, step=step, **given)
 
 
-HEATNET: dict[str, Any] = {
-    **{"judged": "logits", "source_value": 1.0, "target_value": 0.0, "both_ways": True},
-    **{"weighed_by_confidence": True, "supervise_target": True, "alternates": True},
-}
-ADVENT: dict[str, Any] = {
-    **{"judged": "self_information", "verdict_loss": "cross_entropy", "halved": True}
-}
-
-
-def unlabelled(loss: Any, *, guidance: float = 0.0, heads: bool = False, **given: Any) -> Case:
-    weights = {"guidance_weight": guidance, "guidance_threshold": 0.4}
-    return two_domains(UnlabelledTarget, heads=heads, unlabelled=loss, **weights, **given)
+def unlabelled(loss: Any, *, guidance: float = 0.0, heads: bool = False) -> Case:
+    given = {"unlabelled": loss, "guidance_weight": guidance, "guidance_threshold": 0.4}
+    return two_domains(test_domains.unlabelled, heads=heads, **given)
 
 
 def self_training(*, heads: bool = False, **changes: Any) -> Case:
     settings: dict[str, Any] = {
-        **{"decay": 0.999, "teacher_norm": "batch", "threshold": 0.4, "weighted_by": "batch"},
-        **{"ignored_top": 0.1, "ignored_bottom": 0.2, "mixing": "classes", "masked_weight": 0.5},
-        **{"masked_images": "target", **changes},
+        **{"threshold": 0.4, "ignored_top": 0.1, "ignored_bottom": 0.2, "jitter": 1.0},
+        **{"domains": test_domains.linear.domains(heads, labels="none"), "loss": THREE},
     }
-    augmentation = StrongAugmentation(
-        **{"jitter_probability": 1.0, "jitter_strength": 0.2},
-        **{"blur_probability": 1.0, "blur_sigma": (0.15, 1.15)},
-    )
-    weighted = CrossEntropy(class_weights=(0.5, 1.0, 2.0))
-    case = two_domains(
-        SelfTraining,
-        **{"heads": heads, "loss": weighted, "masker": INDEPENDENT},
-        **{"augmentation": augmentation, **settings},
-    )
+
+    def make(net: Any, _: bool, **more: Any) -> Any:
+        return test_self_training.scheme_of(net, masker=INDEPENDENT, **more)
+
+    case = two_domains(make, heads=heads, **settings, **changes)
     for each in () if case.scheme.initial is None else case.scheme.initial.parameters():
         each.data.mul_(0.5)  # as if the network had been trained since
     return case
@@ -226,17 +169,20 @@ def max_squares(normalisation: Any, ratio: float | None) -> MaxSquares:
     return MaxSquares(weight=0.7, normalisation=normalisation, image_wise_ratio=ratio)
 
 
+HEATNET = test_domains.HEATNET
+ADVENT = {**test_domains.LOGISTIC, "judged": "self_information"}
+
 CASES: dict[str, Callable[[], Case]] = {
-    "crm": lambda: crm(spatial=SPATIAL),
+    "crm": crm,
     "masked": lambda: supervised("mask2former", SHALLOW, INDEPENDENT),
-    "temporal masks": lambda: temporal("mask2former", "con", "paper", drop_path_rate=0.3),
+    "temporal masks": lambda: temporal("mask2former", "con", "paper"),
     "temporal con": lambda: temporal("linear", "con", "paper"),
     "temporal con_acc": lambda: temporal("linear", "con_acc", "paper"),
     "temporal con_acc released": lambda: temporal("linear", "con_acc", "released"),
     "temporal dice": lambda: temporal("linear", "dice", "paper"),
     "temporal dice released": lambda: temporal("linear", "dice", "released"),
     "batch norm": lambda: supervised("mfnet", WEIGHTED),
-    "labelled": lambda: two_domains(LabelledDomains, heads=True, labels="given", gradients="kept"),
+    "labelled": lambda: two_domains(test_domains.labelled, "kept", heads=True),
     "adversarial": adversarial,
     "adversarial two heads": lambda: adversarial(heads=True, gradients="together"),
     "advent": lambda: adversarial(**ADVENT, loss=WithAuxiliary(loss=THREE, weight=0.1)),
@@ -288,29 +234,3 @@ def run_case(name: str) -> Values:
     for title, net in case.networks.items():
         found |= {f"buffer {title} {key}": each.clone() for key, each in net.named_buffers()}
     return found
-
-
-def run_cases(names: tuple[str, ...]) -> dict[str, Values]:
-    """By name of the case."""
-    return {name: run_case(name) for name in names}
-
-
-def ten_steps(name: str) -> list[float]:
-    """The losses of ten steps with AdamW, on a new batch each."""
-    case = CASES[name]()
-    net = case.networks["model"]
-    synchronise_batch_norm(net.train())
-    optimizer = torch.optim.AdamW(net.parameters(), lr=1e-4)  # as in the paper
-    losses = []
-    for step in range(10):
-        data = own_part(doubled(batch(purpose=f"batch {step}")))
-        generator_of = lambda purpose, step=step: torch_generator(0, purpose, step)  # noqa: E731
-        (phase,) = case.scheme.phases(data, generator_of)
-        optimizer.zero_grad()
-        loss = torch.stack(list(phase.parts.values())).sum()
-        loss.backward()
-        for parameter, gradient in zip(net.parameters(), averaged_gradients(net), strict=True):
-            parameter.grad = gradient
-        optimizer.step()
-        losses.append(float(mean_over_processes([loss])[0]))
-    return losses

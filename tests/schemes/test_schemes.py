@@ -17,9 +17,7 @@ from tests.losses.problems import batch_of
 
 ONE = Domains(
     source=Domain(split="train", view=None, head=None, labels="given"),
-    target=None,
-    target_is=None,
-    tested_head="own",
+    **{"target": None, "target_is": None, "tested_head": "own"},
 )
 B, Q, K = 2, 3, 4
 
@@ -90,24 +88,29 @@ def test_full_step_weights_four_supervised_passes_and_two_distillations() -> Non
     assert phase.parts["class"] == 1 + 0.5 * 2 + 0.5 * 3 + 4
     assert phase.parts["sdc"] == 2.0 * 3  # |F - F'| = |0 - 3|
     assert phase.parts["sdn"] == 3.0 * (4 + 5)  # |F - R'| + |F - T'|
-    assert crm.model.call["views"] == ("rgbt", "rgb", "thermal")
 
 
-def test_masks_are_predicted_only_where_the_criterion_reads_them() -> None:
-    """SDN reads the class logits of R' and T' alone."""
-    crm = scheme(Halves())
-    list(crm.phases(batch(), generator_of))
-    assert crm.model.call["num_predictions"] == 6
-    assert crm.model.call["num_masks"] == 4
+ALL = ("rgbt", "rgb", "thermal")
 
 
-def test_without_sdn_the_masked_single_modalities_are_not_predicted() -> None:
-    crm = scheme(Halves(), nonlocal_weight=0.0)
+@pytest.mark.parametrize(
+    ("hides", "off", "call", "expected"),
+    [
+        # Only the criterion reads masks; SDN reads the class logits of R' and T' alone.
+        (True, (), (2, ALL, 6, 4), {"class": 1 + 2 + 3 + 4, "sdc": 3, "sdn": 4 + 5}),
+        (True, ("nonlocal",), (2, ALL, 4, 4), {"class": 1 + 2 + 3 + 4, "sdc": 3}),
+        (True, ("modality", "nonlocal"), (2, ALL[:1], 2, 2), {"class": 1 + 2, "sdc": 1}),
+        (False, ("complementary", "nonlocal"), (1, ALL, 3, 3), {"class": 1 + 2 + 3}),
+    ],
+)
+def test_only_what_is_read_is_predicted(
+    hides: bool, off: tuple[str, ...], call: tuple[object, ...], expected: dict[str, int]
+) -> None:
+    crm = scheme(Halves() if hides else Nothing(), **{f"{each}_weight": 0.0 for each in off})
     (phase,) = crm.phases(batch(), generator_of)
-    assert crm.model.call["num_predictions"] == 4
-    assert phase.parts["class"] == 1 + 2 + 3 + 4
-    assert phase.parts["sdc"] == 3.0
-    assert "sdn" not in phase.parts
+    names = ("passes", "views", "num_predictions", "num_masks")
+    assert tuple(crm.model.call[name] for name in names) == call
+    assert phase.parts == expected
 
 
 def test_the_clean_half_of_the_batch_is_not_masked() -> None:
@@ -119,22 +122,6 @@ def test_the_clean_half_of_the_batch_is_not_masked() -> None:
     assert not masks.thermal[:B].any()
     assert masks.rgb[B:].float().mean() == 0.5
     assert torch.equal(masks.rgb[B:], ~masks.thermal[B:])
-
-
-def test_without_masking_there_is_one_pass() -> None:
-    crm = scheme(Nothing(), complementary_weight=0.0, nonlocal_weight=0.0)
-    (phase,) = crm.phases(batch(), generator_of)
-    assert crm.model.call["passes"] == 1
-    assert set(phase.parts) == {"class"}
-    assert phase.parts["class"] == 1 + 2 + 3
-
-
-def test_single_modalities_are_not_decoded_where_nothing_reads_them() -> None:
-    crm = scheme(Halves(), modality_weight=0.0, nonlocal_weight=0.0)
-    (phase,) = crm.phases(batch(), generator_of)
-    assert crm.model.call["views"] == ("rgbt",)
-    assert phase.parts["class"] == 1 + 2
-    assert phase.parts["sdc"] == 1.0
 
 
 def test_supervised_masks_its_pass_when_there_is_a_masker() -> None:

@@ -1,4 +1,4 @@
-"""Self-training: the loss of a step by its definition, and a resumed run with the same bits."""
+"""Self-training: class mixing, the teacher, the loss of a step, and a resumed run."""
 
 from __future__ import annotations
 
@@ -10,31 +10,142 @@ from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from rgbt.checks import InputError
 from rgbt.engine.checkpoint import State
 from rgbt.losses.cross_entropy import CrossEntropy
 from rgbt.losses.distances import FeatureDistance
+from rgbt.models.parts import drop_channels
+from rgbt.randomness import torch_generator
 from rgbt.requirements import Record, record_of
 from rgbt.schemes.self_training import (
     CONFIDENCE,
     CONFIDENT_SHARE,
-    LUMA,
     SelfTraining,
+    Teacher,
+    mixed,
     pasted_pixels,
+    seen_as,
 )
 from rgbt.transforms.strong import StrongAugmentation
 from rgbt.types import Batch, MaskPair, Phase, TwoDomains
-from tests.schemes.linear import (
-    Linear,
-    domains,
-    generator_of,
-    images,
-    network,
-    pairs,
-    trainer,
-)
+from tests.losses.problems import batch_of
+from tests.schemes.linear import Linear, domains, generator_of, images, network, pairs, trainer
+
+# ---- class mixing --------------------------------------------------------------------------------
+
+
+def pair_of(value: float, label: int) -> Batch:
+    size = (1, 2, 3)
+    rgb = torch.full((1, 3, 2, 3), value) * torch.tensor([1.0, 2.0, 3.0]).view(1, 3, 1, 1)
+    thermal, weight = torch.full((1, *size), 10 * value), torch.full(size, 0.25)
+    label_ = torch.full(size, label)
+    return replace(batch_of(label_), rgb=rgb, thermal=thermal, confidence=weight)
+
+
+@pytest.mark.parametrize(("values", "pasted"), [([0, 3, 7, 9], 2), ([0, 3, 255], 2), ([5], 1)])
+def test_half_of_the_values_of_the_batch_are_pasted(values: list[int], pasted: int) -> None:
+    """Rounded up, 255 among them; each image has all values here."""
+    label = torch.tensor(values).expand(8, 2, -1).contiguous()
+    masks = pasted_pixels(label, torch_generator(0, "class mix", 0))
+    for image in masks:
+        # Whole classes: both rows are the same.
+        assert torch.equal(image[0], image[1])
+        assert image[0].sum() == pasted
+    assert len(values) == 1 or not all(torch.equal(masks[0], each) for each in masks)
+
+
+def test_both_images_label_and_weight_are_pasted_with_one_mask() -> None:
+    source, target = pair_of(0.01, label=3), pair_of(0.02, label=5)
+    pasted = torch.tensor([[[True, False, False], [False, True, False]]])
+    found = mixed(source, target, pasted)
+    assert found.label.tolist() == [[[3, 5, 5], [5, 3, 5]]]
+    assert found.confidence.tolist() == [[[1.0, 0.25, 0.25], [0.25, 1.0, 0.25]]]
+    for name in ("rgb", "thermal"):
+        one, two, mix = (getattr(each, name) for each in (source, target, found))
+        assert torch.equal(mix[0, :, pasted[0]], one[0, :, pasted[0]])
+        assert torch.equal(mix[0, :, ~pasted[0]], two[0, :, ~pasted[0]])
+        assert not torch.equal(one, two)
+
+
+def test_views_that_differ_paste_what_the_source_sees() -> None:
+    batch = pair_of(0.1, label=3)
+    # (0.1, 0.2, 0.3): 0.0299 + 0.1174 + 0.0342.
+    thermal = seen_as(batch, "rgb", "thermal").thermal
+    torch.testing.assert_close(thermal, torch.full_like(thermal, 0.1815))
+    rgb = seen_as(batch, "thermal", "rgb").rgb
+    assert torch.equal(rgb, torch.ones_like(rgb))
+    for views in (("rgb", "rgb"), ("thermal", "thermal"), (None, None), ("rgbt", "rgb")):
+        assert seen_as(batch, *views) is batch
+
+
+# ---- the teacher ---------------------------------------------------------------------------------
+
+
+class Net(nn.Module):
+    """A normalisation, a weight, and dropout in training."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.norm = nn.BatchNorm2d(1)
+        self.weight = nn.Parameter(torch.tensor(2.0, dtype=torch.float64))
+        self.double()
+
+    def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        return self.weight * drop_channels(self.norm(x), 0.9 if self.training else 0.0, generator)
+
+
+PIXELS = torch.tensor([1.0, 3.0, 5.0, 7.0], dtype=torch.float64).view(1, 1, 2, 2)
+
+
+def teacher_of(network: nn.Module, decay: float = 0.999, norm: Any = "batch") -> Teacher:
+    return Teacher(network, decay=decay, normalisation=norm)
+
+
+def test_average_follows_its_recursion_once_a_step() -> None:
+    network = Net()
+    teacher = teacher_of(network, decay=0.6)
+    values, expected = [5.0, 1.0, 4.0, 2.0, 8.0], 0.0
+    for step, value in enumerate(values):
+        network.weight.data.fill_(value)
+        teacher.update(step)
+        share = min(1 - 1 / (step + 1), 0.6)
+        expected = share * expected + (1 - share) * value
+        network.weight.data.fill_(-100.0)
+        teacher.update(step)
+        assert teacher.network().weight.item() == pytest.approx(expected, abs=1e-12)
+    # After steps 0 and 1 it is their mean, 3; then 0.6 and 0.4.
+    by_hand = 0.6 * (0.6 * (0.6 * 3 + 0.4 * 4) + 0.4 * 2) + 0.4 * 8
+    assert expected == pytest.approx(by_hand)
+
+
+@pytest.mark.parametrize("norm", ["batch", "running"])
+def test_teacher_predicts_without_dropout_and_changes_no_statistics(norm: str) -> None:
+    network = Net()
+    with torch.no_grad():
+        network.norm.running_mean.fill_(3.0)
+        network.norm.running_var.fill_(4.0)
+    teacher = teacher_of(network, norm=norm)
+    network.weight.data.fill_(4.0)
+    before = {name: each.clone() for name, each in teacher.average.state_dict().items()}
+    for _ in range(2):
+        found = teacher.network()(PIXELS)  # without a generator, so that dropout would raise
+        # Mean 4 and variance 5 of the batch, or mean 3 and variance 4 of the network; weight 2.
+        mean, variance = (4.0, 5.0) if norm == "batch" else (3.0, 4.0)
+        expected = 2 * (PIXELS - mean) / (variance + network.norm.eps) ** 0.5
+        torch.testing.assert_close(found, expected)
+    assert not found.requires_grad
+    after = teacher.average.state_dict()
+    assert all(torch.equal(before[name], after[name]) for name in before)
+    assert network.norm.training
+    assert network.norm.track_running_stats
+    network.norm.running_mean.fill_(5.0)
+    teacher.update(7)  # statistics are those of the student
+    assert teacher.network().norm.running_mean.item() == 5.0
+
+
+# ---- a step --------------------------------------------------------------------------------------
 
 THRESHOLD = 0.44
 """Some pixels of the linear network are above it, and some below."""
@@ -53,24 +164,19 @@ class Halves:
         return MaskPair(left, ~left)
 
 
-def augmentation(jitter: float) -> StrongAugmentation:
-    return StrongAugmentation(
-        jitter_probability=jitter,
-        jitter_strength=0.2,
-        blur_probability=jitter,
-        blur_sigma=(0.15, 1.15),
-    )
-
-
 def scheme_of(model: Linear, *, jitter: float = 0.0, **changes: Any) -> Any:
     settings: dict[str, Any] = {
         **{"decay": 0.999, "teacher_norm": "batch", "threshold": THRESHOLD},
         **{"weighted_by": "batch", "ignored_top": 0.0, "ignored_bottom": 0.0},
         **{"mixing": "classes", "masked_weight": 0.5, "masked_images": "target"},
-        **{"domains": domains(False, labels="none", view="rgb"), "masker": Halves(), **changes},
+        **{"domains": domains(False, labels="none", view="rgb"), "masker": Halves()},
+        **{"loss": CrossEntropy(class_weights=None), **changes},
     }
-    loss = CrossEntropy(class_weights=None)
-    return SelfTraining(model=model, loss=loss, augmentation=augmentation(jitter), **settings)
+    strong = StrongAugmentation(
+        **{"jitter_probability": jitter, "jitter_strength": 0.2, "blur_probability": jitter},
+        blur_sigma=(0.15, 1.15),
+    )
+    return SelfTraining(model=model, augmentation=strong, **settings)
 
 
 DISTANCE: dict[str, Any] = {
@@ -179,13 +285,6 @@ def test_mix_and_masked_target_are_augmented_and_pseudo_labels_are_not() -> None
     assert plain.logged[CONFIDENCE] == strong.logged[CONFIDENCE]
 
 
-def test_without_masked_images_nothing_is_masked() -> None:
-    model, data = network(False), batches()
-    phase = phase_of(scheme_of(model, masked_weight=0.0), data)
-    assert list(phase.parts) == ["source/cross_entropy", "target/cross_entropy"]
-    assert len(model.calls) == 2  # the source and the mix
-
-
 def test_feature_distance_is_that_to_the_start_on_things_of_the_source() -> None:
     model, data = network(False), batches()
     scheme = scheme_of(model, **DISTANCE)
@@ -227,21 +326,6 @@ def test_ignored_rows_leave_rows_for_pseudo_labels() -> None:
     torch.testing.assert_close(phase_of(scheme, data).parts["target/cross_entropy"], expected)
     with pytest.raises(InputError, match="must be below 1"):
         scheme_of(network(False), ignored_top=0.5, ignored_bottom=0.5)
-
-
-def test_thermal_target_gets_the_luma_of_a_source_that_sees_rgb() -> None:
-    model, data = network(False), batches()
-    scheme = scheme_of(model, domains=domains(False, labels="none"), masked_weight=0.0)
-    phase = phase_of(scheme, data)
-    thermal = data.target.thermal.expand(-1, 3, -1, -1)
-    probability, label = logits(model, thermal).softmax(1).max(1)
-    share = (probability >= THRESHOLD).float().mean()
-    pasted = pasted_pixels(data.source.label, generator_of("class mix"))
-    luma = torch.einsum("c,bchw->bhw", torch.tensor(LUMA), data.source.rgb)[:, None]
-    image = torch.where(pasted[:, None], luma.expand(-1, 3, -1, -1), thermal)
-    mixed_label = torch.where(pasted, data.source.label, label)
-    expected = cost(logits(model, image), mixed_label, torch.where(pasted, 1.0, share))
-    torch.testing.assert_close(phase.parts["target/cross_entropy"], expected)
 
 
 def test_labels_are_those_of_the_average_of_the_steps_before() -> None:

@@ -5,30 +5,27 @@ from __future__ import annotations
 from functools import cache
 
 import pytest
-import torch
 
 from tests.processes import run_in_processes
-from tests.schemes.several import CASES, Values, run_cases, ten_steps
+from tests.schemes.several import CASES, Values, run_case
 
-NUMBERS = pytest.mark.parametrize("num_processes", [2, pytest.param(4, marks=pytest.mark.slow)])
 TOLERANCE = 1e-5
 """Of float32 sums in another order, relative to the largest value of a kind."""
 
 
 @cache
-def alone() -> tuple[dict[str, Values], list[float]]:
-    """Values by case, and the losses of ten steps."""
+def alone() -> dict[str, Values]:
     return everything()
 
 
 @cache
-def together(num_processes: int) -> list[tuple[dict[str, Values], list[float]]]:
-    """The same by rank. Processes are started once for all tests."""
+def together(num_processes: int) -> list[dict[str, Values]]:
+    """By rank. Processes are started once for all tests."""
     return run_in_processes(everything, num_processes)
 
 
-def everything() -> tuple[dict[str, Values], list[float]]:
-    return run_cases(tuple(CASES)), ten_steps("crm")
+def everything() -> dict[str, Values]:
+    return {name: run_case(name) for name in CASES}
 
 
 def kind(name: str) -> str:
@@ -48,11 +45,11 @@ def assert_same(found: Values, expected: Values) -> None:
         assert not apart.numel() or apart.max() <= TOLERANCE * largest[kind(name)], name
 
 
-@NUMBERS
+@pytest.mark.parametrize("num_processes", [2, pytest.param(4, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", CASES)
 def test_processes_compute_the_step_of_one(name: str, num_processes: int) -> None:
-    expected = alone()[0][name]
-    for found, _ in together(num_processes):
+    expected = alone()[name]
+    for found in together(num_processes):
         assert_same(found[name], expected)
     # Neither is nothing.
     losses = [value for key, value in expected.items() if " loss " in key]
@@ -60,11 +57,3 @@ def test_processes_compute_the_step_of_one(name: str, num_processes: int) -> Non
     assert all(value.isfinite().all() for value in expected.values())
     assert all(value != 0 for value in losses)
     assert any(value.any() for value in gradients)
-
-
-@NUMBERS
-def test_ten_steps_of_crm_have_the_losses_of_one_process(num_processes: int) -> None:
-    expected = torch.tensor(alone()[1])
-    for _, losses in together(num_processes):
-        torch.testing.assert_close(torch.tensor(losses), expected, rtol=1e-5, atol=0)
-    assert expected.diff().abs().min() > 0.01  # each step has another loss

@@ -1,1 +1,1 @@
-"""CMX: `model.CMX`; what it shares with CMNeXt: `network.CmxNetwork`."""
+"""CMX: `model.CMX`, and `model.CmxNetwork`, which it shares with CMNeXt."""

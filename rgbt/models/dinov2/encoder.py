@@ -2,7 +2,6 @@
 
 Entries have the names and shapes of the published files, except `register_tokens`, which DINOv3
 names `storage_tokens`, and the mask of its bias, which has no entry here.
-
 Letters beyond `rgbt.types`: ``d`` width, ``h w`` rows and columns of patches, ``T`` tokens: class,
 registers, then patches row by row.
 """
@@ -19,14 +18,12 @@ from torch.nn import functional as F
 from rgbt.checks import InputError
 from rgbt.models.parts import Mlp, check_heads
 
-OFFSET = 0.1
-"""Patches added to the size when positions are enlarged by a factor (DINOv2 release)."""
+OFFSET = 0.1  # patches added to the size when positions are enlarged by a factor (DINOv2 release)
 
 Resize = Literal["factor", "size"]
 MlpForm = Literal["gelu", "swiglu"]
 Part = Literal["q", "k", "v"]
-PARTS: tuple[Part, ...] = ("q", "k", "v")
-"""In the order of the rows of a joint projection."""
+PARTS: tuple[Part, ...] = ("q", "k", "v")  # in the order of the rows of a joint projection
 
 Rotation = tuple[Tensor, Tensor]
 """Cosine and sine, (T, D) each, D channels of a head."""
@@ -37,9 +34,9 @@ class LoraProjection(nn.Module):
 
         alpha / rank * B A x,  for each of `parts`, 0 for the others
 
-    Source: LoRA (Hu et al., ICLR 2022), Sec. 4.1, Eq. (3): A is drawn, B is 0, so that the network
-    is unchanged at first. A is drawn as its release does, uniformly with a deviation of
-    1 / sqrt(3 d). The paper updates "q" and "v" (Sec. 7.1).
+    Source: LoRA (Hu et al., ICLR 2022), Sec. 4.1, Eq. (3): B is 0, so that the network is unchanged
+    at first. A is drawn as in its release, uniformly with a deviation of 1 / sqrt(3 d). The paper
+    updates "q" and "v" (Sec. 7.1).
     """
 
     def __init__(self, dim: int, *, rank: int, alpha: float, parts: tuple[Part, ...]) -> None:
@@ -69,9 +66,8 @@ class RotaryPositions(nn.Module):
     y and x are the centre of a patch in [-1, 1], each divided by its own side of the image. The
     first half of the channels has the angles of y, then those of x; the second half repeats them.
 
-    Source: DINOv3 release, `layers/rope_position_encoding.py`, normalize_coords "separate". Its
-    random rescaling of the coordinates while training is left out. The published files hold the
-    periods rounded to bfloat16, so the periods are an entry of the network.
+    Source: DINOv3 release, `layers/rope_position_encoding.py`, normalize_coords "separate", without
+    its random rescaling in training. The published files hold the periods rounded to bfloat16.
     """
 
     periods: Tensor
@@ -106,7 +102,7 @@ def rotated(x: Tensor, rotation: Rotation) -> Tensor:
 class KeylessLinear(nn.Linear):
     """Joint projection of queries, keys and values with a bias whose third for keys counts as 0.
 
-    Source: DINOv3 release, `layers/attention.py`, mask_k_bias. The published files have the third.
+    Source: DINOv3 release, `layers/attention.py`, mask_k_bias.
     """
 
     def forward(self, input: Tensor) -> Tensor:
@@ -121,8 +117,7 @@ class Attention(nn.Module):
 
         softmax(q k' / sqrt(d / heads)) v
 
-    Source: Vision Transformer (Dosovitskiy et al., ICLR 2021), App. A; rotation of q and k:
-    RoFormer (Su et al., 2021), Sec. 3.2.2.
+    Source: Vision Transformer, App. A; rotation of q and k: RoFormer (2021), Sec. 3.2.2.
     """
 
     def __init__(self, dim: int, heads: int, *, key_bias: bool) -> None:
@@ -140,16 +135,11 @@ class Attention(nn.Module):
         if rotation is not None:
             q, k = rotated(q, rotation), rotated(k, rotation)
         out = F.scaled_dot_product_attention(q, k, v)
-        projected: Tensor = self.proj(out.transpose(1, 2).flatten(2))
-        return projected
+        return self.proj(out.transpose(1, 2).flatten(2))
 
 
 class LayerScale(nn.Module):
-    """One factor per channel.
-
-    It is 1 at first (DINOv2 release, `hub/backbones.py`, init_values). DINOv3's own training begins
-    with 1e-5, which matters only without a file of weights.
-    """
+    """One factor per channel, 1 at first (DINOv2 release; DINOv3's own training: 1e-5)."""
 
     def __init__(self, dim: int) -> None:
         super().__init__()
@@ -161,9 +151,7 @@ class LayerScale(nn.Module):
 
 
 class GatedMlp(nn.Module):
-    """The MLP of DINOv3's larger forms.
-
-        w3(silu(w1 x) * w2 x)
+    """``w3(silu(w1 x) * w2 x)``, the MLP of DINOv3's larger forms.
 
     Source: Shazeer, GLU Variants Improve Transformer (2020), Eq. (6); biases: DINOv3 release.
     """
@@ -176,8 +164,7 @@ class GatedMlp(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(..., d) -> (..., d)."""
-        out: Tensor = self.w3(F.silu(self.w1(x)) * self.w2(x))
-        return out
+        return self.w3(F.silu(self.w1(x)) * self.w2(x))
 
 
 class Block(nn.Module):
@@ -185,7 +172,7 @@ class Block(nn.Module):
 
         x + s1 attention(norm(x)),  then  x + s2 mlp(norm(x))
 
-    Source: Vision Transformer, Eqs. (2) and (3); LayerScale: CaiT (Touvron et al., ICCV 2021).
+    Source: Vision Transformer, Eqs. (2) and (3); LayerScale: CaiT (ICCV 2021).
     """
 
     def __init__(
@@ -204,24 +191,18 @@ class Block(nn.Module):
     ) -> Tensor:
         """(N, T, d) -> (N, T, d)."""
         x = x + self.ls1(self.attn(self.norm1(x), lora, rotation))
-        out: Tensor = x + self.ls2(self.mlp(self.norm2(x)))
-        return out
+        return x + self.ls2(self.mlp(self.norm2(x)))
 
 
 def resized_positions(positions: Tensor, hw: tuple[int, int], position_resize: Resize) -> Tensor:
     """Positions of the class token and of h x w patches.
 
-    Source: DINOv2 release, `interpolate_pos_encoding`: both forms are bicubic. The files without
-    registers were trained with "factor", those with registers with "size".
+    Source: DINOv2 release, `interpolate_pos_encoding`: both forms are bicubic. "factor", of the
+    files without registers, enlarges the grid by ((h + 0.1) / g, (w + 0.1) / g) without
+    antialiasing; "size", of those with registers, to h x w with antialiasing.
 
-    Args:
-        positions: (1, 1 + g * g, d), the class token's first, then a square grid row by row.
-        hw: patches of the image.
-        position_resize: "factor": the grid is enlarged by ((h + 0.1) / g, (w + 0.1) / g) without
-            antialiasing; "size": to h x w with antialiasing.
-
-    Returns:
-        (1, 1 + h * w, d) float32; unchanged for a square of g x g patches.
+    (1, 1 + g * g, d), the class token's first, then a square grid row by row -> (1, 1 + h * w, d)
+    float32; unchanged for a square of g x g patches.
     """
     grid = round((positions.shape[1] - 1) ** 0.5)
     if hw == (grid, grid):
@@ -242,10 +223,6 @@ class Encoder(nn.Module):
     Registers" (ICLR 2024), Sec. 2.2; rotary positions, bias and MLP: DINOv3 (Siméoni et al., 2025),
     Sec. 3.2, and its release. Hidden patches get the mask token before the positions. Weights are
     drawn as in the releases.
-
-    Raises:
-        InputError: heads that do not divide the width, or positions that are both learned and
-            rotary, or neither.
     """
 
     def __init__(  # noqa: PLR0913 - see `rgbt.models.dinov2.model.DinoMask2Former`
@@ -266,8 +243,7 @@ class Encoder(nn.Module):
     ) -> None:
         super().__init__()
         check_heads("model.num_heads", (num_heads,), (embed_dim,))
-        is_rotary = {position_grid is None, position_resize is None, rope_base is not None}
-        if len(is_rotary) > 1:
+        if len({position_grid is None, position_resize is None, rope_base is not None}) > 1:
             raise InputError(
                 "model.rope_base is for rotary positions, model.position_grid and "
                 "model.position_resize are for learned ones; set those of the other kind to null."
@@ -309,17 +285,14 @@ class Encoder(nn.Module):
         added: Tensor | None = None,
         lora: nn.ModuleList | None = None,
     ) -> list[Tensor]:
-        """Normalised patch tokens after some of the blocks, as maps.
+        """Normalised patch tokens after some of the blocks, as maps (N, d, h, w).
 
         Args:
             image: (N, 3, H, W) normalised, sides multiples of the patch.
-            hidden: (N, h, w) bool, True = the patch is replaced by the mask token; None: none.
+            hidden: (N, h, w) bool, True = the patch is replaced by the mask token.
             layers: numbers of blocks, rising, 1 = the first block.
-            added: (d,), added to every patch token before the blocks; None: nothing.
-            lora: low-rank updates of the blocks; None: none.
-
-        Returns:
-            (N, d, h, w) for each of `layers`; the final normalisation is applied to all.
+            added: (d,), added to every patch token before the blocks.
+            lora: low-rank updates of the blocks.
         """
         x = self.patch_embed["proj"](image)
         hw = x.shape[2], x.shape[3]

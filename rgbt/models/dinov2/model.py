@@ -13,6 +13,7 @@ from torch.nn import functional as F
 from rgbt.checks import InputError
 from rgbt.models.dinov2.encoder import Encoder, LoraProjection, MlpForm, Part, Resize
 from rgbt.models.inputs import Inputs, as_rgb
+from rgbt.models.mask2former.head import HeadShape
 from rgbt.models.mask2former.network import (
     MODALITIES,
     RECORD,
@@ -23,11 +24,9 @@ from rgbt.models.mask2former.network import (
     MaskNetwork,
     NumQueries,
 )
-from rgbt.models.mask2former.pixel_decoder import HeadShape
 from rgbt.ranges import Blocks, Channels, Epsilon, MlpRatio, NumClasses, Positive
 
 STRIDES = (4, 8, 16, 32)
-Tuning = Literal["frozen", "lora", "full"]
 
 
 class ChannelNorm(nn.LayerNorm):
@@ -63,8 +62,6 @@ class Pyramid(nn.ModuleList):
     Source: ViTDet (Li et al., ECCV 2022), Sec. 3, "simple feature pyramid"; layers as in detectron2
     (`modeling/backbone/vit.py`, SimpleFeaturePyramid). Its last 1x1 and 3x3 convolutions of each
     level are left out, because Mask2Former's pixel decoder begins with convolutions of its own.
-
-    `widths` are the channels of the four maps.
     """
 
     def __init__(self, dim: int, token_px: int) -> None:
@@ -84,9 +81,7 @@ class DinoBackbone(nn.Module):
 
     Sources: fusion: CRM, Sec. III-B. Ours: the shared encoder, with a vector that is added to the
     patch tokens of thermal images (0 at first) and low-rank updates for both or for each modality.
-
-    `lora` are the updates of the blocks of both modalities, by "rgb" and "thermal", or by "both";
-    the other arguments: see `DinoMask2Former`.
+    `lora` has the updates of the blocks by "rgb" and "thermal", or by "both".
     """
 
     def __init__(
@@ -109,13 +104,7 @@ class DinoBackbone(nn.Module):
         self.pyramids = nn.ModuleDict({"rgb": first, "thermal": second})
         self.norm_layers = Fusion(first.widths, fusion)
 
-    def maps(
-        self,
-        modality: str,
-        image: Tensor,
-        hidden: Tensor | None,
-        generator: torch.Generator | None,  # noqa: ARG002 - nothing is dropped at random
-    ) -> Maps:
+    def maps(self, modality: str, image: Tensor, hidden: Tensor | None, _: object) -> Maps:
         """(N, c, H, W) and (N, h, w); images are resized so that a patch has `token_px` pixels."""
         image, patch = as_rgb(image), self.encoder.patch
         if patch != self.token_px:
@@ -129,8 +118,7 @@ class DinoBackbone(nn.Module):
             added=self.thermal_embedding if modality == "thermal" else None,
             lora=self.lora[owner] if len(self.lora) else None,
         )
-        maps: Maps = self.pyramids[modality](tokens)
-        return maps
+        return self.pyramids[modality](tokens)
 
 
 class DinoMask2Former(MaskNetwork):
@@ -140,19 +128,8 @@ class DinoMask2Former(MaskNetwork):
     ViTDet, Sec. 3; fusion: CRM, Sec. III-B; head: Mask2Former, Sec. 3.2. The combination is ours.
     With the weights of a published file, the patch tokens of an RGB image are those of its network.
 
-    The arguments are the keys of ``conf/model/dinov2_vits14.yaml``, and those of DINOv3. With
+    The arguments are the keys of ``conf/model/dinov2_vits14.yaml`` and ``dinov3_vits16.yaml``. With
     `thermal_embedding`, a frozen encoder keeps the activations of thermal images for its gradient.
-
-    Args:
-        rope_base: base of the periods of rotary positions, 100 in DINOv3; None: positions are
-            learned.
-        norm_eps: epsilon of the layer normalisations of the encoder; 1e-6 in DINOv2, 1e-5 in
-            DINOv3.
-        key_bias: whether keys have a bias; not in DINOv3.
-        mlp: MLP of a block, "gelu" or the gated "swiglu".
-
-    Raises:
-        InputError: settings that do not fit each other.
     """
 
     record = replace(
@@ -175,7 +152,7 @@ class DinoMask2Former(MaskNetwork):
         position_resize: Resize | None,
         token_px: Literal[8, 16],
         layers: Annotated[tuple[Blocks, ...], Len(1, 4)],
-        tuning: Tuning,
+        tuning: Literal["frozen", "lora", "full"],
         lora_rank: Channels,
         lora_alpha: Positive,
         lora_parts: Annotated[tuple[Part, ...], Len(1, 3)],

@@ -1,8 +1,8 @@
 """Tools for adapters, which build the networks of odd repositories.
 
-An adapter is a Python file beside a recipe, with a function that returns the network. Within it,
-modules of the checkout can be imported. It keeps constructors from reading weights of files, so
-that a run starts from the weights that its configuration names.
+An adapter is a Python file beside a recipe, with a function that returns the network. It imports
+modules of the checkout, and keeps constructors from reading weights of files, so that a run starts
+from the weights that its configuration names.
 """
 
 from __future__ import annotations
@@ -28,10 +28,7 @@ def skip_init(*names: str) -> None:
 
 
 def stand_in(name: str, **attributes: Any) -> None:
-    """Let a package be imported that is not installed and that the network does not use.
-
-    All that it is expected to have is a mock, but for `attributes`.
-    """
+    """Let a package be imported that is not installed: a mock, but for `attributes`."""
     parts = name.split(".")
     for length in range(1, len(parts) + 1):
         sys.modules.setdefault(".".join(parts[:length]), MagicMock(__path__=[]))

@@ -10,6 +10,7 @@ from annotated_types import Interval
 from torch import Tensor, nn
 
 from rgbt.models.inputs import Inputs
+from rgbt.models.mask2former.head import HeadShape
 from rgbt.models.mask2former.network import (
     RECORD,
     Fusion,
@@ -19,17 +20,16 @@ from rgbt.models.mask2former.network import (
     MaskNetwork,
     NumQueries,
 )
-from rgbt.models.mask2former.pixel_decoder import HeadShape
 from rgbt.models.parts import check_heads
 from rgbt.models.swin import PATCH, Stage, Swin, SwinShape
 from rgbt.ranges import Blocks, Channels, Depths, MlpRatio, NumClasses, ShareBelowOne, Widths
 
 
 class RgbtBackbone(nn.Module):
-    """RGB branch, thermal branch, and their fusion.
+    """RGB branch, thermal branch, and their fusion.   Source: CRM, Sec. III-B.
 
-    Source: CRM, Sec. III-B.   Stages from `share_start` on (0..4) are the RGB branch's own in both
-    branches; embedding and output normalisations never are. `mask_token`: see `Mask2Former`.
+    Stages from `share_start` on (0..4) are the RGB branch's own in both branches; embedding and
+    output normalisations never are.
     """
 
     token_px = PATCH
@@ -53,16 +53,11 @@ class RgbtBackbone(nn.Module):
         self.norm_layers = Fusion(shape.widths, fusion)
 
     def maps(
-        self,
-        modality: str,
-        image: Tensor,
-        hidden: Tensor | None,
-        generator: torch.Generator | None,
+        self, modality: str, image: Tensor, hidden: Tensor | None, generator: torch.Generator | None
     ) -> Maps:
         """(N, c, H, W) with sides that are multiples of 32, and (N, H / 4, W / 4)."""
         branch = self.RGB_branch if modality == "rgb" else self.THR_branch
-        found: Maps = branch(image, hidden, generator)
-        return found
+        return branch(image, hidden, generator)
 
 
 class Mask2Former(MaskNetwork):
@@ -73,8 +68,7 @@ class Mask2Former(MaskNetwork):
     Source: CRM, Sec. III; SpatialSeg, Sec. III-A.   Released: UkcheolShin/CRM_RGBTSeg,
     lab-sun/SpatialSeg (the same network).
 
-    The arguments are the keys of ``conf/model/mask2former_swin_t.yaml``. A mask token stands behind
-    the patch embedding.
+    The arguments are the keys of ``conf/model/mask2former_swin_t.yaml``.
     """
 
     record = replace(

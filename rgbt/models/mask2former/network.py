@@ -10,18 +10,16 @@ from annotated_types import Interval, MultipleOf
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from rgbt.checks import check_choice
+from rgbt.checks import InputError
 from rgbt.geometry.padding import STRIDE, padded_hw
 from rgbt.models.inputs import Inputs, expand_cells
-from rgbt.models.mask2former.decoder import Predictor
-from rgbt.models.mask2former.pixel_decoder import GROUPS, HeadShape, PixelDecoder
+from rgbt.models.mask2former.head import GROUPS, HeadShape, PixelDecoder, Predictor
 from rgbt.models.parts import check_heads
 from rgbt.ranges import Channels
 from rgbt.requirements import Record
 from rgbt.types import VIEWS, MaskPair, Output, View
 
-FAINTEST = 1e-6
-"""Smallest semantic score whose logarithm is taken."""
+FAINTEST = 1e-6  # the smallest semantic score whose logarithm is taken
 
 MODALITIES: tuple[Literal["rgb", "thermal"], ...] = ("rgb", "thermal")
 LEVELS = ("res2", "res3", "res4", "res5")
@@ -39,8 +37,7 @@ RECORD = Record(
         "sem_seg_head.pixel_decoder.transformer.encoder.layers.*",
         "sem_seg_head.predictor.transformer_*_layers.*",
     ),
-)
-"""Of every such network, without its backbone."""
+)  # of every such network, without its backbone
 
 Widths = tuple[int, int, int, int]
 Maps = list[Tensor]
@@ -58,10 +55,7 @@ class Request(NamedTuple):
 class Fusion(nn.ModuleDict):
     """The normalised maximum (or sum) of the maps of both modalities, level by level.
 
-    Source: CRM, Sec. III-B.   Released: batch normalisation of the fused maps only; the maps of
-    a single modality leave as their branch normalised them.
-
-    `widths` are the channels of the four levels, `fusion` is "max" or "add".
+    Source: CRM, Sec. III-B.   Released: the maps of a single modality are not normalised again.
     """
 
     def __init__(self, widths: Widths, fusion: FusionKind) -> None:
@@ -74,8 +68,7 @@ class Fusion(nn.ModuleDict):
     def forward(self, maps: dict[str, Maps], request: Request) -> Maps:
         """Maps of "rgb" and "thermal" to those of all predictions: pass by pass, view by view.
 
-        Maps of one that no view needs may be missing. Batch normalisation takes the passes one
-        after the other, so that each is normalised on its own.
+        Batch normalisation takes the passes one after the other, each on its own.
         """
         predicted = []
         for level, norm in enumerate(self.values()):
@@ -137,23 +130,16 @@ class MaskNetwork(nn.Module):
     ) -> Output:
         """Predictions of every view and pass, as one batch through the head.
 
-        Predictions are in the order F R T F' R' T': pass by pass, within it view by view.
+        Predictions are in the order F R T F' R' T': pass by pass, within it view by view. Images
+        and masks are as `rgbt.models` says, N = passes * B, pass by pass. A cell is a square of a
+        multiple of the backbone's `token_px` pixels; its pixels are 0, and the mask token takes the
+        place of its tokens. Stochastic depth is drawn per sample and branch.
 
-        Args:
-            rgb: as `rgbt.models` says, N = passes * B, pass by pass.
-            thermal: likewise.
-            masks: likewise; a cell is a square of a multiple of the backbone's `token_px` pixels.
-                Its pixels are 0, and the mask token takes the place of its tokens.
-            passes: stacked copies of one batch. The fusion's batch normalisation sees them one
-                after the other, as successive calls would show them.
-            views: which features are predicted from, each at most once: "rgbt" (fused), "rgb",
-                "thermal". () is "rgbt". A modality that no view needs is not computed.
-            num_predictions: P, how many of the len(views) * passes predictions are computed, from
-                the first one on. None: all.
-            num_masks: M, how many of the P have mask logits, from the first one on; the others have
-                class logits alone, which costs less, because the gradient of the finest features is
-                not needed. None: all.
-            generator: draws stochastic depth, per sample and branch.
+        `passes` are stacked copies of one batch, which the fusion's batch normalisation sees one
+        after the other. `views` are predicted from, each at most once; () is "rgbt". A modality
+        that no view needs is not computed. P = `num_predictions` are computed, the first ones, of
+        which the first M = `num_masks` have mask logits (None: all). The others have class logits
+        alone, which costs less, because the gradient of the finest features is not needed.
 
         Returns:
             logits: (B, K, H, W) float32 semantic scores in evaluation mode when there is one view
@@ -162,28 +148,24 @@ class MaskNetwork(nn.Module):
                 "class_logits" (L, P, B, Q, K + 1), last column = no object;
                 "mask_logits" (L, M, B, Q, h, w) at 1/4 of the padded size; in memory the order
                 is M, B, L, Q, h, w.
-
-        Raises:
-            ValueError: passes, views or numbers of predictions that do not fit.
         """
         views = views or VIEWS[:1]
-        for view in views:
-            check_choice("view", view, VIEWS)
+        if not set(views) <= set(VIEWS) or len(set(views)) < len(views):
+            raise InputError(f"modality: expected some of {VIEWS}, each once; view {views}.")
         stacked = len(views) * passes
         predictions = stacked if num_predictions is None else num_predictions
         with_masks = predictions if num_masks is None else num_masks
-        if rgb.shape[0] % passes or len(set(views)) < len(views):
-            raise ValueError(f"{rgb.shape[0]} images in {passes} passes, views {views}: no batch.")
-        if not 1 <= with_masks <= predictions <= stacked:
-            raise ValueError(f"expected 1 <= {with_masks} masks <= {predictions} <= {stacked}.")
+        if rgb.shape[0] % passes or not 1 <= with_masks <= predictions <= stacked:
+            numbers = f"{with_masks} with masks of {predictions} of {stacked}"
+            raise ValueError(f"{rgb.shape[0]} images, {passes} passes, predictions: {numbers}.")
 
         count = rgb.shape[0] // passes
         image_hw = rgb.shape[2], rgb.shape[3]
+        images = self.inputs(rgb, thermal, masks, multiple=STRIDE)
+        padded = images.rgb.shape[2], images.rgb.shape[3]
         hidden = None
         if masks is not None:
-            padded = padded_hw(image_hw)
             hidden = expand_cells(masks, rgb.shape[0], padded, self.backbone.token_px)
-        images = self.inputs(rgb, thermal, masks, multiple=STRIDE)
         maps: dict[str, Maps] = {}
         for index, modality in enumerate(MODALITIES):
             if views != (MODALITIES[1 - index],):
@@ -194,8 +176,7 @@ class MaskNetwork(nn.Module):
         class_logits, mask_logits = self.sem_seg_head["predictor"](pyramid)
         logits = None
         if not self.training and stacked == 1:
-            full_hw = padded_hw(image_hw)
-            logits = semantic_logits(class_logits[-1], mask_logits[-1], image_hw, full_hw)
+            logits = semantic_logits(class_logits[-1], mask_logits[-1], image_hw, padded)
         aux = {
             "class_logits": class_logits.unflatten(1, (predictions, count)),
             "mask_logits": mask_logits.unflatten(1, (with_masks, count)),
@@ -203,10 +184,9 @@ class MaskNetwork(nn.Module):
         return Output(logits, aux)
 
     def dense_logits(self, output: Output, image_hw: tuple[int, int]) -> Tensor:
-        """Class scores of every pixel in training, for losses that compare dense predictions.
+        """Class scores (B, K, H, W) float32 of an output of one pass and view, in training.
 
-        `output` is of one pass and view. (B, K, H, W) float32: logarithm of the semantic scores, so
-        that their softmax is the share of a class in the sum over classes.
+        They are logarithms of the semantic scores, whose softmax is the share of a class.
         """
         classes, masks = (output.aux[name][-1, 0] for name in ("class_logits", "mask_logits"))
         scores = semantic_logits(classes, masks, image_hw, padded_hw(image_hw))
@@ -220,15 +200,12 @@ def semantic_logits(
 
         score(k, pixel) = sum over queries of softmax(class)(k) * sigmoid(mask)(pixel)
 
-    Source: Mask2Former release, semantic inference; the no-object class is dropped.
-
     (B, Q, K + 1) and (B, Q, h, w), which stands for an image of size `padded` whose top left part
-    is `image_hw`, -> (B, K, H, W) float32, >= 0.
+    is `image_hw`, -> (B, K, H, W) float32, >= 0.   Source: Mask2Former release.
     """
     with torch.autocast(class_logits.device.type, enabled=False):
-        masks = F.interpolate(
-            mask_logits.float(), size=padded, mode="bilinear", align_corners=False
-        )
+        masks = mask_logits.float()
+        masks = F.interpolate(masks, size=padded, mode="bilinear", align_corners=False)
         masks = masks[..., : image_hw[0], : image_hw[1]].sigmoid()
         classes = class_logits.float().softmax(-1)[..., :-1]
         scores = classes.transpose(1, 2) @ masks.flatten(2)

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from rgbt.config.compose import compose
-from rgbt.models.external import building
+from rgbt.models.external import network
 from rgbt.models.external.network import ExternalNetwork
 from rgbt.models.inputs import Inputs
 
@@ -41,7 +41,7 @@ class Net(Base):
 
 def forget() -> None:
     """Leave the checkout of this process, as another process would."""
-    building._held.clear()
+    network._held.clear()
     for name in list(sys.modules):
         if name.split(".")[0] in ("model", "toolbox", "absent"):
             del sys.modules[name]
