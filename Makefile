@@ -3,6 +3,7 @@
 # make test-all   the slow tests as well
 # make test-servers  the tests on PostgreSQL and an MLflow server, started on loopback
 # make lint       formatting, lint, types, spelling
+# make results  rewrites docs/results, its figures and the marked numbers from the archive results/
 # make docs       checks the pages and their code, builds the site into site/index.html
 # make mutants    named faults (tests/mutants/*.yaml), each of which a test has to find
 # make bench      benchmarks, as ratios measured in one run
@@ -19,7 +20,10 @@ SPREAD ?= -n auto --maxprocesses 4 --dist worksteal
 # What is spelled: tests misspell names on purpose.
 TEXTS := README.md CONTRIBUTING.md CHANGELOG.md CITATION.cff docs conf rgbt sweeps analysis hydra_plugins
 
-.PHONY: demo test test-all test-servers lint docs mutants bench
+# Pages written by hand with numbers between <!-- results:... --> and <!-- /results -->.
+MARKED := README.md,docs/results/spatial-bias.md
+
+.PHONY: demo test test-all test-servers lint docs results mutants bench
 
 demo: $(VENV)/.ready
 	$(BIN)/python -m rgbt.run +experiment=grbm
@@ -47,6 +51,10 @@ docs: $(VENV)/.ready
 	$(BIN)/python -m pytest $(SPREAD) -m "docs and not slow" tests/docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 	@echo "built site/index.html; with search: $(BIN)/python -m http.server --directory site"
+
+# Runs of this machine do not count: the pages are those of the archive alone.
+results: $(VENV)/.ready
+	$(BIN)/python -m sweeps.report format=markdown runs_dir=none archive=results out=docs/results "fill=$(MARKED)"
 
 mutants: $(VENV)/.ready
 	$(BIN)/python -m tests.mutants

@@ -5,25 +5,32 @@ One table and one sentence: the differences with intervals and p-values, over im
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
-from annotated_types import Interval as Bounds
+import numpy as np
 
-from analysis.arguments import Blocks, Level, Resamples, check_out
+from analysis.arguments import Archive, Blocks, Draws, Level, Resamples, check_out, write_tables
+from analysis.results import Evaluation, groups_in, label_of, open_counts
+from analysis.uncertainty import Comparison, Interval, Resampling, compare
+from analysis.uncertainty.blocks import FEWEST
+from analysis.uncertainty.same_images import common
+from analysis.uncertainty.sentence import sentence
 from rgbt.checks import InputError, split_list
 from rgbt.config.common_options import RunsDir
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
-
-if TYPE_CHECKING:
-    from analysis.results import NamedCounts
-    from analysis.uncertainty import Comparison, Interval, Resampling
-    from rgbt.metrics.counts import Counts
-    from rgbt.metrics.metric import Absent
-    from rgbt.tables import TextTable
+from rgbt.metrics import names, score_grid
+from rgbt.metrics.counts import Counts, convention
+from rgbt.metrics.details import details_of
+from rgbt.metrics.metric import Absent
+from rgbt.metrics.named import parse
+from rgbt.metrics.pairs import HEADLINES, protocol_of
+from rgbt.metrics.scores import absent_notes
+from rgbt.tables import ABSENT, TextTable, number
+from rgbt.terminal import info, plain_text, print_rich, rich_table
 
 
 @dataclass(frozen=True)
@@ -56,14 +63,16 @@ class Options:
             "frames of videos); default: single frames"
         ),
     ] = ""
-    corruption: Annotated[
-        str,
-        Help(
-            "compare the counts of corrupted images of the runs (rgbt robustness run=...): "
-            "corruption=noise:rgb severity=16"
-        ),
+    condition: Annotated[
+        str, Help('input (rgbt evaluate) or corruption (rgbt robustness): thermal, "noise:rgb 16"')
     ] = ""
-    severity: Annotated[str, Help("severity of the corruption")] = ""
+    paired: Annotated[
+        bool,
+        Help(
+            "a and b are the same trainings, measured in two ways, such as along an exact and an "
+            "estimated flow; they may count other pixels"
+        ),
+    ] = False
     missing: Annotated[
         Literal["refuse", "leave_out"],
         Help("images that only one method has: refuse the comparison, or leave_out: exclude them"),
@@ -78,22 +87,14 @@ class Options:
             "convention of the data set"
         ),
     ] = "as counted"
-    seed: Annotated[int, Bounds(ge=0, le=2**31), Help("seed of the resampling")] = 0
+    seed: Draws = 0
     runs_dir: RunsDir = Path("runs")
+    archive: Archive = Path("results")
     out: Annotated[Path | None, Help("output folder of comparison.md and comparison.csv")] = None
 
 
-def main(options: Options, overrides: list[str]) -> int:
+def main(options: Options, _: list[str]) -> int:
     """Compare two methods on the same images."""
-    from rich.markup import escape
-
-    from analysis.uncertainty import Resampling, compare
-    from analysis.uncertainty.sentence import sentence
-    from rgbt.files.atomic import write_atomic
-    from rgbt.metrics.named import parse
-    from rgbt.terminal import path_lines, print_rich, rich_table
-
-    del overrides  # none takes effect
     check_out(options.out)
     opened = _opened(options)
     a, b = _counts(opened, options.missing)
@@ -104,103 +105,92 @@ def main(options: Options, overrides: list[str]) -> int:
         seed=options.seed,
         absent=None if options.absent == "as counted" else options.absent,
     )
-    comparison = compare(a, b, metrics_of(options.metrics, [*a, *b], settings), settings)
-    shown = " ".join(word for word in (options.corruption, options.severity) if word)
-    labels = [f"{label} ({shown})" if shown else label for label in _labels(opened)]
-    notes = absent_classes([*a, *b], settings.absent)
-    grid = replace(comparison_grid(comparison, labels), notes=notes)
-    said = sentence(comparison, *labels)
+    metrics, paired = metrics_of(options.metrics, [*a, *b], settings), options.paired
+    found = compare(a, b, metrics, settings, paired=paired, same_pixels=not paired)
+    shown = f" ({options.condition})" if options.condition else ""
+    labels = [f"{label}{shown}" for label in _labels(opened)]
+    grid = comparison_grid(found, labels, absent_classes([*a, *b], settings.absent))
+    said = sentence(found, *labels)
     print_rich(rich_table(grid))
     # Scores by day and by night are over other images.
-    drawn = {parse(each.metric).part: each.a.said for each in comparison.differences}
+    drawn = {parse(each.metric).part: each.a.said for each in found.differences}
     parts = [f"{part}: {text}." for part, text in drawn.items() if part is not None]
     remark = (
         f"Percent points (Var: squared). Intervals: Student, {settings.resamples} resamples of the "
-        "images, seeds by Welch; p of the last interval; Holm: corrected for the number of lines."
+        f"images, seeds {'in pairs' if paired else 'by Welch'}; p of the last interval; Holm: "
+        "corrected for the number of lines."
     )
-    print_rich(escape("\n".join(filter(None, [said, *parts, comparison.reason, remark]))))
-    out = options.out
-    if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        write_atomic(out / "comparison.md", f"{grid.to_markdown()}\n{said}\n".encode())
-        write_atomic(out / "comparison.csv", comparison_csv(comparison).encode())
-        print_rich(path_lines([("files", f"{out}/ (comparison.md, comparison.csv)")]))
+    print_rich(plain_text("\n".join(filter(None, [said, *parts, found.reason, remark]))))
+    write_tables(options.out, "comparison", f"{grid.to_markdown()}\n{said}\n", _rows(found))
     return 0
 
 
 def metrics_of(text: str, every: Sequence[Counts], settings: Resampling) -> list[str]:
-    """The requested metrics; "auto": the usual scores of the counts, also by day and by night.
+    """The requested metrics; "auto": the usual scores of the counts.
 
-    Of single frames mIoU (by day, by night) and Var and every region; of pairs of frames the two
-    of their protocol (by day, by night). Day and night where all counts distinguish them and have
-    enough images of them for `settings`.
+    Means also by day and by night, where all counts have enough images of both for `settings`.
     """
-    from analysis.uncertainty.blocks import FEWEST
-    from rgbt.metrics import names, score_grid
-    from rgbt.metrics.details import details_of
-    from rgbt.metrics.pairs import HEADLINES, protocol_of
-
+    partition = every[0].partition
     if text != "auto":
         return split_list(text, "metrics")
-    if details_of(every[0].partition) is not None:
+    if details_of(partition) is not None:
         return list(score_grid.headlines(every[0]))
-    headlines: tuple[str, ...] = (names.MIOU,)
-    by_region = [names.VAR, *map(names.region, range(1, every[0].counts.shape[1] + 1))]
-    protocol = protocol_of(every[0].partition)
-    if protocol is not None:
-        headlines, by_region = HEADLINES[protocol], []
-    told = [counts.parts() for counts in every]
+    protocol = protocol_of(partition)
+    means = [names.MIOU] if protocol is None else [*HEADLINES[protocol]]
+    numbers = range(1, every[0].counts.shape[1] + 1)
+    regions = [names.VAR, *map(names.region, numbers)] if protocol is None else []
     # Neighbours of two sequences make no common block: a few images more than the product.
     fewest = FEWEST * (settings.blocks + 1 if isinstance(settings.blocks, int) else 1)
+    told = [counts.parts() for counts in every]
     parts = [
         names.subset(part, metric)
         for part in (names.DAY, names.NIGHT)
         if all(part in each and len(each[part].names) >= fewest for each in told)
-        for metric in headlines
+        for metric in means
     ]
-    return [*headlines, *by_region, *parts]
+    return [*means, *regions, *parts]
 
 
-def comparison_grid(comparison: Comparison, labels: Sequence[str]) -> TextTable:
+def comparison_grid(
+    found: Comparison, labels: Sequence[str], notes: tuple[str, ...] = ()
+) -> TextTable:
     """One line per score."""
-    from rgbt.tables import TextTable, number
 
-    with_seeds = any(each.difference.both is not None for each in comparison.differences)
-    level = f"{100 * comparison.level:g} %"
-    over = [f"{level} over images"]
-    over += [f"{level} over images and seeds"] if with_seeds else []
+    def between(interval: Interval | None) -> str:
+        return f"{interval.low:+.2f} to {interval.high:+.2f}" if interval else ABSENT
+
+    def of_p(p: float) -> str:
+        return ABSENT if p != p else "<0.001" if p < 0.001 else f"{p:.3f}"
+
+    with_seeds = any(each.difference.both is not None for each in found.differences)
     rows = []
-    for each in comparison.differences:
-        difference = number(each.value) if each.value != each.value else f"{each.value:+.2f}"
+    for each in found.differences:
         spreads = ["" if side.sd != side.sd else f" ± {side.sd:.2f}" for side in (each.a, each.b)]
         scores = [number(each.a.value) + spreads[0], number(each.b.value) + spreads[1]]
-        intervals = [_shown(each.difference.images)]
-        intervals += [_shown(each.difference.both)] if with_seeds else []
-        ps = _p(each.difference.p), _p(each.p_corrected)
-        rows.append((each.metric, *scores, difference, *intervals, *ps))
-    singles = f"{comparison.images} single images"
-    drawn = (
-        singles if comparison.said == singles else f"{comparison.images} images, {comparison.said}"
-    )
-    title = f"{labels[1]} minus {labels[0]}: {drawn}, {comparison.partition}"
-    header = ("", *labels, "difference", *over, "p", "p (Holm)")
-    return TextTable(title, header, tuple(rows))
+        scores.append(ABSENT if each.value != each.value else f"{each.value:+.2f}")
+        ends = [between(each.difference.images), between(each.difference.both)][: 1 + with_seeds]
+        rows.append((each.metric, *scores, *ends, of_p(each.difference.p), of_p(each.p_corrected)))
+    level = f"{100 * found.level:g} % over images"
+    over = [level, f"{level} and seeds"][: 1 + with_seeds]
+    singles = f"{found.images} single images"
+    drawn = singles if found.said == singles else f"{found.images} images, {found.said}"
+    title = f"{labels[1]} minus {labels[0]}: {drawn}, {found.partition}"
+    return TextTable(title, ("", *labels, "difference", *over, "p", "p (Holm)"), tuple(rows), notes)
+
+
+def _rows(found: Comparison) -> Iterator[tuple[object, ...]]:
+    """One line per score with all digits."""
+    ends = ("images_low", "images_high", "both_low", "both_high", "p", "p_holm")
+    yield ("metric", "a", "b", "seeds_a", "seeds_b", "difference", *ends)
+    for each in found.differences:
+        intervals = (each.difference.images, each.difference.both)
+        bounds = [end for i in intervals for end in ((i.low, i.high) if i else ("", ""))]
+        scores = each.a.value, each.b.value, each.a.seeds, each.b.seeds, each.value
+        yield (each.metric, *scores, *bounds, each.difference.p, each.p_corrected)
 
 
 def absent_classes(every: Sequence[Counts], absent: Absent | None) -> tuple[str, ...]:
-    """Footnotes about classes that are absent from the counts of both methods.
-
-    Args:
-        every: counts of both methods, of the same images.
-        absent: convention of the table; None: that of the counts.
-    """
-    import numpy as np
-
-    from rgbt.metrics.counts import convention
-    from rgbt.metrics.details import details_of
-    from rgbt.metrics.pairs import protocol_of
-    from rgbt.metrics.scores import absent_notes
-
+    """Footnotes about classes that the counts of both methods lack, by `absent` or as counted."""
     first = every[0]
     if protocol_of(first.partition) is not None or details_of(first.partition) is not None:
         return ()  # matrices of pairs of frames and of boundaries have no labels as rows
@@ -209,35 +199,24 @@ def absent_classes(every: Sequence[Counts], absent: Absent | None) -> tuple[str,
     return absent_notes(summed, first.classes, first.scored, first.split, used)
 
 
-def _opened(options: Options) -> list[tuple[NamedCounts, ...]]:
+def _opened(options: Options) -> list[tuple[Evaluation, ...]]:
     """The trainings of both methods."""
-    from analysis.results import groups_in, open_counts
-    from analysis.robustness import under
-
-    frames, corruption, severity = options.frames, options.corruption, options.severity
-    if severity and not corruption:
-        raise InputError("'severity' has no effect without corruption=..., for example noise.")
-    if corruption and frames:
-        raise InputError(f"corruption={corruption} applies to single frames; omit frames=.")
-    opened = []
+    if options.condition and options.frames:
+        raise InputError(f"condition={options.condition} is of single frames; omit frames=.")
+    stored = options.runs_dir, options.split, options.frames, options.condition, options.archive
     for key, side in (("a", options.a), ("b", options.b)):
         if not side:
-            groups = ", ".join(groups_in(options.runs_dir)) or "none"
+            groups = ", ".join(groups_in(options.runs_dir, options.archive)) or "none"
             raise InputError(
                 f"'{key}' has no value; give a run, a file of counts, or a group of runs. Groups "
                 f"in {options.runs_dir}: {groups}."
             )
-        found = open_counts(side, options.runs_dir, options.split, frames)
-        opened.append(under(found, corruption, severity) if corruption else found)
-    return opened
+    return [open_counts(side, *stored) for side in (options.a, options.b)]
 
 
 def _counts(
-    opened: Sequence[tuple[NamedCounts, ...]], missing: str
+    opened: Sequence[tuple[Evaluation, ...]], missing: str
 ) -> tuple[list[Counts], list[Counts]]:
-    from analysis.uncertainty.same_images import common
-    from rgbt.terminal import info
-
     methods = [[named.counts for named in each] for each in opened]
     shared = {each.path for each in opened[0]} & {each.path for each in opened[1]}
     if shared:
@@ -251,42 +230,13 @@ def _counts(
     return methods[0], methods[1]
 
 
-def _labels(opened: Sequence[tuple[NamedCounts, ...]]) -> list[str]:
+def _labels(opened: Sequence[tuple[Evaluation, ...]]) -> list[str]:
     """Labels that differ: the names of the methods, with their seeds where these are equal."""
-    from analysis.results import label_of
-
     plain = labels = [label_of(each) for each in opened]
     if plain[0] == plain[1]:
         seeds = [sorted(named.seed for named in each if named.seed is not None) for each in opened]
         labels = [f"{plain[0]} seed {', '.join(map(str, each))}" for each in seeds if each]
     return labels if len(set(labels)) == 2 else [f"a: {plain[0]}", f"b: {plain[1]}"]
-
-
-def _shown(interval: Interval | None) -> str:
-    return "-" if interval is None else f"{interval.low:+.2f} to {interval.high:+.2f}"
-
-
-def _p(value: float) -> str:
-    if value != value:
-        return "-"
-    return "<0.001" if value < 0.001 else f"{value:.3f}"
-
-
-def comparison_csv(comparison: Comparison) -> str:
-    """One line per score with all digits; empty where there is no value."""
-    from rgbt.tables import csv_text
-
-    ends = ("images_low", "images_high", "both_low", "both_high", "p", "p_holm")
-    rows: list[tuple[object, ...]] = []
-    rows.append(("metric", "a", "b", "seeds_a", "seeds_b", "difference", *ends))
-    for each in comparison.differences:
-        found = each.difference
-        images = (found.images.low, found.images.high) if found.images else ("", "")
-        both = (found.both.low, found.both.high) if found.both else ("", "")
-        values = (*images, *both, found.p, each.p_corrected)
-        row = (each.a.value, each.b.value, each.a.seeds, each.b.seeds, each.value, *values)
-        rows.append((each.metric, *("" if value != value else value for value in row)))
-    return csv_text(rows)
 
 
 entry = PlainCommand(Options, main, heeds=())

@@ -10,22 +10,26 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
-from annotated_types import Interval as Bounds
-
-from analysis.arguments import Blocks, Level, Resamples, check_out
+from analysis.arguments import Archive, Blocks, Draws, Level, Resamples, check_out, write_tables
+from analysis.results import Evaluation, evaluations_of, label_of, open_counts
+from analysis.uncertainty import Estimate, Resampling, estimate
 from rgbt.checks import InputError
 from rgbt.config.common_options import RunsDir
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
+from rgbt.metrics.counts import Counts
+from rgbt.metrics.details import KINDS, details_of, regions_of
+from rgbt.metrics.score_grid import ScoreGrid, score_grid
+from rgbt.tables import TextTable, number
+from rgbt.terminal import print_rich, rich_table
+from rgbt.types import VIEWS
 
-if TYPE_CHECKING:
-    from analysis.detail_counts import DetailKey
-    from analysis.uncertainty import Estimate, Resampling
-    from rgbt.metrics.counts import Counts
-    from rgbt.metrics.score_grid import ScoreGrid
-    from rgbt.tables import TextTable
+Key = tuple[str, str]
+"""Input of the network ("" where a file does not tell), and partition of the counts."""
+
+Scores = tuple[ScoreGrid, Mapping[str, Estimate]]
 
 
 @dataclass(frozen=True)
@@ -43,133 +47,103 @@ class Options:
     level: Level = 0.95
     resamples: Resamples = 10_000
     blocks: Blocks = "auto"
-    seed: Annotated[int, Bounds(ge=0, le=2**31), Help("seed of the resampling")] = 0
+    seed: Draws = 0
     runs_dir: RunsDir = Path("runs")
+    archive: Archive = Path("results")
     out: Annotated[Path | None, Help("output folder of details.md and details.csv")] = None
 
 
-@dataclass(frozen=True)
-class DetailTable:
-    """The scores of one file of counts, or of one for each seed.
-
-    Attributes:
-        key: what was counted.
-        grid: names of the scores.
-        estimates: by name.
-    """
-
-    key: DetailKey
-    grid: ScoreGrid
-    estimates: Mapping[str, Estimate]
-
-    @property
-    def is_plain(self) -> bool:
-        """Whether the counts are of single frames without details."""
-        from rgbt.metrics.pairs import protocol_of
-
-        return self.key.kind is None and protocol_of(self.key.regions) is None
-
-
-def main(options: Options, overrides: list[str]) -> int:
+def main(options: Options, _: list[str]) -> int:
     """Show every stored score of a method by region, class, bin and input."""
-    from analysis.detail_counts import open_details
-    from analysis.results import label_of, open_counts
-    from analysis.uncertainty import Resampling
-    from rgbt.files.atomic import write_atomic
-    from rgbt.terminal import path_lines, print_rich, rich_table
-
-    del overrides  # none takes effect
     check_out(options.out)
     if not options.run:
         raise InputError("'run' has no value; give a run, a group of runs, or a file of counts.")
     settings = Resampling(
-        resamples=options.resamples,
-        level=options.level,
-        blocks=options.blocks,
-        seed=options.seed,
+        resamples=options.resamples, level=options.level, blocks=options.blocks, seed=options.seed
     )
-    opened = open_counts(options.run, options.runs_dir)
-    tables = [
-        table_of(key, counts, settings)
-        for key, counts in open_details(opened, options.split).items()
-    ]
-    grids = [*text_tables(tables, label_of(opened))]
-    for grid in grids:
-        print_rich(rich_table(grid))
-    first = next(iter(tables[0].estimates.values()))
-    reason = f" {first.reason}" if first.reason else ""
+    opened = open_counts(options.run, options.runs_dir, archive=options.archive)
+    found: dict[Key, Scores] = {}
+    for key, counts in _stored(opened, options.split).items():
+        grid = score_grid(counts[0])
+        found[key] = grid, estimate(counts, list(dict.fromkeys(grid.metrics)), settings)
+    grids = list(_grids(found, label_of(opened)))
+    for each in grids:
+        print_rich(rich_table(each))
+    first = next(iter(next(iter(found.values()))[1].values()))
     seeds = " and seeds" if len(opened) > 1 else ""
     remark = (
         f"In brackets: {100 * settings.level:g} % intervals over images{seeds} ({first.said}), "
-        f"{settings.resamples} resamples.{reason}"
-    )
+        f"{settings.resamples} resamples. {first.reason}"
+    ).strip()
     print_rich(remark)
-    out = options.out
-    if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        text = "\n".join([*(grid.to_markdown() for grid in grids), remark, ""])
-        write_atomic(out / "details.md", text.encode())
-        write_atomic(out / "details.csv", details_csv(tables).encode())
-        print_rich(path_lines([("files", f"{out}/ (details.md, details.csv)")]))
+    text = "\n".join([*(each.to_markdown() for each in grids), remark, ""])
+    write_tables(options.out, "details", text, _rows(found))
     return 0
 
 
-def table_of(key: DetailKey, counts: Sequence[Counts], settings: Resampling) -> DetailTable:
-    """The scores of counts of one kind, one for each seed, with intervals."""
-    from analysis.uncertainty import estimate
-    from rgbt.metrics.score_grid import score_grid
+def _stored(opened: Sequence[Evaluation], split: str) -> dict[Key, list[Counts]]:
+    """The counts of a method by what they are of, one for each training."""
+    stored = [
+        [each for each in evaluations_of(named.run, split) if each.condition in VIEWS]
+        if named.run
+        else [named]
+        for named in opened
+    ]
+    every = [{(e.condition, e.counts.partition): e.counts for e in found} for found in stored]
 
-    grid = score_grid(counts[0])
-    return DetailTable(key, grid, estimate(counts, list(dict.fromkeys(grid.metrics)), settings))
+    def order(key: Key) -> tuple[str, int, int]:
+        details = details_of(key[1])
+        kind = (None, *KINDS).index(details and details.kind)
+        return regions_of(key[1]), kind, ("", *VIEWS).index(key[0])
 
-
-def text_tables(tables: Sequence[DetailTable], label: str) -> Iterator[TextTable]:
-    """The tables as text; those of single frames have one row for each input and come first."""
-    from rgbt.tables import TextTable
-
-    plain: dict[str, list[DetailTable]] = {}
-    for table in tables:
-        if table.is_plain:
-            plain.setdefault(table.key.regions, []).append(table)
-    for regions, group in plain.items():
-        rows = [(each.key.view or "mIoU", *_cells(each, each.grid.metrics)) for each in group]
-        title = f"{label}: {group[0].grid.title} and input ({regions})"
-        yield TextTable(title, ("", *group[0].grid.columns), tuple(rows))
-    for each in tables:
-        if not each.is_plain:
-            rows = [(name, *_cells(each, metrics)) for name, metrics in each.grid.rows]
-            of_view = f", {each.key.view}" if each.key.view else ""
-            title = f"{label}{of_view}: {each.grid.title} ({each.key.regions})"
-            yield TextTable(title, ("", *each.grid.columns), tuple(rows))
-
-
-def details_csv(tables: Sequence[DetailTable]) -> str:
-    """One line per score with all digits; empty where there is no value."""
-    from rgbt.tables import csv_text
-
-    header = ("regions", "details", "input", "metric", "value", "sd", "seeds", "low", "high")
-    rows: list[tuple[object, ...]] = [header]
-    for table in tables:
-        key = table.key
-        for metric, each in table.estimates.items():
-            interval = each.both or each.images
-            ends = (interval.low, interval.high) if interval else ("", "")
-            values = (each.value, each.sd, each.seeds, *ends)
-            shown = ("" if value != value else value for value in values)
-            rows.append((key.regions, key.kind or "", key.view, metric, *shown))
-    return csv_text(rows)
+    keys = sorted({key for found in every for key in found}, key=order)
+    for named, found in zip(opened, every, strict=True):
+        missing = [details_of(key[1]) for key in keys if key not in found]
+        if missing or not keys:
+            views = "modality=all" if len({view for view, _ in keys}) != 1 else "..."
+            kinds = ",".join(dict.fromkeys(each.kind for each in missing if each)) or "boundary"
+            folder = named.path.parent
+            raise InputError(
+                f"{folder} has no counts of {kinds} of split '{split}'; write them with rgbt "
+                f"evaluate run={folder} {views} details={kinds}"
+            )
+    return {key: [found[key] for found in every] for key in keys}
 
 
-def _cells(table: DetailTable, metrics: Sequence[str]) -> list[str]:
-    from rgbt.tables import number
+def _grids(found: Mapping[Key, Scores], label: str) -> Iterator[TextTable]:
+    """The scores as text; tables of one line are joined, with a line for each input."""
+    groups: dict[tuple[str, str, str], list[Key]] = {}
+    for (view, partition), (grid, _) in found.items():
+        alone = view if len(grid.rows) > 1 else ""
+        groups.setdefault((alone, grid.title, regions_of(partition)), []).append((view, partition))
+    for (alone, title, regions), keys in groups.items():
+        grid = found[keys[0]][0]
+        named = ", ".join(filter(None, (label, alone)))
+        is_joined = len(grid.rows) == 1 and keys[0][0] != ""
+        rows = [
+            (key[0] if is_joined else name, *_cells(found[key][1], metrics))
+            for key in keys
+            for name, metrics in found[key][0].rows
+        ]
+        title = f"{named}: {title}{' and input' if is_joined else ''} ({regions})"
+        yield TextTable(title, ("", *grid.columns), tuple(rows))
 
-    cells = []
-    for metric in metrics:
-        each = table.estimates[metric]
-        interval = each.both or each.images
-        around = f" [{interval.low:.2f}, {interval.high:.2f}]" if interval else ""
-        cells.append(number(each.value) + around)
-    return cells
+
+def _cells(estimates: Mapping[str, Estimate], metrics: Sequence[str]) -> Iterator[str]:
+    for each in (estimates[metric] for metric in metrics):
+        ends = each.interval
+        yield number(each.value) + (f" [{ends.low:.2f}, {ends.high:.2f}]" if ends else "")
+
+
+def _rows(found: Mapping[Key, Scores]) -> Iterator[tuple[object, ...]]:
+    """One line per score with all digits."""
+    yield "regions", "details", "input", "metric", "value", "sd", "seeds", "low", "high"
+    for (view, partition), (_, estimates) in found.items():
+        details = details_of(partition)
+        for metric, each in estimates.items():
+            ends = (each.interval.low, each.interval.high) if each.interval else ("", "")
+            of = regions_of(partition), details.kind if details else "", view, metric
+            yield (*of, each.value, each.sd, each.seeds, *ends)
 
 
 entry = PlainCommand(Options, main, heeds=())

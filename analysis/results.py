@@ -1,23 +1,51 @@
-"""Counts of runs and of scored predictions, opened by their names."""
+"""Finished runs of a folder and of an archive, their scores as one frame, and counts by name."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import math
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from rgbt.checks import InputError, nearest, split_list
+from analysis.archive import archived, counts_of, unpack
+from rgbt.checks import InputError, nearest, one_line, split_list
+from rgbt.files.plain_files import read_json
+from rgbt.metrics import names
 from rgbt.metrics.counts import Counts
-from rgbt.metrics.pairs import file_name, protocol_of
-from rgbt.runs.folder import GROUP, Description, counts_name, find_run, runs_in
+from rgbt.metrics.details import KINDS, details_of, regions_of
+from rgbt.metrics.metric import Absent
+from rgbt.metrics.named import parse, value
+from rgbt.metrics.pairs import protocol_of
+from rgbt.metrics.score_grid import score_grid
+from rgbt.metrics.scores import MEANS, iou, miou, recall, variance
+from rgbt.runs.folder import GROUP, counts_name, find_run, is_finished, runs_in
+from rgbt.runs.naming import row_name
 from rgbt.runs.result import RunResult
-from rgbt.terminal import info
+from rgbt.terminal import info, warn
+from rgbt.types import VIEWS
 
-SEED = "rgbt.seed"
+if TYPE_CHECKING:
+    import pandas as pd
+
+SEED, EXPERIMENT = "rgbt.seed", "rgbt.experiment"
+EVALUATIONS, ROBUSTNESS = "evaluations", "robustness"
+"""Tags of runs; folder of their evaluations, and the one below it of corrupted images."""
+
+CLEAN, ALL = "clean", "all"
+"""Condition of images as they are, as the run is made for; subset of all images of a split."""
+
+SCORE_COLUMNS = ("subset", "region", "class", "metric", "value")
+COLUMNS = (
+    *("run", "experiment", "group", "seed", "split", "condition", "severity", "partition"),
+    *SCORE_COLUMNS,
+)
+"""Columns of `score_frame` and `results`."""
 
 RUNS = "runs, files of counts or a group"
 """What a list may contain, for messages."""
@@ -27,188 +55,322 @@ Frames = Literal["", "aligned", "released", "next", "flow", "triples"]
 
 
 @dataclass(frozen=True)
-class NamedCounts:
-    """Counts of a run or of a file, under the name that tables show.
+class Evaluation:
+    """A file of counts, of a run or of another method.
 
     Attributes:
-        label: of the method.
-        run: that they are of; None for a file.
-        seed: of the run; None for a file.
+        run: that was evaluated; None: the file says nothing about one.
+        condition: `CLEAN`, an input ("rgb"), or a corruption ("noise"), each followed by what else
+            was changed: another head, checkpoint, data set, views or statistics of batches.
+        severity: of the corruption, 0 is the clean image; NaN for others.
+        row: the corruption alone: "noise", "rgb_removed", "features-thermal"; "" for others.
+        title: of the corruption, as shown.
+        unit: of the severity; "" where there is one alone.
     """
 
-    label: str
     path: Path
     counts: Counts
     run: RunResult | None = None
-    seed: int | None = None
+    condition: str = ""
+    severity: float = math.nan
+    row: str = ""
+    title: str = ""
+    unit: str = ""
+
+    @property
+    def said(self) -> str:
+        """Condition and severity: "noise 16"."""
+        severity = "" if math.isnan(self.severity) else f" {self.severity:g}"
+        return f"{self.condition}{severity}"
 
     @property
     def key(self) -> str:
         """Config key of the run; "" for a file."""
         return "" if self.run is None else self.run.key
 
+    @property
+    def label(self) -> str:
+        """Name of the method in tables: the group of the run, or the name of file or folder."""
+        if self.run is not None:
+            return self.run.tags.get(GROUP) or self.run.key
+        folder = self.path.parent
+        folder = folder.parent if folder.name == EVALUATIONS else folder
+        is_generic = self.path.stem.startswith(("counts_", "consistency_"))
+        return folder.name if is_generic else self.path.stem
+
+    @property
+    def seed(self) -> int | None:
+        """Of the run; None for a file."""
+        text = "" if self.run is None else self.run.tags.get(SEED, "")
+        return int(text) if text.isdecimal() else None
+
+
+def level_of(path: Path) -> Evaluation:
+    """A file of ``rgbt robustness``, with the description beside it; InputError if damaged."""
+    file, advice = path.with_suffix(".json"), "remove it, and rgbt robustness makes it again"
+    made = read_json(file, dict[str, Any], advice)
+    try:
+        row, title, unit = (str(made[key]) for key in ("row", "title", "unit"))
+        severity = float(made["severity"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{file} is not of rgbt robustness ({one_line(error)}).") from error
+    return Evaluation(path, Counts.load(path), None, row, severity, row, title, unit)
+
+
+def finished_runs(runs: Path | str = "runs", archive: Path | str = "results") -> list[RunResult]:
+    """All finished runs of a folder of runs and of an archive, by key.
+
+    A missing folder or archive is empty. A damaged run is left out with a warning. Of a key with
+    other counts in both, the run of the folder is taken, and a warning names the key. Archived runs
+    are unpacked once, into the cache of the user.
+    """
+    root, found, differing = Path(runs), dict[str, RunResult](), set[str]()
+    folders = [each.path for each in runs_in(root)] if root.is_dir() else []
+    for path in (*filter(is_finished, folders), *archived(Path(archive))):
+        try:
+            run = unpack(path) if path.suffix == ".zip" else RunResult(path)
+            _ = run.result, run.description  # they can be read
+            first = found.setdefault(run.key, run)
+            shared = {each.relative_to(run.folder) for each in counts_of(run.folder)}
+            shared &= {each.relative_to(first.folder) for each in counts_of(first.folder)}
+            for name in shared if first is not run else ():
+                one, two = (Counts.load(each.folder / name) for each in (first, run))
+                differing |= set() if np.array_equal(one.counts, two.counts) else {run.key}
+        except InputError as error:
+            warn(f"{path} is left out: {error}")
+    for key in sorted(differing):
+        warn(f"{key} is stored with other counts, too; those of {found[key].folder} are used.")
+    return [found[key] for key in sorted(found)]
+
+
+def evaluations_of(run: RunResult, split: str = "test") -> Iterator[Evaluation]:
+    """Counts of a run of one split: as it ended, then other inputs, pairs of frames, corruptions.
+
+    A damaged file is left out with a warning.
+    """
+    for path in counts_of(run.folder):
+        try:
+            found = _evaluation(run, path)
+        except InputError as error:
+            warn(f"{path} is left out: {error}")
+            continue
+        # Clean images once more, with their corruptions, are those that the run ended with.
+        is_again = found.row == found.condition == CLEAN
+        if found.counts.split == split and not is_again:
+            yield found
+
+
+def _evaluation(run: RunResult, path: Path) -> Evaluation:
+    """What a file is of; its name and the description beside it say so."""
+    counts = run.counts(path.relative_to(run.folder).as_posix())
+    if path.parent == run.folder:
+        return Evaluation(path, counts, run, CLEAN)
+    other = "" if counts.dataset == run.fingerprint else f"dataset {counts.dataset[:8]}"
+    if path.parent.parent.name == ROBUSTNESS:
+        level, rest = level_of(path), path.parent.name.removeprefix(counts.split).strip("_")
+        words = [level.row, rest, other]
+        return replace(level, run=run, condition=" ".join(filter(None, words)))
+    split, partition = re.escape(counts.split), regions_of(counts.partition)
+    after = f"({'|'.join(VIEWS)})_{partition}(.*?)(-({'|'.join(KINDS)}))?"
+    if match := re.fullmatch(f"consistency_[a-z]+(.*)_{split}(.*)", path.stem):
+        words = [CLEAN, *match.groups(), other]
+    elif match := re.fullmatch(f".*_{split}_{after}", path.stem):
+        words = [match[1], match[2], other]
+    else:
+        words = [path.stem, other]
+    return Evaluation(path, counts, run, " ".join(filter(None, (w.strip("_-") for w in words))))
+
+
+def score_frame(counts: Counts, absent: Absent | None = None) -> pd.DataFrame:
+    """Every score of counts of single frames, of pairs of frames, or of details, one a row.
+
+    `absent`: how a class without pixels scores (`rgbt.metrics.scores`); None: as counted.
+
+    Returns:
+        the columns `SCORE_COLUMNS`: subset ("all", "day", "night"), region (0: the whole image),
+        class ("": all scored classes), metric and value in percent; Var in squared points, NaN:
+        nothing to score.
+    """
+    import pandas as pd
+
+    absent = absent or counts.absent
+    rows: list[tuple[str, int, str, str, float]] = []
+    if not _is_plain(counts):
+        for name in dict.fromkeys(score_grid(counts).metrics):
+            of = parse(name)
+            score = "/".join(filter(None, (of.score, of.bin)))
+            place = of.part or ALL, of.region or 0, of.class_name or "", score
+            rows.append((*place, value(name, counts, absent)))
+        return pd.DataFrame(rows, columns=SCORE_COLUMNS)
+    for subset, part in {ALL: counts, **counts.parts()}.items():
+        by_region = part.by_region()
+        matrices = np.concatenate([by_region.sum(0, keepdims=True), by_region])
+        for metric, mean in MEANS.items():
+            values = 100 * mean(matrices, absent, counts.scored)
+            rows += [(subset, region, "", metric, float(v)) for region, v in enumerate(values)]
+        of_regions = miou(by_region, absent, counts.scored)
+        rows.append((subset, 0, "", names.VAR, float(variance(of_regions))))
+        for metric, by_class in (("IoU", iou), ("acc", recall)):
+            for region, values in enumerate(100 * by_class(matrices, absent)):
+                pairs = zip(counts.classes, values.tolist(), strict=True)
+                rows += [(subset, region, name, metric, each) for name, each in pairs]
+    return pd.DataFrame(rows, columns=SCORE_COLUMNS)
+
+
+def results(
+    runs: Path | str = "runs",
+    archive: Path | str = "results",
+    split: str = "test",
+    *,
+    absent: Absent | None = None,
+    evaluations: bool = True,
+) -> pd.DataFrame:
+    """Scores of all finished runs (`finished_runs`) as one frame: one score a row.
+
+    `absent` is that of `score_frame`. Without `evaluations`, only the counts that a run ended with
+    are read, and none of other inputs, corruptions, details and pairs of frames.
+
+    Returns:
+        the columns `COLUMNS`: run (its key), experiment, group (name that its seeds share), seed,
+        split, condition and severity (see `Evaluation`), partition of the image into regions, and
+        those of `score_frame`.
+    """
+    import pandas as pd
+
+    frames = []
+    for run in finished_runs(runs, archive):
+        texts = run.key, run.tags.get(EXPERIMENT, ""), run.tags.get(GROUP, "")
+        for each in evaluations_of(run, split):
+            if not evaluations and each.path.parent != run.folder:
+                continue
+            found = (*texts, each.seed, split, each.condition, each.severity, each.counts.partition)
+            of_file = dict(zip(COLUMNS, found, strict=False))
+            frames.append(score_frame(each.counts, absent).assign(**of_file))
+    if not frames:
+        return pd.DataFrame(columns=COLUMNS)
+    return pd.concat(frames, ignore_index=True)[[*COLUMNS]].astype({"seed": "Int64"})
+
 
 def open_counts(
-    text: str, runs_dir: Path | str = "runs", split: str = "", frames: Frames = ""
-) -> tuple[NamedCounts, ...]:
+    text: str,
+    runs_dir: Path | str = "runs",
+    split: str = "",
+    frames: Frames = "",
+    condition: str = "",
+    archive: Path | str = "results",
+) -> tuple[Evaluation, ...]:
     """The counts that `text` names, the seeds of one method one after the other.
 
     Args:
         text: a run (folder, config key or MLflow run id), a file of counts (.npz), the name of a
-            group ("grbm sigma_div=2": all its seeds in `runs_dir`), or several of these with commas
-            between them.
+            group ("grbm sigma_div=2": all its seeds), or several of these with commas between them.
         runs_dir: where runs lie.
         split: "": the test split of runs, and whatever a file holds.
         frames: of runs, counts of single frames, or of pairs of frames by one protocol
             (`rgbt.metrics.pairs`); "": single frames of runs, and whatever a file holds.
+        condition: of runs, counts of another input or of corrupted images (`Evaluation`):
+            "thermal", "noise 16", "removed:rgb"; "": as the runs ended.
+        archive: where archived runs lie, which have keys and groups as those of `runs_dir`.
 
     Raises:
-        InputError: there is no such thing, a run has no counts of the split or of pairs, or a file
-            is of others.
+        InputError: there is no such thing, a run lacks what is requested, or a file is of others.
     """
-    root = Path(runs_dir)
-    # A group's name may hold commas itself: "crm train_sizes=[240,480]".
-    is_whole = Path(text).suffix != ".npz" and bool(_of_group(text, root))
-    words = [text] if is_whole else split_list(text, RUNS)
-    found = [each for word in words for each in _open(word, root, split, frames)]
-    for named in found:
-        counts = named.counts
+    found: list[Evaluation] = []
+    for word in split_list(text, RUNS):
+        for source in _named(word, Path(runs_dir), archive):
+            if isinstance(source, RunResult):
+                found.append(_of_run(source, split or "test", frames, condition))
+            else:
+                path = source.resolve()
+                found.append(Evaluation(path, Counts.load(path)))
+    for path, counts in ((each.path, each.counts) for each in found):
         if split and counts.split != split:
-            raise InputError(
-                f"{named.path} is of split '{counts.split}', not of split={split}; omit split=, "
-                "or name counts of that split."
-            )
+            raise InputError(f"{path} is of split '{counts.split}', not of split={split}.")
         if frames and protocol_of(counts.partition) != frames:
-            raise InputError(
-                f"{named.path} is by {counts.partition}, not frames={frames}; omit frames=, "
-                "or name a run or what rgbt consistency run=... counted so."
-            )
+            raise InputError(f"{path} is by {counts.partition}, not frames={frames}.")
     _check_trainings_differ(text, found)
-    labels = dict.fromkeys(each.label for each in found)
-    if len(labels) > 1:
-        info(
-            f"{' and '.join(labels)} are treated as seeds of one method, because they "
-            "were listed together."
-        )
+    if len(labels := dict.fromkeys(each.label for each in found)) > 1:
+        info(f"{' and '.join(labels)}, listed together, are treated as seeds of one method.")
     return tuple(found)
 
 
-def _check_trainings_differ(text: str, found: Sequence[NamedCounts]) -> None:
+def _check_trainings_differ(text: str, found: Sequence[Evaluation]) -> None:
     """Refuse a seed twice or equal counts: they are one training and would narrow the interval."""
     for first, second in combinations(found, 2):
-        if first.path == second.path:
-            raise InputError(f"'{text}' names {first.path} twice; one training counts once.")
+        is_one = first.label == second.label or not (first.run and second.run)
+        if is_one and np.array_equal(first.counts.counts, second.counts.counts):
+            raise InputError(
+                f"'{text}' names the same counts twice ({first.path} and {second.path}); one "
+                "training counts once."
+            )
         is_again = (first.label, first.seed) == (second.label, second.seed)
         if is_again and first.seed is not None:
             raise InputError(
                 f"'{text}' names seed {first.seed} of '{first.label}' twice ({first.key} and "
-                f"{second.key}, which differ in settings other than their overrides); name the "
-                "runs."
-            )
-        is_one = first.label == second.label or not (first.run and second.run)
-        if is_one and np.array_equal(first.counts.counts, second.counts.counts):
-            raise InputError(
-                f"'{text}': {first.path} and {second.path} hold the same counts; one training "
-                "counts once."
+                f"{second.key}, which differ in settings other than their overrides)."
             )
 
 
-def groups_in(runs_dir: Path | str) -> list[str]:
-    """Names of all groups with finished runs in a folder."""
-    runs = [run for run in _runs(Path(runs_dir)) if run.is_finished]
-    return sorted({_description(run).tags.get(GROUP, "") for run in runs} - {""})
+def groups_in(runs_dir: Path | str, archive: Path | str = "results") -> list[str]:
+    """Names of all groups of finished runs."""
+    return sorted({run.tags.get(GROUP, "") for run in finished_runs(runs_dir, archive)} - {""})
 
 
-def label_of(counts: Sequence[NamedCounts]) -> str:
+def label_of(counts: Sequence[Evaluation]) -> str:
     """Name of a method: its group, or the names of all its counts."""
     return " + ".join(dict.fromkeys(each.label for each in counts))
 
 
-def _open(word: str, runs_dir: Path, split: str, frames: Frames) -> list[NamedCounts]:
+def _named(word: str, runs_dir: Path, archive: Path | str) -> Sequence[RunResult | Path]:
+    """The runs, or the file of counts, that a word names."""
     path = Path(word).expanduser()
     if path.suffix == ".npz":
-        return [_of_file(path)]
-    grouped = _of_group(word, runs_dir)
-    if grouped:
-        return [_of_run(folder, split, frames) for folder in grouped]
-    if _is_folder(path) and not (path / "config.yaml").is_file():
-        return [_of_scores(path)]
+        return [path]
     try:
-        folder = find_run(word, runs_dir)
-    except (InputError, OSError) as error:  # OSError: longer than a file's name may be
-        groups = groups_in(runs_dir)
-        known = f" or a group of {runs_dir} ({nearest(word, groups)})" if groups else ""
-        raise InputError(
-            f"'{word}' is not a run folder, config key or MLflow run id in {runs_dir}, nor a file "
-            f"of counts (.npz){known}."
-        ) from error
-    return [_of_run(RunResult(folder), split, frames)]
-
-
-def _is_folder(path: Path) -> bool:
-    try:
-        return path.is_dir()
-    except OSError:  # longer than a file's name may be
-        return False
-
-
-def _of_scores(folder: Path) -> NamedCounts:
-    """The counts in a folder that `analysis.score` wrote: by rings, as the papers' tables are."""
-    files = sorted(folder.glob("counts_ring*.npz")) or sorted(folder.glob("counts_*.npz"))
+        return [RunResult(find_run(word, runs_dir))]
+    except (InputError, OSError):  # OSError: longer than a file's name may be
+        finished = finished_runs(runs_dir, archive)
+    if chosen := [run for run in finished if word in (run.key, run.tags.get(GROUP))]:
+        return chosen
+    # A folder that `analysis.score` wrote has counts by rings, as the papers' tables are, and more.
+    files = []
+    with suppress(OSError):
+        files = sorted(path.glob("counts_ring*.npz")) or sorted(path.glob("counts_*.npz"))
+    if len(files) > 1:
+        raise InputError(f"{path} has {', '.join(f.name for f in files)}; name one of these.")
+    groups = {run.tags.get(GROUP, "") for run in finished} - {""}
+    known = f" or a group of {runs_dir} ({nearest(word, groups)})" if groups else ""
     if not files:
         raise InputError(
-            f"{folder} contains neither a run (config.yaml) nor counts (counts_*.npz); to count "
-            "label images of a method: rgbt score predictions=... dataset=..."
+            f"'{word}' is not a run (folder, config key or MLflow run id in {runs_dir}), nor counts"
+            f" (.npz, or a folder of rgbt score){known}."
         )
-    if len(files) > 1:
-        raise InputError(
-            f"{folder} contains {', '.join(file.name for file in files)}; name one of these files."
-        )
-    return _of_file(files[0])
+    return files
 
 
-def _of_file(path: Path) -> NamedCounts:
-    """A file of counts, named after its folder where its file name is generic."""
-    path = path.resolve()
-    folder = path.parent.parent if path.parent.name == "evaluations" else path.parent
-    label = folder.name if path.stem.startswith(("counts_", "consistency_")) else path.stem
-    return NamedCounts(label, path, Counts.load(path))
-
-
-def _of_group(word: str, runs_dir: Path) -> list[RunResult]:
-    runs = _runs(runs_dir) if word else []  # "" is no group, but that of runs without one
-    return [r for r in runs if word == _description(r).tags.get(GROUP) and r.is_finished]
-
-
-def _runs(runs_dir: Path) -> list[RunResult]:
-    return [RunResult(run.path) for run in runs_in(runs_dir)] if runs_dir.is_dir() else []
-
-
-def _of_run(run: RunResult, split: str, frames: Frames) -> NamedCounts:
-    split = split or "test"
-    path = run.folder / file_name(frames, split) if frames else run.folder / counts_name(split)
-    if frames and not path.is_file():
-        views = {"next": "next", "flow": "video", "triples": "video"}.get(frames, "virtual")
-        raise InputError(
-            f"{run.folder} has no counts of pairs of frames {path.relative_to(run.folder)}; "
-            f"rgbt consistency run={run.folder} split={split} frames={views} makes them once it is "
-            "finished."
-        )
+def _of_run(run: RunResult, split: str, frames: Frames, condition: str) -> Evaluation:
     if not run.is_finished:
         info(f"{run.folder} is not finished; its counts are those of its last evaluation.")
-    description = _description(run)
-    seed = description.tags.get(SEED, "")
-    return NamedCounts(
-        label=description.tags.get(GROUP) or run.key,
-        path=path,
-        counts=Counts.load(path) if frames else run.counts(split),
-        run=run,
-        seed=int(seed) if seed else None,
-    )
+    if not (frames or condition):
+        return Evaluation(run.folder / counts_name(split), run.counts(split), run, CLEAN)
+    known = [
+        each
+        for each in evaluations_of(run, split)
+        if (protocol_of(each.counts.partition) == frames if frames else _is_plain(each.counts))
+    ]
+    name, *severity = (condition or CLEAN).split(" ", 1)
+    wanted = " ".join((row_name(name), *severity))
+    chosen = [each for each in known if wanted in (each.condition, each.said)]
+    if len(chosen) != 1:
+        said = ", ".join(each.said for each in known) or "none"
+        what = f"condition={condition}" if condition else f"frames={frames}"
+        raise InputError(
+            f"{what} is not counted in {run.folder}, which has {said} of split '{split}'; rgbt "
+            "consistency, robustness and evaluate make counts."
+        )
+    return chosen[0]
 
 
-def _description(run: RunResult) -> Description:
-    try:
-        return run.description
-    except (InputError, TypeError):  # a damaged run.json of some run is no reason to stop
-        return Description("", {}, {})
+def _is_plain(counts: Counts) -> bool:
+    """Whether they are of single frames, without details."""
+    return details_of(counts.partition) is None and protocol_of(counts.partition) is None

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
@@ -17,37 +16,58 @@ from analysis.arguments import MOST, Blocks, Level, check_out, dataset_of
 from analysis.bar import progress
 from rgbt.checks import InputError
 from rgbt.config.command import built
-from rgbt.config.common_options import PredictionFormatOptions
+from rgbt.config.common_options import PredictionFormatOptions, RunsDir
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
-from rgbt.metrics.metric import MAX_REGIONS, Partition
-from rgbt.metrics.names import DAY, MIOU, NIGHT, subset
+from rgbt.metrics import names
+from rgbt.metrics.metric import MAX_REGIONS, Absent
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # --help answers without waiting for pandas and OpenCV
+    import pandas as pd
+
     from analysis.predictions.scoring import FolderScores
-    from analysis.predictions.table import ScoreKey, ScoreTable
     from analysis.uncertainty import Resampling
     from rgbt.metrics.counts import Counts
+    from rgbt.tables import TextTable
 
-OF_A_FOLDER = (
-    *("partition", "regions", "format", "palette", "missing", "resize", "prefix", "suffix"),
-    *("name", "threads"),
-)
-"""Options of how a folder is counted; they have no effect on counts of runs."""
-
-MAX_THREADS = 256
 SOURCE = "source.txt"
 """File in a folder of scores that records what was scored."""
 
-PARTITION_NAMES = get_args(Partition)
+COLUMNS = (
+    *("method", "split", "partition", "subset", "images", "region", "class", "metric", "absent"),
+    *("value", "low", "high"),
+)
+SHOWN = (names.MIOU, names.MACC, names.VAR)
+"""Means in the tables; the file of scores holds more."""
 
-OF_PARTS = {"all": MIOU, **{part: subset(part, MIOU) for part in (DAY, NIGHT)}}
-"""Part of the images -> its mIoU."""
+
+@dataclass(frozen=True, kw_only=True)
+class FolderOptions(PredictionFormatOptions):
+    """Options of how a folder is counted; they have no effect on counts of runs."""
+
+    partition: Annotated[
+        Literal["all", "ring", "vertical", "horizontal"], Help("partition of the images")
+    ] = "all"
+    regions: Annotated[
+        int, Interval(ge=1, le=MAX_REGIONS), Help("number of regions of equal area")
+    ] = 5
+    missing: Annotated[
+        Literal["refuse", "leave_out"],
+        Help("images without a prediction: refuse, or leave_out: exclude them"),
+    ] = "refuse"
+    resize: Annotated[
+        Literal["refuse", "nearest", "stretch"],
+        Help(
+            "predictions of another size than their label: refuse; nearest: resize them by the "
+            "nearest pixel; stretch: so too where the ratio of height and width differs"
+        ),
+    ] = "refuse"
+    name: Annotated[str, Help("name of the method in tables; default: name of the folder")] = ""
 
 
-@dataclass(frozen=True)
-class Options(PredictionFormatOptions):
-    """Options of ``rgbt score``."""
+@dataclass(frozen=True, kw_only=True)
+class Options(FolderOptions):
+    """Options of ``rgbt score``; those of `FolderOptions` are for predictions only."""
 
     predictions: Annotated[
         str,
@@ -71,50 +91,19 @@ class Options(PredictionFormatOptions):
             "it, the tables are only printed"
         ),
     ] = None
-    runs_dir: Annotated[Path, Help("folder of runs for counts=...")] = Path("runs")
+    runs_dir: RunsDir = Path("runs")
     resamples: Annotated[
-        int,
-        Interval(ge=0, le=MOST),
-        Help("number of resamples for the intervals over images; 0: no intervals"),
+        int, Interval(ge=0, le=MOST), Help("resamples for the intervals over images; 0: none")
     ] = 10_000
     level: Level = 0.95
     blocks: Blocks = "auto"
-    partition: Annotated[
-        Literal["all", "ring", "vertical", "horizontal"],
-        Help("partition of the images (predictions only)"),
-    ] = "all"
-    regions: Annotated[
-        int,
-        Interval(ge=1, le=MAX_REGIONS),
-        Help("number of regions of equal area (predictions only)"),
-    ] = 5
-    missing: Annotated[
-        Literal["refuse", "leave_out"],
-        Help("images without a prediction: refuse, or leave_out: exclude them"),
-    ] = "refuse"
-    resize: Annotated[
-        Literal["refuse", "nearest", "stretch"],
-        Help(
-            "predictions of another size than their label: refuse; nearest: resize them by the "
-            "nearest pixel; stretch: so too where the ratio of height and width differs"
-        ),
-    ] = "refuse"
-    name: Annotated[
-        str, Help("name of the method in tables; default: name of the folder of predictions")
-    ] = ""
-    threads: Annotated[
-        int,
-        Interval(ge=0, le=MAX_THREADS),
-        Help("threads that read and count predictions; 0: one per core"),
-    ] = 0
 
     @property
     def source(self) -> str:
         """What is scored, as the folder records it."""
         if self.counts:
             return f"counts={self.counts}"
-        folder = Path(self.predictions).resolve()
-        return f"predictions={folder} split={self.split or 'test'}"
+        return f"predictions={Path(self.predictions).resolve()} split={self.split or 'test'}"
 
 
 def main(options: Options, overrides: list[str]) -> int:
@@ -122,161 +111,203 @@ def main(options: Options, overrides: list[str]) -> int:
 
     Overrides choose the data set: dataset=mfnet dataset.root=/data/MFNet
     """
-    from analysis.predictions.text import remarks_on
+    import pandas as pd
+    from rich.console import Group
+
+    from analysis.tables import tidy_csv
     from analysis.uncertainty import Resampling
     from rgbt.files.atomic import write_atomic
+    from rgbt.terminal import path_lines, plain_text, print_rich, rich_table
 
-    given = [key for key in ("predictions", "counts") if getattr(options, key)]
-    if len(given) != 1:
-        raise InputError(
-            "expected one of predictions=folder and counts=run, got "
-            f"{' and '.join(given) or 'neither'}."
-        )
-    out = options.out
-    check_out(out)
-    _check_same_source(out, options.source)
-    settings = None
+    if bool(options.predictions) == bool(options.counts):
+        raise InputError("predictions: expected either predictions=folder or counts=run.")
+    out, settings = options.out, None
+    _make_room(out, options.source)
     if options.resamples:
         settings = Resampling(
             resamples=options.resamples, level=options.level, blocks=options.blocks
         )
-    if given == ["counts"]:
-        counted, remarks = _score_counts(options, overrides), []
+    if options.counts:
+        counted, remarks = _stored_counts(options, overrides), []
     else:
         scored = _scored(options, overrides)
-        counted = [(scored.name, counts) for counts in scored.counts]
-        remarks = remarks_on(scored)
+        counted, remarks = [(scored.name, each) for each in scored.counts], scored.remarks()
         if out is not None:
-            write_counts(scored, out)
-    _show(score_tables(counted, settings), remarks, out)
+            scored.save(out)
+    frames, tables = [], []
+    with progress("scoring", len(counted)) as advance:
+        for name, counts in counted:
+            frame = scores(name, counts)
+            said = add_intervals(frame, counts, settings) if settings else ""
+            frames.append(frame)
+            tables.append(score_tables(frame, counts, said))
+            advance()
+    for each in tables:
+        print_rich(Group(*map(rich_table, each)))
+    print_rich(plain_text("\n".join(remarks)))
     if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        title = "# Scores of " + ", ".join(dict.fromkeys(name for name, _ in counted))
+        texts = (grid.to_markdown() for each in tables for grid in each)
+        write_atomic(out / "scores.md", "\n".join([title, "", *texts, *remarks, ""]).encode())
+        write_atomic(out / "scores.csv", tidy_csv(pd.concat(frames)).encode())
         write_atomic(out / SOURCE, f"{options.source}\n".encode())
+        print_rich(path_lines([("tables", str(out / "scores.md")), ("counts, scores", f"{out}/")]))
     return 0
 
 
-def score_tables(
-    counted: Sequence[tuple[str, Counts]], settings: Resampling | None
-) -> list[ScoreTable]:
-    """The scores of each file of counts, with intervals over images.
+def scores(name: str, counts: Counts) -> pd.DataFrame:
+    """Every score of counts under both conventions for absent classes, one a row: `COLUMNS`.
 
-    Args:
-        counted: (name of the method, counts) in the order of the tables.
-        settings: of the intervals, the convention for absent classes aside; None for none.
+    See `analysis.results.score_frame`; low and high are NaN.
+    """
+    import pandas as pd
+
+    from analysis.results import score_frame
+
+    sizes = {"all": len(counts.names)} | {k: len(v.names) for k, v in counts.parts().items()}
+    both = [score_frame(counts, absent).assign(absent=absent) for absent in get_args(Absent)]
+    frame = pd.concat(both, ignore_index=True)
+    frame = frame.assign(method=name, split=counts.split, partition=counts.partition)
+    frame = frame.assign(images=frame["subset"].map(sizes), low=float("nan"), high=float("nan"))
+    return frame[[*COLUMNS]]
+
+
+def conventions(frame: pd.DataFrame, counts: Counts) -> list[Absent]:
+    """Both where one of the means differs between them; else that of the counts alone."""
+    means = frame[(frame["class"] == "") & frame["metric"].isin(SHOWN)]
+    one, other = (means.loc[means["absent"] == each, "value"] for each in get_args(Absent))
+    same = one.reset_index(drop=True).equals(other.reset_index(drop=True))
+    return [counts.absent] if same else [*get_args(Absent)]
+
+
+def add_intervals(frame: pd.DataFrame, counts: Counts, settings: Resampling) -> str:
+    """Fill low and high of mIoU, also of regions, and of Var; says what the intervals are."""
+    from analysis.uncertainty import estimate
+
+    is_bounded = (frame["class"] == "") & frame["metric"].isin((names.MIOU, names.VAR))
+    for absent in conventions(frame, counts):
+        metrics = {}
+        for row in frame[is_bounded & (frame["absent"] == absent)].itertuples():
+            name = names.region(row.region) if row.region else str(row.metric)
+            metrics[row.Index] = name if row.subset == "all" else names.subset(row.subset, name)
+        found = estimate([counts], [*metrics.values()], replace(settings, absent=absent))
+        for index, name in metrics.items():
+            if (interval := found[name].images) is not None:
+                frame.loc[index, ["low", "high"]] = interval.low, interval.high
+    main = found[names.MIOU]
+    return (
+        f"In brackets: {100 * settings.level:g} % intervals over images (Student, of Var without "
+        f"its bias), {settings.resamples} resamples of {main.said}; none where there are too few. "
+        f"{main.reason}"
+    ).strip()
+
+
+def score_tables(frame: pd.DataFrame, counts: Counts, said: str = "") -> list[TextTable]:
+    """Means and IoU of each class by region; accuracy of each class by region; day and night.
+
+    Means under both conventions for absent classes where these differ; classes without pixels "-".
+    """
+    import pandas as pd
+
+    from analysis.tables import text_table
+    from rgbt.tables import class_labels, number
+
+    shown = conventions(frame, counts)
+    classes = dict(zip(counts.classes, class_labels(counts.classes, counts.unscored), strict=True))
+    is_mean, is_whole = frame["class"] == "", frame["region"] == 0
+    ending = " " + frame["absent"] if len(shown) > 1 else ""
+    values = frame["value"].map(number)
+    ends = frame.apply(lambda row: f" [{row['low']:.1f}, {row['high']:.1f}]", axis=1)
+    cells = frame.assign(
+        label=(frame["metric"] + ending).where(is_mean, frame["class"].map(classes)),
+        column=("region " + frame["region"].astype(str)).where(~is_whole, "whole"),
+        text=values + ends.where(frame["low"].notna(), ""),
+    )
+    is_all, metric = frame["subset"] == "all", frame["metric"]
+    means = is_mean & metric.isin(SHOWN) & frame["absent"].isin(shown)
+    by_class = is_all & ~is_mean & (frame["absent"] == "exclude")
+    ious = [cells[is_all & means & (metric != names.VAR)], cells[by_class & (metric == "IoU")]]
+    # The intervals of regions have a separate table; here they would be too wide.
+    parts = cells.assign(
+        label=frame["subset"] + " (" + frame["images"].astype(str) + ")" + ending,
+        column=metric.where(is_whole, "IoU" + frame["region"].astype(str)),
+        text=cells["text"].where(is_whole, values),
+    )[means & (is_whole | (metric == names.MIOU))].sort_values("region", kind="stable")
+    head = f"{frame['method'][0]}, {counts.split} ({len(counts.names)} images), {counts.partition}"
+
+    def grid(title: str, rows: pd.DataFrame, *notes: str) -> TextTable:
+        wide = rows.set_index(["label", "column"])["text"].unstack(sort=False)
+        return text_table(
+            f"{head}: {title}", wide.rename_axis(""), [each for each in notes if each]
+        )
+
+    return [
+        grid("mIoU, mAcc and IoU of each class by region", pd.concat(ious)),
+        grid("accuracy of each class by region", cells[by_class & (metric == "acc")]),
+        grid("all images, day and night", parts, _about_absent(frame, counts), said),
+    ]
+
+
+def _about_absent(frame: pd.DataFrame, counts: Counts) -> str:
+    scored = frame["class"].isin(set(counts.classes) - set(counts.unscored))
+    gone = set(frame.loc[scored & frame["value"].isna(), "class"])
+    absent = ", ".join(name for name in counts.classes if name in gone) or "no class"
+    same = "" if len(conventions(frame, counts)) > 1 else "; the means agree"
+    return (
+        f"Without a pixel to count in some region or part: {absent}. released counts that as 0, "
+        f"exclude leaves the class out of the mean{same}. The data set counts {counts.absent}."
+    )
+
+
+def _make_room(out: Path | None, source: str) -> None:
+    """Remove what an earlier call counted, because it would pass for a part of this one.
 
     Raises:
-        InputError: blocks that cannot be made of these images.
+        InputError: the folder holds the scores of something else.
     """
-    from analysis.predictions.table import score_table
-
-    tables = [score_table(counts, name) for name, counts in counted]
-    if settings is None:
-        return tables
-    with progress("resampling", len(tables)) as advance:
-        for index, (_, counts) in enumerate(counted):
-            tables[index] = _with_intervals(tables[index], counts, settings)
-            advance()
-    return tables
-
-
-def write_counts(scored: FolderScores, out: Path) -> None:
-    """Write ``counts_<partition>.npz`` of each partition, and ``maps.npz`` where there is one."""
-    from rgbt.terminal import info
-
-    out.mkdir(parents=True, exist_ok=True)
-    # The predictions may be other ones than at the last time: earlier counts and maps would pass
-    # for ones of these.
-    earlier = [path for each in PARTITION_NAMES for path in out.glob(f"counts_{each}*.npz")]
-    new = {f"counts_{counts.partition}.npz" for counts in scored.counts}
-    gone = sorted(path.name for path in earlier if path.name not in new)
-    if gone:
-        info(f"removed from {out}, because counted by an earlier call: {', '.join(gone)}.")
-    for path in (*earlier, out / "maps.npz"):
-        path.unlink(missing_ok=True)
-    for counts in scored.counts:
-        counts.save(out / f"counts_{counts.partition}.npz")
-    if scored.maps is not None:
-        scored.maps.save(out / "maps.npz")
-
-
-def _check_same_source(out: Path | None, source: str) -> None:
-    """Refuse a folder with other scores, because files of both would be mixed."""
+    check_out(out)
     if out is None or not (out / "scores.csv").is_file():
         return
     noted = out / SOURCE
     earlier = noted.read_text(errors="replace").strip() if noted.is_file() else "another call"
     if earlier != source:
         raise InputError(f"out={out} holds the scores of {earlier}; give {source} its own folder.")
-
-
-def _show(tables: Sequence[ScoreTable], remarks: list[str], out: Path | None) -> None:
-    """Write the tables as Markdown and CSV where a folder is given, and print them."""
-    from rich.console import Group
-    from rich.text import Text
-
-    from analysis.predictions.text import convention_line, grids, markdown, tidy_csv
-    from rgbt.files.atomic import write_atomic
-    from rgbt.terminal import path_lines, print_rich, rich_table
-
-    places = []
-    if out is not None:
-        out.mkdir(parents=True, exist_ok=True)
-        title = "Scores of " + ", ".join(dict.fromkeys(table.name for table in tables))
-        write_atomic(out / "scores.md", markdown(title, tables, remarks).encode())
-        write_atomic(out / "scores.csv", tidy_csv(tables).encode())
-        counts = sorted(path.name for path in (*out.glob("counts_*.npz"), *out.glob("maps.npz")))
-        places = [("tables", str(out / "scores.md")), ("tidy", str(out / "scores.csv"))]
-        places += [("counts", f"{out}/ ({', '.join(counts)})")] if counts else []
-    for table in tables:
-        said = "\n".join(filter(None, (convention_line(table), table.intervals)))
-        print_rich(Group(*map(rich_table, grids(table)), Text(f"{said}\n")))
-    if remarks:
-        print_rich(Text("\n".join(remarks)))
-    if places:
-        print_rich(path_lines(places))
+    for kind in ("counts_ring*", "counts_vertical*", "counts_horizontal*", "maps"):
+        for path in out.glob(f"{kind}.npz"):
+            path.unlink()
 
 
 def _scored(options: Options, overrides: list[str]) -> FolderScores:
     from analysis.predictions.scoring import PARTITIONS, ScoringOptions, score_folder
     from rgbt.data.predictions import Affixes, FormatOptions
 
-    dataset, absent = dataset_of(overrides), built("metric", overrides).absent
+    dataset = dataset_of(overrides)
+    affixes = Affixes(options.prefix, options.suffix)
     counting = ScoringOptions(
         partitions=tuple(each for each in PARTITIONS if options.partition in ("all", each)),
         regions=options.regions,
-        format=FormatOptions(
-            form=options.format,
-            palette=options.palette,
-            affixes=Affixes(options.prefix, options.suffix),
-        ),
+        format=FormatOptions(form=options.format, palette=options.palette, affixes=affixes),
         missing=options.missing,
         resize=options.resize,
         name=options.name,
-        threads=options.threads,
-        absent=absent,
+        absent=built("metric", overrides).absent,
     )
     folder, split = Path(options.predictions), options.split or "test"
     with progress("counting", len(dataset.names(split))) as advance:
         return score_folder(folder, dataset, split, counting, advance)
 
 
-def _score_counts(options: Options, overrides: list[str]) -> list[tuple[str, Counts]]:
+def _stored_counts(options: Options, overrides: list[str]) -> list[tuple[str, Counts]]:
     from analysis.results import open_counts
-    from rgbt.terminal import info
 
-    default = Options()
-    without_effect = [key for key in OF_A_FOLDER if getattr(options, key) != getattr(default, key)]
-    without_effect += [word.partition("=")[0] for word in overrides]
-    if without_effect:
-        raise InputError(
-            f"'{without_effect[0]}' has no effect on stored counts; omit it, or give a "
-            "folder with predictions=..."
-        )
+    default = FolderOptions()
+    idle = [key for key, value in vars(default).items() if getattr(options, key) != value]
+    idle += [word.partition("=")[0] for word in overrides]
+    if idle:
+        raise InputError(f"'{idle[0]}' has no effect on stored counts.")
     found = open_counts(options.counts, options.runs_dir, options.split)
-    info(
-        "stored counts have one partition and no map by pixel; for others, write predictions "
-        "with rgbt predict run=... input=<split> out=folder, and score that folder."
-    )
-    labels = [each.label for each in found]
+    labels: Sequence[str] = [each.label for each in found]
     named = []
     for each in found:
         label = each.label
@@ -284,37 +315,6 @@ def _score_counts(options: Options, overrides: list[str]) -> list[tuple[str, Cou
             label = str(each.path) if each.seed is None else f"{label} seed {each.seed}"
         named.append((label, each.counts))
     return named
-
-
-def _with_intervals(table: ScoreTable, counts: Counts, settings: Resampling) -> ScoreTable:
-    """The table with intervals over images, under the conventions that it shows."""
-    from analysis.predictions.table import interval_cells, with_intervals
-    from analysis.uncertainty import estimate
-
-    found: dict[ScoreKey, tuple[float, float]] = {}
-    drawn: dict[str, str] = {}
-    reason = ""
-    for absent, part in product(table.conventions(), table.num_images):
-        named = interval_cells(table, absent)[part]
-        estimates = estimate([counts], list(named), replace(settings, absent=absent))
-        for metric, each in estimates.items():
-            if each.images is not None:
-                found[named[metric]] = (each.images.low, each.images.high)
-        main = estimates[OF_PARTS[part]]
-        drawn[part] = f"of {main.said}" if main.images else f"has none ({main.said} are too few)"
-        reason = main.reason if part == "all" else reason
-    whole_split = drawn.pop("all")
-    if not found:
-        return replace(
-            table, intervals=f"{table.partition}: no intervals, too few images: {whole_split}."
-        )
-    parts = "".join(f"; {part} {said}" for part, said in drawn.items())
-    said = (
-        f"{table.partition}: in brackets, {100 * settings.level:g} % intervals over images "
-        f"(Student, of Var without its bias; {settings.resamples} resamples "
-        f"{whole_split}{parts}). {reason}".rstrip()
-    )
-    return with_intervals(table, found, said)
 
 
 entry = PlainCommand(Options, main, heeds=("dataset",))

@@ -9,17 +9,20 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"  # read by the build (`tool.hatch.version`); CITATION.cff repeats it
 
 if TYPE_CHECKING:
-    from rgbt.api import Results, Run, load_run, results
+    from rgbt.api import Run, load_run
 
-__all__ = ["Results", "Run", "load_run", "results"]
+__all__ = ["Run", "load_run", "results"]
+
+# As the commands, by name: nothing in rgbt imports the analysis.
+_MODULES = {"Run": "rgbt.api", "load_run": "rgbt.api", "results": "analysis.results"}
 
 
 def __getattr__(name: str) -> Any:
-    """The names of `rgbt.api`, imported at their first use (PEP 562)."""
-    if name in __all__:
-        from rgbt import api
+    """The names of `_MODULES`, imported at their first use (PEP 562)."""
+    if name in _MODULES:
+        from importlib import import_module
 
-        return getattr(api, name)
+        return getattr(import_module(_MODULES[name]), name)
     raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
 
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, cast, get_args
+from typing import Any, Literal, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rgbt.assembly.load_run import CHECKPOINTS, open_run, trusted_settings
 from rgbt.assembly.session import Session
 from rgbt.checks import InputError, check_choice
-from rgbt.config.stored_config import parse_trust, read_settings
+from rgbt.config.stored_config import parse_trust
 from rgbt.data.domains import TestedHead
 from rgbt.data.new_images import of_arrays, of_files
 from rgbt.dataset import LabelledDataset
@@ -22,15 +22,11 @@ from rgbt.evaluation.images import batch_of
 from rgbt.evaluation.prediction import Predictor
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.metrics.names import in_percent
-from rgbt.metrics.scores import iou, recall, summary
-from rgbt.runs.folder import GROUP, find_run, is_finished, runs_in
+from rgbt.metrics.scores import summary
+from rgbt.runs.folder import GROUP, find_run
 from rgbt.runs.result import RunResult
 from rgbt.runs.specify import load_spec
-from rgbt.terminal import warn
 from rgbt.types import Batch, View
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 Image = NDArray[Any] | Path | str
 """An image as an array, or the path of its file."""
@@ -158,46 +154,6 @@ class Run(RunResult):
         return predictor, batch_of(session, sample)
 
 
-@dataclass(frozen=True)
-class Results:
-    """The finished runs of a folder, by key; replaced runs are not among them."""
-
-    runs: tuple[Run, ...]
-
-    def __iter__(self) -> Iterator[Run]:
-        return iter(self.runs)
-
-    def __len__(self) -> int:
-        return len(self.runs)
-
-    def to_pandas(self, split: str = "test", *, long: bool = False) -> pd.DataFrame:
-        """Scores of all runs as a table, computed from stored counts; no network is built.
-
-        A run that has no counts of the split, or damaged files, is left out with a warning.
-
-        Args:
-            split: of the counts.
-            long: one row per run, region and class with the columns "region" (0: the whole image),
-                "class", "IoU" and "Acc" (recall), percent; else one per run, as `Run.scores`.
-
-        Returns:
-            begins with the columns "key", "name", "experiment", "group", "seed", "dataset", "split"
-            and "step" (of the best checkpoint). Scores that a run does not have are NaN.
-        """
-        import pandas as pd
-
-        found: list[dict[str, Any]] = []
-        for run in self.runs:
-            try:
-                found += _rows(run, split, long=long)
-            except InputError as error:
-                warn(f"{run.key} is left out: {error}")
-        return pd.DataFrame(found, columns=None if found else COLUMNS)
-
-
-COLUMNS = ("key", "name", "experiment", "group", "seed", "dataset", "split", "step")
-
-
 def load_run(
     run: str | Path,
     overrides: Sequence[str] = (),
@@ -228,26 +184,3 @@ def load_run(
     settings = trusted_settings(folder, modules, overrides)
     load_spec(settings, overrides)  # refused now, and not when it predicts
     return Run(folder, "", tuple(overrides), checkpoint, modules)
-
-
-def results(runs_dir: str | Path = "runs") -> Results:
-    """The finished runs of a folder: ``rgbt.results("runs").to_pandas()[["name", "mIoU"]]``."""
-    return Results(tuple(Run(each.path) for each in runs_in(runs_dir) if is_finished(each.path)))
-
-
-def _rows(run: Run, split: str, *, long: bool) -> list[dict[str, Any]]:
-    """The rows of a run in `Results.to_pandas`."""
-    counts, node = run.counts(split), read_settings(run.folder / "config.yaml").get("dataset", {})
-    dataset = node.get("name") or str(node.get("_target_", "")).rpartition(".")[2].lower()
-    texts, step = (run.key, run.name, run.experiment, run.group), run.result.get("best_step")
-    identity = dict(zip(COLUMNS, (*texts, run.seed, dataset, split, step), strict=True))
-    if not long:
-        return [identity | run.scores(split)]
-    regions = np.concatenate([counts.whole()[None], counts.by_region()])
-    ious, recalls = (100 * score(regions, counts.absent) for score in (iou, recall))
-    return [
-        identity
-        | {"region": region, "class": name, "IoU": ious[region, k], "Acc": recalls[region, k]}
-        for region in range(len(regions))
-        for k, name in enumerate(counts.classes)
-    ]

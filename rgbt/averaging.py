@@ -1,7 +1,7 @@
 """The average of the weights of a network over the steps of its training.
 
 One class for the moving average and the mean of the last steps that are evaluated
-(`rgbt.engine.averaging`), and for the teacher of self-training.
+(`rgbt.engine.checkpoint`), and for the teacher of self-training.
 """
 
 from __future__ import annotations

@@ -35,8 +35,7 @@ def nearest(word: str, known: Iterable[str]) -> str:
     """The names `known` after the nearest one: "did you mean 'grbm'? known: crm, grbm"."""
     names = sorted(known)
     close = difflib.get_close_matches(word, names, n=1, cutoff=0.5)
-    hint = f"did you mean '{close[0]}'? " if close else ""
-    return f"{hint}known: {', '.join(names)}"
+    return "".join(f"did you mean '{each}'? " for each in close) + f"known: {', '.join(names)}"
 
 
 def split_list(text: str, what: str) -> list[str]:
@@ -94,7 +93,7 @@ def check_members(
             raise InputError(f"{name} has no `{member}`; see docs/how-to/add-other-components.md.")
     for method, arguments in calls.items():
         by_keyword = {each[:-1]: None for each in arguments if each.endswith("=")}
-        by_place = arguments[: len(arguments) - len(by_keyword)]
+        by_place = [each for each in arguments if not each.endswith("=")]
         try:
             inspect.signature(getattr(part, method)).bind(*by_place, **by_keyword)
         except TypeError as error:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
@@ -15,14 +15,10 @@ from rgbt.types import Sample, SceneMaps
 class LabelledDataset(Protocol):
     """RGB-thermal pairs in named splits, all or some of them labelled.
 
-    See `rgbt.data.mfnet.MFNet` and `rgbt.data.freiburg.Freiburg`.
-
     Attributes:
-        root: its folder.
-        name: used in messages and tables.
+        root: its folder; `name` is used in messages and tables.
         num_classes: K; labels are 0 to K - 1, or 255 = ignored.
-        classes: names of the K classes.
-        palette: their (red, green, blue) colours, 0..255.
+        classes: names of the K classes, and `palette` their (red, green, blue) colours, 0..255.
         unscored: classes that are counted but left out of every mean over classes.
         background: classes that are no object: sample occupancy leaves them out and overlays do not
             paint them; empty: there is none.
@@ -39,39 +35,30 @@ class LabelledDataset(Protocol):
     @property
     def splits(self) -> Mapping[str, str]:
         """Split -> its list, or the pattern of its files."""
-        ...
 
     def has(self, split: str) -> bool:
         """Whether any image of `split` exists; InputError if the split is unknown."""
-        ...
 
     def names(self, split: str) -> tuple[str, ...]:
         """Names of a split, in order; InputError if it is unknown, missing or empty."""
-        ...
 
     def read(self, name: str) -> Sample:
         """One sample; InputError if it cannot be read."""
-        ...
 
     def label(self, name: str) -> NDArray[np.uint8] | None:
         """The label of `read` alone, (H, W); None if the pair is unlabelled."""
-        ...
 
     def files(self, name: str) -> tuple[Path, ...]:
         """Every file that `read` opens for `name`, in a fixed order, whether it exists or not."""
-        ...
 
     def decoding(self) -> dict[str, Any]:
         """Settings that change what `read` makes of the files, as JSON values by key."""
-        ...
 
     def nights(self, names: tuple[str, ...]) -> tuple[bool, ...] | None:
         """Whether each image was taken at night; None if the data set does not state it."""
-        ...
 
     def fingerprint(self) -> str:
         """Hash of names and files; equal copies in different folders have equal fingerprints."""
-        ...
 
 
 @runtime_checkable
@@ -80,14 +67,12 @@ class KnownScenes(Protocol):
 
     def scene_maps(self, name: str) -> SceneMaps:
         """Maps of the size of the label; InputError if the image has none."""
-        ...
 
 
 class DatasetWrapper:
-    """Base class of a data set that changes another one; a subclass overrides what it changes.
+    """Base of a data set that changes another one, `source`; a subclass overrides what it changes.
 
-    All other members are those of the wrapped data set, the attribute `source`; a subclass calls
-    ``self.source.read(name)`` for what it overrides.
+    All other members are those of the source.
     """
 
     if TYPE_CHECKING:  # what `__getattr__` finds
@@ -124,18 +109,9 @@ class Subset(DatasetWrapper):
         super().__init__(source)
         self._chosen = chosen
 
-    def names(self, split: str) -> tuple[str, ...]:
+    def names(self, split: str) -> tuple[str, ...]:  # noqa: ARG002 - as every data set
         """The chosen names."""
-        del split
         return self._chosen
-
-
-def layers(dataset: LabelledDataset) -> Iterator[LabelledDataset]:
-    """`dataset` and every data set behind it; the one that reads files is the last."""
-    yield dataset
-    while isinstance(dataset, DatasetWrapper):
-        dataset = dataset.source
-        yield dataset
 
 
 def background_indices(dataset: LabelledDataset) -> tuple[int, ...]:
@@ -145,5 +121,6 @@ def background_indices(dataset: LabelledDataset) -> tuple[int, ...]:
 
 def reader_of(dataset: LabelledDataset) -> LabelledDataset:
     """The data set that reads files, behind all wrappers."""
-    *_, reader = layers(dataset)
-    return reader
+    while isinstance(dataset, DatasetWrapper):
+        dataset = dataset.source
+    return dataset

@@ -76,7 +76,7 @@ def main(options: Options, overrides: list[str]) -> int:
     from rgbt.metrics.details import requested
     from rgbt.requirements import record_of
     from rgbt.terminal import print_rich, rich_table
-    from rgbt.training.overview import announce_network
+    from rgbt.training.report import announce_network
 
     if options.out is not None and (options.out.is_dir() or options.modality == ALL):
         raise InputError(f"out={options.out} must be the file of a single evaluation's counts.")

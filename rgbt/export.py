@@ -43,7 +43,7 @@ def main(options: Options, overrides: list[str]) -> int:
     from rgbt.evaluation.export import ExportRequest, check_out, export
     from rgbt.evaluation.request import EvaluationRequest, NetworkRequest
     from rgbt.terminal import path_lines, print_rich
-    from rgbt.training.overview import announce_network
+    from rgbt.training.report import announce_network
 
     if options.exported is not None:
         raise InputError(f"exported={options.exported} is exported already; use run=...")

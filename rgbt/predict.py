@@ -65,7 +65,7 @@ def main(options: Options, overrides: list[str]) -> int:
         split_overrides,
     )
     from rgbt.terminal import path_lines, print_rich, rich_table
-    from rgbt.training.overview import announce_network
+    from rgbt.training.report import announce_network
 
     is_labelling, out = options.pseudo_labels, options.out
     if options.threshold and not is_labelling:

@@ -6,7 +6,7 @@ A constructor that a configuration names declares the range of each setting in i
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 from annotated_types import Interval, Len, Predicate, doc
 
@@ -83,6 +83,13 @@ NumClasses = Annotated[
 NumPoints = Annotated[int, Interval(ge=1, le=10**6), doc("points held in memory for every mask")]
 
 
+Number = TypeVar("Number", int, float)
+
+
 def rising(ends: tuple[float, ...]) -> bool:
     """Whether no number is smaller than the one before it."""
     return all(a <= b for a, b in zip(ends, ends[1:], strict=False))
+
+
+Rising = Annotated[tuple[Number, Number], Predicate(rising), doc("the smaller one first")]
+"""Two ends of a range."""

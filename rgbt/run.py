@@ -25,21 +25,19 @@ def main(config: DictConfig, overrides: list[str]) -> int:
 
     tags = tags_from_environment()
     run = requested_run(config, overrides)
-    if run.pretrained is not None and not run.uses_pretrained:
-        info(
-            f"pretrained={run.pretrained} is ignored: the experiment {run.name} does not use "
-            "ImageNet weights."
-        )
-    if run.out is not None:
-        raise InputError(f"out={run.out} has no effect here: runs are written to runs_dir=...")
+    file, out = run.plain["pretrained"], run.plain["out"]
+    if file is not None and not run.uses_pretrained:
+        info(f"pretrained={file} is ignored: {run.name} does not use ImageNet weights.")
+    if out is not None:
+        raise InputError(f"out={out} has no effect here: runs are written to runs_dir=...")
     if run.is_finished and not run.fresh:
-        from rgbt.training.show import show
+        from rgbt.training.report import show
 
         group = group_from_environment()
         if group is None or group.rank == 0:
             show(run, tags)
         return 0
-    from rgbt.training.start import start
+    from rgbt.training.pipeline import start
 
     # torch is imported from here on, after --help and after finished runs
     return start(run.check(), tags, words_of_run(overrides))

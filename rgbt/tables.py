@@ -22,6 +22,9 @@ from rgbt.metrics.names import DAY, NIGHT
 ABSENT = "-"
 """Shown for an undefined score, e.g. the IoU of a class that occurs nowhere."""
 
+LABEL = re.compile(r"[^\W\d_]{3}.* |.{32}")
+"""Cells of text: words, and names longer than a key or a number."""
+
 FORMULA = re.compile(r"'*[=+\-@\t\r\n]")
 """Beginning of a cell that a spreadsheet may execute, also behind apostrophes."""
 
@@ -102,10 +105,14 @@ class TextTable:
 
         Control characters and new lines of names become "?".
         """
-        rule = ["---", *["---:"] * (len(self.header) - 1)]
-        lines = ["| " + " | ".join(row) + " |" for row in (self.header, rule, *self.rows)]
+        columns = list(zip(*self.rows, strict=True)) or [()] * len(self.header)
+        is_text = [place == 0 or any(map(LABEL.match, each)) for place, each in enumerate(columns)]
+        rule = ["---" if each else "---:" for each in is_text]
+        rows = ([cell.replace("|", "\\|") for cell in row] for row in self.rows)
+        lines = ["| " + " | ".join(row) + " |" for row in (self.header, rule, *rows)]
+        title = [f"**{self.title}**", ""] if self.title else []
         notes = ["", *(f"- {note}" for note in self.notes)] if self.notes else []
-        every = [f"**{self.title}**", "", *lines, *notes]
+        every = [*title, *lines, *notes]
         return "\n".join(without_controls(line.replace("\n", "?")) for line in every) + "\n"
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,16 +13,13 @@ from rich.table import Table
 from rich.text import Text
 
 from rgbt.checks import without_controls
-from rgbt.tables import ResultTables, TextTable, result_grids
+from rgbt.tables import LABEL, ResultTables, TextTable, result_grids
 
 WIDTH = 10_000
 """Columns where stdout is no terminal: a file takes lines of any length."""
 
 SHORTEST = 16
 """Least columns of a broken label; a key takes 12 and stays whole."""
-
-LABEL = re.compile(r"[^\W\d_]{3}.* |.{32}")
-"""Cells that may be broken into several lines: words, and names longer than a key or a number."""
 
 
 def info(sentence: str) -> None:

@@ -40,8 +40,8 @@ def inspect(options: InspectOptions, overrides: list[str]) -> int:
     """
     import torch
 
+    from rgbt.checkpoints.files import read
     from rgbt.checkpoints.load import plan_for, recognised
-    from rgbt.checkpoints.read import read
     from rgbt.checkpoints.starts import start_lines
     from rgbt.runs.run_spec import file_digest
     from rgbt.terminal import path_lines, print_rich
@@ -85,10 +85,7 @@ class ExportOptions:
     """Options of `export`."""
 
     run: Annotated[str, Help("run folder, config key or MLflow run id")]
-    format: Annotated[
-        str,
-        Help("safetensors (names of rgbt), released or released_temporal (as the authors load it)"),
-    ]
+    format: Annotated[str, Help("safetensors (names of rgbt) or released (as the authors load it)")]
     out: Annotated[Path, Help("new file; an existing file is never overwritten")]
     checkpoint: Checkpoint = "best"
     runs_dir: RunsDir = Path("runs")
@@ -97,8 +94,8 @@ class ExportOptions:
 def export(options: ExportOptions, overrides: list[str]) -> int:
     """Write the weights of a run."""
     from rgbt.assembly.session import differences
+    from rgbt.checkpoints.files import read
     from rgbt.checkpoints.kinds import family_named
-    from rgbt.checkpoints.read import read
     from rgbt.checkpoints.release import convention_of, save
     from rgbt.runs.folder import find_run
     from rgbt.terminal import info, print_rich
@@ -119,12 +116,10 @@ def export(options: ExportOptions, overrides: list[str]) -> int:
         "checkpoint": options.checkpoint,
         "step": str(contents.settings.get("step", 0)),
     }
-    remark = save(options.out, options.format, family, contents.tensors, note)
+    save(options.out, options.format, family, contents.tensors, note)
     others = differences(model, convention_of(options.format, family))
     if others:
         info(f"scores will differ in the authors' code, which uses {' '.join(others)}.")
-    if remark:
-        info(f"{remark}.")
     print_rich(plain_text(str(options.out)))
     return 0
 

@@ -19,7 +19,6 @@ from rgbt.metrics.names import MIOU
 from sweeps.settings import SweepSettings
 from sweeps.table.new_table import NewOptions, new
 
-ALL = "all"
 NEW = PlainCommand(NewOptions, new, name="rgbt reproduce new")
 
 
@@ -27,7 +26,7 @@ NEW = PlainCommand(NewOptions, new, name="rgbt reproduce new")
 class Options:
     """Options of ``rgbt reproduce``; the sweeper's file explains those of execution too."""
 
-    table: Annotated[str, Help("spatialseg/table3, my/ablation (in ./tables), a file, or all")]
+    table: Annotated[str, Help("spatialseg/table3, my/ablation (in ./tables), or a file")]
     seeds: Annotated[str, Help("a number (3: 0, 1, 2), a list (0,4,7), or until_decided")] = "1"
     max_seeds: Annotated[int, Interval(ge=4, le=1000), Help("most, with until_decided")] = 20
     scale: Annotated[str, Help("demo (minutes, embedded data), bench or paper")] = "demo"
@@ -76,36 +75,25 @@ def main(options: Options, overrides: list[str]) -> int:
     To write your own table:
     rgbt reproduce new table=my/ablation experiment=grbm masker.sigma_div=1,2,4
     """
-    from sweeps.rendering.preview import print_previews
+    from sweeps.rendering.preview import print_preview
     from sweeps.rendering.publish import publish_table
-    from sweeps.rendering.times import print_lines, time_lines
-    from sweeps.table.load_table import table_names
-    from sweeps.table_plan import plan_tables
-    from sweeps.verdicts.stored import rule_of
-    from sweeps.worker.point_list import run_points
+    from sweeps.table_plan import plan_table
+    from sweeps.verdicts.judge import rule_of
+    from sweeps.worker.point_list import preview_points, run_points
 
     settings = settings_of(options)
-    if options.table == ALL and not settings.dry_run:
-        raise InputError("table=all requires dry_run=true; run one table at a time.")
-    names = table_names() if options.table == ALL else [options.table]
-    plans = plan_tables(names, options, overrides)
+    plan = plan_table(options, overrides)
     if settings.dry_run:
-        previews = [(plan, plan.preview(settings)) for plan in plans]
-        print_previews(previews, settings.workers, is_all=options.table == ALL)
+        outcomes = preview_points(plan.points, settings, plan.planner)
+        print_preview(plan, outcomes, settings.workers)
         return 0
-    (plan,) = plans
-    runs = plan.points.runs
-    plan.evaluate_external(runs.runs_dir, options.trust)
+    plan.evaluate_external(plan.points.runs.runs_dir, options.trust)
     outcomes = run_points(plan.points, settings, plan.planner) if plan.points.points else []
     if plan.until_decided is None:  # an earlier command may have added seeds
-        plan.judge.rule = rule_of(result.tags for each in outcomes for result in each.results)
+        plan.judge.rule = rule_of(result for each in outcomes for result in each.results)
     name = f"{plan.request.name}_{plan.request.variant}"
     out = options.out or options.runs_dir / "tables" / name
-    code = publish_table(plan.judge, plan.request, outcomes, plan.external, out, runs.tracking)
-    results = (result for outcome in outcomes for result in outcome.results)
-    trained = (outcome.point.overrides for outcome in outcomes if outcome.results)
-    print_lines(time_lines(results, trained, plan.planner))
-    return code
+    return publish_table(plan.judge, plan.request, outcomes, plan.external, out)
 
 
 def settings_of(options: Options) -> SweepSettings:

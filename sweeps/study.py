@@ -1,7 +1,6 @@
 """Report of a study: ``rgbt study name=search/grbm``, also while it runs.
 
-Tables in the terminal; ``runs/studies/<name>/`` gets them as Markdown and CSV with the figures, and
-MLflow a run that holds these files.
+Tables in the terminal; ``runs/studies/<name>/`` gets them as Markdown and CSV.
 """
 
 from __future__ import annotations
@@ -11,9 +10,8 @@ from pathlib import Path
 from typing import Annotated
 
 from rgbt.checks import InputError
-from rgbt.config.command import built
 from rgbt.config.common_options import RunsDir
-from rgbt.config.options import Help, readable_paths
+from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
 
 
@@ -28,11 +26,9 @@ class Options:
 
 
 def main(options: Options, overrides: list[str]) -> int:
-    """Show the results of a study: best trials, failures, importances, figures.
-
-    Overrides choose the tracker: tracking=none or tracking.uri=http://host:5000
-    """
-    from sweeps.report.publish import publish_study, study_folder
+    """Show the results of a study: best trials, failures, importances."""
+    del overrides  # none is heeded
+    from sweeps.report.study import publish_study, study_folder
     from sweeps.worker.storage import load_study, open_storage, storage_file, storage_url
 
     runs_dir = options.runs_dir
@@ -42,13 +38,12 @@ def main(options: Options, overrides: list[str]) -> int:
         raise InputError(f"there is no storage {file}; give runs_dir=... or storage=...")
     storage = open_storage(url, runs_dir)
     study = load_study(options.name, storage)
-    tracking = built("tracking", [*readable_paths([f"runs_dir={runs_dir}"]), *overrides])
     out = options.out or study_folder(runs_dir, study.study_name)
-    publish_study(study, out, tracking, url)
+    publish_study(study, out, url)
     return 0
 
 
-entry = PlainCommand(Options, main, heeds=("tracking",))
+entry = PlainCommand(Options, main, heeds=())
 
 if __name__ == "__main__":
     entry()

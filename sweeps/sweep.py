@@ -24,7 +24,7 @@ from sweeps import attributes as names
 from sweeps import space as spaces
 from sweeps.point import UNFINISHED, Point, short_names
 from sweeps.rendering.seed_groups import group_grid, unfinished_grid
-from sweeps.report.publish import publish_study, study_folder
+from sweeps.report.study import publish_study, study_folder
 from sweeps.settings import SweepSettings, read_settings
 from sweeps.space import Space, as_overrides, build_pruner, build_sampler, key_of, signature
 from sweeps.worker import point_list
@@ -202,7 +202,7 @@ def search(request: Search, settings: SweepSettings) -> None:
     if trials and not states["COMPLETE"] and not states["RUNNING"]:
         raise RunError(f"no trial of {request.study} has finished; see the reasons above.")
     url = storage_url(settings.storage, runs_dir)
-    publish_study(study, study_folder(runs_dir, request.study), request.runs.tracking, url)
+    publish_study(study, study_folder(runs_dir, request.study), url)
 
 
 def probe(request: Search, settings: SweepSettings) -> RunSpec:

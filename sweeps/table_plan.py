@@ -15,7 +15,6 @@ from rgbt.config.component import Component
 from rgbt.config.compose import available, compose
 from rgbt.config.options import readable_paths
 from sweeps.point import Outcome
-from sweeps.settings import SweepSettings
 from sweeps.table.cells import is_counted, metric_of
 from sweeps.table.claim import PREVIOUS
 from sweeps.table.efficiency import exact_sizes
@@ -26,7 +25,6 @@ from sweeps.table.table import Row, Table
 from sweeps.verdicts.forms import both_forms
 from sweeps.verdicts.judge import CellRunId, TableJudge
 from sweeps.verdicts.until_decided import START, SeedsUntilDecided
-from sweeps.worker import point_list
 from sweeps.worker.planner import Planner
 from sweeps.worker.point_list import PointList
 from sweeps.worker.run_store import open_run_store
@@ -84,6 +82,7 @@ def select_rows(table: Table, text: str) -> Table:
     claims = table.claims
     if len(rows) < len(table.rows):
         known = {*chosen, PREVIOUS}
+        known |= {str(row.settings.get("method")) for row in rows if row.group}
         claims = tuple(each for each in claims if {*each.rows, *each.against} <= known)
     return replace(table, rows=tuple(rows), claims=claims)
 
@@ -178,7 +177,6 @@ class TablePlan:
         points: its runs that are known in advance, and how further ones are chosen.
         until_decided: adds seeds; None where their number is fixed.
         rows: rows that are evaluated and not trained; `external` are their runs.
-        is_new: whether none of its runs can be finished, and a test has composed them all.
     """
 
     request: TableRequest
@@ -188,13 +186,6 @@ class TablePlan:
     until_decided: SeedsUntilDecided | None
     rows: Sequence[ExternalRow]
     external: dict[CellRunId, Outcome]
-    is_new: bool
-
-    def preview(self, settings: SweepSettings) -> list[Outcome]:
-        """The present state of its points."""
-        if self.is_new:
-            return [Outcome(point, "waiting") for point in self.points.points]
-        return point_list.preview_points(self.points, settings, self.planner)
 
     def evaluate_external(self, runs_dir: Path, trust: str) -> None:
         """Count the rows that are not trained; InputError: a path that does not fit its row."""
@@ -206,10 +197,8 @@ class TablePlan:
             self.external[row.label, FIXED] = outcome
 
 
-def plan_tables(
-    names: Sequence[str], options: Options, overrides: Sequence[str]
-) -> list[TablePlan]:
-    """Tables as a command runs them; `overrides` are of every row and of the tracker."""
+def plan_table(options: Options, overrides: Sequence[str]) -> TablePlan:
+    """A table as a command runs it; `overrides` are of every row and of the tracker."""
     for word in overrides:
         check_override(word)
     tracker = [word for word in overrides if word.lstrip("+~").startswith("tracking")]
@@ -219,42 +208,35 @@ def plan_tables(
         Component.from_node(config.tracking)
     runs, planner = open_run_store(config), Planner(base)
     extra = [word for word in overrides if word not in tracker]
-    is_new = not (extra or options.storage or config.tracking.get("uri"))
-    is_new &= len(names) > 1 and not any(runs.runs_dir.glob("*"))
     adds = options.seeds == UNTIL_DECIDED
-    plans = []
-    for each in names:
-        name, table = read_named(each)
-        words = TableWords(
-            seeds=range(START) if adds else seeds_of(options.seeds),
-            scale=options.scale,
-            form=options.form,
-            rows=options.rows,
-            overrides=extra,
-            until_decided=adds,
+    name, table = read_named(options.table)
+    words = TableWords(
+        seeds=range(START) if adds else seeds_of(options.seeds),
+        scale=options.scale,
+        form=options.form,
+        rows=options.rows,
+        overrides=extra,
+        until_decided=adds,
+    )
+    request, rows = make_request(name, table, words)
+    if extra or is_own(options.table):  # a test checks the others
+        check_equal_runs(request, planner)
+    if adds and not request.table.claims:
+        raise InputError(
+            f"seeds=until_decided: {name} has no claims with these rows (and none with "
+            "form=both); give a number of seeds, or add claims to the table."
         )
-        request, rows = make_request(name, table, words)
-        is_checked = not extra and not is_own(each)  # by a test
-        if not is_checked:
-            check_equal_runs(request, planner)
-        if adds and not request.table.claims:
-            raise InputError(
-                f"seeds=until_decided: {name} has no claims with these rows (and none with "
-                "form=both); give a number of seeds, or add claims to the table."
-            )
-        sizes = {} if options.dry_run else exact_sizes(request)
-        judge = TableJudge(name, request.table, AnyTime() if adds else FixedSeeds(), sizes=sizes)
-        external: dict[CellRunId, Outcome] = {}
-        more = SeedsUntilDecided(request, judge, options.max_seeds, external) if adds else None
-        points = PointList(
-            study=f"table/{name}",
-            title=f"{name} scale={request.scale}",
-            kind="list",
-            points=tuple(request.points()),
-            runs=runs,
-            base=base,
-            more=more,
-        )
-        is_waiting = is_new and is_checked
-        plans.append(TablePlan(request, judge, points, planner, more, rows, external, is_waiting))
-    return plans
+    sizes = {} if options.dry_run else exact_sizes(request)
+    judge = TableJudge(name, request.table, AnyTime() if adds else FixedSeeds(), sizes=sizes)
+    external: dict[CellRunId, Outcome] = {}
+    more = SeedsUntilDecided(request, judge, options.max_seeds, external) if adds else None
+    points = PointList(
+        study=f"table/{name}",
+        title=f"{name} scale={request.scale}",
+        kind="list",
+        points=tuple(request.points()),
+        runs=runs,
+        base=base,
+        more=more,
+    )
+    return TablePlan(request, judge, points, planner, more, rows, external)

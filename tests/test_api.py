@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +14,7 @@ import pytest
 
 import rgbt
 from rgbt import predict
-from rgbt.checkpoints.read import NOTE
-from rgbt.checkpoints.torch_files import read_torch_file, save
+from rgbt.checkpoints.files import NOTE, read_torch_file, save
 from rgbt.checks import InputError
 from rgbt.config.stored_config import read_settings
 from rgbt.metrics.counts import Counts
@@ -137,7 +135,7 @@ def test_own_classes_are_refused_until_their_module_is_trusted(
     np.testing.assert_array_equal(trusted.predict(RGB, THERMAL), run.predict(RGB, THERMAL))
 
 
-def test_results_are_one_row_per_finished_run_or_per_class(
+def test_results_are_those_of_finished_runs(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     runs = tmp_path / "runs"
@@ -145,23 +143,9 @@ def test_results_are_one_row_per_finished_run_or_per_class(
     write_run(runs / "bbb", "grbm", 1)
     write_run(runs / "ccc", "grbm", 2, finished=False)
     write_run(runs / "replaced" / "aaa-1", "crm", 0)
-    results = rgbt.results(runs)
-    assert [run.key for run in results] == ["aaa", "bbb"]
-    row = results.to_pandas().iloc[1]
-    identity = ("bbb", "seed=1 · grbm", "grbm", "grbm", 1, "mfnet", "test", 120)
-    assert tuple(row.iloc[:8]) == identity
-    counts = some_counts(1)
-    for name in ("mIoU", "Var", "region/3", "class/car", "night/mIoU"):
-        assert row[name] == pytest.approx(value(name, counts, "released"))
-    table = results.to_pandas(long=True)
-    assert len(table) == 2 * (1 + 3) * 2
-    chosen = table.set_index(["key", "region", "class"]).loc[("bbb", 3, "car")]
-    assert chosen["IoU"] == pytest.approx(value("class/car/region/3", counts, "released"))
-    whole = table.query("key == 'bbb' and region == 0 and `class` == 'road'")
-    assert whole["Acc"].item() == pytest.approx(value("class/road/acc", counts, "released"))
-    # Unreadable runs are left out with a warning.
-    replace(some_counts(1), split="val").save(runs / "bbb" / counts_name("val"))
-    (runs / "aaa" / counts_name("test")).write_bytes(b"PK")
-    for split in ("val", "test"):
-        assert list(rgbt.results(runs).to_pandas(split)["key"]) == ["bbb"]
-        assert "aaa is left out" in capsys.readouterr().err
+    frame = rgbt.results(runs, tmp_path)
+    assert capsys.readouterr().err == ""  # a run that still trains is no remark
+    assert list(frame["run"].unique()) == ["aaa", "bbb"]
+    means = frame[(frame["metric"] == "mIoU") & (frame["region"] == 0)]
+    found = means.set_index(["experiment", "subset"])["value"]
+    assert found["grbm", "night"] == value("night/mIoU", some_counts(1), "released")

@@ -59,30 +59,29 @@ ROOMS = {
     **{
         "sweeps.worker": {"sweeps.space"},
         "sweeps.space": set(),
-        "sweeps.report": {"sweeps.worker"},
+        "sweeps.report": {f"sweeps.{e}" for e in ("worker", "table", "verdicts", "rendering")},
     },
     **{"sweeps.table": {"sweeps.worker"}, "sweeps.verdicts": {"sweeps.table", "sweeps.worker"}},
-    "sweeps.rendering": {f"sweeps.{each}" for each in ("table", "worker", "report", "verdicts")},
-    **{"analysis.statistics": set(), "analysis.predictions": set(), "analysis.uncertainty": set()},
+    "sweeps.rendering": {f"sweeps.{each}" for each in ("table", "worker", "verdicts")},
+    **{"analysis.predictions": set(), "analysis.uncertainty": set()},
+    "analysis.statistics": {"analysis.uncertainty"},
     "analysis.figures": {f"analysis.{e}" for e in ("statistics", "predictions", "uncertainty")},
-    "analysis.report": {"analysis.uncertainty", "analysis.figures"},
 }
 """Room of sweeps and analysis -> which others of its package it knows. Their commands join them."""
 
-PUBLISHED = {f"sweeps.{each}" for each in ("point", "table", "verdicts", "evaluation", "report")}
 OUTSIDE = {
     "rgbt": set(),
     "sweeps": {
-        "analysis.uncertainty",
+        "analysis",
         "rgbt.evaluation.profile",
         "rgbt.evaluation.profiled_network",
     }
     | {f"rgbt.{each}" for each in READING - {"data", "geometry"}},
-    "analysis": PUBLISHED | {f"rgbt.{each}" for each in READING - {"geometry"}},
-    "analysis.uncertainty": {f"rgbt.{each}" for each in READING - {"geometry"}},
+    "analysis": {f"rgbt.{each}" for each in READING - {"geometry"}},
     "hydra_plugins": {"rgbt", "sweeps"},
 }
-"""Package or room -> what it may import of the other packages; the analysis sees no network."""
+"""Package or room -> what it may import of the other packages, in the order rgbt <- analysis <-
+sweeps; the analysis sees no network."""
 
 
 @cache

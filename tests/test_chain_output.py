@@ -14,7 +14,7 @@ from rgbt.metrics.counts import Counts
 from rgbt.run import main
 from rgbt.runs.specify import specify
 from tests.commands import Call
-from tests.data.freiburg_files import write_freiburg
+from tests.data.layouts import write_freiburg
 
 
 def miou(path: Path, night: bool) -> float:

@@ -15,8 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from analysis.robustness import FORMAT as ROBUSTNESS
-from analysis.robustness import _level
+from analysis.results import level_of
 from rgbt.checks import InputError, RunError
 from rgbt.data.files import decode, read_names
 from rgbt.data.labels import indices
@@ -101,17 +100,17 @@ def pseudo(path: Path) -> None:
 
 def read_pseudo(path: Path) -> Any:
     labels = PseudoLabels(path.parent if path.suffix == ".json" else path.parents[1])
-    return labels.classes, labels.digest, *labels.read("a", 5)
+    return labels.classes, labels.digest, *labels.read("a")
 
 
 def robustness(path: Path) -> None:
     counts(path.with_suffix(".npz"))
-    made = {"format": ROBUSTNESS, "row": "noise", "title": "Noise", "unit": "", "severity": 0.5}
+    made = {"row": "noise", "title": "Noise", "unit": "", "severity": 0.5}
     path.write_text(json.dumps(sealed(made)))
 
 
 def read_robustness(path: Path) -> Any:
-    level = _level(path)
+    level = level_of(path.with_suffix(".npz"))
     return level.row, level.title, level.unit, level.severity
 
 

@@ -26,7 +26,7 @@ from rgbt.engine.batch_norm import (
     share_running_statistics,
     synchronise_batch_norm,
 )
-from rgbt.engine.gradients import average_gradients
+from rgbt.engine.trainer import average_gradients
 from tests.conftest import WriteMFNet
 from tests.models.plain import generator
 from tests.processes import run_in_processes

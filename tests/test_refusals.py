@@ -49,7 +49,7 @@ RUN = [
             ("consistency.splits=[]", "consistency.splits"),
             ("scheme.view.camera.height=1024", "set the intrinsics of your camera"),
             ("consistency.view.camera.cx=900", "principal point"),
-            ("scheme.view.yaw=[-50,50]", "leave no rectangle"),
+            ("scheme.view.yaw=[-50,50]", "a rectangle of 0 %"),
             *(("scheme=supervised", "frames=2"), ("loss.second=none", "loss.beta=1")),
             ("loss@loss.segmentation=set_criterion", "outputs=masks"),
             ("consistency.sets=released_1", "'consistency.sets'"),

@@ -17,7 +17,7 @@ import pytest
 import torch
 
 from rgbt import evaluate, predict
-from rgbt.checkpoints.torch_files import save
+from rgbt.checkpoints.files import save
 from rgbt.config.component import build
 from rgbt.config.compose import compose
 from rgbt.engine.checkpoint import load_checkpoint
@@ -41,11 +41,14 @@ from tests.commands import (
 )
 from tests.composed import specified
 from tests.conftest import write_png
-from tests.data.folder_files import PATTERNS, write_folder
-from tests.data.freiburg_files import write_freiburg
-from tests.data.kp_files import write_kp
-from tests.data.pst900_files import write_pst900
-from tests.data.video_files import write_mvseg
+from tests.data.layouts import (
+    PATTERNS,
+    write_folder,
+    write_freiburg,
+    write_kp,
+    write_mvseg,
+    write_pst900,
+)
 
 NO_PATCH = "masker.patch_size=null"
 OF_SYNTH = (

@@ -1,207 +1,81 @@
 """Command that draws a figure of the papers: ``rgbt figures figure=spatialseg/fig5``.
 
-Without ``figure=`` it lists all figures and what each is made from.
+Without ``figure=`` it lists all figures and their options.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from collections.abc import Iterator
+from dataclasses import fields, make_dataclass
+from typing import Annotated, Any, get_args
 
-from annotated_types import Interval
-
-from analysis.arguments import MOST, Blocks
-from rgbt.checks import InputError, check_choice
-from rgbt.config.options import Help
+from analysis.figures import panels, scores, spatialseg  # noqa: F401 - they register their figures
+from analysis.figures.inputs import FIGURES, Config
+from analysis.tables import text_table, tidy_csv
+from rgbt.checks import InputError, check_choice, nearest
+from rgbt.config.options import Help, types_of
 from rgbt.config.plain_command import PlainCommand
 
-Count = Annotated[int, Interval(ge=1, le=MOST)]
+GROUPS = ("dataset", "metric", "consistency")
 
 
-@dataclass(frozen=True)
-class Options:
-    """The figure, and the options of single figures (`analysis.figures.catalogue`)."""
-
-    figure: Annotated[
-        str, Help('name of the figure, such as spatialseg/fig5; "list": all names and their inputs')
-    ] = "list"
-    out: Annotated[str, Help("output file: .pdf, .svg or .png (300 dots per inch)")] = ""
-    maps: Annotated[str | None, Help("output of rgbt score: folder or maps.npz")] = None
-    statistics: Annotated[
-        str | None,
-        Help(
-            "output of rgbt spatial: folder or statistics.npz; or dataset=... to measure the data "
-            "set now"
-        ),
-    ] = None
-    methods: Annotated[
-        str | None,
-        Help(
-            "methods, label:folder,label:folder: output of rgbt score (spatialseg/fig2, fig3), or "
-            "predicted label images (qualitative panels, pairs of frames)"
-        ),
-    ] = None
-    without_rgb: Annotated[
-        str | None,
-        Help(
-            "predictions of these methods without RGB (rgbt predict corruption=removed:rgb), "
-            "label:folder,label:folder, for crm/fig2"
-        ),
-    ] = None
-    without_thermal: Annotated[
-        str | None, Help("the same without thermal (rgbt predict corruption=removed:thermal)")
-    ] = None
-    runs: Annotated[
-        str | None,
-        Help(
-            "runs, groups or files of counts, separated by commas; label:run,label:run sets their "
-            "labels; entries with the same label are seeds of one method"
-        ),
-    ] = None
-    runs_dir: Annotated[str | None, Help("folder of runs (default: runs)")] = None
-    pairs: Annotated[
-        str | None,
-        Help(
-            "pairs of frames: folder that rgbt consistency export=... wrote (temporal/fig1, fig6)"
-        ),
-    ] = None
-    view_set: Annotated[
-        Count | None, Help("set of virtual views that is shown of these pairs, from 1 (default: 1)")
-    ] = None
-    frames: Annotated[
-        Literal["aligned", "released", "next"] | None,
-        Help(
-            "pairs of frames of temporal/fig5, counted by rgbt consistency: aligned or released "
-            "(virtual views), or next (consecutive frames)"
-        ),
-    ] = None
-    split: Annotated[
-        str | None,
-        Help(
-            "split of the data set or of the runs (default: test; for statistics: train); a file "
-            "of another split is refused"
-        ),
-    ] = None
-    part: Annotated[Literal["all", "day", "night"] | None, Help("images: all, day or night")] = None
-    names: Annotated[str | None, Help("names of the images to show, separated by commas")] = None
-    pick: Annotated[
-        Literal["first", "largest_difference"] | None,
-        Help(
-            "rule that selects the images instead of names=: first, or largest_difference between "
-            "the first and the last method"
-        ),
-    ] = None
-    rows: Annotated[Count | None, Help("number of images (default: 4)")] = None
-    layout: Annotated[
-        Literal["rows", "columns"] | None, Help("one row or one column per image: rows or columns")
-    ] = None
-    format: Annotated[
-        Literal["auto", "index", "colour"] | None,
-        Help("format of predictions: auto, index or colour"),
-    ] = None
-    palette: Annotated[str | None, Help("palette of coloured predictions, as in `rgbt score`")] = (
-        None
-    )
-    prefix: Annotated[str | None, Help("beginning of the file names of predictions")] = None
-    suffix: Annotated[
-        str | None, Help("suffix of the file names of predictions, NAME<suffix>.png")
-    ] = None
-    regions: Annotated[
-        Count | None, Help("number of regions of each partition of spatialseg/fig2 (default: 5)")
-    ] = None
-    absent: Annotated[
-        Literal["released", "exclude"] | None,
-        Help(
-            "class without pixels: released: it scores 0; exclude: it is in no mean; default: "
-            "convention of the data set"
-        ),
-    ] = None
-    estimator: Annotated[
-        Literal["immerkaer", "wavelet_mad", "std"] | None,
-        Help("estimator of the noise: immerkaer, wavelet_mad or std"),
-    ] = None
-    average: Annotated[
-        Literal["pooled", "images"] | None,
-        Help("signal-to-noise ratio over images: pooled or images"),
-    ] = None
-    patches: Annotated[
-        tuple[Count, ...] | None,
-        Help("sides of the patches of crm/fig5 in pixels (default: 8,16,32,64)"),
-    ] = None
-    seed: Annotated[
-        Annotated[int, Interval(ge=0, le=MOST)] | None, Help("seed of the masks (default: 0)")
-    ] = None
-    band: Annotated[
-        Literal["widest", "images", "seeds", "both"] | None,
-        Help("interval over images, seeds or both; widest: both if possible"),
-    ] = None
-    resamples: Annotated[
-        Count | None, Help("number of resamples for that interval (default: 10000)")
-    ] = None
-    level: Annotated[float | None, Help("confidence level of that interval (default: 0.95)")] = None
-    blocks: Annotated[
-        Blocks | None,
-        Help("images resampled together: auto, none, sequence, or a number of neighbouring frames"),
-    ] = None
-    size: Annotated[
-        str | None,
-        Help("size of regions/heat, 16 to 4096 pixels per side (default: 480x640)"),
-    ] = None
-    corruptions: Annotated[
-        str | None,
-        Help(
-            "corruptions to show (robustness), separated by commas: noise:rgb,frozen; default: all "
-            "that were measured"
-        ),
-    ] = None
-
-    @property
-    def given(self) -> dict[str, Any]:
-        """The options of single figures that were given, by name."""
-        every = {key: value for key, value in vars(self).items() if value is not None}
-        return {key: value for key, value in every.items() if key not in ("figure", "out")}
+def _options() -> Iterator[tuple[str, Any, Any]]:
+    """Name, type and default of `figure`, `out`, and the options of all figures."""
+    yield "figure", Annotated[str, Help('name such as spatialseg/fig5; "list": all names')], "list"
+    yield "out", Annotated[str, Help("output file: .pdf, .svg or .png (300 dots per inch)")], ""
+    every = [types_of(spec.options) for spec in FIGURES.values()]
+    for name, annotation in {key: kind for each in every for key, kind in each.items()}.items():
+        kind, *notes = get_args(annotation)
+        yield name, Annotated[(kind | None, *notes)], None
 
 
-def main(options: Options, overrides: list[str]) -> int:
+Options: Any = make_dataclass("Options", _options(), frozen=True)
+
+
+def main(options: Any, overrides: list[str]) -> int:
     """Draw a figure of the papers into a file: vector graphics with selectable text, or PNG.
 
     Overrides choose the data set and the partition: dataset=mfnet dataset.root=/data/MFNet
-    metric=ring9. Stored statistics have one partition; only heat maps can use another one
+    metric=ring9. The numbers of the figure are written beside it, as .csv and .md.
     """
-    from analysis.figures.catalogue import FIGURES, make
+    import pandas as pd
 
-    figure, out, given = options.figure, options.out, options.given
-    if figure == "list":
-        idle = [*(["out"] if out else []), *given, *overrides]
-        if idle:
-            raise InputError(f"'{idle[0]}' needs the name of a figure: figure=...")
-        from rgbt.tables import TextTable
-        from rgbt.terminal import print_rich, rich_table
-
-        rows = tuple((name, spec.shows, spec.needs) for name, spec in FIGURES.items())
-        print_rich(rich_table(TextTable("figures", ("figure", "shows", "made from"), rows)))
-        return 0
-    check_choice("figure", figure, FIGURES)
-    if not out:
-        raise InputError(
-            f"'out' has no value; give the file to write, for example out={figure.split('/')[-1]}"
-            ".pdf (or .svg, .png)."
-        )
-    from analysis.figures.style import out_path, save
+    from analysis.figures.plots import out_path, save
     from rgbt.files.atomic import write_atomic
+    from rgbt.terminal import print_rich, rich_table
 
+    given = {key: value for key, value in vars(options).items() if value is not None}
+    name, out = given.pop("figure"), given.pop("out")
+    if name == "list":
+        rows = {
+            key: (each.shows, " ".join([*each.words, *each.groups]))
+            for key, each in sorted(FIGURES.items())
+        }
+        listed = pd.DataFrame.from_dict(rows, "index", columns=["shows", "options"])
+        print_rich(rich_table(text_table("figures", listed.rename_axis("figure"))))
+        return 0
+    check_choice("figure", name, FIGURES)
+    spec = FIGURES[name]
+    groups = {word: word.lstrip("+~").partition("=")[0].split(".")[0] for word in overrides}
+    known = [each.name for each in fields(spec.options)]
+    idle = [key for key in given if key not in known]
+    idle += [group for group in groups.values() if group not in spec.groups]
+    if idle:
+        near = nearest(idle[0], ["figure", "out", *known, *spec.groups])
+        raise InputError(f"'{idle[0]}' has no effect on figure={name}; {near}.")
     path = out_path(out)
-    drawn, numbers = make(figure, given, overrides)
+    config = Config(tuple(overrides), {"metric": spec.metric, "consistency": "views"})
+    drawn, frame = spec(config, given)
     save(drawn, path)
+    title = f"{name}: {spec.shows}"
+    table = text_table(title, frame.set_index(frame.columns[0])).to_markdown()
+    for suffix, text in ((".csv", tidy_csv(frame)), (".md", table)):
+        write_atomic(path.with_suffix(suffix), text.encode())
     print(path)
-    for suffix, text in numbers.items():
-        beside = path.with_suffix(suffix)
-        write_atomic(beside, text.encode())
-        print(beside)
     return 0
 
 
-entry = PlainCommand(Options, main)
+entry = PlainCommand(Options, main, heeds=GROUPS)
 
 if __name__ == "__main__":
     entry()

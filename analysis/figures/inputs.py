@@ -1,271 +1,259 @@
-"""The inputs of a figure from the command line, opened when the figure needs them."""
+"""All figures by name, their options, and the files that these name."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property, partial
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import MISSING, dataclass, field, fields, make_dataclass
+from functools import cached_property
+from inspect import Parameter, signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_type_hints
 
+import pandas as pd
+from annotated_types import Interval
+from matplotlib.figure import Figure
+
+from analysis.arguments import MOST, dataset_of
 from analysis.bar import progress
+from analysis.results import open_counts
+from analysis.statistics.collect import MeasurementSettings, SpatialStatistics, collect
 from rgbt.checks import InputError, nearest, split_list
 from rgbt.config.command import built
+from rgbt.config.common_options import RunsDir
+from rgbt.config.options import Help
+from rgbt.metrics.counts import Counts, check_same_means
+from rgbt.metrics.metric import Regions
 
-if TYPE_CHECKING:  # the list of figures is there at once
-    from analysis.predictions.maps import PixelMaps
-    from analysis.results import Frames, NamedCounts
-    from analysis.robustness import Training
-    from analysis.statistics.data import SpatialStatistics
+if TYPE_CHECKING:
     from rgbt.dataset import LabelledDataset
-    from rgbt.metrics.counts import Counts
-    from rgbt.metrics.metric import Absent, Regions
 
-T = TypeVar("T")
-Labelled = TypeVar("Labelled", "NamedCounts", "Training")
+Drawn = tuple[Figure, pd.DataFrame]
+"""A figure, and the numbers that it shows."""
+
+Make = TypeVar("Make", bound=Callable[..., Drawn])
+
+Count = Annotated[int, Interval(ge=1, le=MOST)]
+Split = Annotated[
+    str, Help("split of the data set or the runs (default: test; of statistics: train)")
+]
+Part = Annotated[Literal["all", "day", "night"], Help("images: all, day or night")]
+Names = Annotated[str, Help("names of the images to show, separated by commas")]
+Methods = Annotated[
+    str, Help("label:folder,label:folder: output of rgbt score, or predicted label images")
+]
+AbsentClasses = Annotated[
+    Literal["released", "exclude"] | None,
+    Help("class without pixels: released: 0; exclude: in no mean; default: as the counts say"),
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoOptions:
+    """Of a figure that shares none with others."""
 
 
 @dataclass(frozen=True)
-class FigureInput:
-    """The arguments of one figure.
+class FigureSpec:
+    """One figure.
 
-    Attributes:
-        values: options that were given, by key.
-        overrides: of the configuration: ``dataset=...``, ``metric=...``.
-        metric: the partition where no ``metric=`` is given, a file of ``conf/metric/``.
+    `make` takes a `Config` and a dataclass of options, `given`, as far as it has these parameters,
+    and its own options as keywords. `groups` of the configuration take effect; `metric` is the
+    partition unless ``metric=`` is given.
     """
 
-    figure: str
-    values: Mapping[str, Any]
-    overrides: tuple[str, ...]
+    make: Callable[..., Drawn]
+    shows: str
+    groups: tuple[str, ...]
     metric: str
 
-    def need(self, key: str, what: str) -> Any:
-        """The value of a key; without one, an InputError that describes the key by `what`."""
-        if key not in self.values:
-            raise InputError(f"figure={self.figure} needs {key}=..., {what}.")
-        return self.values[key]
-
-    def get(self, key: str, default: T) -> T:
-        """The value of a key, or `default`."""
-        return cast(T, self.values.get(key, default))
-
-    def absent(self, every: Iterable[Counts]) -> Absent:
-        """The convention for absent classes of ``absent=``; without it that of the counts.
-
-        Raises:
-            InputError: counts made with both.
-        """
-        from rgbt.metrics.counts import convention
-
-        return cast(
-            "Absent", self.values["absent"] if "absent" in self.values else convention(every)
-        )
-
-    def named(self, key: str, what: str) -> dict[str, str]:
-        """Label -> place, of ``label:place,label:place``; without a label the place's last name.
-
-        Raises:
-            InputError: not given, an empty entry, or a label twice.
-        """
-        found: dict[str, str] = {}
-        for entry in split_list(self.need(key, what), what):
-            label, colon, place = entry.partition(":")
-            place = place if colon else label
-            label = label if colon else Path(place).name
-            if not label or not place:
-                raise InputError(f"{key}={self.values[key]}: expected label:place, got '{entry}'.")
-            if label in found:
-                raise InputError(f"{key}: two entries are called '{label}'; give other labels.")
-            found[label] = place
-        return found
+    @cached_property
+    def options(self) -> type[Any]:
+        """The dataclass of all options, by the signature of the function."""
+        hints = get_type_hints(self.make, include_extras=True)
+        own = [
+            (p.name, hints[p.name], MISSING if p.default is p.empty else p.default)
+            for p in self._keywords
+        ]
+        shared = hints.get("given", NoOptions)
+        return make_dataclass("Options", own, bases=(shared,), frozen=True, kw_only=True)
 
     @property
-    def has_dataset(self) -> bool:
-        """Whether a data set was chosen."""
-        return any(word.startswith("dataset=") for word in self.overrides)
+    def words(self) -> list[str]:
+        """Names of the options; those without a default are followed by "=..."."""
+        every = fields(self.options)
+        return [f"{each.name}{'=...' * (each.default is MISSING)}" for each in every]
+
+    @property
+    def _keywords(self) -> list[Parameter]:
+        every = signature(self.make).parameters.values()
+        return [each for each in every if each.kind is Parameter.KEYWORD_ONLY]
+
+    def __call__(self, config: Config, values: Mapping[str, Any]) -> Drawn:
+        """Draw with the values of options that were given; InputError where one is missing."""
+        for word in self.words:
+            if word.endswith("=...") and word[:-4] not in values:
+                raise InputError(f"the figure needs {word}")
+        given = self.options(**values)
+        known = signature(self.make).parameters
+        shared = {"config": config, "given": given}
+        named = {name: value for name, value in shared.items() if name in known}
+        return self.make(
+            **named, **{each.name: getattr(given, each.name) for each in self._keywords}
+        )
+
+
+FIGURES: dict[str, FigureSpec] = {}
+
+
+def figure(name: str, shows: str, *groups: str, metric: str = "ring5") -> Callable[[Make], Make]:
+    """Decorator that registers a figure; see `FigureSpec`."""
+
+    def register(make: Make) -> Make:
+        FIGURES[name] = FigureSpec(make, shows, groups, metric)
+        return make
+
+    return register
+
+
+@dataclass(frozen=True)
+class Config:
+    """What overrides such as ``dataset=mfnet`` and ``metric=ring9`` choose, built when needed."""
+
+    overrides: Sequence[str] = ()
+    defaults: Mapping[str, str] = field(default_factory=dict)
+
+    def chooses(self, group: str) -> bool:
+        """Whether a file of the group was chosen."""
+        return any(word.lstrip("+~").startswith(f"{group}=") for word in self.overrides)
+
+    def built(self, node: str, *more: str) -> Any:
+        """The object of one node of the configuration."""
+        usual = [f"{key}={name}" for key, name in self.defaults.items() if not self.chooses(key)]
+        return built(node, [*usual, *self.overrides, *more])
 
     @cached_property
     def dataset(self) -> LabelledDataset:
         """The data set; InputError where none was chosen."""
-        if not self.has_dataset:
-            raise InputError(
-                f"figure={self.figure} needs dataset=..., for example dataset=mfnet "
-                "dataset.root=/data/MFNet."
-            )
-        made: LabelledDataset = self._built("dataset")
-        return made
+        return dataset_of(self.overrides)
 
     @cached_property
     def regions(self) -> Regions:
-        """The partition: of the figure unless another one was given."""
-        made: Regions = self._built("metric")
-        return made
+        """The partition of the image."""
+        regions: Regions = self.built("metric")
+        return regions
 
-    @cached_property
-    def consistency(self) -> Any:
-        """The virtual views (`rgbt.transforms.views.ViewSets`): published unless given."""
-        return self._built("consistency")
+    def names(self, names: str, split: str, number: int = 1) -> list[str]:
+        """The named images of a split, else its first `number`; see `chosen_names`."""
+        return chosen_names(names, self.dataset.names(split or "test"), number)
 
-    def _built(self, node: str) -> Any:
-        usual = {"metric": self.metric, "consistency": "views"}
-        given = {word.partition("=")[0] for word in self.overrides}
-        words = [f"{group}={name}" for group, name in usual.items() if group not in given]
-        return built(node, [*words, *self.overrides])
 
-    def names(self, number: int) -> tuple[str, ...]:
-        """The images of ``names=``, or the first `number` of the split.
+@dataclass(frozen=True, kw_only=True)
+class StatisticsOptions:
+    """Statistics of a data set, stored or measured now."""
 
-        Raises:
-            InputError: a name that the split lacks, or fewer images than requested.
-        """
-        split = self.get("split", "test")
-        listed = self.dataset.names(split)
-        if "names" not in self.values:
-            if len(listed) < number:
-                raise InputError(f"rows={number}, but split '{split}' has {len(listed)} images.")
-            return listed[:number]
-        chosen = tuple(split_list(self.values["names"], "names of images"))
-        for name in chosen:
-            if name not in listed:
-                near = nearest(name, listed[:20])
-                raise InputError(f"names: split '{split}' has no image '{name}'; {near}.")
-        return chosen
+    statistics: Annotated[
+        str,
+        Help("output of rgbt spatial: folder or statistics.npz; or dataset=... to measure it now"),
+    ] = ""
+    split: Split = ""
 
-    def name(self) -> str:
-        """The one image of ``names=``, or the first of the split; InputError for several."""
-        names = self.names(1)
-        if len(names) > 1:
-            raise InputError(f"names: figure={self.figure} shows one image, got {len(names)}.")
-        return names[0]
-
-    def refuse(self, keys: Sequence[str], without: str) -> None:
-        """Refuse keys that have an effect only together with a missing option.
+    def open(self, config: Config, *, by_region: bool = False) -> SpatialStatistics:
+        """The statistics.
 
         Raises:
-            InputError: one of `keys` was given; `without` says what is missing.
+            InputError: a file and a data set, or a file of another split than requested; or,
+                `by_region`, of other regions than requested. (Heat maps are cut anew.)
         """
-        words = [word.lstrip("+~").partition("=")[0] for word in self.overrides]
-        for key in keys:
-            if key in self.values or key in words:
-                raise InputError(
-                    f"'{key}' has no effect on figure={self.figure} without {without}; omit it, "
-                    "or give both."
-                )
-
-    def check_split(self, stored: str, source: object) -> None:
-        """Refuse a ``split=`` that is not the `stored` one of an opened file, `source`."""
-        if self.get("split", stored) != stored:
+        if bool(self.statistics) == config.chooses("dataset"):
             raise InputError(
-                f"split={self.values['split']}: {source} has split '{stored}'; omit split=, "
-                "or give a file of that split."
+                "statistics: expected either statistics=..., the folder that rgbt spatial wrote, "
+                "or dataset=... to measure one now."
             )
-
-    def maps(self) -> PixelMaps:
-        """The pixel maps of ``maps=``, a file or a folder of `analysis.score`."""
-        from analysis.predictions.maps import PixelMaps
-
-        what = "the folder (or its maps.npz) that rgbt score wrote"
-        return PixelMaps.load(_file(self.need("maps", what), "maps.npz"))
-
-    def statistics(self, *, by_region: bool = False) -> SpatialStatistics:
-        """Those of ``statistics=``, a file or a folder of `analysis.spatial`, or of ``dataset=``.
-
-        Args:
-            by_region: the figure shows the regions that were measured, so that a ``metric=`` that
-                was given must be these. (Heat maps are cut anew.)
-
-        Raises:
-            InputError: neither or both were given, or a stored file of another split or partition
-                than requested.
-        """
-        from analysis.statistics.collect import MeasurementSettings, collect
-        from analysis.statistics.data import SpatialStatistics
-
-        if ("statistics" in self.values) == self.has_dataset:
-            raise InputError(
-                f"figure={self.figure} needs statistics=..., the folder that rgbt spatial "
-                "wrote, or dataset=... to measure one now (not both)."
-            )
-        if self.has_dataset:
-            split = self.get("split", "train")
-            settings = MeasurementSettings(regions=self.regions)
-            with progress("measuring", len(self.dataset.names(split))) as advance:
-                return collect(self.dataset, split, settings, advance)
-        path = _file(self.values["statistics"], "statistics.npz")
+        if not self.statistics:
+            split, settings = self.split or "train", MeasurementSettings(regions=config.regions)
+            with progress("measuring", len(config.dataset.names(split))) as advance:
+                return collect(config.dataset, split, settings, advance)
+        path = file_in(self.statistics, "statistics.npz")
         stored = SpatialStatistics.load(path)
-        self.check_split(stored.split, path)
-        has_metric = any(word.lstrip("+~").startswith("metric") for word in self.overrides)
-        if by_region and has_metric and self.regions.name != stored.partition:
-            raise InputError(
-                f"metric: {path} was measured over {stored.partition}, not over "
-                f"{self.regions.name}; omit metric=, or measure again with "
-                "rgbt spatial partition=... regions=..."
-            )
+        check_split(self.split, stored.split, path)
+        if by_region and config.chooses("metric") and config.regions.name != stored.partition:
+            raise InputError(f"metric: {path} was measured over {stored.partition}.")
         return stored
 
-    def runs(self, frames: Frames = "") -> dict[str, list[Counts]]:
-        """Label -> counts of its seeds, of ``runs=``; entries with one label are one method's.
 
-        Args:
-            frames: see `analysis.results.open_counts`.
+@dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """Counts of runs."""
 
-        Raises:
-            InputError: not given, no such counts, or methods on different images.
-        """
-        from analysis.results import open_counts
+    runs: Annotated[
+        str,
+        Help(
+            "runs, groups or files of counts, separated by commas; label:run,label:run sets their "
+            "labels; entries with the same label are seeds of one method"
+        ),
+    ]
+    runs_dir: RunsDir = Path("runs")
+    split: Split = ""
+    absent: AbsentClasses = None
 
-        what = "runs, groups or files of counts, with commas; label:run names one"
-        opened = self.opened_runs(what, partial(open_counts, frames=frames))
-        found = {label: [named.counts for named in each] for label, each in opened.items()}
-        check_same_images(found)
-        return found
-
-    def opened_runs(
-        self, what: str, open_runs: Callable[[str, Path, str], Iterable[Labelled]]
-    ) -> dict[str, list[Labelled]]:
-        """Label -> what `open_runs` gives for (run, folder of runs, split), of ``runs=``."""
-        runs_dir, split = _path(self.get("runs_dir", "runs")), self.get("split", "")
-        found: dict[str, list[Labelled]] = {}
-        for word in split_list(self.need("runs", what), what):
-            label, colon, path = word.partition(":")
-            for each in open_runs(path if colon else label, runs_dir, split):
+    def open(self, opened: Callable[..., Any], *more: Any) -> dict[str, list[Any]]:
+        """Label -> what `opened` gives for (run, folder of runs, split), of each entry."""
+        found: dict[str, list[Any]] = {}
+        for word in split_list(self.runs, "runs"):
+            label, colon, place = word.partition(":")
+            for each in opened(place if colon else word, self.runs_dir, self.split, *more):
                 found.setdefault(label if colon else each.label, []).append(each)
         return found
 
-    def counts(self, key: str, partition: str) -> dict[str, Counts]:
-        """Label -> counts over a partition, of the folders or files that `key` names.
-
-        Raises:
-            InputError: there are none, or of different images.
-        """
-        from rgbt.metrics.counts import Counts
-
-        found = {}
-        what = "label:folder of what rgbt score wrote, with commas between methods"
-        for label, text in self.named(key, what).items():
-            place, path = _path(text), _file(text, f"counts_{partition}.npz")
-            if place.is_dir() and not path.is_file():
-                files = sorted(each.name for each in place.glob("counts*.npz"))
-                raise InputError(
-                    f"{place} does not contain {path.name} "
-                    f"(it contains {', '.join(files) or 'no counts'}); "
-                    "score the predictions over that partition with rgbt score."
-                )
-            found[label] = Counts.load(path)
-        check_same_images({label: [counts] for label, counts in found.items()})
+    def counts(self, *frames: str) -> dict[str, list[Counts]]:
+        """Label -> counts of its seeds; InputError: methods on different images."""
+        opened = self.open(open_counts, *frames).items()
+        found = {label: [each.counts for each in named] for label, named in opened}
+        check_same_images(found)
         return found
 
 
-def check_same_images(methods: Mapping[str, Sequence[Counts]]) -> None:
-    """Refuse a figure that would show methods on different images, or with means over different
-    classes, side by side.
+def chosen_names(names: str, known: Sequence[str], number: int) -> list[str]:
+    """The names that a list with commas holds, else the first `number` of those that are known.
 
     Raises:
-        InputError: naming the two.
+        InputError: an unknown name, or fewer images than requested.
     """
-    from rgbt.metrics.counts import check_same_means
+    chosen = split_list(names, "names") if names else [*known[:number]]
+    for name in chosen:
+        if name not in known:
+            raise InputError(f"names: there is no image '{name}'; {nearest(name, known[:20])}.")
+    if not names and len(chosen) < number:
+        raise InputError(f"rows={number}, but there are {len(known)} images.")
+    return chosen
 
+
+def labelled(text: str) -> dict[str, Path]:
+    """Label -> place, of ``label:place,label:place``; InputError: an empty entry or label twice."""
+    found: dict[str, Path] = {}
+    for entry in split_list(text, "methods"):
+        label, colon, place = entry.partition(":")
+        label, place = (label, place) if colon else (Path(entry).name, entry)
+        if not label or not place or label in found:
+            raise InputError(f"methods: expected different label:folder, got '{entry}'.")
+        found[label] = Path(place).expanduser()
+    return found
+
+
+def open_scored(methods: str, partition: str) -> dict[str, Counts]:
+    """Label -> counts over a partition, of folders of ``rgbt score`` or files.
+
+    Raises:
+        InputError: there are none, or of different images.
+    """
+    places = labelled(methods).items()
+    found = {label: Counts.load(file_in(each, f"counts_{partition}.npz")) for label, each in places}
+    check_same_images({label: [counts] for label, counts in found.items()})
+    return found
+
+
+def check_same_images(methods: Mapping[str, Sequence[Counts]]) -> None:
+    """Refuse methods on different images, or with means over different classes, side by side."""
     every = [(label, counts) for label, seeds in methods.items() for counts in seeds]
     (first, reference), *others = every
     for label, counts in others:
@@ -283,17 +271,18 @@ def check_one_dataset(statistics: SpatialStatistics, counts: Counts) -> None:
     """Refuse statistics of one data set beside scores on another; splits may differ."""
     if statistics.fingerprint != counts.dataset:
         raise InputError(
-            f"the statistics are of {statistics.dataset}, split '{statistics.split}', and the "
-            f"scores of another data set (images such as '{counts.names[0]}'); measure the data "
-            "set that was scored."
+            f"statistics: they are of {statistics.dataset}, split '{statistics.split}', but the "
+            f"scores of another data set (images such as '{counts.names[0]}')."
         )
 
 
-def _file(text: str, name: str) -> Path:
+def check_split(wanted: str, stored: str, source: object) -> None:
+    """Refuse a file of another split than the one that is named."""
+    if wanted not in ("", stored):
+        raise InputError(f"split={wanted}: {source} has split '{stored}'; omit split=.")
+
+
+def file_in(place: Path | str, name: str) -> Path:
     """A file, or the one called `name` in a folder that the other commands wrote."""
-    path = _path(text)
+    path = Path(place).expanduser()
     return path / name if path.is_dir() else path
-
-
-def _path(text: str) -> Path:
-    return Path(text).expanduser()

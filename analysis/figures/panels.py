@@ -1,163 +1,228 @@
-"""Qualitative panels: RGB, thermal, ground truth and methods, with a box on the centre.
+"""Pictures: qualitative panels, pairs of frames with predictions of both, and examples of masks.
 
-One function for SpatialSeg Figs. 8 and 9, Temporal Fig. 6 and CRM Figs. 4 and 6 to 8. None of the
-papers says how its images were chosen. Here they are named, or selected by a stated rule.
+None of the papers says how its images were chosen. Here they are named, or selected by a stated
+rule.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import numpy as np
+import pandas as pd
+from annotated_types import Interval
+from matplotlib import colormaps
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
+from analysis.arguments import MOST
 from analysis.bar import progress
-from analysis.figures import style
-from analysis.figures.grid import Grid, Texts, draw_grid
-from analysis.figures.inputs import FigureInput
+from analysis.figures import plots
+from analysis.figures.inputs import (
+    Config,
+    Count,
+    Drawn,
+    Methods,
+    Names,
+    Split,
+    chosen_names,
+    figure,
+    labelled,
+)
 from analysis.predictions.scoring import ScoringOptions, score_folder
 from rgbt.checks import InputError
-from rgbt.data.predictions import Affixes, FormatOptions, PredictionReader, prediction_paths
+from rgbt.config.common_options import PredictionFormatOptions
+from rgbt.config.options import Help
+from rgbt.data.files import decode, read_rgb
+from rgbt.data.mfnet import NextFrames
+from rgbt.data.predictions import Affixes, FormatOptions, PredictionReader
 from rgbt.metrics.counting import RegionCounter
 from rgbt.metrics.counts import Counts, scored_classes
 from rgbt.metrics.metric import Regions, ring_rectangle
+from rgbt.metrics.pair_list import ListedPair, read_list
 from rgbt.metrics.scores import miou
-from rgbt.terminal import info
 from rgbt.tracking.pictures import colours
+from rgbt.types import IGNORE
 
 if TYPE_CHECKING:
     from rgbt.dataset import LabelledDataset
-    from rgbt.types import Sample
+    from rgbt.types import AnyMasker, Sample
 
-Labels = NDArray[np.uint8]
-ReadPrediction = Callable[[str], Labels]
-"""Name of an image -> (H, W) predicted class indices."""
-
-PREDICTIONS = "label:folder of predicted label images, with commas between methods"
-
-MISSING = {"without_rgb": "no RGB", "without_thermal": "no thermal"}
-"""Option with the predictions without an image -> what they are called."""
-
-LINE = "\n"
+Bytes = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
 
 WHOLE = Regions(partition="ring", regions=1, aspect="image", absent="exclude")
 """The image as one region."""
 
+OUTLINE, OUTLINED = "#FF2A2A", "predictions of both frames differ"
+THERMAL_COLOURS = "jet"
+"""Temporal, captions of Figs. 1 and 2."""
 
-@dataclass(frozen=True)
-class PanelRow:
-    """One image of a panel.
+PATCHES = (8, 16, 32, 64)
+"""Sides in pixels that the paper draws (CRM, Fig. 5 and Table 3b)."""
 
-    Attributes:
-        rgb: (H, W, 3) uint8.
-        thermal: (H, W) uint8.
-        label: (H, W) class indices or 255.
-        predictions: (H, W) class indices of each method.
-        mious: of this image alone, percent, one per method; over the scored classes that label or
-            prediction hold, because a single image lacks most classes.
-    """
+STRIDE = 32
+"""Maskers cut images whose sides are multiples of this; others they would pad with black."""
 
-    name: str
-    rgb: Labels
-    thermal: Labels
-    label: Labels
-    predictions: tuple[Labels, ...]
-    mious: tuple[float, ...]
+HIDDEN = (150, 190, 230)
+"""Colour of a hidden pixel: a grey one would be lost in a thermal image."""
 
 
-@dataclass(frozen=True)
-class QualitativePanel:
-    """A qualitative figure, with a box on the rows and columns of the innermost region."""
-
-    methods: tuple[str, ...]
-    rows: tuple[PanelRow, ...]
-    classes: tuple[str, ...]
-    palette: Labels
-    box: tuple[slice, slice]
-
-
-def make(given: FigureInput) -> Figure:
-    """Images, ground truth and predictions."""
-    made = _read(given, given.named("methods", PREDICTIONS), 4)
-    return draw(made, given.get("layout", "rows"))
+Rows = Annotated[Count, Help("number of images")]
+Layout = Annotated[
+    Literal["rows", "columns"], Help("one row or one column per image: rows or columns")
+]
+Pick = Annotated[
+    Literal["first", "largest_difference"],
+    Help("images shown: first, or largest_difference of the first and the last method"),
+]
 
 
-def make_missing(given: FigureInput) -> Figure:
-    """CRM, Fig. 2: predictions with both images, without RGB and without thermal.
+@dataclass(frozen=True, kw_only=True)
+class PictureOptions(PredictionFormatOptions):
+    """Images and predictions of methods."""
 
-    Raises:
-        InputError: methods whose three folders are not all named.
-    """
-    folders = {key: given.named(key, PREDICTIONS) for key in ("methods", *MISSING)}
-    for key, named in folders.items():
-        if set(named) != set(folders["methods"]):
-            raise InputError(
-                f"{key} names the predictions of {', '.join(named)}, but methods those of "
-                f"{', '.join(folders['methods'])}; give every method in methods=, without_rgb= and "
-                "without_thermal=."
-            )
-    shown = {"methods": "both", **MISSING}
-    named = {
-        f"{label}\n{shown[key]}": folders[key][label]
-        for label in folders["methods"]
-        for key in shown
-    }
-    return draw(_read(given, named, 2), given.get("layout", "rows"), marks="scores")
+    methods: Methods
+    names: Names = ""
+    rows: Rows = 4
+    split: Split = ""
+    layout: Layout = "rows"
+
+    @property
+    def form(self) -> FormatOptions:
+        """The format of the files."""
+        affixes = Affixes(self.prefix, self.suffix)
+        return FormatOptions(form=self.format, palette=self.palette, affixes=affixes)
 
 
-def _reading(
-    folder: Path, names: Sequence[str], dataset: LabelledDataset, described: FormatOptions
-) -> ReadPrediction:
-    """A function that reads the prediction of one of the images.
+@dataclass(frozen=True, kw_only=True)
+class PairOptions(PictureOptions):
+    """Pairs of frames."""
 
-    Raises:
-        InputError: an image without a prediction, or an unknown format.
-    """
-    paths = prediction_paths(folder, names, described.affixes)
-    for path in paths.values():
-        if not path.is_file():
-            raise InputError(
-                f"methods: there is no prediction {path}; name a folder with a file for every "
-                "image shown, or other images with names=..."
-            )
-    reader = PredictionReader(dataset.classes, dataset.palette, described)
-    return lambda name: reader.read(paths[name])
+    pairs: Annotated[str, Help("folder that rgbt consistency export=... wrote")]
+    view_set: Annotated[Count, Help("set of virtual views of these pairs, from 1")] = 1
 
 
-def _read(given: FigureInput, named: Mapping[str, str], number: int) -> QualitativePanel:
-    """The panel of folders of predictions by label, of `number` images unless they are named."""
-    folders = {label: Path(place).expanduser() for label, place in named.items()}
-    dataset = given.dataset
-    described = FormatOptions(
-        form=given.get("format", "index"),
-        palette=given.get("palette", "dataset"),
-        affixes=Affixes(given.get("prefix", ""), given.get("suffix", "")),
-    )
-    if "names" in given.values and ("pick" in given.values or "rows" in given.values):
-        raise InputError("names= selects the images; omit pick= and rows=.")
-    names = given.names(given.get("rows", number))
-    if given.get("pick", "first") == "largest_difference":
-        split = given.get("split", "test")
-        options = ScoringOptions(partitions=("ring",), regions=1, format=described)
+def read_prediction(
+    folder: Path, reader: PredictionReader, name: str, image_hw: tuple[int, ...]
+) -> Bytes:
+    """(H, W) class indices; InputError: no such file, or of another size than the image."""
+    path = folder / f"{reader.options.affixes.file_stem(name)}.png"
+    if not path.is_file():
+        raise InputError(f"methods: there is no prediction {path}.")
+    found = reader.read(path)
+    if found.shape != image_hw:
+        sizes = ["x".join(map(str, shape)) for shape in (found.shape, image_hw)]
+        raise InputError(f"methods: {path} is {sizes[0]} pixels but its image is {sizes[1]}.")
+    return found
+
+
+@figure("spatialseg/fig8", "qualitative results", "dataset", "metric")
+@figure("spatialseg/fig9", "qualitative results on another data set", "dataset", "metric")
+@figure("crm/fig4", "qualitative results", "dataset", "metric")
+def qualitative(config: Config, given: PictureOptions, *, pick: Pick = "first") -> Drawn:
+    """RGB, thermal, ground truth and predictions, with a white box on the centre."""
+    folders, dataset, names = labelled(given.methods), config.dataset, given.names
+    if pick == "largest_difference" and not names:
+        split = given.split or "test"
+        options = ScoringOptions(partitions=("ring",), regions=1, format=given.form)
         mious = {}
         with progress("comparing", len(folders) * len(dataset.names(split))) as advance:
             for label, folder in folders.items():
                 (counts,) = score_folder(folder, dataset, split, options, advance).counts
                 mious[label] = image_mious(counts)
-        names = most_different(mious, dataset.names(split), given.get("rows", number))
-    readers = {
-        label: _reading(folder, names, dataset, described) for label, folder in folders.items()
+        names = ",".join(most_different(mious, given.rows))
+    shown, regions = config.names(names, given.split, given.rows), config.regions
+    if regions.aspect is None:
+        raise InputError(f"metric: {regions.name} has no centre to put a box on; use rings.")
+    made, cells, frame = panel(dataset, folders, shown, given.form, given.layout)
+    height, width = cells[0, 0].images[0].get_array().shape[:2]
+    rows, columns = ring_rectangle((height, width), regions.regions, 1, regions.aspect)
+    corner = (columns.start - 0.5, rows.start - 0.5)
+    size = (columns.stop - columns.start, rows.stop - rows.start)
+    for axes in cells.flat:
+        for colour, edge in (("black", 1.4), ("white", 0.8)):
+            axes.add_patch(Rectangle(corner, *size, fill=False, edgecolor=colour, linewidth=edge))
+    return made, frame
+
+
+@figure("crm/fig2", "predictions with both images, without RGB and without thermal", "dataset")
+def missing(
+    config: Config,
+    given: PictureOptions,
+    *,
+    without_rgb: Annotated[
+        str, Help("predictions of these methods by rgbt predict corruption=removed:rgb")
+    ],
+    without_thermal: Annotated[str, Help("the same with corruption=removed:thermal")],
+    rows: Rows = 2,
+) -> Drawn:
+    """CRM, Fig. 2, with the mIoU of every prediction; InputError: methods differ."""
+    three = {
+        "both": labelled(given.methods),
+        "no RGB": labelled(without_rgb),
+        "no thermal": labelled(without_thermal),
     }
-    made = panel(dataset, readers, names, given.regions)
-    for row in made.rows:
-        scores = zip(made.methods, row.mious, strict=True)
-        said = (f"{label.replace(LINE, ' ')} mIoU {each:.1f}" for label, each in scores)
-        info(f"{row.name}: {', '.join(said)}")
-    return made
+    if any(set(each) != set(three["both"]) for each in three.values()):
+        raise InputError("methods: name the same ones in methods, without_rgb and without_thermal.")
+    every = {f"{label}\n{kind}": three[kind][label] for label in three["both"] for kind in three}
+    shown = config.names(given.names, given.split, rows)
+    made, cells, frame = panel(config.dataset, every, shown, given.form, given.layout)
+    for axes, score in zip(cells[:, 3:].flat, frame["mIoU"], strict=True):
+        plots.in_corner(axes, f"{score:.1f}")
+    return made, frame
+
+
+def panel(
+    dataset: LabelledDataset,
+    folders: Mapping[str, Path],
+    names: Sequence[str],
+    form: FormatOptions,
+    layout: str = "rows",
+) -> tuple[Figure, NDArray[Any], pd.DataFrame]:
+    """The pictures of a panel, one row per name: the figure, its axes, and the mIoU of each image.
+
+    In percent, over the scored classes that label or prediction hold, because a single image lacks
+    most classes. InputError: images without label or of several sizes, or a missing prediction.
+    """
+    reader = PredictionReader(dataset.classes, dataset.palette, form)
+    palette, pictures, numbers = np.array(dataset.palette, np.uint8), [], []
+    scored = scored_classes(dataset.classes, dataset.unscored)
+    whole = RegionCounter(len(scored), WHOLE)
+    for name in names:
+        sample, label = labelled_sample(dataset, name)
+        painted = [label]
+        for method, folder in folders.items():
+            painted.append(read_prediction(folder, reader, name, label.shape))
+            score = float(100 * miou(whole(label, painted[-1]).sum(0), "exclude", scored))
+            numbers.append((name, method.replace("\n", " "), score))
+        thermal = np.repeat(sample.thermal[..., None], 3, axis=2)
+        pictures.append([sample.rgb, thermal, *(colours(each, palette) for each in painted)])
+    check_one_size([row[0].shape for row in pictures])
+    titles = ["RGB", "thermal", "ground truth", *folders]
+    legend: plots.Legend = (dataset.classes, palette, ())
+    made, cells = plots.picture_grid(pictures, names, titles, layout, legend)
+    return made, cells, pd.DataFrame(numbers, columns=["image", "method", "mIoU"])
+
+
+def labelled_sample(dataset: LabelledDataset, name: str) -> tuple[Sample, Bytes]:
+    """A sample and its label; InputError where it has none."""
+    sample = dataset.read(name)
+    if sample.label is None:
+        raise InputError(f"names: '{name}' has no label; choose images that are labelled.")
+    return sample, sample.label
+
+
+def check_one_size(sizes: Sequence[tuple[int, ...]]) -> None:
+    """Refuse images of several sizes."""
+    if len(set(sizes)) > 1:
+        raise InputError(f"names: the images have different sizes {sorted(set(sizes))}.")
 
 
 def image_mious(counts: Counts) -> dict[str, float]:
@@ -166,125 +231,259 @@ def image_mious(counts: Counts) -> dict[str, float]:
     return dict(zip(counts.names, scores.tolist(), strict=True))
 
 
-def panel(
-    dataset: LabelledDataset,
-    methods: Mapping[str, ReadPrediction],
-    names: Sequence[str],
-    regions: Regions,
-) -> QualitativePanel:
-    """The pictures of a panel, one row per name.
+def most_different(scores: Mapping[str, Mapping[str, float]], number: int) -> tuple[str, ...]:
+    """Names of the images where the last method differs most from the first, that most first.
 
-    Args:
-        dataset: holds the images.
-        methods: label -> reader of its predictions.
-        names: of the images.
-        regions: rings; the box is around the innermost.
-
-    Raises:
-        InputError: no rings, images that differ in size, or a prediction of another size.
+    `scores`: method -> name -> score of that image; images with a NaN are left out. InputError:
+    fewer than two methods, or fewer images than requested.
     """
-    samples = [dataset.read(name) for name in names]
-    sizes = {sample.thermal.shape for sample in samples}
-    if len(sizes) > 1:
-        raise InputError(f"names: the images have different sizes {sorted(sizes)}; show one size.")
-    if regions.aspect is None:
-        raise InputError(
-            f"metric.partition={regions.partition} has no centre to put a box on; use rings, for "
-            "example metric=ring5."
-        )
-    height, width = samples[0].thermal.shape
-    scored = scored_classes(dataset.classes, dataset.unscored)
-    return QualitativePanel(
-        methods=tuple(methods),
-        rows=tuple(_row(sample, methods, scored) for sample in samples),
-        classes=tuple(dataset.classes),
-        palette=np.array(dataset.palette, np.uint8),
-        box=ring_rectangle((height, width), regions.regions, 1, regions.aspect),
-    )
-
-
-def _row(
-    sample: Sample, methods: Mapping[str, ReadPrediction], scored: NDArray[np.bool_]
-) -> PanelRow:
-    label = sample.label
-    if label is None:
-        raise InputError(f"names: '{sample.name}' has no label; choose images that are labelled.")
-    predictions = {method: read(sample.name) for method, read in methods.items()}
-    for method, each in predictions.items():
-        if each.shape != label.shape:
-            raise InputError(
-                f"methods: the prediction of '{sample.name}' by '{method}' is {each.shape[0]}x"
-                f"{each.shape[1]} pixels but its label is {label.shape[0]}x{label.shape[1]}; "
-                "save predictions at the size of the labels."
-            )
-    whole = RegionCounter(len(scored), WHOLE)
-    matrices = [whole(label, each).sum(0) for each in predictions.values()]
-    mious = tuple(float(100 * miou(each, "exclude", scored)) for each in matrices)
-    images = sample.rgb, sample.thermal, label
-    return PanelRow(sample.name, *images, tuple(predictions.values()), mious)
-
-
-def most_different(
-    mious: Mapping[str, Mapping[str, float]], names: Sequence[str], number: int
-) -> tuple[str, ...]:
-    """Names of the images where the last method differs most from the first.
-
-    Args:
-        mious: method -> name -> mIoU of that image, percent; images with a NaN are left out.
-        names: of the split, in order.
-        number: how many.
-
-    Returns:
-        names by falling ``|last - first|``; equal ones in the order of the split.
-
-    Raises:
-        InputError: fewer than two methods, or fewer images than requested.
-    """
-    if len(mious) < 2:
+    if len(scores) < 2:
         raise InputError("pick=largest_difference compares two methods; give two in methods=...")
-    first, *_, last = mious.values()
-    gaps = {name: abs(last[name] - first[name]) for name in names}
-    known = [name for name, gap in gaps.items() if not np.isnan(gap)]
+    first, *_, last = scores.values()
+    gaps = {name: abs(last[name] - first[name]) for name in first}
+    known = [name for name, gap in gaps.items() if not math.isnan(gap)]
     if len(known) < number:
         raise InputError(f"rows={number}, but there are only {len(known)} images to choose from.")
     return tuple(sorted(known, key=lambda name: -gaps[name])[:number])
 
 
-@style.styled
-def draw(
-    data: QualitativePanel, layout: str = "rows", marks: Literal["box", "scores"] = "box"
-) -> Figure:
-    """Pictures; below them the classes.
+class Frame(NamedTuple):
+    """One frame with labels: (H, W, 3), (H, W) and (H, W) uint8; 255: no label."""
 
-    Args:
-        data: images and predictions.
-        layout: a row or a column per image.
-        marks: a white box on the centre, or the mIoU of every prediction.
+    rgb: Bytes
+    thermal: Bytes
+    label: Bytes
+
+
+class FramePair(NamedTuple):
+    """A pair of frames and the predictions of M methods.
+
+    All are (H, W): `compared` are pixels of the second frame that count, which are seen in the
+    first one and labelled; `differ`, for each method, those whose two predictions differ.
     """
-    titles = ("RGB", "thermal", "ground truth", *data.methods)
-    pictures = []
-    for row in data.rows:
-        thermal = np.repeat(row.thermal[..., None], 3, axis=2)
-        painted = [colours(each, data.palette) for each in (row.label, *row.predictions)]
-        pictures.append((row.rgb, thermal, *painted))
-    names = [row.name for row in data.rows]
-    grid = draw_grid(pictures, Texts(names, titles, data.classes, data.palette), layout)
-    if marks == "scores":
-        for row, cells in zip(data.rows, grid.cells, strict=True):
-            for axes, miou_of_image in zip(cells[3:], row.mious, strict=True):
-                style.in_corner(axes, f"{miou_of_image:.1f}")
-        return grid.figure
-    _box(grid, data.box)
-    return grid.figure
+
+    name: str
+    frames: tuple[Frame, Frame]
+    predictions: tuple[tuple[Bytes, Bytes], ...]
+    differ: tuple[Mask, ...]
+    compared: Mask
+
+    @property
+    def shares(self) -> tuple[float, ...]:
+        """Percent of the compared pixels that differ, for each method; NaN where none is."""
+        count = int(self.compared.sum())
+        return tuple(100 * int(each.sum()) / count if count else math.nan for each in self.differ)
 
 
-def _box(grid: Grid, box: tuple[slice, slice]) -> None:
-    """A white box on the same rows and columns of every picture."""
-    from matplotlib.patches import Rectangle
+class Pairs:
+    """The pairs of an export, with the predictions of methods; pixels count as in TC.
 
-    box_rows, box_columns = box
-    corner = (box_columns.start - 0.5, box_rows.start - 0.5)
-    size = (box_columns.stop - box_columns.start, box_rows.stop - box_rows.start)
-    for each in (axes for row in grid.cells for axes in row):
-        for colour, edge in (("black", 1.4), ("white", 0.8)):
-            each.add_patch(Rectangle(corner, *size, fill=False, edgecolor=colour, linewidth=edge))
+    Raises:
+        InputError: an export of other images or views, or an unfinished one.
+    """
+
+    def __init__(self, config: Config, given: PairOptions) -> None:
+        self._folder, self._dataset = Path(given.pairs).expanduser(), config.dataset
+        self.methods, listed = labelled(given.methods), read_list(self._folder)
+        self._after = NextFrames(self._dataset) if listed.frames == "next" else None
+        self.second, self._views = "synthesised", config.built("consistency")
+        made_of = self._views.mark or "published"
+        if self._after is not None:
+            self.second, made_of = "next frame", self._after.dataset.fingerprint()[:6]
+        if not listed.complete:
+            raise InputError(f"pairs: the export {given.pairs} was interrupted; rerun its command.")
+        if (listed.dataset, listed.views) != (self._dataset.fingerprint(), made_of):
+            raise InputError(
+                f"pairs: {given.pairs} was exported from other images or other second frames "
+                f"({listed.name}, {listed.views}); give the data set and the consistency settings "
+                "of the export."
+            )
+        self.listed = {each.first: each for each in listed.pairs if each.set == given.view_set}
+        if not self.listed:
+            raise InputError(f"view_set={given.view_set}: the export has no such set of views.")
+        self._reader = PredictionReader(self._dataset.classes, self._dataset.palette, given.form)
+
+    def read(self, name: str) -> FramePair:
+        """The pair whose first frame is called `name`."""
+        pair = self.listed[name]
+        sample, of_first = labelled_sample(self._dataset, name)
+        label, (rows, columns), compared = self._follow(pair, of_first)
+        rgb = read_rgb(self._folder / "rgb" / f"{pair.second}.png")
+        thermal = np.asarray(decode(self._folder / "thermal" / f"{pair.second}.png"), np.uint8)
+        predictions, differ = [], []
+        for folder in self.methods.values():
+            first = read_prediction(folder, self._reader, name, label.shape)
+            second = read_prediction(folder, self._reader, pair.second, label.shape)
+            predictions.append((first, second))
+            differ.append((first[rows, columns] != second) & compared)
+        frames = Frame(sample.rgb, sample.thermal, of_first), Frame(rgb, thermal, label)
+        return FramePair(name, frames, tuple(predictions), tuple(differ), compared)
+
+    def _follow(
+        self, pair: ListedPair, of_first: Bytes
+    ) -> tuple[Bytes, tuple[NDArray[np.int64], NDArray[np.int64]], Mask]:
+        """Label of the second frame, rows and columns of its pixels in the first, which count."""
+        shape = of_first.shape
+        if self._after:
+            _, label = labelled_sample(self._after.dataset, pair.first)
+            rows, columns = self._after.source(pair.first, (shape[0], shape[1]))
+            return label, (rows.clip(0), columns.clip(0)), (rows >= 0) & (label != IGNORE)
+        import torch
+
+        view = self._views.view
+        angles = torch.tensor([[pair.yaw, pair.pitch, pair.roll]], dtype=torch.float64)
+        warp = view.warp(angles, shape)
+        label = warp.nearest(torch.from_numpy(of_first)[None], view.outside_label)[0].numpy()
+        places = torch.arange(label.size).view(1, *shape)
+        rows, columns = np.divmod(warp.nearest(places, 0)[0].numpy(), shape[1])
+        return label, (rows, columns), warp.inside()[0].numpy() & (label != IGNORE)
+
+
+@figure("temporal/fig1", "a real frame and its synthesised next one", "dataset", "consistency")
+def pair_rows(
+    config: Config,
+    given: PairOptions,
+    *,
+    pick: Pick = "first",
+    rows: Rows = 1,
+) -> Drawn:
+    """Both frames, ground truth and predictions; pixels that lower TC are outlined."""
+    opened = Pairs(config, given)
+    methods, listed, names = [*opened.methods], [*opened.listed], given.names
+    if pick == "largest_difference" and not names:
+        shares = {name: opened.read(name).shares for name in listed}
+        by_method = {
+            label: {name: each[index] for name, each in shares.items()}
+            for index, label in enumerate(methods)
+        }
+        names = ",".join(most_different(by_method, rows))
+    shown = [opened.read(name) for name in chosen_names(names, listed, rows)]
+    check_one_size([pair.compared.shape for pair in shown])
+    palette = np.array(config.dataset.palette, np.uint8)
+    line = Line2D([], [], color=OUTLINE, linewidth=1.2, label=OUTLINED)
+    legend = config.dataset.classes, palette, [line]
+    cells = [(p.name, *each) for p in shown for each in zip(methods, p.shares, strict=True)]
+    frame = pd.DataFrame(cells, columns=["image", "method", "differing_percent"])
+    return draw_pairs(shown, methods, legend, opened.second, given.layout), frame
+
+
+@figure("temporal/fig6", "four pairs of frames, two columns each", "dataset", "consistency")
+def pair_columns(
+    config: Config,
+    given: PairOptions,
+    *,
+    pick: Pick = "first",
+    rows: Rows = 4,
+    layout: Layout = "columns",
+) -> Drawn:
+    """As `pair_rows`, with the number and the layout of the printed figure."""
+    return pair_rows(config, replace(given, layout=layout), pick=pick, rows=rows)
+
+
+@plots.styled
+def draw_pairs(
+    pairs: Sequence[FramePair],
+    methods: Sequence[str],
+    legend: plots.Legend,
+    second: str,
+    layout: str,
+) -> Figure:
+    """Pictures of both frames of every pair; below them the classes; `second`: what they are."""
+    pictures, labels = [], []
+    for pair in pairs:
+        # Both frames of a pair share the limits, so that a colour means the same in both.
+        low, high = int(pair.frames[0].thermal.min()), int(pair.frames[0].thermal.max())
+        for index, frame in enumerate(pair.frames):
+            painted = [frame.label, *(both[index] for both in pair.predictions)]
+            relative = ((frame.thermal.astype(float) - low) / max(high - low, 1)).clip(0, 1)
+            thermal = (255 * colormaps[THERMAL_COLOURS](relative)[..., :3]).astype(np.uint8)
+            maps = [colours(each, legend[1]) for each in painted]
+            pictures.append([frame.rgb, thermal, *maps])
+        labels += [pair.name, second]
+    titles = ("RGB", "thermal", "ground truth", *methods)
+    made, cells = plots.picture_grid(pictures, labels, titles, layout, legend)
+    for pair, of_pair in zip(pairs, cells[1::2], strict=True):
+        for axes, differ, share in zip(of_pair[3:], pair.differ, pair.shares, strict=True):
+            if differ.any():
+                # A border of False closes the lines at the edge of the picture.
+                padded, (height, width) = np.pad(differ, 1).astype(float), differ.shape
+                at = np.arange(-1, width + 1), np.arange(-1, height + 1)
+                axes.contour(*at, padded, levels=[0.5], colors=OUTLINE, linewidths=0.5)
+                axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
+            plots.in_corner(axes, "-" if math.isnan(share) else f"{share:.1f} %")
+    return made
+
+
+class MaskExample(NamedTuple):
+    """One mask on a pair of images: (H, W, 3) pictures with hidden pixels in the colour `HIDDEN`,
+    and (H, W) which pixels are hidden.
+    """
+
+    title: str
+    rgb: Bytes
+    thermal: Bytes
+    rgb_hidden: Mask
+    thermal_hidden: Mask
+
+
+@figure("crm/fig5", "masks on a pair of images: a square, and patches of four sizes", "dataset")
+def masks(
+    config: Config,
+    *,
+    names: Names = "",
+    split: Split = "",
+    patches: Annotated[tuple[Count, ...], Help("sides of the patches in pixels")] = PATCHES,
+    seed: Annotated[int, Interval(ge=0, le=MOST), Help("seed of the masks")] = 0,
+) -> Drawn:
+    """CRM, Fig. 5: RGB above, thermal below; what one image hides, the other shows."""
+    sample = config.dataset.read(config.names(names, split)[0])
+    chosen = masker_overrides(patches).items()
+    maskers = {title: config.built("masker", *words) for title, words in chosen}
+    examples = mask_examples(sample, maskers, math.lcm(STRIDE, *patches), seed)
+    pictures = [[each.rgb for each in examples], [each.thermal for each in examples]]
+    made, _ = plots.picture_grid(pictures, ("RGB", "thermal"), [*maskers])
+    rows = [(e.title, e.rgb_hidden.mean(), e.thermal_hidden.mean()) for e in examples]
+    return made, pd.DataFrame(rows, columns=["mask", "rgb_hidden", "thermal_hidden"])
+
+
+def masker_overrides(patches: Sequence[int]) -> dict[str, tuple[str, ...]]:
+    """Title -> what chooses the masker of each column of Fig. 5: a square, then the patches."""
+    by_size = {
+        f"{size} x {size} pixels": ("masker=crm", f"masker.patch_size={size}") for size in patches
+    }
+    every = {"square": ("masker=square",), **by_size}
+    return {title: (*words, "masker.pairing=comp") for title, words in every.items()}
+
+
+def mask_examples(
+    sample: Sample, maskers: Mapping[str, AnyMasker], multiple: int, seed: int
+) -> tuple[MaskExample, ...]:
+    """The pair under each mask, cut around its centre to whole cells: 64 does not divide 480.
+
+    Every cell divides `multiple` pixels; a mask is drawn from the seed and its place among the
+    maskers. InputError: the images are smaller than one cell.
+    """
+    import torch
+
+    from rgbt.randomness import torch_generator
+
+    full = sample.thermal.shape
+    height, width = (length // multiple * multiple for length in full)
+    if min(height, width) == 0:
+        raise InputError(f"patches: '{sample.name}' has {full} pixels, less than {multiple}.")
+    top, left = (full[0] - height) // 2, (full[1] - width) // 2
+    rgb, thermal = (
+        image[top : top + height, left : left + width] for image in (sample.rgb, sample.thermal)
+    )
+    centre = torch.tensor([[height // 2, width // 2]])
+    examples = []
+    for index, (title, masker) in enumerate(maskers.items()):
+        pair = masker((height, width), centre, torch_generator(seed, "figure masks", index))
+        shown = [rgb.copy(), np.repeat(thermal[..., None], 3, axis=2)]
+        hidden: list[Mask] = []
+        for image, cells in zip(shown, (pair.rgb[0].numpy(), pair.thermal[0].numpy()), strict=True):
+            size = height // cells.shape[0], width // cells.shape[1]
+            hidden.append(np.kron(cells, np.ones(size, bool)))
+            image[hidden[-1]] = HIDDEN
+        examples.append(MaskExample(title, shown[0], shown[1], hidden[0], hidden[1]))
+    return tuple(examples)

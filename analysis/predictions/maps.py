@@ -16,7 +16,6 @@ from rgbt.metrics.counts import scored_classes
 ARCHIVE = Archive("rgbt pixel maps 1", "pixel maps", "it is the maps.npz that rgbt score writes")
 
 Bytes = NDArray[np.uint8]
-Heat = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,26 +64,38 @@ class PixelMaps:
 
     @classmethod
     def load(cls, path: Path) -> PixelMaps:
-        """Read what `save` wrote.
-
-        Raises:
-            InputError: no such file, or not a file of pixel maps.
-        """
+        """Read what `save` wrote; InputError: no such file, or not a file of pixel maps."""
         return ARCHIVE.load(path, cls._of_arrays)
 
     @classmethod
     def _of_arrays(cls, values: dict[str, Any]) -> PixelMaps:
-        return cls(
-            intersection=values["intersection"],
-            union=values["union"],
-            images=int(values["images"]),
-            classes=tuple(values["classes"].tolist()),
-            palette=tuple((r, g, b) for r, g, b in values["palette"].tolist()),
-            dataset=str(values["dataset"]),
-            split=str(values["split"]),
-            name=str(values["name"]),
-            unscored=tuple(values["unscored"].tolist()),
-        )
+        plain = {key: array.tolist() for key, array in values.items() if array.ndim < 3}
+        for key in ("classes", "unscored"):
+            plain[key] = tuple(plain[key])
+        palette = tuple((r, g, b) for r, g, b in plain.pop("palette"))
+        arrays = {key: values[key] for key in ("intersection", "union")}
+        return cls(palette=palette, **arrays, **plain)
+
+    def iou(self) -> NDArray[np.float64]:
+        """Mean IoU over classes at every pixel, over the images: the map of SpatialSeg, Fig. 1(a).
+
+            (1 / |C|) sum_{c in C} I_c(y, x) / U_c(y, x)
+
+        C are the scored classes with U > 0 at the pixel: at a single pixel most classes never
+        occur, so that absent ones as 0 would mostly show how many do. The mean of the map over a
+        region is not the mIoU of that region, which adds up pixels before it divides.
+
+        Source: SpatialSeg, Fig. 1(a); how absent classes count is not stated there.
+
+        Returns:
+            (H, W) fractions 0..1; NaN where there is nothing to score.
+        """
+        union = self.union[self.scored]
+        ratio = self.intersection[self.scored] / np.maximum(union, 1)
+        there = (union > 0).sum(0)
+        heat = np.full(there.shape, np.nan)
+        np.divide(ratio.sum(0), there, out=heat, where=there > 0)
+        return heat
 
 
 class MapSum:
@@ -114,25 +125,3 @@ class MapSum:
                 labelled, predicted = label == index, (prediction == index) & counted
                 both += labelled & predicted
                 either += labelled | predicted
-
-
-def iou_map(maps: PixelMaps) -> Heat:
-    """Mean IoU over classes at every pixel, over the images: the map of SpatialSeg, Fig. 1(a).
-
-        (1 / |C|) sum_{c in C} I_c(y, x) / U_c(y, x)
-
-    C are the scored classes with U > 0 at the pixel: at a single pixel most classes never occur, so
-    that absent ones as 0 would mostly show how many do. The mean of the map over a region is not
-    the mIoU of that region, which adds up pixels before it divides; only the latter is printed.
-
-    Source: SpatialSeg, Fig. 1(a); how absent classes count is not stated there.
-
-    Returns:
-        (H, W) fractions 0..1; NaN where there is nothing to score.
-    """
-    union = maps.union[maps.scored]
-    ratio = maps.intersection[maps.scored] / np.maximum(union, 1)
-    there = (union > 0).sum(0)
-    heat: Heat = np.full(there.shape, np.nan)
-    np.divide(ratio.sum(0), there, out=heat, where=there > 0)
-    return heat

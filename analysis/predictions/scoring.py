@@ -1,8 +1,9 @@
-"""Predictions counted by region and by pixel, in one pass over the images."""
+"""Find the predictions of a split in a folder and count them by region and by pixel."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -12,20 +13,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.bar import in_threads
-from analysis.predictions.folder import Missing, PredictionFiles, find
 from analysis.predictions.maps import MapSum, PixelMaps
-from rgbt.checks import InputError, check_choice
-from rgbt.data.predictions import Array, FormatOptions, PredictionReader
+from rgbt.checks import InputError
+from rgbt.data.predictions import OVERLAY, Affixes, Array, FormatOptions, PredictionReader
 from rgbt.dataset import LabelledDataset
 from rgbt.metrics.counting import RegionCounter
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.metric import Absent, Partition, Regions
 
+Missing = Literal["refuse", "leave_out"]
 Resize = Literal["refuse", "nearest", "stretch"]
+
+PARTITIONS: tuple[Partition, ...] = get_args(Partition)
+
 MOST_STRETCH = 0.05
 """Ratio of the aspects of prediction and label, less 1, up to which one is a resized other."""
 
-PARTITIONS: tuple[Partition, ...] = get_args(Partition)
+SHOWN = 3
+"""Most names that a message lists."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,13 +59,6 @@ class ScoringOptions:
     threads: int = 0
     absent: Absent = "released"
 
-    def __post_init__(self) -> None:
-        for partition in self.partitions:
-            check_choice("partition", partition, PARTITIONS)
-        check_choice("absent", self.absent, get_args(Absent))
-        check_choice("missing", self.missing, get_args(Missing))
-        check_choice("resize", self.resize, get_args(Resize))
-
 
 @dataclass(frozen=True)
 class FolderScores:
@@ -69,7 +67,8 @@ class FolderScores:
     Attributes:
         counts: one per partition, in the order of `ScoringOptions.partitions`.
         maps: counts by pixel; None where the images differ in size.
-        found: which files were read, which are missing, which belong to no image.
+        missing: names of the split without a prediction.
+        extra: names of PNG files that belong to no image of the split (overlays left out).
         resized: name of an image whose prediction had another size -> both sizes, such as "480x640
             to 720x1280".
     """
@@ -77,8 +76,68 @@ class FolderScores:
     name: str
     counts: tuple[Counts, ...]
     maps: PixelMaps | None
-    found: PredictionFiles
+    missing: tuple[str, ...]
+    extra: tuple[str, ...]
     resized: dict[str, str]
+
+    def save(self, folder: Path) -> None:
+        """Write ``counts_<partition>.npz`` of each partition, and ``maps.npz``."""
+        folder.mkdir(parents=True, exist_ok=True)
+        for counts in self.counts:
+            counts.save(folder / f"counts_{counts.partition}.npz")
+        if self.maps is not None:
+            self.maps.save(folder / "maps.npz")
+
+    def remarks(self) -> list[str]:
+        """Remarks about the folder that a reader of the numbers needs, one sentence each."""
+        remarks, counted = [], len(self.counts[0].names)
+        if self.missing:
+            remarks.append(
+                f"{len(self.missing)} of {len(self.missing) + counted} images of the split have no "
+                f"prediction and are left out of every number ({_listed(self.missing)})."
+            )
+        for sizes, number in Counter(self.resized.values()).items():
+            remarks.append(
+                f"{number} predictions were resized to their label by the nearest pixel, from "
+                f"{sizes}."
+            )
+        if self.extra:
+            remarks.append(
+                f"{len(self.extra)} other PNG files of the folder belong to no image of the split "
+                f"and were not read ({_listed(self.extra)})."
+            )
+        if self.maps is None:
+            remarks.append("The images differ in size, so there is no map by pixel.")
+        return remarks
+
+
+def find(
+    folder: Path, names: Sequence[str], affixes: Affixes, missing: Missing
+) -> tuple[dict[str, Path], tuple[str, ...], tuple[str, ...]]:
+    """The predictions of images: files prefix + NAME + suffix + ".png".
+
+    Returns:
+        name -> file in the order of `names`; names without a file; other PNG files, overlays apart.
+
+    Raises:
+        InputError: no such folder, none of the files, or files missing and "refuse".
+    """
+    if not folder.is_dir():
+        raise InputError(f"predictions: no such folder: {folder}")
+    stems = {path.stem for path in folder.glob("*.png")}
+    own = {name: affixes.file_stem(name) for name in names}
+    paths = {name: folder / f"{stem}.png" for name, stem in own.items() if stem in stems}
+    absent = tuple(name for name in names if name not in paths)
+    if not paths or (absent and missing == "refuse"):
+        files = [f"{own[name]}.png" for name in absent]
+        held = _listed(sorted(path.name for path in folder.iterdir())) or "nothing"
+        raise InputError(
+            f"predictions: {folder} lacks {len(absent)} of the {len(names)} images of the split "
+            f"({_listed(files)}); it contains {held}. Add them, choose another split, or count the "
+            "others alone with missing=leave_out."
+        )
+    known = {*own.values(), *(f"{name}{OVERLAY}" for name in names)}
+    return paths, absent, tuple(sorted(stems - known))
 
 
 def score_folder(
@@ -104,24 +163,20 @@ def score_folder(
         InputError: files missing, unreadable, of another size, or with values that are no class;
             of several, the first in the order of the split.
     """
-    found = find(folder, dataset, split, options.format.affixes, options.missing)
-    paths = found.paths.values()
+    affixes = options.format.affixes
+    paths, missing, extra = find(folder, dataset.names(split), affixes, options.missing)
     reader = PredictionReader(dataset.classes, dataset.palette, options.format)
-    names = tuple(found.paths)
+    names, maps = tuple(paths), MapSum(dataset.num_classes)
     counters = [
         RegionCounter(dataset.num_classes, _regions(partition, options.regions))
         for partition in options.partitions
     ]
-    maps = MapSum(dataset.num_classes)
 
     def count(image: str, path: Path) -> tuple[NDArray[np.int64], str]:
         """Counts (partitions, R, K, K), and both sizes if it was resized."""
         label = dataset.label(image)
         if label is None:
-            raise InputError(
-                f"'{image}' of {dataset.name} has no label to count predictions against; "
-                "choose a labelled split."
-            )
+            raise InputError(f"split: '{image}' of {dataset.name} has no label to count against.")
         prediction, sizes = reader.read(path), ""
         if prediction.shape != label.shape:
             sizes = f"{_size(prediction)} to {_size(label)}"
@@ -130,9 +185,8 @@ def score_folder(
         return np.stack([counter(label, prediction) for counter in counters]), sizes
 
     shape = (len(counters), len(names), options.regions, *[dataset.num_classes] * 2)
-    counts = np.zeros(shape, np.int32)
-    resized = {}
-    every = in_threads(count, names, paths, threads=options.threads)
+    counts, resized = np.zeros(shape, np.int32), {}
+    every = in_threads(count, names, paths.values(), threads=options.threads)
     for index, (matrices, sizes) in enumerate(every):
         counts[:, index] = matrices
         if sizes:
@@ -143,29 +197,25 @@ def score_folder(
     shared |= {"split": split, "dataset": dataset.fingerprint()}
     summed = None
     if maps.sums is not None and maps.is_one_size:
-        both = {"intersection": maps.sums[0], "union": maps.sums[1]}
         about: Any = {"images": len(names), "palette": dataset.palette, "name": name}
-        summed = PixelMaps(**both, **about, **shared)
+        summed = PixelMaps(intersection=maps.sums[0], union=maps.sums[1], **about, **shared)
     shared |= {"names": names, "night": dataset.nights(names), "absent": options.absent}
     made = [
         Counts(counts=by_image, partition=counter.regions.name, **shared)
         for by_image, counter in zip(counts, counters, strict=True)
     ]
-    return FolderScores(name, tuple(made), summed, found, resized)
+    return FolderScores(name, tuple(made), summed, missing, extra, resized)
 
 
 def _resized(prediction: Array, label: Array, path: Path, resize: Resize) -> Array:
     (height, width), (rows, columns) = prediction.shape, label.shape
+    sizes = f"resize: {path} is {_size(prediction)} pixels but its label is {_size(label)}"
     if resize == "refuse":
-        raise InputError(
-            f"{path} is {height}x{width} pixels but its label is {rows}x{columns}; write "
-            "predictions at the size of the label, or count the nearest pixel with resize=nearest."
-        )
+        raise InputError(f"{sizes}; set resize=nearest to count the nearest pixel.")
     if resize == "nearest" and abs(height / width / (rows / columns) - 1) > MOST_STRETCH:
         raise InputError(
-            f"{path} is {height}x{width} pixels and its label {rows}x{columns}, which is another "
-            "shape and no other size; is it turned, or cropped? If the method resized whole images "
-            "to this shape, set resize=stretch."
+            f"{sizes}, which is another shape: is it turned, or cropped? If the method resized "
+            "whole images to this shape, set resize=stretch."
         )
     nearest = cv2.resize(prediction, (columns, rows), interpolation=cv2.INTER_NEAREST_EXACT)
     return np.asarray(nearest)
@@ -178,3 +228,9 @@ def _size(image: Array) -> str:
 def _regions(partition: Partition, regions: int) -> Regions:
     aspect: Literal["image"] | None = "image" if partition == "ring" else None
     return Regions(partition=partition, regions=regions, aspect=aspect, absent="released")
+
+
+def _listed(names: Sequence[str]) -> str:
+    """The first names of many, for a sentence."""
+    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+    return ", ".join(names[:SHOWN]) + more

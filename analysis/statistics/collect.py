@@ -1,25 +1,141 @@
-"""Measurements of a whole split: one pass, in threads, in memory that does not grow with images.
+"""Statistics of a split by region: what is measured once, and the file that holds it.
 
-Kept per image are a few numbers by region; the maps of occupancy are added up as images come.
+Letters: ``N`` images, ``R`` regions, ``K`` classes, ``H W`` pixels; the second axis of length 2 is
+the modality (`MODALITIES`). What is computed from them is in `sample`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from threading import Lock
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from analysis.bar import in_threads
-from analysis.statistics.data import ALL, SpatialStatistics
-from analysis.statistics.measure import ESTIMATORS, KERNELS, ImageMeasurements, ImageMeter
-from rgbt.checks import InputError, check_range
+from analysis.statistics.measure import KERNELS, ImageMeasurements, ImageMeter
+from rgbt.checks import InputError, check_choice
 from rgbt.dataset import LabelledDataset
+from rgbt.metrics.archive import Archive
 from rgbt.metrics.metric import Regions
 from rgbt.metrics.names import DAY, NIGHT
 from rgbt.types import Sample
+
+MODALITIES = ("rgb", "thermal")
+"""Order of the modality axis. RGB is measured as grey (ITU-R BT.601), rounded to 8 bits."""
+
+ALL = "all"
+
+ARCHIVE = Archive(
+    "rgbt spatial statistics 3", "statistics", "write it with rgbt spatial dataset=... out=..."
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SpatialStatistics:
+    """Measurements of every image of a split, by region.
+
+    Attributes:
+        classes: names of the K classes.
+        background: those that are no object, see `rgbt.dataset.LabelledDataset`.
+        partition: name of the regions, e.g. "ring9" (`rgbt.metrics.metric.Regions.name`).
+        region_map: (H, W) uint8, region index 0..R-1 of every pixel.
+        kernel: of the Laplacian, "four" or "eight" neighbours.
+        names: names of the N images.
+        night: (N,) bool, taken at night; None where the data set does not say.
+        labels: (N, R, K) int64, pixels of each class.
+        ignored: (N, R) int64, pixels whose label is 255.
+        occupied: (2, K, H, W) int32, images by day and at night that have class k at the pixel;
+            all by day where `night` is None.
+        laplacian: (N, 2, R) float64, variance of the Laplacian (Eq. 3), squared grey levels.
+        mean: (N, 2, R) float64, mean pixel value, grey levels 0..255.
+        noise: (N, E, 2, R) float64, standard deviation of the noise by each of `ESTIMATORS`, grey
+            levels; NaN where a region holds no window of the estimator.
+    """
+
+    dataset: str
+    fingerprint: str
+    split: str
+    classes: tuple[str, ...]
+    background: tuple[str, ...]
+    partition: str
+    region_map: NDArray[np.uint8]
+    kernel: str
+    names: tuple[str, ...]
+    night: NDArray[np.bool_] | None
+    labels: NDArray[np.int64]
+    ignored: NDArray[np.int64]
+    occupied: NDArray[np.int32]
+    laplacian: NDArray[np.float64]
+    mean: NDArray[np.float64]
+    noise: NDArray[np.float64]
+
+    @property
+    def num_regions(self) -> int:
+        """R."""
+        return int(self.region_map.max()) + 1
+
+    @property
+    def is_background(self) -> NDArray[np.bool_]:
+        """(K,): which classes are background."""
+        return np.array([name in self.background for name in self.classes], bool)
+
+    @property
+    def objects(self) -> tuple[int, ...]:
+        """Indices of the classes that are not background."""
+        return tuple(np.flatnonzero(~self.is_background).tolist())
+
+    def subsets(self) -> tuple[str, ...]:
+        """Parts of the images: ("all", "day", "night"), or ("all",) without images of both."""
+        both = self.night is not None and 0 < int(self.night.sum()) < len(self.names)
+        return (ALL, DAY, NIGHT) if both else (ALL,)
+
+    def chosen(self, part: str) -> NDArray[np.bool_]:
+        """(N,): which images belong to `part`: "all", "day" or "night".
+
+        Raises:
+            InputError: no such part, a data set without that information, or no such image.
+        """
+        check_choice("part", part, (ALL, DAY, NIGHT))
+        night = np.zeros(len(self.names), bool) if self.night is None else self.night
+        wanted = night | True if part == ALL else night == (part == NIGHT)
+        if not wanted.any() or (self.night is None and part != ALL):
+            raise InputError(
+                f"part={part}: split '{self.split}' of {self.dataset} states no such image."
+            )
+        return wanted
+
+    def occupied_in(self, part: str) -> NDArray[np.int64]:
+        """(K, H, W), images of `part` that have class k at the pixel; see `chosen`."""
+        self.chosen(part)
+        by_part = self.occupied if part == ALL else self.occupied[[int(part == NIGHT)]]
+        return np.asarray(by_part.sum(0))
+
+    def save(self, path: Path) -> None:
+        """Write one compressed file under a temporary name, then rename: never half a file."""
+        values: dict[str, Any] = {each.name: getattr(self, each.name) for each in fields(self)}
+        # Missing is stored as no value at all: npz without pickles knows no None.
+        values["night"] = np.zeros(0, bool) if self.night is None else self.night
+        for key, each in values.items():
+            values[key] = each if isinstance(each, np.ndarray) else np.array(each, str)
+        ARCHIVE.save(path, values)
+
+    @classmethod
+    def load(cls, path: Path) -> SpatialStatistics:
+        """Read what `save` wrote; InputError: no such file, or not a file of statistics."""
+        return ARCHIVE.load(path, cls._of_arrays)
+
+    @classmethod
+    def _of_arrays(cls, values: dict[str, Any]) -> SpatialStatistics:
+        night = values.pop("night")
+        for key, each in values.items():
+            if each.dtype.kind == "U":
+                values[key] = tuple(each.tolist()) if each.ndim else str(each)
+        return cls(night=night if len(night) else None, **values)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,9 +148,6 @@ class MeasurementSettings:
             area and the labels to the nearest pixel; 0: as they are.
         workers: threads; 0: one per core.
         skip_unreadable: leave out what cannot be read, and say so, instead of stopping.
-
-    Raises:
-        InputError: fewer than 0 workers, or a negative edge.
     """
 
     regions: Regions
@@ -42,26 +155,6 @@ class MeasurementSettings:
     short_edge: int = 0
     workers: int = 0
     skip_unreadable: bool = False
-
-    def __post_init__(self) -> None:
-        check_range("workers", self.workers, 0, 1024)
-        check_range("short_edge", self.short_edge, 0, 10_000)
-
-    def resized(self, sample: Sample) -> Sample:
-        """A sample in the size in which it is measured."""
-        height, width = sample.thermal.shape[:2]
-        if self.short_edge in (0, min(height, width)):
-            return sample
-        factor = self.short_edge / min(height, width)
-        size = round(width * factor), round(height * factor)
-        label = sample.label
-        if label is not None:
-            label = np.asarray(cv2.resize(label, size, interpolation=cv2.INTER_NEAREST), np.uint8)
-        rgb, thermal = (
-            np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
-            for image in (sample.rgb, sample.thermal)
-        )
-        return replace(sample, rgb=rgb, thermal=thermal, label=label)
 
 
 def collect(
@@ -78,7 +171,8 @@ def collect(
         split: of the data set.
         settings: see `MeasurementSettings`.
         advance: called once per image.
-        unreadable: with `skip_unreadable`, called with the sentence about each image left out.
+        unreadable: with `skip_unreadable`, called with a sentence about each image left out; of the
+            first ones twice.
 
     Returns:
         the statistics, images in the order of the split.
@@ -88,82 +182,77 @@ def collect(
             an image without label or of another size than the first.
     """
     names = dataset.names(split)
-    like = _first_readable(dataset, names, settings)
-    region_map = settings.regions.map((like.rgb.shape[0], like.rgb.shape[1]))
     nights = dataset.nights(names)
-    parts = (ALL,) if nights is None else (DAY, NIGHT)
-    occupied = np.zeros((len(parts), len(dataset.classes), *region_map.shape), np.int32)
-    meter, lock = ImageMeter(region_map, len(dataset.classes), settings.kernel), Lock()
 
-    def measure(name: str, night: bool) -> ImageMeasurements | None:
+    def read(name: str) -> Sample | None:
         """None for an image that is left out."""
         try:
-            sample = settings.resized(dataset.read(name))
+            return _resized(dataset.read(name), settings.short_edge)
         except InputError as error:
             if not settings.skip_unreadable:
                 raise
             unreadable(str(error))
-            advance()
             return None
-        _check(sample, like)
-        measured = meter(sample)
-        with lock:
-            for index in np.flatnonzero(measured.labels.any(0)):
-                occupied[int(night), index] += sample.label == index
+
+    like = next(filter(None, map(read, names)), None)
+    if like is None:
+        raise InputError(f"split: none of the {len(names)} images of {dataset.name} can be read.")
+    region_map = settings.regions.map((like.rgb.shape[0], like.rgb.shape[1]))
+    occupied = np.zeros((2, len(dataset.classes), *region_map.shape), np.int32)
+    meter, lock = ImageMeter(region_map, len(dataset.classes), settings.kernel), Lock()
+
+    def measure(name: str, night: bool) -> ImageMeasurements | None:
+        measured, sample = None, read(name)
+        if sample is not None:
+            _check(sample, like)
+            measured = meter(sample)
+            with lock:
+                for index in np.flatnonzero(measured.labels.any(0)):
+                    occupied[int(night), index] += sample.label == index
         advance()
         return measured
 
     every = in_threads(measure, names, nights or [False] * len(names), threads=settings.workers)
-    found = {index: row for index, row in enumerate(every) if row is not None}
-    rows, kept = list(found.values()), list(found)
+    kept, rows = zip(*((n, row) for n, row in enumerate(every) if row is not None), strict=True)
     return SpatialStatistics(
         dataset=dataset.name,
         fingerprint=dataset.fingerprint(),
         split=split,
         classes=tuple(dataset.classes),
         background=tuple(dataset.background),
-        palette=np.array(dataset.palette, np.uint8),
         partition=settings.regions.name,
         region_map=region_map,
         kernel=settings.kernel,
         names=tuple(names[index] for index in kept),
-        night=None if nights is None else np.array(nights, bool)[kept],
-        parts=parts,
+        night=None if nights is None else np.array(nights, bool)[[*kept]],
         occupied=occupied,
-        noise={name: np.stack([row.noise[name] for row in rows]) for name in ESTIMATORS},
-        **{
-            key: np.stack([getattr(row, key) for row in rows])
-            for key in ("labels", "ignored", "laplacian", "mean")
-        },
+        **{key: np.stack([getattr(row, key) for row in rows]) for key in ImageMeasurements._fields},
     )
+
+
+def _resized(sample: Sample, short_edge: int) -> Sample:
+    """A sample in the size in which it is measured."""
+    height, width = sample.thermal.shape[:2]
+    if short_edge in (0, min(height, width)):
+        return sample
+    factor = short_edge / min(height, width)
+    size = round(width * factor), round(height * factor)
+    rgb, thermal = (
+        np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+        for image in (sample.rgb, sample.thermal)
+    )
+    label = sample.label
+    if label is not None:
+        label = np.asarray(cv2.resize(label, size, interpolation=cv2.INTER_NEAREST), np.uint8)
+    return replace(sample, rgb=rgb, thermal=thermal, label=label)
 
 
 def _check(sample: Sample, like: Sample) -> None:
     if sample.label is None:
+        raise InputError(f"split: '{sample.name}' has no label; the statistics need one per image.")
+    if sample.thermal.shape != like.thermal.shape:
+        sizes = ["x".join(map(str, each.thermal.shape)) for each in (sample, like)]
         raise InputError(
-            f"'{sample.name}' has no label; the statistics by region need one per image."
+            f"split: '{sample.name}' is {sizes[0]} pixels but '{like.name}' is {sizes[1]}; regions "
+            "need images of one size."
         )
-    size, expected = sample.thermal.shape, like.thermal.shape
-    if size != expected:
-        raise InputError(
-            f"'{sample.name}' is {size[0]}x{size[1]} pixels but '{like.name}' is "
-            f"{expected[0]}x{expected[1]}; regions need images of one size, so give a split "
-            "list for each size."
-        )
-
-
-def _first_readable(
-    dataset: LabelledDataset, names: Sequence[str], settings: MeasurementSettings
-) -> Sample:
-    """The sample whose size the others must have."""
-    first = ""
-    for name in names:
-        try:
-            return settings.resized(dataset.read(name))
-        except InputError as error:
-            if not settings.skip_unreadable:
-                raise
-            first = first or str(error)
-    raise InputError(
-        f"none of the {len(names)} images of {dataset.name} can be read; the first one: {first}"
-    )

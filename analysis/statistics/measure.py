@@ -65,13 +65,13 @@ class RegionSums:
 
 
 class ImageMeasurements(NamedTuple):
-    """One image: labels (R, K) and ignored (R,) pixels; the rest (2, R), see `data`."""
+    """One image, without the first axis of `analysis.statistics.collect.SpatialStatistics`."""
 
     labels: Ints
     ignored: Ints
     laplacian: Floats
     mean: Floats
-    noise: dict[str, Floats]
+    noise: Floats
 
 
 class ImageMeter:
@@ -108,16 +108,15 @@ class ImageMeter:
         labels, ignored = self.count_labels(sample.label)
         grey = cv2.cvtColor(sample.rgb, cv2.COLOR_RGB2GRAY)
         by_image = [self.measure(np.asarray(grey, np.uint8)), self.measure(sample.thermal)]
-        laplacian, mean, *noise = (np.stack(rows) for rows in zip(*by_image, strict=True))
-        return ImageMeasurements(
-            labels, ignored, laplacian, mean, dict(zip(ESTIMATORS, noise, strict=True))
-        )
+        laplacian, mean, *noise = np.stack(by_image, axis=1)
+        return ImageMeasurements(labels, ignored, laplacian, mean, np.stack(noise))
 
-    def measure(self, image: Image) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-        """Laplacian variance, mean, and noise by every estimator of `ESTIMATORS`, each (R,)."""
+    def measure(self, image: Image) -> Floats:
+        """(2 + E, R): Laplacian variance, mean, and noise by every estimator of `ESTIMATORS`."""
         _, laplacian = self._mean_and_variance(self._laplacian(image))
         mean, variance = self._mean_and_variance(image)
-        return laplacian, mean, self._immerkaer(image), self._wavelet_mad(image), np.sqrt(variance)
+        noise = self._immerkaer(image), self._wavelet_mad(image), np.sqrt(variance)
+        return np.stack([laplacian, mean, *noise])
 
     def count_labels(self, label: Image) -> tuple[Ints, Ints]:
         """Pixels by region and class, (R, K), and ignored ones, (R,)."""

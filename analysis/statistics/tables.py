@@ -1,160 +1,23 @@
-"""Tables of the statistics: grids of text for terminal and Markdown, and one tidy table of values.
-
-A grid has a column per region, or, with many regions, a row per region.
-"""
+"""Tables of the statistics of a data set."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
+import pandas as pd
 
-from analysis.statistics import derive
-from analysis.statistics.data import MODALITIES, SpatialStatistics
-from analysis.statistics.judging import FAILS, HOLDS, OPEN, Claim, Finding, Range
-from rgbt.tables import ABSENT, TextTable, csv_text, number
+from analysis.statistics.collect import ALL, SpatialStatistics
+from analysis.tables import text_table
+from rgbt.tables import ABSENT, TextTable
 
-COLUMNS = 12
+WIDEST = 12
 """More regions than this become rows."""
 
-Row = tuple[str, NDArray[np.float64]]
-
-SHORT = {HOLDS: "yes", FAILS: "no", OPEN: "open"}
-
-CSV_COLUMNS = (
-    *("dataset", "split", "partition", "images", "part", "quantity", "modality"),
-    *("class", "estimator", "average", "region", "value"),
-)
-
-
-def occupancy_grids(stats: SpatialStatistics) -> tuple[TextTable, ...]:
-    """Sample occupancy by part, by class, and by class relative to its largest region.
-
-    The first one is left out for a data set without a background class.
-    """
-    parts = stats.subsets() if stats.background else ()
-    rows = [(part, 100 * derive.region_occupancy(stats, part)) for part in parts]
-    names = [stats.classes[index] for index in stats.objects]
-    by_class = derive.class_region_occupancy(stats)
-    relative = derive.normalised(by_class)
-    titles = ("by class, % of the pixels", "by class, % of its largest region (Fig. 3)")
-    whole = (region_grid("sample occupancy rate, % (Eq. 2)", rows),) if rows else ()
-    return (
-        *whole,
-        *(
-            region_grid(title, list(zip(names, 100 * values[list(stats.objects)], strict=True)))
-            for title, values in zip(titles, (by_class, relative), strict=True)
-        ),
-    )
-
-
-def image_grids(stats: SpatialStatistics, estimator: str, average: str) -> tuple[TextTable, ...]:
-    """Laplacian variance, noise and signal to noise of both modalities by part."""
-    title = f"Laplacian variance ({stats.kernel} neighbours, Eq. 3)"
-    return (
-        _modality_grid(title, stats, partial(derive.region_laplacian, stats)),
-        noise_grid(stats, estimator),
-        snr_grid(stats, estimator, average),
-    )
-
-
-def noise_grid(stats: SpatialStatistics, estimator: str) -> TextTable:
-    """Noise of both modalities by part; below one grey level rounding is a good part of it."""
-    title = f"noise, grey levels ({estimator}; rounding alone is 0.29)"
-    return _modality_grid(title, stats, partial(derive.region_noise, stats, estimator=estimator))
-
-
-def snr_grid(stats: SpatialStatistics, estimator: str, average: str) -> TextTable:
-    """Signal to noise of both modalities by part."""
-    of_region = partial(derive.region_snr, stats, estimator=estimator, average=average)
-    return _modality_grid(f"signal to noise (Eq. 4; {estimator}, {average})", stats, of_region)
-
-
-def _modality_grid(
-    title: str, stats: SpatialStatistics, measure: Callable[[str, str], NDArray[np.float64]]
-) -> TextTable:
-    """A row per modality and part, of what `measure` gives for them."""
-    wanted = [(modality, part) for modality in MODALITIES for part in stats.subsets()]
-    return region_grid(title, [(f"{m}, {part}", measure(m, part)) for m, part in wanted])
-
-
-def entropy_grid(stats: SpatialStatistics) -> TextTable:
-    """Label entropy by part, with and without background where there is one."""
-    rows = [
-        (f"{part}, {word}" if word else part, derive.label_entropy(stats, part, background))
-        for part in stats.subsets()
-        for word, background in derive.entropies(stats)
-    ]
-    return region_grid("label entropy, bits (Eq. 5)", rows)
-
-
-def region_grid(title: str, rows: Sequence[Row]) -> TextTable:
-    """Values by region, and their mean over regions."""
-    regions = len(rows[0][1])
-    header = ("", *(f"R{index + 1}" for index in range(regions)), "mean")
-    lines = [(name, *map(number, (*values, float(values.mean())))) for name, values in rows]
-    if regions <= COLUMNS:
-        return TextTable(title, header, tuple(lines))
-    turned = list(zip(header, *lines, strict=True))
-    return TextTable(title, turned[0], tuple(turned[1:]))
-
-
-def claims_grid(claims: Sequence[Claim], level: float) -> TextTable:
-    """A line per claim with its verdict, below it a line per number that decides it."""
-    rows: list[tuple[str, ...]] = []
-    for claim in claims:
-        how = f", {claim.estimator}, {claim.average}" if claim.estimator else ""
-        rows.append((f"{claim.statement}{how} ({claim.source})", "", "", "", claim.verdict, ""))
-        for each in claim.findings:
-            value, low, high = each.interval
-            ends = ABSENT if math.isnan(low) else f"[{digits(low)}, {digits(high)}]"
-            cells = (digits(value), ends, range_text(each.wanted), SHORT[each.verdict], each.note)
-            rows.append((f"   {each.what}", *cells))
-    header = ("claim", "value", f"{100 * level:g} % interval", "claimed", "holds", "")
-    return TextTable("claims of SpatialSeg, Sec. III", header, tuple(rows))
-
-
-def estimator_grid(claims: Sequence[Claim]) -> TextTable:
-    """How the numbers about noise depend on its estimator and on the average."""
-    columns: dict[tuple[str, str], dict[tuple[str, str], Finding]] = {}
-    for claim in claims:
-        if claim.estimator:
-            column = columns.setdefault((claim.estimator, claim.average), {})
-            column |= {(claim.statement, each.what): each for each in claim.findings}
-    ways = list(columns)
-    rows = []
-    for statement, what in columns[ways[0]]:
-        found = [columns[way][statement, what] for way in ways]
-        cells = [f"{digits(each.interval.value)} {SHORT[each.verdict]}" for each in found]
-        rows.append((what, range_text(found[0].wanted), *cells))
-    header = ("signal to noise", "claimed", *(f"{name}, {average}" for name, average in ways))
-    return TextTable(
-        "how it depends on the estimator of the noise and the average", header, tuple(rows)
-    )
-
-
-def markdown(
-    stats: SpatialStatistics, claims: Sequence[Claim], ways: Sequence[tuple[str, str]], level: float
-) -> str:
-    """Everything as Markdown.
-
-    Args:
-        stats: measurements.
-        claims: of every estimator and average.
-        ways: (estimator, average) of every table of signal to noise.
-        level: of the intervals.
-    """
-    first, *others = ways
-    grids = [*occupancy_grids(stats), *image_grids(stats, *first)]
-    grids += [noise_grid(stats, name) for name in stats.noise if name != first[0]]
-    grids += [snr_grid(stats, *way) for way in others]
-    grids += [entropy_grid(stats), claims_grid(claims, level), estimator_grid(claims)]
-    remark = () if stats.background else (derive.no_background(stats), "")
-    lines = [f"# {heading(stats)}", "", *remark, *(grid.to_markdown() for grid in grids)]
-    return "\n".join(lines)
+OF_CLASSES = {
+    "class_occupancy": "by class, % of the pixels",
+    "class_occupancy_normalised": "by class, % of its largest region (Fig. 3)",
+}
 
 
 def heading(stats: SpatialStatistics) -> str:
@@ -168,53 +31,83 @@ def heading(stats: SpatialStatistics) -> str:
     )
 
 
-def to_csv(stats: SpatialStatistics) -> str:
-    """One value per line, with everything it depends on in its own column (`CSV_COLUMNS`)."""
-    rows: list[tuple[object, ...]] = [CSV_COLUMNS]
-    for part in stats.subsets():
-        images = int(stats.chosen(part).sum())
-        start = (stats.dataset, stats.split, stats.partition, images, part)
-        for keys, values in _quantities(stats, part):
-            for region, value in enumerate(values.tolist(), start=1):
-                cell = "" if math.isnan(value) else f"{value:.8g}"
-                rows.append((*start, *keys, region, cell))
-    return csv_text(rows)
+def region_tables(
+    frame: pd.DataFrame, stats: SpatialStatistics, way: tuple[str, str] | None = None
+) -> list[TextTable]:
+    """The quantities by region, a table each; of noise by one `way` to estimate it, or by all."""
+    titles = {
+        "occupancy": "sample occupancy rate, % (Eq. 2)",
+        **OF_CLASSES,
+        "laplacian": f"Laplacian variance ({stats.kernel} neighbours, Eq. 3)",
+        "noise": "noise, grey levels ({}; rounding alone is 0.29)",
+        "snr": "signal to noise (Eq. 4; {}, {})",
+        "label entropy": "label entropy, bits (Eq. 5)",
+    }
+    by_class = frame["quantity"].isin([*OF_CLASSES])
+    objects = frame["class"].isin([stats.classes[index] for index in stats.objects])
+    rows = frame[~by_class | (objects & (frame["part"] == ALL))]
+    labels = rows[["modality", "part"]].agg(", ".join, axis=1).str.removeprefix(", ")
+    what = rows["quantity"].str.partition("entropy ")[2]  # with or without background
+    labels = labels.where(what == "", labels + ", " + what).where(~by_class, rows["class"])
+    factor = np.where(by_class[rows.index] | (rows["quantity"] == "occupancy"), 100, 1)
+    rows = rows.assign(
+        label=labels,
+        region="R" + rows["region"].astype(str),
+        quantity=rows["quantity"].str.partition(" w")[0],
+        value=rows["value"] * factor,
+    )
+    tables = []
+    for name, title in titles.items():
+        of_quantity = rows[rows["quantity"] == name].groupby(["estimator", "average"], sort=False)
+        for each, chosen in of_quantity:
+            if way is None or all(one in ("", other) for one, other in zip(each, way, strict=True)):
+                wide = chosen.set_index(["label", "region"])["value"].unstack(sort=False)
+                wide = wide.assign(mean=wide.mean(axis=1, skipna=False))
+                wide = wide if len(wide.columns) <= WIDEST + 1 else wide.T
+                tables.append(text_table(title.format(*each), wide.rename_axis("")))
+    return tables
 
 
-def _quantities(
-    stats: SpatialStatistics, part: str
-) -> Iterator[tuple[tuple[str, ...], NDArray[np.float64]]]:
-    """((quantity, modality, class, estimator, average), values by region)."""
-    if stats.background:
-        yield ("occupancy", "", "", "", ""), derive.region_occupancy(stats, part)
-    by_class = derive.class_region_occupancy(stats, part)
-    relative = derive.normalised(by_class)
-    for index, name in enumerate(stats.classes):
-        yield ("class_occupancy", "", name, "", ""), by_class[index]
-        yield ("class_occupancy_normalised", "", name, "", ""), relative[index]
-    for word, background in derive.entropies(stats):
-        values = derive.label_entropy(stats, part, background)
-        yield ("_".join(["entropy", *word.split()]), "", "", "", ""), values
-    for modality in MODALITIES:
-        yield ("laplacian", modality, "", "", ""), derive.region_laplacian(stats, modality, part)
-        for estimator in stats.noise:
-            noise = derive.region_noise(stats, modality, part, estimator)
-            yield ("noise", modality, "", estimator, ""), noise
-            for average in derive.AVERAGES:
-                ratio = derive.region_snr(stats, modality, part, estimator, average)
-                yield ("snr", modality, "", estimator, average), ratio
+def statement_table(frame: pd.DataFrame, level: float) -> TextTable:
+    """A line per number of `analysis.statistics.statements.judged`, below its statement."""
+    repeated = frame.duplicated(["key", "estimator", "average"])
+    way = (", " + frame["estimator"] + ", " + frame["average"]).where(frame["estimator"] != "", "")
+    shown = pd.DataFrame(
+        {
+            "statement": (frame["statement"] + way + " (" + frame["place"] + ")").mask(
+                repeated, ""
+            ),
+            "verdict": frame["verdict"].mask(repeated, ""),
+            "number": frame["contrast"],
+            "value": frame["value"].map(digits),
+            f"{100 * level:g} % interval": _intervals(frame),
+            "stated": frame["wanted"],
+            "alone": frame["finding"],
+        }
+    )
+    title = "statements of SpatialSeg, Sec. III"
+    return text_table(title, shown.set_index("statement"))
 
 
-def range_text(wanted: Range) -> str:
-    """Where a claim puts a number, e.g. "> 1"."""
-    low, high = wanted
-    if math.isinf(high):
-        return f"> {low:g}"
-    return f"< {high:g}" if low <= 0 else f"{low:.3g} to {high:.3g}"
+def estimator_table(frame: pd.DataFrame) -> TextTable:
+    """How the numbers about noise depend on its estimator and on the average."""
+    rows = frame[frame["estimator"] != ""]
+    rows = rows.assign(
+        way=rows["estimator"] + ", " + rows["average"],
+        text=rows["value"].map(digits) + " " + rows["finding"],
+    )
+    wide = rows.set_index(["contrast", "wanted", "way"])["text"].unstack(sort=False)
+    title = "how signal to noise depends on the estimator of the noise and on the average"
+    return text_table(title, wide.rename_axis(["number", "stated"]))
 
 
 def digits(value: float) -> str:
-    """Three significant digits, or two decimals of what is larger than 10."""
+    """Three decimals, or two of what is larger than 10."""
     if math.isnan(value):
         return ABSENT
     return f"{value:.3f}" if abs(value) < 10 else f"{value:.2f}"
+
+
+def _intervals(frame: pd.DataFrame) -> pd.Series[str]:
+    ends = "[" + frame["low"].map(digits) + ", " + frame["high"].map(digits) + "]"
+    return ends.where(frame["low"].notna(), ABSENT)

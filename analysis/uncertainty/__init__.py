@@ -4,12 +4,4 @@ from analysis.uncertainty.blocks import Resampling
 from analysis.uncertainty.estimates import Comparison, Difference, Estimate, compare, estimate
 from analysis.uncertainty.intervals import Interval
 
-__all__ = [
-    "Comparison",
-    "Difference",
-    "Estimate",
-    "Interval",
-    "Resampling",
-    "compare",
-    "estimate",
-]
+__all__ = ["Comparison", "Difference", "Estimate", "Interval", "Resampling", "compare", "estimate"]

@@ -4,25 +4,44 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple, get_args
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from rgbt.checks import InputError, check_choice, check_range
 from rgbt.metrics.metric import Absent
+from rgbt.randomness import numpy_generator
 
 NamedBlocks = Literal["auto", "none", "sequence"]
+Places = NDArray[np.int64]
+Values = NDArray[np.float64]
 
 MOST = 1_000_000
 """Most resamples: more take time without a visible effect."""
 
+FEWEST = 10
+"""Blocks below which an interval would rest on almost nothing."""
+
+CHUNK = 500
+"""Resamples computed at once, which limits the memory that their counts take."""
+
+GAP = 3.0
+"""Typical steps between frames of a sequence above which the next frame begins another run. In the
+lists of MFNet neighbours are 1 or 3 numbers apart (a frame left out) or at least 12; in those of KP
+1 or 2 steps of a recording (43 to 203 numbers), or at least 7."""
+
+ALONE = "each image is drawn alone, as if it were independent evidence"
+
+BAND = 1.96
+"""Standard errors ``1 / sqrt(n)`` above which an autocorrelation counts as one."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Resampling:
-    """Settings of intervals and tests.
+    """Settings of intervals and tests; InputError: a value out of range.
 
     Attributes:
         resamples: number of resamples, 100..`MOST`.
@@ -32,11 +51,7 @@ class Resampling:
             that are equal but for one number); "auto": runs of consecutively numbered frames, cut
             where one is too long for that at the distance over which the scores of the images are
             correlated (Politis and White, 2004).
-        absent: how a class without pixels scores, see `rgbt.metrics.scores`; None: as the counts
-            say (`rgbt.metrics.counts.Counts.absent`).
-
-    Raises:
-        InputError: a value out of range.
+        absent: how a class without pixels scores (`rgbt.metrics.scores`); None: as counted.
     """
 
     resamples: int = 10_000
@@ -52,23 +67,8 @@ class Resampling:
             check_choice("absent", self.absent, get_args(Absent))
         if isinstance(self.blocks, int):
             check_range("blocks", self.blocks, 1, MOST)
-        elif self.blocks not in get_args(NamedBlocks):
-            known = ", ".join(get_args(NamedBlocks))
-            raise InputError(f"blocks={self.blocks}: expected {known} or a number of images.")
-
-
-FEWEST = 10
-"""Blocks below which an interval would rest on almost nothing."""
-
-GAP = 3.0
-"""Typical steps between frames of a sequence above which the next frame begins another run. In the
-lists of MFNet neighbours are 1 or 3 numbers apart (a frame left out) or at least 12; in those of KP
-1 or 2 steps of a recording (43 to 203 numbers), or at least 7."""
-
-ALONE = "each image is drawn alone, as if it were independent evidence"
-
-BAND = 1.96
-"""Standard errors ``1 / sqrt(n)`` above which an autocorrelation counts as one."""
+        else:
+            check_choice("blocks", self.blocks, get_args(NamedBlocks))
 
 
 @dataclass(frozen=True)
@@ -76,68 +76,83 @@ class ImageBlocks:
     """A partition of N images.
 
     Attributes:
-        index: (N,) int64, block 0..count-1 of every image.
+        index: (N,) int64, block 0..count-1 of every image; those of one stratum follow each other.
+        sizes: number of blocks of each stratum.
         said: what they are, e.g. "40 blocks of up to 10 neighbouring frames".
         reason: of "auto", the sentence that says why these; "" for blocks that were set by hand.
     """
 
-    index: NDArray[np.int64]
-    count: int
+    index: Places
+    sizes: tuple[int, ...]
     said: str
     reason: str = ""
 
+    @property
+    def count(self) -> int:
+        """Number of blocks."""
+        return sum(self.sizes)
 
-class SequenceFrames(NamedTuple):
-    """Images of one sequence in the order of their frames: numbers, and places in the split."""
+    def summed(self, values: NDArray[np.number]) -> Values:
+        """(N, ...) values of images -> (B, ...) sums inside blocks; whole numbers are exact."""
+        order = np.argsort(self.index, kind="stable")
+        starts = np.searchsorted(self.index[order], np.arange(self.count))
+        return np.add.reduceat(values[order].astype(np.float64, copy=False), starts)
 
-    frames: NDArray[np.float64]
-    places: NDArray[np.int64]
+    def draws(self, settings: Resampling) -> Iterator[Values]:
+        """How often each resample draws each block, (chunk, B); each stratum keeps its number."""
+        rng = numpy_generator(settings.seed, "bootstrap")
+        for start in range(0, settings.resamples, CHUNK):
+            number = min(CHUNK, settings.resamples - start)
+            parts = [rng.multinomial(n, np.full(n, 1.0 / n), number) for n in self.sizes]
+            yield np.hstack(parts).astype(np.float64)
 
 
 def make_blocks(
-    names: Sequence[str], choice: NamedBlocks | int, series: NDArray[np.float64]
+    names: Sequence[str],
+    choice: NamedBlocks | int,
+    series: Values | None = None,
+    strata: ArrayLike | None = None,
 ) -> ImageBlocks:
-    """The blocks that `choice` asks for (see `Resampling.blocks`).
+    """The blocks of N images, of whose names those of one sequence differ in one number alone.
 
-    Args:
-        names: of N images; frames of one sequence differ in one number alone.
-        choice: see `Resampling.blocks`.
-        series: (L, N), influence of every image on each of L scores; read by "auto" alone, which
-            takes the longest of their block lengths.
+    `choice` is that of `Resampling.blocks`. "auto" alone reads `series`, (L, N), the influence of
+    every image on each of L scores, and takes the longest of their block lengths. No block holds
+    images of two `strata`, (N,), such as day and night; None: there is one.
 
     Raises:
-        InputError: fewer than `FEWEST` blocks, or names without a number where frames are asked
-            for.
+        InputError: fewer than `FEWEST` blocks, or names without the number of a frame.
     """
-    if choice == "none":
-        return _singles(len(names))
-    sequences = _sequences(names)
-    if sequences is None and choice == "auto":
-        reason = f"Names such as '{names[0]}' have no consecutive frame numbers; {ALONE}."
-        return _singles(len(names), " (their names show no neighbours)", reason)
-    if sequences is None:
-        raise InputError(
-            f"blocks={choice}: names such as '{names[0]}' show no neighbouring frames (names that "
-            "differ in one number only); use blocks=none."
-        )
+    parts = np.zeros(len(names), np.int64) if strata is None else np.asarray(strata, np.int64)
+    singles, said = [*np.arange(len(names))[:, None]], f"{len(names)} single images"
+    if choice in ("none", 1):
+        return _joined(singles, parts, said)
+    sequences = _sequences(names, parts)
+    if not sequences:
+        such = f"names such as '{names[0]}' show no neighbouring frames (that differ in one number)"
+        if choice != "auto":
+            raise InputError(f"blocks={choice}: {such}; use blocks=none.")
+        said, reason = f"{said} (their names show no neighbours)", f"N{such[1:]}; {ALONE}."
+        return _joined(singles, parts, said, reason)
     if choice == "auto":
-        return _automatic(sequences, series)
-    places = [each.places for each in sequences]
-    if choice == "sequence":
-        blocks = _joined(len(names), places, f"{len(places)} sequences")
-    elif choice == 1:
-        return _singles(len(names))
+        none = np.empty((0, len(names)))
+        pieces, sizes, reason = _automatic(sequences, none if series is None else series)
+        found = f"{len(pieces)} blocks of {sizes} neighbouring frames" if pieces else said
+        return _joined(pieces or singles, parts, found, reason)
+    if isinstance(choice, int):
+        pieces = _cut([places for _, places in sequences], choice)
+        said = f"{len(pieces)} blocks of up to {max(map(len, pieces))} neighbouring frames"
     else:
-        blocks = _pieces(places, choice)
-    if blocks.count < FEWEST:
+        pieces = [places for _, places in sequences]
+        said = f"{len(pieces)} sequences"
+    if len(pieces) < FEWEST:
         raise InputError(
-            f"blocks={choice}: {len(names)} images make {blocks.said}, but an interval needs at "
-            f"least {FEWEST}; use shorter blocks, or blocks=auto."
+            f"blocks={choice}: {len(names)} images make {said}, but an interval needs at least "
+            f"{FEWEST}; use shorter blocks, or blocks=auto."
         )
-    return blocks
+    return _joined(pieces, parts, said)
 
 
-def block_length(series: NDArray[np.float64], sequences: Sequence[NDArray[np.int64]]) -> int:
+def block_length(series: Values, sequences: Sequence[Places]) -> int:
     """Neighbours to draw together, so that resampling sees their correlation.
 
         b = (2 G^2 / D)^(1/3) n^(1/3),  G = sum |k| w(k) R(k),  D = 4/3 (sum w(k) R(k))^2
@@ -150,12 +165,8 @@ def block_length(series: NDArray[np.float64], sequences: Sequence[NDArray[np.int
     Politis and White (2009). Their rule for the window looks at any lag, with a bound that at 100
     images passes over correlations of 0.28; this one is for frames.
 
-    Args:
-        series: (N,) a value of every image.
-        sequences: places of the images of each sequence, in the order of their frames.
-
-    Returns:
-        at least 1.
+    Of an (N,) series of values of the images, and the places of the images of each sequence in the
+    order of their frames; at least 1.
     """
     count = len(series)
     centred = series - series.mean()
@@ -166,12 +177,10 @@ def block_length(series: NDArray[np.float64], sequences: Sequence[NDArray[np.int
         long = [centred[each] for each in sequences if len(each) > lag]
         return float(sum(each[: len(each) - lag] @ each[lag:] for each in long)) / count
 
-    lags = np.array([autocovariance(lag) for lag in range(covered + 1)])
-    if lags[0] <= 0:
-        return 1
-    above = lags[1:] / lags[0] > BAND / math.sqrt(count)
+    lags = np.array([*map(autocovariance, range(covered + 1))])
+    above = lags[1:] > BAND / math.sqrt(count) * lags[0]
     last = len(above) if above.all() else int(np.argmin(above))
-    if last == 0:
+    if lags[0] <= 0 or last == 0:
         return 1
     steps = np.arange(1, min(2 * last, covered) + 1)
     weights = np.minimum(1.0, 2.0 * (1.0 - steps / steps[-1]))
@@ -183,96 +192,79 @@ def block_length(series: NDArray[np.float64], sequences: Sequence[NDArray[np.int
     return max(1, math.ceil(float(length)))
 
 
-def _automatic(sequences: Sequence[SequenceFrames], series: NDArray[np.float64]) -> ImageBlocks:
-    """Runs of consecutive frames, or pieces of them where one run is too long for that."""
-    runs = []
+def _automatic(
+    sequences: Sequence[tuple[Values, Places]], series: Values
+) -> tuple[list[Places], str, str]:
+    """Runs of consecutive frames, or pieces ([]: single images), their sizes, and the reason."""
+    runs: list[Places] = []
     for frames, places in sequences:
         steps = np.diff(frames)
         far = steps > GAP * np.median(steps) if len(steps) else steps
         runs += np.split(places, np.flatnonzero(far) + 1)
-    sizes = [len(run) for run in runs]
-    count, longest = sum(sizes), max(sizes)
-    said = f"{len(runs)} run{'s' * (len(runs) > 1)} of consecutive numbers ({_range(sizes)} images)"
+    count, longest = sum(map(len, runs)), max(map(len, runs))
+    plural = "s" * (len(runs) > 1)
+    said = f"{len(runs)} run{plural} of consecutive numbers ({_range(runs)} images)"
     if longest * FEWEST <= count:
-        shown = f"{len(runs)} blocks of {_range(sizes)} neighbouring frames"
-        return _joined(count, runs, shown, f"The names form {said}; each is one block.")
-    reason = f"The names form {said}, one of them more than 1/{FEWEST} of all images"
-    length = max(block_length(_levelled(each, sequences), runs) for each in series)
-    while length > 1 and sum(math.ceil(size / length) for size in sizes) < FEWEST:
-        length -= 1
-    if length <= 1:
-        reason += f"; scores of neighbours are not shown to be correlated, {ALONE}."
-        return _singles(count, reason=reason)
-    reason += f"; they are cut at {length}, the distance over which scores are correlated."
-    return replace(_pieces(runs, length), reason=reason)
-
-
-def _levelled(
-    series: NDArray[np.float64], sequences: Sequence[SequenceFrames]
-) -> NDArray[np.float64]:
-    """(N,) without the mean of each sequence.
-
-    Sequences whose names differ in a word, such as the days and nights of one data set, may score
-    at different levels. That would look like a correlation between all frames of each of them.
-    """
+        return runs, _range(runs), f"The names form {said}; each is one block."
+    # Sequences, such as days and nights, may score at different levels, which would look like a
+    # correlation between all frames of each of them.
     levelled = series.copy()
     for _, places in sequences:
-        levelled[places] -= series[places].mean()
-    return levelled
+        levelled[:, places] -= levelled[:, places].mean(1, keepdims=True)
+    length = max((block_length(each, runs) for each in levelled), default=1)
+    while length > 1 and len(_cut(runs, length)) < FEWEST:
+        length -= 1
+    reason = f"The names form {said}, one of them more than 1/{FEWEST} of all images"
+    if length <= 1:
+        return [], "", f"{reason}; scores of neighbours are not shown to be correlated, {ALONE}."
+    cut = f"they are cut at {length}, the distance over which scores are correlated"
+    pieces = _cut(runs, length)
+    return pieces, f"up to {max(map(len, pieces))}", f"{reason}; {cut}."
 
 
-def _range(sizes: Sequence[int]) -> str:
-    """For example "2 to 20", or "10" where all are equal."""
-    least, most = min(sizes), max(sizes)
+def _range(pieces: Sequence[Places]) -> str:
+    """Their sizes, for example "2 to 20", or "10" where all are equal."""
+    least, most = min(map(len, pieces)), max(map(len, pieces))
     return str(most) if least == most else f"{least} to {most}"
 
 
-def _sequences(names: Sequence[str]) -> list[SequenceFrames] | None:
-    """The frames of every sequence; None where names tell no neighbours.
+def _sequences(names: Sequence[str], parts: Places) -> list[tuple[Values, Places]]:
+    """The frames of every sequence, numbers and places in their order; [] where names tell none.
 
     The frame is the last number in the names that is not the same in all of them; names that are
-    equal but for it are one sequence.
+    equal but for it, and lie in one stratum, are one sequence.
     """
     words = [re.split(r"(\d+)", name) for name in names]
     shapes: dict[tuple[str, ...], list[int]] = {}
-    for place, parts in enumerate(words):
-        shapes.setdefault(tuple(parts[::2]), []).append(place)
-    if () in {shape[1:] for shape in shapes}:
-        return None
-    found: dict[tuple[str, ...], list[tuple[int, int]]] = {}
+    for place, texts in enumerate(words):
+        shapes.setdefault(tuple(texts[::2]), []).append(place)
+    if any(len(shape) == 1 for shape in shapes):
+        return []
+    found: dict[tuple[object, ...], list[tuple[int, int]]] = {}
     for places in shapes.values():
         numbers = range(1, len(words[places[0]]), 2)
         varied = [at for at in numbers if len({words[place][at] for place in places}) > 1]
         frame = varied[-1] if varied else numbers[-1]
         for place in places:
-            rest = (*words[place][:frame], *words[place][frame + 1 :])
+            rest = (parts[place], *words[place][:frame], *words[place][frame + 1 :])
             found.setdefault(rest, []).append((int(words[place][frame]), place))
     if all(len(frames) == 1 for frames in found.values()):
-        return None
-    ordered = (zip(*sorted(frames), strict=True) for frames in found.values())
-    return [
-        SequenceFrames(np.array(frames, np.float64), np.array(places, np.int64))
-        for frames, places in ordered
-    ]
+        return []
+    ordered = (np.array(sorted(frames)).T for frames in found.values())
+    return [(frames.astype(np.float64), places) for frames, places in ordered]
 
 
-def _pieces(sequences: Sequence[NDArray[np.int64]], length: int) -> ImageBlocks:
+def _cut(sequences: Sequence[Places], length: int) -> list[Places]:
     """Sequences cut into pieces of nearly equal size, at most `length` each."""
-    pieces = [
-        piece for each in sequences for piece in np.array_split(each, math.ceil(len(each) / length))
-    ]
-    said = f"{len(pieces)} blocks of up to {max(map(len, pieces))} neighbouring frames"
-    return _joined(sum(map(len, sequences)), pieces, said)
+    cut = (np.array_split(each, math.ceil(len(each) / length)) for each in sequences)
+    return [piece for pieces in cut for piece in pieces]
 
 
-def _joined(
-    count: int, pieces: Sequence[NDArray[np.int64]], said: str, reason: str = ""
-) -> ImageBlocks:
-    index = np.empty(count, np.int64)
-    for number, piece in enumerate(pieces):
+def _joined(pieces: Sequence[Places], parts: Places, said: str, reason: str = "") -> ImageBlocks:
+    """Pieces as blocks, stratum by stratum."""
+    ordered = sorted(pieces, key=lambda piece: parts[piece[0]])
+    index = np.empty(len(parts), np.int64)
+    for number, piece in enumerate(ordered):
         index[piece] = number
-    return ImageBlocks(index, len(pieces), said, reason)
-
-
-def _singles(count: int, remark: str = "", reason: str = "") -> ImageBlocks:
-    return ImageBlocks(np.arange(count), count, f"{count} single images{remark}", reason)
+    sizes = np.unique([parts[piece[0]] for piece in ordered], return_counts=True)[1]
+    return ImageBlocks(index, tuple(sizes.tolist()), said, reason)

@@ -14,15 +14,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from analysis.uncertainty.blocks import FEWEST, ImageBlocks, Resampling, make_blocks
-from analysis.uncertainty.intervals import Spread, Values, over_images, over_seeds
+from analysis.uncertainty.blocks import FEWEST, ImageBlocks, Resampling, Values, make_blocks
+from analysis.uncertainty.intervals import Spread, over_images, over_seeds
 from analysis.uncertainty.same_images import Alike, in_order
-from analysis.uncertainty.scores import RunScores, watched
 from rgbt.checks import InputError
+from rgbt.metrics import names
 from rgbt.metrics.counts import Counts, convention
+from rgbt.metrics.details import details_of
 from rgbt.metrics.metric import Absent
-from rgbt.metrics.named import images_of, parse
+from rgbt.metrics.named import ParsedMetric, images_of, parse, value, values
+from rgbt.metrics.pairs import HEADLINES, protocol_of
+from rgbt.metrics.score_grid import headlines
 
 FIXED = -1
 """Seed of counts that belong to no seed: a folder of predictions, one file of weights."""
@@ -30,15 +34,11 @@ FIXED = -1
 
 @dataclass(frozen=True, kw_only=True)
 class Term:
-    """One score in a linear contrast.
+    """One score (`rgbt.metrics.named`) in a linear contrast.
 
     Attributes:
-        metric: see `rgbt.metrics.named`.
         counts: by seed; the same images in all terms. `{FIXED: counts}` for a method without seeds.
         keys: by seed, identity of the counts: equal keys, equal counts.
-
-    Raises:
-        ValueError: no counts, other seeds in `keys`, or `FIXED` beside seeds.
     """
 
     weight: float
@@ -47,10 +47,9 @@ class Term:
     keys: Mapping[int, str]
 
     def __post_init__(self) -> None:
-        if not self.counts or set(self.counts) != set(self.keys):
-            raise ValueError("term: expected counts of one seed or more, and a key for each.")
-        if FIXED in self.counts and len(self.counts) > 1:
-            raise ValueError("term: expected either counts by seed or fixed counts, got both.")
+        is_mixed = FIXED in self.counts and len(self.counts) > 1
+        if is_mixed or not self.counts or set(self.counts) != set(self.keys):
+            raise ValueError("term: expected counts and keys of one seed or more, or fixed ones.")
 
     @property
     def fixed(self) -> bool:
@@ -63,14 +62,12 @@ class Evidence:
     """What the data say about one contrast.
 
     Attributes:
-        values: contrast of each seed that all terms with seeds have; of fixed terms alone, and of
-            methods whose seeds are not paired, one value. Percent points; of the variance squared.
+        values: contrast of each seed that all terms with seeds have; one value of fixed terms
+            alone, and of methods whose seeds are not paired. Percent points; of Var squared.
         seeds: of `values`; () where all terms are fixed or not paired.
-        error: standard error, over the draw of the images, of the mean of `values`; NaN with too
-            few blocks for it.
+        error: standard error of their mean over the draw of the images; NaN with too few blocks.
         blocks: number of blocks of images that hold images of the metric.
-        said: what was drawn, e.g. "40 blocks of up to 10 neighbouring frames".
-        reason: why so, see `analysis.uncertainty.blocks.ImageBlocks.reason`.
+        said: what was drawn, and why, see `analysis.uncertainty.blocks.ImageBlocks`.
         drawn: (resamples,) contrasts with blocks drawn anew; () with too few.
         trainings: error over seeds; None for a single seed.
     """
@@ -91,23 +88,19 @@ class Evidence:
 
 
 def combine(weights: Sequence[float], parts: Sequence[Evidence]) -> Evidence:
-    """The evidence about a weighted sum of contrasts with the same seeds and draws of images.
-
-    Raises:
-        ValueError: other seeds or blocks.
-    """
+    """The evidence about a weighted sum of contrasts with the same seeds and draws of images."""
     first = parts[0]
     if any((each.seeds, each.blocks) != (first.seeds, first.blocks) for each in parts):
         raise ValueError("combine: expected the same seeds and images in all parts.")
-    values = np.array(weights) @ np.array([each.values for each in parts])
+    of_seeds = np.array(weights) @ np.array([each.values for each in parts])
     drawn = np.array(weights) @ np.array([each.drawn for each in parts])
     spread = over_images(drawn, first.blocks)
     return replace(
         first,
-        values=tuple(values.tolist()),
+        values=tuple(of_seeds.tolist()),
         error=math.nan if spread is None else spread.error,
         drawn=drawn,
-        trainings=over_seeds(values),
+        trainings=over_seeds(of_seeds),
     )
 
 
@@ -118,16 +111,15 @@ class Resampler:
     ``blocks=auto`` the length of the blocks is that of each contrast (see
     `analysis.uncertainty.blocks.make_blocks`).
 
-    Args:
-        settings: of the resampling; `level` has no effect here.
-        alike: what the counts must have in common beside images and classes.
+    `alike` is what the counts must have in common beside images and classes.
     """
 
     def __init__(self, settings: Resampling, alike: Alike = "labels") -> None:
         self._settings = settings
         self._alike = alike
-        self._scores = RunScores(settings)
         self._ordered: dict[tuple[str, str], Counts] = {}
+        self._resampled: dict[tuple[str, str, Absent, bytes], Values] = {}
+        self._influences: dict[tuple[str, Absent], Values] = {}
 
     def evidence(self, terms: Sequence[Term], *, paired: bool = True) -> Evidence:
         """As `contrast`; InputError where a run has nothing to score."""
@@ -153,86 +145,133 @@ class Resampler:
 
         Raises:
             InputError: other images, classes or labels; no common seed; blocks that cannot be made.
-            ValueError: no terms.
         """
-        if not terms:
-            raise ValueError("contrast: expected one term or more.")
         seeds = _common_seeds(terms) if paired else ()
-        chosen = [
-            list(seeds) if seeds and not term.fixed else sorted(term.counts) for term in terms
-        ]
-        absent = self._settings.absent or convention(
-            counts for term in terms for counts in term.counts.values()
-        )
-        runs = self._runs(terms, chosen)
+        every = [counts for term in terms for counts in term.counts.values()]
+        absent = self._settings.absent or convention(every)
+        runs = [self._runs(terms[0], term, seeds) for term in terms]
         first = next(iter(runs[0].values()))
         blocks = make_blocks(first.names, self._settings.blocks, self._series(terms, runs, absent))
-        used = min(map(self._blocks_used, terms, runs, [blocks] * len(runs)))
+        held = [
+            images_of(parse(term.metric), next(iter(each.values()))).names
+            for term, each in zip(terms, runs, strict=True)
+        ]
+        used = min(len(np.unique(blocks.index[np.isin(first.names, each)])) for each in held)
         parts, drawn = [], np.zeros(self._settings.resamples if used >= FEWEST else 0)
-        for term, at, each in zip(terms, chosen, runs, strict=True):
-            points = self._scores.points(term.metric, each, absent)
-            parts.append(term.weight * np.array([points[term.keys[seed]] for seed in at]))
+        for term, each in zip(terms, runs, strict=True):
+            points = [value(term.metric, counts, absent) for counts in each.values()]
+            parts.append(term.weight * np.array(points))
             if len(drawn):
-                scores = self._scores.drawn(term.metric, each, blocks, absent)
-                drawn += term.weight * np.mean([scores[term.keys[seed]] for seed in at], axis=0)
-        values = np.sum(
-            np.broadcast_arrays(*parts) if paired else [p.mean() for p in parts], axis=0
-        )
+                scores = self._drawn(term.metric, each, blocks, absent)
+                drawn += term.weight * np.mean(scores, axis=0)
+        means = np.broadcast_arrays(*parts) if paired else [part.mean() for part in parts]
+        of_seeds = np.sum(means, axis=0)
         of_images = over_images(drawn, used)
         return Evidence(
-            values=tuple(np.atleast_1d(values).tolist()),
+            values=tuple(np.atleast_1d(of_seeds).tolist()),
             seeds=seeds,
             error=math.nan if of_images is None else of_images.error,
             blocks=used,
             said=blocks.said if used == blocks.count else f"{used} of {blocks.said}",
             reason=blocks.reason,
             drawn=drawn,
-            trainings=over_seeds(values) if paired else over_seeds(*parts),
+            trainings=over_seeds(of_seeds) if paired else over_seeds(*parts),
         )
 
-    def _runs(
-        self, terms: Sequence[Term], chosen: Sequence[Sequence[int]]
-    ) -> list[dict[str, Counts]]:
-        """Per term the counts of the chosen seeds by key, images in the order of their names."""
-        start, at = terms[0], chosen[0][0]
-        reference, name = start.counts[at], start.keys[at]
-        runs: list[dict[str, Counts]] = []
-        for term, seeds in zip(terms, chosen, strict=True):
-            for key, counts in ((term.keys[seed], term.counts[seed]) for seed in seeds):
-                if (name, key) not in self._ordered:
-                    same = in_order(reference, counts, self._alike)
-                    self._ordered[name, key] = same.select(sorted(same.names))
-            runs.append({term.keys[seed]: self._ordered[name, term.keys[seed]] for seed in seeds})
-        return runs
-
-    @staticmethod
-    def _blocks_used(term: Term, runs: Mapping[str, Counts], blocks: ImageBlocks) -> int:
-        """Number of blocks with images of the metric."""
-        counts = next(iter(runs.values()))
-        kept = images_of(parse(term.metric), counts).names
-        return len(np.unique(blocks.index[np.isin(counts.names, kept)]))
+    def _runs(self, reference: Term, term: Term, seeds: Sequence[int]) -> dict[str, Counts]:
+        """The counts of the used seeds by key, images in the order of their names."""
+        firsts = [each for each in seeds if each in reference.counts] or sorted(reference.counts)
+        name, found = reference.keys[firsts[0]], {}
+        for seed in seeds if seeds and not term.fixed else sorted(term.counts):
+            key = term.keys[seed]
+            if (name, key) not in self._ordered:
+                same = in_order(reference.counts[firsts[0]], term.counts[seed], self._alike)
+                self._ordered[name, key] = same.select(sorted(same.names))
+            found[key] = self._ordered[name, key]
+        return found
 
     def _series(
         self, terms: Sequence[Term], runs: Sequence[Mapping[str, Counts]], absent: Absent
-    ) -> Values:
+    ) -> Values | None:
         """(L, N) influence of every image on each term and on the contrast, for "auto" blocks."""
         if self._settings.blocks != "auto":
-            return np.empty((0, 0))
-        every = [self._scores.influence(each, absent) for each in runs]
+            return None
+        every = [
+            np.mean([self._influence(key, counts, absent) for key, counts in each.items()], axis=0)
+            for each in runs
+        ]
         kinds = {watched(counts) for each in runs for counts in each.values()}
         if len(terms) > 1 and len(kinds) == 1:
             weighted = [term.weight * each for term, each in zip(terms, every, strict=True)]
             every.append(np.sum(weighted, axis=0))
         return np.asarray(np.nan_to_num(np.concatenate(every)), np.float64)
 
+    def _influence(self, key: str, counts: Counts, absent: Absent) -> Values:
+        """(L, N) the `watched` scores without each image."""
+        if (key, absent) not in self._influences:
+            every = counts.counts.astype(np.float64)
+            without = every.sum(0) - every
+            series = [values(each, without, counts, absent) for each in watched(counts)]
+            self._influences[key, absent] = np.stack(series)
+        return self._influences[key, absent]
+
+    def _drawn(
+        self, metric: str, runs: Mapping[str, Counts], blocks: ImageBlocks, absent: Absent
+    ) -> list[Values]:
+        """(resamples,) scores of each run with `blocks` drawn anew; NaN: nothing to score."""
+        place = metric, absent, blocks.index.tobytes()
+        missing = {
+            key: counts for key, counts in runs.items() if (key, *place) not in self._resampled
+        }
+        columns, scores = {}, {key: list[Values]() for key in missing}
+        for key, counts in missing.items():
+            array, parsed = _columns(parse(metric), counts)
+            columns[key] = blocks.summed(array.reshape(len(array), -1)), array.shape[1:], parsed
+        for weights in blocks.draws(self._settings) if missing else ():
+            for key, (flat, shape, parsed) in columns.items():
+                summed = (weights @ flat).reshape(-1, *shape)
+                scores[key].append(values(parsed, summed, missing[key], absent))
+        self._resampled |= {(key, *place): np.concatenate(scores[key]) for key in missing}
+        return [self._resampled[key, *place] for key in runs]
+
+
+def watched(like: Counts) -> tuple[ParsedMetric, ...]:
+    """Scores that tell how far neighbouring images are alike, whatever is requested: the main ones.
+
+    Of single frames also pixel accuracy, which shows likeness most clearly.
+    """
+    if details_of(like.partition) is not None:
+        return tuple(map(parse, headlines(like)))
+    protocol = protocol_of(like.partition)
+    single = (names.MIOU, names.PIXEL_ACCURACY)
+    return tuple(map(parse, HEADLINES[protocol] if protocol else single))
+
+
+def _columns(metric: ParsedMetric, counts: Counts) -> tuple[NDArray[np.integer], ParsedMetric]:
+    """(N, ...) counts that the metric reads, and the metric of their sum.
+
+    Images of another part of the day are 0. Regions that are not read are summed or left out,
+    because the draws are the slow part.
+    """
+    array: NDArray[np.integer] = counts.counts
+    if metric.part is not None:
+        used = np.isin(counts.names, images_of(metric, counts).names)
+        array = array * used[:, None, None, None]
+    # Rows of counts of pairs of frames and of details are not regions.
+    if protocol_of(counts.partition) is None and metric.details is None:
+        if metric.region is None and metric.score != names.VAR:
+            array = array.sum(1, keepdims=True, dtype=np.int64)
+        elif metric.region is not None and metric.region <= array.shape[1]:
+            array = array[:, metric.region - 1 : metric.region]
+            metric = replace(metric, region=1)
+    return array, metric
+
 
 def _common_seeds(terms: Sequence[Term]) -> tuple[int, ...]:
     """Seeds that all terms with seeds have, ascending; () where all terms are fixed."""
     trained = [set(term.counts) for term in terms if not term.fixed]
-    if not trained:
-        return ()
-    shared = set.intersection(*trained)
-    if not shared:
+    shared = set.intersection(*trained) if trained else set()
+    if trained and not shared:
         lists = [", ".join(map(str, sorted(seeds))) for seeds in trained]
         raise InputError(
             f"the compared rows have no seed in common: {' and '.join(dict.fromkeys(lists))}. "

@@ -16,9 +16,10 @@ from typing import Literal
 
 import numpy as np
 
+from analysis.uncertainty.blocks import Values
 from analysis.uncertainty.contrasts import Evidence, combine
 from analysis.uncertainty.estimates import Estimate, estimate_of
-from analysis.uncertainty.intervals import Spread, Values, holm
+from analysis.uncertainty.intervals import Spread, holm
 
 Noise = Literal["cells", "effects"]
 """Whose spread over seeds is the error: "cells", what is left of all cells after their means and
@@ -60,26 +61,18 @@ def estimate_effects(
     if contrasts.shape[1:] != (count,) or not set(contrasts.sum(1)) <= {0, count}:
         raise ValueError(f"contrasts: expected balanced rows of {count} signs.")
     values = np.array([cell.values for cell in cells]).T
+    seeds = len(values)
+    # Each seed is a block: initial weights and the order of the data are the same in all its cells.
+    left = values - values.mean(0) - values.mean(1, keepdims=True) + values.mean()
     found = []
     for signs in contrasts:
         is_mean = bool((signs > 0).all())
         weights = signs / count if is_mean else 2.0 * signs / count
         evidence = combine(weights.tolist(), cells)
-        if noise == "cells" and not is_mean and len(values) > 1:
-            left = _left_over(values)
-            scale = math.sqrt(float((weights**2).sum()) / len(values))
-            evidence = replace(evidence, trainings=Spread(left.error * scale, left.freedom))
+        if noise == "cells" and not is_mean and seeds > 1:
+            freedom = (seeds - 1) * (count - 1)
+            variance = float((left**2).sum()) / freedom * float((weights**2).sum()) / seeds
+            evidence = replace(evidence, trainings=Spread(math.sqrt(variance), freedom))
         found.append(estimate_of(evidence, level))
     ps = holm([math.nan if each.both is None else each.p for each in found])
     return [Effect(each, p) for each, p in zip(found, ps, strict=True)]
-
-
-def _left_over(values: Values) -> Spread:
-    """Standard deviation of (S, C) values around the means of their cells and seeds.
-
-    Each seed is a block: initial weights and the order of the data are the same in all its cells.
-    """
-    seeds, cells = values.shape
-    left = values - values.mean(0) - values.mean(1, keepdims=True) + values.mean()
-    freedom = (seeds - 1) * (cells - 1)
-    return Spread(math.sqrt(float((left**2).sum()) / freedom), freedom)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -38,7 +38,6 @@ class Estimate:
         trainings: interval over seeds, images as they are; None for one seed.
         both: interval over images and seeds; None where one of the two is.
         p: two-sided p-value of `interval` against 0; NaN without one.
-        evidence: the numbers that the intervals follow from.
     """
 
     value: float
@@ -67,29 +66,25 @@ class Estimate:
 
 
 def estimate_of(evidence: Evidence, level: float, metric: str = "") -> Estimate:
-    """Student's intervals of a contrast.
+    """Student's intervals of a contrast, or of a score called `metric`.
 
-    Args:
-        evidence: of the contrast.
-        level: of the intervals.
-        metric: of a score that is no difference; variances over regions and calibration errors
-            are never negative, and chance alone raises them and raises each resample again.
+    Variances over regions and calibration errors are never negative, and chance alone raises them
+    and raises each resample again.
     """
-    value, images, trainings = float(np.mean(evidence.values)), evidence.images, evidence.trainings
+    value, used = float(np.mean(evidence.values)), evidence.images
     parsed = parse(metric) if metric else None
     around = over_seeds = both = None
-    if images is not None and not math.isnan(value):
-        around = student(value, images, level)
+    if used is not None and not math.isnan(value):
+        around = student(value, used, level)
         if parsed is not None and parsed.score == names.VAR:
             bias = float(np.nanmean(evidence.drawn)) - value
-            around = corrected(value, bias, images, level)
+            around = corrected(value, bias, used, level)
         elif parsed is not None and parsed.details == "calibration":
-            around = of_gaps(value, evidence.drawn, images, level)
-    used = images
-    if trainings is not None:
-        over_seeds = student(value, trainings, level)
-        if around is not None and images is not None:
-            used = images_and_seeds(images, trainings, level)
+            around = of_gaps(value, evidence.drawn, used, level)
+    if evidence.trainings is not None:
+        over_seeds = student(value, evidence.trainings, level)
+        if around is not None and used is not None:
+            used = images_and_seeds(used, evidence.trainings, level)
             both = student(value, used, level)
     intervals = [around, over_seeds, both]
     if metric:  # no score is negative
@@ -109,25 +104,18 @@ def estimate_of(evidence: Evidence, level: float, metric: str = "") -> Estimate:
 def estimate(
     seeds: Sequence[Counts], metrics: Sequence[str], settings: Resampling
 ) -> dict[str, Estimate]:
-    """Scores of one method.
-
-    Args:
-        seeds: counts of its trainings on the same images, one or more.
-        metrics: names, see `rgbt.metrics.named`.
-        settings: of the resampling.
+    """Scores of one method, of counts of one or more trainings on the same images.
 
     Returns:
-        metric -> estimate, in the requested order.
+        metric (`rgbt.metrics.named`) -> estimate, in the requested order.
 
     Raises:
         InputError: no such metric, class or region; seeds on different images; blocks that cannot
             be made.
     """
-    engine, runs = Resampler(settings, "pixels"), _runs(seeds, "a")
-    return {
-        metric: estimate_of(engine.contrast([_term(1.0, metric, runs)]), settings.level, metric)
-        for metric in metrics
-    }
+    engine = Resampler(settings, "pixels")
+    found = {metric: engine.contrast([_term(1.0, metric, seeds, "a")]) for metric in metrics}
+    return {metric: estimate_of(each, settings.level, metric) for metric, each in found.items()}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,34 +181,25 @@ def compare(
 ) -> Comparison:
     """Compare two methods on the same images.
 
-    Args:
-        a: counts of the trainings of the first method, one or more.
-        b: of the second, on the same images.
-        metrics: names, see `rgbt.metrics.named`.
-        settings: of the resampling.
-        paired: counts i of `a` and of `b` are of the same training, evaluated in two ways. Seeds of
-            two methods are not paired (Welch).
-        same_pixels: whether both must count the same pixels of every image, by the same partition.
+    Of counts of one or more trainings of each, in the named metrics (`rgbt.metrics.named`).
+    Seeds of two methods are not `paired` (Welch), but counts i of `a` and of `b` may be of the same
+    training, evaluated in two ways. These need not count the `same_pixels` by the same partition.
 
     Raises:
         InputError: other images, classes, scored classes, regions or labels; fewer than `FEWEST`
-            blocks of images of every metric; no such metric.
-        ValueError: paired, but not as many.
+            blocks of images of every metric; no such metric; paired, but not as many.
     """
     if paired and len(a) != len(b):
-        raise ValueError(f"paired: expected as many counts in a and b, got {len(a)} and {len(b)}.")
+        raise InputError(f"paired: expected as many counts in a and b, got {len(a)} and {len(b)}.")
     engine = Resampler(settings, "pixels" if same_pixels else "labels")
-    runs, found = (_runs(a, "a"), _runs(b, "b")), []
+    found = []
     for metric in dict.fromkeys(metrics):
-        terms = [
-            _term(weight, metric, each) for weight, each in zip((-1.0, 1.0), runs, strict=True)
-        ]
-        evidence = engine.contrast(terms, paired=paired)
+        terms = [_term(-1.0, metric, a, "a"), _term(1.0, metric, b, "b")]
+        difference = estimate_of(engine.contrast(terms, paired=paired), settings.level)
         sides = [
             estimate_of(engine.contrast([replace(term, weight=1.0)]), settings.level, metric)
             for term in terms
         ]
-        difference = estimate_of(evidence, settings.level)
         found.append(Difference(metric=metric, a=sides[0], b=sides[1], difference=difference))
     if all(each.difference.evidence.blocks < FEWEST for each in found):
         said = found[0].difference.said
@@ -234,14 +213,6 @@ def compare(
     )
 
 
-def _runs(seeds: Sequence[Counts], side: str) -> dict[int, tuple[str, Counts]]:
-    return {seed: (f"{side}{seed}", counts) for seed, counts in enumerate(seeds)}
-
-
-def _term(weight: float, metric: str, runs: Mapping[int, tuple[str, Counts]]) -> Term:
-    return Term(
-        weight=weight,
-        metric=metric,
-        counts={seed: counts for seed, (_, counts) in runs.items()},
-        keys={seed: key for seed, (key, _) in runs.items()},
-    )
+def _term(weight: float, metric: str, seeds: Sequence[Counts], side: str) -> Term:
+    keys = {seed: f"{side}{seed}" for seed in range(len(seeds))}
+    return Term(weight=weight, metric=metric, counts=dict(enumerate(seeds)), keys=keys)

@@ -7,9 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Values = NDArray[np.float64]
+from analysis.uncertainty.blocks import Values
 
 
 @dataclass(frozen=True)
@@ -36,34 +35,28 @@ class Spread:
     freedom: float
 
 
-def over_images(drawn: Values, blocks: int) -> Spread | None:
+def over_images(drawn: Values, *blocks: int) -> Spread | None:
     """Standard error of a score over the draw of the images.
 
     Drawing B blocks from B blocks gives their mean ``sqrt((B - 1) / B)`` of its standard error. The
     same holds for B blocks with images of the metric among more blocks: where all are drawn, the
     number of those B that are drawn varies by as much as makes up for it.
 
-    Args:
-        drawn: (resamples,) scores with B blocks drawn anew; NaN (nothing to score) is left out.
-        blocks: B.
-
-    Returns:
-        None where there is nothing to score.
+    Of (resamples,) scores with B blocks drawn anew, of which NaN (nothing to score) is left out,
+    and B of each stratum of images, of which the smallest decides. None where there is nothing to
+    score, or a stratum has one block.
     """
-    known = drawn[~np.isnan(drawn)]
-    if not known.size:
+    known, least = drawn[~np.isnan(drawn)], min(blocks)
+    if not known.size or least < 2:
         return None
-    return Spread(float(known.std()) * math.sqrt(blocks / (blocks - 1)), blocks - 1)
+    error = float(known.std()) * math.sqrt(least / (least - 1))
+    return Spread(error, sum(blocks) - len(blocks))
 
 
 def over_seeds(*methods: Values) -> Spread | None:
-    """Standard error of the mean over seeds, or of a sum of such means (Welch).
+    """Standard error of the mean of (S,) scores over seeds, or of a sum of such means (Welch).
 
-    Args:
-        methods: (S,) scores of the seeds of each method, times its weight.
-
-    Returns:
-        None where one of them has a single seed or a score is missing.
+    None where one of them has a single seed or a score is missing.
     """
     if any(len(each) < 2 or np.isnan(each).any() for each in methods):
         return None
@@ -111,23 +104,14 @@ def student_p(value: float, spread: Spread) -> float:
 def corrected(value: float, bias: float, spread: Spread, level: float) -> Interval:
     """Student's interval of a score that is never negative, without the bias of its estimate.
 
-        value - bias -+ t error,  cut at 0
+        value - bias -+ t error,  cut at 0,  and containing `value`
 
     For the variance over regions: regions that are equally good in truth differ in a sample, so
     that the estimate is too high by the mean error variance of their scores, and each resample is
-    too high by as much again.
+    too high by as much again (`bias`, the mean of the resamples less `value`).
 
     Source: Davison and Hinkley, Bootstrap Methods and their Application (1997), Sec. 5.2.1, with
     Student's quantile.
-
-    Args:
-        value: the estimate, >= 0.
-        bias: mean of the resamples less `value`; 0 for other scores.
-        spread: standard error of the estimate.
-        level: of the interval.
-
-    Returns:
-        at least 0; contains `value`; `value` is the upper end where the estimate is all bias.
     """
     around = student(value - bias, spread, level)
     return Interval(min(max(0.0, around.low), value), max(around.high, value))
@@ -143,12 +127,6 @@ def of_gaps(value: float, drawn: Values, spread: Spread, level: float) -> Interv
     the mean ``sqrt(2) s sqrt(2 / pi)``. So if all differences are chance, the true bias is
     ``bias / (sqrt(2) - 1) = (1 + sqrt 2) bias``; if they are large, both are near 0. The lower end
     allows for the first, the upper end for the second.
-
-    Args:
-        value: the estimate, >= 0.
-        drawn: (resamples,) with blocks of images drawn anew.
-        spread: standard error of the estimate.
-        level: of the interval.
     """
     low, high = np.nanquantile(drawn, [(1 - level) / 2, (1 + level) / 2])
     bias = max(float(np.nanmean(drawn)) - value, 0.0)

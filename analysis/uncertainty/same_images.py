@@ -36,25 +36,20 @@ def in_order(first: Counts, other: Counts, alike: Alike) -> Counts:
             f"counts by {first.partition} cannot be compared with counts by {other.partition}: "
             "the regions, or the second frames of pairs, differ. Measure both in the same way."
         )
-    if set(other.names) != set(first.names):
-        if not set(other.names) & set(first.names):
-            raise InputError(
-                f"the counts are of different images: such as '{first.names[0]}' (split "
-                f"'{first.split}') and '{other.names[0]}' (split '{other.split}'); score both on "
-                "one split of one data set."
-            )
-        only = sorted(set(first.names) ^ set(other.names))
+    only = sorted(set(first.names) ^ set(other.names))
+    if only:
+        shared = set(first.names) & set(other.names)
+        advice = (
+            "set missing=leave_out to compare the common images" if shared else "none is in both"
+        )
         raise InputError(
             f"the counts are not of the same images: {len(first.names)} of split '{first.split}' "
             f"against {len(other.names)} of split '{other.split}', '{only[0]}' is in only one; "
-            "score both on one split, or set missing=leave_out to compare the common images."
+            f"score both on one split ({advice})."
         )
     same = other if other.names == first.names else other.select(first.names)
     if None not in (first.night, same.night) and first.night != same.night:
-        raise InputError(
-            "the counts do not agree about which images were taken at night; score both on one "
-            "data set."
-        )
+        raise InputError("the counts do not agree about which images were taken at night.")
     if alike != "names":
         _check_labels(first, same)
     return same
@@ -70,20 +65,16 @@ def common(methods: Sequence[Sequence[Counts]]) -> list[list[Counts]]:
     shared = set(every[0].names).intersection(*(counts.names for counts in every))
     kept = [name for name in every[0].names if name in shared]
     if not kept:
-        splits = ", ".join(dict.fromkeys(f"'{counts.split}'" for counts in every))
-        raise InputError(
-            f"no image is in all counts, which are of {splits} with names such as "
-            f"'{every[0].names[0]}' and '{every[-1].names[0]}'; score all on one split."
-        )
+        firsts = ", ".join(dict.fromkeys(f"'{counts.names[0]}'" for counts in every))
+        raise InputError(f"no image is in all counts ({firsts}, ...); score all on one split.")
     return [[counts.select(kept) for counts in seeds] for seeds in methods]
 
 
 def _check_labels(first: Counts, same: Counts) -> None:
     """Compare the labelled pixels of every image, by region where both have the same regions."""
-    kinds = [_kind(each) for each in (first, same)]
     if first.partition == same.partition:
         labelled = [_labelled(each) for each in (first, same)]
-    elif kinds == [None, None]:
+    elif [_kind(each) for each in (first, same)] == [None, None]:
         labelled = [each.counts.sum((1, -1), dtype=np.int64) for each in (first, same)]
     else:
         return
@@ -104,23 +95,16 @@ def _kind(counts: Counts) -> str | None:
 
 def _labelled(counts: Counts) -> NDArray[np.int64]:
     """(N, ...) numbers of pixels that depend on the labels alone."""
-    array = counts.counts
-    labelled: NDArray[np.int64]
-    match _kind(counts):
-        case None | "distance" | "size":
-            labelled = array.sum(-1, dtype=np.int64)
-        case "boundary":
-            labelled = array[:, :, LABEL].astype(np.int64)
-        case "calibration":
-            # Bins and classes are those of the prediction; only their sum over a region is not.
-            details = details_of(counts.partition)
-            groups = 1 if details is None else details.groups
-            number = array[:, :, NUMBER].sum(-1, dtype=np.int64)
-            labelled = number.reshape(len(array), -1, groups).sum(-1)
-        case "triples":
-            # Every index is a predicted class; only the number of pixels is that of the images.
-            labelled = array.sum((-3, -2, -1), dtype=np.int64)
-        case _:
-            # Of pairs of frames the label is no row but says which matrix it is.
-            labelled = array.sum((-2, -1), dtype=np.int64)
-    return labelled
+    array, kind = counts.counts, _kind(counts)
+    if kind == "boundary":
+        return array[:, :, LABEL].astype(np.int64)
+    if kind == "calibration":
+        # Bins and classes are those of the prediction; only their sum over a region is not.
+        details = details_of(counts.partition)
+        number = (
+            array[:, :, NUMBER].sum(-1).reshape(len(array), -1, details.groups if details else 1)
+        )
+        return np.asarray(number.sum(-1, dtype=np.int64))
+    # Labels are rows; of pairs of frames a matrix each; of triples every index is a prediction.
+    axes = {None: (-1,), "distance": (-1,), "size": (-1,), "triples": (-3, -2, -1)}
+    return np.asarray(array.sum(axes.get(kind, (-2, -1)), dtype=np.int64))

@@ -32,13 +32,8 @@ def e_value(t: float, count: int, precision: float = PRECISION) -> float:
 
         e = sqrt(r) ((1 + x) / (1 + r x))^(n / 2),  x = t^2 / (n - 1),  r = c / (n + c)
 
-    Args:
-        t: ``(mean - tested mean) sqrt(n) / s``, with the standard deviation s of n - 1.
-        count: n, number of values.
-        precision: c, of the prior over the effect size.
-
-    Returns:
-        above 0; 1 for one value, which says nothing where the variance is unknown.
+    with ``t = (mean - tested mean) sqrt(n) / s``, the standard deviation s of n - 1 and the
+    precision c of the prior. 1 for one value, which says nothing where the variance is unknown.
     """
     if count < 2:
         return 1.0
@@ -49,15 +44,10 @@ def e_value(t: float, count: int, precision: float = PRECISION) -> float:
 
 
 def half_width(sd: float, count: int, alpha: float, precision: float = PRECISION) -> float:
-    """Half of the width of the interval after `count` values; infinite where they are too few.
+    """Half of the width of the interval after `count` values of standard deviation `sd` (n - 1).
 
-    The condition ``e_value < 1 / alpha`` solved for the tested mean.
-
-    Args:
-        sd: standard deviation of the values (n - 1).
-        count: n, number of values.
-        alpha: bound of the rate of sequences that ever miss the mean, 0..1.
-        precision: of the prior over the effect size.
+    The condition ``e_value < 1 / alpha`` solved for the tested mean; infinite with too few values.
+    `alpha`, 0..1, bounds the rate of sequences that ever miss the mean.
     """
     if count < 2:
         return math.inf

@@ -70,13 +70,10 @@ def check_part(node: str, part: object, kind: str = "") -> None:
 def check_arrays(
     returned: str, value: Any, arrays: Mapping[str, tuple[str, str]], **sizes: int
 ) -> None:
-    """Refuse a returned value of which an array has another shape or dtype.
+    """Refuse a value of which an array, an attribute or key, has another shape or dtype.
 
-    Args:
-        returned: begins the message: "loss: Mine.__call__ returned".
-        value: has the arrays as attributes or keys.
-        arrays: shape and dtype ("": any) of each, see `SAMPLE`.
-        sizes: dimensions that are known.
+    `returned` begins the message; `arrays` has shape and dtype ("": any) of each, see `SAMPLE`;
+    `sizes` are the dimensions that are known.
     """
     for name, (shape, dtype) in arrays.items():
         found = value[name] if isinstance(value, Mapping) else getattr(value, name, None)
@@ -101,9 +98,7 @@ def check_type(returned: str, value: object, kind: type) -> None:
 def check_dataset(dataset: Any, splits: Iterable[str] = ()) -> None:
     """Refuse a user's data set that differs from `rgbt.dataset.LabelledDataset`.
 
-    Args:
-        dataset: any object; one of this package passes.
-        splits: of which the first sample is read.
+    The first sample of each of the `splits` is read.
     """
     if not is_own(dataset):
         return
@@ -215,11 +210,8 @@ class CheckedLoss:
 def check_parts(
     session: Session, names: Lists, masker: AnyMasker, records: Mapping[str, Record]
 ) -> dict[str, tuple[int, ...]]:
-    """Use a user's own parts, another author's network, the masker and the cameras once.
-
-    Returns the sizes of an image.
-    """
-    transform, seed = session.transform, session.spec.seed
+    """Use a user's own parts, an author's network, masker and cameras once; sizes of an image."""
+    transform, seed = session.transform, session.drawn.order
     check_dataset(reader_of(session.dataset), names)
     check_part("transform", transform)
     first = first_readable(session, names[session.domains.source.split])
@@ -267,7 +259,7 @@ def _probe_external(session: Session, train_hw: tuple[int, int], test_hw: tuple[
         images = [torch.zeros(count, each, *image_hw, device=session.device) for each in (3, 1)]
         try:
             with torch.set_grad_enabled(is_training), session.autocast():
-                output = model(*images, generator=torch_generator(session.spec.seed, "probe"))
+                output = model(*images, generator=torch_generator(session.drawn.order, "probe"))
         except (InputError, torch.OutOfMemoryError):
             raise
         except Exception as error:

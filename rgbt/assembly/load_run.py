@@ -55,9 +55,17 @@ def open_network(
 ) -> Session:
     """A trained network: of a run, of a file of `rgbt export`, or of a file of weights.
 
-    `source` is a folder, config key or MLflow run id; or, as a path, an ONNX file, which names its
-    data set and settings. "": the weights are those of `model.weights` in the configuration of
-    `overrides` at scale=paper. Evaluations of files are written below `runs_dir` by default.
+    Evaluations of files are written below `runs_dir` by default.
+
+    Args:
+        source: folder, config key or MLflow run id; or, as a path, an ONNX file, which names its
+            data set and settings. "": the weights are those of `model.weights` in the configuration
+            of `overrides` at scale=paper.
+        runs_dir: the folder of runs.
+        overrides: of the configuration, see `rgbt.runs.specify.load_spec`.
+        checkpoint: "best" by the selection split, or "last".
+        label_map: from the classes it was trained with to those of the data set, where they differ.
+        trust: modules that the configuration may name (`rgbt.config.stored_config`).
 
     Raises:
         InputError: as `open_run`; no weights, or a file that does not hold all of them.
@@ -102,14 +110,7 @@ def open_run(
     label_map: LabelMap | None = None,
     trust: Collection[str] = (),
 ) -> Session:
-    """The network of a run with its weights.
-
-    Args:
-        folder: the run folder.
-        overrides: of its configuration, see `rgbt.runs.specify.load_spec`.
-        checkpoint: "best" by the selection split, or "last".
-        label_map: from the classes it was trained with to those of the data set, where they differ.
-        trust: modules that its configuration may name (`rgbt.config.stored_config`).
+    """The network of the run in a folder with its weights; other arguments as of `open_network`.
 
     Raises:
         InputError: a target not trusted, overrides that do not fit, no checkpoint, other classes.

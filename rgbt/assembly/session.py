@@ -7,6 +7,7 @@ import json
 from collections.abc import Iterable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,14 +23,13 @@ from rgbt.data.cache import CachedDataset
 from rgbt.data.domains import Domains
 from rgbt.data.loader_settings import LoaderSettings
 from rgbt.dataset import LabelledDataset
-from rgbt.engine.device import autocast, choose_device, fix_threads, keep_memory
-from rgbt.engine.network_settings import place
+from rgbt.engine.device import autocast, choose_device, fix_threads, keep_memory, place
 from rgbt.engine.prediction import Prediction
 from rgbt.engine.settings import TrainerSettings
 from rgbt.metrics.metric import Regions
 from rgbt.randomness import derive
 from rgbt.requirements import check_requirements
-from rgbt.runs.run_spec import WEIGHTS, RunSpec
+from rgbt.runs.run_spec import WEIGHTS, RunSpec, SourceSeeds
 from rgbt.terminal import info
 from rgbt.transforms.views import ViewSets
 
@@ -43,6 +43,7 @@ class Session:
     """What every command needs, built once.
 
     Attributes:
+        drawn: seed of every source of random draws.
         regions: partition of the image and the rule for absent classes.
         consistency: virtual views that TC and CA are measured on, if any.
         model: the network, on the device, not wrapped.
@@ -54,6 +55,7 @@ class Session:
     """
 
     spec: RunSpec
+    drawn: SourceSeeds
     dataset: LabelledDataset
     domains: Domains
     transform: Any
@@ -74,7 +76,7 @@ class Session:
         """Context of a forward pass at the precision of the run."""
         return autocast(self.device, self.trainer.precision)
 
-    @property
+    @cached_property
     def selection_split(self) -> str | None:
         """The split that is evaluated during training.
 
@@ -84,10 +86,12 @@ class Session:
         is_needed = self.trainer.tested == "best" or self.dataset.has(split)
         return split if is_needed else None
 
-    def read_splits(self) -> tuple[str, ...]:
-        """Every split that the run reads: of the training, of the selection if any, of the test."""
+    @cached_property
+    def names(self) -> dict[str, tuple[str, ...]]:
+        """Images of every split that the run reads: training, selection if any, and test."""
         trained = (domain.split for domain in self.domains.named.values())
-        return tuple(dict.fromkeys(filter(None, (*trained, self.selection_split, "test"))))
+        splits = dict.fromkeys(filter(None, (*trained, self.selection_split, "test")))
+        return {split: self.dataset.names(split) for split in splits}
 
 
 def open_session(
@@ -100,29 +104,28 @@ def open_session(
 ) -> Session:
     """Build data set, transform and network; nothing is trained or evaluated yet.
 
-    Weights are drawn from (seed, "weights") without touching the global generator; those that
-    `model.weights` names replace them.
-
     Args:
         spec: the run.
         label_map: from the classes of the network to those of the data set, where they differ.
         load_weights: False: `model.weights` is left out, because an upstream run is not finished.
-        network: used as it is; None: it is built from the settings.
+        network: used as it is; None: built, with weights drawn from (seed, "weights").
         device: where the network is placed; None: `choose_device` of the settings.
 
     Raises:
         InputError: settings that do not fit each other, the machine or the file of weights.
     """
+    trainer, loading = spec.trainer, spec.data
     keep_memory()
-    fix_threads(spec.trainer.threads)
-    trainer = spec.trainer
+    fix_threads(trainer.threads)
     device = device or choose_device(trainer)
+    built = spec.build("drawn", "dataset", "transform", "metric", "consistency")
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(derive(spec.drawn.weights, "weights"))
+        torch.manual_seed(derive(built["drawn"].weights, "weights"))
         model: nn.Module = spec.model.build() if network is None else network
-    files: LabelledDataset = spec.dataset.build()
-    check_dataset(files)
-    dataset = files if spec.data.cache is None else CachedDataset(files, spec.data.cache)
+    dataset: LabelledDataset = built["dataset"]
+    check_dataset(dataset)
+    if loading.cache is not None:
+        dataset = CachedDataset(dataset, loading.cache)
     num_classes = spec.model.values.get("num_classes", dataset.num_classes)
     if label_map is not None:
         label_map.check(num_classes, tuple(dataset.classes), dataset.name)
@@ -137,12 +140,13 @@ def open_session(
     return Session(
         spec=spec,
         dataset=dataset,
+        drawn=built["drawn"],
         domains=spec.domains,
-        transform=spec.transform.build(),
-        loading=spec.data,
-        regions=spec.metric.build(),
+        transform=built["transform"],
+        loading=loading,
+        regions=built["metric"],
         prediction=spec.prediction,
-        consistency=spec.consistency.build(),
+        consistency=built["consistency"],
         trainer=trainer,
         device=device,
         model=place(model, device, trainer),
@@ -154,10 +158,7 @@ def start_from_weights(model: nn.Module, spec: RunSpec) -> Plan | None:
     """Load the weights that `model.weights` names and report this on stderr; None without weights.
 
     A second line warns if the network has other inputs or settings than the weights were trained
-    with, as far as the file or its layout tells.
-
-    Raises:
-        InputError: the file does not fit, or `model.fresh` without a file.
+    with, as far as the file or its layout tells. InputError: the file does not fit.
     """
     source, fresh = spec.weights_path, spec.fresh_parts
     if source is None:
@@ -206,5 +207,5 @@ def _holds(node: Mapping[str, Any], override: str) -> bool:
 def names_key(session: Session) -> str:
     """SHA-256 over the names of the training splits and of the test split."""
     domains = (domain.split for domain in session.domains.named.values())
-    lists = {split: session.dataset.names(split) for split in (*domains, "test")}
+    lists = {split: session.names[split] for split in (*domains, "test")}
     return hashlib.sha256(json.dumps(lists).encode()).hexdigest()

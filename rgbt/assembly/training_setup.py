@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -24,8 +25,9 @@ from rgbt.checks import InputError
 from rgbt.data.domains import GIVEN, NONE, Domain
 from rgbt.data.loaders import Batches, PairedBatches, steps_per_epoch, train_batches
 from rgbt.dataset import LabelledDataset
+from rgbt.engine.batch_norm import check_batch_norm_parts, synchronise_batch_norm
+from rgbt.engine.device import prepare_training
 from rgbt.engine.fabric import open_fabric
-from rgbt.engine.network_settings import prepare_training
 from rgbt.engine.schedules import Schedule
 from rgbt.engine.settings import TrainerSettings
 from rgbt.engine.trainer import Scheme
@@ -34,7 +36,7 @@ from rgbt.randomness import derive
 from rgbt.requirements import Record, check_requirements, record_of
 from rgbt.runs.run_spec import WEIGHTS, RunSpec, labels_key
 from rgbt.terminal import info
-from rgbt.types import AnyMasker, Loadable
+from rgbt.types import Loadable
 
 if TYPE_CHECKING:  # most runs have one domain, draw no classes, and train a network of this package
     from rgbt.data.rare_classes import RareClasses
@@ -45,21 +47,16 @@ class TrainingSetup:
     """The objects of a training, before anything is written.
 
     Attributes:
-        fabric: device, precision and connection of the processes.
-        names: of the images of every split that the run reads.
         datasets: of each domain, with the labels that it is trained with.
         model: the network as Fabric wrapped it.
         others: further networks that are trained, wrapped, by name.
         optimizers: by the names that the scheme's phases use.
         rare: how images of the source are drawn by class; None: each once per epoch.
-        scheme: yields the phases of a step.
-        schedule: learning rate factor per step.
         sizes: height and width of the first image: "stored", "trained" and "predicted".
     """
 
     session: Session
     fabric: Fabric
-    names: Lists
     datasets: dict[str, LabelledDataset]
     model: nn.Module
     others: dict[str, nn.Module]
@@ -67,8 +64,9 @@ class TrainingSetup:
     rare: RareClasses | None
     scheme: Scheme
     schedule: Schedule
-    sizes: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    sizes: Mapping[str, tuple[int, ...]]
 
+    @cached_property
     def steps_per_epoch(self) -> int:
         """Batches of one epoch of the source."""
         split = self.session.domains.source.split
@@ -76,7 +74,7 @@ class TrainingSetup:
 
     def batches(self, steps: range) -> Batches[Loadable] | PairedBatches:
         """Training batches of these steps: of one domain, or a pair of batches of both."""
-        session, seed = self.session, self.session.spec.drawn.order
+        session, seed = self.session, self.session.drawn.order
         loading = session.loading
         data, split = self.datasets["source"], session.domains.source.split
         source = train_batches(data, split, session.transform, loading, seed, steps, self.rare)
@@ -92,11 +90,7 @@ class TrainingSetup:
 
 
 def validate(spec: RunSpec) -> None:
-    """Build everything once, so that errors are reported before the upstream runs are trained.
-
-    Raises:
-        InputError: as `set_up_training`; what unfinished upstream runs will write is left out.
-    """
+    """Build all but what unfinished upstream runs will write; errors as of `set_up_training`."""
     for name in spec.domains.named:
         teacher = spec.dependency(labels_key(name))
         if teacher is not None:
@@ -110,38 +104,39 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
     """Build everything and read all lists of images of the run, so that errors come first.
 
     Where not `upstream_finished`, weights and pseudo-labels of upstream runs are left out.
-
-    Raises:
-        InputError: settings that do not fit each other, the machine or the data.
+    InputError: settings that do not fit each other, the machine or the data.
     """
     missing = () if upstream_finished else [each.key for each in spec.dependencies]
     fabric = open_fabric(spec.trainer)
     session = open_session(spec, load_weights=WEIGHTS not in missing, device=fabric.device)
     session = replace(session, run=spec.key)
     domains, loading = session.domains, session.loading
-    masker: AnyMasker = spec.masker.build()
-    loss = spec.loss.build()
+    built = spec.build("masker", "loss", "optimizer", "schedule")
+    masker, loss = built["masker"], built["loss"]
     checked = CheckedLoss(loss) if is_own(loss) else loss
     _share_batch_norm(session.model, session.trainer)
     prepare_training(session.model, session.trainer)
     model = fabric.setup_module(session.model)
     collaborators = {"model": model, "loss": checked, "masker": masker, "domains": domains}
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(derive(spec.drawn.weights, "scheme weights"))  # of networks of its own
+        seed = derive(session.drawn.weights, "scheme weights")  # of networks of its own
+        torch.manual_seed(seed)
         scheme: Any = spec.scheme.build(**collaborators, dataset=session.dataset)
     check_part("scheme", scheme)
     components = {
         **{"scheme": scheme, "loss": loss, "domains": domains, "model": session.model},
         **{"masker": masker, "transform": session.transform, "data": loading},
         **{"dataset": session.dataset, "consistency": session.consistency},
-        WEIGHTS: SimpleNamespace(record=Record(pretrained=spec.weights is not None)),
+        WEIGHTS: SimpleNamespace(
+            record=Record(pretrained=spec.model.plain.get("weights") is not None)
+        ),
     }
     records = check_requirements(components)
-    names = {split: session.dataset.names(split) for split in session.read_splits()}
+    names = session.names
     datasets = {}
     for name, domain in domains.named.items():
         steps_per_epoch(session.dataset, loading, domain.split)
-        is_missing = labels_key(name) in missing
+        is_missing = bool(missing) and labels_key(name) in missing
         datasets[name] = session.dataset if is_missing else _labelled(session, name, domain, names)
     sizes = check_parts(session, names, masker, records)
     if upstream_finished:
@@ -151,12 +146,11 @@ def set_up_training(spec: RunSpec, *, upstream_finished: bool = True) -> Trainin
         from rgbt.data.rare_classes import count_rare_classes  # most runs draw no classes
 
         rare = count_rare_classes(datasets["source"], domains.source.split, loading)
-    others, optimizers = _networks_and_optimizers(session, fabric, records["scheme"])
-    schedule: Schedule = spec.schedule.build()
-    return TrainingSetup(
-        *(session, fabric, names, datasets, model, others, optimizers, rare, scheme, schedule),
-        sizes=sizes,
+    others, optimizers = _networks_and_optimizers(
+        session, built["optimizer"], fabric, records["scheme"]
     )
+    parts = (session, fabric, datasets, model, others, optimizers, rare, scheme)
+    return TrainingSetup(*parts, built["schedule"], sizes)
 
 
 def _shared_with_test(names: Lists, split: str) -> int:
@@ -232,20 +226,16 @@ def _labelled(session: Session, name: str, domain: Domain, names: Lists) -> Labe
 
 def _share_batch_norm(network: nn.Module, trainer: TrainerSettings) -> None:
     """Let the processes of a run normalise their batch together, unless each has its own part."""
-    if num_processes() == 1:
-        return
-    from rgbt.engine.batch_norm import check_batch_norm_parts, synchronise_batch_norm
-
-    check_batch_norm_parts(trainer.batch_norm_parts, num_processes())
-    if trainer.batch_norm_parts == 1:
+    number = num_processes()
+    check_batch_norm_parts(trainer.batch_norm_parts, number)
+    if number > 1 and trainer.batch_norm_parts == 1:
         synchronise_batch_norm(network)
 
 
 def _networks_and_optimizers(
-    session: Session, fabric: Fabric, record: Record
+    session: Session, builder: Any, fabric: Fabric, record: Record
 ) -> tuple[dict[str, nn.Module], dict[str, torch.optim.Optimizer]]:
-    """Further networks of a scheme, wrapped in place, and all optimisers."""
-    builder = session.spec.optimizer.build()
+    """Further networks of a scheme, wrapped in place, and all optimisers, by their `builder`."""
     parts, others = record.optimizers, record.networks
     built = {name: builder(session.model, without=without) for name, without in parts.items()}
     for name in record.builders:

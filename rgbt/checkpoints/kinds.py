@@ -2,7 +2,7 @@
 
 `KINDS` has a row for each kind of file that a family of networks takes: files of whole networks as
 their authors publish them, and of ImageNet backbones. The names here are those of the releases but
-for a prefix and a few words. How a file is read and loaded is in `read` and `load`.
+for a prefix and a few words. How a file is read and loaded is in `files` and `load`.
 """
 
 from __future__ import annotations
@@ -34,12 +34,9 @@ class Kind:
         source: entry of the network -> name in the file, behind the prefix.
         unused: regular expression for names of the file that the network has no place for.
         fresh: for entries that such a file does not hold; a backbone has some.
-        stems: for convolutions whose input channels may be others than in the file: for one channel
-            the mean over the file's, for further ones behind the file's the same mean.
-        converted: tensors of the file -> under the names that `source` gives; for files that split
-            tensors of the network.
-        convention: overrides for the inputs and the evaluation of the release, which its weights do
-            not show.
+        stems: for first convolutions, which may have other input channels than in the file.
+        converted: tensors of the file -> under the names that `source` gives.
+        convention: overrides for inputs and evaluation of the release, which weights do not show.
     """
 
     title: str
@@ -79,8 +76,8 @@ CRM = Kind(
     unused=r".*\.relative_position_index$|criterion\.empty_weight$",
     convention=("model/inputs=crm",),
 )
-# Released: CRM and SpatialSeg, DetectionCheckpointer with the thermal convolution averaged
-# (keepdim). The file's last normalisation is not norm3.
+# Released: DetectionCheckpointer with the thermal convolution averaged (keepdim). The file's last
+# normalisation is not norm3.
 SWIN = Kind(
     "ImageNet Swin Transformer",
     has=("patch_embed.proj.", "layers.0.blocks.0.attn.qkv.", "layers.0.downsample."),
@@ -90,16 +87,16 @@ SWIN = Kind(
     stems=r"backbone\.THR_branch\.patch_embed\.proj\.weight",
 )
 
-
-def _timm_swin(entry: str) -> str:
-    """The merging between two stages is saved with the second of them in timm 0.9 and later.
-
-    Source: timm/models/swin_transformer.py, `checkpoint_filter_fn`.
-    """
-    name = SWIN.source(entry)
-    later = re.fullmatch(r"layers\.(\d)\.(downsample\..*)", name)
-    return f"layers.{int(later[1]) + 1}.{later[2]}" if later else name
-
+# timm 0.9 and later has the merging of two stages in the second (`checkpoint_filter_fn` of swin).
+TIMM_SWIN = replace(
+    SWIN,
+    title="ImageNet Swin Transformer of timm",
+    has=(*SWIN.has[:2], "layers.3.downsample."),
+    source=renaming(
+        (f"^{BRANCH}", ""),
+        *((rf"^layers\.{n}\.downsample", f"layers.{n + 1}.downsample") for n in (2, 1, 0)),
+    ),
+)
 
 # CMX and CMNeXt. Released: CMX and the temporal release feed thermal three times, so that the stem
 # is copied; one of one channel gets the mean.
@@ -125,24 +122,17 @@ MIT = Kind(
     stems=r"backbone\.extra_patch_embed1\.proj\.weight",
 )
 
-
-def _cmnext(entry: str) -> str:
-    """The released name of an entry of CMNeXt.
-
-    Source: DELIVER release, with two modalities. The thermal patch embeddings, numbered from 0
-    there, and the decoder have other names than here, where they are those of CMX.
-    """
-    if found := re.fullmatch(r"backbone\.extra_patch_embed(\d)\.(proj|norm)\.(.*)", entry):
-        layer = {"proj": "proj.module", "norm": "norm.ln_0"}[found[2]]
-        return f"backbone.extra_downsample_layers.{int(found[1]) - 1}.{layer}.{found[3]}"
-    fuse = "decode_head.linear_fuse"
-    return entry.replace(f"{fuse}.0.", f"{fuse}.conv.").replace(f"{fuse}.1.", f"{fuse}.bn.")
-
-
+# Source: DELIVER release, with two modalities. The thermal patch embeddings, numbered from 0 there,
+# and the decoder have other names than here, where they are those of CMX.
+LAYERS = r"^(backbone\.extra_downsample_layers\.\d"
 CMNEXT = Kind(
     "CMNeXt checkpoint",
     has=("backbone.patch_embed", "backbone.extra_block1.0.c_nets.", "backbone.extra_downsample_"),
-    source=_cmnext,
+    source=renaming(
+        *((f"extra_patch_embed{n + 1}", f"extra_downsample_layers.{n}") for n in range(4)),
+        *((rf"{LAYERS}\.proj)", r"\1.module"), (rf"{LAYERS}\.norm)", r"\1.ln_0")),
+        *((r"(linear_fuse)\.0", r"\1.conv"), (r"(linear_fuse)\.1", r"\1.bn")),
+    ),
     convention=("model/inputs=imagenet_unit",),
 )
 
@@ -199,10 +189,9 @@ SIZE = ("model/inputs=cmx", "model.position_resize=size")
 
 
 def _dinov2_of_timm(tensors: Tensors) -> Tensors:
-    """Names of DINOv2 for timm's, which drops the token of hidden patches.
+    """With registers, the position of the class is part of its token: here it is 0 then.
 
-    With registers the position of the class is part of its token (timm/models/
-    vision_transformer.py, `_convert_dinov2`), so that this position becomes 0.
+    Source: timm/models/vision_transformer.py, `_convert_dinov2`.
     """
     found = dict(tensors)
     if "reg_token" in found:
@@ -229,82 +218,71 @@ DINOV3 = Kind(
     fresh=OUTSIDE,
     convention=("model/inputs=cmx", "model.norm_eps=1e-05", "model.rope_base=100.0"),
 )
-FROM_HUGGING_FACE: Names = (
-    (r"^embeddings\.patch_embeddings\.", "patch_embed.proj."),
-    (r"^embeddings\.register_tokens$", "storage_tokens"),
-    (r"^embeddings\.", ""),
-    (r"^layer\.", "blocks."),
-    (r"\.layer_scale(\d)\.lambda1$", r".ls\1.gamma"),
-    (r"\.attention\.o_proj\.", ".attn.proj."),
-    (r"\.attention\.([qkv])_proj\.", r".attn.\1."),
-    (r"\.mlp\.gate_proj\.", ".mlp.w1."),
-)
-GATED = ((r"\.mlp\.up_proj\.", ".mlp.w2."), (r"\.mlp\.down_proj\.", ".mlp.w3."))
-PLAIN = ((r"\.mlp\.up_proj\.", ".mlp.fc1."), (r"\.mlp\.down_proj\.", ".mlp.fc2."))
-FROM_TIMM: Names = (
-    (r"^reg_token$", "storage_tokens"),
-    (r"\.gamma_(\d)$", r".ls\1.gamma"),
-    (r"\.attn\.([qv])_bias$", r".attn.\1.bias"),
-)
-GATED_TIMM = (
-    *((r"\.mlp\.fc1_g\.", ".mlp.w1."), (r"\.mlp\.fc1_x\.", ".mlp.w2.")),
-    (r"\.mlp\.fc2\.", ".mlp.w3."),
-)
 
 
-def _dinov3_of_hugging_face(tensors: Tensors) -> Tensors:
-    """Released names; queries, keys and values as one projection, keys without a bias.
+def _dinov3_of(others: Names, gated: Names, plain: Names = ()) -> Callable[[Tensors], Tensors]:
+    """A function from the names of another program to the released ones.
 
-    Source: transformers, models/dinov3_vit.
+    Networks with gated layers have the names `gated`, those without `plain`. Queries, keys and
+    values become one projection. Its bias, which keys do not have, is 0 where no block has one; a
+    lone one keeps its name, and is reported.
     """
-    gated = any(".mlp.gate_proj." in name for name in tensors)
-    name_of = renaming(*FROM_HUGGING_FACE, *(GATED if gated else PLAIN))
-    found = {name_of(name): tensor for name, tensor in tensors.items()}
-    if "mask_token" in found:
-        found["mask_token"] = found["mask_token"].flatten(0, -2)
-    for start in [name[: -len("q.weight")] for name in found if name.endswith(".attn.q.weight")]:
-        parts = [f"{start}{part}.weight" for part in "qkv"]
-        if all(part in found for part in parts):
-            found[f"{start}qkv.weight"] = torch.cat([found.pop(part) for part in parts])
-        _join_biases(found, start)
-    return found
+
+    def converted(tensors: Tensors) -> Tensors:
+        is_gated = any(re.search(gated[0][0], name) for name in tensors)
+        name_of = renaming(*others, *(gated if is_gated else plain))
+        found = {name_of(name): tensor for name, tensor in tensors.items()}
+        if "mask_token" in found:
+            found["mask_token"] = found["mask_token"].flatten(0, -2)
+        has_bias = any(name.endswith((".attn.q.bias", ".attn.v.bias")) for name in found)
+        for start in {name.partition(".attn.")[0] for name in found if ".attn." in name}:
+            parts = [f"{start}.attn.{part}.weight" for part in "qkv"]
+            joint = f"{start}.attn.qkv"
+            if all(part in found for part in parts):
+                found[f"{joint}.weight"] = torch.cat([found.pop(part) for part in parts])
+            first, last = (f"{start}.attn.{part}.bias" for part in "qv")
+            if first in found and last in found:
+                query, value = found.pop(first), found.pop(last)
+                found[f"{joint}.bias"] = torch.cat([query, torch.zeros_like(query), value])
+            elif not has_bias and (weight := found.get(f"{joint}.weight")) is not None:
+                found[f"{joint}.bias"] = weight.new_zeros(len(weight))
+        return found
+
+    return converted
 
 
-def _dinov3_of_timm(tensors: Tensors) -> Tensors:
-    """Released names; a joint bias, which is 0 where the file has none (timm/models/eva.py)."""
-    gated = any(".mlp.fc1_g." in name for name in tensors)
-    name_of = renaming(*FROM_TIMM, *(GATED_TIMM if gated else ()))
-    found = {name_of(name): tensor for name, tensor in tensors.items()}
-    has_bias = any(name.endswith((".attn.q.bias", ".attn.v.bias")) for name in found)
-    for start in [name[: -len("weight")] for name in found if name.endswith(".attn.qkv.weight")]:
-        if has_bias:
-            _join_biases(found, start.removesuffix("qkv."))
-        else:
-            weight = found[f"{start}weight"]
-            found[f"{start}bias"] = weight.new_zeros(len(weight))
-    return found
-
-
-def _join_biases(tensors: dict[str, Tensor], start: str) -> None:
-    """Replace the biases of queries and values by the joint one; a lone one stays, and is named."""
-    first, last = f"{start}q.bias", f"{start}v.bias"
-    if first in tensors and last in tensors:
-        query, value = tensors.pop(first), tensors.pop(last)
-        tensors[f"{start}qkv.bias"] = torch.cat([query, torch.zeros_like(query), value])
-
+# Source: transformers, models/dinov3_vit.
+_dinov3_of_hugging_face = _dinov3_of(
+    (
+        (r"^embeddings\.patch_embeddings\.", "patch_embed.proj."),
+        (r"^embeddings\.register_tokens$", "storage_tokens"),
+        (r"^embeddings\.", ""),
+        (r"^layer\.", "blocks."),
+        (r"\.layer_scale(\d)\.lambda1$", r".ls\1.gamma"),
+        (r"\.attention\.o_proj\.", ".attn.proj."),
+        (r"\.attention\.([qkv])_proj\.", r".attn.\1."),
+    ),
+    gated=(
+        *((r"\.mlp\.gate_proj\.", ".mlp.w1."), (r"\.mlp\.up_proj\.", ".mlp.w2.")),
+        (r"\.mlp\.down_proj\.", ".mlp.w3."),
+    ),
+    plain=((r"\.mlp\.up_proj\.", ".mlp.fc1."), (r"\.mlp\.down_proj\.", ".mlp.fc2.")),
+)
+# Source: timm/models/eva.py.
+_dinov3_of_timm = _dinov3_of(
+    (
+        (r"^reg_token$", "storage_tokens"),
+        (r"\.gamma_(\d)$", r".ls\1.gamma"),
+        (r"\.attn\.([qv])_bias$", r".attn.\1.bias"),
+    ),
+    gated=(
+        *((r"\.mlp\.fc1_g\.", ".mlp.w1."), (r"\.mlp\.fc1_x\.", ".mlp.w2.")),
+        (r"\.mlp\.fc2\.", ".mlp.w3."),
+    ),
+)
 
 KINDS: Mapping[str, tuple[Kind, ...]] = {
-    "mask2former": (
-        CRM,
-        replace(CRM, prefix=""),
-        SWIN,
-        replace(
-            SWIN,
-            title="ImageNet Swin Transformer of timm",
-            has=(*SWIN.has[:2], "layers.3.downsample."),
-            source=_timm_swin,
-        ),
-    ),
+    "mask2former": (CRM, replace(CRM, prefix=""), SWIN, TIMM_SWIN),
     "cmnext": (
         CMNEXT,
         replace(CMNEXT, has=CMNEXT.has[:2], source=str),  # with the names here
@@ -323,8 +301,7 @@ KINDS: Mapping[str, tuple[Kind, ...]] = {
             has=("encoder_rgb_", "encoder_thermal_", "deconv"),
             convention=("model/inputs=unit", "model.final_relu=true"),
         ),
-        # Released: the thermal stem is the mean of the RGB stem. Paper
-        # (model.thermal_stem=xavier): it is drawn anew, like the decoder.
+        # Released: the thermal stem is the mean. Paper (model.thermal_stem=xavier): it is drawn.
         replace(
             RESNET,
             source=renaming((r"^encoder_(rgb|thermal)_", "")),
@@ -386,7 +363,6 @@ KINDS: Mapping[str, tuple[Kind, ...]] = {
             converted=_dinov3_of_timm,
         ),
     ),
-    "external": (),
 }
 """Module of rgbt.models -> kinds of files for its networks, in the order they are tried."""
 

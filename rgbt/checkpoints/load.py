@@ -6,23 +6,19 @@ import json
 import re
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
+from rgbt.checkpoints.files import Contents, in_words, read
 from rgbt.checkpoints.kinds import KINDS, NONE, OWN, Kind, family_of
-from rgbt.checkpoints.read import Contents, read
-from rgbt.checkpoints.torch_files import in_words
 from rgbt.checks import InputError, not_finite, one_line
 from rgbt.requirements import record_of
 
 COUNTER = "num_batches_tracked"
 """Last word of batch normalisation's counters, which files of old torch versions lack."""
-
-INPUT_CHANNELS = (1, 4)
-"""Of a first convolution that a file of three input channels fills."""
 
 
 @dataclass(frozen=True)
@@ -30,15 +26,12 @@ class Plan:
     """The effect of a file on a network.
 
     Attributes:
-        contents: the file.
-        kind: of the file.
-        num_entries: of the network.
-        num_set: of them, from the file.
+        contents: the file, of this `kind`.
+        num_entries: of the network, of which `num_set` are set.
         values: these entries -> their values, of the same shape; {} once they are set.
         zeros: counters of batch normalisation that the file lacks; they begin at 0.
         fresh: entries that keep their initial values.
         unused: names of the file without a place.
-        misfits: entries whose tensor in the file has another shape or kind -> that tensor.
         problems: everything that does not fit, in words; none: the file fits.
     """
 
@@ -47,11 +40,10 @@ class Plan:
     num_entries: int
     num_set: int
     values: Mapping[str, Tensor]
-    zeros: Sequence[str] = ()
-    fresh: Sequence[str] = ()
-    unused: Sequence[str] = ()
-    misfits: Mapping[str, Tensor] = field(default_factory=dict)
-    problems: Sequence[str] = ()
+    zeros: Sequence[str]
+    fresh: Sequence[str]
+    unused: Sequence[str]
+    problems: Sequence[str]
 
     @property
     def is_own(self) -> bool:
@@ -86,9 +78,9 @@ class Plan:
                 "with model.fresh=[...]"
             )
         parts = [f"{self.num_set} of {self.num_entries} entries set"]
-        parts += [f"{len(self.zeros)} counters begin at 0"] if self.zeros else []
-        for what, names in (("initial values", self.fresh), ("unused in the file", self.unused)):
-            parts += [f"{len(names)} {what} ({_some(names)})"] if names else []
+        lists = {"counters begin at 0": self.zeros, "initial values": self.fresh}
+        lists["unused in the file"] = self.unused
+        parts += [f"{len(all_)} {what} ({_some(all_)})" for what, all_ in lists.items() if all_]
         return f"weights of {where}: {'; '.join(parts)}"
 
 
@@ -102,17 +94,15 @@ def load_weights(
 
     Args:
         model: the network; its class says which kinds of files fit.
-        path: of the file (see `rgbt.checkpoints.read.read`).
-        fresh: parts that keep their initial values, by the beginning of their names, such as
-            "sem_seg_head.predictor.class_embed" for another number of classes.
+        path: of the file (see `rgbt.checkpoints.files.read`).
+        fresh: parts that keep their initial values, by the beginning of their names.
         other_classes: whether parts whose shape differs keep their initial values too.
 
     Returns:
         what was set, without the values.
 
     Raises:
-        InputError: unreadable, asking for code, of another network, incomplete, of another shape
-            or type, or with NaN or infinity.
+        InputError: unreadable, of another network, incomplete, or with NaN or infinity.
     """
     plan = plan_for(model, read(Path(path)), fresh, other_classes=other_classes)
     if plan.problems:
@@ -120,8 +110,7 @@ def load_weights(
     if broken := not_finite(plan.values):
         raise InputError(
             f"{path}: '{broken[0]}' holds NaN or infinity ({len(broken)} of {len(plan.values)} "
-            "tensors do), because the training that wrote it diverged. Use a checkpoint of an "
-            "earlier step."
+            "tensors do). Use a checkpoint of an earlier step."
         )
     state = model.state_dict()
     with torch.no_grad():
@@ -141,9 +130,7 @@ def plan_for(
 ) -> Plan:
     """Find a place in `model` for every tensor of a file; arguments as of `load_weights`.
 
-    Raises:
-        InputError: `fresh` names no part of the network, or no row of `KINDS` and no network of
-            another author has such a file.
+    InputError: `fresh` names no part of the network, or the file is of no kind for it.
     """
     state = model.state_dict(keep_vars=True)
     for part in fresh:
@@ -155,45 +142,35 @@ def plan_for(
     tensors = kind.converted(contents.tensors)
     sources = {entry: kind.prefix + kind.source(entry) for entry in state}
     found: dict[str, list[str]] = defaultdict(list)
-    values, misfits = {}, {}
+    values = {}
     for entry, place in state.items():
-        name = sources[entry]
         if _under(entry, fresh) or entry.startswith(drawn) or re.match(kind.fresh, entry):
             found["fresh"].append(entry)
             continue
-        if name not in tensors:
+        if sources[entry] not in tensors:
             found["zeros" if entry.endswith(COUNTER) else "missing"].append(entry)
             continue
-        value = _adapted(tensors[name], place, is_stem=bool(re.match(kind.stems, entry)))
+        value = tensors[sources[entry]]
+        value = _as_stem(value, place) if re.match(kind.stems, entry) else value
         is_kind = value.is_floating_point() == place.is_floating_point()
         if is_kind and value.shape == place.shape:
             values[entry] = value
         elif is_kind and other_classes:
             found["fresh"].append(entry)
         else:
-            misfits[entry] = value
+            found["others"].append(f"{entry} is {in_words(value)} instead of {in_words(place)}")
     used = {sources[entry] for entry in state if not re.match(kind.fresh, entry)}
-    for name in tensors.keys() - used:
+    for name in sorted(tensors.keys() - used):
         is_known = re.match(kind.unused, name.removeprefix(kind.prefix))
         found["unused" if is_known else "unknown"].append(name)
     problems = [
-        *(f"{e} is {in_words(v)} instead of {in_words(state[e])}" for e, v in misfits.items()),
+        *found["others"],
         *(f"{entry} is missing" for entry in found["missing"]),
-        *(f"{name} is unknown" for name in sorted(found["unknown"])),
+        *(f"{name} is unknown" for name in found["unknown"]),
         *_torn(state, values),
     ]
-    return Plan(
-        contents=contents,
-        kind=kind,
-        num_entries=len(state),
-        num_set=len(values),
-        values=values,
-        zeros=found["zeros"],
-        fresh=found["fresh"],
-        unused=sorted(found["unused"]),
-        misfits=misfits,
-        problems=problems,
-    )
+    left = {name: found[name] for name in ("zeros", "fresh", "unused")}
+    return Plan(contents, kind, len(state), len(values), values, problems=problems, **left)
 
 
 def recognised(contents: Contents) -> str:
@@ -216,9 +193,7 @@ def _kind_of(model: nn.Module, contents: Contents) -> Kind:
     if names := record_of(model).author_names:
         beginning, prefix = names
         return Kind(
-            "of its author",
-            prefix=prefix,
-            source=lambda entry: entry.removeprefix(beginning),
+            "of its author", prefix=prefix, source=lambda each: each.removeprefix(beginning)
         )
     what = recognised(contents) or f"with names such as {_some(list(contents.tensors))}"
     raise InputError(
@@ -227,33 +202,25 @@ def _kind_of(model: nn.Module, contents: Contents) -> Kind:
     )
 
 
-def _adapted(tensor: Tensor, place: Tensor, *, is_stem: bool) -> Tensor:
-    """A file's tensor for its place; only first convolutions may have other input channels.
+def _as_stem(tensor: Tensor, place: Tensor) -> Tensor:
+    """A first convolution (C, 3, k, k) for images of one or four channels, others as they are.
 
-    One input channel gets the mean over the file's three; a fourth one behind these gets it too.
-
-    Args:
-        tensor: (C, 3, k, k) where it is adapted.
-        place: (C, 1, k, k) or (C, 4, k, k).
-        is_stem: whether it may be adapted.
+    One channel gets the mean over the file's three; a fourth one behind these gets it too.
     """
-    if not is_stem or tensor.dim() != 4 or place.dim() != 4 or tensor.shape == place.shape:
-        return tensor
-    if tensor.shape[1] != 3 or place.shape[1] not in INPUT_CHANNELS:
+    channels = place.shape[1] if place.dim() == tensor.dim() == 4 and tensor.shape[1] == 3 else 3
+    if channels not in (1, 4):
         return tensor
     mean = tensor.float().mean(1, keepdim=True)
-    return mean if place.shape[1] == 1 else torch.cat([tensor.float(), mean], 1)
+    return mean if channels == 1 else torch.cat([tensor.float(), mean], 1)
 
 
 def _torn(state: Mapping[str, Tensor], values: Mapping[str, Tensor]) -> Iterator[str]:
     """Entries that share one parameter but would get different values."""
-    shared: dict[int, list[str]] = defaultdict(list)
-    for entry in values:
-        shared[id(state[entry])].append(entry)
-    for first, *others in shared.values():
-        for other in others:
-            if not torch.equal(values[first], values[other]):
-                yield f"{first} and {other} are one in the network but differ in the file"
+    shared: dict[int, str] = {}
+    for other, value in values.items():
+        first = shared.setdefault(id(state[other]), other)
+        if first != other and not torch.equal(values[first], value):
+            yield f"{first} and {other} are one in the network but differ in the file"
 
 
 def _under(entry: str, parts: tuple[str, ...]) -> bool:

@@ -10,21 +10,23 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rgbt.checkpoints.kinds import CMNEXT, KINDS, TEMPORAL
-from rgbt.checkpoints.read import NOTE
+from rgbt.checkpoints.files import NOTE
+from rgbt.checkpoints.kinds import CMNEXT, KINDS
 from rgbt.checks import InputError, check_choice
 from rgbt.files.atomic import replacing
 
-FORMATS = ("safetensors", "released", "released_temporal")
+FORMATS = ("safetensors", "released")
 
 Note = Mapping[str, str]
 """The note of an export: network, inputs and run."""
 
-WRAPPED = {"mask2former": "state_dict", "semseg": "state_dict", "cmx": "model"}
-"""Family -> key under which its releases put the weights; others have them at the top."""
-
-PREFIXES = {"mask2former": "network.", "semseg": "module.", "pspnet": "module.trgb_segnet."}
-"""Family -> before every released name, where there is something."""
+RELEASES = {
+    **{"mask2former": ("state_dict", "network."), "semseg": ("state_dict", "module.")},
+    **{"cmx": ("model", ""), "pspnet": ("", "module.trgb_segnet.")},
+    **dict.fromkeys(("cmnext", "rtfnet", "mfnet", "external"), ("", "")),
+}
+"""Family -> key under which its releases put the weights ("": at the top), and what is before every
+name. HeatNet's code loads the file of a PSPNet with no_conf, without discriminators."""
 
 EXTERNAL_PREFIX = "network."
 """Before the names of a network from elsewhere (`rgbt.models.external.network`)."""
@@ -33,74 +35,40 @@ CLASS_WEIGHT = "sem_seg_head.predictor.class_embed.weight"
 NO_OBJECT = 0.1
 """Last of the class weights of the released loss of CRM."""
 
-REMARKS = {
-    "pspnet": (
-        "the file has no entries under module.critics., because a discriminator is not part of "
-        "this network; HeatNet's code loads it with no_conf, without critics"
-    )
-}
-"""Family -> what the authors' code needs to know."""
-
 
 def convention_of(layout: str, family: str) -> tuple[str, ...]:
     """How the authors' code feeds and evaluates the network that a file of a layout is for."""
-    if layout == "safetensors" or family not in KINDS or not KINDS[family]:
+    if layout == "safetensors" or not KINDS.get(family):
         return ()
-    kind = TEMPORAL if layout == "released_temporal" else KINDS[family][family == "cmx"]
-    return (*kind.convention, *(("model.fusion=max",) if family == "mask2former" else ()))
+    fusion = ("model.fusion=max",) if family == "mask2former" else ()
+    return (*KINDS[family][family == "cmx"].convention, *fusion)
 
 
-def save(
-    path: Path, layout: str, family: str, state: Mapping[str, Tensor], note: Note
-) -> str | None:
-    """Write weights under a temporary name and rename it.
+def save(path: Path, layout: str, family: str, state: Mapping[str, Tensor], note: Note) -> None:
+    """Write the weights of a network, "" for the `family` of one from elsewhere, to a new file.
 
-    Args:
-        path: of the new file.
-        layout: one of `FORMATS`; "released_temporal" is CMX as the temporal release has it.
-        family: of the network, "" for one from elsewhere.
-        state: its entries.
-        note: the note of the file, stored if the format has a place for it.
-
-    Returns:
-        a remark about the file, or none.
-
-    Raises:
-        InputError: the file exists, the format is unknown or does not fit the network.
+    `layout` is one of `FORMATS`; the `note` is stored if it has a place for it. InputError: the
+    file exists, the format is unknown or does not fit the network.
     """
     check_choice("format", layout, FORMATS)
     if path.exists():
         raise InputError(f"out={path} already exists; remove it or choose another file name.")
     is_safe = layout == "safetensors"
-    content = _safetensors(state, note) if is_safe else payload(layout, family, state, note)
+    content = _safetensors(state, note) if is_safe else released(family, state, note)
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as file:
         if isinstance(content, bytes):
             file.write(content)
         else:
             torch.save(content, file)
-    return REMARKS.get(family) if layout == "released" else None
 
 
-def payload(layout: str, family: str, state: Mapping[str, Tensor], note: Note) -> dict[str, Any]:
-    """The value that torch.save writes for a released layout; arguments as of `save`.
-
-    Raises:
-        InputError: there is no such layout for this family.
-    """
-    if layout == "released_temporal" and family == "cmx":
-        voting = torch.zeros(
-            *(len(state["decode_head.linear_pred.weight"]) * n for n in (1, 2)), 3, 3
-        )
-        unused = {"voting.weight": voting, "voting.bias": voting[:, 0, 0, 0].clone()}
-        return OrderedDict(state, **unused)  # a convolution that it never uses
-    whole = (*PREFIXES, "cmx", "cmnext", "rtfnet", "mfnet", "external")
-    if layout == "released_temporal" or family not in whole:
-        raise InputError(
-            f"format={layout} does not exist for {family or 'this network'}; use "
-            "format=safetensors."
-        )
-    prefix = PREFIXES.get(family, "")
+def released(family: str, state: Mapping[str, Tensor], note: Note) -> dict[str, Any]:
+    """What torch.save writes for the authors' code; arguments and errors as of `save`."""
+    if family not in RELEASES:
+        what = family or "this network"
+        raise InputError(f"format=released does not exist for {what}; use format=safetensors.")
+    wrapper, prefix = RELEASES[family]
     named = OrderedDict((prefix + _released_name(family, key), each) for key, each in state.items())
     if family == "mask2former":
         for key, value in state.items():
@@ -108,15 +76,11 @@ def payload(layout: str, family: str, state: Mapping[str, Tensor], note: Note) -
                 named[prefix + key.replace("bias_table", "index")] = position_index(len(value))
         named[f"{prefix}criterion.empty_weight"] = torch.ones(len(state[CLASS_WEIGHT]))
         named[f"{prefix}criterion.empty_weight"][-1] = NO_OBJECT
-    if family not in WRAPPED:
+    if not wrapper:
         return named
     steps = {"global_step": int(note.get("step", 0)), "pytorch-lightning_version": "1.9.2"}
-    return {
-        "epoch": 0,
-        **(steps if family == "mask2former" else {}),
-        WRAPPED[family]: named,
-        NOTE: dict(note),
-    }
+    more = steps if family == "mask2former" else {}
+    return {"epoch": 0, **more, wrapper: named, NOTE: dict(note)}
 
 
 def _released_name(family: str, entry: str) -> str:
@@ -126,13 +90,9 @@ def _released_name(family: str, entry: str) -> str:
 
 
 def position_index(rows: int) -> Tensor:
-    """Row of Swin's bias table for every pair of tokens of a window.
+    """Row of Swin's bias table, of (2 w - 1)^2 rows, for every pair of tokens of a window.
 
-    Args:
-        rows: of the table, (2 w - 1)^2 for windows of w x w tokens.
-
-    Returns:
-        (w^2, w^2) int64: (dy + w - 1) (2 w - 1) + dx + w - 1, first token less second.
+    (w^2, w^2) int64: (dy + w - 1) (2 w - 1) + dx + w - 1, first token less second.
     """
     span = round(rows**0.5)
     side = (span + 1) // 2

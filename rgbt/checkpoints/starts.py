@@ -6,7 +6,8 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any
+
+from pydantic import TypeAdapter
 
 from rgbt.files.yaml_files import read_yaml
 
@@ -37,22 +38,15 @@ class Recipe:
         return tuple(n for n in experiments if any(fnmatchcase(n, each) for each in patterns))
 
 
-def _frozen(entry: dict[str, Any]) -> dict[str, Any]:
-    return {key: tuple(each) if isinstance(each, list) else each for key, each in entry.items()}
-
-
 _TABLE = read_yaml(Path(__file__).with_name("starts.yaml"))
-STARTS = tuple(Start(**_frozen(each)) for each in _TABLE["files"])
-RECIPES = tuple(Recipe(**_frozen(each)) for each in _TABLE["recipes"])
+STARTS: tuple[Start, ...] = TypeAdapter(tuple[Start, ...]).validate_python(_TABLE["files"])
+RECIPES: tuple[Recipe, ...] = TypeAdapter(tuple[Recipe, ...]).validate_python(_TABLE["recipes"])
 
 
 def start_lines(file: str, digest: str, experiments: Collection[str]) -> Iterator[tuple[str, str]]:
     """Which published file a file is, and what starts from it, as lines of (word, text).
 
-    Args:
-        file: its name.
-        digest: its SHA-256 in hexadecimal.
-        experiments: names of all experiments.
+    `digest` is its SHA-256 in hexadecimal; `experiments` are the names of all of them.
     """
     for start in STARTS:
         is_same = bool(start.digest) and digest.startswith(start.digest)
@@ -61,10 +55,8 @@ def start_lines(file: str, digest: str, experiments: Collection[str]) -> Iterato
         if is_same or not start.digest:
             yield "published", f"{start.file}: {start.trained_on} ({start.origin})"
         else:
-            text = f"not the published {file}, whose SHA-256 begins with {start.digest}"
-            yield "remark", text
-        for model in start.models:
-            yield "fits", f"model={model}"
+            yield "remark", f"not the published {file}, whose SHA-256 begins with {start.digest}"
+        yield from (("fits", f"model={model}") for model in start.models)
         for recipe in RECIPES:
             if start.file in recipe.files:
                 yield "recipes", ", ".join(recipe.named(experiments))

@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import collections.abc
 import functools
+import importlib
 import inspect
 import typing
 from collections.abc import Collection, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -118,6 +120,14 @@ def checked_nodes(
     return found
 
 
+def objects(parts: Mapping[str, Any], collaborators: Mapping[str, Any]) -> dict[str, Any]:
+    """The objects of components by name, and all other values as they are."""
+    return {
+        name: part.build(**collaborators) if isinstance(part, Component) else part
+        for name, part in parts.items()
+    }
+
+
 def build(node: Any, **collaborators: Any) -> Any:
     """The object of a node, checked and built at once (see `Component`)."""
     return Component.from_node(node).build(**collaborators)
@@ -147,6 +157,9 @@ def _authorized(target: Any, path: str) -> functools.partial[Any]:
 @functools.cache
 def _partial(target: str) -> functools.partial[Any]:
     """Cached, because Hydra needs 2 ms and a configuration has 40 targets."""
+    if target.startswith("rgbt."):  # Hydra would look for an attribute of each package first
+        with suppress(ImportError):
+            importlib.import_module(target.rpartition(".")[0])
     partial: functools.partial[Any] = instantiate({"_target_": target, "_partial_": True})
     return partial
 

@@ -2,15 +2,13 @@
 
     rgbt check dataset=mfnet dataset.root=...
 
-Every listed sample is read once, in threads. Progress goes to stderr, the report to stdout. Exit
-code 0: no problem, 1: problems, 2: wrong input.
+Progress goes to stderr, the report to stdout. Exit code 0: no problem, 1: problems, 2: wrong input.
 """
 
 from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import combinations
@@ -18,33 +16,24 @@ from itertools import combinations
 import numpy as np
 from omegaconf import DictConfig
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import track
 
 from rgbt.checks import InputError
 from rgbt.config.command import command
 from rgbt.config.component import build
-from rgbt.data.file_dataset import FileDataset
+from rgbt.data.file_dataset import FileDataset, SplitNames
 from rgbt.data.labels import PixelCounts, label_pixels
 from rgbt.tables import TextTable
 from rgbt.terminal import plain_text, print_rich, rich_table
 
-Names = tuple[str, ...]
-
 
 @dataclass(frozen=True)
 class SplitReport:
-    """One split.
+    """One split: numbers of names by kind, and what is in its images.
 
-    Attributes:
-        names: lines of the list, or frames of the folders.
-        read: names that could be read, each counted once.
-        unlabelled: of these, those without a label.
-        day: names of day images without mirrored copies.
-        night: names of night images without mirrored copies.
-        mirrored: names of mirrored copies.
-        sizes: (height, width) -> number of images.
-        pixels: (K + 1,) pixels per class; the last are ignored.
-        images: (K + 1,) images in which a class occurs.
+    `read` and `unlabelled` count each name once; `day` and `night` leave out mirrored copies.
+    `sizes` has the number of images of each (height, width); `pixels` and `images` (K + 1,) the
+    pixels of each class and the images that show it, ignored pixels last.
     """
 
     names: int
@@ -76,21 +65,14 @@ def main(config: DictConfig, _overrides: list[str]) -> int:
             f"dataset: {type(dataset).__name__} cannot be checked, because it is not a "
             "rgbt.data.file_dataset.FileDataset."
         )
-    with Progress(console=Console(stderr=True)) as progress:
-        task = progress.add_task("reading", total=None)
-
-        def advance(done: int, total: int) -> None:
-            progress.update(task, completed=done, total=total)
-
-        report = check_dataset(dataset, num_threads=os.cpu_count() or 1, advance=advance)
-    print_rich(plain_text(f"{dataset.name} ({dataset.title}): {dataset.root}"))
+    report = check_dataset(dataset, num_threads=os.cpu_count() or 1, is_shown=True)
+    print_rich(plain_text(f"{dataset.name} ({type(dataset).__name__}): {dataset.root}"))
     for table in tables(dataset, report):
         print_rich(rich_table(table))
-    for kind, lines in (("note", report.notes), ("problem", report.problems)):
-        for line in lines:
-            print_rich(plain_text(f"{kind}: {line}"))
-    problems, notes = len(report.problems), len(report.notes)
-    print_rich(plain_text(f"{problems} problem(s), {notes} note(s)."))
+    lines = [f"note: {each}" for each in report.notes]
+    lines += [f"problem: {each}" for each in report.problems]
+    lines += [f"{len(report.problems)} problem(s), {len(report.notes)} note(s)."]
+    print_rich(plain_text("\n".join(lines)))
     return 1 if report.problems else 0
 
 
@@ -118,19 +100,10 @@ def tables(dataset: FileDataset, report: DatasetReport) -> tuple[TextTable, Text
 
 
 def check_dataset(
-    dataset: FileDataset,
-    *,
-    num_threads: int = 4,
-    advance: Callable[[int, int], object] = lambda *_: None,
+    dataset: FileDataset, *, num_threads: int = 4, is_shown: bool = False
 ) -> DatasetReport:
-    """Read every sample of the splits and report problems.
-
-    Args:
-        dataset: reads files.
-        num_threads: files decoded at a time.
-        advance: called with the number of samples that have been read, and that of all.
-    """
-    lists: dict[str, Names] = {}
+    """Read every sample of the splits, in threads, and report problems; progress goes to stderr."""
+    lists: dict[str, tuple[str, ...]] = {}
     problems: list[str] = []
     notes: list[str] = []
     for split in dataset.splits:
@@ -148,11 +121,13 @@ def check_dataset(
         pixels = None if label is None else label_pixels(label, dataset.num_classes)
         return sample.thermal.shape, pixels
 
-    listed = sorted(set().union(*lists.values()))
-    contents = {}
+    every = tuple(dict.fromkeys(name for names in lists.values() for name in names))
+    contents: dict[str, tuple[tuple[int, ...], PixelCounts | None]] = {}
+    console = Console(stderr=True)
     with ThreadPoolExecutor(num_threads) as pool:
-        for done, (name, found) in enumerate(zip(listed, pool.map(read, listed), strict=True), 1):
-            advance(done, len(listed))
+        results = pool.map(read, every)
+        shown = track(results, "reading", len(every), console=console, disable=not is_shown)
+        for name, found in zip(every, shown, strict=True):
             if isinstance(found, str):
                 problems.append(found)
             else:
@@ -162,14 +137,14 @@ def check_dataset(
         own = [contents[name] for name in dict.fromkeys(names) if name in contents]
         labelled = [pixels for _, pixels in own if pixels is not None]
         counts = np.array(labelled, np.int64).reshape(-1, dataset.num_classes + 1)
-        times = Counter(_time_of(dataset, name) for name in names if not _mirrored(dataset, name))
+        kinds = Counter(_kind_of(dataset, name) for name in names)
         splits[split] = SplitReport(
             names=len(names),
             read=len(own),
             unlabelled=len(own) - len(labelled),
-            day=times["day"],
-            night=times["night"],
-            mirrored=sum(_mirrored(dataset, name) for name in names),
+            day=kinds["day"],
+            night=kinds["night"],
+            mirrored=kinds["mirrored"],
             sizes=dict(Counter(hw for hw, _ in own)),
             pixels=counts.sum(0),
             images=(counts > 0).sum(0),
@@ -189,12 +164,10 @@ def check_dataset(
     return DatasetReport(splits, tuple(problems), tuple(notes))
 
 
-def _mirrored(dataset: FileDataset, name: str) -> bool:
-    return dataset.mirrored is not None and name.endswith(dataset.mirrored)
-
-
-def _time_of(dataset: FileDataset, name: str) -> str:
-    """Either "day" or "night", or "" if that is unknown."""
+def _kind_of(dataset: FileDataset, name: str) -> str:
+    """Either "mirrored", "day", "night", or "" if that is unknown."""
+    if dataset.mirrored is not None and name.endswith(dataset.mirrored):
+        return "mirrored"
     try:
         nights = dataset.nights((name,))
     except InputError:  # reading it reports the problem
@@ -208,26 +181,26 @@ def _uneven(dataset: FileDataset, splits: dict[str, SplitReport]) -> list[str]:
     notes = []
     for split, r in whole.items():
         others = [other for name, other in whole.items() if name != split]
-        times = [
+        lacking = [
             f"{time} images"
             for time, own in (("day", r.day), ("night", r.night))
             if not own and any(getattr(other, time) for other in others)
         ]
         labelled = r.unlabelled < r.read
-        classes = [
+        lacking += [
             f"'{name}'"
             for index, name in enumerate(dataset.classes)
             if labelled and not r.pixels[index] and any(other.pixels[index] for other in others)
         ]
-        if times or classes:
+        if lacking:
             notes.append(
-                f"split {split} has no {', '.join([*times, *classes])}, which other splits have; "
-                "a score of it says nothing about them."
+                f"split {split} has no {', '.join(lacking)}, which other splits have; a score of "
+                "it says nothing about them."
             )
     return notes
 
 
-def _list_problems(dataset: FileDataset, lists: dict[str, Names]) -> list[str]:
+def _list_problems(dataset: FileDataset, lists: SplitNames) -> list[str]:
     """Names listed twice, of another time of day, mirrored for testing, or in two splits.
 
     Two splits may share names if one is a part of the other by name, as "test_day" is of "test",
@@ -237,25 +210,21 @@ def _list_problems(dataset: FileDataset, lists: dict[str, Names]) -> list[str]:
     of_source = {dataset.splits[split]: split for split in lists}
     lists = {split: lists[split] for split in of_source.values()}
     for split, names in lists.items():
-        problems += [
-            f"split {split} lists '{name}' {count} times."
-            for name, count in Counter(names).items()
-            if count > 1
-        ]
         other = {"day": "night", "night": "day"}.get(split.rpartition("_")[2])
-        problems += [
-            f"split {split} lists '{name}', which is a {other} image."
-            for name in dict.fromkeys(names)
-            if other and _time_of(dataset, name) == other
-        ]
-        flipped = [name for name in names if _mirrored(dataset, name)]
+        kinds = {name: _kind_of(dataset, name) for name in names}
+        for name, count in Counter(names).items():
+            if count > 1:
+                problems.append(f"split {split} lists '{name}' {count} times.")
+            if kinds[name] == other:
+                problems.append(f"split {split} lists '{name}', which is a {other} image.")
+        flipped = [name for name in names if kinds[name] == "mirrored"]
         if flipped and "train" not in split:
             problems.append(f"split {split} lists {len(flipped)} mirrored copies: '{flipped[0]}'.")
     for one, other in combinations(lists, 2):
         words, other_words = set(one.split("_")), set(other.split("_"))
         is_part = words <= other_words or other_words <= words
         both = sorted(set(lists[one]) & set(lists[other]))
-        if both and not is_part and set(dataset.sources(one)).isdisjoint(dataset.sources(other)):
+        if both and not is_part:
             problems.append(
                 f"splits {one} and {other} share {len(both)} names; the first is '{both[0]}'."
             )

@@ -22,21 +22,10 @@ TestedHead = Literal["own", "source", "target"]
 class Domain:
     """One domain: its training images, their view and their labels.
 
-    Attributes:
-        split: of the data set.
-        view: images of a pair that the network gets; null leaves the choice to the network.
-        head: the network's head for this domain; null where it has one for all.
-        labels: "given", those of the data set; "none", none at all, whatever the data set has; or a
-            folder that `rgbt predict ... pseudo_labels=true` wrote.
-            "experiment:NAME/best.pt" predicts them with that checkpoint of the run of the
-            experiment NAME, with the same seed and on the same data, which is trained first.
-        teacher_view: the same for the network of "experiment:..."; null for other labels.
-        threshold: least confidence of a pixel that keeps its label of "experiment:..."; 0 for all
-            else.
-        confidence: whether the loss of a pixel is weighted by the confidence of its label.
-
-    Raises:
-        InputError: confidences of labels that have none.
+    conf/domains/one.yaml describes each setting. `threshold` and `teacher_view` belong to labels
+    "experiment:NAME/best.pt", which are predicted with that checkpoint of the run of the experiment
+    NAME, with the same seed and on the same data, which is trained first. InputError: confidences
+    of labels that have none.
     """
 
     split: Text
@@ -56,12 +45,10 @@ class Domain:
 
     def requires(self, key: str) -> Iterator[Requirement]:
         """The requirements that follow from the settings of the domain at `key`."""
-        if self.view is not None:
-            yield Requirement("scheme", "shows_views", True, f"{key}.view={self.view}")
-            yield Requirement("model", "views", (self.view,), f"{key}.view={self.view}")
-        if self.head is not None:
-            yield Requirement("scheme", "shows_views", True, f"{key}.head={self.head}")
-            yield Requirement("model", "heads", (self.head,), f"{key}.head={self.head}")
+        for each, value in (("view", self.view), ("head", self.head)):
+            if value is not None:
+                yield Requirement("scheme", "shows_views", True, f"{key}.{each}={value}")
+                yield Requirement("model", f"{each}s", (value,), f"{key}.{each}={value}")
         if self.teacher_view is not None:
             setting = f"{key}.teacher_view={self.teacher_view}"
             yield Requirement(f"network of {key}.labels", "views", (self.teacher_view,), setting)
@@ -73,18 +60,8 @@ class Domain:
 class Domains:
     """The domains of a run, and which head predicts which image in evaluation.
 
-    Attributes:
-        source: labelled.
-        target: null for ordinary training on the source alone.
-        target_is: which images belong to the target domain: those seen in the target's view
-            ("view": RGB to thermal), or those of the night ("night": day to night); null without
-            heads of their own.
-        tested_head: the head that predicts an image in evaluation: "own", that of its domain, or
-            "source", one head for all. The thesis' day-to-night scripts score the night images
-            with the head for the day ("source").
-
-    Raises:
-        InputError: heads that cannot be distinguished, or settings without effect.
+    conf/domains/one.yaml describes each setting. The target is that of its view (RGB to thermal) or
+    of the night (day to night). InputError: heads that cannot be distinguished.
     """
 
     source: Domain
@@ -98,17 +75,16 @@ class Domains:
                 "domains.source.labels=none, but every scheme requires labels of the source."
             )
         heads, target = self.heads, self.target
-        is_two = len(heads) == 2
         if target is not None and (self.source.head is None) != (target.head is None):
             raise InputError(
                 "domains: source and target must both have a head, or neither; got "
                 f"{self.source.head or 'null'} and {target.head or 'null'}."
             )
-        if (self.target_is is not None) != is_two or (self.tested_head == "source" and not is_two):
+        is_two, selects = len(heads) == 2, self.tested_head == "source"
+        if (self.target_is is not None) != is_two or (selects and not is_two):
             raise InputError(
                 f"domains.target_is={self.target_is or 'null'} and domains.tested_head="
-                f"{self.tested_head} with {len(heads)} heads: target_is selects one of two heads "
-                "and is null otherwise; tested_head=source requires two heads."
+                f"{self.tested_head} with {len(heads)} heads: both select one of two heads."
             )
         if self.target_is == "view" and self.named["target"].view in (None, self.source.view):
             raise InputError(
@@ -143,7 +119,8 @@ class Domains:
     @property
     def heads(self) -> tuple[str, ...]:
         """Names of the heads, the source's first; () if the network has one for all."""
-        return tuple(dict.fromkeys(head for head in self._own_heads() if head is not None))
+        heads = (domain.head for domain in self.named.values())
+        return tuple(dict.fromkeys(head for head in heads if head is not None))
 
     def heads_in_words(self, choice: TestedHead) -> str:
         """Which head predicts which images, for messages; "" if there is one for all."""
@@ -157,19 +134,15 @@ class Domains:
         return f"{target} for {self.named['target'].view}, {source} otherwise"
 
     def head_of(self, view: View, night: bool | None, choice: TestedHead) -> str | None:
-        """The head that predicts an image.
+        """Name of the head that predicts an image; None if the network has one head for all.
 
         Args:
             view: the images that the network gets.
             night: whether it was taken at night; None if the data set does not state it.
             choice: "own", or the domain of the head that predicts all images.
 
-        Returns:
-            its name; None if the network has one head for all.
-
         Raises:
-            InputError: the network has one head only; or no head can be chosen because
-                the data set does not state the time of day.
+            InputError: `choice` of one head only; or the time of day decides, and is unknown.
         """
         heads = self.heads
         if len(heads) < 2:
@@ -189,6 +162,3 @@ class Domains:
                 )
             choice = "target" if night else "source"
         return self.named[choice].head
-
-    def _own_heads(self) -> tuple[str | None, ...]:
-        return tuple(domain.head for domain in self.named.values())

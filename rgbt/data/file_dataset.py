@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Mapping
+import os
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError, check_choice, nearest
-from rgbt.data.files import is_there, within
-from rgbt.data.images import PairPattern, PairReader, Range, check_size
+from rgbt.data.files import read_names, within
+from rgbt.data.images import PairReader, Range, check_size
 from rgbt.data.labels import LabelCodes
 from rgbt.data.patterns import Frame, Patterns
-from rgbt.data.splits import SplitRule
 from rgbt.requirements import Record
 from rgbt.types import Sample
 
@@ -27,37 +27,25 @@ SplitNames = Mapping[str, tuple[str, ...]]
 class FileDataset:
     """A reader of files that never resizes, augments or remaps and refuses inexact content.
 
-    Subclasses define the attributes below, `frame` and `nights`, and the members for `rgbt check`
-    if they differ.
-
-    Args:
-        root: its folder.
-        name: used in messages and tables.
-        num_classes: number of classes; other nodes of the configuration interpolate it.
-        classes: their names, in order of the class index.
-        palette: their (red, green, blue) colours, 0..255.
-        unscored: classes that are counted but left out of every mean over classes; (): every class
-            counts, as in the published tables.
-        background: classes that are no object, see `rgbt.dataset.LabelledDataset`.
+    A subclass defines `frame` and `nights`, and sets the attributes below. Its arguments are the
+    keys of its file in conf/dataset, which describes each; InputError: no such root, another
+    layout, or settings that do not fit each other.
 
     Attributes:
         images: how its images, and new ones of any folder, are read.
         codes: the meaning of label values.
-        patterns: of the paths of its files, where they follow patterns.
-        rule: divides its frames into splits, where a subclass does not.
-
-    Raises:
-        InputError: no such folder; numbers of classes, names and colours that differ; or a class
-            that is not one.
+        patterns: of the paths of its files.
+        splits: split -> its list, or the pattern of its files.
+        splits_key: setting that names the splits, for messages.
+        mirrored: suffix of the names of mirrored copies, which only training splits may list.
     """
 
     images: PairReader
     codes: LabelCodes
     patterns: Patterns
-    rule: SplitRule
-
+    splits: dict[str, str]
     splits_key = "dataset.splits"
-    """Setting that names the splits, for messages."""
+    mirrored: str | None = None
 
     def __init__(  # noqa: PLR0913 - settings of every data set
         self,
@@ -79,10 +67,8 @@ class FileDataset:
                     f"dataset.num_classes is {num_classes} but dataset.{key} has {len(values)} "
                     "entries; both numbers must be equal."
                 )
-        self.name = name
-        self.num_classes = num_classes
-        self.classes = classes
-        self.palette = palette
+        self.name, self.num_classes = name, num_classes
+        self.classes, self.palette = classes, palette
         self.check_classes(unscored=unscored, background=background)
         self.unscored, self.background = unscored, background
         self._names: dict[str, tuple[str, ...]] = {}
@@ -90,16 +76,8 @@ class FileDataset:
     @property
     def record(self) -> Record:
         """The number of its classes, and what the first one is."""
-        is_background = self.classes[0] in self.background
-        return Record(
-            num_classes=self.num_classes,
-            first_class="background" if is_background else "object",
-        )
-
-    @property
-    def splits(self) -> dict[str, str]:
-        """Split -> its list, or the pattern of its files."""
-        return self.rule.splits
+        first = self.classes[0] in self.background
+        return Record(num_classes=self.num_classes, first_class="background" if first else "object")
 
     def check_classes(self, **settings: tuple[str, ...]) -> None:
         """Refuse settings that name what is not one of its classes (InputError)."""
@@ -116,7 +94,7 @@ class FileDataset:
             )
         self.patterns = Patterns.of(rgb, thermal, label)
         self.images = PairReader(
-            layouts=(PairPattern(rgb, thermal),),
+            layouts=(self.patterns._replace(label=None),),
             thermal_range=limits,
             advice="dataset.thermal with the pattern of dataset.rgb reads a fourth channel as "
             "thermal; values that are no grey levels of 8 bits require dataset.thermal_range="
@@ -125,7 +103,19 @@ class FileDataset:
 
     def listed(self, split: str) -> tuple[str, ...]:
         """Names of a known split, in order; () if there are none, InputError if unreadable."""
-        return self.rule.names(split)
+        return self.lines(split)
+
+    def lines(self, split: str) -> tuple[str, ...]:
+        """Lines of the list of a split, a file below the root or anywhere; () without a file."""
+        path = self.root / Path(self.splits[split]).expanduser()
+        return read_names(path, f"{self.splits_key}.{split}") if os.path.lexists(path) else ()
+
+    def check_split(self, split: str) -> None:
+        """Refuse a split that is not one of `splits`."""
+        if split not in self.splits:
+            raise InputError(
+                f"{self.splits_key} has no split '{split}'; {nearest(split, self.splits)}."
+            )
 
     def has(self, split: str) -> bool:
         """Whether any sample of `split` exists; InputError if the split is unknown."""
@@ -151,88 +141,64 @@ class FileDataset:
         """Whether each image was taken at night; None if the data set does not state it."""
         raise NotImplementedError
 
-    def check_split(self, split: str) -> None:
-        """Refuse a split that is not one of `splits`."""
-        if split not in self.splits:
-            raise InputError(
-                f"{self.splits_key} has no split '{split}'; {nearest(split, self.splits)}."
-            )
-
     def files(self, name: str) -> tuple[Path, ...]:
         """Every file that `read` opens: RGB, thermal (if it has its own) and label (if any)."""
-        frame = self.frame(name)
-        paths = (frame.rgb, frame.thermal, frame.label)
-        return tuple(dict.fromkeys(path for path in paths if path is not None))
-
-    def existing(self, what: str, path: Path, name: str) -> Path:
-        """`path`, one file of the sample `name`; InputError if it is missing or outside `root`."""
-        if not is_there(path):
-            raise InputError(
-                f"'{name}': its {what} {path} is missing; restore it, or skip unreadable frames "
-                "with data.on_error=skip."
-            )
-        return within(path, self.root)
+        return tuple(dict.fromkeys(path for path in self.frame(name)[2:] if path is not None))
 
     def read(self, name: str) -> Sample:
-        """The sample called `name`, decoded.
-
-        Returns:
-            Sample with rgb (H, W, 3), thermal (H, W), label (H, W) or None, all uint8.
+        """The sample called `name`: rgb (H, W, 3), thermal (H, W), label (H, W) or None, all uint8.
 
         Raises:
             InputError: no such name, a file is missing, leads out of the root, cannot be decoded,
                 has other channels, bits or size than expected, or the label holds a value that has
                 no meaning.
         """
-        pair, label = self.pair(name), self.label(name)
+        frame = self.frame(name)
+        rgb, thermal = (within(path, self.root) for path in frame[2:4])
+        pixels, values = self.images.whole(name, rgb, thermal)
+        label = self.codes.read(within(frame.label, self.root)) if frame.label else None
         if label is not None:
-            check_size(pair.rgb, "its label", label, name, self.frame(name).label)
-        return replace(pair, label=label)
+            label = self.images.cut(self.fitted(label, frame, values.shape), name)
+            label = np.ascontiguousarray(label)
+        return replace(self.images.sample(name, pixels, values, thermal), label=label)
 
     def pair(self, name: str) -> Sample:
         """The images of `read` alone, without the label; InputError as there."""
-        frame = self.frame(name)
-        rgb = self.existing("RGB image", frame.rgb, name)
-        return self.images.read(name, rgb, self.existing("thermal image", frame.thermal, name))
+        return self.images.read(name, *(within(path, self.root) for path in self.frame(name)[2:4]))
 
     def label(self, name: str) -> NDArray[np.uint8] | None:
         """The label of `read` alone, (H, W) uint8, or None; InputError as there."""
         path = self.frame(name).label
-        return None if path is None else self.codes.read(self.existing("label", path, name))
+        return None if path is None else self.codes.read(within(path, self.root))
+
+    def fitted(
+        self, label: NDArray[np.uint8], frame: Frame, hw: tuple[int, ...]
+    ) -> NDArray[np.uint8]:
+        """The label of a whole frame of this size, not cut; InputError if it does not fit."""
+        check_size(hw, "its label", label, frame.name, frame.label)
+        return label
 
     def decoding(self) -> dict[str, Any]:
         """Settings that change what `read` makes of the files."""
-        keys = ("layouts", "thermal_range", "most_tint", "crop")
-        settings = {key: getattr(self.images, key) for key in keys}
-        return {"codes": sorted(self.codes.codes.items()), **settings}
+        settings = {
+            key: getattr(self.images, key) for key in ("thermal_range", "most_tint", "crop")
+        }
+        layouts = [str(each) for each in self.images.layouts]
+        return {"codes": sorted(self.codes.codes.items()), "layouts": layouts, **settings}
 
     def fingerprint(self) -> str:
         """See `hash_of_files`; splits that are not there are empty."""
         return hash_of_files({split: self.listed(split) for split in self.splits}, self.files)
 
-    # Members for `rgbt check`.
-
-    @property
-    def title(self) -> str:
-        """The layout, for a headline."""
-        return type(self).__name__
-
-    mirrored: str | None = None
-    """Suffix of the names of mirrored copies, which only training splits may list."""
-
     def repeats(self, split: str) -> bool:
         """Whether a split only repeats images of other splits, and need not exist."""
         return split.endswith(("_day", "_night"))
 
-    def sources(self, split: str) -> tuple[str, ...]:
-        """The source of a split; splits of one source may share names."""
-        return (self.splits[split],)
-
-    def unused(self, lists: SplitNames) -> Iterable[Path]:
+    def unused(self, lists: SplitNames) -> Collection[Path]:
         """Files of the layout that belong to no image of a split."""
         used = {path for names in lists.values() for name in names for path in self.files(name)}
         patterns = (pattern for pattern in self.patterns if pattern is not None)
-        return {match.path for each in patterns for match in each.files(self.root)} - used
+        return {path for each in patterns for path in each.files(self.root)} - used
 
     def own_problems(self, lists: SplitNames) -> list[str]:  # noqa: ARG002 - of subclasses
         """Further problems of names and files; no image is opened."""
@@ -243,9 +209,7 @@ class FileDataset:
         return []
 
 
-def hash_of_files(
-    splits: Mapping[str, tuple[str, ...]], files: Callable[[str], Iterable[Path]]
-) -> str:
+def hash_of_files(splits: SplitNames, files: Callable[[str], Iterable[Path]]) -> str:
     """SHA-256 in hexadecimal over the names of every split and the sizes of their files.
 
     Nothing is decoded and folders are left out, so that equal copies have equal fingerprints.

@@ -1,8 +1,4 @@
-"""Read bytes, lists, images and arrays, and refuse files that would be misread.
-
-Pillow decodes and verifies images. The thermal image may be in the alpha channel, so the four
-channels must not be processed as one image.
-"""
+"""Read bytes, lists, images and arrays, and refuse files that would be misread."""
 
 from __future__ import annotations
 
@@ -44,27 +40,23 @@ UNREADABLE = (
 
 
 def read_bytes(path: Path) -> bytes:
-    """Every byte of `path`.
-
-    Raises:
-        InputError: a missing file, a broken link, not a regular file, or an error of the system.
-    """
+    """Every byte; InputError for a missing or irregular file, or an error of the system."""
     try:
         if path.exists() and not path.is_file():  # a pipe would be waited for
             raise InputError(f"{path} is not a regular file; {LEFT_OUT}.")
         return path.read_bytes()
     except (FileNotFoundError, NotADirectoryError):
         link = f" (a link to {path.readlink()})" if path.is_symlink() else ""
-        raise InputError(f"{path} is missing{link}.") from None
+        raise InputError(f"{path} is missing{link}; {LEFT_OUT}.") from None
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror}); {LEFT_OUT}.") from error
 
 
 def read_names(path: Path, key: str) -> tuple[str, ...]:
-    """Stripped lines of a list file in order, without empty ones; `key` begins the messages.
+    """Stripped lines of a list file in order, without empty ones.
 
     Raises:
-        InputError: as `read_bytes`, not a text in UTF-8, or no line.
+        InputError: as `read_bytes`, not a text in UTF-8, or no line; `key` begins the message.
     """
     try:
         text = read_bytes(path).decode("utf-8-sig")
@@ -78,25 +70,11 @@ def read_names(path: Path, key: str) -> tuple[str, ...]:
     return names
 
 
-def is_there(path: Path) -> bool:
-    """Whether `path` exists; broken links and files without permission count too."""
-    try:
-        path.lstat()
-    except (FileNotFoundError, NotADirectoryError):
-        return False
-    except OSError:
-        return True
-    return True
-
-
 def within(path: Path, root: Path) -> Path:
-    """`path`, if it is below `root` after resolving all links.
+    """`path`, if it is below `root` after resolving all links; InputError if it is outside.
 
     A reader checks every file that it opens: a line of a list may contain "../..", and a link in a
     downloaded folder may lead anywhere. A missing file passes; `read_bytes` reports it.
-
-    Raises:
-        InputError: it is outside `root`.
     """
     home = _resolved(str(root))
     # Folders hold thousands of files: a folder is resolved once, and a file only if it is a link.
@@ -148,6 +126,12 @@ def opened(path: Path) -> tuple[Image.Image, int]:
     return image, bits
 
 
+def values_of(image: Image.Image) -> NDArray[Any]:
+    """(H, W) or (H, W, C) as decoded; sixteen bits in the order of this machine."""
+    array = np.asarray(image)
+    return array.astype(np.uint16) if image.mode.startswith("I;16") else array
+
+
 def decode(path: Path) -> NDArray[Any]:
     """An image as written, (H, W) or (H, W, C) in the order R, G, B, A; InputError as `opened`.
 
@@ -156,13 +140,7 @@ def decode(path: Path) -> NDArray[Any]:
     image: Image.Image = opened(path)[0]
     if image.mode == "P":
         image = image.convert("RGBA" if "transparency" in image.info else "RGB")
-    array = np.asarray(image)
-    return array.astype(np.uint16) if image.mode.startswith("I;16") else array
-
-
-def channels(image: NDArray[Any]) -> int:
-    """Channels of (H, W) or (H, W, C)."""
-    return 1 if image.ndim == 2 else image.shape[2]
+    return values_of(image)
 
 
 def decode_bytes(path: Path, number: int, advice: str) -> Array:
@@ -170,10 +148,11 @@ def decode_bytes(path: Path, number: int, advice: str) -> Array:
     image = decode(path)
     if image.dtype != np.uint8:
         raise InputError(f"{path}: expected 8 bits per channel, got {image.dtype}.")
-    if channels(image) != number:
+    channels = 1 if image.ndim == 2 else image.shape[2]
+    if channels != number:
         raise InputError(
             f"{path}: expected {number} channels (red, green, blue{', thermal' * (number == 4)}), "
-            f"got {channels(image)}; {advice}."
+            f"got {channels}; {advice}."
         )
     return image
 
@@ -189,10 +168,8 @@ def read_rgb(path: Path, advice: str = "use the original file") -> Array:
     return decode_bytes(path, 3, advice)
 
 
-def read_indices(path: Path) -> NDArray[Any]:
-    """Whole numbers (H, W) of an image of one channel, at its own depth, unchanged.
-
-    Of a PNG with a palette the indices are returned, not the colours.
+def open_indices(path: Path) -> Image.Image:
+    """A decoded image of one channel that holds whole numbers, perhaps with a palette.
 
     Raises:
         InputError: as `opened`, several channels, or a format that changes values: JPEG, and grey
@@ -205,8 +182,7 @@ def read_indices(path: Path) -> NDArray[Any]:
             f"{path}: expected one channel of class indices of 8 bits, got {image.format} of mode "
             f"{image.mode}; save the indices themselves as PNG, not their colours."
         )
-    array = np.asarray(image)
-    return array.astype(np.uint16) if image.mode.startswith("I;16") else array
+    return image
 
 
 def read_colours(path: Path) -> Array:
@@ -221,7 +197,7 @@ def read_colours(path: Path) -> Array:
     if image.format == "JPEG" or image.mode not in ("P", "RGB", "RGBA"):
         raise InputError(
             f"{path}: expected unchanged colours (red, green, blue of 8 bits), got {image.format} "
-            f"of mode {image.mode}; save a PNG, or read indices with dataset.ids."
+            f"of mode {image.mode}; save a PNG, or read indices instead."
         )
     rgba = np.array(image.convert("RGBA"))
     if (rgba[..., 3] < 255).any():
@@ -230,22 +206,16 @@ def read_colours(path: Path) -> Array:
 
 
 def read_array(path: Path, what: str) -> NDArray[Any]:
-    """The array of a `.npy` file; `what` is the expected content, for the message.
-
-    Raises:
-        InputError: missing, damaged, or something else.
-    """
+    """The array of a `.npy` file; InputError if it is missing, damaged, or not `what`."""
     try:
         file = io.BytesIO(read_bytes(path))
         array = np.load(file, allow_pickle=False)
-        if isinstance(array, np.ndarray) and file.read(1):
-            raise ValueError("more bytes than its header announces")
+        if not isinstance(array, np.ndarray) or file.read(1):
+            raise ValueError("several arrays, or more bytes than its header announces")
     except InputError:
         raise
     except (ValueError, EOFError, MemoryError, OSError, tokenize.TokenError) as error:
         raise InputError(
             f"{path} cannot be read as an array of {what} ({one_line(error)}); {LEFT_OUT}."
         ) from error
-    if not isinstance(array, np.ndarray):
-        raise InputError(f"{path}: expected {what}, got several arrays; use the original file.")
     return array

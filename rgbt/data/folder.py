@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable
+from collections import Counter, defaultdict
+from collections.abc import Collection, Mapping
 from fnmatch import fnmatchcase
 from functools import cached_property
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Annotated
 
 from annotated_types import Interval
@@ -20,8 +21,8 @@ from rgbt.checks import InputError, check_choice
 from rgbt.data.file_dataset import FileDataset, SplitNames, hash_of_files
 from rgbt.data.images import Range
 from rgbt.data.labels import LabelValue, each_colour, label_codes, painted
-from rgbt.data.patterns import SPLIT, Frame, check_partners, find_frames, without_rgb
-from rgbt.data.splits import FOLDERS, ByFolder, ByList, ByShare, SplitRule
+from rgbt.data.patterns import NAME, SEQUENCE, SPLIT, Frame, find_frames, in_order, without_rgb
+from rgbt.randomness import numpy_generator
 from rgbt.ranges import Colour, Names, NumClasses, Seed, Share, Text
 
 
@@ -32,9 +33,6 @@ class Folder(FileDataset):
     frame, {split} its split, {sequence} a group of consecutive frames, and any other word matches
     any text. The values of the words in the path of the RGB image, joined by "_", are the name of a
     sample; thermal image and label have the same values in their paths.
-
-    Arguments: the keys of conf/dataset/folder.yaml, which describes each. InputError: no such
-    root, another layout, or settings that do not fit each other.
     """
 
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
@@ -66,24 +64,65 @@ class Folder(FileDataset):
             own = {word: each_colour(colour)[0] for word, colour in (colours or {}).items()}
             generated = zip(classes, painted(num_classes), strict=False)
             palette = tuple(own.get(word, colour) for word, colour in generated)
-        super().__init__(
-            *(root, name, num_classes, classes, palette),
-            background=background,
-            unscored=unscored,
-        )
+        common = (root, name, num_classes, classes, palette)
+        super().__init__(*common, background=background, unscored=unscored)
         if len(set(classes)) < num_classes:
             raise InputError(f"dataset.classes: a name occurs twice in {', '.join(classes)}.")
-        self.night = night
+        self.night, self.unlabelled = night, unlabelled
         self.codes = label_codes(classes, ids, colours, ignored)
         self.follow(rgb, thermal, label, thermal_range)
         self.frames = find_frames(self.root, self.patterns)
-        self.rule = self._rule_of(folders, lists, shares, (shares_seed, block))
-        self.unlabelled = unlabelled
+        self._divided: SplitNames = self._divide(folders, lists, shares, (shares_seed, block))
         for split in unlabelled:
             check_choice("dataset.unlabelled", split, self.splits)
-        # Without labelled splits these may be new images, of the day alone and without labels.
-        if set(self.splits) - set(unlabelled):
-            self._check_labels_and_night()
+        is_new = set(self.splits) <= set(unlabelled)  # perhaps of the day alone
+        if night is not None and not is_new and not any(self.nights(tuple(self.frames)) or ()):
+            raise InputError(f"dataset.night: '{night}' matches no name of {len(self.frames)}.")
+
+    def listed(self, split: str) -> tuple[str, ...]:
+        """Names of a known split: drawn, in a folder, or the frames that a list names."""
+        if split in self._divided:
+            return self._divided[split]
+        lines = self.lines(split)
+        names = tuple(self._forms.get(line) or self._forms.get(_stem(line), line) for line in lines)
+        if lines and set(names).isdisjoint(self.frames):
+            raise InputError(
+                f"dataset.lists.{split}: none of the {len(lines)} lines of {self.splits[split]} is "
+                f"a frame. The first is '{lines[0]}'; expected names such as "
+                f"'{next(iter(self.frames))}'."
+            )
+        return names
+
+    def _divide(
+        self,
+        folders: dict[str, str] | None,
+        lists: dict[str, str] | None,
+        shares: dict[str, float] | None,
+        draw: tuple[int, int | None],
+    ) -> SplitNames:
+        """Set `splits`, and return the names of each; of lists, which are read later, nothing."""
+        pattern = self.patterns.rgb
+        given = {
+            f"{{{SPLIT}}} in dataset.rgb": SPLIT in pattern.words or folders is not None,
+            "dataset.lists": lists is not None,
+            "dataset.shares": shares is not None,
+        }
+        if sum(given.values()) != 1 or (folders is not None and SPLIT not in pattern.words):
+            raise InputError(
+                f"dataset: exactly one of {', '.join(given)} must define the splits, got "
+                f"{' and '.join(key for key, each in given.items() if each) or 'none'}."
+            )
+        if lists is not None:
+            self.splits, self.splits_key = lists, "dataset.lists"
+            return {}
+        if shares is not None:
+            self.splits = {split: f"{share:g} of the frames" for split, share in shares.items()}
+            return draw_shares(self.frames, shares, *draw)
+        words = {split: split for split in ("train", "val", "test")} if folders is None else folders
+        text = pattern.text
+        self.splits = {split: text.replace(f"{{{SPLIT}}}", word) for split, word in words.items()}
+        found = [(name, frame.values[SPLIT]) for name, frame in self.frames.items()]
+        return {s: tuple(name for name, f in found if f == word) for s, word in words.items()}
 
     def frame(self, name: str) -> Frame:
         """The files of `name`, without a label in splits that have none."""
@@ -111,58 +150,84 @@ class Folder(FileDataset):
         files = hash_of_files(listed, self.files)
         return hashlib.sha256(f"{meaning}\n{files}".encode()).hexdigest()
 
-    @property
-    def title(self) -> str:
-        """The patterns of its images."""
-        return str(self.images.layouts[0])
-
-    def unused(self, lists: SplitNames) -> Iterable[Path]:  # noqa: ARG002 - as every data set
+    def unused(self, lists: SplitNames) -> Collection[Path]:  # noqa: ARG002 - as every data set
         """Thermal images and labels without an RGB image."""
-        matches = without_rgb(self.root, self.patterns[1:], self.frames.values())
-        return {match.path for match in matches}
+        return without_rgb(self.root, self.patterns[1:], self.frames.values())
 
     def own_notes(self, lists: SplitNames) -> list[str]:
         """Frames of no split."""
-        others = [name for name in self.frames if name not in set().union(*lists.values())]
-        first = others[:1]
-        return [f"{len(others)} frames are in no split; the first is '{name}'." for name in first]
+        listed = set().union(*lists.values())
+        others = [name for name in self.frames if name not in listed]
+        return [f"{len(others)} frames are in no split; the first is '{n}'." for n in others[:1]]
 
     @cached_property
     def _without_labels(self) -> frozenset[str]:
         return frozenset(name for split in self.unlabelled for name in self.listed(split))
 
-    def _rule_of(
-        self,
-        folders: dict[str, str] | None,
-        lists: dict[str, str] | None,
-        shares: dict[str, float] | None,
-        draw: tuple[int, int | None],
-    ) -> SplitRule:
-        in_path = SPLIT in self.patterns.rgb.words
-        given = {
-            f"{{{SPLIT}}} in dataset.rgb": in_path or folders is not None,
-            "dataset.lists": lists is not None,
-            "dataset.shares": shares is not None,
-        }
-        if sum(given.values()) != 1 or (folders is not None and not in_path):
-            raise InputError(
-                f"dataset: exactly one of {', '.join(given)} must define the splits, got "
-                f"{' and '.join(key for key, each in given.items() if each) or 'none'}."
-            )
-        if shares is None and draw != (0, None):
-            raise InputError("dataset.shares_seed and dataset.block require dataset.shares.")
-        if shares is not None:
-            return ByShare(self.frames, shares, *draw)
-        if lists is not None:
-            return ByList(self.root, lists, frames=self.frames)
-        return ByFolder(self.frames, self.patterns.rgb, FOLDERS if folders is None else folders)
+    @cached_property
+    def _forms(self) -> dict[str, str]:
+        """Everything that a line of a list may be -> the name of the frame; names come first.
 
-    def _check_labels_and_night(self) -> None:
-        labelled = [f for name, f in self.frames.items() if name not in self._without_labels]
-        if self.patterns.label is not None:
-            check_partners(self.patterns.label, labelled, self.root)
-        if self.night is not None and not any(self.nights(tuple(self.frames)) or ()):
+        The name; the values of the words of the RGB pattern, joined by "/"; the path of the RGB
+        image below the root, with or without suffix; or the value of {name}, if it is unique.
+        """
+        shared = Counter(frame.values[NAME] for frame in self.frames.values())
+        forms = {name: name for name in self.frames}
+        for name, frame in self.frames.items():
+            path = frame.rgb.relative_to(self.root).as_posix()
+            for form in ("/".join(frame.values.values()), path, _stem(path)):
+                forms.setdefault(form, name)
+            if shared[frame.values[NAME]] == 1:
+                forms.setdefault(frame.values[NAME], name)
+        return forms
+
+
+def draw_shares(
+    frames: Mapping[str, Frame], shares: Mapping[str, float], seed: int, block: int | None
+) -> dict[str, tuple[str, ...]]:
+    """Divide frames at random into splits: split -> its names, in the order of all frames.
+
+    The unit of the draw is one {sequence}, or the whole folder if the pattern has no such word,
+    divided into blocks of `block` consecutive frames, if given. In the order drawn, each unit is
+    added to the split that lacks most frames of its share.
+
+    InputError: shares that are not positive or not 1 together, or a split that gets no frame.
+    """
+    if not all(share > 0 for share in shares.values()) or abs(sum(shares.values()) - 1) > 1e-6:
+        raise InputError(
+            "dataset.shares: expected shares above 0 that add up to 1, such as {train: 0.8, "
+            f"val: 0.1, test: 0.1}}, got {dict(shares)}."
+        )
+    sequences: dict[str, list[Frame]] = defaultdict(list)
+    for frame in frames.values():
+        sequences[frame.values.get(SEQUENCE, "")].append(frame)
+    units: list[list[str]] = []
+    for sequence in sorted(sequences, key=in_order):
+        # Two cameras of one moment are consecutive, whatever word is first in the path.
+        moments = sorted(
+            sequences[sequence], key=lambda f: (in_order(f.values[NAME]), in_order(f.name))
+        )
+        names = [frame.name for frame in moments]
+        size = block or len(names)
+        units += [names[start : start + size] for start in range(0, len(names), size)]
+    lacking = {split: share * len(frames) for split, share in shares.items()}
+    split_of: dict[str, str] = {}
+    for index in numpy_generator(seed, "shares").permutation(len(units)):
+        split = max(lacking, key=lambda each: lacking[each])
+        split_of |= dict.fromkeys(units[index], split)
+        lacking[split] -= len(units[index])
+    drawn = {split: tuple(n for n in frames if split_of[n] == split) for split in shares}
+    for split, names_of_split in drawn.items():
+        if not names_of_split:
             raise InputError(
-                f"dataset.night: none of {len(self.frames)} names matches '{self.night}'; the "
-                f"first name is '{next(iter(self.frames))}'."
+                f"dataset.shares: split '{split}' gets no frame, because neighbours stay together, "
+                f"in {len(units)} unit(s) of up to {max(map(len, units))} frames. Set a smaller "
+                "dataset.block (frames that stay together), a larger share, or another "
+                "dataset.shares_seed."
             )
+    return drawn
+
+
+def _stem(line: str) -> str:
+    """`line` without what follows the last dot of its last piece."""
+    return str(PurePath(line).with_suffix("")) if PurePath(line).name else line

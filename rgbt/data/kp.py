@@ -10,10 +10,9 @@ from typing import Literal
 
 from rgbt.checks import InputError
 from rgbt.data.file_dataset import FileDataset, SplitNames
-from rgbt.data.files import is_there, read_names
-from rgbt.data.images import PairPattern, PairReader
+from rgbt.data.images import PairReader
 from rgbt.data.labels import indices
-from rgbt.data.patterns import Frame, Patterns
+from rgbt.data.patterns import Frame, Pattern, Patterns
 from rgbt.ranges import Colour, Names, NumClasses, Text
 
 CLASSES = (
@@ -36,12 +35,12 @@ SETS = {"train": (0, 1, 2, 3, 4, 5), "val": (6, 10), "test": (7, 8, 9, 11)}
 """Recordings of each split, as the lists of the CRM release divide the labelled images."""
 
 NIGHT_SETS = (3, 4, 5, 9, 10, 11)
-TIMES = ("day", "night")
-SPLITS = {
-    split: f"{split}.txt"
-    for base in SETS
-    for split in (base, *(f"{base}_{time}" for time in TIMES))
+SETS_OF = {
+    f"{split}{time}": tuple(n for n in sets if not time or (n in NIGHT_SETS) == (time == "_night"))
+    for split, sets in SETS.items()
+    for time in ("", "_day", "_night")
 }
+SPLITS = {split: f"{split}.txt" for split in SETS_OF}
 NAME = re.compile(r"(?P<set>set(?:0\d|1[01]))_(?P<video>V\d{3})_(?P<frame>I\d{5})")
 
 
@@ -49,21 +48,13 @@ def parts_of(name: str) -> dict[str, str]:
     """Set, video and frame of `name`, as set00, V000 and I00050; InputError if it is invalid."""
     match = NAME.fullmatch(name)
     if match is None:
-        raise InputError(
-            f"'{name}' is not a name such as set00_V000_I00050 with a set from 00 to 11, so its "
-            "files and its time of day are unknown."
-        )
+        raise InputError(f"'{name}' is not a name such as set00_V000_I00050, of a set up to 11.")
     return match.groupdict()
 
 
 def set_of(name: str) -> int:
     """Number of the recording of `name`; InputError if the name is invalid."""
     return int(parts_of(name)["set"].removeprefix("set"))
-
-
-def is_night(name: str) -> bool:
-    """Whether `name` was recorded at night, by its set; InputError if the name is invalid."""
-    return set_of(name) in NIGHT_SETS
 
 
 class KP(FileDataset):
@@ -74,24 +65,18 @@ class KP(FileDataset):
 
     Splits: "train", "val", "test" and the day and night of each. Lists hold one name per line, with
     or without .png. Where there are none, the labels on disk are divided by set numbers, as in the
-    CRM release.
-
-    Label files hold 0 to K - 1 and K (19) for void, which becomes 255; 255 is accepted as well.
+    CRM release. Label files hold 0 to K - 1 and K (19) for void, which becomes 255.
 
     Thermal is the mean over the three channels of the lwir image, rounded. If channels differ, the
-    releases disagree: CRM takes the real mean, OpenRSS truncates it. A grey JPEG decodes to equal
-    channels; if it was saved as a colour image, its channels may differ by a few levels. A
-    difference of up to 8 levels is accepted; an image with a larger one is a colour image.
+    releases disagree: CRM takes the real mean, OpenRSS truncates it. A difference of up to 8 levels
+    is accepted, as of a grey JPEG that was saved in colour.
 
     Source: images KAIST multispectral pedestrian data set (Hwang et al., CVPR 2015); labels MS-UDA
     (Kim et al., RA-L 2021); split CRM (Shin et al., ICRA 2024).
-
-    Arguments: the keys of conf/dataset/kp.yaml, which describes each. InputError: no such
-    root, another layout, or settings that do not fit each other.
     """
 
     images = PairReader(
-        layouts=(PairPattern(*PATTERNS[:2]),),
+        layouts=(Patterns.of(*PATTERNS[:2]),),
         most_tint=8,
         advice="use the original file of the folder lwir",
     )
@@ -110,30 +95,19 @@ class KP(FileDataset):
     ) -> None:
         super().__init__(root, name, num_classes, classes, palette, background=background)
         if not all((self.root / folder).is_dir() for folder in ("images", "labels")):
-            raise InputError(
-                f"dataset.root: '{root}' does not hold the folders images and labels of KP."
-            )
+            raise InputError(f"dataset.root: '{root}' does not hold the folders images and labels.")
         self.codes = indices(num_classes, num_classes)  # the value after the last class is void
         self.patterns = Patterns.of(*PATTERNS)
-        self._files = dict(splits)
         exist = any((self.root / path).is_file() for path in splits.values())
-        self.by_set = lists == "sets" or not (exist or self._files != SPLITS)
-
-    @property
-    def splits(self) -> dict[str, str]:
-        """Split -> its list, or its sets."""
-        if not self.by_set:
-            return self._files
-        return {split: f"labels of the sets {self._sets(split)}" for split in SPLITS}
+        self.by_set = lists == "sets" or not (exist or splits != SPLITS)
+        by_set = {split: f"labels of the sets {list(sets)}" for split, sets in SETS_OF.items()}
+        self.splits = by_set if self.by_set else dict(splits)
 
     def listed(self, split: str) -> tuple[str, ...]:
         """Names of a split, in the order of its list, or sorted; InputError for invalid names."""
         if self.by_set:
-            wanted = self._sets(split)
-            return tuple(name for name in self._labels if set_of(name) in wanted)
-        path = self.root / self._files[split]
-        lines = read_names(path, f"dataset.splits.{split}") if is_there(path) else ()
-        names = tuple(line.removesuffix(".png") for line in lines)
+            return tuple(name for name in self._labels if set_of(name) in SETS_OF[split])
+        names = tuple(line.removesuffix(".png") for line in self.lines(split))
         self.nights(names)  # refuses invalid names
         return names
 
@@ -143,7 +117,7 @@ class KP(FileDataset):
 
     def nights(self, names: tuple[str, ...]) -> tuple[bool, ...]:
         """Whether each image was taken at night, by set number; InputError for other names."""
-        return tuple(is_night(name) for name in names)
+        return tuple(set_of(name) in NIGHT_SETS for name in names)
 
     def unused(self, lists: SplitNames) -> list[Path]:
         """Labels of no split; images without a label are many and not meant."""
@@ -153,15 +127,8 @@ class KP(FileDataset):
     @cached_property
     def _labels(self) -> dict[str, Path]:
         """Name -> label file, sorted, of all that are there; listed once."""
-        pattern = self.patterns.label
-        assert pattern is not None, "the layout has labels"
-        return {
-            path.stem: path for path, _ in pattern.files(self.root) if NAME.fullmatch(path.stem)
-        }
-
-    def _sets(self, split: str) -> list[int]:
-        base, _, time = split.partition("_")
-        return [n for n in SETS[base] if not time or (n in NIGHT_SETS) == (time == "night")]
+        files = Pattern(PATTERNS[2], "dataset.root").files(self.root)
+        return {path.stem: path for path in files if NAME.fullmatch(path.stem)}
 
 
 def pick_kp(kaist: Path, labels: Path, out: Path) -> int:
@@ -170,29 +137,24 @@ def pick_kp(kaist: Path, labels: Path, out: Path) -> int:
     Args:
         kaist: download, with setXX/VYYY/{visible,lwir}/IZZZZZ.jpg.
         labels: those of MS-UDA; of its folders only those drawn by hand are read, val_day and
-            val_night.
+            val_night. InputError if there are none, or if an image is missing.
         out: new folder.
 
     Returns:
         number of pairs.
-
-    Raises:
-        InputError: no labels, or an image that is missing.
     """
     found = {path.stem: path for path in sorted(labels.rglob("set*.png"))}
     by_hand = {n: path for n, path in found.items() if path.parent.name.startswith("val_")}
-    patterns, copies = Patterns.of(*PATTERNS), {}
+    copies: dict[Path, Path] = {}
     for name, label in (by_hand or found).items():
-        frame = patterns.frame(out, name, parts_of(name))
-        assert frame.label is not None, "the layout has labels"
-        copies[frame.label] = label
-        for target in (frame.rgb, frame.thermal):
-            copies[target] = kaist / target.relative_to(out / "images")
+        rgb, thermal, target = (out / text.format(**parts_of(name)) for text in PATTERNS)
+        images = {path: kaist / path.relative_to(out / "images") for path in (rgb, thermal)}
+        copies |= {target: label, **images}
     missing = [path for path in copies.values() if not path.is_file()]
     if missing or not copies:
         first = f"{len(missing)} files, such as {missing[0]}" if missing else f"labels in {labels}"
         raise InputError(f"expected {first}; give the whole of KAIST and the labels of MS-UDA.")
-    for target, path in copies.items():
-        target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(path, target)
+    for path, original in copies.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(original, path)
     return len(copies) // 3

@@ -15,18 +15,12 @@ from rgbt.ranges import Byte, Names, NumClasses, Text
 
 @dataclass(frozen=True, kw_only=True)
 class LabelMap:
-    """The class of a data set for each class of a network.
+    """The class of a data set for each class of a network; `groups`: class -> ids that become it.
 
     Ids are mapped after the argmax, as in the thesis: probabilities of classes that map to one
     class are not added up. The confidence is that of the most probable class.
 
-    Attributes:
-        num_source: classes of the network, 1 to 255; their ids are 0 .. num_source - 1.
-        targets: names of the classes of the data set, in order of their ids.
-        groups: name of a target class -> ids of the classes that become it; each id occurs once.
-
-    Raises:
-        InputError: a name that is no target, an id that is missing, unknown or there twice.
+    InputError: a name that is no target, an id that is missing, unknown or there twice.
     """
 
     num_source: NumClasses

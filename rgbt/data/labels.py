@@ -8,12 +8,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, cast
 
+import cv2
 import numpy as np
 from annotated_types import Interval
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError, check_choice
-from rgbt.data.files import read_array, read_colours, read_indices
+from rgbt.data.files import open_indices, read_array, read_colours, values_of
 from rgbt.ranges import Colour
 from rgbt.types import IGNORE
 
@@ -29,17 +30,13 @@ class LabelCodes:
 
     Attributes:
         codes: whole number -> class index, or 255; a colour is 65536 red + 256 green + blue.
-        key: of the configuration that names the values: "dataset.ids", "dataset.colours", or ""
-            where they are fixed.
+        key: of the configuration that names the values; "" where they are fixed, and of 8 bits.
+        of_colours: whether the files hold colours.
     """
 
     codes: dict[int, int]
     key: str = ""
-
-    @property
-    def of_colours(self) -> bool:
-        """Whether the files hold colours."""
-        return self.key == "dataset.colours"
+    of_colours: bool = False
 
     def read(self, path: Path) -> Array:
         """Class indices (H, W) uint8, 255 = ignored, of an image or a `.npy` file.
@@ -47,17 +44,31 @@ class LabelCodes:
         Raises:
             InputError: it cannot be read, or holds a value without a class: which, and how often.
         """
-        raw = self._raw(path)
-        if not self.key and raw.dtype != np.uint8 and path.suffix.lower() != ".npy":
-            raise InputError(f"{path}: expected 8 bits per channel, got {raw.dtype}.")
+        if self.of_colours:
+            return self.classes(code_of(read_colours(path)), path)
+        if path.suffix.lower() != ".npy":
+            raw = values_of(open_indices(path))
+            if not self.key and raw.dtype != np.uint8:
+                raise InputError(f"{path}: expected 8 bits per channel, got {raw.dtype}.")
+            return self.classes(raw, path)
+        raw = read_array(path, "whole numbers of shape (rows, columns)")
+        if raw.dtype.kind not in "iu" or raw.ndim != 2 or not raw.size:
+            raise InputError(
+                f"{path}: expected whole numbers of shape (rows, columns), got {raw.shape} "
+                f"{raw.dtype}; save class indices, or the values of dataset.ids."
+            )
+        return self.classes(raw, path)
+
+    def classes(self, raw: NDArray[Any], path: Path) -> Array:
+        """`read` of the values (H, W) of `path`, whole numbers of any type."""
         if raw.dtype == np.uint8:
-            classes = self._of_bytes[raw]
+            classes = np.asarray(cv2.LUT(raw, self._of_bytes))
         else:
             known = np.array(sorted(self.codes), np.int64)
             at = np.minimum(np.searchsorted(known, raw), len(known) - 1)
             of_known = np.array([self.codes[code] for code in known.tolist()], np.int16)
             classes = np.where(known[at] == raw, of_known[at], -1)
-        if classes.min(initial=0) < 0:
+        if classes.min() < 0:
             values, counts = np.unique(raw[classes < 0], return_counts=True)
             code, count = int(values[counts.argmax()]), counts.max()
             shown = [code // 65536, code // 256 % 256, code % 256] if self.of_colours else code
@@ -72,19 +83,11 @@ class LabelCodes:
     def _of_bytes(self) -> NDArray[np.int16]:
         return np.array([self.codes.get(value, -1) for value in range(256)], np.int16)
 
-    def _raw(self, path: Path) -> NDArray[Any]:
-        if self.of_colours:
-            red, green, blue = np.moveaxis(read_colours(path).astype(np.int64), -1, 0)
-            return np.asarray(65536 * red + 256 * green + blue)
-        if path.suffix.lower() != ".npy":
-            return read_indices(path)
-        raw = read_array(path, "whole numbers of shape (rows, columns)")
-        if raw.dtype.kind not in "iu" or raw.ndim != 2:
-            raise InputError(
-                f"{path}: expected whole numbers of shape (rows, columns), got {raw.shape} "
-                f"{raw.dtype}; save class indices, or the values of dataset.ids."
-            )
-        return raw
+
+def code_of(colours: NDArray[Any]) -> NDArray[np.int64]:
+    """(..., 3) red, green and blue as one number each: 65536 red + 256 green + blue."""
+    red, green, blue = np.moveaxis(colours.astype(np.int64), -1, 0)
+    return np.asarray(65536 * red + 256 * green + blue)
 
 
 def indices(num_classes: int, *ignored: int) -> LabelCodes:
@@ -102,10 +105,7 @@ def label_codes(
     """The map of label values of a configuration, see `rgbt.data.folder.Folder`.
 
     Without `ids` and `colours` a value is the index of its class; 255 is ignored unless `ids` gives
-    it a class.
-
-    Raises:
-        InputError: both ids and colours, an unknown class, or a value that occurs twice.
+    it a class. InputError: both ids and colours, an unknown class, or a value that occurs twice.
     """
     if ids is not None and colours is not None:
         raise InputError("dataset.ids and dataset.colours: set one of them to null.")
@@ -122,10 +122,8 @@ def label_codes(
     named = [(classes.index(word), value) for word, value in pairs]
     for index, value in [*named, *((IGNORE, value) for value in ignored)]:
         if isinstance(value, int) != (colours is None):
-            raise InputError(
-                f"dataset.ignored: {value} is no value of labels as {key} describes them."
-            )
-        code = value if isinstance(value, int) else 65536 * value[0] + 256 * value[1] + value[2]
+            raise InputError(f"dataset.ignored: {value} is no value of labels as {key} has them.")
+        code = value if isinstance(value, int) else int(code_of(np.array(value)))
         if code in codes:
             raise InputError(f"{key}: {value} occurs twice in the classes and dataset.ignored.")
         codes[code] = index
@@ -133,7 +131,7 @@ def label_codes(
         codes.setdefault(IGNORE, IGNORE)
     if not codes:
         raise InputError("dataset.colours: expected the colour of every class, got none.")
-    return LabelCodes(codes, key)
+    return LabelCodes(codes, key, of_colours=colours is not None)
 
 
 def each_colour(given: Colour | tuple[Colour, ...]) -> tuple[Colour, ...]:
@@ -143,10 +141,10 @@ def each_colour(given: Colour | tuple[Colour, ...]) -> tuple[Colour, ...]:
 
 
 def painted(num_classes: int) -> tuple[Colour, ...]:
-    """Colours that differ for up to 256 classes, the first of them black.
+    """Colours that differ for up to 256 classes, as in the masks of PASCAL VOC.
 
     The bits of the index are dealt out to red, green and blue in turn, each from its highest bit
-    downwards: 0 black, 1 dark red, 2 dark green, 3 dark yellow, as in the masks of PASCAL VOC.
+    downwards: 0 black, 1 dark red, 2 dark green, 3 dark yellow.
     """
 
     def level(number: int) -> int:

@@ -1,8 +1,7 @@
 """Load batches for training and evaluation.
 
 The samples of a batch and their augmentation depend on (seed, step) alone, not on the number of
-worker processes. Where several processes train one run, each loads every W-th sample of a batch
-(`rgbt.processes`). Batches are not padded: networks pad images and losses pad labels.
+worker processes. Batches are not padded: networks pad images and losses pad labels.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
-from functools import partial
 from itertools import count
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar, cast
 
@@ -38,12 +36,8 @@ if TYPE_CHECKING:
 
 LOG = logging.getLogger(__name__)
 
-CROP_ADVICE = (
-    "; choose a transform.crop_hw that fits into every resized image, or the sizes for this data "
-    "set (recipe=kp, ...)"
-)
+CROP_ADVICE = "; choose a transform.crop_hw that fits into every resized image"
 EVAL_ADVICE = "; set data.eval_batch_size=1"
-
 DEAD_WORKER = re.compile(r"DataLoader worker .*(exited unexpectedly|killed by signal)")
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -53,7 +47,6 @@ LOOK_S = 2.0
 """Interval at which a worker checks that its main process exists."""
 
 Kind = TypeVar("Kind", bound=Loadable)
-
 MakeExample = Callable[[Any, dict[str, str]], Any]
 """(key, skipped) -> example, or None if it is left out; adds unreadable names to `skipped`."""
 
@@ -63,23 +56,16 @@ class Transform(Protocol):
 
     def train(self, sample: Sample, rng: np.random.Generator) -> Example:
         """Augmented example; every draw comes from `rng`."""
-        ...
 
     def test(self, sample: Sample) -> Example:
         """Example for evaluation, the same every time."""
-        ...
 
 
 @dataclass(frozen=True)
 class Examples:
-    """Reads and transforms the samples of one split.
+    """Reads and transforms the samples `names` of one split.
 
-    Attributes:
-        dataset: reads samples.
-        names: the split.
-        transform: makes examples.
-        skip_errors: record an unreadable sample instead of raising.
-        seed: run seed.
+    `skip_errors`: unreadable samples are recorded instead of raised. `seed`: of the run.
     """
 
     dataset: LabelledDataset
@@ -124,11 +110,8 @@ class Examples:
 def collate(examples: Sequence[Example], advice: str = "") -> Batch:
     """Stack examples of one size (see `rgbt.types.Batch` for shapes and dtypes).
 
-    `advice` ends the message if sizes differ; it names the key to change.
-
-    Raises:
-        InputError: images or labels differ in size, naming the first two that do; only some of the
-            labels carry confidences.
+    InputError: images or labels differ in size, naming the first two that do, and `advice`, the key
+    to change.
     """
     first = examples[0]
     for example in examples[1:]:
@@ -140,11 +123,6 @@ def collate(examples: Sequence[Example], advice: str = "") -> Batch:
                     f"{expected[0]}x{expected[1]} ('{first.name}') and {found[0]}x{found[1]} "
                     f"('{example.name}'){advice}."
                 )
-        if (first.confidence is None) != (example.confidence is None):
-            raise InputError(
-                f"all labels of one batch must carry confidences, or none; '{first.name}' and "
-                f"'{example.name}' differ. Write the pseudo-labels of the whole split again."
-            )
 
     def stacked(images: Iterable[NDArray[Any] | None]) -> Tensor | None:
         present = [image for image in images if image is not None]
@@ -166,12 +144,9 @@ def collate(examples: Sequence[Example], advice: str = "") -> Batch:
 
 @dataclass(frozen=True)
 class LoadedBatch:
-    """The result of a worker.
+    """The result of a worker: a batch, or None if every sample was left out, or after an error.
 
-    Attributes:
-        batch: a dataclass of tensors; None if every sample was left out, or after an error.
-        skipped: name -> error.
-        error: message of an InputError; a text, because torch wraps exceptions of workers.
+    `skipped`: name -> error. `error`: message of an InputError, because torch wraps exceptions.
     """
 
     batch: Loadable | None = None
@@ -180,20 +155,16 @@ class LoadedBatch:
 
     def pin_memory(self) -> LoadedBatch:
         """The batch in pinned memory; called by a thread of the loader."""
-        return self if self.batch is None else replace(self, batch=_each(self.batch, _pinned))
+        pin = torch.Tensor.pin_memory
+        return self if self.batch is None else replace(self, batch=_each(self.batch, pin))
 
 
+@dataclass
 class BatchReader(Dataset[LoadedBatch]):
-    """Makes the batch of a list of keys.
+    """Makes the batch of a list of keys, one example of each; `advice`: see `collate`."""
 
-    Args:
-        make_example: called once per key.
-        advice: see `collate`.
-    """
-
-    def __init__(self, make_example: MakeExample, advice: str):
-        self.make_example = make_example
-        self.advice = advice
+    make_example: MakeExample
+    advice: str
 
     def __getitem__(self, keys: list[Any]) -> LoadedBatch:
         """The batch of `keys`, without the samples that are left out."""
@@ -210,12 +181,7 @@ class BatchReader(Dataset[LoadedBatch]):
 
 
 class Batches(Iterator[Kind]):
-    """Batches in order, as `train_batches` and `eval_batches` make them.
-
-    Args:
-        reader: makes a batch of a list of keys.
-        keys: one list of keys per batch.
-        settings: processes that read, and how far ahead.
+    """Batches in order, each made by `reader` of a list of `keys`.
 
     Attributes:
         skipped: name -> error, of the samples skipped so far.
@@ -229,7 +195,6 @@ class Batches(Iterator[Kind]):
             reader,
             sampler=keys,
             batch_size=None,  # a key is a whole batch
-            collate_fn=_unchanged,
             num_workers=settings.num_workers,
             prefetch_factor=settings.prefetch if settings.num_workers else None,
             worker_init_fn=start_worker,
@@ -237,8 +202,7 @@ class Batches(Iterator[Kind]):
             # Without it the loader draws the seed of its workers from the global generator.
             generator=torch.Generator(),
         )
-        # Processes are started with these signals blocked in all threads: some libraries, such as
-        # Arrow, start threads of their own in a process as soon as it is forked.
+        # Blocked in all threads of the new processes: some libraries start some when forked.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
         try:
             self._loaded = cast(Iterator[LoadedBatch], iter(loader))
@@ -248,10 +212,8 @@ class Batches(Iterator[Kind]):
     def __next__(self) -> Kind:
         """The next batch that holds at least one sample.
 
-        Raises:
-            InputError: a file cannot be read (on_error="raise"), sizes differ within the batch, or
-                there is no shared memory left.
-            RunError: a worker process died.
+        InputError: a file cannot be read (on_error="raise"), sizes differ within the batch, or
+        there is no shared memory left. RunError: a worker process died.
         """
         while True:
             try:
@@ -291,18 +253,15 @@ def train_batches(  # noqa: PLR0913 - most trainings draw no classes
 ) -> Batches[Loadable]:
     """Augmented training batches of the global steps in `steps`, made by ``transform.train``.
 
-    Process r of W has the samples r, r + W, r + 2 W, ... of each batch.
-
     Epoch e is a permutation of the split drawn from (seed, "order", e), cut into whole batches; the
     incomplete last one is dropped. Sample i of epoch e is augmented from (seed, "augment", e, i).
     So ``steps=range(10, 20)`` continues ``range(10)`` exactly. With `rare`, sample i of epoch e is
-    drawn by its class from (seed, "rare class", e, i) instead.
+    drawn by its class from (seed, "rare class", e, i) instead. Process r of W has the samples r,
+    r + W, r + 2 W, ... of each batch (`rgbt.processes`).
 
-    Raises:
-        InputError: the split is smaller than a batch, or, with on_error="skip", unreadable; the
-            processes cannot share a batch equally.
+    InputError: as `steps_per_epoch`; with on_error="skip", the split is unreadable.
     """
-    per_epoch = steps_per_epoch(dataset, settings, split)
+    steps_per_epoch(dataset, settings, split)
     names = dataset.names(split)
     source = Examples(dataset, names, transform, settings.on_error == "skip", seed)
     make: MakeExample = source.train
@@ -310,13 +269,10 @@ def train_batches(  # noqa: PLR0913 - most trainings draw no classes
         from rgbt.data.rare_classes import RareClassExamples  # few runs draw by class
 
         make = RareClassExamples(source, rare)
-    order = partial(numpy_generator, seed, "order")
-    whole_batches = _train_keys(
-        len(names), settings.batch_size, per_epoch, steps, None if rare else order
-    )
+    keys = _train_keys(len(names), settings.batch_size, steps, seed, is_shuffled=rare is None)
     own_samples = slice(rank(), None, num_processes())
-    keys = (keys[own_samples] for keys in whole_batches)
-    return Batches(BatchReader(make, CROP_ADVICE), keys=keys, settings=settings)
+    own_keys = (whole_batch[own_samples] for whole_batch in keys)
+    return Batches(BatchReader(make, CROP_ADVICE), keys=own_keys, settings=settings)
 
 
 def eval_batches(
@@ -339,8 +295,7 @@ def steps_per_epoch(
 ) -> int:
     """Whole batches of one epoch, at least 1.
 
-    Raises:
-        InputError: the split is smaller than a batch; the processes cannot share one equally.
+    InputError: the split is smaller than a batch; the processes cannot share one equally.
     """
     check_batch_size(settings, num_processes())
     size = len(dataset.names(split))
@@ -362,26 +317,17 @@ def check_batch_size(settings: LoaderSettings, processes: int) -> None:
 
 
 def _train_keys(
-    size: int,
-    batch_size: int,
-    per_epoch: int,
-    steps: range,
-    rng_of: Callable[[int], np.random.Generator] | None,
+    size: int, batch_size: int, steps: range, seed: int, *, is_shuffled: bool
 ) -> Iterator[list[tuple[int, int]]]:
-    """(epoch, index in the split) of every sample of every step; numbers without `rng_of`."""
-    drawn = -1
-    order = list(range(size))
+    """(epoch, index in the split) of every sample of every step."""
+    drawn, order = -1, list(range(size))
     for step in steps:
-        epoch, position = divmod(step, per_epoch)
-        if rng_of is not None and epoch != drawn:
-            order = rng_of(epoch).permutation(size).tolist()
+        epoch, position = divmod(step, size // batch_size)
+        if is_shuffled and epoch != drawn:
+            order = numpy_generator(seed, "order", epoch).permutation(size).tolist()
             drawn = epoch
         start = position * batch_size
         yield [(epoch, index) for index in order[start : start + batch_size]]
-
-
-def _unchanged(loaded: Any) -> Any:
-    return loaded
 
 
 def start_worker(_: int) -> None:
@@ -413,10 +359,6 @@ def _each(batch: Any, change: Callable[[Tensor], Tensor]) -> Any:
     return replace(batch, **{name: change(value) for name, value in tensors.items()})
 
 
-def _pinned(tensor: Tensor) -> Tensor:
-    return tensor.pin_memory()
-
-
 def _shared(tensor: Tensor) -> Tensor:
     """`tensor` in memory that the main process can read.
 
@@ -437,10 +379,7 @@ def _shared(tensor: Tensor) -> Tensor:
 class LoadedPair:
     """The batches of both domains; on the device they are `TwoDomains`.
 
-    Attributes:
-        source: with labels.
-        target: with or without labels.
-        step: optimiser step that it is for, counted from the start of the run.
+    `step` is the optimiser step that it is for, counted from the start of the run.
     """
 
     source: Loadable
@@ -461,13 +400,10 @@ class PairedBatches(Iterator[LoadedPair]):
     """A batch of the source with a batch of the target, each from its own stream.
 
     The two lists may differ in length. Each is shuffled again at its end, and an epoch of the run
-    is one of the source. Each process has its own samples of both (`train_batches`).
+    is one of the source.
 
-    Args:
-        source: of the labelled domain.
-        target: of the other one.
-        first: number of the first pair, counted from the start of the run.
-        per_step: pairs of one optimiser step, whose number they have.
+    `first` is the number of the first pair, counted from the start of the run; `per_step` pairs
+    belong to one optimiser step and have its number.
     """
 
     def __init__(

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from rgbt.checks import InputError
 from rgbt.data.file_dataset import FileDataset
 from rgbt.data.files import read_array
-from rgbt.data.images import PairPattern, PairReader
+from rgbt.data.images import PairReader
 from rgbt.data.labels import indices
 from rgbt.data.patterns import Frame, Patterns
-from rgbt.data.splits import ByList
 from rgbt.dataset import LabelledDataset, reader_of
 from rgbt.ranges import Colour, Names, NumClasses, Text
 
@@ -48,14 +47,10 @@ class MFNet(FileDataset):
     A name NAME_flip in a list is read from its own files; nothing is mirrored here.
 
     Source: MFNet (Ha et al., IROS 2017), archive ir_seg_dataset; the folders layout is the one of
-    the SpatialSeg and Temporal downloads. Class 0 is a class ("unlabeled", trained and scored as
-    in the published tables); 255 is ignored.
-
-    Arguments: the keys of conf/dataset/mfnet.yaml, which describes each. InputError: no such
-    root, another layout, or settings that do not fit each other.
+    the SpatialSeg and Temporal downloads. Class 0 is trained and scored, as in published tables.
     """
 
-    images = PairReader(layouts=tuple(PairPattern(*layout[:2]) for layout in LAYOUTS.values()))
+    images = PairReader(layouts=tuple(Patterns.of(*layout[:2]) for layout in LAYOUTS.values()))
     mirrored = MIRRORED
 
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
@@ -71,43 +66,30 @@ class MFNet(FileDataset):
         layout: Literal["auto"] | Layout = "auto",
     ) -> None:
         super().__init__(root, name, num_classes, classes, palette, background=background)
-        folders = {
-            known: {text.partition("/")[0] for text in texts} for known, texts in LAYOUTS.items()
-        }
         wanted = [each for each in LAYOUTS if layout in ("auto", each)]
-        found = [
-            each for each in wanted if all((self.root / name).is_dir() for name in folders[each])
-        ]
+        folders = {each: [text.partition("/")[0] for text in LAYOUTS[each]] for each in wanted}
+        found = [each for each in wanted if all((self.root / f).is_dir() for f in folders[each])]
         if not found:
-            listed = " or ".join("+".join(sorted(folders[each])) for each in wanted)
+            listed = " or ".join("+".join(sorted(set(folders[each]))) for each in wanted)
             raise InputError(f"dataset.root: '{root}' does not hold the folders {listed}.")
         self.layout = found[0]
         self.patterns = Patterns.of(*LAYOUTS[self.layout])
         self.codes = indices(num_classes)
-        self.rule = ByList(self.root, dict(splits), "dataset.splits")
+        self.splits = dict(splits)
 
     def frame(self, name: str) -> Frame:
         """The files of `name`."""
         return self.patterns.frame(self.root, name, {"name": name})
 
     def nights(self, names: tuple[str, ...]) -> tuple[bool, ...] | None:
-        """Whether each name ends in N (night) and not D (day), before the suffix "_flip".
-
-        None if none does, InputError if only some do.
-        """
+        """Whether each name ends in N, not D; None if no name does, InputError if only some do."""
         times = [name.removesuffix(MIRRORED)[-1:] for name in names]
         without = [name for name, time in zip(names, times, strict=True) if time not in ("D", "N")]
         if without and len(without) < len(names):
             raise InputError(
-                f"the name '{without[0]}' in {self.root} does not state a time of day, as others "
-                f"do: expected a name that ends in D or N (before '{MIRRORED}')."
+                f"the name '{without[0]}' in {self.root} states no time of day, as others do."
             )
         return None if without else tuple(time == "N" for time in times)
-
-    @property
-    def title(self) -> str:
-        """One of the two layouts."""
-        return f"{self.layout} layout"
 
     def repeats(self, split: str) -> bool:
         """Lists by time of day only repeat names of others, and need not exist."""
@@ -117,22 +99,16 @@ class MFNet(FileDataset):
 class NextFrames:
     """The second frames of a data set, and the positions of their points in the first frames.
 
-    They are in the folder `next` beside the images. `synth` writes it (``dataset.ego_forward_m``);
-    any data set in MFNet's layout may hold one:
-
-        next/                 the same layout and the same names, one moment later
-        next/flow/NAME.npy    (H, W, 2) float32: for every pixel of the second frame, how many
-                              (rows, columns) further the same point lies in the first; NaN if it
-                              is hidden there or outside
-
-    Args:
-        first: the data set of the first frames, in MFNet's layout.
+    The folder `next` beside the images has the same layout and names, one moment later, and
+    flow/NAME.npy, (H, W, 2) float32: for every pixel of the second frame, how many (rows, columns)
+    further the same point lies in the first; NaN if it is hidden there or outside. `synth` writes
+    it (``dataset.ego_forward_m``); any data set in MFNet's layout may hold one.
 
     Attributes:
         dataset: reader of the second frames.
 
     Raises:
-        InputError: the data set has no second frames, or another layout.
+        InputError: the data set of the `first` frames has no second ones, or another layout.
     """
 
     def __init__(self, first: LabelledDataset) -> None:
@@ -156,17 +132,9 @@ class NextFrames:
         )
 
     def flow(self, name: str, image_hw: tuple[int, int]) -> NDArray[np.float32]:
-        """Offset (H, W, 2) of each pixel of the second frame to its position in the first.
+        """Offset (H, W, 2) in rows and columns of each pixel of the second frame to the first.
 
-        Args:
-            name: of the frame.
-            image_hw: its size, which the flow must have.
-
-        Returns:
-            (rows, columns); NaN if the point was not visible.
-
-        Raises:
-            InputError: no flow, or one of another size.
+        NaN if the point was not visible there. InputError: no flow, or not of the size `image_hw`.
         """
         path = self._path(name)
         flow = read_array(path, "rows and columns")
@@ -180,15 +148,11 @@ class NextFrames:
     def source(self, name: str, image_hw: tuple[int, int]) -> tuple[NDArray[np.int64], ...]:
         """Position of each pixel of the second frame in the first frame.
 
-        Args:
-            name: of the frame.
-            image_hw: its size, which the flow must have.
-
         Returns:
             rows and columns (H, W) int64, nearest pixels; -1 if the point was not visible.
 
         Raises:
-            InputError: no flow, one of another size, or one that leads out of the image.
+            InputError: as `flow`, or a flow that leads out of the image.
         """
         flow = self.flow(name, image_hw)
         grid = np.moveaxis(np.indices(image_hw), 0, -1)
@@ -196,9 +160,8 @@ class NextFrames:
         first_yx = np.rint(np.where(seen[..., None], grid + flow, 0)).astype(np.int64)
         if (first_yx < 0).any() or (first_yx >= image_hw).any():
             raise InputError(
-                f"{self._path(name)} points outside the first frame of "
-                f"{image_hw[0]}x{image_hw[1]} pixels; points that were not visible there must be "
-                "NaN."
+                f"{self._path(name)} points outside the first frame of {image_hw[0]}x{image_hw[1]} "
+                "pixels; points that were not visible there must be NaN."
             )
         first_yx[~seen] = -1
         return first_yx[..., 0], first_yx[..., 1]

@@ -10,8 +10,8 @@ from typing import Any, Literal
 import numpy as np
 
 from rgbt.checks import InputError, nearest
-from rgbt.data.images import PairPattern, PairReader, ReadsPairs
-from rgbt.data.patterns import Pattern, in_order, what_is_in
+from rgbt.data.images import PairReader, ReadsPairs
+from rgbt.data.patterns import Frame, Patterns, what_is_in
 from rgbt.dataset import LabelledDataset, reader_of
 from rgbt.types import Sample
 
@@ -19,21 +19,18 @@ KINDS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp")
 """Suffixes of image files."""
 
 PLAIN = (
-    *(PairPattern(f"rgb/{{name}}{kind}", f"thermal/{{name}}{kind}") for kind in KINDS),
-    PairPattern("{name}.png", "{name}.png"),
+    *(Patterns.of(f"rgb/{{name}}{kind}", f"thermal/{{name}}{kind}") for kind in KINDS),
+    Patterns.of("{name}.png", "{name}.png"),
 )
 """Layouts that are read for every data set: folders rgb and thermal, or files of four channels."""
 
 
 @dataclass(frozen=True)
 class ToPredict:
-    """Images to predict, in order.
+    """Images to predict, in order, by name; names of written files begin with theirs.
 
-    Attributes:
-        names: of the images; names of written files begin with them.
-        read: name -> its images, without a label.
-        folders: of the files, which must not be overwritten.
-        skipped: name -> error, of skipped images; `samples` adds to it.
+    `read` returns the images of a name, without a label; `folders` hold the files, which must not
+    be overwritten; `skipped`: name -> error, to which `samples` adds.
     """
 
     names: tuple[str, ...]
@@ -42,11 +39,7 @@ class ToPredict:
     skipped: dict[str, str] = field(default_factory=dict)
 
     def samples(self, on_error: Literal["raise", "skip"]) -> Iterator[Sample]:
-        """The images one after the other.
-
-        Raises:
-            InputError: one cannot be read and `on_error` is "raise", or none can.
-        """
+        """The images in order; InputError for the first unreadable one, or if all are."""
         for name in self.names:
             try:
                 sample = self.read(name)
@@ -64,11 +57,6 @@ class ToPredict:
         """Refuse a folder that holds the input images, which would be overwritten."""
         if out.resolve() in {folder.resolve() for folder in self.folders}:
             raise InputError(f"out={out} holds the input images; choose another folder.")
-        twice = [name for name in self.names if f"{name}_overlay" in self.names]
-        if twice:
-            raise InputError(
-                f"out: the files of '{twice[0]}' and '{twice[0]}_overlay' are the same."
-            )
 
 
 def of_split(dataset: LabelledDataset, split: str) -> ToPredict:
@@ -86,9 +74,8 @@ def of_path(dataset: LabelledDataset, text: str, on_error: Literal["raise", "ski
     A folder is read by the patterns of the data set, or by `PLAIN`: the first of them that matches
     a pair. An RGB image without a thermal image is left out if `on_error` is "skip".
 
-    Raises:
-        InputError: no such path, no pair in the folder, two pairs of one name, an RGB image without
-            a thermal one.
+    InputError: no such path, no pair in the folder, two pairs of one name, an RGB image without a
+    thermal one.
     """
     folder, images = Path(text), images_of(dataset)
     if folder.is_file():
@@ -98,46 +85,32 @@ def of_path(dataset: LabelledDataset, text: str, on_error: Literal["raise", "ski
             f"input={text}: this is neither a file, nor a folder, nor a split of {dataset.name}; "
             f"splits: {nearest(text, dataset.splits)}."
         )
-    pairs: dict[str, tuple[Path, Path]] = {}
-    layouts = iter((*images.layouts, *PLAIN))
-    while not any(thermal.is_file() for _, thermal in pairs.values()):
-        layout = next(layouts, None)
-        if layout is None:
-            wanted = "; ".join(map(str, images.layouts))
-            raise InputError(
-                f"input={folder} holds no pair of images but {what_is_in(folder)}; expected "
-                f"{wanted}, or folders rgb and thermal with equal names, or PNG files of four "
-                "channels. To predict a single pair, use rgb=FILE thermal=FILE."
-            )
-        pairs = _pairs(folder, layout)
-    alone = {str(rgb): f"{rgb} has no {path}." for rgb, path in pairs.values() if not path.exists()}
+    pairs: dict[str, Frame] = {}
+    for layout in (*images.layouts, *PLAIN):
+        pairs = layout.frames(folder)
+        if any(frame.thermal.is_file() for frame in pairs.values()):
+            break
+    else:
+        wanted = "; ".join(map(str, images.layouts))
+        raise InputError(
+            f"input={folder} holds no pair of images but {what_is_in(folder)}; expected {wanted}, "
+            "or folders rgb and thermal with equal names, or PNG files of four channels. To "
+            "predict a single pair, use rgb=FILE thermal=FILE."
+        )
+    alone = {
+        str(frame.rgb): f"{frame.rgb} has no {frame.thermal}."
+        for frame in pairs.values()
+        if not frame.thermal.exists()
+    }
     for reason in list(alone.values())[: on_error == "raise"]:
         raise InputError(
             f"input={text}: {len(alone)} RGB images have no thermal image: {reason} Restore it, or "
             "skip such images with data.on_error=skip."
         )
-    pairs = {name: pair for name, pair in pairs.items() if str(pair[0]) not in alone}
-    folders = {folder, *(file.parent for pair in pairs.values() for file in pair)}
-    names = tuple(sorted(pairs, key=in_order))
-    read: Callable[[str], Sample] = lambda name: images.read(name, *pairs[name])  # noqa: E731
-    return ToPredict(names, read, frozenset(folders), alone)
-
-
-def _pairs(folder: Path, layout: PairPattern) -> dict[str, tuple[Path, Path]]:
-    """Name -> RGB and expected thermal image, of one layout."""
-    rgb, thermal = Pattern(layout.rgb, "input"), Pattern(layout.thermal, "input")
-    found = rgb.files(folder)
-    # If all are in one folder, "{name}.png" matches 7.png and 7_ir.png, which is "{name}_ir.png".
-    partners = {thermal.path(folder, v) for _, v in found if rgb.text != thermal.text}
-    pairs: dict[str, tuple[Path, Path]] = {}
-    for path, values in found:
-        name = "_".join(values[word] for word in rgb.words)
-        if path in partners:
-            continue
-        if name in pairs:
-            raise InputError(f"input: {pairs[name][0]} and {path} would both be called '{name}'.")
-        pairs[name] = (path, thermal.path(folder, values))
-    return pairs
+    pairs = {name: frame for name, frame in pairs.items() if str(frame.rgb) not in alone}
+    folders = {folder, *(file.parent for pair in pairs.values() for file in pair[2:4])}
+    read: Callable[[str], Sample] = lambda name: images.read(name, *pairs[name][2:4])  # noqa: E731
+    return ToPredict(tuple(pairs), read, frozenset(folders), alone)
 
 
 def of_files(dataset: LabelledDataset, rgb: Path, thermal: Path) -> ToPredict:
@@ -151,19 +124,11 @@ def of_files(dataset: LabelledDataset, rgb: Path, thermal: Path) -> ToPredict:
 
 
 def of_arrays(dataset: LabelledDataset, rgb: Any, thermal: Any) -> Sample:
-    """One pair of arrays, without a label.
+    """One pair of arrays, rgb (H, W, 3) uint8 and thermal (H, W), without a label.
 
     Thermal values of 8 bits are grey levels, as in `Sample`. Values of other types are those of the
     camera, and both images are read like files of the data set: cut, and scaled by its
-    ``thermal_range``.
-
-    Args:
-        dataset: of the network.
-        rgb: (H, W, 3) uint8, RGB order.
-        thermal: (H, W), uint8 or camera values.
-
-    Raises:
-        InputError: other types, shapes or values.
+    ``thermal_range``. InputError: other types, shapes or values.
     """
     rgb, thermal = np.asarray(rgb), np.asarray(thermal)
     if rgb.dtype != np.uint8 or rgb.shape != (*thermal.shape, 3) or thermal.ndim != 2:
@@ -191,7 +156,6 @@ def images_of(dataset: LabelledDataset) -> PairReader:
     if not isinstance(reader, ReadsPairs):
         raise InputError(
             f"{type(reader).__name__} does not declare how to read new images. Name one of its "
-            f"splits ({', '.join(reader.splits)}), or give the class `images` and `pair` (see "
-            "docs/tutorials/own-data-set.md)."
+            f"splits ({', '.join(reader.splits)}), or give the class `images` and `pair`."
         )
     return reader.images

@@ -6,6 +6,8 @@ import glob
 import os
 import re
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
@@ -18,79 +20,68 @@ NAME, SPLIT, SEQUENCE = "name", "split", "sequence"
 WordValues = Mapping[str, str]
 """Word -> its value in the path of a file."""
 
-NO_VALUES: WordValues = MappingProxyType({})
 
-
-class PathMatch(NamedTuple):
-    """A file, or a folder above it, and the values of the words in its path."""
-
-    path: Path
-    values: WordValues
-
-
+@dataclass(frozen=True)
 class Pattern:
     """Paths below a root, in which a word in braces matches any text without a slash.
 
     A word that occurs twice has the same value in both positions. Of two words in one piece of the
     path the first matches as much as possible: "{sequence}_{name}.png" reads a_b_c.png as a_b, c.
 
-    Args:
+    Attributes:
         text: pieces joined by "/", relative to the root; such as "{split}/ir/{name}_ir.tif".
         key: of the configuration, for messages.
-
-    Attributes:
-        words: in braces, in order.
 
     Raises:
         InputError: an absolute path, "..", an unpaired brace, two words with nothing between them,
             or no word.
     """
 
-    def __init__(self, text: str, key: str) -> None:
-        self.text = text
-        self.key = key
-        self.words = tuple(dict.fromkeys(re.findall(r"\{(\w+)\}", text)))
-        is_below = set(text.split("/")).isdisjoint(("", ".", ".."))
-        has_others = re.search(r"[{}]", re.sub(r"\{[^\W\d]\w*\}", "", text)) or "}{" in text
-        if not is_below or has_others or not self.words:
+    text: str
+    key: str
+
+    def __post_init__(self) -> None:
+        is_below = set(self.text.split("/")).isdisjoint(("", ".", ".."))
+        plain = re.sub(r"\{[^\W\d]\w*\}", "", self.text)
+        if not is_below or re.search(r"[{}]", plain) or "}{" in self.text or not self.words:
             raise InputError(
-                f"{key}: expected a path below dataset.root with words in braces and other text "
-                f"between them, such as {{split}}/rgb/{{name}}.png, got '{text}'."
+                f"{self.key}: expected a path below dataset.root with words in braces and other "
+                f"text between them, such as {{split}}/rgb/{{name}}.png, got '{self.text}'."
             )
+
+    @cached_property
+    def words(self) -> tuple[str, ...]:
+        """Words in braces, in order."""
+        return tuple(dict.fromkeys(re.findall(r"\{(\w+)\}", self.text)))
 
     def path(self, root: Path, values: WordValues) -> Path:
         """The file of `values`, which has every word."""
         return root / _filled(self.text, values)
 
     def files(
-        self, root: Path, values: WordValues = NO_VALUES, *, any_case: bool = False
-    ) -> list[PathMatch]:
-        """The paths below `root` that match, sorted; words with a value match this one alone.
+        self, root: Path, values: WordValues = MappingProxyType({}), *, any_case: bool = False
+    ) -> dict[Path, WordValues]:
+        """The paths below `root` that match, sorted, and the values of the words in each.
 
-        Names that begin with a dot are left out, as operating systems write such files.
-
-        Raises:
-            InputError: a folder may not be listed.
+        Words with a value match this one alone. Names that begin with a dot are left out, as
+        operating systems write such files. InputError if a folder may not be listed.
         """
         text = _filled(self.text, values)
         wild = re.sub(r"\{\w+\}", "*", glob.escape(text))
         if any_case:
             wild = re.sub(r"[^\W\d_]", lambda each: f"[{each[0].lower()}{each[0].upper()}]", wild)
+        # `glob` leaves out folders without permission; that of `Path` lists hidden files as well,
+        # and no broken links.
         above = wild.rpartition("/")[0]
         while above:
-            for found in glob.glob(above, root_dir=root):  # noqa: PTH207 - see below
+            for found in glob.glob(above, root_dir=root):  # noqa: PTH207
                 _check_listable(root / found)
             above = above.rpartition("/")[0]
         _check_listable(root)
         expression = re.compile(_expression(text), re.IGNORECASE * any_case)
-        # That of `Path` lists hidden files, and no broken links.
         paths = sorted(glob.glob(wild, root_dir=root), key=lambda each: each.split("/"))  # noqa: PTH207
         matches = {path: expression.fullmatch(path) for path in paths}
-        return [
-            PathMatch(root / path, {**values, **match.groupdict()})
-            for path, match in matches.items()
-            if match
-        ]
+        return {root / path: {**values, **m.groupdict()} for path, m in matches.items() if m}
 
 
 def _filled(text: str, values: WordValues) -> str:
@@ -99,19 +90,18 @@ def _filled(text: str, values: WordValues) -> str:
 
 
 def _expression(text: str) -> str:
-    seen: set[str] = set()
-    parts = []
-    for index, part in enumerate(re.split(r"\{(\w+)\}", text)):
+    """The regular expression of a pattern; a word that occurs again refers to the first one."""
+    parts = re.split(r"\{(\w+)\}", text)
+    for index, part in enumerate(parts):
         if index % 2 == 0:
-            parts.append(re.escape(part))
+            parts[index] = re.escape(part)
         else:
-            parts.append(f"(?P={part})" if part in seen else f"(?P<{part}>[^/]+)")
-            seen.add(part)
+            first = f"(?P<{part}>[^/]+)"
+            parts[index] = f"(?P={part})" if first in parts else first
     return "".join(parts)
 
 
 def _check_listable(folder: Path) -> None:
-    """Refuse a folder without permission, which `glob` would leave out without a word."""
     if folder.is_dir() and not os.access(folder, os.R_OK | os.X_OK):
         raise InputError(f"{folder} cannot be listed: permission denied; allow access.")
 
@@ -158,13 +148,19 @@ class Patterns(NamedTuple):
     label: Pattern | None
 
     @classmethod
-    def of(cls, rgb: str, thermal: str, label: str | None) -> Patterns:
+    def of(cls, rgb: str, thermal: str, label: str | None = None) -> Patterns:
         """Those of the texts of a configuration; InputError for an invalid pattern."""
-        return cls(
-            Pattern(rgb, "dataset.rgb"),
-            Pattern(thermal, "dataset.thermal"),
-            None if label is None else Pattern(label, "dataset.label"),
-        )
+        of_label = None if label is None else Pattern(label, "dataset.label")
+        return cls(Pattern(rgb, "dataset.rgb"), Pattern(thermal, "dataset.thermal"), of_label)
+
+    @property
+    def packed(self) -> bool:
+        """Whether thermal is the fourth channel of the RGB image."""
+        return self.rgb.text == self.thermal.text
+
+    def __str__(self) -> str:
+        rgb, thermal = self.rgb.text, self.thermal.text
+        return f"{rgb} of four channels" if self.packed else f"RGB {rgb} with thermal {thermal}"
 
     def frame(self, root: Path, name: str, values: WordValues) -> Frame:
         """The files of a frame, whether they exist or not; `values` has every word."""
@@ -172,68 +168,66 @@ class Patterns(NamedTuple):
         rgb, thermal = (pattern.path(root, values) for pattern in (self.rgb, self.thermal))
         return Frame(name, values, rgb, thermal, label)
 
+    def frames(self, root: Path) -> dict[str, Frame]:
+        """Name -> frame of every RGB image below `root`, in the order of the names (9 before 10).
+
+        InputError if two have one name.
+        """
+        every = [
+            self.frame(root, "_".join(values[word] for word in self.rgb.words), values)
+            for values in self.rgb.files(root).values()
+        ]
+        # In a single folder, "{name}.png" matches 7.png and 7_ir.png, which is "{name}_ir.png".
+        partners = {path for each in every for path in each[3:] if path != each.rgb}
+        frames: dict[str, Frame] = {}
+        for frame in every:
+            if frame.rgb not in partners and frames.setdefault(frame.name, frame) is not frame:
+                raise InputError(
+                    f"{self.rgb.key}: {frames[frame.name].rgb} and {frame.rgb} would both be "
+                    f"called '{frame.name}'; rename one of them."
+                )
+        return {name: frames[name] for name in sorted(frames, key=in_order)}
+
 
 def find_frames(root: Path, patterns: Patterns) -> dict[str, Frame]:
-    """Name -> frame, of every RGB image below `root`, in the order of the names (9 before 10).
+    """`Patterns.frames` of a user's configuration.
 
-    Raises:
-        InputError: no {name} in the first pattern, a word that only another one has, no RGB image,
-            no thermal image, two frames of one name, or two that would share a partner.
+    InputError: no {name} in the first pattern, a word that only another one has, no RGB image, no
+    thermal image, or two frames that would share a partner.
     """
     rgb, thermal, label = patterns
     if NAME not in rgb.words:
         raise InputError(f"dataset.rgb: '{rgb.text}' has no {{{NAME}}}, which stands for frames.")
-    partners_of = [each for each in (thermal, label) if each is not None]
-    for pattern in partners_of:
+    partners = [each for each in (thermal, label) if each is not None]
+    for pattern in partners:
         for word in pattern.words:
             check_choice(f"{pattern.key}: word of the pattern", word, rgb.words)
-    every = [
-        patterns.frame(root, "_".join(values[word] for word in rgb.words), values)
-        for _, values in rgb.files(root)
-    ]
-    # If all are in one folder, "{name}.png" matches 7.png and 7_ir.png, which is "{name}_ir.png".
-    partners = {path for each in every for path in (each.thermal, each.label) if path != each.rgb}
-    frames: dict[str, Frame] = {}
-    for frame in every:
-        if frame.rgb in partners:
-            continue
-        if frame.name in frames:
-            raise InputError(
-                f"dataset.rgb: {frames[frame.name].rgb} and {frame.rgb} would both be called "
-                f"'{frame.name}'; rename one of them."
-            )
-        frames[frame.name] = frame
+    frames = patterns.frames(root)
     if not frames:
         raise InputError(
             f"dataset.rgb: '{rgb.text}' matches no file in {root}, which holds {what_is_in(root)}."
         )
-    found = {name: frames[name] for name in sorted(frames, key=in_order)}
-    for pattern in partners_of:
-        paths = [pattern.path(root, frame.values) for frame in found.values()]
+    for pattern in partners:
+        paths = [pattern.path(root, frame.values) for frame in frames.values()]
         if len(set(paths)) < len(paths):
             shared = next(path for path in paths if paths.count(path) > 1)
             raise InputError(
                 f"{pattern.key}: several frames would share {shared}; use every word of "
                 "dataset.rgb in which they differ."
             )
-    check_partners(thermal, found.values(), root)
-    return found
-
-
-def check_partners(pattern: Pattern, frames: Iterable[Frame], root: Path) -> None:
-    """Refuse a pattern by which no frame of `frames`, if there are any, has an existing file."""
-    paths = [pattern.path(root, frame.values) for frame in frames]
-    if paths and not any(map(os.path.lexists, paths)):
-        raise InputError(
-            f"{pattern.key}: '{pattern.text}' matches no existing file: the first would be "
-            f"{paths[0]}, but {paths[0].parent.name} holds {what_is_in(paths[0].parent)}."
-        )
+        if not any(map(os.path.lexists, paths)) and pattern is thermal:
+            folder = paths[0].parent
+            raise InputError(
+                f"{pattern.key}: '{pattern.text}' matches no existing file: the first would be "
+                f"{paths[0]}, but {folder.name} holds {what_is_in(folder)}."
+            )
+    return frames
 
 
 def without_rgb(
     root: Path, partners: Iterable[Pattern | None], frames: Iterable[Frame]
-) -> list[PathMatch]:
+) -> dict[Path, WordValues]:
     """Files of the patterns of thermal images and labels that belong to no frame."""
-    used = {path for each in frames for path in (each.rgb, each.thermal, each.label)}
-    matches = [match for each in partners if each is not None for match in each.files(root)]
-    return [match for match in matches if match.path not in used]
+    used = {path for each in frames for path in each[2:]}
+    found = [each.files(root).items() for each in partners if each is not None]
+    return {path: values for items in found for path, values in items if path not in used}

@@ -35,45 +35,31 @@ FULL = 65535
 
 
 class Manifest(TypedDict, total=False):
-    """Types in ``pseudo_labels.json``; what they mean: see `PseudoLabels`."""
+    """Content of ``pseudo_labels.json``."""
 
     format: Required[str]
-    teacher: str
-    weights: str
+    teacher: str  # a run's key, or a file
+    weights: str  # SHA-256 of the teacher's parameters
     view: str | None
     head: str | None
-    label_map: dict[str, Any] | None
+    label_map: dict[str, Any] | None  # num_source, targets, groups; None: none
     threshold: float
     dataset: str
-    fingerprint: str
+    fingerprint: str  # of the data set
     split: str
-    classes: Required[list[str]]
-    images: int
-    skipped: list[str]
-    kept: float
-    mean_confidence: float
-    by_class: dict[str, dict[str, float | None]]
-    digest: Required[str]
+    classes: Required[list[str]]  # their names, in order of their ids
+    images: int  # how many
+    skipped: list[str]  # unreadable ones
+    kept: float  # share of pixels with a label
+    mean_confidence: float  # of all pixels
+    by_class: dict[str, dict[str, float | None]]  # share of pixels, mean_confidence of those
+    digest: Required[str]  # SHA-256 over names, labels and confidences
 
 
 class PseudoLabels:
-    """A complete folder of pseudo-labels.
+    """A complete folder of pseudo-labels; InputError if there is none, or an incomplete one.
 
-    Args:
-        folder: see the module.
-
-    Attributes:
-        folder: its path.
-        manifest: content of ``pseudo_labels.json``: "format", "teacher" (a run's key, or a file),
-            "weights" (SHA-256 of the teacher's parameters), "view", "head", "label_map"
-            (num_source, targets, groups; None: none),
-            "threshold", "dataset", "fingerprint" (of the data set), "split", "classes" (their
-            names), "images" (how many), "skipped" (unreadable ones), "kept" (share of pixels with
-            a label), "mean_confidence" (of all pixels), "by_class" (per class: "share" of all
-            pixels, "mean_confidence" of those; None without pixels) and "digest".
-
-    Raises:
-        InputError: no such folder, or an incomplete one.
+    `manifest` is a `Manifest`.
     """
 
     def __init__(self, folder: str | Path) -> None:
@@ -86,29 +72,36 @@ class PseudoLabels:
                 f"Write it with rgbt predict ... out={self.folder} pseudo_labels=true."
             )
         self.manifest: dict[str, Any] = read_json(path, Manifest, "remove it and predict again")
-        if self.manifest.get("format") != FORMAT:
+        if self.manifest["format"] != FORMAT:
             raise InputError(
-                f"{path}: expected the format '{FORMAT}', got '{self.manifest.get('format')}'; "
+                f"{path}: expected the format '{FORMAT}', got '{self.manifest['format']}'; "
                 "choose another folder."
             )
-
-    @property
-    def classes(self) -> tuple[str, ...]:
-        """Names of the classes, in order of their ids."""
-        return tuple(self.manifest["classes"])
-
-    @property
-    def digest(self) -> str:
-        """SHA-256 over the names and the decoded labels and confidences: their content."""
-        return str(self.manifest["digest"])
+        self.classes: tuple[str, ...] = tuple(self.manifest["classes"])
+        self.digest: str = self.manifest["digest"]
 
     def missing(self, names: Iterable[str]) -> tuple[str, ...]:
         """Those of the names that have no pseudo-label here."""
         return tuple(name for name in names if not label_path(self.folder, name).is_file())
 
-    def read(self, name: str, num_classes: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """Label and confidence of the image `name`, see `read_pair`."""
-        label, confidence = read_pair(self.folder, name, num_classes)
+    def read(self, name: str) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """Label (H, W) uint8, 255 = no label, and confidence (H, W) from 0 to 1, of one image.
+
+        InputError: a file is missing, cannot be decoded, or holds something else.
+        """
+        if self.missing([name]):
+            raise InputError(
+                f"'{name}' has no pseudo-label in {self.folder}; predict the split that it belongs "
+                "to."
+            )
+        label = indices(len(self.classes)).read(label_path(self.folder, name))
+        path = confidence_path(self.folder, name)
+        confidence = decode(path)
+        if confidence.dtype != np.uint16 or confidence.shape != label.shape:
+            raise InputError(
+                f"{path}: expected 16 bits of shape {label.shape}, as the label has, got "
+                f"{confidence.dtype} of shape {confidence.shape}."
+            )
         return label, (confidence / np.float32(FULL)).astype(np.float32)
 
 
@@ -122,39 +115,10 @@ def confidence_path(folder: Path, name: str) -> Path:
     return folder / "confidence" / f"{name}.png"
 
 
-def read_pair(
-    folder: Path, name: str, num_classes: int
-) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
-    """Label (H, W) uint8, 255 = no label, and confidence (H, W) uint16, 65535 = 1, of one image.
-
-    Raises:
-        InputError: a file is missing, cannot be decoded, or holds something else.
-    """
-    if not label_path(folder, name).is_file():
-        raise InputError(
-            f"'{name}' has no pseudo-label in {folder}; predict the split that it belongs to."
-        )
-    label = indices(num_classes).read(label_path(folder, name))
-    path = confidence_path(folder, name)
-    confidence = decode(path)
-    if confidence.dtype != np.uint16 or confidence.shape != label.shape:
-        raise InputError(
-            f"{path}: expected 16 bits of shape {label.shape}, as the label has, got "
-            f"{confidence.dtype} of shape {confidence.shape}."
-        )
-    return label, np.asarray(confidence, np.uint16)
-
-
 class PseudoLabelled(DatasetWrapper):
-    """A data set whose labels are replaced by pseudo-labels.
+    """A data set whose labels, perhaps with confidences, are the pseudo-labels of a folder.
 
-    Args:
-        dataset: the data set; its `classes` must be those of the pseudo-labels.
-        folder: of pseudo-labels.
-        with_confidence: whether samples carry the confidence as well.
-
-    Raises:
-        InputError: the folder is not complete, or its classes differ from those of the data set.
+    InputError: the folder is not complete, or its classes differ from those of the data set.
     """
 
     def __init__(
@@ -163,29 +127,27 @@ class PseudoLabelled(DatasetWrapper):
         super().__init__(dataset)
         self.labels = PseudoLabels(folder)
         self.with_confidence = with_confidence
-        classes = tuple(self.classes)
-        if self.labels.classes != classes:
+        if self.labels.classes != tuple(self.classes):
             raise InputError(
                 f"the pseudo-labels of {self.labels.folder} have the classes "
-                f"{', '.join(self.labels.classes)}, but {self.name} has {', '.join(classes)}; "
+                f"{', '.join(self.labels.classes)}, but {self.name} has {', '.join(self.classes)}; "
                 "predict them for this data set (label_map=... for a teacher of other classes)."
             )
 
     def read(self, name: str) -> Sample:
         """The sample with its pseudo-label; InputError if it has none, or one of another size."""
         sample = self.source.read(name)
-        label, confidence = self.labels.read(name, len(self.labels.classes))
+        label, confidence = self.labels.read(name)
         if label.shape != sample.thermal.shape:
             raise InputError(
                 f"'{name}' has {sample.thermal.shape} pixels but its pseudo-label in "
                 f"{self.labels.folder} {label.shape}; predict them for the data set as it is now."
             )
-        carried = confidence if self.with_confidence else None
-        return replace(sample, label=label, confidence=carried)
+        return replace(sample, label=label, confidence=confidence if self.with_confidence else None)
 
     def label(self, name: str) -> NDArray[np.uint8]:
         """The pseudo-label alone."""
-        return self.labels.read(name, len(self.labels.classes))[0]
+        return self.labels.read(name)[0]
 
 
 class Unlabelled(DatasetWrapper):

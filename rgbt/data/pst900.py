@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from functools import cached_property
 from pathlib import Path
 from typing import Annotated
 
@@ -11,7 +10,7 @@ from annotated_types import Interval
 
 from rgbt.checks import InputError
 from rgbt.data.file_dataset import FileDataset, SplitNames
-from rgbt.data.images import PairPattern, PairReader
+from rgbt.data.images import PairReader
 from rgbt.data.labels import indices
 from rgbt.data.patterns import Frame, Patterns
 from rgbt.ranges import Colour, Names, NumClasses, Text
@@ -38,26 +37,20 @@ class PST900(FileDataset):
     Layout (NAME as in 58_bag21_rect_rgb_frame0000000440, the same in each folder):
     {train,test}/{rgb,thermal,labels}/NAME.png; thermal_raw and depth are not read.
 
-    Splits: "train", "val", "test". The archive has no validation part. As in the CRM and
-    SpatialSeg releases "val" is the test part, so that the best checkpoint is chosen on what is
-    reported; `val_bags` takes recordings out of training instead.
+    The archive has no validation part. As in the CRM and SpatialSeg releases "val" is the test
+    part, so that the best checkpoint is chosen on what is reported; `val_bags` takes recordings out
+    of training instead. Thermal images are grey levels of 8 bits in which pixels without a
+    measurement are 0.
 
-    Class indices are those of the files, in the order of the authors' toolkit. Two traps of
-    published material: the authors' colours are in OpenCV's order, so that id 1 is red there; here
-    they are (red, green, blue) as the LASNet and CRM releases save them, id 1 being blue. And many
-    tables print their columns as hand drill, backpack, fire extinguisher, some with the values of
-    drill and extinguisher exchanged: compare by name with care, the mean is not affected.
-
-    Thermal images are grey levels of 8 bits in which pixels without a measurement are 0.
+    Class indices are those of the files. Many tables print their columns as hand drill, backpack,
+    fire extinguisher, some with the values of drill and extinguisher exchanged; the mean is not
+    affected. The authors' colours are in OpenCV's order; here they are (red, green, blue).
 
     Source: PST900 (Shivakumar et al., ICRA 2020). Nothing is ignored, 255 is accepted.
-
-    Arguments: the keys of conf/dataset/pst900.yaml, which describes each. InputError: no such
-    root, another layout, or settings that do not fit each other.
     """
 
     images = PairReader(
-        layouts=(PairPattern(*PATTERNS[:2]),),
+        layouts=(Patterns.of(*PATTERNS[:2]),),
         advice="use the folder thermal, whose images have 8 bits; thermal_raw is not supported",
     )
 
@@ -74,30 +67,29 @@ class PST900(FileDataset):
     ) -> None:
         super().__init__(root, name, num_classes, classes, palette, background=background)
         if not any((self.root / part / "rgb").is_dir() for part in PARTS):
-            raise InputError(
-                f"dataset.root: '{root}' does not hold train/rgb or test/rgb of PST900; give the "
-                "folder into which the archive was unpacked."
-            )
+            raise InputError(f"dataset.root: '{root}' does not hold train/rgb or test/rgb.")
         self.codes = indices(num_classes)
         self.val_bags = val_bags
         self.patterns = Patterns.of(*PATTERNS)
-
-    @property
-    def splits(self) -> dict[str, str]:
-        """Split -> its files."""
-        bags = list(self.val_bags)
-        return {
+        bags = list(val_bags)
+        self.splits = {
             "train": "train/rgb/*.png" + f" without the bags {bags}" * bool(bags),
             "val": f"train/rgb/*.png of the bags {bags}" if bags else "test/rgb/*.png",
             "test": "test/rgb/*.png",
         }
+        self._part_of: dict[str, list[str]] = {}
+        for part in PARTS:
+            for values in self.patterns.rgb.files(self.root, {"part": part}).values():
+                self._part_of.setdefault(values["name"], []).append(part)
 
     def listed(self, split: str) -> tuple[str, ...]:
         """Names of a split, sorted; InputError if it lacks a bag of `val_bags`."""
-        train = self._names_of["train"]
+        names = {
+            part: [n for n in sorted(self._part_of) if part in self._part_of[n]] for part in PARTS
+        }
         if split == "test" or (split == "val" and not self.val_bags):
-            return tuple(self._names_of["test"])
-        bags = {bag_of(name) for name in train}
+            return tuple(names["test"])
+        bags = {bag_of(name) for name in names["train"]}
         for bag in self.val_bags:
             if bag not in bags:
                 raise InputError(
@@ -105,11 +97,11 @@ class PST900(FileDataset):
                     f"bags are {sorted(each for each in bags if each is not None)}."
                 )
         is_val = split == "val"
-        return tuple(name for name in train if (bag_of(name) in self.val_bags) == is_val)
+        return tuple(name for name in names["train"] if (bag_of(name) in self.val_bags) == is_val)
 
     def frame(self, name: str) -> Frame:
         """The files of `name`; InputError if no part or both have it."""
-        parts = [part for part in PARTS if name in self._names_of[part]]
+        parts = self._part_of.get(name, [])
         if len(parts) != 1:
             reason = "both train and test have" if parts else "neither train nor test has"
             raise InputError(f"{self.name} ({self.root}): {reason} an image called '{name}'.")
@@ -125,14 +117,3 @@ class PST900(FileDataset):
     def unused(self, lists: SplitNames) -> set[Path]:
         """Files of the layout that belong to no image of a split."""
         return {path for path in super().unused(lists) if path.parts[-3] in PARTS}
-
-    @cached_property
-    def _names_of(self) -> dict[str, dict[str, None]]:
-        """Part -> its names, sorted; folders are listed once, so later changes have no effect."""
-        pattern = self.patterns.rgb
-        return {
-            part: dict.fromkeys(
-                sorted(values["name"] for _, values in pattern.files(self.root, {"part": part}))
-            )
-            for part in PARTS
-        }

@@ -1,8 +1,7 @@
 """Rare class sampling: training images drawn by a class that they show, rare classes more often.
 
-It replaces the permutation of the split in every epoch (`data.sampling=rare_classes`), for the
-labelled images of any training. Each sample has draws of its own (seed, purpose, epoch, number), so
-that batches depend neither on loader processes nor on where a run resumes.
+It replaces the permutation of the split in every epoch (`data.sampling=rare_classes`). Each sample
+has draws of its own (seed, purpose, epoch, number).
 """
 
 from __future__ import annotations
@@ -38,17 +37,12 @@ def class_probabilities(pixels: PixelCounts, temperature: float) -> NDArray[np.f
     mmseg/datasets/uda_dataset.py, get_rcs_class_probs: of the classes that occur; T = 0.01, in
     configs/daformer/gta2cs_uda_warm_fdthings_rcs_croppl_a999_daformer_mitb5_s0.py.
 
-    Args:
-        pixels: (C,) of each class, of which one at least is above 0.
-        temperature: T, > 0; a high one draws all classes alike.
-
-    Returns:
-        (C,) that sum to 1.
+    `pixels` (C,) of each class, one at least above 0, give (C,) that sum to 1; a high `temperature`
+    T > 0 draws all classes alike.
     """
     scaled = (1 - pixels / pixels.sum()) / temperature
     weights = np.exp(scaled - scaled.max())
-    found: NDArray[np.float64] = weights / weights.sum()
-    return found
+    return np.asarray(weights / weights.sum())
 
 
 @dataclass(frozen=True)
@@ -56,12 +50,10 @@ class RareClasses:
     """How the images of a split are drawn.
 
     Attributes:
-        classes: indices of the C classes that are drawn.
-        names: their names.
-        probabilities: (C,) float64, of each.
+        classes: indices of the C classes that are drawn; `names` and `probabilities` (C,) are
+            theirs.
         images: for each, positions in the list of the split of the images that show enough of it.
-        min_crop_pixels: a crop with as many pixels of its class or fewer is drawn again; None: no
-            crop is.
+        min_crop_pixels: a crop with as many pixels of its class or fewer is drawn again, if given.
     """
 
     classes: tuple[int, ...]
@@ -88,15 +80,11 @@ def count_rare_classes(
     """Count the labels of a split, and how its images are drawn.
 
     An image is drawn for a class if it has more than `min_class_pixels` pixels of it, in the label
-    as stored. Classes that never occur are not drawn. Neither are those that no score has
-    (`LabelledDataset.unscored`), whose pixels count as ignored ones.
+    as stored (Paper: any pixel.   Released: more than 3000). Classes that never occur are not
+    drawn. Neither are those that no score has (`LabelledDataset.unscored`).
 
-    Paper: an image that contains the class.   Released: one with more than 3000 of its pixels,
-    counted before the image is resized and cropped.
-
-    Raises:
-        InputError: a label cannot be read (on_error="raise"); a class occurs, but no image has
-            enough of it; nothing is labelled.
+    InputError: a label cannot be read (on_error="raise"); a class occurs, but no image has enough
+    of it; nothing is labelled.
     """
 
     def counted(name: str) -> PixelCounts:
@@ -106,8 +94,8 @@ def count_rare_classes(
             if settings.on_error == "raise":
                 raise
             label = None
-        nothing = np.zeros(dataset.num_classes, np.int64)
-        return nothing if label is None else label_pixels(label, dataset.num_classes)[:-1]
+        label = np.empty(0, np.uint8) if label is None else label
+        return label_pixels(label, dataset.num_classes)[:-1]
 
     with ThreadPoolExecutor(NUM_THREADS) as pool:
         pixels = np.stack(list(pool.map(counted, dataset.names(split))))
@@ -132,12 +120,7 @@ def count_rare_classes(
 
 @dataclass(frozen=True)
 class RareClassExamples:
-    """Augmented examples of drawn classes; a key is (epoch, number of the sample in it).
-
-    Attributes:
-        source: reads and augments samples.
-        rare: how images are drawn.
-    """
+    """Augmented examples of drawn classes; a key is (epoch, number of the sample in it)."""
 
     source: Examples
     rare: RareClasses
@@ -148,9 +131,7 @@ class RareClassExamples:
         It is augmented again, up to `MOST_REDRAWS` times, until it has more than
         `min_crop_pixels` pixels of the class; the last one is kept in any case. Released: more than
         half of 3000 pixels (DAFormer), or twice as many (HRDA, MIC); never again at a ratio of 0.
-
-        Raises:
-            InputError: no image of the class can be read.
+        InputError: no image of the class can be read.
         """
         drawn, positions = self.rare.draw(numpy_generator(self.source.seed, "rare class", *key))
         names = [self.source.names[position] for position in positions]

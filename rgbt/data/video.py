@@ -1,29 +1,41 @@
-"""Read videos of RGB-thermal frames: MVSeg, and any folder of numbered frames."""
+"""Read videos of RGB-thermal frames: MVSeg, and any folder of numbered frames.
+
+A sequence is a run of frames with equal steps between their numbers, as the data set or its names
+say; a pair of consecutive frames are two neighbours of one sequence.
+"""
 
 from __future__ import annotations
 
 import os
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from itertools import pairwise
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from itertools import pairwise, zip_longest
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal
 
 from rgbt.checks import InputError
 from rgbt.data.file_dataset import FileDataset, SplitNames, hash_of_files
-from rgbt.data.images import PairPattern, PairReader, Range
+from rgbt.data.images import PairReader, Range
 from rgbt.data.labels import LabelCodes, LabelValue, label_codes, painted
-from rgbt.data.patterns import NAME, Frame, Pattern, find_frames, in_order, without_rgb
-from rgbt.data.sequences import consecutive
-from rgbt.data.splits import ByList
+from rgbt.data.patterns import (
+    NAME,
+    Frame,
+    Pattern,
+    Patterns,
+    find_frames,
+    in_order,
+    without_rgb,
+)
+from rgbt.dataset import DatasetWrapper, LabelledDataset, reader_of
 from rgbt.ranges import Colour, Names, NumClasses, Text
 from rgbt.types import IGNORE
 
 Gaps = Literal["refuse", "split"]
 """What a missing number in a video means: an error, or the beginning of another sequence."""
 
-VIDEO = "video"
-"""The word of the patterns that names a video."""
+Sequences = tuple[tuple[str, ...], ...]
+
+VIDEO = "video"  # the word of the patterns that names one
 
 CLASSES = (
     *("background", "car", "bus", "motorcycle", "bicycle", "pedestrian", "motorcyclist"),
@@ -47,18 +59,15 @@ APART = 20_000
 """Between the numbers of two recordings of MVSeg, so that 10000 does not follow 09999."""
 
 
-class NumberedFrame(NamedTuple):
-    """A frame of a video.
-
-    Attributes:
-        video: its name; "" where the whole data set is one video.
-        number: of the frame.
-        files: its images, and where its label is expected.
-    """
-
-    video: str
-    number: int
-    files: Frame
+KINDS = ("jpg", "png")
+LAYOUTS = tuple(
+    Patterns.of(
+        f"data/{{video}}/visible/{{name}}v.{kind}",
+        f"data/{{video}}/infrared/{{name}}i.{kind}",
+        "data/{video}/label/{name}l.png",
+    )
+    for kind in KINDS
+)
 
 
 class VideoDataset(FileDataset):
@@ -68,7 +77,7 @@ class VideoDataset(FileDataset):
     split has no label. `sequences` are all frames, for temporal consistency.
 
     Attributes:
-        frames: name -> frame.
+        frames: name -> files; the value of {video} is the video, "" if the whole data set is one.
         videos: name of a video -> number -> name of the frame.
     """
 
@@ -76,59 +85,45 @@ class VideoDataset(FileDataset):
 
     def add(
         self,
-        frames: Iterable[NumberedFrame],
+        frames: Iterable[tuple[int, Frame]],
         partners: Sequence[Pattern | None],
         lists: dict[str, str] | None,
         gaps: Gaps,
     ) -> None:
-        """Use these frames.
+        """Use these frames of all videos, each with its number.
 
-        Args:
-            frames: of all videos.
-            partners: patterns of their thermal images and labels.
-            lists: split -> list of names of videos in `root`; None: the split "test" is all videos.
-            gaps: what a missing number in a video means.
-
-        Raises:
-            InputError: two frames of a video have one number.
+        `partners` are the patterns of thermal images and labels; `lists`: split -> list of videos,
+        None: the split "test" is all; `gaps`: what a missing number in a video means. InputError:
+        two frames of a video have one number.
         """
-        self._partners, self.gaps = partners, gaps
-        self._lists = None if lists is None else ByList(self.root, dict(lists))
-        self.frames: dict[str, NumberedFrame] = {}
-        self.videos: dict[str, dict[int, str]] = {}
-        for frame in sorted(frames, key=lambda each: each.number):
-            files = frame.files
+        self._partners, self.gaps, self._is_listed = partners, gaps, lists is not None
+        self.splits = {"test": "all videos"} if lists is None else dict(lists)
+        self.frames: dict[str, Frame] = {}
+        videos: dict[str, dict[int, str]] = {}
+        for number, frame in sorted(frames, key=lambda each: each[0]):
             # A broken link is kept; reading it says where it leads.
-            if files.label is not None and not os.path.lexists(files.label):
-                files = files._replace(label=None)
-            known = self.videos.setdefault(frame.video, {})
-            if frame.number in known:
+            has_label = frame.label is not None and os.path.lexists(frame.label)
+            self.frames[frame.name] = frame if has_label else frame._replace(label=None)
+            known = videos.setdefault(_video_of(frame), {})
+            if number in known:
                 raise InputError(
-                    f"video '{frame.video}' has two frames with the number {frame.number}, "
-                    f"'{known[frame.number]}' and '{files.name}'; rename one of them."
+                    f"video '{_video_of(frame)}' has two frames with the number {number}, "
+                    f"'{known[number]}' and '{frame.name}'; rename one of them."
                 )
-            known[frame.number] = files.name
-            self.frames[files.name] = frame._replace(files=files)
-        self.videos = {video: self.videos[video] for video in sorted(self.videos, key=in_order)}
-
-    @property
-    def splits(self) -> dict[str, str]:
-        """Split -> its list."""
-        return {"test": "all videos"} if self._lists is None else self._lists.splits
+            known[number] = frame.name
+        self.videos = {video: videos[video] for video in sorted(videos, key=in_order)}
 
     def videos_of(self, split: str) -> tuple[str, ...]:
         """Names of the videos of a split; InputError if one of them is not there, or empty."""
         self.check_split(split)
-        if self._lists is None:
-            return tuple(self.videos)
-        names = self._lists.names(split)
+        names = dict.fromkeys(self.lines(split) if self._is_listed else self.videos)
         for name in names:
             if name not in self.videos:
                 raise InputError(
                     f"dataset.lists.{split}: video '{name}' has no frames in {self.root}; expected "
                     f"{self.images.layouts[0]}."
                 )
-        return tuple(dict.fromkeys(names))
+        return tuple(names)
 
     def all_names(self, split: str) -> tuple[str, ...]:
         """Names of all frames of a split, labelled or not."""
@@ -136,21 +131,18 @@ class VideoDataset(FileDataset):
             name for video in self.videos_of(split) for name in self.videos[video].values()
         )
 
-    def sequences(self, split: str) -> tuple[tuple[str, ...], ...]:
+    def sequences(self, split: str) -> Sequences:
         """Names of all frames of a split, one tuple for each run without a gap.
 
-        Raises:
-            InputError: a video of the list is empty, or, with gaps="refuse", lacks a number, an RGB
-                image or a thermal image.
+        InputError: a video is empty, or, with gaps="refuse", lacks a number or an image.
         """
         videos = self.videos_of(split)
-        if self.gaps == "refuse":
-            problems = [*self._gaps(videos), *self._unpaired(videos)]
-            if problems:
-                raise InputError(
-                    f"{problems[0]}; restore it, or set dataset.gaps=split to begin another "
-                    "sequence after each gap."
-                )
+        problems = self._gaps(videos) + self._unpaired(videos) if self.gaps == "refuse" else []
+        if problems:
+            raise InputError(
+                f"{problems[0]}; restore it, or set dataset.gaps=split to begin another sequence "
+                "after each gap."
+            )
         return tuple(run for video in videos for run in consecutive(self.videos[video]))
 
     def listed(self, split: str) -> tuple[str, ...]:
@@ -162,7 +154,7 @@ class VideoDataset(FileDataset):
         """The files of `name`; no label where there was none when the folder was listed."""
         if name not in self.frames:
             raise InputError(f"{self.name} ({self.root}) has no frame called '{name}'.")
-        return self.frames[name].files
+        return self.frames[name]
 
     def nights(self, names: tuple[str, ...]) -> tuple[bool, ...] | None:
         """Whether the video of each name is in a list of a split "..._night", or "..._day".
@@ -170,27 +162,24 @@ class VideoDataset(FileDataset):
         A video in neither list is a day video where its split has a list of the night alone. None
         if a video is in no list at all.
         """
-        if self._lists is None:
+        if not self._is_listed:
             return None
-        listed = {split: set(self._lists.names(split)) for split in self.splits}
+        listed = {split: set(self.lines(split)) for split in self.splits}
         at_night, by_day = set[str](), set[str]()
         for split, videos in listed.items():
             whole, _, part = split.rpartition("_")
-            if part == "night":
-                at_night |= videos
-                by_day |= listed.get(whole, set())
-            elif part == "day":
-                by_day |= videos
-        found = [self.frames[name].video for name in names]
-        if not set(found) <= at_night | by_day:
+            at_night |= videos if part == "night" else set()
+            by_day |= {"night": listed.get(whole, set()), "day": videos}.get(part, set())
+        found = {_video_of(self.frames[name]) for name in names}
+        if not found <= at_night | by_day:
             return None
-        return tuple(video in at_night for video in found)
+        return tuple(_video_of(self.frames[name]) in at_night for name in names)
 
     def fingerprint(self) -> str:
         """See `hash_of_files`; of all frames, labelled or not."""
         return hash_of_files({s: self.all_names(s) for s in self.splits}, self.files)
 
-    def unused(self, lists: SplitNames) -> Iterable[Path]:  # noqa: ARG002 - as every data set
+    def unused(self, lists: SplitNames) -> Collection[Path]:  # noqa: ARG002 - as every data set
         """None: frames without a label belong to a video, for the rest see `own_problems`."""
         return ()
 
@@ -211,19 +200,22 @@ class VideoDataset(FileDataset):
 
     def _unpaired(self, videos: Collection[str] | None, read: Collection[str] = ()) -> list[str]:
         """What videos lack (None: all), as beginnings of sentences, but for frames in `read`."""
-        files = [each.files for each in self.frames.values()]
         no_rgb = [
             f"{path} has no RGB image"
-            for path, values in without_rgb(self.root, self._partners, files)
-            if videos is None or values.get(VIDEO, "") in videos
+            for path, v in without_rgb(self.root, self._partners, self.frames.values()).items()
+            if videos is None or v.get(VIDEO, "") in videos
         ]
         no_thermal = [
-            f"the frame '{name}' has no thermal image {frame.files.thermal}"
+            f"the frame '{name}' has no thermal image {frame.thermal}"
             for name, frame in self.frames.items()
-            if (videos is None or frame.video in videos) and name not in read
-            if not os.path.lexists(frame.files.thermal)
+            if (videos is None or _video_of(frame) in videos) and name not in read
+            if not os.path.lexists(frame.thermal)
         ]
         return no_rgb + no_thermal
+
+
+def _video_of(frame: Frame) -> str:
+    return frame.values.get(VIDEO, "")
 
 
 class Video(VideoDataset):
@@ -232,9 +224,6 @@ class Video(VideoDataset):
     A pattern is a path below the root with words in braces (`rgbt.data.patterns`): {name} is the
     frame, whose last number counts, and {video} its video, if there are several. The name of a
     sample is that of its video and that of its frame, joined by "_".
-
-    Arguments: the keys of conf/dataset/video.yaml, which describes each. InputError: no such
-    root, another layout, or settings that do not fit each other.
     """
 
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
@@ -257,43 +246,35 @@ class Video(VideoDataset):
         thermal_range: Range | None = None,
     ) -> None:
         colours = painted(num_classes) if palette is None else palette
-        super().__init__(
-            *(root, name, num_classes, classes, colours),
-            background=background,
-            unscored=unscored,
-        )
+        common = (root, name, num_classes, classes, colours)
+        super().__init__(*common, background=background, unscored=unscored)
         self.codes = label_codes(classes, ids, None, ignored)
         self.follow(rgb, thermal, label, thermal_range)
-        frames = find_frames(self.root, self.patterns).values()
-        numbered = [NumberedFrame(f.values.get(VIDEO, ""), _number_of(f), f) for f in frames]
-        self.add(numbered, self.patterns[1:], lists, gaps)
+        frames: list[tuple[int, Frame]] = []
+        for frame in find_frames(self.root, self.patterns).values():
+            found = re.findall(r"\d+", frame.values[NAME])
+            if not found:
+                raise InputError(f"the frame {frame.rgb} of a video has no number in its name.")
+            frames.append((int(found[-1]), frame))
+        self.add(frames, self.patterns[1:], lists, gaps)
 
 
 class MVSeg(VideoDataset):
     """RGB-thermal videos with about five labelled frames each, in the layout of the MVSeg archive.
 
     Layout: {train,val,test,test_day,test_night}.txt, one name of a video per line, and
-    data/VIDEO/visible/NNNNNv.jpg, data/VIDEO/infrared/NNNNNi.jpg (or png, as the first file of the
-    folder), data/VIDEO/label/NNNNNl.png. The frame number is the last four digits; what is before
+    data/VIDEO/visible/NNNNNv.jpg, data/VIDEO/infrared/NNNNNi.jpg (or png),
+    data/VIDEO/label/NNNNNl.png. The frame number is the last four digits; what is before
     them distinguishes recordings of one video.
 
     Value 255 of a label is ignored; the authors' code trains and scores it as "ground".
 
     Source: Ji et al., "Multispectral Video Semantic Segmentation: A Benchmark Dataset and
     Baseline", CVPR 2023.
-
-    Arguments: the keys of conf/dataset/mvseg.yaml, which describes each. InputError: no such
-    root, another layout, or settings that do not fit each other.
     """
 
-    images = PairReader(
-        layouts=(
-            PairPattern("data/{video}/visible/{name}v.jpg", "data/{video}/infrared/{name}i.jpg"),
-            PairPattern("data/{video}/visible/{name}v.png", "data/{video}/infrared/{name}i.png"),
-        ),
-        # JPEG stores grey images with three channels that may differ by rounding.
-        most_tint=8,
-    )
+    # JPEG stores grey images with three channels that may differ by rounding.
+    images = PairReader(layouts=tuple(each._replace(label=None) for each in LAYOUTS), most_tint=8)
 
     def __init__(  # noqa: PLR0913 - each is a key of the configuration
         self,
@@ -316,41 +297,89 @@ class MVSeg(VideoDataset):
         self.codes = LabelCodes({**{value: value for value in range(num_classes)}, IGNORE: rest})
         if not (self.root / "data").is_dir():
             raise InputError(f"dataset.root: '{root}' does not hold the folder data.")
-        frames: list[NumberedFrame] = []
-        for folder in sorted(self.root.glob("data/[!.]*/visible"), key=lambda p: in_order(str(p))):
-            rgb, thermal = _images(folder, "v"), _images(folder.with_name("infrared"), "i")
-            ending = next(iter((thermal or rgb).values()), folder).suffix
-            for stem, path in rgb.items():
-                expected = folder.with_name("infrared") / f"{stem}i{ending}"
-                frames.append(_frame(stem, path, thermal.get(stem, expected)))
-        texts = [f"data/{{video}}/infrared/{{name}}i.{kind}" for kind in ("jpg", "png")]
-        texts += ["data/{video}/label/{name}l.png"]
-        self.add(frames, [Pattern(each, "dataset.root") for each in texts], lists, gaps)
+        frames: list[tuple[int, Frame]] = []
+        found = [each.frames(self.root) for each in LAYOUTS]
+        for frame in (found[0] | found[1]).values():
+            stem = frame.values[NAME]
+            match = STEM.fullmatch(stem)
+            if match is None:
+                raise InputError(
+                    f"{frame.rgb} is no frame of MVSeg: expected a number of four digits or more "
+                    "before the letter v, such as 00237v.jpg."
+                )
+            others = [frame.thermal.with_name(f"{stem}i.{kind}") for kind in KINDS]
+            thermal = next((path for path in others if os.path.lexists(path)), frame.thermal)
+            number = int(match[2]) + APART * int(match[1] or 0)
+            frames.append((number, frame._replace(thermal=thermal)))
+        partners = [each for layout in LAYOUTS for each in layout[1:]]
+        self.add(frames, partners, lists, gaps)
 
 
-def _number_of(frame: Frame) -> int:
-    found = re.findall(r"\d+", frame.values[NAME])
-    if not found:
-        raise InputError(f"the frame {frame.rgb} of a video has no number in its name.")
-    return int(found[-1])
+class FramesInOrder(DatasetWrapper):
+    """All frames of the sequences of `split`, instead of the labelled ones in the order of a list.
+
+    Attributes:
+        sequences: names of each sequence, in the order of their frames; two or more each.
+        alone: number of frames without a neighbour, which are left out.
+
+    Raises:
+        InputError: no two frames of the split follow each other.
+    """
+
+    def __init__(self, source: LabelledDataset, split: str) -> None:
+        super().__init__(source)
+        reader = reader_of(source)
+        if isinstance(reader, VideoDataset):
+            every = reader.sequences(split)
+        else:
+            every = sequences_of_names(source.names(split))
+        self.sequences = tuple(each for each in every if len(each) > 1)
+        self.alone = sum(len(each) == 1 for each in every)
+        if not self.sequences:
+            raise InputError(
+                f"split '{split}' of {source.name} has no two consecutive frames among its "
+                f"{self.alone} frame(s); frames=video requires names whose numbers follow each "
+                "other, such as 00101D and 00102D."
+            )
+        self._frames = tuple(name for each in self.sequences for name in each)
+        self._split = split
+
+    @property
+    def pairs(self) -> dict[str, str]:
+        """Second frame -> the frame before it."""
+        return {later: name for each in self.sequences for name, later in pairwise(each)}
+
+    def names(self, split: str) -> tuple[str, ...]:
+        """All frames in order; of another split as the source has them."""
+        return self._frames if split == self._split else self.source.names(split)
 
 
-def _images(folder: Path, letter: str) -> Mapping[str, Path]:
-    """Stem without the letter -> file, of the ending that the first file has."""
-    paths = sorted(path for path in folder.glob(f"[!.]*{letter}.*"))
-    known = [path for path in paths if path.suffix.lower() in (".jpg", ".jpeg", ".png")]
-    return {path.stem[:-1]: path for path in known if path.suffix == known[0].suffix}
+def sequences_of_names(names: Iterable[str]) -> Sequences:
+    """Runs of names that are equal but for their last number, and whose numbers are consecutive.
+
+    Consecutive are numbers that differ by the smallest step that occurs between such names, so that
+    every fifth frame of a video is a sequence too. Names without a number are alone.
+    """
+    groups: dict[tuple[str, str], dict[int, str]] = {}
+    others: list[str] = []
+    for name in dict.fromkeys(names):
+        match = re.fullmatch(r"(.*?)(\d+)(\D*)", name)
+        if match is None:
+            others.append(name)
+        else:
+            groups.setdefault((match[1], match[3]), {})[int(match[2])] = name
+    runs = [run for _, frames in sorted(groups.items()) for run in consecutive(frames)]
+    return (*runs, *((name,) for name in others))
 
 
-def _frame(stem: str, rgb: Path, thermal: Path) -> NumberedFrame:
-    match = STEM.fullmatch(stem)
-    if match is None:
-        raise InputError(
-            f"{rgb} is no frame of MVSeg: expected a number of four digits or more before the "
-            "letter v, such as 00237v.jpg."
-        )
-    video = rgb.parents[1]
-    label = video / "label" / f"{stem}l.png"
-    values = {"video": video.name, "name": stem}
-    files = Frame(f"{video.name}_{stem}", values, rgb, thermal, label)
-    return NumberedFrame(video.name, int(match[2]) + APART * int(match[1] or 0), files)
+def consecutive(frames: Mapping[int, str]) -> Iterator[tuple[str, ...]]:
+    """Frames by number, cut where these are further apart than the smallest step."""
+    numbers = sorted(frames)
+    steps = [later - number for number, later in pairwise(numbers)]
+    usual = min(steps, default=1)
+    run: list[str] = []
+    for number, after in zip_longest(numbers, steps):
+        run.append(frames[number])
+        if after != usual:
+            yield tuple(run)
+            run = []

@@ -1,4 +1,1 @@
-"""The training loop with optimizers, schedules, checkpoints, evaluation and progress.
-
-Networks, losses and data sets are passed in as objects.
-"""
+"""The training loop; networks, losses and data sets are passed in as objects."""

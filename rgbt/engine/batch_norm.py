@@ -1,8 +1,4 @@
-"""Batch normalisation of a run with several processes: over the whole batch, or over its parts.
-
-With `trainer.batch_norm_parts` 1, mean and variance are those of the samples of all processes, and
-the result does not depend on their number. Otherwise each process normalises its own samples.
-"""
+"""Batch normalisation of a run with several processes: over the whole batch, or over its parts."""
 
 from __future__ import annotations
 
@@ -14,53 +10,45 @@ from rgbt.checks import InputError
 from rgbt.processes import agreed, num_processes, total
 
 OF_TORCH = (nn.BatchNorm1d, nn.BatchNorm2d, nn.BatchNorm3d)
-"""Classes that can be replaced without a change of behaviour."""
 
 
 def check_batch_norm_parts(parts: int, processes: int) -> None:
     """Refuse parts of a batch that this number of processes does not make."""
     if parts not in (1, processes):
-        raise InputError(
-            f"trainer.batch_norm_parts is {parts}, but the run has {processes} devices; set it to "
-            f"1 or {processes}."
-        )
+        raise InputError(f"trainer.batch_norm_parts={parts}: expected 1 or {processes} (devices).")
 
 
 def synchronise_batch_norm(model: nn.Module) -> nn.Module:
-    """Let every batch normalisation read the batch of all processes.
+    """Let every batch normalisation read the batch of all processes; nothing with one process.
 
-    Parameters, buffers and their names stay the same. On CUDA devices torch's own modules are
-    used. With one process, `model` is returned as it is.
-
-    Args:
-        model: on its device, before an optimizer or a wrapper refers to its modules; changed in
-            place, unless it is itself a normalisation.
-
-    Raises:
-        InputError: a subclass of torch's normalisations, whose behaviour would be lost.
+    The state keeps its keys; the model is changed in place, unless it is itself a normalisation.
     """
     if num_processes() == 1:
         return model
+    known = (*OF_TORCH, nn.SyncBatchNorm, SynchronisedBatchNorm)
     for name, module in model.named_modules():
-        known = (*OF_TORCH, nn.SyncBatchNorm, SynchronisedBatchNorm)
         if isinstance(module, _BatchNorm) and type(module) not in known:
-            raise InputError(
-                f"model: '{name}' is a {type(module).__name__}, a class derived from a batch "
-                "normalisation of torch, which several devices cannot synchronise; set "
-                f"trainer.batch_norm_parts={num_processes()}."
-            )
+            said = f"model: several devices cannot synchronise '{name}' ({type(module).__name__})"
+            raise InputError(f"{said}; set trainer.batch_norm_parts={num_processes()}.")
     if any(parameter.is_cuda for parameter in model.parameters()):
         on_cuda: nn.Module = nn.SyncBatchNorm.convert_sync_batchnorm(model)  # type: ignore[no-untyped-call]
         return on_cuda
     return _converted(model)
 
 
-def share_running_statistics(model: nn.Module) -> None:
-    """Give every process the running statistics of process 0.
+def _converted(module: nn.Module) -> nn.Module:
+    """`module` with every batch normalisation of torch replaced, with its own tensors."""
+    if isinstance(module, OF_TORCH):
+        made = SynchronisedBatchNorm(module.num_features)
+        made.__dict__ |= module.__dict__
+        return made
+    for name, child in module.named_children():
+        module.add_module(name, _converted(child))
+    return module
 
-    Needed before an evaluation or a checkpoint where each process normalises its own samples;
-    the statistics have no effect on training. Called by all processes.
-    """
+
+def share_running_statistics(model: nn.Module) -> None:
+    """Give every process the running statistics of process 0; called by all."""
     norms = [module for module in model.modules() if isinstance(module, _BatchNorm)]
     buffers = [buffer for norm in norms for buffer in norm.buffers(recurse=False)]
     for buffer, value in zip(buffers, agreed([each.cpu() for each in buffers]), strict=True):
@@ -68,10 +56,10 @@ def share_running_statistics(model: nn.Module) -> None:
 
 
 class SynchronisedBatchNorm(_BatchNorm):
-    """Batch normalisation over the samples of all processes, for devices without one of torch.
+    """Batch normalisation over the samples of all processes, as many each; torch has one for CUDA.
 
-    All processes have as many values. The variance of the batch is computed from differences to
-    the mean, so that the result equals that of one process to rounding.
+    The variance is computed from differences to the mean, so that the result equals that of one
+    process to rounding.
     """
 
     def forward(self, input: Tensor) -> Tensor:  # noqa: A002 - the name in torch
@@ -94,25 +82,13 @@ class SynchronisedBatchNorm(_BatchNorm):
 
     @torch.no_grad()
     def _track(self, mean: Tensor, unbiased_variance: Tensor) -> None:
-        assert self.num_batches_tracked is not None, "running statistics are tracked"
-        self.num_batches_tracked.add_(1)
-        share = self.momentum
-        if share is None:
-            share = 1.0 / float(self.num_batches_tracked)
-        for running, new in ((self.running_mean, mean), (self.running_var, unbiased_variance)):
+        tracked, number = (self.running_mean, self.running_var), self.num_batches_tracked
+        assert number is not None, "running statistics are tracked"
+        number.add_(1)
+        share = 1.0 / float(number) if self.momentum is None else self.momentum
+        for running, new in zip(tracked, (mean, unbiased_variance), strict=True):
             assert running is not None, "running statistics are tracked"
             running.mul_(1 - share).add_(new, alpha=share)
 
     def _check_input_dim(self, input: Tensor) -> None:  # noqa: A002 - the name in torch
         """Any number of dimensions."""
-
-
-def _converted(module: nn.Module) -> nn.Module:
-    """`module` with every batch normalisation of torch replaced, with its own tensors."""
-    if isinstance(module, OF_TORCH):
-        made = SynchronisedBatchNorm(module.num_features)
-        made.__dict__ |= module.__dict__
-        return made
-    for name, child in module.named_children():
-        module.add_module(name, _converted(child))
-    return module

@@ -1,13 +1,8 @@
-"""Checkpoints of a run: the state to resume from, and the best weights.
+"""What a run saves: the weights that are evaluated, the state to resume from, and their files.
 
-When a run starts, the first of these that exists is used:
-1. ``last.pt`` of the run folder (the run resumes);
-2. `model.weights` (read by `rgbt.weights`);
-3. random weights.
-
+A run starts from ``last.pt`` of its folder, else from `model.weights`, else from random weights.
 ``best.pt`` is written before the ``last.pt`` that names its step, each under a temporary name. A
-process that is killed in between resumes from the state before, and makes the same best weights
-again.
+process that is killed in between resumes from the state before, and makes the same weights again.
 """
 
 from __future__ import annotations
@@ -24,40 +19,70 @@ from annotated_types import Ge
 from pydantic import TypeAdapter
 from torch import Tensor, nn
 
-from rgbt.checkpoints.read import NOTE
-from rgbt.checkpoints.torch_files import is_plain, misfits, read_torch_file, save
-from rgbt.checks import InputError, RunError, not_finite, one_line
+from rgbt.averaging import AveragedNetwork
+from rgbt.checkpoints.files import NOTE, is_plain, misfits, read_torch_file, save
+from rgbt.checks import InputError, RunError, one_line
+from rgbt.engine.settings import TrainerSettings
 
-UNAVERAGED = "unaveraged"
-"""Entry of a checkpoint with the weights of the last step, where "model" has averaged ones."""
-
-ADVICE = (
-    "The last checkpoint is kept. Lower optimizer.lr, or use trainer.precision=32-true if the "
-    "precision was mixed."
-)
-"""Advice for numbers that are not finite."""
-
-
+UNAVERAGED = "unaveraged"  # weights of the last step, where "model" has averaged ones
+WARM_UP = 9  # the decay of step n is at most n / (n + 9), as in TensorFlow's moving average
+CHANGING = {"lr", "foreach", "fused", "capturable"}  # set before every step, or by the device
 Count = Annotated[int, Ge(0)]
+
+
+class EvaluatedWeights:
+    """The weights of a network that are evaluated: its own, or those of an average, a copy.
+
+    Source: "ema" is the teacher of Tarvainen and Valpola (2017); "last" is stochastic weight
+    averaging of Izmailov et al. (2018), but statistics of batch normalisation are averaged, not
+    estimated again on the training images.
+    """
+
+    def __init__(self, model: nn.Module, settings: TrainerSettings) -> None:
+        self._model, self._settings = model, settings
+        is_averaged = settings.averaging != "none"
+        self._average = AveragedNetwork(model, buffers=True) if is_averaged else None
+        self._is_begun = settings.averaging == "ema"
+
+    def update(self, step: int) -> None:
+        """Add the weights after `step` optimizer steps, >= 1; called after every step."""
+        settings = self._settings
+        if settings.averaging == "ema":
+            share = 1 - min(settings.ema_decay, step / (step + WARM_UP))
+        else:
+            averaged = max(1, round(settings.averaged_share * settings.max_steps))
+            number = step - (settings.max_steps - averaged)
+            share = 1 / number if number > 0 else 0.0
+        if self._average is not None and share:
+            self._average.update(self._model, share)
+            self._is_begun = True
+
+    @property
+    def network(self) -> nn.Module:
+        """The network to evaluate: the average, or the trained one before an average begins."""
+        average = self._average if self._is_begun else None
+        return self._model if average is None else average.module
+
+    def state(self) -> dict[str, dict[str, Tensor]]:
+        """Weights to evaluate ("model"), and to resume from where these are others."""
+        own = {} if self.network is self._model else {UNAVERAGED: self._model.state_dict()}
+        return {"model": self.network.state_dict(), **own}
+
+    def restore(self, payload: Mapping[str, dict[str, Tensor]], source: Path) -> None:
+        """Restore the network and its average from a checkpoint; InputError: of another network."""
+        self._is_begun = UNAVERAGED in payload
+        restore_weights(self.network, payload["model"], source)
+        if self._is_begun:
+            restore_weights(self._model, payload[UNAVERAGED], source)
 
 
 @dataclass
 class State:
     """Progress of a run. Generators need no entry: they are derived from seed and step.
 
-    Attributes:
-        step: optimiser steps done.
-        best_score: highest selection score so far, fraction; -1 before the first evaluation, and
-            in a run without a selection split.
-        best_step: the step of the best score.
-        seed: from which every generator of a step is derived, together with `step`: `seeds.masks`,
-            or the seed of the run.
-        skipped: names of the unreadable files that were skipped so far, sorted.
-        evaluated_step: step of the last evaluation; below `step` where a signal came before the
-            evaluation of `step`, which is then made on resuming.
-        unlogged: values of the steps since the last line of ``metrics.jsonl``.
-        key: of the run.
-        settings: digest of its settings (`rgbt.runs.run_spec.settings_digest`).
+    `evaluated_step` is that of the last evaluation: a signal may have come before that of `step`.
+    `unlogged` are values since the last line of ``metrics.jsonl``. `key` and `settings` (a digest,
+    `rgbt.runs.run_spec.settings_digest`) say which run it is.
     """
 
     seed: Count
@@ -76,12 +101,12 @@ class State:
 
     @classmethod
     def of(cls, payload: Mapping[str, Any]) -> State:
-        """The state in a checkpoint; TypeError if there is none."""
-        text = json.dumps(payload.get("state"))
+        """The state in a checkpoint; TypeError: none."""
         try:
+            text = json.dumps(payload.get("state"))
             return TypeAdapter(cls).validate_json(text, strict=True)
         except ValueError as error:
-            raise TypeError(one_line(str(error))) from error
+            raise TypeError(one_line(error)) from error
 
 
 def training_payload(
@@ -90,14 +115,7 @@ def training_payload(
     optimizers: dict[str, torch.optim.Optimizer],
     state: State,
 ) -> dict[str, Any]:
-    """Everything a run needs to resume as if it had not stopped.
-
-    Args:
-        weights: of the network (`rgbt.engine.averaging.EvaluatedWeights.state`).
-        others: further networks that are trained, by name.
-        optimizers: by name.
-        state: progress.
-    """
+    """Everything a run needs to resume; `weights` are those of `EvaluatedWeights.state`."""
     return {
         **weights,
         "others": {name: module.state_dict() for name, module in others.items()},
@@ -107,46 +125,25 @@ def training_payload(
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
-    """The payload of a checkpoint file, tensors on the CPU.
-
-    Raises:
-        InputError: missing, damaged, or not a checkpoint of rgbt; nothing in it is executed.
-    """
+    """The payload of a checkpoint of rgbt, tensors on the CPU; InputError: it is none."""
     payload = read_torch_file(path)
     loaded: dict[str, Any] = payload if isinstance(payload, dict) else {}
-    networks = {key: loaded[key] for key in ("model", UNAVERAGED) if key in loaded}
-    for group in ("others", "optimizers"):
-        found = loaded.get(group, {})
-        networks |= found if isinstance(found, dict) else {group: None}
-    if "model" not in loaded or not all(isinstance(each, dict) for each in networks.values()):
+    groups = [loaded.get(key, {}) for key in ("others", "optimizers")]
+    parts = [loaded.get("model"), loaded.get(UNAVERAGED, {}), *groups]
+    parts += [each for group in groups if isinstance(group, dict) for each in group.values()]
+    if not all(isinstance(each, dict) for each in parts):
         raise InputError(f"{path} is no checkpoint written by `rgbt run`.")
     return loaded
 
 
 def check_origin(payload: Mapping[str, Any], source: Path, key: str, settings: str) -> None:
-    """Refuse a checkpoint of another run, or of a configuration that was changed since.
-
-    Args:
-        payload: of the checkpoint.
-        source: its file.
-        key: of the run, the name of its folder.
-        settings: digest of the configuration of the run.
-
-    Raises:
-        InputError: naming both runs.
-    """
+    """Refuse a checkpoint of another run or of changed settings (a digest), by InputError."""
     stored = payload.get(NOTE, payload.get("state"))
     found = stored if isinstance(stored, dict) else {}
     if found.get("key") != key:
-        raise InputError(
-            f"{source} belongs to the run {found.get('key')}, not to {key}; restore the file of "
-            "this run, or give its folder the name of the run."
-        )
+        raise InputError(f"{source} belongs to the run {found.get('key')}, not to {key}.")
     if found.get("settings") != settings:
-        raise InputError(
-            f"{source.parent / 'config.yaml'} was changed after training; restore it, or train "
-            "with the new settings."
-        )
+        raise InputError(f"{source.parent / 'config.yaml'} was changed after training; restore it.")
 
 
 def step_of(payload: Mapping[str, Any], source: Path) -> int:
@@ -158,47 +155,39 @@ def step_of(payload: Mapping[str, Any], source: Path) -> int:
     return step
 
 
+def restore_weights(model: nn.Module, weights: dict[str, Tensor], source: Path) -> None:
+    """Put `weights` into `model`; InputError names what has not the shape and type of its place."""
+    found = misfits(model.state_dict(), weights)
+    if found:
+        said = one_line("; ".join(found))
+        raise InputError(f"{source} is a checkpoint of another model: {said}.")
+    model.load_state_dict(weights)
+
+
 def restore_optimizer(optimizer: torch.optim.Optimizer, stored: Any, source: Path) -> None:
-    """Restore the state of an optimizer, each tensor in the memory format of its parameter.
-
-    A fused optimizer reads both in the order of memory, and a checkpoint may come from a run with
-    another `trainer.memory_format`.
-
-    Raises:
-        InputError: it is the state of another optimizer.
-    """
+    """Restore the state of an optimizer; InputError: it is that of another one."""
     try:
-        _check_places(optimizer, stored)
-        # The rate alone changes in training; how a step is computed follows from the device.
         groups = optimizer.state_dict()["param_groups"]
-        for own, group in zip(groups, stored["param_groups"], strict=True):
-            own["lr"] = group["lr"]
+        _check_places(optimizer, groups, stored)
         optimizer.load_state_dict({**stored, "param_groups": groups})
     except (ValueError, TypeError, LookupError, AttributeError, RuntimeError) as error:
-        raise InputError(
-            f"{source} holds the state of a different optimizer than this run uses "
-            f"({one_line(str(error))})."
-        ) from error
+        said = f"{source} holds the state of a different optimizer than that of this run"
+        raise InputError(f"{said} ({one_line(error)}).") from error
+    # A fused optimizer reads parameters and moments in the order of memory, and a checkpoint may
+    # come from a run with another trainer.memory_format.
     for parameter, state in optimizer.state.items():
         for name, value in state.items():
             if isinstance(value, Tensor) and value.shape == parameter.shape:
                 state[name] = torch.empty_like(parameter, dtype=value.dtype).copy_(value)
 
 
-def _check_places(optimizer: torch.optim.Optimizer, stored: Any) -> None:
-    """Raise ValueError unless every value has the shape and type of its place.
-
-    torch compares neither: a moment of another shape ends the next step by SIGSEGV.
-    """
-    groups = optimizer.state_dict()["param_groups"]
+def _check_places(optimizer: torch.optim.Optimizer, groups: Any, stored: Any) -> None:
+    """Raise an error for other settings, or for values at whose step torch would end by SIGSEGV."""
     for own, group in zip(groups, stored["param_groups"], strict=True):
-        if own["params"] != group["params"] or own.keys() - group.keys():
-            raise ValueError("other parameters or settings")
-        for key in own.keys() - {"foreach", "fused", "capturable"}:  # of the device
-            values = [each[key] for each in (own, group)]
-            if _kind(values[0]) != _kind(values[1]) or (key != "lr" and values[0] != values[1]):
+        for key in own.keys() - CHANGING:
+            if own[key] != group[key]:
                 raise ValueError(f"{key} is {group[key]}")
-    of_state = [{name: _kind(v) for name, v in each.items()} for each in stored["state"].values()]
+    of_state = [{n: type(v) for n, v in each.items()} for each in stored["state"].values()]
     if any(each != of_state[0] for each in of_state):
         raise ValueError("the states of parameters differ in kind")
     places = dict(enumerate(each for group in optimizer.param_groups for each in group["params"]))
@@ -208,42 +197,16 @@ def _check_places(optimizer: torch.optim.Optimizer, stored: Any) -> None:
             if not isinstance(value, Tensor):
                 continue
             is_fit = value.ndim == 0 or (value.shape, value.dtype) == (place.shape, place.dtype)
-            if not (is_plain(value) and value.is_floating_point() and is_fit):
+            if not (is_fit and is_plain(value) and value.is_floating_point()):
                 raise ValueError(f"{name} of parameter {index} has another shape or type")
 
 
-def _kind(value: object) -> object:
-    """The type of a value, of a tuple those of its parts; a whole number is a number."""
-    if isinstance(value, tuple):
-        return tuple(map(_kind, value))
-    return float if type(value) is int else type(value)
-
-
-def restore_weights(model: nn.Module, weights: dict[str, Tensor], source: Path) -> None:
-    """Put `weights` into `model`; every name, shape and dtype must be that of its place.
-
-    Raises:
-        InputError: naming what does not fit.
-    """
-    found = misfits(model.state_dict(), weights)
-    if found:
-        raise InputError(
-            f"{source} is a checkpoint of another model: {one_line('; '.join(found))}."
-        )
-    model.load_state_dict(weights)
-
-
 class Checkpoints:
-    """Read and write the checkpoints of one run folder (see the module).
-
-    Args:
-        folder: of the run.
-    """
+    """Read and write the checkpoints of the run folder `folder` (see the module)."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.last = folder / "last.pt"
-        self.best = folder / "best.pt"
+        self.last, self.best = folder / "last.pt", folder / "best.pt"
 
     def commit(self, payload: dict[str, Any], state: State) -> None:
         """Write the weights if this step is the best, then the state."""
@@ -254,11 +217,7 @@ class Checkpoints:
         save(self.last, payload)
 
     def load(self) -> tuple[dict[str, Any], State]:
-        """The payload of the last checkpoint and its state.
-
-        Raises:
-            RunError: last.pt or best.pt is missing or damaged.
-        """
+        """The payload of the last checkpoint and its state; RunError: a file is unusable."""
         with self._saying_what_to_do():
             payload = load_checkpoint(self.last)
             state = State.of(payload)
@@ -267,41 +226,20 @@ class Checkpoints:
         return payload, state
 
     def load_best(self, state: State) -> dict[str, Any]:
-        """The best weights of a run, by name.
-
-        Raises:
-            RunError: the file is missing or damaged, or holds the weights of another step.
-        """
+        """The best weights of a run; RunError: the file is unusable or of another step."""
         with self._saying_what_to_do():
             payload = load_checkpoint(self.best)
             check_origin(payload, self.best, state.key, state.settings)
             found = step_of(payload, self.best)
             # Weights of a later step were written just before the run was killed.
             if found != state.best_step and found <= state.step:
-                raise InputError(
-                    f"{self.best} is of step {found}, but the best evaluation of this run is of "
-                    f"step {state.best_step}."
-                )
-        weights: dict[str, Any] = payload["model"]
-        return weights
+                raise InputError(f"{self.best} is of step {found}, not of {state.best_step}")
+        return dict(payload["model"])
 
     @contextmanager
     def _saying_what_to_do(self) -> Iterator[None]:
         try:
             yield
         except (InputError, TypeError) as error:
-            said = one_line(str(error)).rstrip(".")
             advice = "remove the folder and rerun the command to train the run from the start."
-            raise RunError(f"{self.folder}: {said}; {advice}") from error
-
-
-def check_weights(modules: Mapping[str, nn.Module], step: int) -> None:
-    """Refuse to evaluate or save parameters and buffers that are not finite.
-
-    Raises:
-        RunError: naming the step and the first tensor with NaN or infinity.
-    """
-    for module in modules.values():
-        broken = not_finite(module.state_dict())
-        if broken:
-            raise RunError(f"step {step}: '{broken[0]}' holds NaN or infinity. {ADVICE}")
+            raise RunError(f"{self.folder}: {one_line(error)}; {advice}") from error

@@ -1,4 +1,4 @@
-"""Device, precision, threads and memory allocator of a command.
+"""How a network computes, but not what: device, precision, threads, memory, compilation.
 
 Only a training opens Lightning Fabric (`rgbt.engine.fabric`), which takes a second to import.
 """
@@ -8,31 +8,27 @@ from __future__ import annotations
 import ctypes
 import os
 import platform
+import re
+import warnings
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, Protocol
+from typing import Any
 
 import torch
+from torch import nn
+from torch.utils.checkpoint import checkpoint
 
 from rgbt.checks import InputError
 from rgbt.engine.settings import Precision, TrainerSettings
+from rgbt.requirements import record_of
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
-
-
-class Autocast(Protocol):
-    """An object that knows the precision of a forward pass, such as a session."""
-
-    def autocast(self) -> AbstractContextManager[Any]:
-        """Context of a forward pass."""
-        ...
+# `trainer.compile` -> mode of torch.compile. With CUDA graphs, the passes of one step would
+# overwrite each other's results.
+MODES = {"default": "default", "max-autotune": "max-autotune-no-cudagraphs"}
 
 
 def choose_device(trainer: TrainerSettings) -> torch.device:
-    """The device of a run in one process; "auto" prefers a GPU.
-
-    Raises:
-        InputError: the machine has no such device.
-    """
+    """The device of a run in one process; "auto" prefers a GPU. InputError: there is none."""
     found = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
     kinds = [*(kind for kind, is_there in found.items() if is_there), "cpu"]
     kind = kinds[0] if trainer.accelerator == "auto" else trainer.accelerator
@@ -49,38 +45,114 @@ def autocast(device: torch.device, precision: Precision) -> AbstractContextManag
 
 
 def fix_threads(num_threads: int) -> None:
-    """Compute with this number of threads, >= 1, independently of the number of cores.
+    """Compute with this number of threads, >= 1: sums of other parts round to other bits.
 
-    Sums are divided among the threads, and other parts round to other bits. OMP_NUM_THREADS,
-    MKL_NUM_THREADS, MKL_DYNAMIC and a smaller set of cores (taskset, a cluster's job) have no
-    effect after this call.
-
-    Raises:
-        InputError: the environment lets OpenMP take fewer threads: torch then waits for ever for
-            the others (seen with torch 2.13).
+    OMP_NUM_THREADS, MKL_NUM_THREADS, MKL_DYNAMIC and fewer cores (taskset, a cluster's job) have no
+    effect after this call. InputError: OpenMP may take fewer, and torch would wait for ever.
     """
     limit = os.environ.get("OMP_THREAD_LIMIT", "")
     is_limited = limit.isdecimal() and int(limit) < num_threads
     if is_limited or os.environ.get("OMP_DYNAMIC", "").strip().lower() == "true":
         name = "OMP_THREAD_LIMIT" if is_limited else "OMP_DYNAMIC"
-        raise InputError(
-            f"trainer.threads={num_threads}: the environment variable {name}={os.environ[name]} "
-            "limits OpenMP to fewer threads; unset it."
-        )
+        raise InputError(f"trainer.threads={num_threads}: unset {name}={os.environ[name]}.")
     torch.set_num_threads(num_threads)
 
 
 def keep_memory() -> None:
     """Tell glibc to keep freed tensors instead of giving their pages back to the kernel.
 
-    By default every large tensor is unmapped when freed and page-faulted in again when the next
-    one is made: adding 1 to a 40 MB tensor took 28.5 ms, and 6 ms with this setting. The price is
-    up to 30 % more resident memory. Must run before torch allocates.
+    Adding 1 to a tensor of 40 MB took 28.5 ms, and 6 ms with this setting; up to 30 % more memory
+    is resident. Must run before torch allocates.
     """
-    if platform.libc_ver()[0] != "glibc":
-        return
-    libc = ctypes.CDLL("libc.so.6")
-    # Both are needed: the first stops single large blocks from being mapped one by one, the
-    # second stops the heap from being trimmed.
-    libc.mallopt(M_MMAP_THRESHOLD, 1 << 30)
-    libc.mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
+    if platform.libc_ver()[0] == "glibc":
+        libc = ctypes.CDLL("libc.so.6")
+        # Large blocks are not mapped one by one, and the heap is not trimmed.
+        libc.mallopt(M_MMAP_THRESHOLD, 1 << 30)
+        libc.mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
+
+
+def place(network: nn.Module, device: torch.device, settings: TrainerSettings) -> nn.Module:
+    """The network on `device`; convolutions with kernels in "channels_last" return such maps."""
+    if settings.memory_format == "contiguous":
+        return network.to(device)
+    moved: nn.Module = network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return moved
+
+
+def prepare_training(network: nn.Module, settings: TrainerSettings) -> None:
+    """Recompute the activations of a network or compile its forward, in place.
+
+    The keys of its state do not change, and evaluation uses the network as it is.
+    """
+    if settings.activation_checkpointing and settings.compile != "none":
+        raise InputError("trainer.activation_checkpointing: cannot be used with trainer.compile.")
+    if settings.activation_checkpointing:
+        recompute_activations(network)
+    if settings.compile != "none":
+        # The graph recomputes what these functions keep per size, which costs little.
+        warnings.filterwarnings("ignore", message=r"(?s).*lru_cache", category=UserWarning)
+        object.__setattr__(network, "forward", Compiled(network, MODES[settings.compile]))
+
+
+class Compiled:
+    """The forward of a network: compiled in training (at the first call), its own in evaluation."""
+
+    def __init__(self, network: nn.Module, mode: str) -> None:
+        self.network, self.plain = network, network.forward
+        self.compiled = torch.compile(network.forward, mode=mode)
+
+    def __call__(self, *arguments: Any, **keywords: Any) -> Any:
+        """Call the forward."""
+        trains = self.network.training and torch.is_grad_enabled()
+        return (self.compiled if trains else self.plain)(*arguments, **keywords)
+
+
+def recompute_activations(network: nn.Module) -> None:
+    """Compute activations of the modules in `Record.recomputed`, which draw nothing, again."""
+    patterns = [re.escape(each).replace(r"\*", "[^.]*") for each in record_of(network).recomputed]
+    pattern = re.compile("|".join(patterns))
+    modules = [each for name, each in network.named_modules() if name and pattern.fullmatch(name)]
+    if not modules:
+        raise InputError(
+            "trainer.activation_checkpointing: the network has no module that the record of "
+            f'{type(network).__name__} declares; write recomputed=("blocks.*",) there.'
+        )
+    for module in modules:
+        object.__setattr__(module, "forward", Recomputed(module))
+
+
+class Recomputed:
+    """The forward of a module that keeps its inputs alone in training."""
+
+    def __init__(self, module: nn.Module) -> None:
+        self.module, self.forward = module, module.forward
+
+    def __call__(self, *arguments: Any, **keywords: Any) -> Any:
+        """Call the forward."""
+        if not (self.module.training and torch.is_grad_enabled()):
+            return self.forward(*arguments, **keywords)
+        return checkpoint(
+            self.forward,
+            *arguments,
+            use_reentrant=False,
+            preserve_rng_state=False,
+            context_fn=lambda: (nullcontext(), KeptStatistics(self.module)),
+            **keywords,
+        )
+
+
+class KeptStatistics(AbstractContextManager[None]):
+    """Within it, buffers are copies: running statistics are updated in the forward alone."""
+
+    def __init__(self, module: nn.Module) -> None:
+        self.module = module
+
+    def __enter__(self) -> None:
+        modules = self.module.modules()
+        self.kept = [(m, n, b) for m in modules for n, b in m.named_buffers(recurse=False)]
+        for module, name, buffer in self.kept:
+            setattr(module, name, buffer.clone())
+
+    def __exit__(self, *_: object) -> None:
+        for module, name, buffer in self.kept:
+            setattr(module, name, buffer)

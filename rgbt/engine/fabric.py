@@ -20,41 +20,31 @@ from rgbt.runtime.group import group_from_environment
 # Fabric sets itself to INFO when imported, and would repeat the configuration in a line.
 logging.getLogger("lightning_fabric").setLevel(logging.WARNING)
 
-PATIENCE = timedelta(days=7)
-"""Time that processes wait for each other: process 0 does some work alone, and may wait for an
-upstream run that another command trains."""
+PATIENCE = timedelta(days=7)  # process 0 may wait for the training of another command
 
 
 def open_fabric(trainer: TrainerSettings) -> Fabric:
-    """Device and precision of this process; of several, it connects them the first time.
-
-    Raises:
-        InputError: the machine has no such device.
-    """
+    """Device and precision of this process; of several, it connects them the first time."""
     device, group = choose_device(trainer), group_from_environment()
     if group is None:
         # Without an environment, Fabric reads the variables of SLURM, also for a single process.
+        alone = LightningEnvironment()
         return Fabric(
-            accelerator=device.type,
-            devices=1,
-            precision=trainer.precision,
-            plugins=[LightningEnvironment()],
+            accelerator=device.type, devices=1, precision=trainer.precision, plugins=[alone]
         )
-    is_torchrun = TorchElasticEnvironment.detect()
-    environment = TorchElasticEnvironment() if is_torchrun else SLURMEnvironment()
-    devices = [device] * group.local_size
-    if device.type == "cuda" and torch.cuda.device_count() > 1:
+    environment = TorchElasticEnvironment if TorchElasticEnvironment.detect() else SLURMEnvironment
+    devices, visible = [device] * group.local_size, 0
+    if device.type == "cuda" and (visible := torch.cuda.device_count()) > 1:
         devices = [torch.device("cuda", index) for index in range(group.local_size)]
-    # What is not on a GPU goes through gloo, which waits without using a core.
     fabric = Fabric(
         accelerator=device.type,
-        # A job of SLURM may show each process its own GPU alone.
-        devices=1 if device.type == "cuda" and torch.cuda.device_count() == 1 else group.local_size,
+        devices=1 if visible == 1 else group.local_size,  # SLURM may show each process its own GPU
         num_nodes=group.size // group.local_size,
         precision=trainer.precision,
         strategy=_OneProcessPerDevice(
             parallel_devices=devices,
-            cluster_environment=environment,
+            cluster_environment=environment(),
+            # What is not on a GPU goes through gloo, which waits without using a core.
             process_group_backend="cpu:gloo,cuda:nccl" if device.type == "cuda" else "gloo",
             timeout=PATIENCE,
         ),
@@ -64,7 +54,7 @@ def open_fabric(trainer: TrainerSettings) -> Fabric:
 
 
 class _OneProcessPerDevice(DDPStrategy):
-    """Places and connects the processes; the loop averages gradients (`rgbt.engine.gradients`)."""
+    """Places and connects the processes; the loop averages gradients (`rgbt.engine.trainer`)."""
 
     def setup_module(self, module: nn.Module) -> nn.Module:  # type: ignore[override]
         return module

@@ -1,9 +1,6 @@
-"""The progress bar of a training: loss, speed and remaining time in one line."""
+"""The progress bar of a command: what was done, speed and remaining time in one line."""
 
 from __future__ import annotations
-
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 from rich.console import Console
 from rich.progress import (
@@ -20,11 +17,10 @@ CONSOLE = Console(stderr=True)
 """Progress goes to stderr; stdout is for results."""
 
 
-@contextmanager
-def progress() -> Iterator[Progress]:
+def progress() -> Progress:
     """A progress display with columns for count, time left and a note (task field `note`)."""
     # Drawing ten times a second takes 2 % of a core. In a file only the last state is written.
-    with Progress(
+    return Progress(
         SpinnerColumn(),
         TextColumn("{task.description:<10}", markup=False),
         BarColumn(bar_width=30),
@@ -36,5 +32,4 @@ def progress() -> Iterator[Progress]:
         console=CONSOLE,
         refresh_per_second=4,
         auto_refresh=CONSOLE.is_terminal,
-    ) as display:
-        yield display
+    )

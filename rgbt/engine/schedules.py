@@ -1,5 +1,7 @@
 """Learning rate schedules: a factor of the base rate as a function of the optimiser step."""
 
+# ruff: noqa: D102 - calls are those of `Schedule`
+
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -15,24 +17,17 @@ from rgbt.ranges import NumSteps, NumStepsOrZero, Power, Share
 class Schedule(Protocol):
     """The interface of a schedule."""
 
-    def __call__(self, step: int, max_steps: int, steps_per_epoch: int) -> float:
-        """Factor of the base learning rate at optimiser step `step` (0-based)."""
-        ...
+    def __call__(self, step: int, max_steps: int, steps_per_epoch: int, /) -> float:
+        """Factor of the base learning rate at `step`, from 0."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Poly:
     """Polynomial decay ``(1 - t / max_steps) ** power`` after a linear warm-up.
 
-    Paper: CRM and SpatialSeg train with "poly", t counting iterations (`per: iteration`).
-    Released: t counts epochs while the denominator stays in iterations (`per: epoch`), so the
-    rate hardly falls: to 0.98-0.997 of its start at the end of training.
-
-    Attributes:
-        power: 0.9 in both releases.
-        per: what t counts.
-        warmup_steps: steps over which the factor rises linearly from 1 / warmup_steps to 1; the
-            decay, counted from step 0, follows (as in the temporal release).
+    Paper: CRM and SpatialSeg train with "poly", t counting iterations. Released: t counts epochs
+    while the denominator stays in iterations, so the rate hardly falls. The decay after the warm-up
+    is counted from step 0 (temporal release).
     """
 
     power: Power
@@ -40,7 +35,6 @@ class Poly:
     warmup_steps: NumStepsOrZero
 
     def __call__(self, step: int, max_steps: int, steps_per_epoch: int) -> float:
-        """Factor of the base learning rate at `step`."""
         done = step if self.per == "iteration" else step // steps_per_epoch
         decay = max(0.0, 1.0 - done / max_steps) ** self.power
         return (step + 1) / self.warmup_steps if step < self.warmup_steps else float(decay)
@@ -53,14 +47,7 @@ class WarmupPoly:
         t < w: start + (1 - start) t / w,   else ((T - t) / (T - w)) ** power
         T = max_steps counted_epochs / epochs
 
-    Source: CMNeXt release (DELIVER), whose T has one epoch more than are trained.
-
-    Attributes:
-        power: 0.9 there.
-        warmup_steps: w, steps of the linear warm-up.
-        warmup_start: factor of the first step of the warm-up; 0.1 there.
-        epochs: that the run is divided into; 500 there.
-        counted_epochs: that the decay is counted over, >= epochs; 501 there.
+    w is `warmup_steps`. Source: CMNeXt release (DELIVER): one epoch more than are trained.
     """
 
     power: Power
@@ -70,14 +57,9 @@ class WarmupPoly:
     counted_epochs: NumSteps
 
     def __post_init__(self) -> None:
-        if self.counted_epochs < self.epochs:
-            raise InputError(
-                f"schedule.counted_epochs={self.counted_epochs} must be at least "
-                f"schedule.epochs={self.epochs}; see rgbt.engine.schedules.WarmupPoly."
-            )
+        _check_at_least("counted_epochs", self.counted_epochs, "epochs", self.epochs)
 
-    def __call__(self, step: int, max_steps: int, steps_per_epoch: int) -> float:  # noqa: ARG002
-        """Factor of the base learning rate at `step`."""
+    def __call__(self, step: int, max_steps: int, _: int) -> float:
         if step < self.warmup_steps:
             return self.warmup_start + (1 - self.warmup_start) * step / self.warmup_steps
         total = max_steps * self.counted_epochs / self.epochs
@@ -88,16 +70,12 @@ class WarmupPoly:
 class ThesisPoly:
     """``(1 - t / max_steps) ** power``, iterations t counted from 1: the last step has rate 0.
 
-    Source: thesis (J. Sun), code of all networks with one or two heads.
-
-    Attributes:
-        power: 0.9 there.
+    Source: thesis (J. Sun), code of all networks with one or two heads; power 0.9.
     """
 
     power: Power
 
-    def __call__(self, step: int, max_steps: int, steps_per_epoch: int) -> float:  # noqa: ARG002
-        """Factor of the base learning rate at `step`."""
+    def __call__(self, step: int, max_steps: int, _: int) -> float:
         return float((1.0 - (step + 1) / max_steps) ** self.power)
 
 
@@ -116,15 +94,9 @@ class LatePoly:
 
         t = s + e (C / E - 1) n / epochs,  e = floor(s epochs / n),  T = n C / E
 
-    Source: CMX release (E = C), temporal release (E = 1568, C = 1874: computed from the 1873
-    images of another data set).
-
-    Attributes:
-        power: 0.9 in both releases.
-        warmup_steps: of the run, whose W is then warmup_steps C / E.
-        epochs: that the run is divided into.
-        epoch_steps: E, >= 1.
-        counted_steps: C, >= E.
+    E is `epoch_steps`, C `counted_steps` and W of a run warmup_steps C / E. Source: CMX release
+    (E = C), temporal release (E = 1568, C = 1874: computed from the 1873 images of another data
+    set).
     """
 
     power: Power
@@ -134,21 +106,15 @@ class LatePoly:
     counted_steps: NumSteps
 
     def __post_init__(self) -> None:
-        if self.counted_steps < self.epoch_steps:
-            raise InputError(
-                f"schedule.counted_steps={self.counted_steps} must be at least "
-                f"schedule.epoch_steps={self.epoch_steps}; see rgbt.engine.schedules.LatePoly."
-            )
+        _check_at_least("counted_steps", self.counted_steps, "epoch_steps", self.epoch_steps)
 
-    def __call__(self, step: int, max_steps: int, steps_per_epoch: int) -> float:  # noqa: ARG002
-        """Factor of the base learning rate at `step`."""
+    def __call__(self, step: int, max_steps: int, _: int) -> float:
         if step == 0:
             return 1.0
         done = step - 1
-        epoch = done * self.epochs // max_steps
-        # t, W and T of the docstring times E * epochs: whole numbers, so that t = W is met exactly.
         extra = (self.counted_steps - self.epoch_steps) * max_steps
-        count = done * self.epoch_steps * self.epochs + epoch * extra
+        # t, W and T of the docstring times E * epochs: whole numbers, so that t = W is met exactly.
+        count = done * self.epoch_steps * self.epochs + done * self.epochs // max_steps * extra
         warmup = self.warmup_steps * self.counted_steps * self.epochs
         total = max_steps * self.counted_steps * self.epochs
         return count / warmup if count < warmup else float((1.0 - count / total) ** self.power)
@@ -156,39 +122,33 @@ class LatePoly:
 
 @dataclass(frozen=True, kw_only=True)
 class Exponential:
-    """``factor ** epoch``, epochs counted from 0 and rounded down.
+    """``factor ** epoch``, epochs counted from 0 and rounded down (MFNet and RTFNet releases).
 
-    Source: MFNet and RTFNet releases.
-
-    Attributes:
-        factor: 0.95 in both releases' code; MFNet's released weights were trained with 0.94.
-        epoch_steps: length of an epoch in steps, where the list of a release is longer than that
-            of rgbt; null: the length of the list.
+    `epoch_steps` is the length of an epoch of a release; None: that of our list.
     """
 
     factor: Share
     epoch_steps: NumSteps | None
 
-    def __call__(self, step: int, max_steps: int, steps_per_epoch: int) -> float:  # noqa: ARG002
-        """Factor of the base learning rate at `step`."""
+    def __call__(self, step: int, _: int, steps_per_epoch: int) -> float:
         return float(self.factor ** (step // (self.epoch_steps or steps_per_epoch)))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Steps:
-    """``factor ** n``, n counting how often a share of the run has passed, rounded down.
+    """``factor ** n``, n counting how often the share `every` of the run has passed, rounded down.
 
-    Source: HeatNet release (half every 60 of 200 epochs).
-
-    Attributes:
-        factor: in [0, 1]; 0.5 there.
-        every: share of the run, in (0, 1]; 0.3 there.
+    Source: HeatNet release, 0.5 every 0.3 of the run (60 of 200 epochs).
     """
 
     factor: Share
     every: Annotated[float, Interval(ge=1e-6, le=1)]
 
-    def __call__(self, step: int, max_steps: int, steps_per_epoch: int) -> float:  # noqa: ARG002
-        """Factor of the base learning rate at `step`."""
+    def __call__(self, step: int, max_steps: int, _: int) -> float:
         # As a fraction: 0.3 of 608400 steps are 182520, and not the float below.
         return float(self.factor ** (step // (Fraction(str(self.every)) * max_steps)))
+
+
+def _check_at_least(key: str, value: int, other: str, least: int) -> None:
+    if value < least:
+        raise InputError(f"schedule.{key}={value} must be at least schedule.{other}={least}.")

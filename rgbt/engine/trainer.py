@@ -5,29 +5,27 @@ from __future__ import annotations
 import math
 import resource
 import time
-from collections.abc import Callable, Container, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Protocol
 
 import torch
 from lightning_fabric import Fabric
-from torch import Tensor, nn
+from torch import Tensor, distributed, nn
 
-from rgbt.checks import InputError, RunError
-from rgbt.engine.averaging import EvaluatedWeights
+from rgbt.checks import InputError, RunError, not_finite
 from rgbt.engine.batch_norm import share_running_statistics
 from rgbt.engine.checkpoint import (
-    ADVICE,
     Checkpoints,
+    EvaluatedWeights,
     State,
     check_origin,
-    check_weights,
     restore_optimizer,
     restore_weights,
     training_payload,
 )
-from rgbt.engine.gradients import average_gradients, check_gradients
 from rgbt.engine.optimizers import step_without_gradient
 from rgbt.engine.progress import progress
 from rgbt.engine.schedules import Schedule
@@ -37,12 +35,11 @@ from rgbt.randomness import generators_of_step
 from rgbt.runtime.signals import Stopped, at_once, deferred, ending_command, noted, raise_noted
 from rgbt.types import Batch, GeneratorOf, Phase, TwoDomains
 
-RecordStep = Callable[[int, dict[str, float]], None]
-Validate = Callable[[int], float]
 StepData = Batch | TwoDomains
+Values = dict[str, float]
 
-WAIT_SHARE = "wait_share"
-"""Share of the time of a step that the loop waited for its images, 0..1."""
+WAIT_SHARE = "wait_share"  # of the time of a step, spent waiting for its images
+ADVICE = "Lower optimizer.lr, or set trainer.precision=32-true; the last checkpoint is kept."
 
 
 class Loaded(Protocol):
@@ -51,11 +48,9 @@ class Loaded(Protocol):
     @property
     def name(self) -> tuple[str, ...]:
         """Names of all samples."""
-        ...
 
     def to(self, device: torch.device | str) -> StepData:
         """The data of the step on `device`, with images as float32 in [0, 1]."""
-        ...
 
 
 class Scheme(Protocol):
@@ -63,33 +58,22 @@ class Scheme(Protocol):
 
     def phases(self, batch: StepData, generator_of: GeneratorOf, /) -> Iterator[Phase]:
         """The backward passes of one step, in order."""
-        ...
 
 
 @dataclass(kw_only=True, eq=False)
 class Trainer:
-    """Runs a scheme to its last step, with evaluations and checkpoints.
+    """Runs a scheme to its last step, with evaluations and checkpoints in `folder`.
 
     Of several processes, each has one, with its part of every batch; process 0 writes.
 
     Attributes:
-        fabric: device, precision and gradient synchronisation.
-        settings: durations and limits.
-        scheme: yields the phases of a step.
-        model: the network, not wrapped.
         others: further modules of the scheme (such as a discriminator), by name in checkpoints.
-        optimizers: by the names that phases use.
-        schedule: learning rate factor per step.
-        steps_per_epoch: optimiser steps in one epoch.
-        folder: where checkpoints go.
         record: called with (step, values) every `settings.log_every` steps.
         validate: called with the step; evaluates `weights.network` and returns the score that
-            selects the best checkpoint. None: nothing is evaluated, and the weights of the last
-            step take the place of the best ones.
+            selects the best checkpoint. None: the weights of the last step are the best.
         keep: called where the weights just evaluated are the best, before they are saved.
         committed: called after an evaluation has been committed.
-        after_step: called after every step, before its evaluation. A signal interrupts it, and the
-            step is saved.
+        after_step: called before the evaluation of a step; a signal interrupts it.
     """
 
     fabric: Fabric
@@ -101,8 +85,8 @@ class Trainer:
     schedule: Schedule
     steps_per_epoch: int
     folder: Path
-    record: RecordStep
-    validate: Validate | None
+    record: Callable[[int, Values], None]
+    validate: Callable[[int], float] | None
     keep: Callable[[], None] = lambda: None
     committed: Callable[[], None] = lambda: None
     after_step: Callable[[], None] = lambda: None
@@ -110,14 +94,11 @@ class Trainer:
     def __post_init__(self) -> None:
         self.checkpoints = Checkpoints(self.folder)
         self.weights = EvaluatedWeights(self.model, self.settings)
-        self._checked_phases: set[tuple[str, ...]] = set()
 
     def resume(self, state: State) -> bool:
         """Restore everything from the last checkpoint into `state`; False if there is none.
 
-        Raises:
-            RunError: the checkpoints are damaged.
-            InputError: they are of another configuration.
+        RunError: the checkpoints are damaged; InputError: they are of another configuration.
         """
         source = self.checkpoints.last
         if not agreed(source.exists()):
@@ -126,10 +107,7 @@ class Trainer:
         check_origin(payload, source, state.key, state.settings)
         others, optimizers = payload.get("others", {}), payload.get("optimizers", {})
         if others.keys() != self.others.keys() or optimizers.keys() != self.optimizers.keys():
-            raise InputError(
-                f"{source} is a checkpoint of other networks than those of this run. Resume with "
-                "the code that wrote it, or train again in another runs_dir=..."
-            )
+            raise InputError(f"{source} is a checkpoint of other networks than those of this run.")
         self.weights.restore(payload, source)
         for name, module in self.others.items():
             restore_weights(module, others[name], source)
@@ -139,18 +117,11 @@ class Trainer:
         return True
 
     def fit(self, batches: Iterator[Loaded], state: State) -> None:
-        """Train from ``state.step`` to the last step, keeping `state` up to date.
-
-        A signal that ends the command is handled after the current step, or at once during an
-        evaluation; the state is saved first.
-
-        Args:
-            batches: training batches, starting at that step.
-            state: progress of the run; changed in place.
+        """Train from ``state.step`` to the last step with batches from there, updating `state`.
 
         Raises:
             RunError: a loss part, the gradient or a weight is not finite.
-            Stopped: a signal came; its `step` is saved.
+            Stopped: a signal came; it waits for the step, and its `step` is saved.
         """
         total = self.settings.max_steps
         with progress() as display, deferred():
@@ -174,7 +145,7 @@ class Trainer:
     def _is_due(self, state: State) -> bool:
         """Whether the weights of this step are to be evaluated."""
         is_last = state.step == self.settings.max_steps
-        is_step = is_last or (state.step > 0 and state.step % self.settings.eval_every == 0)
+        is_step = is_last or state.step % self.settings.eval_every == 0
         return is_step and state.evaluated_step < state.step
 
     def _evaluate_and_save(self, state: State) -> None:
@@ -184,7 +155,7 @@ class Trainer:
         if saves or signalled:
             self._exchange(state)
         if due and rank() == 0:
-            check_weights({"model": self.model, **self.others}, state.step)
+            self._check_weights(state)
         try:
             raise_noted(signalled)
             if rank() == 0:  # a signal to another process alone waits for the next step
@@ -226,17 +197,24 @@ class Trainer:
             for module in (self.model, self.weights.network, *self.others.values()):
                 share_running_statistics(module)
 
+    def _check_weights(self, state: State) -> None:
+        """Refuse to evaluate or save parameters and buffers that are not finite, by RunError."""
+        for module in (self.model, *self.others.values()):
+            for name in not_finite(module.state_dict()):
+                raise RunError(f"step {state.step}: '{name}' holds NaN or infinity. {ADVICE}")
+
     def _save(self, state: State) -> None:
         if rank() == 0:
-            check_weights({"model": self.model, **self.others}, state.step)
+            self._check_weights(state)
             weights = self.weights.state()
             payload = training_payload(weights, self.others, self.optimizers, state)
             self.checkpoints.commit(payload, state)
 
-    def _step(self, step: int, batches: Iterator[Loaded], seed: int) -> dict[str, float]:
+    def _step(self, step: int, batches: Iterator[Loaded], seed: int) -> Values:
         """One optimizer step of every phase; returns the values to record."""
         started = time.perf_counter()
         factor = self.schedule(step, self.settings.max_steps, self.steps_per_epoch)
+        values: Values = {}
         rates = {}
         for name, optimizer in self.optimizers.items():
             for index, group in enumerate(optimizer.param_groups):
@@ -249,7 +227,6 @@ class Trainer:
             self.scheme.phases(batch.to(device), generators_of_step(seed, index, device))
             for index, batch in enumerate(micro, start=step * self.settings.accumulate)
         ]
-        values: dict[str, float] = {}
         try:
             for phase in parts[0]:
                 # A phase of all batches ends before the next one of any begins: that one may
@@ -261,15 +238,11 @@ class Trainer:
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
         if device.type == "cuda":
             peak = torch.cuda.max_memory_allocated(device) / 2**20
-        return {
-            **values,
-            **rates,
-            "images_per_s": num_processes() * sum(len(batch.name) for batch in micro) / elapsed,
-            WAIT_SHARE: waited / elapsed,
-            "peak_memory_mib": peak,
-        }
+        images = num_processes() * sum(len(batch.name) for batch in micro)
+        values |= {"images_per_s": images / elapsed, WAIT_SHARE: waited / elapsed}
+        return values | rates | {"peak_memory_mib": peak}
 
-    def _run_phase(self, phase: Phase, others: list[Iterator[Phase]]) -> dict[str, float]:
+    def _run_phase(self, phase: Phase, others: list[Iterator[Phase]]) -> Values:
         """Backward through a phase of every accumulated batch, then its optimisers' steps."""
         if phase.clear:
             for optimizer in self.optimizers.values():
@@ -278,51 +251,67 @@ class Trainer:
         groups = [group["params"] for optimizer in stepped for group in optimizer.param_groups]
         # Once for all of them: what two optimisers share is clipped as one gradient.
         parameters = list({id(each): each for group in groups for each in group}.values())
-        names = "+".join(phase.optimizers)
-        losses = [self._backward(phase), *(self._backward(next(phases)) for phases in others)]
-        if phase.optimizers not in self._checked_phases:  # the first time, by all processes
-            check_gradients(parameters, names)
-            self._checked_phases.add(phase.optimizers)
+        names, share = "+".join(phase.optimizers), 1.0 / self.settings.accumulate
+        losses = [self._backward(each, share) for each in chain([phase], map(next, others))]
         average_gradients(parameters)
         norm = nn.utils.clip_grad_norm_(parameters, self.settings.clip_norm or math.inf)
         # One transfer for all values: each one would wait for the device.
         numbers = iter(torch.cat([*(values for _, values in losses), norm.reshape(1)]).tolist())
-        logged: dict[str, float] = {}
+        logged: Values = {}
         for parts, _ in losses:
-            values = _finite_values({name: next(numbers) for name in parts})
-            _add(logged, self._logged(values, phase.logged))
+            values = {name: _finite(name, next(numbers)) for name in parts}
+            beside = phase.logged  # no losses
+            _add(logged, {n if n in beside else f"loss/{n}": v * share for n, v in values.items()})
+            _add(logged, {"loss": sum(v for n, v in values.items() if n not in beside) * share})
         key = "grad_norm" if len(self.optimizers) == 1 else f"grad_norm/{names}"
-        logged[key] = _finite_values({"gradient norm": next(numbers)})["gradient norm"]
+        logged[key] = _finite("gradient norm", next(numbers))
         for optimizer in stepped:
             optimizer.step()
         for name in phase.idle:
             step_without_gradient(self.optimizers[name])
         return logged
 
-    def _backward(self, phase: Phase) -> tuple[tuple[str, ...], Tensor]:
+    def _backward(self, phase: Phase, share: float) -> tuple[tuple[str, ...], Tensor]:
         """Backward through a phase; names and values to log, not read from the device yet."""
-        parts, factor = list(phase.parts.values()), 1.0 / self.settings.accumulate
-        self.fabric.backward(torch.stack(parts).sum() * factor)
+        parts = list(phase.parts.values())
+        self.fabric.backward(torch.stack(parts).sum() * share)
         parts += phase.logged.values()
         values = torch.stack([part.detach().float() for part in parts])
         # Checked after the mean, so that all processes raise the same error.
         return (*phase.parts, *phase.logged), mean_count(values)
 
-    def _logged(self, values: dict[str, float], beside: Container[str]) -> dict[str, float]:
-        """The share of an accumulated batch in the values of a step; `beside` are not losses."""
-        share = 1.0 / self.settings.accumulate
-        logged = {n if n in beside else f"loss/{n}": v * share for n, v in values.items()}
-        logged["loss"] = sum(v for n, v in values.items() if n not in beside) * share
-        return logged
+
+@torch.no_grad()
+def average_gradients(parameters: Sequence[nn.Parameter]) -> None:
+    """Replace each gradient by its mean over the processes, after the last pass of a phase.
+
+    A step may have several forward passes, heads that one domain alone uses, and parameters that
+    two optimizers step, unlike in DistributedDataParallel. What a parameter kept from an earlier
+    phase is the mean already. No gradient is 0 where another process has one.
+    """
+    if num_processes() == 1:
+        return
+    used = mean_count(torch.tensor([each.grad is not None for each in parameters]))
+    by_dtype: dict[torch.dtype, list[Tensor]] = {}
+    for each, share in zip(parameters, used.tolist(), strict=True):
+        if share:
+            each.grad = torch.zeros_like(each) if each.grad is None else each.grad
+            by_dtype.setdefault(each.dtype, []).append(each.grad)
+    for gradients in by_dtype.values():
+        flat = torch.cat([gradient.reshape(-1) for gradient in gradients])
+        distributed.all_reduce(flat)
+        flat /= num_processes()
+        parts = torch.split(flat, [gradient.numel() for gradient in gradients])
+        for gradient, part in zip(gradients, parts, strict=True):
+            gradient.copy_(part.view(gradient.shape))
 
 
-def _add(values: dict[str, float], more: dict[str, float]) -> None:
+def _add(values: Values, more: Values) -> None:
     for name, value in more.items():
         values[name] = values.get(name, 0.0) + value
 
 
-def _finite_values(values: dict[str, float]) -> dict[str, float]:
-    for name, value in values.items():
-        if not math.isfinite(value):
-            raise RunError(f"{name} is {value}.")
-    return values
+def _finite(name: str, value: float) -> float:
+    if not math.isfinite(value):
+        raise RunError(f"{name} is {value}.")
+    return value

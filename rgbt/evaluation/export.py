@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-import rgbt
 from rgbt.assembly.session import Session
 from rgbt.checks import InputError
 from rgbt.class_scores import classes_of
@@ -18,15 +17,13 @@ from rgbt.data.domains import TestedHead
 from rgbt.data.loaders import collate
 from rgbt.data.new_images import of_split
 from rgbt.evaluation.prediction import heads_of, view_of
-from rgbt.exported.graph import (
-    OPSET,
+from rgbt.exported.onnx_network import (
     Description,
+    ExportedNetwork,
     ScoresOfImages,
     onnx_bytes,
     require_packages,
-    traced,
 )
-from rgbt.exported.onnx_network import ExportedNetwork
 from rgbt.files.atomic import write_atomic
 from rgbt.requirements import record_of
 from rgbt.types import View
@@ -86,7 +83,6 @@ def export(session: Session, request: ExportRequest) -> tuple[Description, Compa
     graph = ScoresOfImages(session.model.cpu().float().eval(), view=view, head=head)
     image_hw = (images[0][0].shape[-2], images[0][0].shape[-1])
     description = Description(
-        version=rgbt.__version__,
         network=type(session.model).__name__,
         run=session.evaluations.parent.name if session.step else session.label,
         step=session.step,
@@ -97,11 +93,10 @@ def export(session: Session, request: ExportRequest) -> tuple[Description, Compa
         head=head,
         outputs=record_of(session.model).outputs,
         image_hw=image_hw,
-        opset=OPSET,
         # Where runs are tracked may hold a password and does not change a prediction.
         settings={**session.spec.plain, "tracking": {"_target_": NO_TRACKING}},
     )
-    content = onnx_bytes(traced(graph, image_hw), description)
+    content = onnx_bytes(graph, description)
     network = ExportedNetwork(content, request.out)
     compared = compare(graph, lambda rgb, thermal: network(rgb, thermal).logits, images)
     compared.check(request.tolerance)

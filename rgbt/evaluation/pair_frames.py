@@ -20,7 +20,7 @@ from torch import Tensor
 from rgbt.checks import InputError
 from rgbt.data.loaders import eval_batches
 from rgbt.data.mfnet import NextFrames
-from rgbt.data.sequences import FramesInOrder
+from rgbt.data.video import FramesInOrder
 from rgbt.dataset import LabelledDataset
 from rgbt.evaluation.prediction import EvaluationData
 from rgbt.evaluation.segmentation import NUM_PANELS, panel_names

@@ -28,7 +28,7 @@ from rgbt.config.component import build
 from rgbt.config.compose import compose
 from rgbt.data.loader_settings import LoaderSettings
 from rgbt.data.predictions import Affixes, FormatOptions, PredictionReader, prediction_paths
-from rgbt.data.sequences import FramesInOrder
+from rgbt.data.video import FramesInOrder
 from rgbt.dataset import LabelledDataset
 from rgbt.engine.progress import progress
 from rgbt.evaluation.images import write_png

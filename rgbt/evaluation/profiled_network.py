@@ -21,8 +21,7 @@ from rgbt.data.domains import Domains
 from rgbt.engine.device import autocast, choose_device, fix_threads, keep_memory
 from rgbt.engine.evaluate import class_maps
 from rgbt.engine.settings import TrainerSettings
-from rgbt.exported.graph import require_packages
-from rgbt.exported.onnx_network import exported_network
+from rgbt.exported.onnx_network import exported_network, require_packages
 from rgbt.files.yaml_files import read_yaml
 from rgbt.randomness import derive, torch_generator
 from rgbt.ranges import Size, Text

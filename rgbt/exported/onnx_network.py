@@ -1,4 +1,4 @@
-"""A network that onnxruntime computes from an ONNX file of `rgbt export`.
+"""A network as one ONNX graph with fixed image size: traced, written, and computed by onnxruntime.
 
 An ONNX file is data: a graph of named operators with their constants, and no code. A graph whose
 constants are in other files is refused.
@@ -6,8 +6,13 @@ constants are in other files is refused.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import importlib.util
+import json
+import logging
+import warnings
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,20 +21,82 @@ from torch import Tensor, nn
 
 import rgbt
 from rgbt.checks import InputError, one_line
-from rgbt.exported.graph import (
-    OPSET,
-    Description,
-    ScoresOfImages,
-    onnx_bytes,
-    require_packages,
-    traced,
-)
-from rgbt.files.plain_files import read_bytes
-from rgbt.requirements import Record, record_of
+from rgbt.files.plain_files import parse_json, read_bytes
+from rgbt.requirements import Outputs, Record, record_of
 from rgbt.types import Output, View
+
+PREFIX = "rgbt."
+"""Of every name in the metadata of a file."""
+
+PACKAGES = ("onnx", "onnxruntime", "onnxscript")
+"""What the optional extra `export` installs."""
+
+OPSET = 18
+"""Version of the ONNX operators: the one that PyTorch's exporter is written for. grid_sample of
+deformable attention requires 16."""
 
 INPUTS = {"rgb": 3, "thermal": 1}
 """Inputs of the graph, with their channels."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Description:
+    """The metadata of an exported network.
+
+    Attributes:
+        network: its class.
+        run: key of the run, or name of the file of weights.
+        step: optimiser step of the weights; 0 where it is not known.
+        fingerprint: of the files of the data set.
+        classes: names, in the order of the scores.
+        view: input images that the graph uses; the other image is an input too and is ignored.
+        head: of a network with one head per domain; None: it has one for all images.
+        outputs: whether the scores are of classes, or sums over masks of queries.
+        settings: configuration of the run, without tracking: how images are read and predicted.
+    """
+
+    version: str = rgbt.__version__
+    network: str
+    run: str = ""
+    step: int = 0
+    dataset: str = ""
+    fingerprint: str = ""
+    classes: tuple[str, ...]
+    view: View
+    head: str | None = None
+    outputs: Outputs
+    image_hw: tuple[int, int]
+    settings: dict[str, Any]
+    rgb: str = "float32, (batch, 3, height, width), R, G, B in [0, 1]"
+    thermal: str = "float32, (batch, 1, height, width), grey level in [0, 1]"
+
+    @classmethod
+    def from_metadata(cls, path: Path, metadata: Mapping[str, str]) -> Description:
+        """The description in the metadata of the file `path`; InputError if there is none."""
+        own = {k.removeprefix(PREFIX): v for k, v in metadata.items() if k.startswith(PREFIX)}
+        try:
+            text = json.dumps({key: json.loads(value) for key, value in own.items()})
+            found: Description = parse_json(text, cls)
+        except (ValueError, RecursionError) as error:
+            raise InputError(
+                f"{path} has no description of rgbt ({one_line(error)}); write the file with rgbt "
+                "export run=... out=..."
+            ) from error
+        return found
+
+
+class ScoresOfImages(nn.Module):
+    """RGB (B, 3, H, W) and thermal (B, 1, H, W) in [0, 1] to class scores (B, K, H, W)."""
+
+    def __init__(self, network: nn.Module, *, view: View, head: str | None) -> None:
+        super().__init__()
+        self.network = network
+        self._options: dict[str, Any] = {"views": (view,)} | ({"head": head} if head else {})
+
+    def forward(self, rgb: Tensor, thermal: Tensor) -> Tensor:
+        """(B, K, H, W) scores at the size of the images."""
+        scores: Tensor = self.network(rgb, thermal, **self._options).logits
+        return scores
 
 
 class ExportedNetwork(nn.Module):
@@ -37,21 +104,26 @@ class ExportedNetwork(nn.Module):
 
     onnxruntime computes on the CPU, with as many threads as PyTorch has.
 
-    Attributes:
-        description: the metadata of the file.
-
     Raises:
         InputError: the packages of the extra are missing, or the file is damaged, of another
-            program, or of other inputs or classes than it states.
+            program, or of other inputs or classes than its `description` states.
     """
 
     def __init__(self, content: bytes, path: Path) -> None:
         super().__init__()
         require_packages()
+        import onnxruntime
+
         self._path = path
-        with _explained(path):
+        settings = onnxruntime.SessionOptions()
+        settings.intra_op_num_threads = torch.get_num_threads()
+        settings.inter_op_num_threads = 1
+        settings.log_severity_level = 4  # errors are raised
+        # The fallback would print, and try the same again.
+        cpu = {"providers": ["CPUExecutionProvider"], "enable_fallback": 0}
+        with _explained(f"{path} cannot be used by onnxruntime", "Export the network again."):
             _check_constants(content)
-            self._graph = _session(content)
+            self._graph = onnxruntime.InferenceSession(content, settings, **cpu)
             metadata = self._graph.get_modelmeta().custom_metadata_map
         self.description = made = Description.from_metadata(path, metadata)
         kind, hw = "tensor(float)", made.image_hw
@@ -79,106 +151,115 @@ class ExportedNetwork(nn.Module):
     def forward(
         self, rgb: Tensor, thermal: Tensor, *, views: tuple[View, ...] = (), head: str | None = None
     ) -> Output:
-        """Class scores; arguments as `rgbt.models` says.
+        """Class scores, for arguments as `rgbt.models` says.
 
-        Raises:
-            InputError: images of another size, or another view or head than those of the file.
+        InputError: images of another size, or another view or head than those of the file.
         """
-        made, got = self.description, tuple(rgb.shape[-2:])
+        made = self.description
         if views not in ((), (made.view,)):
             raise InputError(f"modality: {self._path} predicts from {made.view} alone.")
         if head not in (None, made.head):
             raise InputError(f"head={head}: {self._path} has the head '{made.head}'.")
-        if got != made.image_hw:
-            own, other = (" x ".join(map(str, hw)) for hw in (made.image_hw, got))
-            raise InputError(
-                f"{self._path} takes images of {own} pixels, but got {other}; export the network "
-                f"with image_hw={got[0]},{got[1]}, or change the size of the images."
-            )
-        images = {"rgb": rgb, "thermal": thermal}
-        arrays = {name: image.float().cpu().numpy() for name, image in images.items()}
-        with _explained(self._path):
-            (scores,) = self._graph.run(["scores"], arrays)
+        images = {"rgb": rgb.float().cpu().numpy(), "thermal": thermal.float().cpu().numpy()}
+        advice = (
+            f"Its images have the size {made.image_hw}; export it with image_hw=... for others."
+        )
+        with _explained(f"{self._path} cannot be computed", advice):
+            (scores,) = self._graph.run(["scores"], images)
         return Output(torch.from_numpy(scores).to(rgb.device), {})
+
+
+def require_packages() -> None:
+    """Refuse where packages of the extra are missing; InputError names them."""
+    missing = [name for name in PACKAGES if importlib.util.find_spec(name) is None]
+    if missing:
+        what = ", ".join(missing)
+        raise InputError(f"ONNX files require {what}; install them: pip install 'rgbt[export]'.")
+
+
+def onnx_bytes(graph: ScoresOfImages, made: Description) -> bytes:
+    """The content of an ONNX file; the size of the batch stays open.
+
+    Raises:
+        InputError: the network depends on values of the images or of the batch in Python, or has
+            an operator that ONNX does not have.
+    """
+    # Two images: PyTorch would take a batch of one for a constant.
+    images = tuple(torch.full((2, channels, *made.image_hw), 0.5) for channels in INPUTS.values())
+    batch = torch.export.Dim("batch", min=1)
+    advice = "Its forward must not depend on values in Python; use x.shape[0] instead of len(x)."
+    with torch.no_grad():
+        # What networks keep per image size is made before: in the trace it would have no values.
+        graph.eval()(*images)
+        with _explained(f"{made.network} cannot be exported", advice):
+            dynamic = ({0: batch}, {0: batch})
+            written = torch.onnx.export(
+                torch.export.export(graph, images, dynamic_shapes=dynamic, strict=False),
+                (),
+                dynamo=True,
+                opset_version=OPSET,
+                input_names=[*INPUTS],
+                output_names=["scores"],
+                external_data=False,
+                verbose=False,
+            )
+    assert written is not None, "dynamo=True returns the program"
+    proto = written.model_proto
+    body = proto.graph
+    for each in (body, *body.node, *body.input, *body.output, *body.value_info, *body.initializer):
+        del each.metadata_props[:]  # notes of the exporter, with paths of this machine
+    for name, value in asdict(made).items():
+        proto.metadata_props.add(key=f"{PREFIX}{name}", value=json.dumps(value))
+    content: bytes = proto.SerializeToString()
+    return content
 
 
 def exported_network(
     network: nn.Module, view: View, image_hw: tuple[int, int], name: str
 ) -> ExportedNetwork:
-    """A network that is not of a run, in onnxruntime; nothing is written.
+    """A network in evaluation mode on the CPU, in onnxruntime; nothing is written.
 
-    Args:
-        network: in evaluation mode, on the CPU.
-        view: input images of the prediction.
-        image_hw: height and width of the images.
-        name: for messages.
-
-    Raises:
-        InputError: it cannot be exported.
+    InputError: it cannot be exported; `name` is for messages.
     """
-    program = traced(ScoresOfImages(network, view=view, head=None), image_hw)
-    num_classes = program.graph.output_node().args[0][0].meta["val"].shape[1]
+    graph = ScoresOfImages(network, view=view, head=None)
+    with torch.no_grad():
+        scores = graph(*(torch.zeros(1, channels, *image_hw) for channels in INPUTS.values()))
     made = Description(
-        version=rgbt.__version__,
         network=type(network).__name__,
-        run="",
-        step=0,
-        dataset="",
-        fingerprint="",
-        classes=tuple(map(str, range(num_classes))),
+        classes=tuple(map(str, range(scores.shape[1]))),
         view=view,
-        head=None,
         outputs=record_of(network).outputs,
         image_hw=image_hw,
-        opset=OPSET,
         settings={},
     )
-    return ExportedNetwork(onnx_bytes(program, made), Path(name))
+    return ExportedNetwork(onnx_bytes(graph, made), Path(name))
 
 
 def _check_constants(content: bytes) -> None:
-    """Refuse constants in other files: onnxruntime would open any path."""
+    """Refuse constants in other files, wherever they are: onnxruntime would open any path."""
     import onnx
 
-    graph = onnx.load_model_from_string(content)
-    bodies = [graph.graph, *graph.functions]
-    if any(each.data_location == onnx.TensorProto.EXTERNAL for each in _constants(bodies)):
+    def tensors(message: Any) -> Iterator[Any]:
+        yield from [message] if isinstance(message, onnx.TensorProto) else []
+        for field, value in message.ListFields():
+            if field.message_type is not None:
+                for each in [value] if hasattr(value, "ListFields") else value:
+                    yield from tensors(each)
+
+    model = onnx.load_model_from_string(content)
+    if any(each.data_location == onnx.TensorProto.EXTERNAL for each in tensors(model)):
         raise ValueError("it keeps constants in another file, which is not read")
 
 
-def _constants(bodies: Iterable[Any]) -> Iterator[Any]:
-    """The tensors of graphs and functions, and of the graphs inside their nodes."""
-    for body in bodies:
-        yield from getattr(body, "initializer", ())  # a function has none
-        for attribute in (each for node in body.node for each in node.attribute):
-            yield from (attribute.t, *attribute.tensors)
-            inner = [attribute.g] if attribute.HasField("g") else []
-            yield from _constants([*inner, *attribute.graphs])
-
-
-def _session(content: bytes) -> Any:
-    """The graph, ready to compute."""
-    import onnxruntime
-
-    settings = onnxruntime.SessionOptions()
-    settings.intra_op_num_threads = torch.get_num_threads()
-    settings.inter_op_num_threads = 1
-    settings.log_severity_level = 4  # errors are raised
-    return onnxruntime.InferenceSession(
-        content,
-        settings,
-        providers=["CPUExecutionProvider"],
-        enable_fallback=0,  # it prints, and tries the same again
-    )
-
-
 @contextmanager
-def _explained(path: Path) -> Iterator[None]:
-    """Turn what onnx and onnxruntime raise, errors of many kinds, into an InputError."""
+def _explained(what: str, advice: str = "") -> Iterator[None]:
+    """Turn what the packages raise, errors of many kinds, into an InputError; no reports."""
+    logging.disable(logging.WARNING)
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
     except Exception as error:
-        raise InputError(
-            f"{path} cannot be used by onnxruntime ({one_line(error)}); export the network again "
-            "with rgbt export."
-        ) from error
+        raise InputError(f"{what} ({one_line(error)}). {advice}".rstrip()) from error
+    finally:
+        logging.disable(logging.NOTSET)

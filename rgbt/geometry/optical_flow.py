@@ -1,14 +1,12 @@
 """Estimate where the points of a frame lie in the frame before it, without training.
 
 Flows are (H, W, 2) float32: for every pixel of one frame, how many (rows, columns) further the same
-point lies in the other. They are estimated in both directions. Pixels count whose two flows agree,
-because a point that is hidden in one of the frames has no partner there.
+point lies in the other. Pixels count whose flows in both directions agree: others are hidden.
 """
 
 from __future__ import annotations
 
-from functools import cache
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -20,7 +18,7 @@ FlowSource = Literal["rgb", "thermal", "both"]
 """Images that the flow is estimated from; "both": at each pixel, the one whose flows agree best."""
 
 SMALLEST = 16
-"""Least height and width of frames in pixels, that of two patches of the estimation."""
+"""Least height and width of frames in pixels: two patches of the estimation."""
 
 RELATIVE, ABSOLUTE = 0.01, 0.5
 """Limit of the squared disagreement of two flows: 0.01 (|w|^2 + |w'|^2) + 0.5 square pixels."""
@@ -41,12 +39,12 @@ class FrameFlow(NamedTuple):
 
     def source(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Rows and columns (H, W) of the nearest pixels of the first frame; -1 where not used."""
-        grid = np.moveaxis(np.indices(self.used.shape), 0, -1)
-        first_yx = np.rint(grid + self.flow).astype(np.int64)
-        limit = np.array(self.used.shape) - 1
-        first_yx = np.clip(first_yx, 0, limit)
-        first_yx[~self.used] = -1
-        return first_yx[..., 0], first_yx[..., 1]
+        places = np.indices(self.used.shape) + np.moveaxis(self.flow, -1, 0)
+        rows, columns = (
+            np.where(self.used, np.rint(place).astype(np.int64).clip(0, side - 1), -1)
+            for place, side in zip(places, self.used.shape, strict=True)
+        )
+        return rows, columns
 
 
 def gray_of(rgb: NDArray[np.uint8]) -> Gray:
@@ -65,7 +63,7 @@ def frame_flow(
     found = []
     for name in names:
         flow = estimate(second[name], first[name])
-        found.append((flow, disagreement(flow, estimate(first[name], second[name]))[0]))
+        found.append((flow, disagreement(flow, estimate(first[name], second[name]))))
     flow, error = found[0]
     for other, other_error in found[1:]:
         better = other_error < error
@@ -74,31 +72,26 @@ def frame_flow(
 
 
 def estimate(start: Gray, end: Gray) -> Flow:
-    """Flow from `start` (H, W) to `end` by dense inverse search.
+    """Flow from `start` (H, W) to `end` by dense inverse search; errors as of `frame_flow`.
 
     Source: Kroeger et al., "Fast Optical Flow using Dense Inverse Search", ECCV 2016, in OpenCV
     with its preset "medium".
-
-    Raises:
-        InputError: sizes differ, or are below `SMALLEST`.
     """
     if start.shape != end.shape or min(start.shape) < SMALLEST:
         sizes = [" x ".join(map(str, each.shape)) for each in (start, end)]
         raise InputError(f"flow: expected one size of at least {SMALLEST} pixels, got {sizes}.")
-    columns_rows = _search().calc(start, end, None)
-    return np.ascontiguousarray(columns_rows[..., ::-1], dtype=np.float32)
+    # OpenCV's type stubs lack this function.
+    search = vars(cv2)["DISOpticalFlow_create"](cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    return np.ascontiguousarray(search.calc(start, end, None)[..., ::-1], dtype=np.float32)
 
 
-def disagreement(flow: Flow, back: Flow) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """How far `back` misses the start of `flow`, relative to the limit; and what is inside.
+def disagreement(flow: Flow, back: Flow) -> NDArray[np.float32]:
+    """How far `back` misses the start of `flow`, relative to the limit: (H, W), inf outside.
 
         |w(x) + w'(x + w(x))|^2 / (0.01 (|w|^2 + |w'|^2) + 0.5)
 
     Source: Sundaram, Brox and Keutzer, "Dense Point Trajectories by GPU-accelerated Large
     Displacement Optical Flow", ECCV 2010, Eq. 5.
-
-    Returns:
-        (H, W), at most 1 where both agree; infinite where the point is outside, (H, W) bool.
     """
     height, width = flow.shape[:2]
     rows, columns = np.indices((height, width), np.float32)
@@ -107,10 +100,4 @@ def disagreement(flow: Flow, back: Flow) -> tuple[NDArray[np.float32], NDArray[n
     there = cv2.remap(back, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     missed = np.square(flow + there).sum(-1)
     limit = RELATIVE * (np.square(flow).sum(-1) + np.square(there).sum(-1)) + ABSOLUTE
-    return np.where(inside, missed / limit, np.inf).astype(np.float32), inside
-
-
-@cache
-def _search() -> Any:
-    # OpenCV's type stubs lack this function.
-    return vars(cv2)["DISOpticalFlow_create"](cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    return np.where(inside, missed / limit, np.inf).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Warp images, labels and scores of a frame to a view of it, in batches on their device.
+"""Warp images, labels and scores of a frame to a view of it; maps of half the size.
 
 A pixel of the second frame shows a point of the canvas (the view before it is cut), by the
 rectangle, and this a point of the first frame, by the inverse homography. Points outside the
@@ -18,12 +18,12 @@ from torch.nn import functional as F
 
 from rgbt.checks import check_shape
 from rgbt.geometry.padding import pad_to
+from rgbt.types import IGNORE
 
 Resampling = Literal["once", "twice"]
-"""How often a value is interpolated on its way: "once", along the composed map, where the border
-pixels of the first frame reach to its outline; "twice", as in the release of Temporal: onto the
-canvas, where borders fade into zeros, and from the cut rectangle to the full size."""
-
+"""How often a value is interpolated: "once", along the composed map, where the border pixels of the
+first frame reach to its outline; "twice", as in the release of Temporal: onto the canvas, where
+borders fade into zeros, and from the cut rectangle to the full size."""
 
 NOWHERE = -1e6
 """A coordinate in pixels that is outside every frame."""
@@ -32,18 +32,14 @@ NOWHERE = -1e6
 def powers_of_two(image_hw: tuple[int, int]) -> tuple[int, int]:
     """(height, width) of the padded frame in which points are normalised.
 
-    Only for such sizes does `grid_sample` find a whole pixel again exactly: (x + 0.5) / W is then
-    a float without rounding. At 640 columns it is off by 1e-5 pixel.
+    `grid_sample` finds whole pixels exactly at such sizes alone: (x + 0.5) / W is not rounded.
     """
     height, width = (1 << (side - 1).bit_length() for side in image_hw)
     return height, width
 
 
 def normalised(x: Tensor, y: Tensor, image_hw: tuple[int, int]) -> Tensor:
-    """(B, H, W, 2) of points (B, H, W) in pixels: -1 and 1 are the edges of the padded frame.
-
-    float32.
-    """
+    """(B, H, W, 2) of points (B, H, W) in pixels: -1 and 1 are the edges of the padded frame."""
     sides = reversed(powers_of_two(image_hw))
     # A product with a power of two is exact, so that one rounding is left.
     parts = [
@@ -51,45 +47,6 @@ def normalised(x: Tensor, y: Tensor, image_hw: tuple[int, int]) -> Tensor:
         for at, side in zip((x, y), sides, strict=True)
     ]
     return torch.stack(parts, -1)
-
-
-def sample(values: Tensor, grid: Tensor) -> Tensor:
-    """`values` (B, C, H, W) at the points of `grid` (B, h, w, 2) of `normalised`, 0 outside.
-
-    Values and gradients, which can be taken once, are bit by bit those of bilinear `grid_sample`
-    with zero padding. That keeps its input for the gradient of the points; here points have none,
-    so that the backward pass gets a zero in place of the input.
-    """
-    return cast(Tensor, _Sample.apply(values, grid))  # type: ignore[no-untyped-call]
-
-
-class _Sample(torch.autograd.Function):
-    """`grid_sample` of a padded frame that keeps the grid alone.
-
-    torch computes the gradient of the points too: of one zero that stands for all values. For nine
-    classes of 480x640, 19 MB per image are not kept.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, values: Tensor, grid: Tensor) -> Tensor:
-        ctx.save_for_backward(grid)
-        ctx.image_hw = values.shape[-2:]
-        padded = pad_to(values, powers_of_two(ctx.image_hw))
-        return F.grid_sample(padded, grid.to(values.dtype), align_corners=False)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        (grid,) = ctx.saved_tensors
-        height, width = ctx.image_hw
-        padded_hw = powers_of_two(ctx.image_hw)
-        anything = gradient.new_zeros(()).expand(*gradient.shape[:2], *padded_hw)
-        bilinear, zeros = 0, 0  # torch's numbers of the interpolation and of the padding
-        of_values, _ = torch.ops.aten.grid_sampler_2d_backward(
-            *(gradient, anything, grid.to(gradient.dtype), bilinear, zeros, False),
-            output_mask=[True, False],
-        )
-        return of_values[..., :height, :width], None
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +59,6 @@ class Warp:
         rectangle: (B, 4) float64, (left, top, right, bottom) of what is cut from the canvas and
             resized to the whole frame, in pixel edges; NaN: the frame shows nothing.
         image_hw: height and width of both frames.
-        resampling: "once" or "twice".
     """
 
     homography: Tensor
@@ -111,8 +67,7 @@ class Warp:
     resampling: Resampling
 
     def __post_init__(self) -> None:
-        batch = check_shape("homography", self.homography, "B M N", M=3, N=3)["B"]
-        check_shape("rectangle", self.rectangle, "B S", B=batch, S=4)
+        check_shape("rectangle", self.rectangle, "B S", B=len(self.homography), S=4)
 
     def resized(self, image_hw: tuple[int, int]) -> Warp:
         """The same view for the same frames at another size, (height, width)."""
@@ -130,9 +85,7 @@ class Warp:
         )
 
     def halved(self) -> Warp:
-        """The same view for frames whose pixels cover 2x2 pixels of these.
-
-        (`rgbt.geometry.halving`.)
+        """The same view for frames whose pixels cover 2x2 pixels of these, as `halved_mean`.
 
         At odd sizes, both frames end one row or column later, so that pixels keep their places.
         """
@@ -144,7 +97,7 @@ class Warp:
         return even.resized((rows // 2, columns // 2))
 
     def bilinear(self, values: Tensor, levels: int | None = None) -> Tensor:
-        """Interpolated `values` (B, C, H, W) float, 0 outside; differentiable in `values` once.
+        """Interpolated `values` (B, C, H, W) float, 0 outside; differentiable in `values`.
 
         Where a point falls on a pixel, that pixel's value comes back bit by bit. `levels` 255
         rounds to 8-bit levels after each interpolation, without a gradient.
@@ -152,7 +105,8 @@ class Warp:
         self._check(values, "B C H W")
         sampled = values.to(torch.promote_types(values.dtype, torch.float32))
         for grid in self._grids:
-            sampled = sample(sampled, grid)
+            padded = pad_to(sampled, powers_of_two(self.image_hw))
+            sampled = F.grid_sample(padded, grid.to(padded.dtype), align_corners=False)
             sampled = sampled if levels is None else (sampled * levels).round() / levels
         return sampled.to(values.dtype)
 
@@ -169,10 +123,7 @@ class Warp:
         return self._pixels[1].view(-1, *self.image_hw)
 
     def moved(self, points_yx: Tensor) -> Tensor:
-        """Where pixels (B, 2) of the first frame lie in the second; the nearest of it, if outside.
-
-        (row, column), one per frame; int64.
-        """
+        """Pixel of the second frame nearest to that of the first; (B, 2) int64 (row, column)."""
         row, column = points_yx.to(self.homography.device, torch.float64).unbind(1)
         points = torch.stack([column, row, torch.ones_like(row)], 1)
         x, y, w = (self.homography @ points[..., None])[..., 0].unbind(1)
@@ -181,8 +132,7 @@ class Warp:
         rows = (y / w - top) * height / (bottom - top) - 0.5
         columns = (x / w - left) * width / (right - left) - 0.5
         limit = torch.tensor([height - 1, width - 1], device=row.device)
-        nearest = torch.stack([rows, columns], 1).round().long()
-        return torch.minimum(nearest.clamp(min=0), limit)
+        return torch.stack([rows, columns], 1).round().long().clamp(min=0).minimum(limit)
 
     def _check(self, values: Tensor, letters: str) -> None:
         height, width = self.image_hw
@@ -196,14 +146,11 @@ class Warp:
         height, width = self.image_hw
         return left + columns * ((right - left) / width), top + rows * ((bottom - top) / height)
 
-    def _whole(self) -> tuple[Tensor, Tensor]:
+    def _whole(self) -> list[Tensor]:
         """Columns (1, W) and rows (1, H), float64."""
-        height, width = self.image_hw
         device = self.rectangle.device
-        return (
-            torch.arange(width, dtype=torch.float64, device=device)[None],
-            torch.arange(height, dtype=torch.float64, device=device)[None],
-        )
+        sides = reversed(self.image_hw)
+        return [torch.arange(side, dtype=torch.float64, device=device)[None] for side in sides]
 
     def _source(self, columns: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
         """x, y (B, H, W) float32 in the first frame of canvas points; NaN behind the camera."""
@@ -215,17 +162,29 @@ class Warp:
 
     @cached_property
     def _composed(self) -> tuple[Tensor, Tensor, Tensor]:
-        """x, y of every pixel of the second frame in the first, and whether it is there."""
-        x, y = self._source(*self._cut)
-        return x, y, self._within(x, y)
-
-    def _within(self, x: Tensor, y: Tensor) -> Tensor:
-        """(B, H, W) bool; NaN is outside."""
+        """x, y (B, H, W) in the first frame of the second's pixels, and whether they are there."""
+        points = self._cut
+        if self.resampling == "twice":  # what OpenCV's nearest resize takes from the rectangle
+            left, top, right, bottom = self.rectangle[..., None].unbind(1)
+            columns, rows = self._whole()
+            points = _nearest_resize(columns, left, right), _nearest_resize(rows, top, bottom)
+        x, y = self._source(*points)
         height, width = self.image_hw
         inside = x >= -0.5
         for each in (x <= width - 0.5, y >= -0.5, y <= height - 0.5):
             inside &= each
-        return inside
+        return x, y, inside
+
+    @cached_property
+    def _pixels(self) -> tuple[Tensor, Tensor]:
+        """Flat index (B, H W) int64 of the nearest pixel, and (B, H W) whether there is one."""
+        x, y, inside = self._composed
+        height, width = self.image_hw
+        column, row = (
+            (at + 0.5).floor_().clamp_(0, side - 1).nan_to_num_(0).int()
+            for at, side in ((x, width), (y, height))
+        )
+        return row.mul_(width).add_(column).long().flatten(1), inside.flatten(1)
 
     @cached_property
     def _grids(self) -> list[Tensor]:
@@ -233,11 +192,8 @@ class Warp:
         height, width = self.image_hw
         if self.resampling == "once":
             x, y, inside = self._composed
-            outside = ~inside
-            x, y = (
-                at.clamp(0, side - 1).masked_fill_(outside, NOWHERE)
-                for at, side in ((x, width), (y, height))
-            )
+            x = x.clamp(0, width - 1).masked_fill_(~inside, NOWHERE)
+            y = y.clamp(0, height - 1).masked_fill_(~inside, NOWHERE)
             return [normalised(x, y, self.image_hw)]
         left, top, right, bottom = self.rectangle[..., None].unbind(1)
         columns, rows = self._cut
@@ -248,30 +204,55 @@ class Warp:
             for across, down in (self._source(*self._whole()), (x, y))
         ]
 
-    @cached_property
-    def _pixels(self) -> tuple[Tensor, Tensor]:
-        """Flat index (B, H W) int64 of the nearest pixel, and (B, H W) whether there is one."""
-        height, width = self.image_hw
-        if self.resampling == "once":
-            x, y, inside = self._composed
-        else:  # canvas pixels that OpenCV's nearest resize takes from the rectangle
-            left, top, right, bottom = self.rectangle[..., None].unbind(1)
-            columns, rows = self._whole()
-            picked = _nearest_resize(columns, left, right), _nearest_resize(rows, top, bottom)
-            x, y = self._source(*picked)
-            inside = self._within(x, y)
-        column, row = (
-            (at + 0.5).floor_().clamp_(0, side - 1).nan_to_num_(0).int()
-            for at, side in ((x, width), (y, height))
-        )
-        return row.mul_(width).add_(column).long().flatten(1), inside.flatten(1)
-
 
 def _nearest_resize(pixels: Tensor, low: Tensor, high: Tensor) -> Tensor:
-    """First pixel + floor(i * cut / size), with OpenCV's rounding of the factor.
-
-    The rounding decides where the product is a whole number, as at 576 of 640 pixels.
-    """
+    """First pixel + floor(i * cut / size)."""
+    # With OpenCV's rounding, which decides where the product is whole, as at 576 of 640 pixels.
     step = 1 / (pixels.shape[-1] / (high - low))
     first = low + 0.5
     return first.floor() + (first.frac() + pixels * step).floor()
+
+
+def halved_mean(values: Tensor) -> Tensor:
+    """(B, C, H, W) float -> (B, C, ceil(H / 2), ceil(W / 2)), means of 2x2 pixels of what exists.
+
+    It can be differentiated once. `avg_pool2d` takes three times the CPU time.
+    """
+    return cast(Tensor, _Mean.apply(_even(values)))  # type: ignore[no-untyped-call]
+
+
+class _Mean(torch.autograd.Function):
+    @staticmethod
+    def forward(_: Any, values: Tensor) -> Tensor:
+        rows = values[..., ::2, :] + values[..., 1::2, :]
+        return (rows[..., ::2] + rows[..., 1::2]).mul_(0.25)
+
+    @staticmethod
+    @once_differentiable
+    def backward(_: Any, gradient: Tensor) -> Tensor:
+        return F.interpolate(gradient * 0.25, scale_factor=2, mode="nearest")
+
+
+def halved_all(mask: Tensor) -> Tensor:
+    """(B, H, W) bool -> (B, ceil(H / 2), ceil(W / 2)), whether all of 2x2 pixels are true."""
+    a, b, c, d = _corners(mask)
+    return a & b & c & d
+
+
+def halved_label(label: Tensor) -> Tensor:
+    """(B, H, W) int64 -> (B, ceil(H / 2), ceil(W / 2)): the class of 2x2 pixels, 255 of several."""
+    a, b, c, d = _corners(label)
+    return a.where((a == b) & (a == c) & (a == d), IGNORE)
+
+
+def _corners(values: Tensor) -> list[Tensor]:
+    """The four pixels of each half pixel: (..., ceil(H / 2), ceil(W / 2)) each."""
+    even = _even(values)
+    return [even[..., row::2, column::2] for row in (0, 1) for column in (0, 1)]
+
+
+def _even(values: Tensor) -> Tensor:
+    """(..., H, W) with the last row and column twice where their number is odd."""
+    if values.shape[-2] % 2:
+        values = torch.cat([values, values[..., -1:, :]], -2)
+    return torch.cat([values, values[..., -1:]], -1) if values.shape[-1] % 2 else values

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from rgbt.checks import InputError
-from rgbt.geometry.halving import halved_label, halved_mean
+from rgbt.geometry.warp import halved_label, halved_mean
 from rgbt.losses.cross_entropy import single
 from rgbt.processes import total
 from rgbt.ranges import NonNegative

@@ -1,5 +1,5 @@
 """Count (region, label, prediction), and derive every score from these counts.
 
-`regions` cuts the image, `metric` is the configured choice, `confusion` counts, `counts` stores,
-`scores` derives, `names` holds every metric name once. Not here: running a network.
+`metric` is the configured partition, `counting` counts, `counts` stores, `scores` derives, `named`
+computes a score by its name (`names`). Not here: running a network.
 """

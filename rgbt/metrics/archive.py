@@ -14,9 +14,7 @@ from numpy.typing import NDArray
 from rgbt.checks import InputError, one_line
 from rgbt.files.atomic import replacing
 
-FORMAT, DIGEST = "format", "digest"
-"""Members of every file: its mark, and the SHA-256 of all others."""
-
+FORMAT, DIGEST = "format", "digest"  # members of every file
 T = TypeVar("T")
 
 
@@ -37,11 +35,7 @@ class Archive:
             np.savez_compressed(file, **arrays)
 
     def load(self, path: Path, build: Callable[[dict[str, Any]], T]) -> T:
-        """What `build` makes of the arrays that `save` wrote; nothing in the file is executed.
-
-        Raises:
-            InputError: no such file, a damaged one, or another kind of file.
-        """
+        """What `build` makes of what `save` wrote; InputError: no, damaged or another file."""
         if not path.is_file():
             raise InputError(f"the file of {self.what} '{path}' does not exist; {self.advice}.")
         try:
@@ -53,10 +47,8 @@ class Archive:
                 raise ValueError(f"expected the mark '{self.mark}', got '{one_line(mark)}'")
             return build(arrays)
         except Exception as error:  # zipfile and NumPy raise anything on damaged bytes
-            raise InputError(
-                f"'{path}' is not a readable file of {self.what} ({one_line(error)}); "
-                f"{self.advice}."
-            ) from error
+            reason = f"is not a readable file of {self.what} ({one_line(error)})"
+            raise InputError(f"'{path}' {reason}; {self.advice}.") from error
 
 
 def _digest(arrays: Mapping[str, NDArray[Any]]) -> str:

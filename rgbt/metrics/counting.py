@@ -1,6 +1,7 @@
 """Count the pixels of one image with one histogram: label by prediction, pairs of frames, details.
 
 The counts of images add exactly, in any order and over any number of processes: all are integers.
+Maps are (H, W) of one shape, arrays or tensors; ValueError: they are not, or hold other classes.
 """
 
 from __future__ import annotations
@@ -21,22 +22,13 @@ if TYPE_CHECKING:
 Map: TypeAlias = "NDArray[Any] | Tensor"
 Counted = NDArray[np.int64]
 
-MOST_CLASSES = 254
-"""Of boundaries, where a byte has two values for pixels that are not counted."""
-
 
 def histogram(
     *axes: tuple[NDArray[Any], int], where: NDArray[np.bool_], weights: Any = None
 ) -> Counted:
-    """Numbers of pixels by several indices at once.
+    """(s1, s2, ...): numbers of the pixels `where`, by indices (H, W) with s1, s2, ... values.
 
-    Args:
-        axes: index (H, W) and number of its values; an index may lie outside where not counted.
-        where: (H, W), pixels that count.
-        weights: (H, W) whole numbers that are added instead of 1.
-
-    Returns:
-        (s1, s2, ...) of the sizes of the axes.
+    `weights` are whole numbers (H, W) that are added instead of 1.
     """
     sizes = [size for _, size in axes]
     flat = axes[0][0].astype(np.int32)
@@ -44,36 +36,24 @@ def histogram(
         flat *= size
         flat += index.astype(np.int32, copy=False)
     number = math.prod(sizes)
-    flat[~where] = number
+    flat[~where] = number  # indices may lie outside there
     # float64, in which weights are added, holds whole numbers below 2^53 exactly.
-    counted = np.bincount(
-        flat.ravel(), None if weights is None else weights.ravel(), minlength=number + 1
-    )
+    added = None if weights is None else weights.ravel()
+    counted = np.bincount(flat.ravel(), added, minlength=number + 1)
     return counted[:number].astype(np.int64, copy=False).reshape(sizes)
 
 
 @dataclass(frozen=True)
 class RegionCounter:
-    """Counts label by prediction in every region, of images of any size.
-
-    Attributes:
-        num_classes: K, 1..255.
-        regions: the partition.
-    """
+    """Counts label by prediction in every region, of images of any size; K is `num_classes`."""
 
     num_classes: int
     regions: Regions
 
     def __call__(self, label: Map, prediction: Map) -> Counted:
-        """(R, K, K) counts of one image, rows = label, columns = prediction.
+        """(R, K, K) counts of labels 0..255 (K and above: ignored) by predictions 0..K-1.
 
-        Source: SpatialSeg release, metric code (a confusion matrix per region); pixels whose label
-        is no class (255 = ignore) are left out.
-
-        (H, W) integer labels 0..255, of which K and above are ignored, and predictions 0..K-1.
-
-        Raises:
-            ValueError: shapes differ, or a prediction is no class.
+        Source: SpatialSeg release, metric code (a confusion matrix per region).
         """
         label_HW, prediction_HW = _maps(label=label, prediction=prediction)
         _check_classes(self.num_classes, prediction=prediction_HW)
@@ -90,24 +70,13 @@ def pair_counts(
 ) -> Counted:
     """(K + 1, K, K) counts of one pair of frames: label (row K: no class), first, second.
 
-    Several sets of second frames are put one after the other.
-
-    Args:
-        first: (H, W) prediction 0..K-1 of the first frame, as the protocol compares it (see
-            `rgbt.metrics.pairs`); anything 0..255 where not `valid`.
-        second: (H, W) prediction of the second frame.
-        label: (H, W) of the second frame, 0..255; K and above is no class.
-        num_classes: K, 1..255.
-        valid: (H, W) bool, pixels that count; None: all.
-
-    Raises:
-        ValueError: shapes differ, or a prediction that counts is no class.
+    `first` is the prediction of the first frame as the protocol compares it (see
+    `rgbt.metrics.pairs`), anything where not `valid`; `second` and its `label` as of
+    `RegionCounter`. `valid` are the pixels that count; None: all.
     """
-    given = {"first": first, "second": second, "label": label}
-    first_HW, second_HW, label_HW, *masks = _maps(
-        **given, **({} if valid is None else {"valid": valid})
-    )
-    valid_HW = masks[0].astype(bool) if masks else np.ones(label_HW.shape, bool)
+    every = np.ones(tuple(label.shape), bool) if valid is None else valid
+    maps = _maps(first=first, second=second, label=label, valid=every)
+    first_HW, second_HW, label_HW, valid_HW = (*maps[:3], maps[3].astype(bool))
     _check_classes(num_classes, first=first_HW * valid_HW, second=second_HW)
     rows = np.minimum(label_HW.astype(np.int32), num_classes), num_classes + 1
     return histogram(rows, (first_HW, num_classes), (second_HW, num_classes), where=valid_HW)
@@ -115,92 +84,54 @@ def pair_counts(
 
 @dataclass(frozen=True)
 class DetailCounter:
-    """Counts what details need of one image (see `rgbt.metrics.details`).
-
-    Attributes:
-        num_classes: K.
-        regions: the partition.
-        details: the kind and its setting.
-    """
+    """Counts what details need of one image (see `rgbt.metrics.details`)."""
 
     num_classes: int
     regions: Regions
     details: Details
 
     def __post_init__(self) -> None:
-        if self.details.kind == "boundary" and self.num_classes > MOST_CLASSES:
-            raise ValueError(f"boundaries of at most {MOST_CLASSES} classes can be counted.")
+        # A byte has two values for pixels that are not counted.
+        if self.details.kind == "boundary" and self.num_classes > 254:
+            raise ValueError("boundaries of at most 254 classes can be counted.")
 
     def __call__(self, label: Map, prediction: Map, values: Map | None = None) -> Counted:
-        """(R G, M, K) counts of one image.
+        """(R G, M, K) counts of one image; label and prediction as of `RegionCounter`.
 
-        Args:
-            label: (H, W) integers 0..255, of which K and above are ignored.
-            prediction: (H, W) integers 0..K-1.
-            values: (H, W) by kind: of "calibration" the probability 0..1 of the prediction; of
-                "distance" metres > 0, inf: the sky; of "size" the number of the object, 0: none.
-
-        Raises:
-            ValueError: shapes differ.
+        `values`: of "calibration" the probability of the prediction; of "distance" metres > 0,
+        inf: the sky; of "size" the number of the object, 0: none.
         """
         given = {"label": label, "prediction": prediction}
-        label_HW, prediction_HW, *others = _maps(
-            **given, **({} if values is None else {"values": values})
-        )
-        if self.details.kind == "boundary":
-            return self._boundaries(label_HW, prediction_HW)
-        if self.details.kind == "calibration":
-            return self._confidences(label_HW, prediction_HW, others[0])
+        given |= {} if values is None else {"values": values}
+        label_HW, prediction_HW, *others = _maps(**given)
+        rows = self.regions.map(label_HW.shape), self.regions.regions
+        classes = (label_HW, self.num_classes), (prediction_HW, self.num_classes)
+        valid, kind, groups = label_HW < self.num_classes, self.details.kind, self.details.groups
+        if kind == "boundary":
+            width, *border = self.details.setting
+            pixels = max(1, round(width * math.hypot(*label_HW.shape)))
+            near, near_too = (
+                outlined(each, valid, pixels, border=bool(border)) for each, _ in classes
+            )
+            both = near & near_too & (label_HW == prediction_HW)
+            chosen = zip((classes[0], *classes), (both, near, near_too), strict=True)
+            return np.stack([histogram(rows, each, where=where) for each, where in chosen], 1)
+        (value_HW,) = others
+        if kind == "calibration":
+            sure = value_HW.astype(np.float64)
+            # Bin m holds (m / M, (m + 1) / M]; 0 itself is in the first.
+            bins = np.ceil(sure * groups).astype(np.int32).clip(1, groups) - 1
+            axes = rows, (bins, groups), classes[1]
+            number = histogram(*axes, where=valid)
+            correct = histogram(*axes, where=valid & (label_HW == prediction_HW))
+            total = histogram(*axes, where=valid, weights=np.rint(sure * UNITS))
+            return np.stack([number, correct, total], 2).reshape(-1, 3, self.num_classes)
         # Group b holds edge b <= value < edge b + 1; the last one pixels without a value.
-        value = others[0] if self.details.kind == "distance" else areas(others[0])
+        value = value_HW if kind == "distance" else areas(value_HW)
         group = np.searchsorted(self.details.setting, value, side="right")
-        group = np.where(np.isfinite(value), group, self.details.groups - 1)
-        counted = histogram(
-            *(self._rows(label_HW), (group, self.details.groups)),
-            *((label_HW, self.num_classes), (prediction_HW, self.num_classes)),
-            where=label_HW < self.num_classes,
-        )
+        group = np.where(np.isfinite(value), group, groups - 1)
+        counted = histogram(rows, (group, groups), *classes, where=valid)
         return counted.reshape(-1, self.num_classes, self.num_classes)
-
-    def _rows(self, label: NDArray[Any]) -> tuple[NDArray[Any], int]:
-        return self.regions.map((label.shape[0], label.shape[1])), self.regions.regions
-
-    def _boundaries(self, label: NDArray[Any], prediction: NDArray[Any]) -> Counted:
-        """(R, 3, K): boundary pixels of both, of the label and of the prediction."""
-        width, *border = self.details.setting
-        valid = label < self.num_classes
-        pixels = boundary_pixels((label.shape[0], label.shape[1]), width)
-        near, near_too = (
-            outlined(each, valid, pixels, border=bool(border)) for each in (label, prediction)
-        )
-        chosen = (
-            (near & near_too & (label == prediction), label),
-            (near, label),
-            (near_too, prediction),
-        )
-        rows = self._rows(label)
-        return np.stack(
-            [histogram(rows, (each, self.num_classes), where=where) for where, each in chosen], 1
-        )
-
-    def _confidences(
-        self, label: NDArray[Any], prediction: NDArray[Any], confidence: NDArray[Any]
-    ) -> Counted:
-        """(R M, 3, K): pixels, right ones and sums of confidences by predicted class."""
-        sure, groups = confidence.astype(np.float64), self.details.groups
-        # Bin m holds (m / M, (m + 1) / M]; 0 itself is in the first.
-        bins = np.ceil(sure * groups).astype(np.int32).clip(1, groups) - 1
-        axes = self._rows(label), (bins, groups), (prediction, self.num_classes)
-        valid = label < self.num_classes
-        number = histogram(*axes, where=valid)
-        correct = histogram(*axes, where=valid & (label == prediction))
-        total = histogram(*axes, where=valid, weights=np.rint(sure * UNITS))
-        return np.stack([number, correct, total], 2).reshape(-1, 3, self.num_classes)
-
-
-def boundary_pixels(image_hw: tuple[int, int], width: float) -> int:
-    """The d of images of this size: ``round(width * diagonal)``, at least 1."""
-    return max(1, round(width * math.hypot(*image_hw)))
 
 
 def outlined(
@@ -208,14 +139,9 @@ def outlined(
 ) -> NDArray[np.bool_]:
     """(H, W): whether a valid pixel belongs to the boundary of its class.
 
-    It does if the square of 2 d + 1 pixels around it holds a valid pixel of another class or, with
-    `border`, reaches over the border of the image. That is what d erosions of each mask leave.
-
-    Args:
-        classes: (H, W) 0..253 where valid.
-        valid: (H, W), pixels that are counted.
-        pixels: d >= 1.
-        border: whether the border of the image is an outline.
+    It does if the square of 2 d + 1 `pixels` around it holds a valid pixel of another class
+    (0..253) or, with `border`, reaches over the border of the image. That is what d erosions of
+    each mask leave.
     """
     import cv2  # code that only derives scores does not need it
 
@@ -238,7 +164,6 @@ def areas(objects: NDArray[np.integer]) -> NDArray[np.float64]:
 
 
 def _maps(**maps: Map) -> list[NDArray[Any]]:
-    """The maps as arrays; ValueError unless all are H x W of one shape."""
     found = [np.asarray(each.cpu() if hasattr(each, "cpu") else each) for each in maps.values()]
     if found[0].ndim != 2 or len({each.shape for each in found}) > 1:
         shapes = ", ".join(str(each.shape) for each in found)
@@ -247,11 +172,9 @@ def _maps(**maps: Map) -> list[NDArray[Any]]:
 
 
 def _check_classes(num_classes: int, **predictions: NDArray[Any]) -> None:
-    """Raise ValueError where a prediction is no class, which would be counted as another pixel."""
+    """Refuse a prediction that is no class, which would be counted as another pixel."""
     if not 1 <= num_classes <= 255:
         raise ValueError(f"num_classes must be between 1 and 255, got {num_classes}.")
     for name, each in predictions.items():
-        if int(each.max()) >= num_classes:
-            raise ValueError(
-                f"{name}: expected classes 0..{num_classes - 1}, got {int(each.max())}."
-            )
+        if (top := int(each.max())) >= num_classes:
+            raise ValueError(f"{name}: expected classes 0..{num_classes - 1}, got {top}.")

@@ -11,16 +11,13 @@ setting, such as "ring5-distance-10-20-40". Region r has a row for each of G gro
     size         bins + 1     label by prediction (K x K); the last group is in no object
 
 Summed over the groups, the counts of the last two are the usual ones. Depth and object are those of
-the labelled scene: a pixel wrongly predicted as car counts at the distance of what is really there.
-A wrong pixel has no object of its class, so that recall by size is defined, and IoU is not. An
-object has the same size in every region: its visible area in the whole image, in pixels.
+the labelled scene. A wrong pixel has no object of its class, so that recall by size is defined, and
+IoU is not. The size of an object is its visible area in the whole image, in pixels.
 
 The boundary of a class are the pixels of its mask within d pixels of its outline, as left by d
 erosions with 3x3 pixels. d is a share of the image diagonal, at least 1 pixel. Ignored pixels are
-not counted, and their edges are no outlines; the prediction is compared as if it were ignored there
-too. So a prediction that is right in every counted pixel scores 100 %. Source: Cheng et al.:
-"Boundary IoU", CVPR 2021, Sec. 4. In its released code the border of the image is an outline too,
-which raises the scores of the outer regions; here it is one only where the setting says so.
+not counted, and their edges are no outlines. Source: Cheng et al.: "Boundary IoU", CVPR 2021, Sec.
+4. In its released code the border of the image is an outline too.
 """
 
 from __future__ import annotations
@@ -38,43 +35,27 @@ KINDS: tuple[DetailKind, ...] = get_args(DetailKind)
 
 BOTH, LABEL, PREDICTED = range(3)
 NUMBER, CORRECT, CONFIDENCE = range(3)
-"""Rows of the counts, see the module."""
-
-OF_SCENES: tuple[DetailKind, ...] = ("distance", "size")
-"""Kinds that need `rgbt.types.SceneMaps`."""
-
-WIDTH: Final = 0.02
-"""Width of a boundary as a share of the image diagonal (Cheng et al., CVPR 2021, Sec. 4)."""
-
-CALIBRATION_BINS: Final = 15
-"""Equal bins of confidence (Guo et al., ICML 2017, Sec. 5)."""
-
-DISTANCES: Final = (10.0, 20.0, 40.0)
-"""Edges in metres."""
-
-SIZES: Final = (64.0, 256.0, 1024.0)
-"""Edges in pixels of the image: squares of 8, 16 and 32 pixels."""
-
+OF_SCENES: tuple[DetailKind, ...] = ("distance", "size")  # need `rgbt.types.SceneMaps`
+WIDTH: Final = 0.02  # of a boundary, share of the image diagonal (Cheng et al., Sec. 4)
+DEFAULTS: dict[DetailKind, tuple[float, ...]] = {
+    "boundary": (WIDTH,),
+    "calibration": (15.0,),  # equal bins (Guo et al., ICML 2017, Sec. 5)
+    "distance": (10.0, 20.0, 40.0),
+    "size": (64.0, 256.0, 1024.0),  # squares of 8, 16 and 32 pixels
+}
 MOST_EDGES: Final = 20
-
 UNITS: Final = 10_000
-"""Units of a confidence of 1. The confidence of a pixel is rounded to whole units before it is
-added, so that all counts are integers; this changes an error by at most 0.005 percent points."""
+"""Units of a confidence of 1, to which that of a pixel is rounded, so that all counts are integers;
+this changes an error by at most 0.005 percent points."""
 
 
 @dataclass(frozen=True)
 class Details:
     """A kind of counts and its setting.
 
-    Attributes:
-        kind: see the module.
-        setting: of boundaries their width as a share of the image diagonal, 0.001..0.2, and then
-            1 if the border of the image is an outline; of calibration the number of bins; of
-            distance (metres) and size (pixels of the image) the rising edges between bins, above
-            0.
-
-    Raises:
-        InputError: a value out of range.
+    The setting is: of boundaries their width as a share of the image diagonal, 0.001..0.2, and then
+    1 if the border of the image is an outline; of calibration the number of bins; of distance
+    (metres) and size (pixels) the rising edges between bins. InputError: out of range.
     """
 
     kind: DetailKind
@@ -83,34 +64,26 @@ class Details:
     def __post_init__(self) -> None:
         if self.kind == "boundary":
             check_range("boundary_width", self.setting[0], 0.001, 0.2)
-        elif self.kind != "calibration":
-            edges = self.setting
-            rising = all(low < high for low, high in pairwise((0.0, *edges, math.inf)))
-            if not rising or not 1 <= len(edges) <= MOST_EDGES:
-                given = ",".join(map(_text, edges))
-                raise InputError(
-                    f"{self.kind}s={given}: expected 1 to {MOST_EDGES} rising numbers above 0."
-                )
+        elif self.kind in OF_SCENES:
+            rising = all(low < high for low, high in self._edges())
+            if not rising or not 1 <= len(self.setting) <= MOST_EDGES:
+                given = f"{self.kind}s={','.join(map(_text, self.setting))}"
+                raise InputError(f"{given}: expected 1 to {MOST_EDGES} rising numbers above 0.")
 
-    @property
-    def with_border(self) -> bool:
-        """Of boundaries, whether the border of the image is an outline."""
-        return self.kind == "boundary" and len(self.setting) > 1
+    def _edges(self) -> pairwise[tuple[float, float]]:
+        return pairwise((0.0, *self.setting, math.inf))
 
     @property
     def bins(self) -> tuple[str, ...]:
         """Names of the bins of distance and size: "0-10", "10-20", "20-inf"; else ()."""
         if self.kind not in OF_SCENES:
             return ()
-        edges = pairwise((0.0, *self.setting, math.inf))
-        return tuple(f"{_text(low)}-{_text(high)}" for low, high in edges)
+        return tuple(f"{_text(low)}-{_text(high)}" for low, high in self._edges())
 
     @property
     def groups(self) -> int:
         """G, rows of counts of one region."""
-        if self.kind == "calibration":
-            return int(self.setting[0])
-        return len(self.bins) + 1
+        return int(self.setting[0]) if self.kind == "calibration" else len(self.bins) + 1
 
     def measures(self, num_classes: int) -> int:
         """M, second last dimension of the counts."""
@@ -121,20 +94,6 @@ class Details:
         return "-".join([regions, self.kind, *map(_text, self.setting)])
 
 
-DEFAULTS: dict[DetailKind, tuple[float, ...]] = {
-    "boundary": (WIDTH,),
-    "calibration": (float(CALIBRATION_BINS),),
-    "distance": DISTANCES,
-    "size": SIZES,
-}
-"""Setting of each kind unless another one is chosen."""
-
-
-def default(kind: DetailKind) -> Details:
-    """A kind with its default setting."""
-    return Details(kind, DEFAULTS[kind])
-
-
 def requested(
     kinds: str, boundary: tuple[float, bool], distances: str, sizes: str
 ) -> tuple[Details, ...]:
@@ -142,22 +101,22 @@ def requested(
 
     `boundary` is the width, and whether the border of the image is an outline; `distances` and
     `sizes` are lists of edges.
-
-    Raises:
-        InputError: an unknown kind, or a setting out of range.
     """
     if kinds in ("none", "[]"):
         return ()
-    named = KINDS if kinds == "all" else dict.fromkeys(split_list(kinds, "details"))
     found = []
-    for name in named:
+    for name in KINDS if kinds == "all" else dict.fromkeys(split_list(kinds, "details")):
         check_choice("details", name, KINDS)
         kind = cast(DetailKind, name)
         setting = DEFAULTS[kind]
         if kind == "boundary":
             setting = (boundary[0], *([1.0] if boundary[1] else []))
         elif kind in OF_SCENES:
-            setting = _edges(f"{kind}s", distances if kind == "distance" else sizes)
+            text = distances if kind == "distance" else sizes
+            try:
+                setting = tuple(map(float, split_list(text, f"{kind}s")))
+            except ValueError as error:
+                raise InputError(f"{kind}s={text}: {error}.") from error
         found.append(Details(kind, setting))
     return tuple(found)
 
@@ -179,10 +138,3 @@ def regions_of(partition: str) -> str:
 
 def _text(number: float) -> str:
     return f"{number:.12g}"
-
-
-def _edges(key: str, text: str) -> tuple[float, ...]:
-    try:
-        return tuple(map(float, split_list(text, key)))
-    except ValueError as error:
-        raise InputError(f"{key}={text}: expected numbers, separated by commas.") from error

@@ -1,7 +1,4 @@
-"""Partitions of an image into regions of equal area, and the rule for absent classes.
-
-`Regions` is the choice of conf/metric/. Index r of its map is region r + 1 of the tables.
-"""
+"""Partitions of an image into regions of equal area; index r is region r + 1 of the tables."""
 
 from __future__ import annotations
 
@@ -20,27 +17,15 @@ Absent = Literal["released", "exclude"]
 Partition = Literal["ring", "vertical", "horizontal"]
 Aspect = Literal["image", "released_3_4"]
 RegionMap = NDArray[np.uint8]
-"""(H, W): region index 0..R-1 of every pixel."""
-
-MAX_REGIONS = 255
-"""What the bytes of a `RegionMap` can number."""
+MAX_REGIONS = 255  # what bytes can number
 
 
 @dataclass(frozen=True, kw_only=True)
 class Regions:
-    """A partition of the image, and the rule for classes that are absent in a region.
+    """A partition of the image, and the rule for absent classes; conf/metric/ explains the keys.
 
-    Attributes:
-        partition: "ring" nested rectangles, region 1 innermost; "vertical" strips from left to
-            right; "horizontal" strips from top to bottom.
-        regions: number of regions of equal area, 1..255.
-        aspect: of the rings: "image" or "released_3_4" (see `ring_map`); None for strips, which
-            have none.
-        absent: score of a class without a pixel to count: "released" 0, "exclude" left out of
-            the mean (see `rgbt.metrics.scores`).
-
-    Raises:
-        InputError: an aspect where it cannot take effect.
+    Rings are nested rectangles, region 1 innermost, with an aspect (see `ring_map`); strips are
+    numbered from left to right or from top to bottom. `absent`: see `rgbt.metrics.scores`.
     """
 
     partition: Partition
@@ -50,45 +35,36 @@ class Regions:
 
     def __post_init__(self) -> None:
         if (self.partition == "ring") != (self.aspect is not None):
-            raise InputError(
-                f"metric.aspect={self.aspect or 'null'}: a ring has an aspect, a strip has null."
-            )
+            raise InputError(f"metric.aspect={self.aspect}: a ring has an aspect, a strip null.")
 
     @property
     def name(self) -> str:
         """Short name of the partition, stored with the counts: "ring5", "ring9_released_3_4"."""
-        suffix = "_released_3_4" if self.aspect == "released_3_4" else ""
+        suffix = "" if self.aspect in (None, "image") else f"_{self.aspect}"
         return f"{self.partition}{self.regions}{suffix}"
 
     def map(self, image_hw: tuple[int, int]) -> RegionMap:
-        """(H, W) uint8 region index of every pixel, read-only, computed once per image size.
-
-        Raises:
-            InputError: the image is too small for so many regions.
-        """
-        return _region_map(self.partition, self.regions, self.aspect, image_hw)
+        """(H, W) region index of every pixel, read-only; InputError: the image is too small."""
+        return _region_map(self, image_hw)
 
 
 @lru_cache(maxsize=16)
-def _region_map(
-    partition: Partition, regions: int, aspect: Aspect | None, image_hw: tuple[int, int]
-) -> RegionMap:
-    if aspect is not None:
-        found = ring_map(image_hw, regions, aspect)
+def _region_map(metric: Regions, image_hw: tuple[int, int]) -> RegionMap:
+    regions = metric.regions
+    if metric.aspect is not None:
+        found = ring_map(image_hw, regions, metric.aspect)
     else:
-        found = strip_map(image_hw, regions, vertical=partition == "vertical")
+        found = strip_map(image_hw, regions, vertical=metric.partition == "vertical")
     if np.bincount(found.ravel(), minlength=regions).min() == 0:
-        size = "{}x{}".format(*image_hw)
-        raise InputError(f"metric.regions={regions} is too many for an image of {size} pixels.")
+        raise InputError(f"metric.regions={regions} is too many for an image of {image_hw}.")
     found.flags.writeable = False
     return found
 
 
 def strip_map(image_hw: tuple[int, int], regions: int, *, vertical: bool) -> RegionMap:
-    """Strips of equal width (``vertical``, left to right) or height (top to bottom).
+    """Strips: pixel n of a side of length N lies in region ``floor(n R / N)``; R is `regions`.
 
-    Pixel n of a side of length N lies in region ``floor(n R / N)``, so that widths differ by at
-    most one pixel; R is `regions`. Source: SpatialSeg, Fig. 2; the release has no strips.
+    Source: SpatialSeg, Fig. 2; the release has no strips.
     """
     length = image_hw[1] if vertical else image_hw[0]
     strip = (np.arange(length) * regions // length).astype(np.uint8)
@@ -99,22 +75,15 @@ def ring_map(image_hw: tuple[int, int], regions: int, aspect: Aspect) -> RegionM
     """Nested centred rectangles of equal area steps; index 0 is the innermost.
 
     The rectangle around regions 0..r-1 has the area ``r H W / R``; R is `regions`.
-    Paper: SpatialSeg, Sec. IV-D and Fig. 2(c); region 1 is the centre; `aspect` "image" gives the
-    rectangles the image's own. Released: sides in the ratio 3:4 for every image, numbered from the
-    outside ("released_3_4" is the same map with our numbers). For images of 3:4 both are equal.
-
-    Raises:
-        InputError: the released rectangles do not fit into the image.
+    Paper: SpatialSeg, Sec. IV-D and Fig. 2(c); `aspect` "image" gives the rectangles the image's
+    own. Released: sides in the ratio 3:4 for every image, numbered from the outside
+    ("released_3_4" is the same map with our numbers). InputError: these do not fit.
     """
-    height, width = image_hw
     region_map = np.full(image_hw, regions - 1, np.uint8)
     for inner in range(regions - 1, 0, -1):
         rows, columns = ring_rectangle(image_hw, regions, inner, aspect)
         if rows.start < 0 or columns.start < 0:
-            raise InputError(
-                f"metric.aspect=released_3_4: the rectangle around region {inner} of {regions} "
-                f"does not fit into {height}x{width} pixels; use metric.aspect=image."
-            )
+            raise InputError(f"metric.aspect={aspect} does not fit {image_hw} pixels; use image.")
         region_map[rows, columns] = inner - 1
     return region_map
 

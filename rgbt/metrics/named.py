@@ -1,7 +1,7 @@
 """Compute scores from counts by the names that tables and comparisons use.
 
 A name is ``[day/ or night/][class/<name>/][region/<n>/][score]``, where the score is one of
-`SCOPES`; distance and size are followed by a bin: ``class/car/region/1/size/64-256``. Without a
+`SCORES`; distance and size are followed by a bin: ``class/car/region/1/size/64-256``. Without a
 score, ``region/<n>`` is the mIoU of region n, and ``class/<name>`` the IoU of a class. Means are
 over the scored classes (`Counts.scored`); every single class is available by name.
 """
@@ -16,37 +16,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.checks import InputError, nearest
-from rgbt.metrics import names, pairs
+from rgbt.metrics import names, pairs, scores
 from rgbt.metrics.counts import Counts
-from rgbt.metrics.details import DetailKind, details_of
+from rgbt.metrics.details import KINDS, DetailKind, details_of
 from rgbt.metrics.metric import Absent
-from rgbt.metrics.scores import (
-    MEANS,
-    Matrices,
-    Scores,
-    boundary_iou,
-    class_mean,
-    ece,
-    iou,
-    miou,
-    object_recall,
-    recall,
-    variance,
-)
+from rgbt.metrics.scores import MEANS, Matrices, Scores
 
-OF_PAIRS: dict[str, Callable[[Matrices, Absent], Scores]] = {
+ByClass = Callable[[Matrices, Absent], Scores]
+"""Counts -> fractions (..., K)."""
+
+OF_PAIRS: dict[str, ByClass] = {
     names.TC: pairs.tc,
     names.CA: pairs.ca,
     names.CA_RELEASED: pairs.ca_released,
 }
-"""Scores by class of (..., S (K + 1), K, K) counts of pairs of frames as fractions (..., K)."""
-
+# Pixels that change and all pixels (..., K), by the class of the first frame.
 CHANGES: dict[str, Callable[[Matrices], tuple[Scores, Scores]]] = {
     names.WARPING_ERROR: pairs.changed,
     names.FLICKER: pairs.flickered,
 }
-"""Pixels that change and all pixels (..., K), by the class of the first frame."""
-
 SCORES_OF: dict[pairs.Protocol, tuple[str, ...]] = {
     "aligned": (*OF_PAIRS, names.WARPING_ERROR),
     "released": tuple(OF_PAIRS),
@@ -54,31 +42,24 @@ SCORES_OF: dict[pairs.Protocol, tuple[str, ...]] = {
     "flow": (*OF_PAIRS, names.WARPING_ERROR),
     "triples": (names.FLICKER,),
 }
-"""Protocol of pairs of frames -> the scores of its counts."""
-
-KIND_OF: dict[str, DetailKind] = {
-    **dict.fromkeys((names.BOUNDARY_MIOU, names.BOUNDARY_IOU), "boundary"),
-    **{names.ECE: "calibration", names.DISTANCE: "distance", names.SIZE: "size"},
+BY_CLASS: dict[str, ByClass] = {
+    **{"IoU": scores.iou, "acc": scores.recall, names.DISTANCE: scores.iou},
+    **dict.fromkeys((names.BOUNDARY_MIOU, names.BOUNDARY_IOU), scores.boundary_iou),
+    names.SIZE: lambda counts, _: scores.object_recall(counts),
 }
-"""Score of details -> the kind of counts that has it."""
-
-BY_CLASS: dict[str, Callable[[Matrices, Absent], Scores]] = {
-    **{"IoU": iou, "acc": recall, names.DISTANCE: iou},
-    **dict.fromkeys((names.BOUNDARY_MIOU, names.BOUNDARY_IOU), boundary_iou),
-    names.SIZE: lambda counts, _: object_recall(counts),
+SINGLE, PAIRS = "single frames", "pairs of frames"
+EVERYWHERE = ("", "region", "class", "class region")
+SCORES: dict[str, tuple[str, tuple[str, ...]]] = {
+    **dict.fromkeys((*MEANS, names.VAR), (SINGLE, ("",))),
+    "acc": (SINGLE, ("class",)),
+    **dict.fromkeys((*OF_PAIRS, *CHANGES), (PAIRS, ("", "class"))),
+    names.BOUNDARY_MIOU: ("boundary", ("", "region")),
+    names.BOUNDARY_IOU: ("boundary", ("class", "class region")),
+    names.ECE: ("calibration", EVERYWHERE),
+    names.DISTANCE: ("distance", EVERYWHERE),
+    names.SIZE: ("size", EVERYWHERE),
 }
-"""Scores of one region and bin by class as fractions (..., K)."""
-
-SCOPES: dict[str, tuple[str, ...]] = {
-    **dict.fromkeys((*MEANS, names.VAR), ("",)),
-    **dict.fromkeys((*OF_PAIRS, *CHANGES), ("", "class")),
-    **{"acc": ("class",), names.BOUNDARY_MIOU: ("", "region")},
-    names.BOUNDARY_IOU: ("class", "class region"),
-    **dict.fromkeys(
-        (names.ECE, names.DISTANCE, names.SIZE), ("", "region", "class", "class region")
-    ),
-}
-"""Score -> what may be named before it."""
+"""Score -> the counts that have it, and what may be named before it."""
 
 NAME = re.compile(
     r"((?P<part>day|night)/)?(class/(?P<name>[^/]+)(/|$))?(region/(?P<region>[1-9]\d*)(/|$))?"
@@ -88,15 +69,7 @@ NAME = re.compile(
 
 @dataclass(frozen=True)
 class ParsedMetric:
-    """A metric name, taken apart.
-
-    Attributes:
-        part: "day", "night", or None for all images.
-        score: one of `SCOPES`, or "IoU" of a class.
-        class_name: of one class alone, or None.
-        region: number from 1, or None for the whole image.
-        bin: of distance and size, e.g. "10-20"; "" for others.
-    """
+    """A metric name, taken apart: None for all images, classes, regions (from 1); "" for no bin."""
 
     metric: str
     part: str | None
@@ -106,38 +79,29 @@ class ParsedMetric:
     bin: str = ""
 
     @property
-    def details(self) -> DetailKind | None:
-        """Kind of details that have the score; None: other counts."""
-        return KIND_OF.get(self.score)
-
-    @property
     def needs(self) -> str:
         """The counts that have the score, in words."""
-        of_pairs = self.score in OF_PAIRS or self.score in CHANGES
-        return self.details or ("pairs of frames" if of_pairs else "single frames")
+        return SCORES.get(self.score, (SINGLE,))[0]
+
+    @property
+    def details(self) -> DetailKind | None:
+        """Kind of details that have the score; None: other counts."""
+        return self.needs if self.needs in KINDS else None
 
 
 def parse(metric: str) -> ParsedMetric:
-    """Take a metric name apart.
-
-    Raises:
-        InputError: it is not a metric name; the message contains the nearest one.
-    """
+    """Take a metric name apart; InputError: it is none, with the nearest one."""
     if (found := NAME.fullmatch(metric)) and not metric.endswith("/"):
-        scope = " ".join(
-            key for key, group in (("class", "name"), ("region", "region")) if found[group]
-        )
+        scope = f"{'class ' * bool(found['name'])}{'region' * bool(found['region'])}".strip()
         score, which = found["score"], found["bin"] or ""
         is_binned = score in (names.DISTANCE, names.SIZE)
-        is_known = scope in SCOPES.get(score, ()) if score else bool(scope)
+        is_known = scope in SCORES.get(score, ("", ()))[1] if score else bool(scope)
         if is_known and bool(which) == is_binned:
             region = int(found["region"]) if found["region"] else None
             score = score or ("IoU" if found["name"] else names.MIOU)
             return ParsedMetric(metric, found["part"], score, found["name"], region, which)
-    known = nearest(re.sub("^(day|night)/", "", metric), [*SCOPES, "region/<n>", "class/<name>"])
-    raise InputError(
-        f"'{metric}' is not a metric; {known}; each may have the prefix day/ or night/."
-    )
+    known = nearest(re.sub("^(day|night)/", "", metric), [*SCORES, "region/<n>", "class/<name>"])
+    raise InputError(f"'{metric}' is not a metric; {known}; each also as day/ or night/...")
 
 
 def value(metric: str, counts: Counts, absent: Absent) -> float:
@@ -146,8 +110,7 @@ def value(metric: str, counts: Counts, absent: Absent) -> float:
     NaN: nothing to score. `absent`: how a class without pixels counts, see `rgbt.metrics.scores`.
 
     Raises:
-        InputError: no such metric, class or region, a metric that such counts do not have, or
-            images without a time of day.
+        InputError: no such metric, class or region, or one that such counts do not have.
     """
     parsed = parse(metric)
     by_region = images_of(parsed, counts).by_region()
@@ -157,27 +120,23 @@ def value(metric: str, counts: Counts, absent: Absent) -> float:
 def values(
     parsed: ParsedMetric, by_region: Matrices, like: Counts, absent: Absent
 ) -> NDArray[np.float64]:
-    """The score of many summed counts at once, e.g. one per resample.
+    """(...): the score of many summed counts at once, e.g. one per resample; see also `value`.
 
     Args:
         parsed: the score; its part (day, night) has been taken by `images_of` before summing.
         by_region: (..., R, K, K), summed over images; of details (..., R G, M, K).
         like: counts of the same classes, scored ones and partition; nothing else of it is used.
         absent: see `value`.
-
-    Returns:
-        (...), units as of `value`.
-
-    Raises:
-        InputError: no such class or region, or a metric that such counts do not have.
     """
     check_kind(parsed, like.partition)
     name, details = parsed.class_name, details_of(like.partition)
-    index = None if name is None else _class_index(parsed, like.classes)
+    if name is not None and name not in like.classes:
+        raise InputError(f"'{parsed.metric}': no class '{name}'; {nearest(name, like.classes)}.")
+    index = None if name is None else like.classes.index(name)
 
     def mean_or_class(by_class: Scores) -> Scores:
-        found = class_mean(by_class, like.scored) if index is None else by_class[..., index]
-        return np.asarray(found)
+        mean = scores.class_mean(by_class, like.scored) if index is None else by_class[..., index]
+        return np.asarray(mean)
 
     if parsed.score in CHANGES:
         part, every = (
@@ -188,12 +147,12 @@ def values(
     if parsed.score in OF_PAIRS:
         return mean_or_class(100.0 * pair_scores(parsed.score, by_region, like.partition, absent))
     if parsed.score == names.VAR:
-        return variance(miou(by_region, absent, like.scored))
+        return scores.variance(scores.miou(by_region, absent, like.scored))
     groups = 1 if details is None else details.groups
     *leading, _, measures, classes = by_region.shape
     chosen = _of_region(parsed, by_region.reshape(*leading, -1, groups, measures, classes))
     if parsed.score == names.ECE:
-        return 100.0 * ece(chosen if index is None else chosen[..., index : index + 1])
+        return 100.0 * scores.ece(chosen if index is None else chosen[..., index : index + 1])
     group = chosen[..., details.bins.index(parsed.bin) if details and parsed.bin else 0, :, :]
     if parsed.score in MEANS:
         return 100.0 * MEANS[parsed.score](group, absent, like.scored)
@@ -201,10 +160,7 @@ def values(
 
 
 def pair_scores(score: str, by_region: Matrices, partition: str, absent: Absent) -> Scores:
-    """A score of `OF_PAIRS` by class, fractions (..., K).
-
-    CA along an estimated flow is over labelled pixels; NaN without any.
-    """
+    """A score of `OF_PAIRS` by class (..., K); CA along an estimated flow is of labelled pixels."""
     if pairs.protocol_of(partition) == "flow" and score != names.TC:
         known = pairs.only_labelled(by_region)
         without = np.isnan(known[..., :1, 0, 0])
@@ -213,48 +169,37 @@ def pair_scores(score: str, by_region: Matrices, partition: str, absent: Absent)
 
 
 def check_kind(parsed: ParsedMetric, partition: str) -> None:
-    """Refuse a score of other counts; InputError says how counts that have it are made."""
+    """Refuse a score of other counts; InputError says how these are made."""
     details, protocol = details_of(partition), pairs.protocol_of(partition)
-    has = details.kind if details else "pairs of frames" if protocol else "single frames"
+    has = details.kind if details else PAIRS if protocol else SINGLE
     these = f"these counts ({partition})"
     if has != parsed.needs:
-        command = "consistency" if parsed.needs == "pairs of frames" else "evaluate"
+        command = "consistency" if parsed.needs == PAIRS else "evaluate"
         option = f" details={parsed.details}" if parsed.details else ""
-        raise InputError(
-            f"'{parsed.metric}' is a score of {parsed.needs}, but {these} are of {has}; use counts "
-            f"of rgbt {command} run=...{option}"
-        )
-    if protocol and parsed.score not in SCORES_OF[protocol]:
-        known = ", ".join(SCORES_OF[protocol])
-        raise InputError(f"'{parsed.metric}' is no score of {these}; use {known}.")
-    if details and parsed.bin and parsed.bin not in details.bins:
-        bins = ", ".join(details.bins)
-        raise InputError(f"'{parsed.metric}': {these} have the bins {bins}; use one of these.")
+        said = f"'{parsed.metric}' is a score of {parsed.needs}, but {these} are of {has}"
+        raise InputError(f"{said}; use counts of rgbt {command} run=...{option}")
+    known = SCORES_OF[protocol] if protocol else details.bins if details else ()
+    word = parsed.score if protocol else parsed.bin
+    if word and known and word not in known:
+        raise InputError(f"'{parsed.metric}': {these} have {', '.join(known)}; use one of these.")
 
 
 def images_of(parsed: ParsedMetric, counts: Counts) -> Counts:
-    """The images that a metric is over: all, those of the day or those of the night.
-
-    Raises:
-        InputError: the split does not hold both, the data set does not distinguish them, or such
-            counts do not have the metric.
-    """
+    """The images that a metric is over: all, or those of day or night; InputError: not both."""
     check_kind(parsed, counts.partition)
     if parsed.part is None:
         return counts
     parts = counts.parts()
     if parsed.part not in parts:
-        raise InputError(
-            f"'{parsed.metric}': split '{counts.split}' of the run's data set does not contain "
-            "both images marked as day and images marked as night."
-        )
+        both = "both images marked as day and images marked as night"
+        raise InputError(f"'{parsed.metric}': split '{counts.split}' does not contain {both}.")
     return parts[parsed.part]
 
 
 def details_of_metric(metric: str) -> DetailKind | None:
     """The kind of details that a metric name needs; None: other counts, or no metric."""
     found = NAME.fullmatch(metric)
-    return KIND_OF.get(found["score"] or "") if found else None
+    return ParsedMetric(metric, None, found["score"] or "").details if found else None
 
 
 def _of_region(parsed: ParsedMetric, by_region: Matrices) -> Matrices:
@@ -263,17 +208,5 @@ def _of_region(parsed: ParsedMetric, by_region: Matrices) -> Matrices:
     if parsed.region is None:
         return np.asarray(by_region.sum(-4))
     if parsed.region > regions:
-        raise InputError(
-            f"'{parsed.metric}': the counts have the regions 1 to {regions}; use counts of more "
-            "regions (another file of conf/metric)."
-        )
+        raise InputError(f"'{parsed.metric}': the counts have the regions 1 to {regions}.")
     return by_region[..., parsed.region - 1, :, :, :]
-
-
-def _class_index(parsed: ParsedMetric, classes: tuple[str, ...]) -> int:
-    if parsed.class_name not in classes:
-        raise InputError(
-            f"'{parsed.metric}': the data set of the run has no class '{parsed.class_name}'; "
-            f"{nearest(str(parsed.class_name), classes)}."
-        )
-    return classes.index(parsed.class_name)

@@ -12,11 +12,9 @@ from rgbt.files.atomic import write_atomic
 from rgbt.files.plain_files import read_json
 
 PAIR_LIST = "pairs.json"
-"""File that lists exported pairs of frames; see `rgbt.evaluation.pair_predictions`."""
 
 Frames = Literal["virtual", "next", "video"]
-"""Second frames: virtual views of the first ones, true ones that were taken after them and are
-stored beside them, or the next images of the same video."""
+"""Second frames: virtual views, true ones that are stored beside the first, or of a video."""
 
 
 @dataclass(frozen=True)
@@ -33,19 +31,10 @@ class ListedPair:
 
 @dataclass(frozen=True)
 class PairList:
-    """The content of ``pairs.json``.
+    """The content of ``pairs.json``; `complete`: all images are written.
 
-    Attributes:
-        format: version of the file.
-        complete: whether all images are written.
-        dataset: fingerprint of the data set.
-        name: of the data set.
-        split: of the data set.
-        frames: what the second frames are.
-        views: mark of the second frames (`rgbt.evaluation.pair_frames.Pairing`); "published":
-            the published sets of virtual views.
-        sets: names of the sets of views.
-        pairs: in the order of the split.
+    `name` is that of the data set, `dataset` its fingerprint. `views` marks the second frames
+    (`rgbt.evaluation.pair_frames.Pairing`); "published": the published sets of virtual views.
     """
 
     format: Literal["rgbt pairs 1"]
@@ -75,17 +64,10 @@ def second_name(first: str, frames: Frames, number: int) -> str:
 
 
 def read_list(place: Path) -> PairList:
-    """The list of pairs in a folder, or at the path of the file itself.
-
-    Raises:
-        InputError: there is none, or it is damaged.
-    """
+    """The list of pairs in a folder, or at the path of the file itself; InputError: no list."""
     path = place / PAIR_LIST if place.is_dir() else place
     if not path.is_file():
-        raise InputError(
-            f"{path} does not exist; name the folder of the export with pairs=FOLDER, or copy its "
-            f"{PAIR_LIST} to the predictions."
-        )
+        raise InputError(f"{path} does not exist; name the folder of the export: pairs=FOLDER.")
     listed: PairList = read_json(path, PairList, "write the images again with export=...")
     return listed
 
@@ -93,14 +75,9 @@ def read_list(place: Path) -> PairList:
 def check_same(listed: PairList, wanted: PairList) -> None:
     """Refuse predictions of other images than those that are counted, by InputError."""
     if not listed.complete:
-        raise InputError(
-            f"the export of {listed.name} was interrupted; rerun its command, then predict again."
-        )
+        raise InputError(f"the export of {listed.name} was interrupted; rerun it, then predict.")
     for key in ("split", "frames", "dataset", "views", "pairs"):
-        given, expected = getattr(wanted, key), getattr(listed, key)
-        if given != expected:
-            raise InputError(
-                f"{key}: the pairs were exported from {one_line(expected)} ({listed.name}, sets "
-                f"{', '.join(listed.sets) or 'none'}), but {one_line(given)} ({wanted.name}, sets "
-                f"{', '.join(wanted.sets) or 'none'}) is counted; give the settings of the export."
-            )
+        exported, counted = (one_line(getattr(each, key)) for each in (listed, wanted))
+        if getattr(listed, key) != getattr(wanted, key):
+            said = f"the pairs were exported from {exported}, but {counted} is counted"
+            raise InputError(f"{key}: {said}; give the settings of the export.")

@@ -13,6 +13,8 @@ partition, e.g. "aligned3", is the protocol and S:
                 be missing: TC is over all these pixels, CA over the labelled ones.
     "triples":  three frames A, B, C along two estimated flows: y is the class of A, p1 that of B
                 and p2 that of C, at the pixels of C that are reliable in both.
+
+Scores take counts (..., S (K + 1), K, K), summed over images, and return (..., K) by class.
 """
 
 from __future__ import annotations
@@ -29,6 +31,7 @@ from rgbt.metrics.scores import Matrices, Scores, class_mean, iou, ratio
 Protocol = Literal["aligned", "released", "next", "flow", "triples"]
 PROTOCOLS: tuple[Protocol, ...] = get_args(Protocol)
 
+# The main scores of a protocol, TC and CA first: CA of the paper, or that of its release.
 HEADLINES: dict[Protocol, tuple[str, ...]] = {
     "aligned": (names.TC, names.CA),
     "released": (names.TC, names.CA_RELEASED),
@@ -36,15 +39,11 @@ HEADLINES: dict[Protocol, tuple[str, ...]] = {
     "flow": (names.TC, names.CA, names.WARPING_ERROR),
     "triples": (names.FLICKER,),
 }
-"""The main scores of a protocol, TC and CA first: CA of the paper, or that of its release."""
 
 
 def partition_name(protocol: Protocol, sets: int, views: str = "") -> str:
-    """The partition name of counts of pairs: "aligned3".
-
-    `views` are virtual views: "" the published ones, "aligned3-1c0ffe" has others.
-    """
-    return f"{protocol}{sets}{_dashed(views)}"
+    """The partition of counts of pairs: "aligned3"; `views` marks other than the published."""
+    return f"{protocol}{sets}-{views}".rstrip("-")
 
 
 def protocol_of(partition: str) -> Protocol | None:
@@ -55,61 +54,41 @@ def protocol_of(partition: str) -> Protocol | None:
 
 def file_name(protocol: Protocol, split: str, views: str = "") -> str:
     """Where counts of pairs lie inside a run folder; `views` as for `partition_name`."""
-    return f"evaluations/consistency_{protocol}{_dashed(views)}_{split}.npz"
-
-
-def _dashed(views: str) -> str:
-    return f"-{views}" if views else ""
+    name = f"{protocol}-{views}".rstrip("-")
+    return f"evaluations/consistency_{name}_{split}.npz"
 
 
 def tc(pairs: Matrices, absent: Absent) -> Scores:
-    """Temporal consistency of each class: IoU of the two predictions.
+    """Temporal consistency of each class, a fraction 0..1: IoU of the two predictions.
 
         |P1 = P2 = c| / |P1 = c or P2 = c|,  of every set alone, then the mean over the S sets
 
-    Pixels without a label count where the protocol counted them.
-
-    Source: Temporal, Fig. 4; release, evaluation code.
-
-    (..., S (K + 1), K, K), summed over images -> (..., K) fractions 0..1. `absent`, for a class
-    that neither frame of a set shows: "released" 0 (the release, whose denominator has 1e-10 more);
-    "exclude" NaN, left out of the mean over the sets; NaN where no set shows the class.
-
-    Raises:
-        ValueError: the rows are no whole number of sets.
+    Source: Temporal, Fig. 4; release, evaluation code, whose denominator has 1e-10 more. By
+    `absent`, a class that neither frame of a set shows is left out of the mean over the sets.
     """
     return _over_sets(iou(_by_set(pairs).sum(-3), absent))
 
 
 def ca(pairs: Matrices, absent: Absent) -> Scores:
-    """Consistent accuracy of each class: both predictions and the label over their exact union.
+    """Consistent accuracy of each class, as `tc`. Source: Temporal, Fig. 4 (E over A + ... + G).
 
-        |P1 = P2 = Y2 = c| / |P1 = c or P2 = c or Y2 = c|
-
-    Source: Temporal, Fig. 4 (E over A + ... + G). Arguments, result and errors as of `tc`.
+    |P1 = P2 = Y2 = c| / |P1 = c or P2 = c or Y2 = c|
     """
     three, sizes, overlaps = _triples(pairs)
     return _over_sets(ratio(three, sizes - overlaps + three, absent))
 
 
 def ca_released(pairs: Matrices, absent: Absent) -> Scores:
-    """`ca` as coded, which counts what two of the three share, and not the third, twice.
+    """`ca` as coded (Temporal release), which counts what just two of the three share twice.
 
-        |P1 = P2 = Y2 = c| / (|P1 = c| + |P2 = c| + |Y2 = c| - 2 |P1 = P2 = Y2 = c|)
-
-    Never above `ca`.
-
-    Source: Temporal release, evaluation code.
+    |P1 = P2 = Y2 = c| / (|P1 = c| + |P2 = c| + |Y2 = c| - 2 |P1 = P2 = Y2 = c|)
     """
     three, sizes, _ = _triples(pairs)
     return _over_sets(ratio(three, sizes - 2 * three, absent))
 
 
 def only_labelled(pairs: Matrices) -> Scores:
-    """The counts without pixels that have no label; NaN where no pixel has one.
-
-    Shapes as of `tc`, of arguments and result.
-    """
+    """The counts without pixels that have no label, of the same shape; NaN where none has one."""
     by_set = _by_set(pairs).copy()
     by_set[..., -1, :, :] = 0
     known = by_set.any((-4, -3, -2, -1), keepdims=True)
@@ -119,11 +98,7 @@ def only_labelled(pairs: Matrices) -> Scores:
 def changed(pairs: Matrices) -> tuple[Scores, Scores]:
     """Pixels by the class of the first frame: those with another class in the second, and all.
 
-    Their ratio is the warping error of Lai et al., "Learning Blind Video Temporal Consistency"
-    (ECCV 2018), with classes in place of colours: over pixels that are not occluded, the mean of
-    0 (same class) and 1 (another one).
-
-    Shapes: (..., S (K + 1), K, K) -> (..., K) twice, summed over the S sets.
+    Source: Lai et al. (ECCV 2018), with classes in place of colours. Summed over the S sets.
     """
     frames = _by_set(pairs).sum((-4, -3))
     every = frames.sum(-1)
@@ -131,10 +106,7 @@ def changed(pairs: Matrices) -> tuple[Scores, Scores]:
 
 
 def flickered(triples: Matrices) -> tuple[Scores, Scores]:
-    """Pixels by the class of frame A: those with it in A and C but not in B, and all.
-
-    Arguments and result as of `changed`, of counts by "triples".
-    """
+    """Pixels by the class of frame A: those with it in A and C but not in B, and all."""
     rows = _by_set(triples).sum(-4)[..., :-1, :, :]
     outer = np.einsum("...aba->...a", rows)
     return outer - np.einsum("...aaa->...a", rows), rows.sum((-2, -1))
@@ -156,13 +128,9 @@ def _by_set(pairs: Matrices) -> Scores:
     """(..., S, K + 1, K, K); float64, whose sums of whole numbers are exact."""
     *leading, rows, classes, _ = pairs.shape
     if rows % (classes + 1):
-        raise ValueError(
-            f"pairs: expected S x {classes + 1} rows (labels of {classes} classes, and none), got "
-            f"{rows}."
-        )
+        raise ValueError(f"pairs: expected S x {classes + 1} rows, got {rows}.")
     return np.asarray(pairs, np.float64).reshape(*leading, -1, classes + 1, classes, classes)
 
 
 def _over_sets(scores: Scores) -> Scores:
-    """(..., S, K) -> (..., K)."""
     return class_mean(np.swapaxes(scores, -1, -2))

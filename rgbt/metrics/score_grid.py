@@ -9,18 +9,10 @@ from rgbt.metrics.counts import Counts
 from rgbt.metrics.details import Details, details_of
 from rgbt.metrics.pairs import HEADLINES, protocol_of
 
-MEAN = "mean"
-
 
 @dataclass(frozen=True)
 class ScoreGrid:
-    """A table of metric names (`rgbt.metrics.named`).
-
-    Attributes:
-        title: what the scores are, with their unit.
-        columns: titles of the columns.
-        rows: label and names, one for each column.
-    """
+    """A table of metric names: its title with the unit, titles of columns, and rows of names."""
 
     title: str
     columns: tuple[str, ...]
@@ -35,51 +27,44 @@ class ScoreGrid:
 def score_grid(counts: Counts) -> ScoreGrid:
     """The scores of counts; only their classes, partition and time of day are used."""
     details, protocol = details_of(counts.partition), protocol_of(counts.partition)
-    labels = {
-        name: f"{name} (not in means)" if name in counts.unscored else name
-        for name in counts.classes
-    }
 
     def by_class(scores: tuple[str, ...]) -> list[tuple[str, tuple[str, ...]]]:
+        labels = {name: f"{name} (not in means)" for name in counts.unscored}
         return [
-            (label, tuple(names.of_class(name, each) for each in scores))
-            for name, label in labels.items()
+            (labels.get(name, name), tuple(names.of_class(name, each) for each in scores))
+            for name in counts.classes
         ]
 
     if protocol is not None:
         scores = HEADLINES[protocol]
         rows = [*by_class(scores), ("all images", scores)]
-        rows += [
-            (part, tuple(names.subset(part, each) for each in scores)) for part in counts.parts()
-        ]
+        rows += [(part, tuple(names.subset(part, s) for s in scores)) for part in counts.parts()]
         columns = tuple(score.replace("_", " ") for score in scores)
         return ScoreGrid("Consistency of pairs of frames in percent", columns, tuple(rows))
-    groups = 1 if details is None else details.groups
-    numbers = range(1, counts.counts.shape[1] // groups + 1)
+    numbers = _regions(counts, details)
     regions = tuple(f"region {number}" for number in numbers)
     if details is None:
         row = (*map(names.region, numbers), names.MIOU, names.VAR)
         columns = (*regions, names.MIOU, names.VAR)
         return ScoreGrid("mIoU in percent by region", columns, ((names.MIOU, row),))
-    if details.bins:
-        means = _bins(details)
-        rows = [*by_class(means), (MEAN, means)]
-        rows += [
-            (f"{MEAN}, {region}", tuple(names.in_region(number, each) for each in means))
-            for number, region in zip(numbers, regions, strict=True)
-        ]
-        title = "IoU in percent by distance in metres"
-        if details.kind == "size":
-            title = "Recall in percent by size of the object in pixels"
-        return ScoreGrid(title, details.bins, tuple(rows))
-    columns = ("image", *regions)
+    means, columns = headlines(counts), details.bins or ("image", *regions)
     if details.kind == "calibration":
         title = f"Expected calibration error in percent points, {details.groups} bins"
-        return ScoreGrid(title, columns, (("all pixels", _everywhere(names.ECE, numbers)),))
-    rows = by_class(_everywhere(names.BOUNDARY_IOU, numbers))
-    rows.append((MEAN, _everywhere(names.BOUNDARY_MIOU, numbers)))
-    title = f"Boundary IoU in percent, width {100 * details.setting[0]:g} % of the image diagonal"
-    title += ", with the border of the image" if details.with_border else ""
+        return ScoreGrid(title, columns, (("all pixels", means),))
+    if details.kind == "boundary":
+        rows = by_class(_everywhere(names.BOUNDARY_IOU, numbers))
+        title = (
+            f"Boundary IoU in percent, width {100 * details.setting[0]:g} % of the image diagonal"
+        )
+        title += ", with the border of the image" if len(details.setting) > 1 else ""
+        return ScoreGrid(title, columns, (*rows, ("mean", means)))
+    rows = [*by_class(means), ("mean", means)]
+    for number in numbers:
+        row = tuple(names.in_region(number, each) for each in means)
+        rows.append((f"mean, region {number}", row))
+    title = "IoU in percent by distance in metres"
+    if details.kind == "size":
+        title = "Recall in percent by size of the object in pixels"
     return ScoreGrid(title, columns, tuple(rows))
 
 
@@ -88,13 +73,13 @@ def headlines(counts: Counts) -> tuple[str, ...]:
     details = details_of(counts.partition)
     assert details is not None, "counts of details"
     if details.bins:
-        return _bins(details)
+        return tuple(f"{details.kind}/{each}" for each in details.bins)
     score = names.ECE if details.kind == "calibration" else names.BOUNDARY_MIOU
-    return _everywhere(score, range(1, counts.counts.shape[1] // details.groups + 1))
+    return _everywhere(score, _regions(counts, details))
 
 
-def _bins(details: Details) -> tuple[str, ...]:
-    return tuple(f"{details.kind}/{each}" for each in details.bins)
+def _regions(counts: Counts, details: Details | None) -> range:
+    return range(1, counts.counts.shape[1] // (details.groups if details else 1) + 1)
 
 
 def _everywhere(score: str, numbers: range) -> tuple[str, ...]:

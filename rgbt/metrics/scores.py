@@ -1,7 +1,8 @@
 """Compute all scores from counts.
 
-Counts are (..., K, K), rows = label, columns = prediction; leading dimensions (regions, images) are
-kept. Scores are fractions 0..1; variances are in squared percent points, as the papers print them.
+Counts are (..., K, K), rows = label, columns = prediction. Scores of classes are (..., K), means
+over the scored ones (`rgbt.metrics.counts.Counts.scored`) are (...): fractions 0..1; variances are
+in squared percent points, as the papers print them.
 
 A score whose denominator has no pixel (0 / 0) is, by `absent`:
     "released": 0 and takes part in means, as in the CRM and SpatialSeg releases and their tables,
@@ -9,8 +10,7 @@ A score whose denominator has no pixel (0 / 0) is, by `absent`:
     "exclude":  NaN and is left out of means, as in the CMX release.
 The denominator decides, by score and by region: IoU and F1 lack one where the class is neither
 labelled nor predicted, recall where it is not labelled, precision where it is not predicted. One
-false pixel of a class that no label holds makes its IoU 0 with either convention. Means are over
-the scored classes alone (`rgbt.metrics.counts.Counts.scored`).
+false pixel of a class that no label holds makes its IoU 0 with either convention.
 """
 
 from __future__ import annotations
@@ -27,38 +27,29 @@ from rgbt.metrics.metric import Absent
 
 Scores = NDArray[np.float64]
 Matrices = NDArray[np.integer] | NDArray[np.float64]
-Scored = NDArray[np.bool_] | None
-"""(K,): which classes means are over; None: all."""
+Scored = NDArray[np.bool_] | None  # (K,): which classes means are over; None: all
 
 
 def iou(counts: Matrices, absent: Absent) -> Scores:
-    """Intersection over union of each class: ``TP / (TP + FP + FN)``.
-
-    Source: SpatialSeg, Eq. 18; CRM, RTFNet and Temporal releases.
-    Shapes: (..., K, K) -> (..., K).
-    """
+    """Intersection over union of each class: ``TP / (TP + FP + FN)`` (SpatialSeg, Eq. 18)."""
     right, labelled, predicted = _sums(counts)
     return ratio(right, labelled + predicted - right, absent)
 
 
 def recall(counts: Matrices, absent: Absent) -> Scores:
-    """``TP / (TP + FN)`` of each class, "Acc" in the papers' tables. Shapes as in `iou`."""
+    """``TP / (TP + FN)`` of each class, "Acc" in the papers' tables."""
     right, labelled, _ = _sums(counts)
     return ratio(right, labelled, absent)
 
 
 def precision(counts: Matrices, absent: Absent) -> Scores:
-    """``TP / (TP + FP)`` of each class. Shapes as in `iou`."""
+    """``TP / (TP + FP)`` of each class."""
     right, _, predicted = _sums(counts)
     return ratio(right, predicted, absent)
 
 
 def f1(counts: Matrices, absent: Absent) -> Scores:
-    """``2 TP / (2 TP + FP + FN)`` of each class. Shapes as in `iou`.
-
-    Released (Temporal): from precision and recall, hence NaN also for a class that is there and
-    never found right; here that is 0 under both settings.
-    """
+    """``2 TP / (2 TP + FP + FN)``; released (Temporal): NaN for a class that is never found."""
     right, labelled, predicted = _sums(counts)
     return ratio(2 * right, labelled + predicted, absent)
 
@@ -71,23 +62,14 @@ def class_mean(scores: Scores, scored: Scored = None) -> Scores:
 
 
 def miou(counts: Matrices, absent: Absent, scored: Scored) -> Scores:
-    """Mean over the scored classes of `iou`; the background is one unless it is left out.
-
-    For the mIoU of the tables pass the counts of the whole image, regions summed.
-    Shapes: (..., K, K) -> (...).
-    """
+    """Mean over the scored classes of `iou`; that of the tables is of the regions summed."""
     return class_mean(iou(counts, absent), scored)
 
 
 def variance(region_scores: ArrayLike) -> Scores:
-    """Population variance over regions, in squared percent points.
-
-        10^4 / R  sum_r (s_r - mean s)^2
+    """``10^4 / R  sum_r (s_r - mean s)^2``, without NaN regions; fractions (..., R) -> (...).
 
     Source: SpatialSeg, Eq. 19.
-
-    (..., R) fractions -> (...); regions that are NaN (no class to score) are left out, NaN where
-    all are.
     """
     percents = 100 * np.asarray(region_scores, dtype=np.float64)
     distances = percents - class_mean(percents)[..., None]
@@ -95,33 +77,23 @@ def variance(region_scores: ArrayLike) -> Scores:
 
 
 def pixel_accuracy(counts: Matrices) -> Scores:
-    """Share of the valid pixels, of unscored classes too, that are right; NaN without any.
-
-    Shapes: (..., K, K) -> (...).
-    """
+    """Share of the valid pixels, of unscored classes too, that are right; NaN without any."""
     right, labelled, _ = _sums(counts)
     return _divide(right.sum(-1), labelled.sum(-1), np.nan)
 
 
 def boundary_iou(counts: Matrices, absent: Absent) -> Scores:
-    """``|G_d and P_d| / |G_d or P_d|`` of each class, of counts of boundaries.
-
-    Source: Cheng et al.: "Boundary IoU", CVPR 2021, Sec. 4.
-    Shapes: (..., 3, K), summed over images -> (..., K) fractions 0..1.
-    """
+    """``|G_d and P_d| / |G_d or P_d|`` of each class, of counts of boundaries (..., 3, K)."""
     both, label, predicted = (counts[..., row, :].astype(np.float64) for row in range(3))
     return ratio(both, label + predicted - both, absent)
 
 
 def ece(counts: Matrices) -> Scores:
-    """``sum_b |correct_b - confidence_b| / sum_b number_b``, a fraction 0..1.
+    """``sum_b |correct_b - confidence_b| / sum_b number_b``, of counts (..., M, 3, K).
 
-    That is the mean over pixels of ``|acc(B_m) - conf(B_m)|``. All pixels of all images are pooled,
-    those of unscored classes included.
-
-    Source: Guo et al.: "On Calibration of Modern Neural Networks", ICML 2017, Eq. 3, with M equal
-    bins (0, 1/M], (1/M, 2/M], ... of the highest probability of each pixel.
-    Shapes: (..., M, 3, K), summed over images -> (...); NaN without pixels.
+    That is the mean over pixels of ``|acc(B_m) - conf(B_m)|``, those of unscored classes included;
+    NaN without pixels. Source: Guo et al.: "On Calibration of Modern Neural Networks", ICML 2017,
+    Eq. 3, with M equal bins (0, 1/M], (1/M, 2/M], ... of the highest probability of each pixel.
     """
     number, correct, confidence = np.moveaxis(counts.sum(-1, dtype=np.float64), -1, 0)
     gaps = np.abs(correct - confidence / UNITS).sum(-1)
@@ -129,11 +101,7 @@ def ece(counts: Matrices) -> Scores:
 
 
 def object_recall(counts: Matrices) -> Scores:
-    """Recall of each class among the pixels of objects: ``TP / (TP + FN)``. Shapes as in `iou`.
-
-    NaN where no object of that size has a pixel of the class, whatever the convention for absent
-    classes: most classes have no objects of most sizes, and no published table counts them as 0.
-    """
+    """Recall of each class among the pixels of objects; NaN without an object of that size."""
     return recall(counts, "exclude")
 
 
@@ -144,23 +112,16 @@ MEANS: dict[str, Callable[[Matrices, Absent, Scored], Scores]] = {
     names.MF1: lambda counts, absent, scored: class_mean(f1(counts, absent), scored),
     names.PIXEL_ACCURACY: lambda counts, _, __: pixel_accuracy(counts),
 }
-"""Scores of (..., K, K) matrices as fractions (...), over the scored classes."""
 
 
 def summary(counts: Counts, absent: Absent) -> dict[str, float]:
-    """Every score that is followed over a run, by its name in `rgbt.metrics.names`.
-
-    Means, variance over regions, mIoU of each region, IoU of each class (unscored ones too); mIoU
-    and variance again for day and for night if the data set distinguishes them. Fractions, squared
-    percent points for the variance; NaN: nothing to score.
-    """
+    """Every score that is followed over a run, by its name in `rgbt.metrics.names`."""
     whole, scored = counts.whole(), counts.scored
-    by_class = iou(whole, absent)
     result = _mean_and_variance(counts, absent)
     result |= {name: float(mean(whole, absent, scored)) for name, mean in MEANS.items()}
     for number, score in enumerate(miou(counts.by_region(), absent, scored), start=1):
         result[names.region(number)] = float(score)
-    for name, score in zip(counts.classes, by_class, strict=True):
+    for name, score in zip(counts.classes, iou(whole, absent), strict=True):
         result[names.class_iou(name)] = float(score)
     for part, subset in counts.parts().items():
         for name, value in _mean_and_variance(subset, absent).items():
@@ -182,13 +143,10 @@ def absent_notes(
     split: str,
     absent: Absent,
 ) -> tuple[str, ...]:
-    """Footnotes of a class table, about absent classes that change the means over classes.
+    """Footnotes of a class table, from (R, K, K) counts: absent scored classes change the means.
 
-    A class is absent where it is neither labelled nor predicted.
-
-    Of the (R, K, K) counts of all images, K names and the scored ones (K,), the others not being
-    mentioned: at most three sentences without a full stop, about absent classes, classes that are
-    predicted only, and classes that some regions lack.
+    Classes that are neither labelled nor predicted, that are predicted only, and that some regions
+    lack.
     """
     counted = {"released": "counted as 0", "exclude": "left out of the mean"}[absent]
     labelled = by_region.sum(-1) > 0
@@ -198,22 +156,19 @@ def absent_notes(
     for each in np.flatnonzero(scored & there.any(0) & ~there.all(0)).tolist():
         regions = [str(number) for number in (np.flatnonzero(~there[:, each]) + 1)]
         lacks.append(f"{classes[each]} (region{'s' * (len(regions) > 1)} {', '.join(regions)})")
+    gone, unlabelled = (np.array(classes)[scored & each].tolist() for each in (gone, unlabelled))
     named = {
-        f"absent from the {split} split: {{}} ({counted})": np.array(classes)[scored & gone],
-        f"predicted, but not labelled in the {split} split: {{}} (IoU 0)": np.array(classes)[
-            scored & unlabelled
-        ],
+        f"absent from the {split} split: {{}} ({counted})": gone,
+        f"predicted, but not labelled in the {split} split: {{}} (IoU 0)": unlabelled,
         f"absent from some regions: {{}}; {counted} there": lacks,
     }
-    return tuple(note.format(", ".join(each)) for note, each in named.items() if len(each))
+    return tuple(note.format(", ".join(each)) for note, each in named.items() if each)
 
 
 def _sums(counts: Matrices) -> tuple[Scores, Scores, Scores]:
     """Right, labelled and predicted pixels of each class: TP, TP + FN, TP + FP; (..., K) each."""
     right = np.diagonal(counts, axis1=-2, axis2=-1).astype(np.float64)
-    labelled = counts.sum(-1, dtype=np.float64)
-    predicted = counts.sum(-2, dtype=np.float64)
-    return right, labelled, predicted
+    return right, counts.sum(-1, dtype=np.float64), counts.sum(-2, dtype=np.float64)
 
 
 def ratio(part: Scores, whole: Scores, absent: Absent) -> Scores:

@@ -19,13 +19,14 @@ from typing import Any, Generic, Literal, NamedTuple, TypeVar, cast, overload
 from typing_extensions import TypedDict  # pydantic takes no other before Python 3.12
 
 from rgbt.checks import InputError
-from rgbt.config.component import Component, checked_nodes
+from rgbt.config.component import Component, checked_nodes, objects
 from rgbt.config.stored_config import EXTERNAL, targets
 from rgbt.config.values import check_value
-from rgbt.data.domains import GIVEN, NONE, Domains
+from rgbt.data.domains import GIVEN, NONE, Domain, Domains
 from rgbt.data.loader_settings import LOADING, LoaderSettings
 from rgbt.engine.prediction import Prediction
 from rgbt.engine.settings import OF_MACHINE, Recipe, Scale, TrainerSettings
+from rgbt.files.atomic import is_held
 from rgbt.files.plain_files import read_json
 from rgbt.ranges import Seed, Text
 from rgbt.runs.folder import is_finished
@@ -139,11 +140,6 @@ class Dependency:
     checkpoint: CheckpointFile
     is_common: bool = False
 
-    @property
-    def path(self) -> Path:
-        """The checkpoint file."""
-        return self.run.folder / self.checkpoint
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RunSpec:
@@ -151,7 +147,7 @@ class RunSpec:
 
     Attributes:
         plain: the whole configuration as resolved YAML values, for ``config.yaml``.
-        overrides: as typed on the command line, for the name of the run.
+        overrides: as typed, for the name of the run.
         dependencies: the upstream runs, in the order in which they are needed.
         fresh: whether a finished run is trained again.
     """
@@ -198,27 +194,8 @@ class RunSpec:
         """Of every generator, but for those that `seeds` names."""
         return int(self.plain["seed"])
 
-    @property
-    def runs_dir(self) -> str:
-        """The folder of run folders."""
-        return str(self.plain["runs_dir"])
-
-    @property
-    def pretrained(self) -> str | None:
-        """File of ImageNet weights that the network, or that of its first upstream run, takes."""
-        return cast("str | None", self.plain["pretrained"])
-
-    @property
-    def out(self) -> str | None:
-        """Where a command that draws or predicts writes."""
-        return cast("str | None", self.plain["out"])
-
     def check(self) -> RunSpec:
-        """This specification, after all settings of it and of its upstream runs were checked.
-
-        Raises:
-            InputError: a missing value, an unknown key, a value of a wrong type or range.
-        """
+        """This specification, after all settings were checked; InputError names a wrong one."""
         check_value("", {key: self.plain[key] for key in Values.__annotations__}, Values)
         self.use([name for name in NODES if name not in vars(self)])
         for each in self.dependencies:
@@ -229,6 +206,10 @@ class RunSpec:
         """Check nodes and make them attributes: settings are built, other components later."""
         found = checked_nodes(self.plain, names, [n for n in NODES if NODES[n].kind != Component])
         vars(self).update(found)
+
+    def build(self, *names: str, **collaborators: Any) -> dict[str, Any]:
+        """Attributes by name; of components the objects, with those collaborators they take."""
+        return objects({name: getattr(self, name) for name in names}, collaborators)
 
     @cached_property
     def key(self) -> str:
@@ -277,12 +258,26 @@ class RunSpec:
     @property
     def folder(self) -> Path:
         """The run folder."""
-        return Path(self.runs_dir) / self.key
+        return Path(self.plain["runs_dir"]) / self.key
 
     @property
     def is_finished(self) -> bool:
         """Whether the run has its result."""
         return is_finished(self.folder)
+
+    @property
+    def is_locked(self) -> bool:
+        """Whether a process is training the run now."""
+        return is_held(self.folder / "lock")
+
+    @property
+    def pending(self) -> tuple[RunSpec, ...]:
+        """The unfinished runs upstream of this one, each after those it depends on; then this."""
+        order: dict[str, RunSpec] = {}
+        for spec in self.upstream:
+            if not spec.is_finished:
+                order |= {each.key: each for each in spec.pending}
+        return (*order.values(), self)
 
     @property
     def upstream(self) -> tuple[RunSpec, ...]:
@@ -305,21 +300,29 @@ class RunSpec:
 
     @property
     def weights_path(self) -> Path | None:
-        """The file that `model.weights` names; of a run folder its best checkpoint.
-
-        Raises:
-            InputError: there is no such file, or the upstream run is not finished.
-        """
+        """The file of `model.weights`, of a folder its best checkpoint; InputError without it."""
         if self.weights is None:
             return None
         dependency = self.dependency(WEIGHTS)
-        path = Path(self.weights).expanduser() if dependency is None else dependency.path
+        path = Path(self.weights).expanduser()
+        if dependency is not None:
+            path = dependency.run.folder / dependency.checkpoint
         path = path / "best.pt" if path.is_dir() else path
         if not path.is_file():
             raise InputError(
                 f"model.weights={self.weights}: {path} does not exist; give a file or a run folder."
             )
         return path
+
+    @property
+    def missing_labels(self) -> list[tuple[Dependency, Domain, Path]]:
+        """Upstream runs whose pseudo-labels are not there yet, with their domain and folder."""
+        missing = []
+        for name, domain in self.domains.named.items():
+            teacher, folder = self.dependency(labels_key(name)), self.labels_folder(name)
+            if teacher is not None and folder is not None and not folder.is_dir():
+                missing.append((teacher, domain, folder))  # renamed when complete
+        return missing
 
     def labels_folder(self, domain: str) -> Path | None:
         """The folder of pseudo-labels of "source" or "target"; None where it takes none."""
@@ -336,15 +339,12 @@ class RunSpec:
     @property
     def uses_pretrained(self) -> bool:
         """Whether this run, or one upstream of it, starts from the file `pretrained`."""
-        return self.weights == self.pretrained or any(
+        return self.weights == self.plain["pretrained"] or any(
             each.run.uses_pretrained for each in self.dependencies
         )
 
     def with_seed(self, seed: int) -> RunSpec:
-        """The same run with another seed; its upstream runs have it too.
-
-        Common ones keep theirs, unless `seeds.start` is "run".
-        """
+        """The same run with another seed; so its upstream runs, but for a common start of all."""
         words = [word for word in self.overrides if not word.startswith("seed=")]
         further = seed - self.seed if self.seeds.start == "run" else 0
 

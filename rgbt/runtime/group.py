@@ -1,7 +1,7 @@
 """The processes that train one run, as torchrun or srun describe them; without torch.
 
-``rgbt run`` with several devices starts them by torchrun itself (`rgbt.training.start`). Process 0
-prints and writes; what the others print is dropped.
+``rgbt run`` with several devices starts them by torchrun itself (`rgbt.training.pipeline`). Process
+0 prints and writes; what the others print is dropped.
 """
 
 from __future__ import annotations

@@ -12,6 +12,7 @@ import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from types import FrameType
 
 WORDS = {
@@ -22,22 +23,13 @@ WORDS = {
 
 
 class Stopped(KeyboardInterrupt):
-    """Raised for the first signal that ends a command, when no step or file is incomplete.
-
-    Attributes:
-        number: of the signal.
-        step: of the checkpoint that was written for it; None where there was nothing to save.
-    """
+    """Raised for the signal `number`; `step` is that of the checkpoint saved for it, or None."""
 
     def __init__(self, number: int) -> None:
         super().__init__()
         self.number = number
+        self.code = 128 + number
         self.step: int | None = None
-
-    @property
-    def code(self) -> int:
-        """Exit code of the command."""
-        return 128 + self.number
 
     def __str__(self) -> str:
         saved = "" if self.step is None else f" at step {self.step}, and the checkpoint is saved"
@@ -68,8 +60,9 @@ def answered() -> Iterator[None]:
         del frame
         if os.getpid() != process:  # a forked process has nothing to clean up
             os._exit(128 + number)
-        if number == signal.SIGHUP:
-            _leave(terminals)
+        for stream in terminals if number == signal.SIGHUP else ():  # closed: every write fails
+            with Path(os.devnull).open("w") as nowhere:
+                os.dup2(nowhere.fileno(), stream)
         if _signals.number == 0:
             _signals.number = number
             if not _signals.is_deferred:
@@ -96,24 +89,18 @@ def ending_command() -> Iterator[None]:
     """Turn an error after a signal into `Stopped`: a library left halfway may raise one."""
     try:
         yield
-    except Exception as error:
-        if _signals.number:
-            raise Stopped(_signals.number) from error
+    except Exception:
+        raise_noted()
         raise
 
 
 @contextmanager
 def deferred() -> Iterator[None]:
-    """Note signals; the one that came is raised on leaving, or by `at_once`.
-
-    An error after it is taken for its consequence: processes that were started just now end.
-    """
+    """Note signals; the one that came is raised on leaving, or by `at_once`."""
     before, _signals.is_deferred = _signals.is_deferred, True
     try:
-        yield
-    except Exception:
-        raise_noted()
-        raise
+        with ending_command():  # processes that were started just now may end with an error
+            yield
     finally:
         _signals.is_deferred = before
     if not before:
@@ -122,11 +109,7 @@ def deferred() -> Iterator[None]:
 
 @contextmanager
 def at_once() -> Iterator[None]:
-    """Inside `deferred`: raise the signal that came, and others when they come.
-
-    Raises:
-        Stopped: a signal came.
-    """
+    """Inside `deferred`: raise the signal that came, and others when they come."""
     before, _signals.is_deferred = _signals.is_deferred, False
     try:
         raise_noted()
@@ -146,11 +129,3 @@ def raise_noted(number: int | None = None) -> None:
     if number:
         _signals.number = number
         raise Stopped(number)
-
-
-def _leave(terminals: list[int]) -> None:
-    """Ignore output to a terminal that was closed."""
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    for stream in terminals:
-        os.dup2(nowhere, stream)
-    os.close(nowhere)

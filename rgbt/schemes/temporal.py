@@ -14,8 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
-from rgbt.geometry.halving import halved_all, halved_mean
-from rgbt.geometry.warp import Warp
+from rgbt.geometry.warp import Warp, halved_all, halved_mean
 from rgbt.processes import own_draw
 from rgbt.requirements import Record, Requirement, record_of
 from rgbt.types import Batch, Frame, GeneratorOf, Output, Phase

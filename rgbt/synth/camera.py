@@ -1,7 +1,7 @@
 """Pinhole camera above the ground plane: projection, rays, and the motion between two frames.
 
-World: X right, Y up, Z ahead, metres, ground at Y = 0. SynthCamera: x right, y down, z ahead.
-Pixels: the centre of the top-left pixel is (0, 0).
+World: X right, Y up, Z ahead, metres, ground at Y = 0. Camera: x right, y down, z ahead. Pixels:
+the centre of the top-left pixel is (0, 0).
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ def floats(values: Sequence[object] | NDArray[np.float64]) -> Floats:
     return np.array(values, np.float32)
 
 
+Key = tuple[int, int]
+"""Seed and index of a scene."""
+
 NEAR_M = 0.3
 """Nothing nearer than this along the optical axis is drawn."""
 
 
 @dataclass(frozen=True)
 class SynthCamera:
-    """Size of the image and focal length in pixels, position in metres, angles in radians.
-
-    `pitch` tilts downward, `yaw` turns to the right.
-    """
+    """Pixels; the position in metres; radians downward (`pitch`) and to the right (`yaw`)."""
 
     height: int
     width: int
@@ -62,7 +62,7 @@ class SynthCamera:
 
     def to_camera(self, points: NDArray[Real]) -> NDArray[Real]:
         """World points (..., 3) in camera coordinates, in the precision they come in."""
-        # As one list of points: a stack of small matrices would be multiplied one by one.
+        # One list of points: a stack of small matrices would be multiplied one by one.
         moved = points.reshape(-1, 3) - np.asarray(self.position, points.dtype)
         return (moved @ self.rotation.T.astype(points.dtype)).reshape(points.shape)
 
@@ -92,26 +92,17 @@ class SynthCamera:
 
     def moved(self, motion: EgoMotion) -> SynthCamera:
         """The camera after `motion`."""
-        yaw = self.yaw + float(np.deg2rad(motion.yaw_deg))
+        yaw, step = self.yaw + float(np.deg2rad(motion.yaw_deg)), motion.forward_m
         x, y, z = self.position
-        step = motion.forward_m
-        return replace(
-            self,
-            position=(x + step * float(np.sin(yaw)), y, z + step * float(np.cos(yaw))),
-            yaw=yaw,
-        )
+        position = (x + step * float(np.sin(yaw)), y, z + step * float(np.cos(yaw)))
+        return replace(self, position=position, yaw=yaw)
 
 
 def camera_of(factors: SceneFactors) -> SynthCamera:
     """The camera that the factors describe, above the origin, looking along Z."""
-    half_angle = np.deg2rad(factors.field_of_view_deg) / 2
-    return SynthCamera(
-        height=factors.height,
-        width=factors.width,
-        focal=float(factors.width / 2 / np.tan(half_angle)),
-        position=(0.0, factors.camera_height_m, 0.0),
-        pitch=float(np.deg2rad(factors.camera_pitch_deg)),
-    )
+    focal = factors.width / 2 / np.tan(np.deg2rad(factors.field_of_view_deg) / 2)
+    position, pitch = (0.0, factors.camera_height_m, 0.0), np.deg2rad(factors.camera_pitch_deg)
+    return SynthCamera(factors.height, factors.width, float(focal), position, float(pitch))
 
 
 def flow_between(depth_HW: Floats, source: SynthCamera, target: SynthCamera) -> Floats:
@@ -119,20 +110,16 @@ def flow_between(depth_HW: Floats, source: SynthCamera, target: SynthCamera) -> 
 
         p' = K (R' R^T K^-1 p z + R' (C - C')) / z',   flow = p' - p
 
-    with R, C rotation and position of `source`, R', C' those of `target`, z the depth.
-
-    `depth_HW` is that along the optical axis of `source` in metres, infinity for the sky. Returns
-    (H, W, 2) float32 (rows, columns) in pixels, NaN behind `target`; ValueError if the two cameras
-    differ in image size or focal length.
+    with R, C rotation and position of `source`, R', C' those of `target`, a camera that differs in
+    nothing else, and z the depth in metres, infinity for the sky. (H, W, 2) float32 (rows, columns)
+    in pixels, NaN behind `target`.
     """
+    assert replace(target, position=source.position, pitch=source.pitch, yaw=source.yaw) == source
     shift = target.rotation @ (np.asarray(source.position) - np.asarray(target.position))
     rays = source.rays()
     turned = np.tensordot((target.rotation @ source.rotation.T).astype(np.float32), rays, 1)
     # Divided by the depth, so that the sky (inverse depth 0) needs no case of its own.
     points = turned + (1.0 / depth_HW) * shift.astype(np.float32)[:, None, None]
     ahead = np.where(points[2] > 0, points[2], np.nan)
-    focal = source.focal
-    if (target.focal, target.centre) != (focal, source.centre):
-        raise ValueError("flow_between: the two cameras must be the same but for where they stand.")
     rows, columns = (points[axis] / ahead - rays[axis] for axis in (1, 0))
-    return np.asarray(np.stack([rows, columns], axis=2) * np.float32(focal), np.float32)
+    return np.asarray(np.stack([rows, columns], axis=2) * np.float32(source.focal), np.float32)

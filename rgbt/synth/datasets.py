@@ -6,7 +6,6 @@ Each is written on first use and read by the ordinary reader of its layout. A fu
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import cv2
@@ -32,16 +31,7 @@ from rgbt.synth.factors import (
     with_factors,
 )
 from rgbt.synth.scene import Scene
-from rgbt.synth.shapes import (
-    BUMP,
-    CAR_STOP,
-    COLOR_CONE,
-    ELSEWHERE,
-    PERSON,
-    UNLABELED,
-    Table,
-    class_table,
-)
+from rgbt.synth.street import BUMP, CAR_STOP, COLOR_CONE, PERSON, UNLABELED, Table, class_table
 from rgbt.types import SceneMaps
 
 
@@ -50,7 +40,11 @@ def _bgr(scene: Scene) -> NDArray[np.uint8]:
     return np.ascontiguousarray(scene.rgb[..., ::-1])
 
 
-# ---- MFNet ----------------------------------------------------------------------------------
+def _ids(table: Table, scene: Scene) -> NDArray[np.uint8]:
+    ids = table[scene.label, scene.material]
+    assert (ids != 255).all(), "every material of the scenery has a class"
+    return ids
+
 
 SKY = 65535
 """Depth of the sky in a file, and of anything farther than 655 m."""
@@ -93,25 +87,8 @@ def synth(  # noqa: PLR0913 - each is a key of the configuration
     scene/00012D.png    of test images: 16 bits, channels depth in centimetres, number of the object
     next/               the same names after the ego-motion, with flow/NAME.npy, if requested
 
-    Args:
-        name: of the data set.
-        cache_dir: folder that holds written data sets; None: $XDG_CACHE_HOME/rgbt or ~/.cache/rgbt.
-        num_classes: MFNet's nine; other nodes of the configuration interpolate it.
-        seed: of the data set; independent of the seed of a run.
-        num_train: scenes of the training split.
-        num_val: scenes of the validation split.
-        num_test: scenes of the test split; no scene is in two splits.
-        factors: given as keywords, from `height` to `whole_shadows`; see `SceneFactors`.
-        ego_forward_m: None: single frames. A number: every scene is also written as it looks after
-            this motion, in the sub-folder `next`, with the exact flow back to the first frame; see
-            `EgoMotion`.
-        ego_yaw_deg: turn of that motion.
-
-    Returns:
-        the reader of the written folder.
-
-    Raises:
-        InputError: a turn without a motion, a cache that cannot be written.
+    ``conf/dataset/synth.yaml`` says what each argument is; `factors` are given as keywords, see
+    `SceneFactors`. InputError for a turn without a motion and a cache that cannot be written.
     """
     if ego_forward_m is None and ego_yaw_deg != 0:
         raise InputError("dataset.ego_yaw_deg requires dataset.ego_forward_m (0: on the spot).")
@@ -122,14 +99,9 @@ def synth(  # noqa: PLR0913 - each is a key of the configuration
     return SceneDataset(str(folder), name=name, num_classes=num_classes)
 
 
-def _mfnet_shots(plan: Plan) -> list[Shot]:
+def _mfnet_named(shots: list[Shot]) -> list[Shot]:
     """Names have five digits and D (day) or N (night), as in MFNet."""
-    return [
-        Shot(scene, split, night, f"{scene:05d}{'N' if night else 'D'}")
-        for split, scenes in plan.splits
-        for scene in scenes
-        for night in [plan.is_night(scene)]
-    ]
+    return [s._replace(name=f"{s.scene:05d}{'N' if s.night else 'D'}") for s in shots]
 
 
 def _mfnet_images(scene: Scene, shot: Shot) -> Images:
@@ -148,21 +120,15 @@ def _mfnet_images(scene: Scene, shot: Shot) -> Images:
     return written
 
 
-def _mfnet_lists(shots: Sequence[Shot]) -> dict[str, list[str]]:
-    """The names of each split, and those of the test split by day and at night."""
-    lists: dict[str, list[str]] = {}
-    for shot in shots:
-        lists.setdefault(f"{shot.split}.txt", []).append(shot.name)
-        if shot.split == "test":
-            time = "night" if shot.night else "day"
-            lists.setdefault(f"test_{time}.txt", []).append(shot.name)
-    return lists
+def _mfnet_lists(shot: Shot) -> dict[str, str]:
+    """The list of its split, and that of the test split by day or at night."""
+    time = "night" if shot.night else "day"
+    lists = [shot.split, *([f"test_{time}"] if shot.split == "test" else [])]
+    return {f"{each}.txt": shot.name for each in lists}
 
 
-MFNET_LAYOUT = Layout(_mfnet_shots, _mfnet_images, _mfnet_lists)
+MFNET_LAYOUT = Layout(_mfnet_named, _mfnet_images, _mfnet_lists)
 
-
-# ---- KP -------------------------------------------------------------------------------------
 
 _FRAMES_PER_VIDEO = 40
 _SETS = {
@@ -198,26 +164,22 @@ def synth_kp(  # noqa: PLR0913 - each is a key of the configuration
     labels/setXX_VYYY_IZZZZZ.png                  class ids, 19 for void
     {train,val,test}{,_day,_night}.txt            one label file per line
 
-    Five of the 19 classes are in no scene (see `kp_ids`): where absent classes count as 0, as in
-    the published tables, no network scores more than 14 / 19 = 73.7 %.
+    Where absent classes count as 0, no network scores more than 14 / 19 = 73.7 % (`kp_ids`).
     """
     numbers = {"train": num_train, "val": num_val, "test": num_test}
     plan = Plan(name="synth_kp", seed=seed, numbers=numbers, factors=factors)
     return KP(str(exported(KP_LAYOUT, plan, cache_dir)), name=plan.name, num_classes=num_classes)
 
 
-def _kp_shots(plan: Plan) -> list[Shot]:
-    shots = []
-    for split, scenes in plan.splits:
-        nights = [plan.is_night(scene) for scene in scenes]
-        for number, (scene, night) in enumerate(zip(scenes, nights, strict=True)):
-            # How many scenes of the same time of day come before this one.
-            before = nights[:number].count(night)
-            sets = _SETS[split, night]
-            recording = sets[before * len(sets) // nights.count(night)]
-            name = f"set{recording:02d}_V{before // _FRAMES_PER_VIDEO:03d}_I{scene:05d}"
-            shots.append(Shot(scene, split, night, name))
-    return shots
+def _kp_named(shots: list[Shot]) -> list[Shot]:
+    """Scenes of one time of day are spread over its recordings, in order."""
+    named = []
+    for same in ([shot for shot in shots if shot.night == night] for night in (False, True)):
+        for number, shot in enumerate(same):
+            sets = _SETS[shot.split, shot.night]
+            recording, video = sets[number * len(sets) // len(same)], number // _FRAMES_PER_VIDEO
+            named.append(shot._replace(name=f"set{recording:02d}_V{video:03d}_I{shot.scene:05d}"))
+    return sorted(named)
 
 
 def _kp_images(scene: Scene, shot: Shot) -> Images:
@@ -230,37 +192,25 @@ def _kp_images(scene: Scene, shot: Shot) -> Images:
     }
 
 
-def _kp_lists(shots: Sequence[Shot]) -> dict[str, list[str]]:
-    lists: dict[str, list[str]] = {}
-    for shot in sorted(shots, key=lambda shot: shot.name):
-        for suffix in ("", "_night" if shot.night else "_day"):
-            lists.setdefault(f"{shot.split}{suffix}.txt", []).append(f"{shot.name}.png")
-    return lists
+def _kp_lists(shot: Shot) -> dict[str, str]:
+    lists = (shot.split, f"{shot.split}_{'night' if shot.night else 'day'}")
+    return {f"{each}.txt": f"{shot.name}.png" for each in lists}
 
 
-KP_LAYOUT = Layout(_kp_shots, _kp_images, _kp_lists)
-
-
-def _ids(table: Table, scene: Scene) -> NDArray[np.uint8]:
-    ids = table[scene.label, scene.material]
-    assert (ids != ELSEWHERE).all(), "every material of the scenery has a class"
-    return ids
+KP_LAYOUT = Layout(_kp_named, _kp_images, _kp_lists)
 
 
 def kp_ids(scene: Scene) -> NDArray[np.uint8]:
     """Class ids of KP, those of Cityscapes: (H, W) uint8, 0 to 19.
 
-    Of the 19 classes five are never there: traffic_light, truck, bus, train, motorcycle; vans are
-    cars as in Cityscapes. Guardrails are "fence" so that there is one; Cityscapes gives them no
-    class.
+    Five classes are never there: traffic_light, truck, bus, train, motorcycle; vans are cars as in
+    Cityscapes. Guardrails are "fence" so that there is one; Cityscapes gives them no class.
     """
     ids = _ids(KP_TABLE, scene)
     ridden = [n for n, thing in enumerate(scene.placed) if thing.shape.name == "bike_ridden"]
     on_bike = (scene.label == PERSON) & np.isin(scene.owner, ridden)
     return np.where(on_bike, np.uint8(kp.CLASSES.index("rider")), ids)
 
-
-# ---- PST900 ---------------------------------------------------------------------------------
 
 VAL_BAG = 20
 """The recording of the training part that scenes for validation lie in."""
@@ -273,7 +223,7 @@ _STANDS_FOR = {
     **{COLOR_CONE: "fire_extinguisher", CAR_STOP: "backpack"},
     **{BUMP: "hand_drill", PERSON: "survivor"},
 }
-"""Which object of a street stands for which of the four; everything else is background."""
+"""Which object of a street stands for which of the four; others are background."""
 
 PST900_IDS = np.array(
     [pst900.CLASSES.index(_STANDS_FOR.get(label, "background")) for label in range(9)], np.uint8
@@ -292,17 +242,12 @@ def synth_pst900(  # noqa: PLR0913 - each is a key of the configuration
     num_test: NumScenes = 80,
     factors: SceneFactors,
 ) -> PST900:
-    """Streets in the layout of the PST900 archive; arguments and errors as of `synth`.
+    """Streets in the layout of the PST900 archive; arguments and errors as of `synth` and `PST900`.
 
     {train,test}/{rgb,thermal,labels}/NAME.png, NAME as in 58_bag21_rect_rgb_frame0000000440
 
     These are streets and not tunnels. They imitate the files and the rarity of the four objects
-    (about 1 % of the pixels each, as backpack and survivor in PST900; the other two are rarer
-    there): traffic cones for fire extinguishers, car stops for backpacks, bumps for hand drills,
-    persons for survivors. Results on them say nothing about PST900.
-
-    `val_bags` of `rgbt.data.pst900.PST900`; () makes "val" the test part, as in the releases, and
-    leaves the scenes for validation in training.
+    (about 1 % of the pixels each). ``val_bags=()`` leaves the scenes for validation in training.
     """
     numbers = {"train": num_train, "val": num_val, "test": num_test}
     plan = Plan(name="synth_pst900", seed=seed, numbers=numbers, factors=factors)
@@ -310,15 +255,14 @@ def synth_pst900(  # noqa: PLR0913 - each is a key of the configuration
     return PST900(folder, name=plan.name, num_classes=num_classes, val_bags=val_bags)
 
 
-def _pst900_shots(plan: Plan) -> list[Shot]:
-    shots = []
-    for split, scenes in plan.splits:
-        bags, part = _BAGS[split], "test" if split == "test" else "train"
-        for number, scene in enumerate(scenes):
-            bag = bags[number * len(bags) // len(scenes)]
-            name = f"{scene}_bag{bag:02d}_rect_rgb_frame{scene * _FRAME_STEP:010d}"
-            shots.append(Shot(scene, split, plan.is_night(scene), name, part))
-    return shots
+def _pst900_named(shots: list[Shot]) -> list[Shot]:
+    named = []
+    for shot in shots:
+        bags = _BAGS[shot.split]
+        bag, frame = bags[shot.place * len(bags) // shot.total], shot.scene * _FRAME_STEP
+        name = f"{shot.scene}_bag{bag:02d}_rect_rgb_frame{frame:010d}"
+        named.append(shot._replace(name=name, folder="test" if shot.split == "test" else "train"))
+    return named
 
 
 def _pst900_images(scene: Scene, shot: Shot) -> Images:
@@ -329,15 +273,12 @@ def _pst900_images(scene: Scene, shot: Shot) -> Images:
     }
 
 
-PST900_LAYOUT = Layout(_pst900_shots, _pst900_images)
+PST900_LAYOUT = Layout(_pst900_named, _pst900_images)
 
-
-# ---- Freiburg Thermal -----------------------------------------------------------------------
 
 VAL_SEQUENCE = "seq_04_day"
-_SEQUENCES = {"train_day": 4, "train_night": 3}
-_PIECES = 2
-"""Of each sequence."""
+_SEQUENCES, _PIECES = {"train_day": 4, "train_night": 3}, 2
+"""Sequences of each split, and pieces of each of them."""
 
 _LARGE_LABELS = "train/seq_01_day/"
 """The sequence whose labels are twice the size of its frames."""
@@ -346,15 +287,9 @@ BLACK, WHITE = 21800, 23700
 """Counts of the grey levels 0 and 1, which some pixels lie beyond."""
 
 _MARGINS = ((0.151, 0.0), (0.172, 1.0), (0.826, 1.0), (0.845, 0.0))
-"""Corners (share of the width, of the height) of what the thermal camera sees, which leaves a few
-pixels of the crop without."""
+"""Corners (share of the width, of the height) of what the thermal camera sees."""
 
-_FREIBURG_LABELS = (
-    *("car", "person", "bicycle", "curb"),
-    *("background", "fence", "background", "road"),
-)
-"""Class of MFNet's labels 1 to 8."""
-
+_FREIBURG_LABELS = ["car", "person", "bicycle", "curb", "background", "fence", "background", "road"]
 FREIBURG_TABLE = class_table(freiburg.CLASSES, _FREIBURG_LABELS, "freiburg")
 
 
@@ -382,12 +317,8 @@ def synth_freiburg(  # noqa: PLR0913 - each is a key of the configuration
     The files have the irregularities of the archives: thermal images are counts of 16 bits that end
     in slanted black margins, because the thermal camera sees less than the RGB camera; labels of
     one sequence have another size than its frames; test folders are spelt in two ways, and stamps
-    there end in another 0 or not; test labels are arrays.
-
-    Labels are exact, those for training too, which in the real data set a network has predicted.
-    "ignore" is in test labels alone: what the thermal camera does not see. `num_train_day` scenes
-    are labelled, `num_train_night` others are not, `num_val` are labelled, by day and of a sequence
-    of their own, and `num_test` are labelled, half by day and half at night.
+    there end in another 0 or not; test labels are arrays. "ignore" is in test labels alone: what
+    the thermal camera does not see.
     """
     numbers = {"train_day": num_train_day, "train_night": num_train_night}
     numbers |= {"val": num_val, "test": num_test}
@@ -404,29 +335,28 @@ def synth_freiburg(  # noqa: PLR0913 - each is a key of the configuration
     )
 
 
-def _freiburg_shots(plan: Plan) -> list[Shot]:
-    shots = []
-    for split, scenes in plan.splits:
-        for number, scene in enumerate(scenes):
-            night = split == "train_night"
-            if split == "val":
-                folder = f"train/{VAL_SEQUENCE}/00"
-            elif split == "test":
-                night = number >= len(scenes) - len(scenes) // 2
-                folder = f"test/{'night' if night else 'day'}"
-            else:
-                pieces = _SEQUENCES[split] * _PIECES
-                sequence, piece = divmod(number * pieces // len(scenes), _PIECES)
-                folder = f"train/seq_{sequence:02d}_{split.removeprefix('train_')}/{piece:02d}"
-            # Seconds and nanoseconds, which end in the number of the frame in its burst: 0.
-            stamp = f"{1_570_000_000 + 3 * scene}_{scene * 618_033_989 % 10**9:09d}0"
-            shots.append(Shot(scene, split, night, stamp, folder))
-    return shots
+def _freiburg_named(shots: list[Shot]) -> list[Shot]:
+    """Days, nights for training, and a test split whose second half is at night."""
+    named = []
+    for shot in shots:
+        night, folder = shot.split == "train_night", f"train/{VAL_SEQUENCE}/00"
+        if shot.split == "test":
+            night = shot.place >= shot.total - shot.total // 2
+            folder = f"test/{'night' if night else 'day'}"
+        elif shot.split != "val":
+            pieces = _SEQUENCES[shot.split] * _PIECES
+            sequence, piece = divmod(shot.place * pieces // shot.total, _PIECES)
+            time = shot.split.removeprefix("train_")
+            folder = f"train/seq_{sequence:02d}_{time}/{piece:02d}"
+        # Seconds and nanoseconds, which end in the number of the frame in its burst: 0.
+        stamp = f"{1_570_000_000 + 3 * shot.scene}_{shot.scene * 618_033_989 % 10**9:09d}0"
+        named.append(shot._replace(night=night, name=stamp, folder=folder))
+    return named
 
 
 def _freiburg_images(scene: Scene, shot: Shot) -> Images:
     folder, stamp = shot.folder, shot.name
-    ids = freiburg_ids(scene)
+    ids = _ids(FREIBURG_TABLE, scene)
     counts = np.where(seen_in_thermal(*ids.shape), counts_of(scene.grey), np.uint16(0))
     if shot.split == "test":
         rgb, thermal = ("ImagesRgb", "ImagesIr") if shot.night else ("ImagesRGB", "ImagesIR")
@@ -449,12 +379,7 @@ def _freiburg_images(scene: Scene, shot: Shot) -> Images:
     return images
 
 
-FREIBURG_LAYOUT = Layout(_freiburg_shots, _freiburg_images)
-
-
-def freiburg_ids(scene: Scene) -> NDArray[np.uint8]:
-    """Class ids of Freiburg Thermal, (H, W) uint8, 0 to 12."""
-    return _ids(FREIBURG_TABLE, scene)
+FREIBURG_LAYOUT = Layout(_freiburg_named, _freiburg_images)
 
 
 def counts_of(grey: Floats) -> NDArray[np.uint16]:

@@ -1,7 +1,4 @@
-"""Write scenes in the layout of a data set, once, with several processes if there are many.
-
-The layouts are defined in `rgbt.synth.datasets`.
-"""
+"""Write scenes in a layout of `rgbt.synth.datasets`, once, with several processes if many."""
 
 from __future__ import annotations
 
@@ -32,11 +29,8 @@ from rgbt.synth.scene import Scene, render_pair, render_scene
 VERSION = 3
 """Of the files. Raise it with every change that changes a byte, so that no cache is stale."""
 
-_WORTH_A_POOL = 200
-"""Scenes; fewer are written before a pool has started."""
-
-_WORTH_A_BAR = 100
-"""Scenes; about a second's work."""
+_WORTH_A_POOL, _WORTH_A_BAR = 200, 100
+"""Scenes: fewer are written before a pool has started, or in less than a second."""
 
 _FAST_PNG = [cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
 """A third of the time of the quickest ordinary compression, and smaller: the images are noisy."""
@@ -50,10 +44,7 @@ FRAMES = "next"
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """The plan of a written data set; equal plans give equal files.
-
-    `numbers` are scenes by split; `motion` leads to a second frame of every scene.
-    """
+    """A data set: scenes by split, and the motion to a second frame; equal plans, equal files."""
 
     name: str
     seed: int
@@ -61,52 +52,51 @@ class Plan:
     factors: SceneFactors
     motion: EgoMotion | None = None
 
-    @property
-    def splits(self) -> Iterator[tuple[str, range]]:
-        """Every split and its scenes; none is in two of them."""
-        first = 0
-        for split, number in self.numbers.items():
-            yield split, range(first, first + number)
-            first += number
-
-    def is_night(self, scene: int) -> bool:
-        """Whether a scene is one at night, by the share of the factors."""
-        return is_night(self.seed, scene, self.factors.night_share)
-
 
 class Shot(NamedTuple):
-    """One scene to be written: its number, its split, whether it is night, its name and folder."""
+    """One scene to be written: its number, that in its split (`place` of `total`), its names."""
 
     scene: int
     split: str
+    place: int
+    total: int
     night: bool
-    name: str
+    name: str = ""
     folder: str = ""
 
 
 class Layout(NamedTuple):
-    """Which files of which scenes a data set has.
+    """Which files a data set has.
 
-    Attributes:
-        shots: every scene, in the order of their numbers.
-        images: the files of a scene.
-        lists: the split lists, by path, if there are any.
+    The shots of a split with their names and folders, the files of a scene, and the split lists
+    that a shot is in, if there are any, with its line.
     """
 
-    shots: Callable[[Plan], list[Shot]]
+    named: Callable[[list[Shot]], list[Shot]]
     images: Callable[[Scene, Shot], Images]
-    lists: Callable[[Sequence[Shot]], dict[str, list[str]]] | None = None
+    lists: Callable[[Shot], dict[str, str]] | None = None
+
+
+def shots_of(layout: Layout, plan: Plan) -> list[Shot]:
+    """Every scene of a data set, in the order of their numbers; none is in two splits."""
+    shots: list[Shot] = []
+    for split, total in plan.numbers.items():
+        first = len(shots)
+        nights = [is_night(plan.seed, first + n, plan.factors.night_share) for n in range(total)]
+        plain = [Shot(first + n, split, n, total, night) for n, night in enumerate(nights)]
+        shots += layout.named(plain)
+    return shots
 
 
 def exported(layout: Layout, plan: Plan, cache_dir: str | Path | None) -> Path:
     """The folder of a data set, written now if it is not there yet.
 
-    It is written under another name and renamed when complete, so that an interrupted generation
-    leaves nothing that looks like a data set, and two at once cannot mix. The plan is stored in it.
-    `cache_dir` None: `default_cache`; InputError if it cannot be written.
+    It is renamed when complete, so that an interrupted generation leaves nothing and two cannot
+    mix. `cache_dir` None: $XDG_CACHE_HOME/rgbt or ~/.cache/rgbt; InputError if that is impossible.
     """
     text = json.dumps({"version": VERSION, **asdict(plan)}, sort_keys=True, indent=1)
-    cache = Path(cache_dir).expanduser() if cache_dir else default_cache()
+    base = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache") / "rgbt"
+    cache = Path(cache_dir or base).expanduser()
     folder = cache / f"{plan.name}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
     if folder.is_dir():
         return folder
@@ -126,26 +116,20 @@ def exported(layout: Layout, plan: Plan, cache_dir: str | Path | None) -> Path:
     return folder
 
 
-def default_cache() -> Path:
-    """$XDG_CACHE_HOME/rgbt, or ~/.cache/rgbt where that is not set."""
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "rgbt"
-
-
 def write(layout: Layout, plan: Plan, folder: Path) -> None:
     """Write the whole data set into `folder`, which exists; OSError if that is impossible."""
-    shots = layout.shots(plan)
+    shots = shots_of(layout, plan)
     work = partial(write_shot, layout, plan, folder)
-    hidden = len(shots) < _WORTH_A_BAR
-    with Progress(console=Console(stderr=True), transient=True, disable=hidden) as progress:
-        task = progress.add_task("writing synthetic scenes", total=len(shots))
-        for _ in _for_each(work, shots):
-            progress.advance(task)
-    lists = layout.lists(shots) if layout.lists else {}
+    bar = Progress(console=Console(stderr=True), transient=True, disable=len(shots) < _WORTH_A_BAR)
+    with bar:
+        list(bar.track(_for_each(work, shots), len(shots), description="writing synthetic scenes"))
+    lists: dict[str, list[str]] = {}
+    for shot in shots:
+        for path, line in layout.lists(shot).items() if layout.lists else ():
+            lists.setdefault(path, []).append(f"{line}\n")
     for root in [folder, folder / FRAMES] if plan.motion else [folder]:
         for path, lines in lists.items():
-            text = "".join(f"{line}\n" for line in lines)
-            (root / path).write_text(text, encoding="utf-8")
+            (root / path).write_text("".join(sorted(lines)), encoding="utf-8")
 
 
 def write_shot(layout: Layout, plan: Plan, folder: Path, shot: Shot) -> None:

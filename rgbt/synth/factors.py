@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import wraps
 from typing import Annotated, Any, Literal, TypeVar, get_type_hints
 
@@ -21,18 +21,15 @@ Side = Annotated[int, Interval(ge=32, le=2048), doc("pixels")]
 Strength = Annotated[float, Interval(ge=0, le=4)]
 Gain = Annotated[float, Interval(ge=0, le=20)]
 RadiusGain = Annotated[float, Interval(ge=-0.95, le=20)]
-"""Corners have (1 + this) times the value of the centre; negative: the centre has more."""
-
 Metres = Annotated[float, Interval(ge=2, le=60)]
 Multiple = Annotated[float, Interval(ge=0.1, le=10)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class SceneFactors:
-    """The factors of a scene; a study varies one of them and keeps the others fixed.
+    """The factors of a scene, see ``conf/dataset/synth.yaml``; a study varies one of them.
 
-    The comments of ``conf/dataset/synth.yaml`` say what each of them is. A gain by radius changes
-    with the squared radius, from 1 at the centre to (1 + gain) at the corners.
+    A gain by radius changes with the squared radius, from 1 at the centre to 1 + gain in a corner.
     """
 
     height: Side = 120
@@ -69,7 +66,6 @@ class SceneFactors:
 
 ForwardMetres = Annotated[float, Interval(ge=-3, le=3)]
 YawDegrees = Annotated[float, Interval(ge=-15, le=15)]
-"""What a camera moves between two frames of a video."""
 
 
 @dataclass(frozen=True)
@@ -83,35 +79,31 @@ class EgoMotion:
 def with_factors(
     *left_out: str, **defaults: float
 ) -> Callable[[Callable[..., Made]], Callable[..., Made]]:
-    """Lets a function of ``factors: SceneFactors`` take each factor as a keyword of its own.
+    """Lets a function of ``factors: SceneFactors`` take each factor as a keyword, as a key is.
 
-    The keys of a data set in the configuration are the arguments of the function that makes it.
     `left_out` are factors that the data set decides itself; `defaults` are those that differ.
     """
 
     def with_keywords(function: Callable[..., Made]) -> Callable[..., Made]:
-        own = inspect.signature(function)
         types = get_type_hints(SceneFactors, include_extras=True)
-        added = {
-            each.name: inspect.Parameter(
-                each.name,
-                inspect.Parameter.KEYWORD_ONLY,
-                default=defaults.get(each.name, each.default),
-                annotation=types[each.name],
+        kind = inspect.Parameter.KEYWORD_ONLY
+        added = [
+            inspect.Parameter(
+                name, kind, default=defaults.get(name, default), annotation=types[name]
             )
-            for each in fields(SceneFactors)
-            if each.name not in left_out
-        }
+            for name, default in vars(SceneFactors()).items()
+            if name not in left_out
+        ]
 
         @wraps(function)
         def made(**settings: Any) -> Made:
-            chosen = {name: settings.pop(name, each.default) for name, each in added.items()}
-            return function(factors=SceneFactors(**chosen), **settings)
+            factors = {each.name: settings.pop(each.name, each.default) for each in added}
+            return function(factors=SceneFactors(**factors), **settings)
 
+        own = inspect.signature(function)
         kept = [each for each in own.parameters.values() if each.name != "factors"]
-        parameters = [*kept, *added.values()]
-        made.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]
-        made.__annotations__ = {each.name: each.annotation for each in parameters}
+        made.__signature__ = own.replace(parameters=[*kept, *added])  # type: ignore[attr-defined]
+        made.__annotations__ = {each.name: each.annotation for each in (*kept, *added)}
         return made
 
     return with_keywords

@@ -1,22 +1,20 @@
 """Draw time of day, sun, sky, lamps and glare of one scene, for the RGB and the thermal image.
 
-Lamps light by night: the own headlights, street lamps, oncoming cars, vending machines. Strong
-lights in view lay a veil over RGB, because the lens scatters them: headlights that point at the
-camera by night, and a low sun by day.
+Lamps light by night: the own headlights, street lamps, oncoming cars, vending machines. Headlights
+that point at the camera, and a low sun by day, lay a veil over RGB: the lens scatters them.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from functools import lru_cache
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from rgbt.randomness import numpy_generator
-from rgbt.synth.camera import NEAR_M, Floats, SynthCamera, floats
+from rgbt.synth.camera import NEAR_M, Floats, Key, SynthCamera, floats
 from rgbt.synth.street import Placed
 
 _GOLDEN = 0.6180339887
@@ -27,19 +25,15 @@ class Light(NamedTuple):
     """The light sources of a scene.
 
     Attributes:
-        sun: (3,) unit vector towards the sun.
+        sun: (3,) unit vector towards the sun, whose strength is `direct`.
         exposure: factor on all light.
         tint: colour cast of the camera.
         headlight: strength of the own headlights by night.
         lamp: colour of the street lamps; zero where they are off.
         lit_windows: share of windows with light by night.
         visibility_m: distance at which 37 % of the light comes through.
-        direct: strength of the sun, 0 under clouds.
-        ambient: strength of the sky.
-        zenith: colour of the sky above.
-        horizon: colour of the sky at the horizon, and of the haze.
-        cloud: how much clouds show, 0..1.
-        clear: a day without a cover of clouds.
+        ambient: strength of the sky, whose colours are `zenith` above and `horizon`, as the haze.
+        cloud: how much clouds show, 0..1; `clear`: a day without a cover of them.
         others: factor on the light that cars and vending machines cast.
     """
 
@@ -62,19 +56,12 @@ class Light(NamedTuple):
 
 def is_night(seed: int, index: int, night_share: float) -> bool:
     """Whether scene `index` is a night scene; consecutive scenes keep the share closely."""
-    return (_night_start(seed) + index * _GOLDEN) % 1.0 < night_share
-
-
-@lru_cache(maxsize=64)
-def _night_start(seed: int) -> float:
-    return float(numpy_generator(seed, "synth/night").random())
+    start = numpy_generator(seed, "synth/night").random()
+    return (start + index * _GOLDEN) % 1.0 < night_share
 
 
 def draw_light(seed: int, index: int, night_share: float, night_light: float = 1.0) -> Light:
-    """The light of one scene. Both day and night are drawn, so the share changes nothing else.
-
-    `night_light` is a factor on everything that lights the night.
-    """
+    """The light of one scene; `night_light` is a factor on everything that lights the night."""
     u = numpy_generator(seed, "synth/light", index).random(16).tolist()
     angle, height = 2 * math.pi * u[2], math.radians(22 + 43 * u[3])
     flat = math.cos(height)
@@ -95,13 +82,13 @@ def draw_light(seed: int, index: int, night_share: float, night_light: float = 1
 
 def _day(light: Light, u: list[float]) -> Light:
     """Clear, or in a third of the scenes cloudy."""
-    brighter = light._replace(exposure=1.25 * light.exposure)
+    light = light._replace(exposure=1.25 * light.exposure)
     if u[9] < 0.35:
         grey = floats([0.74, 0.77, 0.82]) * (0.85 + 0.3 * u[10])
-        sky: dict[str, Any] = {"zenith": grey * 0.9, "horizon": grey}
-        return brighter._replace(direct=0.15, ambient=0.72, cloud=0.25, **sky)
-    sky = {"zenith": floats([0.28, 0.50, 0.95]), "horizon": floats([0.80, 0.88, 0.98])}
-    return brighter._replace(clear=True, direct=0.95, ambient=0.42, cloud=0.9 * u[11], **sky)
+        light = light._replace(zenith=grey * 0.9, horizon=grey)
+        return light._replace(direct=0.15, ambient=0.72, cloud=0.25)
+    light = light._replace(zenith=floats([0.28, 0.50, 0.95]), horizon=floats([0.80, 0.88, 0.98]))
+    return light._replace(clear=True, direct=0.95, ambient=0.42, cloud=0.9 * u[11])
 
 
 def _night(light: Light, u: list[float], factor: float) -> Light:
@@ -121,14 +108,8 @@ def _night(light: Light, u: list[float], factor: float) -> Light:
 
 
 _MAX_LAMPS = 6
-
-
-class Lamp(NamedTuple):
-    """A lamp that lights its surroundings: position, colour times strength, reach in metres."""
-
-    position: tuple[float, float, float]
-    colour: Floats
-    reach_m: float
+Lamp = tuple[tuple[float, float, float], Floats, float]
+"""A lamp that lights its surroundings: position, colour times strength, reach in metres."""
 
 
 def lamplight(world_3HW: Floats, lamps: list[Lamp]) -> Floats:
@@ -136,13 +117,13 @@ def lamplight(world_3HW: Floats, lamps: list[Lamp]) -> Floats:
     if not lamps:
         return np.zeros_like(world_3HW)
     points = world_3HW.reshape(3, -1)
-    positions = floats([lamp.position for lamp in lamps])
-    reach = floats([lamp.reach_m for lamp in lamps])
-    colours = np.stack([lamp.colour for lamp in lamps], axis=1)
+    places, colours, reaches = zip(*lamps, strict=True)
+    positions, reach = floats(places), floats(reaches)
     # |p - q|^2 = |p|^2 - 2 p.q + |q|^2: one product of matrices for all lamps.
     squared = (points * points).sum(0) + (positions**2).sum(1)[:, None] - 2 * positions @ points
     nearness = 1.0 + np.maximum(squared, 0) / (reach**2)[:, None]
-    return np.asarray(colours @ (1.0 / (nearness * nearness)), np.float32).reshape(world_3HW.shape)
+    total = np.stack(colours, axis=1) @ (1.0 / (nearness * nearness))
+    return np.asarray(total, np.float32).reshape(world_3HW.shape)
 
 
 def headlight(world_3HW: Floats, camera: SynthCamera) -> Floats:
@@ -157,82 +138,61 @@ def headlight(world_3HW: Floats, camera: SynthCamera) -> Floats:
     return np.asarray(reach * cv2.exp(-spread * spread - 1.6 * above), np.float32)
 
 
-def lamps_of(placed: Sequence[Placed], light: Light) -> list[Lamp]:
-    """The nearest lamps that light their surroundings; `placed` is sorted far to near."""
-    lamps = [lamp for thing in placed if thing.lit for lamp in _lamps(thing, light)]
-    return lamps[-_MAX_LAMPS:]
-
-
 def is_oncoming(thing: Placed) -> bool:
     """Whether it is a car whose headlights point at the camera."""
     return thing.shape.name.startswith("car_") and math.cos(thing.yaw) < 0
 
 
-def _lamps(thing: Placed, light: Light) -> list[Lamp]:
-    if thing.shape.name == "street_lamp":
-        reach = 1.35 * math.cos(thing.yaw)
-        return [Lamp((thing.x + reach, 5.4, thing.z), light.lamp, 5.5)]
-    if thing.shape.name == "vending_machine":
-        colour = floats([0.30, 0.33, 0.36]) * np.float32(light.others)
-        return [Lamp((thing.x, 1.0, thing.z - 0.7), colour, 1.6)]
-    if is_oncoming(thing):
-        colour = floats([0.9, 0.85, 0.75]) * np.float32(light.others)
-        return [Lamp((thing.x, 0.4, thing.z - 4.0), colour, 1.8)]
-    return []
+def lamps_of(placed: Sequence[Placed], light: Light) -> list[Lamp]:
+    """The nearest lamps that light their surroundings; `placed` is sorted far to near."""
+    lamps: list[Lamp] = []
+    others = np.float32(light.others)
+    for thing in (thing for thing in placed if thing.lit):
+        x, z = thing.x, thing.z
+        if thing.shape.name == "street_lamp":
+            lamps.append(((x + 1.35 * math.cos(thing.yaw), 5.4, z), light.lamp, 5.5))
+        elif thing.shape.name == "vending_machine":
+            lamps.append(((x, 1.0, z - 0.7), floats([0.30, 0.33, 0.36]) * others, 1.6))
+        elif is_oncoming(thing):
+            lamps.append(((x, 0.4, z - 4.0), floats([0.9, 0.85, 0.75]) * others, 1.8))
+    return lamps[-_MAX_LAMPS:]
 
 
+_SUN, _HEADLAMP = floats([1.0, 0.95, 0.85]), floats([1.0, 0.97, 0.90])
 _SUN_SHARE = 0.33
-_SUN = floats([1.0, 0.95, 0.85])
-_HEADLAMP = floats([1.0, 0.97, 0.90])
 _REACH = 0.16
 """Distance at which a veil has half its strength, as a share of the image width."""
 
 
 def veil_of(
-    placed: Sequence[Placed],
-    camera: SynthCamera,
-    light: Light,
-    strength: float,
-    key: tuple[int, int],
+    placed: Sequence[Placed], camera: SynthCamera, light: Light, strength: float, key: Key
 ) -> Floats | None:
     """(3, H, W) light that is added to the image; None where there is no source of glare.
 
-    A headlight pair 10 m ahead has the brightness `strength`, 1 = white of the day. `key`, (seed,
-    index) of the scene, draws whether and where there is a low sun.
+    Headlights 10 m ahead have the brightness `strength`, 1 = white of the day. In a share of the
+    clear days the sun is low at the end of the road.
     """
     if strength == 0:
         return None
-    sources = list(_headlamps(placed, camera) if light.is_night else _low_sun(camera, light, key))
+    height, width = camera.height, camera.width
+    sources = []
+    if light.is_night:
+        for thing in (thing for thing in placed if thing.lit and is_oncoming(thing)):
+            point = camera.to_camera(floats([thing.x, 0.7, thing.z]))
+            column, row = camera.project(point).tolist()
+            if 0 <= column < width and 0 <= row < height and point[2] > NEAR_M:
+                sources.append((column, row, 10 / max(float(point[2]), 10.0)))
+    elif light.clear:
+        u = numpy_generator(key[0], "synth/glare", key[1]).random(3).tolist()
+        if u[0] < _SUN_SHARE:
+            sources.append((width * (0.3 + 0.4 * u[1]), height * (0.2 + 0.25 * u[2]), 1.0))
     if not sources:
         return None
-    rows, columns = np.mgrid[: camera.height, : camera.width].astype(np.float32)
-    reach = np.float32(_REACH * camera.width)
-    veil = np.zeros((camera.height, camera.width), np.float32)
+    rows, columns = np.mgrid[:height, :width].astype(np.float32)
+    reach = np.float32(_REACH * width)
+    veil = np.zeros((height, width), np.float32)
     for column, row, brightness in sources:
         squared = (columns - np.float32(column)) ** 2 + (rows - np.float32(row)) ** 2
         veil += np.float32(strength * brightness) / (1 + squared / reach**2)
     colour = _HEADLAMP if light.is_night else _SUN
     return np.asarray(colour[:, None, None] * veil, np.float32)
-
-
-def _headlamps(
-    placed: Sequence[Placed], camera: SynthCamera
-) -> Iterator[tuple[float, float, float]]:
-    """Column, row and brightness of each pair of headlights in view."""
-    oncoming = (thing for thing in placed if thing.lit and is_oncoming(thing))
-    points = (camera.to_camera(floats([thing.x, 0.7, thing.z])) for thing in oncoming)
-    for point in points:
-        column, row = camera.project(point).tolist()
-        inside = 0 <= column < camera.width and 0 <= row < camera.height
-        if inside and point[2] > NEAR_M:
-            yield column, row, 10 / max(float(point[2]), 10.0)
-
-
-def _low_sun(
-    camera: SynthCamera, light: Light, key: tuple[int, int]
-) -> Iterator[tuple[float, float, float]]:
-    """The sun just above the end of the road, in a share of the clear days."""
-    seed, index = key
-    u = numpy_generator(seed, "synth/glare", index).random(3).tolist()
-    if light.clear and u[0] < _SUN_SHARE:
-        yield camera.width * (0.3 + 0.4 * u[1]), camera.height * (0.2 + 0.25 * u[2]), 1.0

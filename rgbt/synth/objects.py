@@ -1,18 +1,14 @@
-"""Place what stands in a street: labelled objects, and the scenery, which has no label.
-
-Labelled are near groups, small far objects, guardrails and bumps (kerbs: `rgbt.synth.street`);
-scenery are buildings, walls, trees, lamps, poles, signs and the horizon.
-"""
+"""Place what stands in a street: labelled objects, and the scenery, which has no label."""
 
 from __future__ import annotations
 
 import math
 from bisect import bisect
 from collections.abc import Callable
+from functools import partial
 
 from rgbt.randomness import numpy_generator
 from rgbt.synth.factors import SceneFactors
-from rgbt.synth.shapes import shapes
 from rgbt.synth.street import (
     BACKDROP,
     COLOUR,
@@ -25,25 +21,14 @@ from rgbt.synth.street import (
     Road,
     Row,
     draw_rows,
+    paints,
+    shapes,
 )
 
 _GOLDEN = 0.6180339887
 _MAX_GROUP = 5
-RAIL_STEP_M = 2.0
-"""Length of one guardrail segment."""
-
-_CAR_PAINTS = (
-    *((0.78, 0.78, 0.78), (0.62, 0.63, 0.65), (0.05, 0.05, 0.06), (0.25, 0.26, 0.28)),
-    *((0.04, 0.09, 0.28), (0.48, 0.04, 0.04), (0.80, 0.79, 0.74), (0.10, 0.22, 0.16)),
-)
-_CLOTHES = (
-    *((0.06, 0.06, 0.07), (0.10, 0.12, 0.20), (0.45, 0.08, 0.08), (0.55, 0.54, 0.50)),
-    *((0.14, 0.24, 0.40), (0.30, 0.28, 0.22), (0.70, 0.68, 0.66), (0.10, 0.22, 0.14)),
-)
-_FACADES: tuple[Paint, ...] = (
-    *((0.56, 0.53, 0.48), (0.62, 0.60, 0.58), (0.44, 0.30, 0.24), (0.38, 0.38, 0.40)),
-    *((0.66, 0.60, 0.48), (0.30, 0.34, 0.38), (0.50, 0.44, 0.38)),
-)
+_RAIL_STEP_M = 2.0
+_CAR_PAINTS, _CLOTHES, _FACADES = map(paints, ("car", "clothes", "facade"))
 _STOPS = ("stop_block", "stop_bollard", "stop_cube")
 
 _NEAR_SHARES = {"demo": (0.22, 0.45, 0.73, 0.87, 1.0), "mfnet": (0.30, 0.54, 0.78, 0.90, 1.0)}
@@ -51,16 +36,12 @@ _FAR_SHARES = {"demo": (0.34, 0.72, 0.82, 0.88, 1.0), "mfnet": (0.15, 0.62, 0.80
 """Object mix -> cumulative shares of the kinds, in the order of `_GROUPS`."""
 
 _FAR_Z = (26.0, 90.0)
-
 At = tuple[float, float]
 """(Z, lateral position) in metres."""
 
 
 def place_objects(seed: int, index: int, road: Road, factors: SceneFactors) -> list[Placed]:
-    """All labelled objects of a scene except kerbs.
-
-    `factors` say how many near groups and far objects; the first of each are always the same.
-    """
+    """All labelled objects of a scene except kerbs; with more of them, the first stay the same."""
     u = numpy_generator(seed, "synth/structures", index).random(8).tolist()
     near = draw_rows(seed, index, "near", factors.num_objects * _MAX_GROUP)
     placed = _structures(road, u, factors)
@@ -69,8 +50,7 @@ def place_objects(seed: int, index: int, road: Road, factors: SceneFactors) -> l
         share = (u[7] + number * _GOLDEN) % 1.0
         rows = near[number * _MAX_GROUP : (number + 1) * _MAX_GROUP]
         # The first row chooses kind and side.
-        kind = bisect(_NEAR_SHARES[factors.object_mix], rows[0][0])
-        nearest, farthest, place = _GROUPS[kind]
+        nearest, farthest, place = _GROUPS[bisect(_NEAR_SHARES[factors.object_mix], rows[0][0])]
         z = nearest * (farthest / nearest) ** share
         placed += place(road, rows, z, -1 if rows[0][1] < 0.5 else 1)
     far = draw_rows(seed, index, "far", factors.num_far_objects)
@@ -79,22 +59,22 @@ def place_objects(seed: int, index: int, road: Road, factors: SceneFactors) -> l
 
 def _without_collisions(placed: list[Placed]) -> list[Placed]:
     """Remove objects that overlap a car; of two objects the earlier one stays."""
-    kept: list[Placed] = []
-    taken: list[tuple[float, float, float, float, bool]] = []
+    kept = []
+    taken: list[tuple[Placed, bool]] = []
     for thing in placed:
+        is_car = thing.shape.name.startswith("car_")
         if thing.layer == GROUND:
             kept.append(thing)
-            continue
-        x, z, is_car = thing.x, thing.z, thing.shape.name.startswith("car_")
-        across, along = thing.shape.half_width, thing.shape.half_length
-        if all(
-            abs(x - other[0]) >= across + other[2] or abs(z - other[1]) >= along + other[3]
-            for other in taken
-            if is_car or other[4]
-        ):
+        elif not any(_overlap(thing, other) for other, car in taken if is_car or car):
             kept.append(thing)
-            taken.append((x, z, across, along, is_car))
+            taken.append((thing, is_car))
     return kept
+
+
+def _overlap(one: Placed, other: Placed) -> bool:
+    across = one.shape.half_width + other.shape.half_width
+    along = one.shape.half_length + other.shape.half_length
+    return abs(one.x - other.x) < across and abs(one.z - other.z) < along
 
 
 def _far_object(road: Road, row: Row, factors: SceneFactors) -> Placed:
@@ -124,42 +104,32 @@ def _structures(road: Road, u: list[float], factors: SceneFactors) -> list[Place
     if u[0] < factors.rail_share:
         lateral = (-1 if u[1] < 0.5 else 1) * (road.half_width + 0.45)
         for number in range(4 + int(u[3] * 7)):
-            z = 3.5 + 7 * u[2] + RAIL_STEP_M * number
+            z = 3.5 + 7 * u[2] + _RAIL_STEP_M * number
             placed.append(road.place("guardrail", z, lateral, yaw=road.heading(z)))
     if u[4] < factors.bump_share:
         depth = factors.bump_farthest_m - factors.bump_nearest_m
-        both_lanes, z = u[6] < 0.6, factors.bump_nearest_m + depth * u[5] ** 1.3
-        width = 2 * road.half_width - 0.3 if both_lanes else road.half_width - 0.2
-        bump = road.place(
-            "bump",
-            z,
-            0.0 if both_lanes else -road.half_width / 2,
-            yaw=road.heading(z),
-            scale=(width, 1.0, 1.0),
-            layer=GROUND,
-            shadow_from=NO_SHADOW,
-        )
-        placed.append(bump)
+        z, lateral = factors.bump_nearest_m + depth * u[5] ** 1.3, -road.half_width / 2
+        size, yaw = (road.half_width - 0.2, 1.0, 1.0), road.heading(z)
+        if u[6] < 0.6:  # of both lanes
+            size, lateral = (2 * road.half_width - 0.3, 1.0, 1.0), 0.0
+        bump = road.place("bump", z, lateral, yaw=yaw, scale=size, layer=GROUND)
+        placed.append(bump._replace(shadow_from=NO_SHADOW))
     return placed
 
 
-# ---- one object -----------------------------------------------------------------------------
-
-
-def _paint(palette: tuple[Paint, ...], u: float, shade: float) -> Paint:
+def _paint(palette: list[Paint], u: float, shade: float) -> Paint:
     red, green, blue = palette[int(u * len(palette))]
     return min(red * shade, 1.0), min(green * shade, 1.0), min(blue * shade, 1.0)
 
 
 def _car(road: Road, row: Row, at: At, parked: bool) -> Placed:
     """A car: parked ones are cold and dark, moving ones warm and lit."""
-    z, lateral = at
-    away = lateral < 0 if row[4] < 0.85 else lateral >= 0
+    away = at[1] < 0 if row[4] < 0.85 else at[1] >= 0
     paint = _paint(_CAR_PAINTS, row[COLOUR], 0.75 + 0.4 * row[COLOUR + 1])
     return road.place(
         f"car_{int(row[5] * 4)}",
         *at,
-        yaw=road.heading(z) + (0.0 if away else math.pi) + 0.12 * (row[6] - 0.5),
+        yaw=road.heading(at[0]) + (0.0 if away else math.pi) + 0.12 * (row[6] - 0.5),
         paints=(paint, paint),
         warmth=0.15 * row[HEAT] if parked else 0.65 + 0.35 * row[HEAT],
         lit=float(not parked),
@@ -168,8 +138,7 @@ def _car(road: Road, row: Row, at: At, parked: bool) -> Placed:
 
 def _person(road: Road, row: Row, at: At) -> Placed:
     """A person; one in eight is dressed so warmly that little of them shows in thermal."""
-    size = 0.90 + 0.16 * row[6]
-    wrapped = row[HEAT + 1] < 0.12
+    size, wrapped = 0.90 + 0.16 * row[6], row[HEAT + 1] < 0.12
     return road.place(
         f"person_{int(row[5] * 6)}",
         *at,
@@ -200,9 +169,6 @@ def _bike(road: Road, row: Row, at: At, yaw: float, ridden: bool) -> Placed:
 def _stop(road: Road, row: Row, at: At, kind: int) -> Placed:
     """A car stop, roughly along the road."""
     return road.place(_STOPS[kind], *at, yaw=road.heading(at[0]) + 0.2 * (row[4] - 0.5))
-
-
-# ---- near groups ----------------------------------------------------------------------------
 
 
 def _cars(road: Road, rows: list[Row], z: float, side: int) -> list[Placed]:
@@ -250,9 +216,8 @@ def _stops(road: Road, rows: list[Row], z: float, side: int) -> list[Placed]:
     """A row of two to four car stops: blocks beside the lane, or bollards along the sidewalk."""
     u = rows[0]
     kind = int(u[2] * len(_STOPS))
-    is_bollard = _STOPS[kind] == "stop_bollard"
-    lateral = side * (road.half_width + 0.55 if is_bollard else road.half_width - 0.55)
-    step = (2.4, 1.7, 1.9)[kind]
+    step, beside = ((2.4, -0.55), (1.7, 0.55), (1.9, -0.55))[kind]
+    lateral = side * (road.half_width + beside)
     chosen = enumerate(rows[: 2 + int(u[3] * 3)])
     return [_stop(road, row, (z + step * number, lateral), kind) for number, row in chosen]
 
@@ -261,16 +226,12 @@ def _cones(road: Road, rows: list[Row], z: float, side: int) -> list[Placed]:
     """A row of three to five cones that slants into the road."""
     u = rows[0]
     start, slant = side * (road.half_width - 0.35), -side * (0.1 + 0.25 * u[3])
-    step, size = 1.0 + 0.8 * u[2], 0.9 + 0.35 * u[4]
-    return [
-        road.place(
-            "cone",
-            z + step * number,
-            start + slant * number + 0.15 * (row[5] - 0.5),
-            scale=(size, size, size),
-        )
+    step, size = 1.0 + 0.8 * u[2], (0.9 + 0.35 * u[4],) * 3
+    places = [
+        (z + step * number, start + slant * number + 0.15 * (row[5] - 0.5))
         for number, row in enumerate(rows[: 3 + int(u[6] * 3)])
     ]
+    return [road.place("cone", *place, scale=size) for place in places]
 
 
 _GROUPS: tuple[tuple[float, float, Callable[[Road, list[Row], float, int], list[Placed]]], ...] = (
@@ -280,10 +241,7 @@ _GROUPS: tuple[tuple[float, float, Callable[[Road, list[Row], float, int], list[
 """Nearest and farthest Z, and what places it given road, rows, Z and side (-1 left)."""
 
 
-# ---- scenery --------------------------------------------------------------------------------
-
-_LAST_Z = 85.0
-_FAR_TREE_M = 22.0
+_LAST_Z, _FAR_TREE_M = 85.0, 22.0
 
 
 def place_scenery(seed: int, index: int, road: Road) -> list[Placed]:
@@ -308,14 +266,12 @@ def _horizon(rows: list[Row]) -> list[Placed]:
     placed = []
     for number, u in enumerate(rows):
         x, z = (number + u[0] - 6) * 32, 190 + 60 * u[1]
-        size = (4 + 4 * u[2], 7 + 9 * u[3], 1.0)
+        name, size = "tree_line", (4 + 4 * u[2], 7 + 9 * u[3], 1.0)
         if number % 2 == 0:
-            size = (12 + 26 * u[2], 9 + 34 * u[3] ** 2, 1.0)
-        shape = shapes()["tree_line" if number % 2 else "skyline"]
+            name, size = "skyline", (12 + 26 * u[2], 9 + 34 * u[3] ** 2, 1.0)
         paints = _shaded((0.38, 0.40, 0.44), 0.8 + 0.4 * u[COLOUR])
-        placed.append(
-            Placed(shape, x, z, scale=size, paints=paints, layer=BACKDROP, shadow_from=NO_SHADOW)
-        )
+        thing = Placed(shapes()[name], x, z, scale=size, paints=paints, layer=BACKDROP)
+        placed.append(thing._replace(shadow_from=NO_SHADOW))
     return placed
 
 
@@ -336,7 +292,7 @@ def _plots(road: Road, rows: list[Row], side: int) -> list[Placed]:
 
 
 Plot = tuple[float, float, float]
-"""Middle (Z), length along the road, lateral position of the edge towards the road (signed)."""
+"""Middle (Z), length, lateral position of the edge towards the road (signed)."""
 
 
 def _building(road: Road, row: Row, plot: Plot) -> list[Placed]:
@@ -345,26 +301,14 @@ def _building(road: Road, row: Row, plot: Plot) -> list[Placed]:
     side = math.copysign(1.0, edge)
     depth, height = 9 + 6 * row[4], 4.5 + 13 * row[5] ** 1.5
     front = edge + side * (0.3 + 2.5 * row[6])
-    house = road.place(
-        "building",
-        z,
-        front + side * depth / 2,
-        scale=(depth, height, length),
-        paints=_shaded(_FACADES[int(row[COLOUR] * len(_FACADES))], 0.75 + 0.5 * row[COLOUR + 1]),
-        lit=row[COLOUR + 2],
-        layer=BACKDROP,
-    )
+    paints = _shaded(_FACADES[int(row[COLOUR] * len(_FACADES))], 0.75 + 0.5 * row[COLOUR + 1])
+    house = road.place("building", z, front + side * depth / 2, paints=paints, layer=BACKDROP)
+    house = house._replace(scale=(depth, height, length), lit=row[COLOUR + 2])
     if row[HEAT] > 0.6:
         return [house]
-    outlet = Placed(
-        shapes()["vent"],
-        road.x(z, front) - side * 0.05,
-        z - length * (row[7] - 0.5) * 0.8,
-        y=0.5 + 2.5 * row[6],
-        shadow_from=NO_SHADOW,
-        layer=BACKDROP,
-    )
-    return [house, outlet]
+    x, z, y = road.x(z, front) - side * 0.05, z - length * (row[7] - 0.5) * 0.8, 0.5 + 2.5 * row[6]
+    vent = Placed(shapes()["vent"], x, z, y=y, shadow_from=NO_SHADOW, layer=BACKDROP)
+    return [house, vent]
 
 
 def _green(road: Road, row: Row, plot: Plot) -> list[Placed]:
@@ -372,23 +316,18 @@ def _green(road: Road, row: Row, plot: Plot) -> list[Placed]:
     z, length, edge = plot
     side = math.copysign(1.0, edge)
     lateral = edge + side * 0.4
-    low = row[4] < 0.4
-    border = road.place(
-        "wall" if low else "hedge",
-        z,
-        lateral,
-        yaw=road.heading(z),
-        scale=(0.3, 1.1 + 0.9 * row[5], length) if low else (0.8, 0.7 + 0.9 * row[5], length),
-        paints=_shaded((0.55, 0.53, 0.49), 0.6 + 0.5 * row[COLOUR]),
-        layer=BACKDROP,
-    )
+    name, size = "hedge", (0.8, 0.7 + 0.9 * row[5], length)
+    if row[4] < 0.4:
+        name, size = "wall", (0.3, 1.1 + 0.9 * row[5], length)
+    paints = _shaded((0.55, 0.53, 0.49), 0.6 + 0.5 * row[COLOUR])
+    border = road.place(name, z, lateral, yaw=road.heading(z), scale=size, paints=paints)
+    border = border._replace(layer=BACKDROP)
     behind = lateral + side * (2.2 + 2 * row[6])
-    sizes = (1.0 + 0.7 * row[COLOUR + 1], 1.0 + 0.7 * row[COLOUR + 2])
-    trees = [
-        _tree(road, (z + length * (0.45 * number - 0.2), behind), size, row[7 - number])
-        for number, size in enumerate(sizes)
-    ]
-    return [border, *trees]
+    placed = [border]
+    for number, u in enumerate(row[COLOUR + 1 : COLOUR + 3]):
+        at = (z + length * (0.45 * number - 0.2), behind)
+        placed.append(_tree(road, at, 1.0 + 0.7 * u, row[7 - number]))
+    return placed
 
 
 def _tree(road: Road, at: At, size: float, u: float, layer: int = BACKDROP) -> Placed:
@@ -413,13 +352,9 @@ def _street_trees(road: Road, rows: list[Row], side: int) -> list[Placed]:
 
 def _signs(road: Road, rows: list[Row], side: int) -> list[Placed]:
     """Up to two traffic signs, and in some streets a vending machine, on the sidewalk."""
+    at = side * (road.half_width + 0.4)
     placed = [
-        road.place(
-            f"sign_{int(u[2] * 3)}",
-            7 + 24 * u[1],
-            side * (road.half_width + 0.4),
-            shadow_from=NO_SHADOW,
-        )
+        road.place(f"sign_{int(u[2] * 3)}", 7 + 24 * u[1], at, shadow_from=NO_SHADOW)
         for u in rows[:2]
         if u[0] < 0.4
     ]
@@ -435,10 +370,8 @@ def _poles(road: Road, u: Row) -> list[Placed]:
     side = 1 if u[0] < 0.5 else -1
     lateral = side * (road.half_width + 0.45)
     yaw = 0.0 if side < 0 else math.pi
-    zs = [5 + 12 * u[2] + (17 + 8 * u[1]) * number for number in range(5)]
-    placed = [
-        road.place("street_lamp", z, lateral, yaw=yaw, lit=1.0, shadow_from=NO_SHADOW) for z in zs
-    ]
+    lamp = partial(road.place, "street_lamp", yaw=yaw, lit=1.0, shadow_from=NO_SHADOW)
+    placed = [lamp(5 + 12 * u[2] + (17 + 8 * u[1]) * number, lateral) for number in range(5)]
     if u[3] >= 0.6:
         return placed
     lateral, first, step = -side * (road.half_width + 0.6), 8 + 10 * u[4], 20 + 8 * u[5]
@@ -449,14 +382,7 @@ def _poles(road: Road, u: Row) -> list[Placed]:
             placed.append(road.place("utility_pole", z, lateral, shadow_from=NO_SHADOW))
         turn = math.atan2(road.x(z + step, lateral) - x, step)
         size = (1.0, 1.0, step / math.cos(turn))
-        placed += [
-            Placed(
-                *(shapes()["wire"], x + offset, z),
-                yaw=turn,
-                scale=size,
-                shadow_from=NO_SHADOW,
-                y=y,
-            )
-            for offset, y in ((-0.8, 8.3), (0.8, 8.3), (0.3, 7.3))
-        ]
+        wire = Placed(shapes()["wire"], x, z, turn, size, shadow_from=NO_SHADOW)
+        offsets = ((-0.8, 8.3), (0.8, 8.3), (0.3, 7.3))
+        placed += [wire._replace(x=x + offset, y=y) for offset, y in offsets]
     return placed

@@ -1,19 +1,134 @@
-"""The street of a scene: the road, its strips on the ground, and the record of a placed object."""
+"""Materials and shapes, the record of a placed object, and the road with its strips on the ground.
+
+Materials (``materials.csv``) have a reflectance, degrees above the air by day and at night
+(plausible, not measured), further degrees when the object is warm, amplitudes of the texture in RGB
+and in degrees, light that they give off at night (1 = white of the day), whether nothing heats them
+but the sun, and the classes of scenery made of them.
+
+Shapes (``shapes.csv``) are flat, convex faces in drawing order, one a line: x right, y up, z ahead
+(away from the camera for yaw 0), metres, standing on y = 0; `thin` ones are seen from both sides,
+the others from outside, where their normals point.
+"""
 
 from __future__ import annotations
 
+import csv
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import groupby
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.randomness import numpy_generator
-from rgbt.synth.camera import Floats
+from rgbt.synth.camera import Floats, floats
 from rgbt.synth.factors import SceneFactors
-from rgbt.synth.shapes import CURVE, INDEX, MAX_CORNERS, UNLABELED, Shape, shapes
+
+UNLABELED, CAR, PERSON, BIKE, CURVE, CAR_STOP, GUARDRAIL, COLOR_CONE, BUMP = range(9)
+"""MFNet's label ids."""
 
 Paint = tuple[float, float, float]
+"""Reflectance of red, green and blue."""
+
+MAX_CORNERS = 8
+"""Faces are padded to this many corners by repeating the last one."""
+
+
+def _table(name: str) -> list[dict[str, str]]:
+    with Path(__file__).with_name(name).open(newline="") as lines:
+        return list(csv.DictReader(lines))
+
+
+_MATERIALS = _table("materials.csv")
+INDEX = {row["name"]: number for number, row in enumerate(_MATERIALS)}
+"""Material -> number. The sky comes first: index 0 is what is seen where nothing is drawn."""
+
+
+def column(*fields: str) -> NDArray[np.float32]:
+    """Columns of the table of materials: (M,) of one, (M, n) of several; rows as in `INDEX`."""
+    values = [[float(row[field]) for field in fields] for row in _MATERIALS]
+    found = np.array(values, np.float32)
+    return found[:, 0] if len(fields) == 1 else found
+
+
+COLOURS = column("red", "green", "blue")
+
+
+def paints(palette: str) -> list[Paint]:
+    """The paints of cars, clothes or facades in ``paints.csv``."""
+    rows = [row for row in _table("paints.csv") if row["palette"] == palette]
+    return [(float(row["red"]), float(row["green"]), float(row["blue"])) for row in rows]
+
+
+Table = NDArray[np.uint8]
+"""(labels, materials) -> class id; 255 for materials that only labelled objects are made of."""
+
+
+def class_table(classes: Sequence[str], by_label: Sequence[str], scenery: str) -> Table:
+    """The class of every pair of label and material; ids follow the order of `classes`.
+
+    `by_label` has the classes of MFNet's labels from 1 on, whatever the material; `scenery` is the
+    column of the table of materials for what MFNet leaves unlabelled (0).
+    """
+    table = np.full((1 + len(by_label), len(INDEX)), 255, np.uint8)
+    for number, row in enumerate(_MATERIALS):
+        if row[scenery]:
+            table[0, number] = classes.index(row[scenery])
+    for label, name in enumerate(by_label, 1):
+        table[label] = classes.index(name)
+    return table
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """The faces of one kind of object, as arrays in drawing order.
+
+    Attributes:
+        corners: (F, 8, 3) float32, of which `num_corners` (F,) differ.
+        meta: (F, 4) int: material index, label, paint (0: the material's own colour, 1 or 2: the
+            object's first or second), thin.
+        half_width: half the extent along x, `half_length` along z, for shadows and collisions.
+        height: extent along y.
+    """
+
+    name: str
+    corners: NDArray[np.float32]
+    num_corners: NDArray[np.intp]
+    meta: NDArray[np.intp]
+    half_width: float
+    half_length: float
+    height: float
+
+    @classmethod
+    def of(cls, name: str, faces: Sequence[tuple[NDArray[np.float32], Sequence[int]]]) -> Shape:
+        """The shape of faces: corners (n, 3) and a row of `meta` each."""
+        outlines, meta = zip(*faces, strict=True)
+        counts = np.array([len(each) for each in outlines], np.intp)
+        at = np.arange(MAX_CORNERS)
+        corners = np.stack([each[at.clip(max=len(each) - 1)] for each in outlines])
+        half_width, height, half_length = np.abs(corners).max((0, 1)).tolist()
+        return cls(name, corners, counts, np.array(meta, np.intp), half_width, half_length, height)
+
+
+@cache
+def shapes() -> dict[str, Shape]:
+    """Every shape of the table, by name."""
+    found = {}
+    for name, rows in groupby(_table("shapes.csv"), key=lambda row: row["shape"]):
+        faces = [
+            (
+                np.array(row["corners"].split(), np.float32).reshape(-1, 3),
+                (INDEX[row["material"]], int(row["label"]), int(row["paint"]), int(row["thin"])),
+            )
+            for row in rows
+        ]
+        found[name] = Shape.of(name, faces)
+    return found
+
 
 GROUND, BACKDROP, STANDING = range(3)
 """Drawing layers, first to last; within a layer far objects are drawn before near ones."""
@@ -29,7 +144,7 @@ class Placed(NamedTuple):
         scale: factors on the shape's x, y, z.
         paints: first and second paint, reflectance (R, G, B).
         warmth: 0 cold (parked, well wrapped) to 1 (engine on, lightly dressed).
-        lit: 0 or 1: whether its lamps are on by night.
+        lit: 0 or 1: whether its lamps are on by night; of buildings the style of their windows.
         shadow_from: share of the height from which it casts a shadow, or `NO_SHADOW`.
     """
 
@@ -53,10 +168,7 @@ COLOUR, HEAT = 8, 12
 
 
 def draw_rows(seed: int, index: int, pool: str, num: int) -> list[Row]:
-    """Numbers for the first `num` objects of the pool `pool` in scene `index`.
-
-    Rows are drawn one after the other, so that the first rows do not depend on their number.
-    """
+    """Numbers for the first `num` objects of the pool `pool` in scene `index`, row by row."""
     rows: list[Row] = numpy_generator(seed, f"synth/{pool}", index).random((num, 14)).tolist()
     return rows
 
@@ -64,9 +176,7 @@ def draw_rows(seed: int, index: int, pool: str, num: int) -> list[Row]:
 KERB_M = (0.24, 0.17)
 """Width and height of a kerb. Wider than a real one, so that it is seen at 120 x 160 pixels."""
 
-_STEPS = np.array([-4, 2, 5, 8, 12, 17, 24, 34, 50, 75, 120, 250], np.float32)
-
-
+_STEPS = floats([-4, 2, 5, 8, 12, 17, 24, 34, 50, 75, 120, 250])
 Numbers = float | NDArray[np.float64] | Floats
 
 
@@ -77,7 +187,7 @@ class Road(NamedTuple):
         half_width: from the centre line to the kerb.
         centre: X of the centre line beside the camera; positive, traffic keeps left.
         curvature: 1 / metres, positive to the right.
-        kerb_m: width and height of kerbs.
+        kerb: whether there is one; `kerb_m` are its width and height.
         crossing_z: distance of a zebra crossing, or None.
         line_phase: where in a dash the centre line begins, 0..1.
         patches: (n, 4) rows of Z, lateral position, width and length of repaired asphalt.
@@ -133,16 +243,15 @@ def draw_road(seed: int, index: int, factors: SceneFactors) -> Road:
     )
 
 
-class Quads(NamedTuple):
-    """Quads on the ground in drawing order: corners (F, 8, 3), material (F,), label (F,)."""
+Quads = tuple[Floats, NDArray[np.intp], NDArray[np.intp]]
+"""Quads on the ground in drawing order: corners (F, 8, 3), material (F,), label (F,)."""
 
-    corners: Floats
-    material: NDArray[np.intp]
-    label: NDArray[np.intp]
+TERRAIN = [(-2500.0, -2.0), (-2500.0, 2500.0), (2500.0, 2500.0), *[(2500.0, -2.0)] * 5]
+"""Corners (X, Z) of the ground around the road."""
 
 
 def ground_quads(road: Road) -> Quads:
-    """Terrain, sidewalks, asphalt, markings and kerbs, from bottom to top."""
+    """Terrain, sidewalks, asphalt, markings, kerbs and a manhole, from bottom to top."""
     w, (left, right) = road.half_width, road.sidewalk
     z, x, width, length = road.patches.T
     strips = [
@@ -151,35 +260,23 @@ def ground_quads(road: Road) -> Quads:
         ("asphalt", UNLABELED, _strip(-w, w)),
         ("patch", UNLABELED, _rows(z, z + length, x, x + width)),
         *(("line", UNLABELED, rows) for rows in _markings(road)),
-        *_kerbs(road),
     ]
-    counts = [len(rows) for _, _, rows in strips]
-    flat = [_flat(TERRAIN), _flat(_circle(road, *road.manhole, 0.36))]
-    first = [INDEX["grass"], INDEX["manhole"]]
-    return Quads(
-        np.concatenate(
-            [flat[0], _corners(road, np.concatenate([rows for _, _, rows in strips])), flat[1]]
-        ),
-        np.concatenate(
-            [first[:1], np.repeat([INDEX[name] for name, _, _ in strips], counts), first[1:]]
-        ),
-        np.concatenate([[0], np.repeat([label for _, label, _ in strips], counts), [0]]),
-    )
-
-
-TERRAIN = [(-2500.0, -2.0), (-2500.0, 2500.0), (2500.0, 2500.0), (2500.0, -2.0)]
-"""Corners (X, Z) of the ground around the road."""
-
-
-def _flat(outline: list[tuple[float, float]]) -> Floats:
-    padded = outline + [outline[-1]] * (MAX_CORNERS - len(outline))
-    return np.array([[(x, 0, z) for x, z in padded]], np.float32)
-
-
-def _circle(road: Road, z: float, lateral: float, radius: float) -> list[tuple[float, float]]:
+    wide, high = road.kerb_m
+    for side in (side for side, present in zip((-1, 1), road.kerb, strict=True) if present):
+        top, face = _strip(side * w, side * (w + wide), (high, high)), (0, high)
+        strips.append(("kerb_top", CURVE, top))
+        strips.append(("kerb_face", CURVE, _strip(side * w, side * w, face)))
+    names, labels, rows = zip(*strips, strict=True)
+    counts = [1, *map(len, rows), 1]
+    z, x = road.manhole[0], road.x(*road.manhole)
     angles = [2 * math.pi * corner / MAX_CORNERS for corner in range(MAX_CORNERS)]
-    x = road.x(z, lateral)
-    return [(x + radius * math.cos(angle), z + radius * math.sin(angle)) for angle in angles]
+    circle = [(x + 0.36 * math.cos(angle), z + 0.36 * math.sin(angle)) for angle in angles]
+    terrain, manhole = (floats([[(x, 0, z) for x, z in each]]) for each in (TERRAIN, circle))
+    return (
+        np.concatenate([terrain, _corners(road, np.concatenate(rows)), manhole]),
+        np.repeat([INDEX[name] for name in ("grass", *names, "manhole")], counts),
+        np.repeat([UNLABELED, *labels, UNLABELED], counts),
+    )
 
 
 def _rows(
@@ -187,7 +284,7 @@ def _rows(
 ) -> Floats:
     """Quads as rows: Z of both ends, lateral position of both sides, height of both sides."""
     columns = (start, end, left, right, *y)
-    rows = np.empty((max(np.size(column) for column in columns), 6), np.float32)
+    rows = np.empty((max(map(np.size, columns)), 6), np.float32)
     for number, column in enumerate(columns):
         rows[:, number] = column
     return rows
@@ -222,14 +319,3 @@ def _markings(road: Road) -> list[Floats]:
         stop = road.crossing_z - 1.6
         lines.append(_rows(stop, stop + 0.35, -road.half_width + 0.3, -0.1))
     return lines
-
-
-def _kerbs(road: Road) -> list[tuple[str, int, Floats]]:
-    width, height = road.kerb_m
-    strips = []
-    for side, present in zip((-1, 1), road.kerb, strict=True):
-        if present:
-            inner, outer = side * road.half_width, side * (road.half_width + width)
-            strips.append(("kerb_top", CURVE, _strip(inner, outer, (height, height))))
-            strips.append(("kerb_face", CURVE, _strip(inner, inner, (0, height))))
-    return strips

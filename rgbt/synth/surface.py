@@ -1,25 +1,215 @@
-"""Compute position, texture and shadow of each pixel before lighting, for RGB and thermal."""
+"""Draw the flat parts of a scene into a map of their numbers, and what follows for each pixel.
+
+The map has twice the image size. Labels and depth are read at pixel centres, so they are exact;
+colours are averaged around them (`average`), so edges are smooth.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from rgbt.randomness import numpy_generator
-from rgbt.synth.camera import NEAR_M, Floats, SynthCamera, floats
+from rgbt.synth.camera import NEAR_M, Floats, Key, SynthCamera, floats
 from rgbt.synth.light import Light
-from rgbt.synth.raster import Drawing, Facets, beyond_near
-from rgbt.synth.shapes import INDEX
-from rgbt.synth.street import Placed
+from rgbt.synth.street import COLOURS, INDEX, MAX_CORNERS, Placed, Quads
 
-_TILE = 256
-_LAST_SHADOW_M = 45.0
+SCALE, _SHIFT = 2, 4
+"""Facets are drawn at this multiple of the image size, with so many binary digits."""
+
+_SMALLEST = 0.8
+"""Facets with a smaller projected extent, in pixels, are left out."""
+
+_TILE, _LAST_SHADOW_M = 256, 45.0
 _FACADES = [INDEX["facade"], INDEX["facade_side"]]
+
+
+@dataclass(frozen=True)
+class Facets:
+    """N facets, far to near: (N,) each, corners (N, 8, 3) world points, colour (N, 3) reflectance.
+
+    `warmth` and `lit` are as in `Placed`; what is `on_ground` lies flat and receives shadows;
+    `owner` is the number of the object, -1 the ground.
+    """
+
+    corners: Floats
+    num_corners: NDArray[np.intp]
+    material: NDArray[np.intp]
+    label: NDArray[np.intp]
+    thin: NDArray[np.bool_]
+    colour: Floats
+    warmth: Floats
+    lit: Floats
+    on_ground: NDArray[np.bool_]
+    owner: NDArray[np.intp]
+
+
+def sorted_for_drawing(placed: Sequence[Placed]) -> list[Placed]:
+    """By layer, and within a layer the farthest first (painter's algorithm)."""
+    return sorted(placed, key=lambda thing: (thing.layer, -thing.z))
+
+
+def facets_of(ground: Quads, placed: Sequence[Placed]) -> Facets:
+    """The ground's quads, then the parts of `placed`, one or more, in the order given."""
+    shapes = [thing.shape for thing in placed]
+    owner = np.repeat(np.arange(len(placed)), [len(shape.meta) for shape in shapes])
+    # One table of numbers per object: many small arrays would cost more than all the arithmetic.
+    columns = [
+        (p.x, p.y, p.z, p.yaw, p.warmth, p.lit, *p.scale, *p.paints[0], *p.paints[1])
+        for p in placed
+    ]
+    numbers = floats(columns)[owner]
+    meta = np.concatenate([shape.meta for shape in shapes])
+    corners = _in_world(np.concatenate([shape.corners for shape in shapes]), numbers)
+    painted = np.where(meta[:, 2:3] == 2, numbers[:, 12:15], numbers[:, 9:12])
+    colour = np.where(meta[:, 2:3] > 0, painted, COLOURS[meta[:, 0]])
+
+    (corners_of_ground, material, label), join = ground, np.concatenate
+    number = len(material)
+    no_heat = np.zeros(number, np.float32)
+    return Facets(
+        corners=join([corners_of_ground, corners]),
+        num_corners=join([np.full(number, MAX_CORNERS), *(s.num_corners for s in shapes)]),
+        material=join([material, meta[:, 0]]),
+        label=join([label, meta[:, 1]]),
+        thin=join([np.ones(number, bool), meta[:, 3] > 0]),
+        colour=join([COLOURS[material], colour]),
+        warmth=join([no_heat, numbers[:, 4]]),
+        lit=join([no_heat, numbers[:, 5]]),
+        on_ground=np.arange(number + len(meta)) < number,
+        owner=join([np.full(number, -1), owner]),
+    )
+
+
+def _in_world(local: Floats, numbers: Floats) -> Floats:
+    """Corners scaled, turned about the upright axis and moved to where each object stands."""
+    x, y, z, yaw = numbers[:, :4].T[:, :, None]
+    scaled = local * numbers[:, None, 6:9]
+    sin, cos = np.sin(yaw), np.cos(yaw)
+    turned = np.empty_like(scaled)
+    turned[..., 0] = scaled[..., 0] * cos + scaled[..., 2] * sin + x
+    turned[..., 1] = scaled[..., 1] + y
+    turned[..., 2] = scaled[..., 2] * cos - scaled[..., 0] * sin + z
+    return turned
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """What the camera sees, as numbers of facets; 0 is the sky, n + 1 is facet n.
+
+    Attributes:
+        fine: (2H, 2W); the entry (2i, 2j) lies at the centre of pixel (i, j).
+        ids: (H, W), the entries at pixel centres.
+        planes: (N + 1, 3); inverse depth of a pixel is ``planes[id] @ ray``.
+        bounds: (N + 1, 2), smallest and largest inverse depth of each facet's corners.
+        normals: (N + 1, 3) unit normals in world coordinates, towards the camera.
+    """
+
+    fine: NDArray[np.intp]
+    ids: NDArray[np.intp]
+    planes: Floats
+    bounds: Floats
+    normals: Floats
+
+    def inverse_depth(self, rays_3HW: Floats) -> Floats:
+        """(H, W) float32, 1 / metres along the optical axis, 0 for the sky."""
+        total = np.zeros(self.ids.shape, np.float32)
+        for plane, ray in zip(np.ascontiguousarray(self.planes.T), rays_3HW, strict=True):
+            total += np.take(plane, self.ids) * ray
+        # Outlines are up to half a pixel wide: there the plane of a grazing facet would run away.
+        low, high = np.ascontiguousarray(self.bounds.T)
+        return np.clip(total, np.take(low, self.ids), np.take(high, self.ids))
+
+
+def draw(facets: Facets, camera: SynthCamera) -> Drawing:
+    """Facets in their order, later ones over earlier ones."""
+    corners = camera.to_camera(facets.corners)
+    # In double precision: the terrain is a plane through corners kilometres away.
+    three = camera.to_camera(facets.corners[:, :3].astype(np.float64))
+    first, second, third = three.transpose(1, 0, 2)
+    normals = _cross(second - first, third - first)
+    offset = (normals * first).sum(1)
+    # y runs down in camera coordinates, which mirrors the world: outward normals point inwards.
+    seen = (offset > 1e-9) | (facets.thin & (offset < -1e-9))
+    ids = _paint(corners, facets.num_corners, seen, camera).astype(np.intp)
+    planes = normals / np.where(offset == 0, 1, offset)[:, None]
+    length = np.maximum(np.linalg.norm(normals, axis=1), 1e-12)
+    towards = -np.sign(offset)[:, None] * normals / length[:, None]
+    depth = corners[..., 2].T
+    bounds = 1.0 / np.maximum(np.stack([depth.max(0), depth.min(0)], 1), NEAR_M)
+    sky = np.zeros((1, 3), np.float32)
+    return Drawing(
+        fine=ids,
+        ids=np.ascontiguousarray(ids[::SCALE, ::SCALE]),
+        planes=np.concatenate([sky, planes.astype(np.float32)]),
+        bounds=np.concatenate([sky[:, :2], bounds.astype(np.float32)]),
+        normals=np.concatenate([sky, (towards @ camera.rotation).astype(np.float32)]),
+    )
+
+
+def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Row by row; np.cross takes ten times as long on arrays of this size."""
+    (ax, ay, az), (bx, by, bz) = a.T, b.T
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
+
+
+def average(values_N4: NDArray[np.uint8], drawing: Drawing) -> NDArray[np.uint8]:
+    """Four values per facet, averaged around each pixel (binomial weights, 0.5 pixels wide).
+
+    From (N + 1, 4) uint8, row 0 for the sky, to (H, W, 4) uint8.
+    """
+    packed = np.ascontiguousarray(values_N4).view(np.uint32)[:, 0]
+    fine = np.take(packed, drawing.fine, mode="clip").view(np.uint8)
+    return np.asarray(cv2.pyrDown(fine.reshape(*drawing.fine.shape, 4)), np.uint8)
+
+
+def _paint(
+    corners: Floats, num_corners: NDArray[np.intp], seen: NDArray[np.bool_], camera: SynthCamera
+) -> NDArray[np.uint16]:
+    numbers = np.flatnonzero(seen)
+    # Corners first: the reductions over them are several times faster along the first axis.
+    by_corner = np.ascontiguousarray(corners[numbers].transpose(1, 0, 2))
+    columns_rows = camera.project(by_corner)
+    low, high = columns_rows.min(0), columns_rows.max(0)
+    nearest, farthest = by_corner[..., 2].min(0), by_corner[..., 2].max(0)
+    crosses = nearest < NEAR_M
+    size = (camera.width, camera.height)
+    inside = (high >= 0).all(1) & (low < size).all(1) & ((high - low).max(1) > _SMALLEST)
+    drawn = np.flatnonzero((inside | crosses) & (farthest > NEAR_M))
+
+    points = np.ascontiguousarray(_fixed_point(columns_rows[:, drawn]).transpose(1, 0, 2))
+    counts = num_corners[numbers[drawn]].tolist()
+    fine = np.zeros((camera.height * SCALE, camera.width * SCALE), np.uint16)
+    polygons = [points[row, :count] for row, count in enumerate(counts)]
+    for row in np.flatnonzero(crosses[drawn]).tolist():
+        corners_of = by_corner[: counts[row], drawn[row]].tolist()
+        polygons[row] = _fixed_point(_beyond_near(corners_of, camera))
+    for number, polygon in zip(numbers[drawn].tolist(), polygons, strict=True):
+        cv2.fillConvexPoly(fine, polygon, number + 1, cv2.LINE_8, _SHIFT)
+    return fine
+
+
+def _fixed_point(columns_rows: Floats) -> NDArray[np.int32]:
+    limit = 2**26
+    return np.clip(np.rint(columns_rows * (SCALE << _SHIFT)), -limit, limit).astype(np.int32)
+
+
+def _beyond_near(polygon: list[list[float]], camera: SynthCamera) -> Floats:
+    """The part of a polygon beyond the near plane (Sutherland-Hodgman), (M, 2) as (column, row)."""
+    kept = []
+    for start, end in zip(polygon, polygon[1:] + polygon[:1], strict=True):
+        if start[2] >= NEAR_M:
+            kept.append(start)
+        if (start[2] >= NEAR_M) != (end[2] >= NEAR_M):
+            share = (NEAR_M - start[2]) / (end[2] - start[2])
+            kept.append([a + share * (b - a) for a, b in zip(start, end, strict=True)])
+    return camera.project(np.array(kept, np.float32))
 
 
 @dataclass(frozen=True)
@@ -27,18 +217,12 @@ class Surface:
     """Maps (H, W) of one frame.
 
     Attributes:
-        facets: what there is.
-        camera: where it is seen from.
-        drawing: which facet is where.
-        rays: (3, H, W) in camera coordinates.
-        world: (3, H, W), metres.
+        rays: (3, H, W) in camera coordinates; `world`: (3, H, W), metres.
         depth: metres along the optical axis; infinity for the sky.
-        material: material index.
         texture: zero mean, about unit variance near the camera.
         patches: its coarse part: heat spreads, so its fine grain is not seen.
         window: share of the pixel that is a window.
         window_lit: 0..1, draw of the window: lit where below the share of lit ones.
-        shadow: 0..1.
     """
 
     facets: Facets
@@ -56,16 +240,9 @@ class Surface:
 
 
 def surface_of(
-    drawing: Drawing,
-    facets: Facets,
-    camera: SynthCamera,
-    shadow: Floats,
-    texture_key: tuple[int, int],
+    drawing: Drawing, facets: Facets, camera: SynthCamera, shadow: Floats, key: Key
 ) -> Surface:
-    """Surface maps of one frame; `shadow` is (H, W) of `shadow_map`.
-
-    `texture_key` is (seed, scene index): textures stay where they are when the camera moves.
-    """
+    """Surface maps of one frame; `shadow` is (H, W) of `shadow_map`."""
     rays = camera.rays()
     inverse_depth = drawing.inverse_depth(rays)
     world = camera.to_world(rays, inverse_depth)
@@ -75,21 +252,9 @@ def surface_of(
         depth = 1.0 / inverse_depth
     pixel_m = depth / np.float32(camera.focal)
     window, window_lit = _windows(world, pixel_m, material, drawing, facets, camera)
-    texture, patches = _texture(world, on_ground, pixel_m, texture_key)
-    return Surface(
-        facets=facets,
-        camera=camera,
-        drawing=drawing,
-        rays=rays,
-        world=world,
-        depth=depth,
-        material=material,
-        texture=texture,
-        patches=patches,
-        window=window,
-        window_lit=window_lit,
-        shadow=shadow * on_ground,
-    )
+    texture, patches = _texture(world, on_ground, pixel_m, key)
+    maps = (rays, world, depth, material, texture, patches, window, window_lit)
+    return Surface(facets, camera, drawing, *maps, shadow * on_ground)
 
 
 @lru_cache(maxsize=8)
@@ -109,7 +274,7 @@ def sample_tile(seed: int, s: Floats, t: Floats) -> Floats:
 
 
 def _texture(
-    world: Floats, on_ground: NDArray[np.bool_], pixel_m: Floats, key: tuple[int, int]
+    world: Floats, on_ground: NDArray[np.bool_], pixel_m: Floats, key: Key
 ) -> tuple[Floats, Floats]:
     """Fine grain (5 cm) and coarse patches (40 cm) where pixels resolve them; patches alone."""
     seed, index = key
@@ -176,43 +341,34 @@ def shadow_map(
     in_camera = camera.to_camera(points)
     pixels = np.rint(camera.project(in_camera) * 16).astype(np.int32)
     ahead = in_camera[..., 2] > NEAR_M
+
+    def fill(part: slice, value: int, shown: Any) -> None:
+        for row in np.flatnonzero(shown).tolist():
+            outline = pixels[row, part]
+            outline = cv2.convexHull(outline) if len(outline) > 4 else outline
+            cv2.fillConvexPoly(canvas, outline, value, cv2.LINE_8, 4)
+        for row in np.flatnonzero(ahead[:, part].any(1) & ~shown & whole).tolist():
+            on_ground = np.ascontiguousarray(points[row, part][:, [0, 2]])
+            hull = points[row, part][cv2.convexHull(on_ground, returnPoints=False).ravel()]
+            outline = np.rint(_beyond_near(camera.to_camera(hull).tolist(), camera) * 16)
+            cv2.fillConvexPoly(canvas, outline.astype(np.int32), value, cv2.LINE_8, 4)
+
     if light.direct > 0.5:
-        for row in np.flatnonzero(ahead.all(1)).tolist():
-            cv2.fillConvexPoly(canvas, cv2.convexHull(pixels[row, :8]), 190, cv2.LINE_8, 4)
-        for row in np.flatnonzero(ahead[:, :8].any(1) & ~ahead.all(1) & whole).tolist():
-            _fill_beyond(canvas, points[row, :8], camera, 190)
-    for row in np.flatnonzero(ahead[:, 8:].all(1)).tolist():
-        cv2.fillConvexPoly(canvas, pixels[row, 8:], 230, cv2.LINE_8, 4)
-    for row in np.flatnonzero(ahead[:, 8:].any(1) & ~ahead[:, 8:].all(1) & whole).tolist():
-        _fill_beyond(canvas, points[row, 8:], camera, 230)
+        fill(slice(0, 8), 190, ahead.all(1))
+    fill(slice(8, 12), 230, ahead[:, 8:].all(1))
     return np.asarray(cv2.GaussianBlur(canvas, (3, 3), 0.7), np.float32) / 255.0
-
-
-def _fill_beyond(
-    canvas: NDArray[np.uint8], points: Floats, camera: SynthCamera, value: int
-) -> None:
-    """Fill the part beyond the near plane of the hull of points (M, 3) on the ground."""
-    hull = cv2.convexHull(np.ascontiguousarray(points[:, [0, 2]]), returnPoints=False).ravel()
-    outline = beyond_near(camera.to_camera(points[None, hull])[0].tolist(), camera)
-    cv2.fillConvexPoly(canvas, np.rint(outline * 16).astype(np.int32), value, cv2.LINE_8, 4)
 
 
 def _footprints(casting: Sequence[Placed]) -> tuple[Floats, Floats, Floats]:
     """Corners (M, 4, 2) of each object's base in (X, Z), its height, the start of its shadow."""
-    numbers = np.array(
-        [
-            (p.x, p.z, p.yaw, p.shape.half_width * p.scale[0], p.shape.half_length * p.scale[2],
-             p.shape.height * p.scale[1], p.shadow_from)
-            for p in casting
-        ],
-        np.float32,
-    )  # fmt: skip
-    x, z, yaw, half_width, half_length, height, start = numbers.T
+    x, z, yaw, start = floats([(p.x, p.z, p.yaw, p.shadow_from) for p in casting]).T
+    sizes = [(p.shape.half_width, p.shape.height, p.shape.half_length) for p in casting]
+    scales = np.array([p.scale for p in casting])
+    half_width, height, half_length = (np.array(sizes) * scales).astype(np.float32).T
     sin, cos = np.sin(yaw), np.cos(yaw)
-    corners = []
-    for a, b in ((-1, -1), (-1, 1), (1, 1), (1, -1)):
+    corners = np.empty((len(casting), 4, 2), np.float32)
+    for number, (a, b) in enumerate(((-1, -1), (-1, 1), (1, 1), (1, -1))):
         across, along = a * half_width, b * np.maximum(half_length, 0.12)
-        corners.append(
-            np.stack([x + across * cos + along * sin, z - across * sin + along * cos], 1)
-        )
-    return np.stack(corners, 1), height, start
+        corners[:, number, 0] = x + across * cos + along * sin
+        corners[:, number, 1] = z - across * sin + along * cos
+    return corners, height, start

@@ -1,81 +1,176 @@
-"""Train a run after its upstream runs, in topological order.
+"""Train a run after its upstream runs, in as many processes as it has devices.
 
 A finished upstream run is used as it is. An interrupted one is resumed, and the command waits for
-one that another process trains. Of several processes of a run, process 0 looks at files, and the
-others do as it found (`agreed`).
+one that another process trains. Of several processes, which torchrun or srun start, process 0 looks
+at files, and the others do as it found (`agreed`).
 """
 
 from __future__ import annotations
 
+import os
+import signal
+import socket
+import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
-from rgbt.assembly.load_run import with_weights
-from rgbt.assembly.training_setup import validate
-from rgbt.checks import InputError
-from rgbt.evaluation.request import EvaluationRequest
-from rgbt.files.atomic import is_held
+import torch
+from torch import distributed
+
+from rgbt.checks import InputError, RunError
+from rgbt.data.loaders import check_batch_size
+from rgbt.engine.batch_norm import check_batch_norm_parts
+from rgbt.engine.fabric import open_fabric
+from rgbt.engine.settings import TrainerSettings
 from rgbt.files.plain_files import check_links
-from rgbt.processes import agreed, alone, num_processes, rank
+from rgbt.processes import agreed, num_processes, rank
 from rgbt.runs.provenance import other_code
-from rgbt.runs.run_spec import WEIGHTS, Dependency, RunSpec
+from rgbt.runs.run_spec import RunSpec
+from rgbt.runtime.group import Group, group_from_environment
+from rgbt.runtime.signals import WORDS, Stopped
 from rgbt.terminal import info, warn
-from rgbt.training.train import train
+from rgbt.training.train import Training
+
+OF_GLOO = "gloo/transport"
+"""In the message of every error of a lost connection between CPUs."""
+
+GRACE_S = 5.0
+"""Time in which torchrun or srun ends a process because another one has failed, in seconds."""
+
+SHUTDOWN_S = 300
+"""Time that torchrun waits for the step in progress and its checkpoint, in seconds."""
 
 POLL_S = 1.0
 """Interval between two checks of a run that another process trains."""
 
 
-def run_pipeline(run: RunSpec, extra_tags: Mapping[str, str]) -> None:
-    """Train a run after the runs upstream of it.
+def start(run: RunSpec, extra_tags: Mapping[str, str], words: Sequence[str]) -> int:
+    """Train a run after its upstream runs, see `run_pipeline`; returns the exit code.
 
-    The whole pipeline is validated before the first run starts.
+    `words` are the arguments of ``rgbt run`` that describe it. InputError: the devices do not fit
+    the processes or the batch.
+    """
+    group = group_from_environment()
+    size = group.size if group else _num_devices(run.trainer)
+    for spec in run.pending if size > 1 else ():
+        check_batch_size(spec.data, size)
+        check_batch_norm_parts(spec.trainer.batch_norm_parts, size)
+    if group is None and size > 1:
+        return launch(size, words)
+    with _taking_part(group, run.trainer):
+        run_pipeline(run, extra_tags)
+    return 0
+
+
+def _num_devices(trainer: TrainerSettings) -> int:
+    """Devices of this machine that a run uses: `trainer.devices`, where "auto" means all GPUs."""
+    found = torch.cuda.device_count() if trainer.accelerator in ("auto", "cuda") else 0
+    if trainer.devices == "auto":
+        return max(1, found)
+    if found and trainer.devices > found:
+        raise InputError(
+            f"trainer.devices={trainer.devices}, but this machine shows {found} GPUs (see "
+            "nvidia-smi and CUDA_VISIBLE_DEVICES)."
+        )
+    return trainer.devices
+
+
+@contextmanager
+def _taking_part(group: Group | None, trainer: TrainerSettings) -> Iterator[None]:
+    """Connect the processes of a run, if there are several; one of them reports an error."""
+    if group is None:
+        yield
+        return
+    try:
+        open_fabric(trainer)
+        yield
+    except Exception as error:
+        is_lost = isinstance(error, distributed.DistError) or OF_GLOO in str(error)
+        if group.rank == 0 and not is_lost:
+            raise
+        # The process that failed first reports it; this one is ended meanwhile, or failed alone.
+        try:
+            time.sleep(GRACE_S)
+        except Stopped as stop:
+            sys.exit(stop.code)
+        sys.stdout, sys.stderr = sys.__stdout__, sys.__stderr__
+        title = f"process {group.rank} of {group.size}"
+        if is_lost:
+            raise RunError(f"{title} lost another one; rerun the command to resume.") from error
+        if isinstance(error, InputError | RunError):
+            raise type(error)(f"{title}: {error}") from error
+        raise
+    distributed.destroy_process_group()
+
+
+def launch(num_processes: int, words: Sequence[str]) -> int:
+    """Run ``rgbt run`` with these words in so many processes by torchrun; returns its exit code."""
+    from torch.distributed.elastic.multiprocessing.api import SignalException
+    from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
+    from torch.distributed.run import get_args_parser, main
+
+    # Threads of one process that wait in a loop would take the cores of the others.
+    preferred = {"OMP_WAIT_POLICY": "PASSIVE", "OMP_NUM_THREADS": "1"}
+    if any(name == "lo" for _, name in socket.if_nameindex()):
+        # Otherwise gloo looks up the name of this machine, which containers may not know.
+        preferred["GLOO_SOCKET_IFNAME"] = "lo"
+    for name, value in preferred.items():
+        os.environ.setdefault(name, value)
+    heard = [each.name for each in WORDS if signal.getsignal(each) is not signal.SIG_IGN]  # nohup
+    options = [f"--signals-to-handle={','.join(heard)}", f"--shutdown-timeout={SHUTDOWN_S}"]
+    known = get_args_parser().format_help()  # older versions of torch have neither
+    options = [each for each in options if each.partition("=")[0] in known]
+    options += ["--standalone", "--local-addr=127.0.0.1", f"--nproc-per-node={num_processes}"]
+    try:
+        main([*options, "-m", "rgbt.run", *words])
+    except SignalException as stop:
+        return 128 + int(stop.sigval)
+    except ChildFailedError as failed:
+        rank, failure = failed.get_first_failure()
+        if failure.exitcode > 0:  # it has said why
+            return failure.exitcode
+        name = signal.Signals(-failure.exitcode).name
+        info(f"process {rank} of {num_processes} was stopped by {name}; rerun to resume.")
+        return 128 - failure.exitcode
+    return 0
+
+
+def run_pipeline(run: RunSpec, extra_tags: Mapping[str, str]) -> None:
+    """Train a run after those upstream of it; all are validated before the first one starts.
 
     Args:
         run: the requested run.
         extra_tags: MLflow tags of the requested run; its upstream runs do not get them.
 
     Raises:
-        InputError: see `validate` and `train`; the message names the upstream run that is wrong.
+        InputError: see `Training`; the message names the upstream run that is wrong.
     """
-    upstream = run.upstream
-    for spec in upstream:
-        check_links(spec.folder)
-    for dependency in run.dependencies if run.fresh else ():  # fresh=true does not repeat them
-        spec = dependency.run
-        made_by = other_code(spec.folder) if spec.is_finished else None
-        if made_by is not None:
+    for each in run.dependencies:
+        folder = each.run.folder
+        check_links(folder)
+        # fresh=true does not repeat them
+        if run.fresh and each.run.is_finished and (made_by := other_code(folder)) is not None:
             warn(
-                f"the upstream run {spec.folder} ({dependency.key}) was trained by other code "
-                f"({made_by}) and is used as it is. To train it again, run "
-                f"+experiment={spec.name} with fresh=true."
+                f"the upstream run {folder} ({each.key}) was trained by other code ({made_by}) and "
+                f"is used as it is. To train it again, run +experiment={each.run.name} with "
+                "fresh=true."
             )
-    if agreed(run.is_finished) and not run.fresh:
-        train(run, extra_tags)  # shows the result
-        return
-    specs = topological_order(run)
-    if rank() == 0:
-        _validate(specs, run)
-    for spec in specs:
-        teachers = [each for each in spec.dependencies if each.key != WEIGHTS]
+    specs: tuple[RunSpec, ...] = agreed(run.pending)
+    is_incomplete = len(specs) > 1 or bool(run.dependencies and run.missing_labels)
+    for spec in specs if is_incomplete and rank() == 0 else ():
         with _naming(spec, run):
-            for teacher in teachers if rank() == 0 else ():
-                _predict_labels(spec, teacher)
-            agreed(None)  # process 0 has written the labels
-            if spec is run:
-                train(run, extra_tags)
+            Training(spec).validate()
+    for spec in specs:
+        with _naming(spec, run):
+            if spec.dependencies and rank() == 0:
+                Training(spec).predict_labels()
+            if spec.dependencies:
+                agreed(None)  # process 0 has written the labels
+            if spec.key == run.key:
+                Training(spec, extra_tags).complete()
             else:
-                _train_upstream(spec, run)
-
-
-def topological_order(run: RunSpec) -> list[RunSpec]:
-    """The unfinished runs upstream of a run, each after those that it depends on, then the run."""
-    order: dict[str, RunSpec] = {}
-    for spec in run.upstream:
-        if not agreed(spec.is_finished):
-            order |= {each.key: each for each in topological_order(spec)}
-    return [*order.values(), run]
+                _train_upstream(spec, run.name)
 
 
 @contextmanager
@@ -84,57 +179,26 @@ def _naming(spec: RunSpec, run: RunSpec) -> Iterator[None]:
     try:
         yield
     except InputError as error:
-        if spec is run:
+        if spec.key == run.key:
             raise
         raise InputError(f"upstream run {spec.name} of {run.name}: {error}") from error
 
 
-@alone()
-def _validate(specs: Sequence[RunSpec], run: RunSpec) -> None:
-    """Validate a run and those upstream of it, unless all that it depends on is there already."""
-    labels = [run.labels_folder(name) for name in run.domains.named]
-    has_labels = all(each is None or each.is_dir() for each in labels)  # renamed when complete
-    if has_labels and all(each.is_finished for each in run.upstream):
-        return
-    for spec in specs:
-        with _naming(spec, run):
-            validate(spec)
-
-
-def _train_upstream(spec: RunSpec, run: RunSpec) -> None:
+def _train_upstream(spec: RunSpec, downstream: str) -> None:
     is_waiting = False
-    while not agreed(spec.is_finished):
-        if agreed(is_held(spec.folder / "lock")):
+    while True:
+        is_finished, is_locked = agreed((spec.is_finished, spec.is_locked))
+        if is_finished:
+            return
+        if is_locked:
             if not is_waiting:
                 info(f"{spec.folder} is being trained by another process; waiting for it.")
             is_waiting = True
             time.sleep(POLL_S)
             continue
         try:
-            train(spec, upstream_of=run.name)
+            Training(spec, upstream_of=downstream).complete()
         except InputError:
             # Another process may have started it since the look, and even finished it.
-            if num_processes() > 1 or not (spec.is_finished or is_held(spec.folder / "lock")):
+            if num_processes() > 1 or not (spec.is_finished or spec.is_locked):
                 raise
-
-
-@alone()
-def _predict_labels(spec: RunSpec, teacher: Dependency) -> None:
-    """Predict the pseudo-labels of a run with the network of an upstream run."""
-    name = teacher.key.split(".")[1]
-    folder, domain = spec.labels_folder(name), spec.domains.named[name]
-    assert folder is not None, "the domain takes labels of an upstream run"
-    if folder.is_dir():
-        return
-    checkpoint = teacher.checkpoint.removesuffix(".pt")
-    # Its configuration is the one that this command composed; its folder may be a copy.
-    session = with_weights(teacher.run, teacher.run.folder, checkpoint, teacher.run.plain)
-    from rgbt.evaluation.images import write_pseudo_labels  # few runs have a teacher
-
-    write_pseudo_labels(
-        session,
-        teacher.run.folder.name,
-        EvaluationRequest(split=domain.split, view=domain.teacher_view),
-        folder,
-        threshold=domain.threshold,
-    )

@@ -1,16 +1,11 @@
-"""Everything of a sample that moves together, and what moves it: crop, flip, resize, pad.
-
-Every transform has `train(sample, rng)`, for which all draws come from `rng`, and `test(sample)`;
-of a sample without a label, all pixels are ignored. Colours are in
-`rgbt.transforms.crm`.
-"""
+"""Everything of a sample that moves together, and what moves it: crop, flip, resize, pad."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -19,24 +14,21 @@ from numpy.typing import ArrayLike, DTypeLike, NDArray
 from rgbt.types import IGNORE, Example, Sample
 
 Indices = NDArray[np.int64]
-Change = Callable[[NDArray[Any]], NDArray[Any]]
+Change = Callable[[NDArray[Any], int], NDArray[Any]]
+"""Of a map and its number: RGB (0) and thermal (1) are images; label (2) and confidence (3)."""
 
+Fill = tuple[ArrayLike, ArrayLike, int, float]
+"""What pixels beyond a sample have in these four maps."""
 
-class Window(NamedTuple):
-    """A rectangle of an image: its first row and column, and how many it has."""
-
-    top: int
-    left: int
-    height: int
-    width: int
+Window = tuple[slice, slice]
+"""Rows and columns of a part, each with its first pixel and its end."""
 
 
 @dataclass(frozen=True)
 class Maps:
-    """The maps of one sample, all of one size, and the place in the file of each of their pixels.
+    """The maps of one sample, as in `rgbt.types.Example`, but all of one size.
 
-    As in `rgbt.types.Example`; the label is 255 where the sample has none. `rows` (H,) and
-    `columns` (W,) are those of the file, whose size is `source_hw`.
+    `rows` (H,) and `columns` (W,) are those of the file, whose size is `source_hw`.
     """
 
     rgb: NDArray[Any]
@@ -50,7 +42,7 @@ class Maps:
 
     @classmethod
     def of(cls, sample: Sample) -> Maps:
-        """The whole sample as it is in its files."""
+        """The whole sample as it is in its files; all pixels ignored where it has no label."""
         height, width = hw = sample.thermal.shape
         label = np.full(hw, IGNORE, np.uint8) if sample.label is None else sample.label
         place = (np.arange(height), np.arange(width), (height, width))
@@ -61,35 +53,28 @@ class Maps:
         """Height and width."""
         return len(self.rows), len(self.columns)
 
-    def each(self, image: Change, exact: Change) -> Maps:
-        """Images changed by one function, label and confidence by another."""
+    def each(self, change: Change) -> Maps:
+        """Every map changed by one function of it and of its number."""
         return replace(
             self,
-            rgb=image(self.rgb),
-            thermal=image(self.thermal),
-            label=exact(self.label),
-            confidence=None if self.confidence is None else exact(self.confidence),
+            rgb=change(self.rgb, 0),
+            thermal=change(self.thermal, 1),
+            label=change(self.label, 2),
+            confidence=None if self.confidence is None else change(self.confidence, 3),
         )
 
     def crop(self, window: Window) -> Maps:
         """The part within `window`."""
-        top, left, height, width = window
-        rows, columns = slice(top, top + height), slice(left, left + width)
-
-        def cut(each: NDArray[Any]) -> NDArray[Any]:
-            return each[rows, columns]
-
-        return replace(self.each(cut, cut), rows=self.rows[rows], columns=self.columns[columns])
+        rows, columns = window
+        cropped = self.each(lambda each, _: each[window])
+        return replace(cropped, rows=self.rows[rows], columns=self.columns[columns])
 
     def flip(self, flipped: bool) -> Maps:
         """All of it mirrored left to right, if `flipped`."""
         if not flipped:
             return self
-
-        def turned(each: NDArray[Any]) -> NDArray[Any]:
-            return np.asarray(cv2.flip(each, 1))
-
-        return replace(self.each(turned, turned), columns=self.columns[::-1])
+        turned = self.each(lambda each, _: np.asarray(cv2.flip(each, 1)))
+        return replace(turned, columns=self.columns[::-1])
 
     def resize(
         self,
@@ -101,139 +86,144 @@ class Maps:
     ) -> Maps:
         """Images bilinear with half-pixel centres and without antialiasing, the rest nearest.
 
-        Args:
-            hw: size of all of it after resizing.
-            window: part of the resized maps that is returned; only its pixels are computed.
-            dtype: of the images, uint8 (rounded) or float32.
-            area: where no side grows, a pixel of an image is the mean of what it covers.
+        Returned, and computed, is the part of all `hw` pixels within `window`. Images become
+        `dtype`, uint8 (rounded) or float32. `area`: where no side grows, a pixel of an image is the
+        mean of what it covers.
         """
-        top, left, height, width = window or Window(0, 0, *hw)
-        rows = _block(self.hw[0], hw[0], slice(top, top + height))
-        columns = _block(self.hw[1], hw[1], slice(left, left + width))
+        window = window or (slice(0, hw[0]), slice(0, hw[1]))
+        rows, columns = (_axis(*each) for each in zip(self.hw, hw, window, strict=True))
         # "Exact": whole-number arithmetic for uint8, so that block and whole image round alike and
         # every machine gives the same bits. For float32 it is the ordinary bilinear.
         shrinks = area and hw[0] <= self.hw[0] and hw[1] <= self.hw[1]
         how = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR_EXACT
 
-        def image(pixels: NDArray[Any]) -> NDArray[Any]:
-            block = pixels[rows.source, columns.source].astype(dtype, copy=False)
+        def resized(each: NDArray[Any], number: int) -> NDArray[Any]:
+            if number > 1:
+                return each.take(rows.nearest, 0).take(columns.nearest, 1)
+            block = each[rows.source, columns.source].astype(dtype, copy=False)
             if hw != self.hw:
                 block = cv2.resize(block, (columns.size, rows.size), interpolation=how)
             return np.asarray(block[rows.window, columns.window])
 
-        at_rows = nearest_source(self.hw[0], hw[0])[top : top + height]
-        at_columns = nearest_source(self.hw[1], hw[1])[left : left + width]
-        resized = self.each(image, lambda each: each.take(at_rows, 0).take(at_columns, 1))
-        return replace(resized, rows=self.rows[at_rows], columns=self.columns[at_columns])
+        maps = self.each(resized)
+        return replace(maps, rows=self.rows[rows.nearest], columns=self.columns[columns.nearest])
 
     def pad(
-        self,
-        hw: tuple[int, int],
-        rgb: ArrayLike,
-        thermal: ArrayLike,
-        corner_yx: tuple[int, int] | None = None,
+        self, hw: tuple[int, int], fill: Fill, corner_yx: tuple[int, int] | None = None
     ) -> Maps:
-        """All of it in a frame of `hw` pixels, 255 in the label and 0 in its confidence.
+        """All of it in a larger frame, from `corner_yx` on.
 
-        Args:
-            hw: size of the result; no side is shorter than now.
-            rgb: (3,) or () colour of the frame, grey levels.
-            thermal: () grey level of the frame.
-            corner_yx: where the maps begin; None: in the middle, of odd margins the larger one is
-                below and right.
+        None: in the middle; odd margins are larger below and right.
         """
         if hw == self.hw:
             return self
         height, width = self.hw
         top, left = corner_yx or ((hw[0] - height) // 2, (hw[1] - width) // 2)
 
-        def framed(values: NDArray[Any], fill: ArrayLike) -> NDArray[Any]:
-            canvas = np.empty((*hw, *values.shape[2:]), values.dtype)
-            canvas[:] = fill
-            canvas[top : top + height, left : left + width] = values
+        def framed(each: NDArray[Any], number: int) -> NDArray[Any]:
+            canvas = np.empty((*hw, *each.shape[2:]), each.dtype)
+            canvas[:] = fill[number]
+            canvas[top : top + height, left : left + width] = each
             return canvas
 
         return replace(
-            self,
-            rgb=framed(self.rgb, rgb),
-            thermal=framed(self.thermal, thermal),
-            label=framed(self.label, IGNORE),
-            confidence=None if self.confidence is None else framed(self.confidence, 0.0),
+            self.each(framed),
             rows=np.pad(self.rows, (top, hw[0] - height - top), mode="edge"),
             columns=np.pad(self.columns, (left, hw[1] - width - left), mode="edge"),
         )
 
-    def example(self, track_position: bool) -> Example:
-        """The example; `track_position`: with the map of places in the file.
+    def rotate(self, angle: float, middle_xy: tuple[float, float], fill: Fill) -> Maps:
+        """Rotated counter-clockwise about a point, by degrees; places are counted `around` anew."""
+        matrix = np.asarray(cv2.getRotationMatrix2D(middle_xy, angle, 1.0))
 
-        Its centre is the pixel nearest to the centre of the file, the first in row-major order.
-        Source: the centre that GRBM follows through the crop, in the SpatialSeg release (MFNet data
-        set). The squared distance is a row term plus a column term, so each is minimised alone.
+        def warped(each: NDArray[Any], number: int) -> NDArray[Any]:
+            how = cv2.INTER_LINEAR if number < 2 else cv2.INTER_NEAREST
+            size, border = self.hw[::-1], cv2.BORDER_CONSTANT
+            return np.asarray(cv2.warpAffine(each, matrix, size, None, how, border, fill[number]))
+
+        column, row = np.rint(matrix @ [*self.centre_yx[::-1], 1.0])
+        rotated = self.each(warped)
+        return rotated.around(int(row.clip(0, self.hw[0] - 1)), int(column.clip(0, self.hw[1] - 1)))
+
+    def around(self, row: int, column: int) -> Maps:
+        """The same with places that are counted from the pixel that shows the file's centre."""
+        height, width = self.source_hw
+        rows, columns = (np.arange(side) for side in self.hw)
+        return replace(self, rows=rows - row + height // 2, columns=columns - column + width // 2)
+
+    def blur(self, kernel: int) -> Maps:
+        """Images blurred by OpenCV's Gaussian kernel of a side in pixels."""
+        side = (kernel, kernel)
+        return self.each(lambda each, n: cv2.GaussianBlur(each, side, 0) if n < 2 else each)
+
+    @property
+    def centre_yx(self) -> tuple[int, int]:
+        """The pixel nearest to the centre of the file, the first in row-major order.
+
+        GRBM follows it through the crop, in the SpatialSeg release (MFNet data set). The squared
+        distance is a row term plus a column term, so each is minimised alone.
         """
-        places, sides = (self.rows, self.columns), self.source_hw
-        row, column = (
-            int(np.abs(place - side // 2).argmin())
-            for place, side in zip(places, sides, strict=True)
-        )
+        height, width = self.source_hw
+        row = np.abs(self.rows - height // 2).argmin()
+        return int(row), int(np.abs(self.columns - width // 2).argmin())
+
+    def example(self, track_position: bool) -> Example:
+        """The example; `track_position`: with the map of places in the file."""
         position = None
         if track_position:
             position = np.empty((2, *self.hw), np.float32)
             position[0], position[1] = self.rows[:, None], self.columns
-        whole = self.each(np.ascontiguousarray, np.ascontiguousarray)
+        whole = self.each(lambda each, _: np.ascontiguousarray(each))
         return Example(
-            rgb=whole.rgb,
-            thermal=whole.thermal,
-            label=whole.label,
-            centre_yx=(row, column),
-            position=position,
-            original_hw=self.source_hw,
-            name=self.name,
-            confidence=whole.confidence,
+            *(whole.rgb, whole.thermal, whole.label, self.centre_yx, position),
+            *(self.source_hw, self.name, whole.confidence),
         )
 
 
-def evaluated(  # noqa: PLR0913 - as of `Maps.resize`
+def evaluated(
     sample: Sample,
     short_edge: int | None,
+    max_size: int | None = None,
     *,
     track_position: bool,
-    max_size: int | None = None,
-    dtype: DTypeLike = np.uint8,
-    area: bool = False,
+    **how: Any,
 ) -> Example:
-    """The whole images of a sample, resized to `short_edge` if that is set; the label as it is.
-
-    See `short_edge_hw` for `max_size` and `Maps` for the others.
-    """
+    """Whole images, resized as `short_edge_hw` and `Maps.resize` say; the label as it is."""
     maps = Maps.of(sample)
     hw = maps.hw if short_edge is None else short_edge_hw(maps.hw, short_edge, max_size)
-    example = maps.resize(hw, dtype=dtype, area=area).example(track_position)
+    example = maps.resize(hw, **how).example(track_position)
     return replace(example, label=maps.label, confidence=maps.confidence)
 
 
-def drawn_window(hw: tuple[int, int], crop_hw: tuple[int, int], rng: np.random.Generator) -> Window:
+def drawn_window(
+    hw: tuple[int, int],
+    crop_hw: tuple[int, int],
+    rng: np.random.Generator,
+    release: Literal["crm", "cmx", "cmnext"] = "crm",
+) -> Window:
     """A crop at a uniformly drawn place; a side longer than the image is clipped to it.
 
-    Source: augmentation step 2 of the CRM release.
+    The first pixel of a side lies in 0..n, n = max(length - crop, 0), in the release of CRM. In
+    that of CMX it may lie one too far, so that the crop lacks a pixel, and in that of CMNeXt also
+    where the whole side would fit.
     """
-    height, width = min(crop_hw[0], hw[0]), min(crop_hw[1], hw[1])
-    top = int(rng.integers(hw[0] - height + 1))
-    return Window(top, int(rng.integers(hw[1] - width + 1)), height, width)
+
+    def drawn(length: int, crop: int) -> slice:
+        spare = max(length - crop, 0)
+        too_far = {"crm": 0, "cmx": int(spare > 0), "cmnext": 1}[release]
+        first = min(int(rng.integers(spare + too_far + 1)), length - 1)
+        return slice(first, min(first + crop, length))
+
+    rows, columns = map(drawn, hw, crop_hw)
+    return rows, columns
 
 
 def short_edge_hw(
     source_hw: tuple[int, int], short_edge: int, max_size: int | None
 ) -> tuple[int, int]:
-    """Size with a given short edge and the same aspect, unless the long edge would pass a limit.
+    """Size of the same aspect, (floor(f H + 1/2), floor(f W + 1/2)). Source: CRM release.
 
-        f = min(short_edge / min(H, W), max_size / max(H, W))
-        size = (floor(f H + 1/2), floor(f W + 1/2))
-
-    Source: augmentation step 1 of the CRM release. Lengths in pixels; `max_size` None: no limit.
-
-    Example:
-        >>> short_edge_hw((720, 1280), 1440, 1920)
-        (1080, 1920)
+    f = min(short_edge / min(H, W), max_size / max(H, W))
     """
     factor = short_edge / min(source_hw)
     if max_size is not None:
@@ -243,14 +233,10 @@ def short_edge_hw(
 
 
 def nearest_source(source: int, resized: int) -> Indices:
-    """(resized,) index on an axis of length `source`, as torch's "nearest" picks it.
-
-    floor(i * source / resized), in float32
-    """
+    """(resized,) int64: floor(i * source / resized) in float32, as torch's "nearest" picks it."""
     factor = np.float32(source) / np.float32(resized)
     index = np.floor(np.arange(resized, dtype=np.float32) * factor).astype(np.int64)
-    clipped: Indices = np.minimum(index, source - 1)
-    return clipped
+    return np.asarray(np.minimum(index, source - 1))
 
 
 def nearest(label: NDArray[Any], hw: tuple[int, int]) -> NDArray[Any]:
@@ -259,40 +245,39 @@ def nearest(label: NDArray[Any], hw: tuple[int, int]) -> NDArray[Any]:
     return label.take(rows, 0).take(columns, 1)
 
 
-def bilinear(image: NDArray[np.uint8], hw: tuple[int, int]) -> NDArray[np.uint8]:
+def bilinear(image: NDArray[Any], hw: tuple[int, int]) -> NDArray[Any]:
     """An image (H, W) at another size, as `Maps.resize`."""
-    return np.asarray(cv2.resize(image, hw[::-1], interpolation=cv2.INTER_LINEAR_EXACT), np.uint8)
+    return np.asarray(cv2.resize(image, hw[::-1], interpolation=cv2.INTER_LINEAR_EXACT))
 
 
 def mixed(label: NDArray[np.uint8], hw: tuple[int, int]) -> NDArray[np.uint8]:
-    """A label (H, W) at another size whose numbers are interpolated as if they were brightness.
-
-    Pixels that an ignored one takes part in are ignored.
-    """
-    ignored = (label == IGNORE).astype(np.float32)
-    touched = cv2.resize(ignored, hw[::-1], interpolation=cv2.INTER_LINEAR_EXACT) > 0
+    """A label (H, W) resized as if it were brightness; a mix with an ignored pixel is ignored."""
+    touched = bilinear((label == IGNORE).astype(np.float32), hw) > 0
     return np.where(touched, np.uint8(IGNORE), bilinear(label, hw))
 
 
-class _Block(NamedTuple):
-    """Part of one axis that can be resized alone: source pixels, resized length, window in it."""
+class _Axis(NamedTuple):
+    """What of an axis is resized alone: pixels of the source, their number after it, and the part
+    that is kept of these; `nearest` are its pixels of the source without interpolation.
+    """
 
     source: slice
     size: int
     window: slice
+    nearest: Indices
 
 
-def _block(source: int, resized: int, span: slice) -> _Block:
-    """The smallest block around `span` whose resizing gives the pixels of the whole axis.
+def _axis(source: int, resized: int, kept: slice) -> _Axis:
+    """The smallest block around `kept` whose resizing gives the pixels of the whole axis.
 
     With source : resized = p : q in lowest terms, resized pixel k q + i samples at p k plus the
-    place of pixel i. So any run of whole periods may be resized by itself; one more period on
-    either side holds the neighbours that the kernel reaches for.
+    place of pixel i. So whole periods may be resized alone, with one more on either side for the
+    neighbours that the kernel reaches for.
     """
     periods = math.gcd(source, resized)
     p, q = source // periods, resized // periods
-    first = max(0, span.start // q - 1)
-    last = min(periods, -(-span.stop // q) + 1)
-    offset = span.start - first * q
-    window = slice(offset, offset + span.stop - span.start)
-    return _Block(slice(first * p, last * p), (last - first) * q, window)
+    first = max(0, kept.start // q - 1)
+    last = min(periods, -(-kept.stop // q) + 1)
+    window = slice(kept.start - first * q, kept.stop - first * q)
+    at = nearest_source(source, resized)[kept]
+    return _Axis(slice(first * p, last * p), (last - first) * q, window, at)

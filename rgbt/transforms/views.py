@@ -1,8 +1,7 @@
 """Virtual views: a labelled frame as it looks after a small turn of the camera (VVIG).
 
 A turn moves every pixel by a homography; cutting the result to the largest rectangle without empty
-pixels and enlarging it again imitates moving forward. Where pixels come from is arithmetic in
-`rgbt.geometry`; here it is drawn, or read from fixed sets of angles, and applied to batches.
+pixels and enlarging it again imitates moving forward (`rgbt.geometry` has the arithmetic).
 """
 
 from __future__ import annotations
@@ -13,34 +12,26 @@ from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
-from annotated_types import Interval, Predicate, doc
+from annotated_types import Interval, doc
 from torch import Tensor
 
 from rgbt.checks import InputError, nearest
 from rgbt.files.plain_files import read_bytes
-from rgbt.geometry.camera import Camera
-from rgbt.geometry.homography import Order, homography
-from rgbt.geometry.rectangle import Rule, check_rectangle, inner_rectangle
+from rgbt.geometry.camera import Camera, Order, Rule, homography, inner_rectangle
 from rgbt.geometry.warp import Resampling, Warp
-from rgbt.ranges import Names, rising
+from rgbt.ranges import Names, Rising
 from rgbt.requirements import Record, Requirement, record_of
 from rgbt.types import IGNORE, Batch
 
 Angle = Annotated[float, Interval(ge=-60, le=60), doc("degrees")]
-"""A camera of ordinary width that turns further sees nothing of what it saw."""
-
-Degrees = Annotated[tuple[Angle, Angle], Predicate(rising), doc("the smaller one first")]
 
 LEAST = 0.1
 """Share of the frame that the smallest rectangle of the drawn angles must hold."""
 
-BYTE = 255
-
-HEADER = "yaw,pitch,roll"
 PUBLISHED = Path(__file__).with_name("angles")
 """The three sets of the Temporal release: 393 triples each, one per image of MFNet's test list."""
 
@@ -58,16 +49,13 @@ class VirtualView:
         corners for the rectangle, interpolated twice (warp, then cut and resize) with images
         rounded to bytes each time, empty pixels are background. Its intrinsics are those of
         another camera (see ``conf/camera``).
-
-    Raises:
-        InputError: angles out of range, or so large that no rectangle is left.
     """
 
     camera: Camera
     order: Order
-    yaw: Degrees
-    pitch: Degrees
-    roll: Degrees
+    yaw: Rising[Angle]
+    pitch: Rising[Angle]
+    roll: Rising[Angle]
     angles: Literal["uniform", "integer"]
     mode: Literal["both", "rotation", "translation"]
     rectangle: Rule
@@ -81,17 +69,9 @@ class VirtualView:
             whole = float(low).is_integer() and float(high).is_integer() and low < high
             if self.angles == "integer" and not whole:
                 raise InputError(f"view.{name}: expected two whole degrees, got {low, high}.")
-        # A grid of turns over the ranges, looked at here so that no step has to wait for it.
+        # A grid of turns over the ranges, so that no step has to wait for a check.
         steps = [torch.linspace(low, high, 5).tolist() for low, high in self.ranges.values()]
-        turns = torch.tensor(list(product(*steps)), dtype=torch.float64)
-        left, top, right, bottom = self.check(turns).unbind(1)
-        share = (right - left) * (bottom - top) / (self.camera.height * self.camera.width)
-        if bool((share < LEAST).any()):
-            worst = "yaw {:g}, pitch {:g}, roll {:g}".format(*turns[share.argmin()].tolist())
-            raise InputError(
-                f"view: {worst} degrees leave a rectangle of {100 * float(share.min()):.2g} % of "
-                f"the frame, but at least {100 * LEAST:g} % is required."
-            )
+        self.check(torch.tensor(list(product(*steps)), dtype=torch.float64), LEAST)
 
     @property
     def record(self) -> Record:
@@ -99,6 +79,19 @@ class VirtualView:
         painted = Requirement.of_background("view.outside=background")
         requires = () if self.outside == "ignore" else (painted,)
         return Record(requires=requires, camera=self.camera)
+
+    def check(self, angles: Tensor, least: float = 0.0) -> None:
+        """InputError where angles (B, 3) leave no more than a share of the camera's own images."""
+        size = (self.camera.height, self.camera.width)
+        turn = homography(angles, self.camera.matrix(size), self.order)
+        left, top, right, bottom = inner_rectangle(turn, size, self.rectangle).unbind(1)
+        share = ((right - left) * (bottom - top) / (size[0] * size[1])).nan_to_num(0)
+        if float(share.min()) <= least:
+            worst = "yaw {:g}, pitch {:g}, roll {:g}".format(*angles[share.argmin()].tolist())
+            raise InputError(
+                f"view: {worst} degrees leave a rectangle of {100 * float(share.min()):.2g} % of "
+                f"the frame; more than {100 * least:g} % is required."
+            )
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """(count, 3) float64: yaw, pitch, roll in degrees, on the device of `generator`."""
@@ -110,16 +103,8 @@ class VirtualView:
         return angles.floor() if self.angles == "integer" else angles
 
     def warp(self, angles: Tensor, image_hw: tuple[int, int]) -> Warp:
-        """Where the pixels of the view come from.
-
-        Args:
-            angles: (B, 3) degrees: yaw, pitch, roll.
-            image_hw: size of both frames in pixels.
-
-        Raises:
-            InputError: the camera is one of images of another shape.
-        """
-        turn = self._turn(angles, image_hw)
+        """Where the pixels of the view by `angles` (B, 3) come from; errors as `Camera.matrix`."""
+        turn = homography(angles, self.camera.matrix(image_hw), self.order)
         if self.mode == "rotation":
             height, width = image_hw
             whole = turn.new_tensor([-0.5, -0.5, width - 0.5, height - 0.5])
@@ -130,44 +115,17 @@ class VirtualView:
             turn = torch.eye(3, dtype=turn.dtype, device=turn.device).expand_as(turn)
         return Warp(turn, rectangle, image_hw, self.resampling)
 
-    def settings(self) -> dict[str, Any]:
-        """What decides how given angles become a view, as plain values."""
-        return {
-            "camera": asdict(self.camera),
-            "order": self.order,
-            "mode": self.mode,
-            "rectangle": self.rectangle,
-            "resampling": self.resampling,
-            "outside": self.outside_label,
-        }
-
-    def check(self, angles: Tensor) -> Tensor:
-        """(B, 4): the rectangles that angles leave of the camera's own images.
-
-        Raises:
-            InputError: one leaves none. Looking for that waits for the device.
-        """
-        size = (self.camera.height, self.camera.width)
-        rectangle = inner_rectangle(self._turn(angles, size), size, self.rectangle)
-        check_rectangle(rectangle, angles)
-        return rectangle
-
     def batch(self, batch: Batch, warp: Warp) -> Batch:
         """The frames as seen from the view: images bilinear, the other maps nearest.
 
-        What the first frame does not show has the confidence 1 where it is trained on as
-        background.
+        Images are float in [0, 1] and have the size of `warp`; the label may have another one, as
+        in evaluation. What the first frame does not show has the confidence 1 where it is trained
+        on as background.
 
         Networks that divide thermal by its own maximum do so for the view again. The release
-        divides before the view is made, so that its second frame is the darker by what the view
-        lost of the maximum: 1.5 to 4.4 % on eight frames of MFNet.
-
-        Args:
-            batch: images float in [0, 1], see `rgbt.types.Batch.to`. The label may have another
-                size than the images, as in evaluation.
-            warp: of the images' size.
+        divides before, so that its second frame is 1.5 to 4.4 % darker (eight frames of MFNet).
         """
-        levels = BYTE if self.resampling == "twice" else None
+        levels = 255 if self.resampling == "twice" else None
         images = warp.bilinear(torch.cat([batch.rgb, batch.thermal], 1), levels)
         of_label = warp.resized((batch.label.shape[1], batch.label.shape[2]))
         position, confidence = batch.position, batch.confidence
@@ -187,33 +145,24 @@ class VirtualView:
         inside = warp.inside()
         return inside if self.outside_label == IGNORE else torch.ones_like(inside)
 
-    def _turn(self, angles: Tensor, image_hw: tuple[int, int]) -> Tensor:
-        return homography(angles, self.camera.matrix(image_hw).to(angles.device), self.order)
-
 
 class ViewSets:
     """The virtual views and splits on which consistency (TC and CA) is measured.
 
-    Source: Temporal, Table I: the mean over the same three sets of angles; the sets are those of
-    its release. The k-th triple belongs to the k-th image of the split's list; a split with more
-    images than triples begins again with the first triple.
+    Source: Temporal, Table I: the mean over three sets of angles, those of its release. The k-th
+    triple belongs to the k-th image of the split's list; longer lists begin again with the first.
 
     Args:
         view: how a triple becomes a view; its ranges of angles are not drawn from.
         sets: names of published sets ("released_1" .. "released_3"), or CSV files with the columns
             yaw,pitch,roll in degrees. None: a run measures no consistency.
         splits: what a run measures at its end, with its best checkpoint.
-
-    Raises:
-        InputError: no such set, a line that is no triple, or a triple that leaves no rectangle.
     """
 
     def __init__(
         self, *, view: VirtualView, sets: Names, splits: tuple[Literal["val", "test"], ...]
     ) -> None:
-        self.view = view
-        self.sets = sets
-        self.splits = splits
+        self.view, self.sets, self.splits = view, sets, splits
         if sets and not splits:
             raise InputError("consistency.splits: consistency.sets requires val or test.")
         self._triples = [read_angles(name) for name in sets]
@@ -231,30 +180,22 @@ class ViewSets:
 
     @cached_property
     def mark(self) -> str:
-        """Empty for the published views; six hexadecimal digits of any others, for names of files.
-
-        Depends on the triples and on how they become views, not on names or places of files.
-        """
-        triples = [each.tolist() for each in self._triples]
-        text = json.dumps([self.view.settings(), triples], sort_keys=True)
+        """For names of files: "" for the published views, six digits for other triples or views."""
+        names = ("order", "mode", "rectangle", "resampling")
+        settings = {name: getattr(self.view, name) for name in names}
+        settings |= {"camera": asdict(self.view.camera), "outside": self.view.outside_label}
+        text = json.dumps([settings, [each.tolist() for each in self._triples]], sort_keys=True)
         digest = hashlib.sha256(text.encode()).hexdigest()[:6]
         return "" if digest == PUBLISHED_VIEWS else digest
 
     def angles(self, number: int, indices: list[int]) -> Tensor:
-        """(B, 3) float64 degrees: the triples of set `number` (0-based) for images of a split.
-
-        `indices` are the places of the images in the split's list.
-        """
+        """(B, 3) float64 degrees: triples of set `number` (0-based) at places in a split's list."""
         triples = self._triples[number]
         return triples[torch.tensor(indices) % len(triples)]
 
 
 def read_angles(name: str) -> Tensor:
-    """(N, 3) float64: the triples of a published set, or of a file.
-
-    Raises:
-        InputError: neither a published set nor a file, or a line that is no triple of numbers.
-    """
+    """(N, 3) float64: the triples of a published set, or of a file; InputError for no triples."""
     published = {path.stem: path for path in PUBLISHED.glob("*.csv")}
     path = published.get(name, Path(name).expanduser())
     if not path.is_file():
@@ -265,9 +206,7 @@ def read_angles(name: str) -> Tensor:
         triples = np.loadtxt(lines, delimiter=",", ndmin=2) if lines else np.empty((0, 0))
     except ValueError as error:  # of the encoding, too
         raise InputError(f"consistency.sets: {path}: {error}") from error
-    if header != HEADER or triples.shape[1] != 3 or not np.isfinite(triples).all():
-        raise InputError(
-            f"consistency.sets: {path}: expected the line {HEADER}, then three finite numbers "
-            "(degrees) per line."
-        )
+    if header != "yaw,pitch,roll" or triples.shape[1] != 3 or not np.isfinite(triples).all():
+        lines_of = "the line yaw,pitch,roll, then three finite numbers (degrees) per line"
+        raise InputError(f"consistency.sets: {path}: expected {lines_of}.")
     return torch.from_numpy(triples)

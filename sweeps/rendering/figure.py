@@ -1,16 +1,14 @@
 """The figure of a computed table: ours with error bars over seeds, published values hollow beside.
 
-Three forms: over the factor that the rows vary; rows below each other, one panel per column; or,
-for tables of regions or classes without a mean, one panel per row over the columns.
+Two forms: over the factor that the rows vary; or rows below each other, one panel per column.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from sweeps.table.cells import ScoredTable, headline_columns, published
 from sweeps.table.efficiency import SCALE
@@ -27,18 +25,14 @@ OURS, PUBLISHED = "#0072B2", "#D55E00"
 FAR_APART = 2.0
 """Two sets of values get an axis each where the gap between them is this many times their range."""
 
-MAX_PANELS = 4
-"""Columns of a table without headlines up to which each has a panel."""
-
-MAX_HEADLINES = 5
-"""Of a table; those after them are left out of its figure."""
+MAX_PANELS, MAX_HEADLINES = 4, 5
+"""Columns of a table without headlines, and headlines, that are shown."""
 
 SHIFT = 0.13
 """Shift of published markers beside ours, in rows or columns."""
 
 
-@dataclass(frozen=True)
-class Series:
+class Series(NamedTuple):
     """Values along an axis and half lengths of their error bars; NaN: there is none."""
 
     positions: Sequence[float]
@@ -50,48 +44,38 @@ class Series:
         return [mean for mean in self.means if not math.isnan(mean)]
 
 
-def draw_table(scored: ScoredTable, path: Path) -> bool:
-    """Draw the figure as PNG; whether there was anything to draw."""
-    return write_png(figure_of(scored), path)
-
-
-def write_png(figure: Figure | None, path: Path) -> bool:
-    """Write a figure; whether there is one."""
+def write_figure(figure: Figure, path: Path) -> Path:
+    """Write a figure as PNG or SVG; equal figures give equal bytes."""
+    import matplotlib as mpl
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    if figure is None:
-        return False
     FigureCanvasAgg(figure)
-    figure.savefig(path, dpi=150)
-    return True
-
-
-def main_columns(scored: ScoredTable) -> list[Column]:
-    """What the figure shows: the headlines that the table has, else all of a few columns."""
-    columns = [column for column in scored.table.columns if _has_values(scored, column)]
-    chosen = headline_columns(columns)
-    if chosen:
-        return chosen[:MAX_HEADLINES]
-    return columns if len(columns) <= MAX_PANELS else []
+    path.parent.mkdir(parents=True, exist_ok=True)
+    metadata = {"Date": None} if path.suffix == ".svg" else {}
+    with mpl.rc_context({"svg.hashsalt": "rgbt", "svg.fonttype": "none"}):
+        figure.savefig(path, dpi=150, metadata=metadata)
+    return path
 
 
 def figure_of(scored: ScoredTable) -> Figure | None:
     """The figure; None where there is no value at all."""
-    if not any(_has_values(scored, column) for column in scored.table.columns):
-        return None
-    columns = main_columns(scored)
+    rows = scored.table.rows
+    columns = [each for each in scored.table.columns if any(_values(scored, rows, each))]
     if not columns:
-        return _profiles(scored)
-    with_x = [row for row in scored.table.rows if row.x is not None]
-    return _over_factor(scored, columns) if len(with_x) > 1 else _by_row(scored, columns)
+        return None
+    shown = headline_columns(columns)[:MAX_HEADLINES]
+    shown = shown or columns[:MAX_PANELS]
+    with_x = [row for row in rows if row.x is not None]
+    return _over_factor(scored, shown) if len(with_x) > 1 else _by_row(scored, shown)
 
 
-def _has_values(scored: ScoredTable, column: Column) -> bool:
-    ours = (scored.cells.get((row.label, column.name)) for row in scored.table.rows)
-    theirs = (published(row, column) for row in scored.table.rows)
-    return any(cell is not None and not math.isnan(cell.mean) for cell in ours) or any(
-        value is not None for value in theirs
-    )
+def _values(scored: ScoredTable, rows: Sequence[Row], column: Column) -> list[bool]:
+    """Whether there is a value of ours or of the paper, by row."""
+    cells = [scored.cells.get((row.label, column.name)) for row in rows]
+    ours = [cell is not None and not math.isnan(cell.mean) for cell in cells]
+    return [
+        each or published(row, column) is not None for each, row in zip(ours, rows, strict=True)
+    ]
 
 
 def _over_factor(scored: ScoredTable, columns: Sequence[Column]) -> Figure:
@@ -128,8 +112,8 @@ def _by_row(scored: ScoredTable, columns: Sequence[Column]) -> Figure:
     from matplotlib.figure import Figure
 
     rows = scored.table.rows
-    size = (2.2 + 3.2 * len(columns), 1.9 + 0.32 * len(rows))
-    figure = Figure(figsize=(max(size[0], 6.4), size[1]), layout="constrained")
+    size = (max(2.2 + 3.2 * len(columns), 6.4), 1.9 + 0.32 * len(rows))
+    figure = Figure(figsize=size, layout="constrained")
     panels = figure.subplots(1, len(columns), sharey=True, squeeze=False)[0]
     for axes, column in zip(panels, columns, strict=True):
         series = _series(scored, [(row, column) for row in rows], range(len(rows)), SHIFT)
@@ -138,29 +122,6 @@ def _by_row(scored: ScoredTable, columns: Sequence[Column]) -> Figure:
         axes.grid(axis="y", alpha=0.25)
     panels[0].set_yticks(range(len(rows)), [row.label for row in rows])
     panels[0].set_ylim(len(rows) - 0.5, -0.5)
-    return _finished(figure, scored)
-
-
-def _profiles(scored: ScoredTable) -> Figure:
-    from matplotlib.figure import Figure
-
-    columns = scored.table.columns
-    rows = [row for row in scored.table.rows if any(row.values) or row.experiment is not None]
-    abreast = min(4, len(rows))
-    height = math.ceil(len(rows) / abreast)
-    width = max(2.6, 0.28 * len(columns))
-    figure = Figure(figsize=(0.6 + width * abreast, 1 + 2.1 * height), layout="constrained")
-    panels = figure.subplots(height, abreast, sharex=True, squeeze=False).ravel()
-    rotation = 0 if max(len(column.name) for column in columns) <= 2 else 90
-    for axes, row in zip(panels, rows, strict=False):
-        positions = range(len(columns))
-        series = _series(scored, [(row, column) for column in columns], positions)
-        _draw_pair(axes, *series, across=False, joined=True)
-        axes.set_title(row.label, fontsize=9)
-        axes.set_xticks(positions, [column.name for column in columns], rotation=rotation)
-        axes.tick_params(labelsize=7)
-    for axes in panels[len(rows) :]:
-        axes.set_visible(False)
     return _finished(figure, scored)
 
 
@@ -180,15 +141,6 @@ def _series(
     return Series(positions, means, sds), Series(beside, theirs, [math.nan] * len(theirs))
 
 
-def are_far_apart(ours: Sequence[float], theirs: Sequence[float]) -> bool:
-    """Whether one axis for both would press each into a line."""
-    if not ours or not theirs:
-        return False
-    gap = max(min(ours) - max(theirs), min(theirs) - max(ours))
-    widest = max(max(ours) - min(ours), max(theirs) - min(theirs))
-    return gap > FAR_APART * widest and gap > 0
-
-
 def _draw_pair(
     axes: Axes, ours: Series, theirs: Series, *, across: bool, joined: bool
 ) -> tuple[Axes, Axes]:
@@ -196,8 +148,10 @@ def _draw_pair(
 
     With `across`, values run to the right and places down, instead of values up.
     """
-    other = axes
-    if are_far_apart(ours.known(), theirs.known()):
+    other, (mine, printed) = axes, (ours.known(), theirs.known())
+    gap = max(min(mine) - max(printed), min(printed) - max(mine)) if mine and printed else 0.0
+    widest = max((max(each) - min(each) for each in (mine, printed) if each), default=0.0)
+    if gap > max(0.0, FAR_APART * widest):  # one axis for both would press each into a line
         other = axes.twiny() if across else axes.twinx()
         side, second = ("x", "top") if across else ("y", "right")
         axes.tick_params(axis=side, colors=OURS)  # type: ignore[arg-type]
@@ -205,30 +159,27 @@ def _draw_pair(
         other.spines[second].set_color(PUBLISHED)
         other.set(**{f"{side}label": "published"})
         getattr(other, f"{side}axis").label.set_color(PUBLISHED)
-    line = "-" if joined else "none"
     style: dict[str, Any] = {"fmt": "o", "ms": 5, "lw": 1, "capsize": 3}
+    style["ls"] = "-" if joined else "none"
     named = [(axes, ours, OURS, "ours", OURS), (other, theirs, PUBLISHED, "published", "none")]
     for target, series, colour, label, face in named:
         if not series.known():
             continue
-        values, positions = series.means, series.positions
         bars = None if all(map(math.isnan, series.sds)) else series.sds
-        x, y = (values, positions) if across else (positions, values)
+        x, y = (series.means, series.positions) if across else (series.positions, series.means)
         xerr, yerr = (bars, None) if across else (None, bars)
-        marker = style | {"ls": line, "color": colour, "mfc": face, "label": label}
-        target.errorbar(x, y, yerr, xerr, **marker)
+        target.errorbar(x, y, yerr, xerr, **style, color=colour, mfc=face, label=label)
     axes.grid(axis="x" if across else "y", alpha=0.25)
     return axes, other
 
 
 def _finished(figure: Figure, scored: ScoredTable) -> Figure:
     """With a title above all panels, and below them one legend for all."""
+    ours = f"ours: counted at scale={SCALE}" if scored.cells else "published"
     if scored.seeds:
         many = len(scored.seeds)
-        spread = f", mean ± sd of {many} seeds" if many > 1 else f", seed {scored.seeds[0]}"
-        ours = f"ours: scale={scored.scale}{spread}"
-    else:
-        ours = f"ours: counted at scale={SCALE}" if scored.cells else "published"
+        spread = f"mean ± sd of {many} seeds" if many > 1 else f"seed {scored.seeds[0]}"
+        ours = f"ours: scale={scored.scale}, {spread}"
     figure.suptitle(f"{scored.name} ({ours})", fontsize=10)
     handles: dict[str, Artist] = {}
     for axes in figure.axes:

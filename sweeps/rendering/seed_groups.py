@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from rgbt.metrics import names
 from rgbt.tables import ABSENT, TextTable, number
 from sweeps.point import Outcome, Point
-from sweeps.rendering.rendered_table import TextCell
-from sweeps.table.cells import TableCell, Value, over_seeds
+from sweeps.table.cells import Value, over_seeds
 
 MOST_REGIONS = 99
 
@@ -22,23 +21,28 @@ def group_grid(title: str, outcomes: Sequence[Outcome]) -> TextTable:
         alone, and of configurations of one run each the key of that run.
     """
     groups: dict[str, list[Outcome]] = {}
+    scores = {}
     for outcome in outcomes:
-        groups.setdefault(configuration(outcome.point), []).append(outcome)
-    known = {
-        name for outcome in outcomes for run in outcome.results for name in run.recorded_scores()
-    }
+        groups.setdefault(_configuration(outcome.point), []).append(outcome)
+        is_finished = outcome.state == "finished" and outcome.results
+        scores[id(outcome)] = outcome.results[0].recorded_scores() if is_finished else {}
+    known = {name for each in scores.values() for name in each}
     regions = map(names.region, range(1, MOST_REGIONS))
-    measured = [name for name in regions if f"test/{name}" in known]
-    metrics = [names.MIOU, names.VAR, *measured]
+    metrics = [names.MIOU, names.VAR, *(name for name in regions if f"test/{name}" in known)]
     has_seeds = any(len(members) > 1 for members in groups.values())
     rows = []
     for label, members in groups.items():
-        cells = [_cell(metric, members) for metric in metrics]
+        cells = []
+        for metric in metrics:
+            values: dict[int, Value] = {
+                place: scores[id(each)].get(f"test/{metric}", each.reason or each.state)
+                for place, each in enumerate(members)
+            }
+            cells.append(over_seeds(values))
         count = cells[0].seeds
         seeds = f"{count} of {len(members)}" if count < len(members) else str(count)
-        spreads = [number(cell.sd) if cell.seeds > 1 else "" for cell in cells]
-        pairs = zip(cells, spreads, strict=True)
-        shown = [TextCell(number(cell.mean), spread).whole for cell, spread in pairs]
+        spreads = (f" ± {number(cell.sd)}" if cell.seeds > 1 else "" for cell in cells)
+        shown = (f"{number(cell.mean)}{s}" for cell, s in zip(cells, spreads, strict=True))
         beside = [] if has_seeds else [" ".join(members[0].keys) or ABSENT]
         rows.append((label, seeds, *shown, *beside))
     header = ("configuration", "seeds", *metrics, *([] if has_seeds else ["run"]))
@@ -55,20 +59,8 @@ def unfinished_grid(outcomes: Sequence[Outcome]) -> TextTable:
     return TextTable("Points without a result", ("point", "state", "run", "reason"), rows)
 
 
-def configuration(point: Point) -> str:
+def _configuration(point: Point) -> str:
     """The label of a point without its seed, else its experiment."""
     label = " ".join(word for word in point.label.split(" ") if not word.startswith("seed="))
     named = (word.partition("=") for word in point.overrides)
     return label or next((value for key, _, value in named if key == "+experiment"), ABSENT)
-
-
-def _cell(metric: str, members: Sequence[Outcome]) -> TableCell:
-    values: dict[int, Value] = {}
-    for index, outcome in enumerate(members):
-        scores = (
-            outcome.results[0].recorded_scores()
-            if outcome.state == "finished" and outcome.results
-            else {}
-        )
-        values[index] = scores.get(f"test/{metric}", outcome.reason or outcome.state)
-    return over_seeds(values)

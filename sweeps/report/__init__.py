@@ -1,1 +1,1 @@
-"""Report of a study: tables, figures, and records in MLflow."""
+"""Pages of results, the report of a study, and records in MLflow."""

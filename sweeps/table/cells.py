@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,6 +13,7 @@ from rgbt.checks import InputError
 from rgbt.metrics import names
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import details_of_metric, value
+from rgbt.runs.result import RunResult
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Outcome
 from sweeps.table.table import COUNTED, MEASURED, Column, Form, Row, Table
@@ -26,6 +27,7 @@ NO_SEED = "-1"  # of a row that was not trained here: analysis.uncertainty.contr
 
 CellId = tuple[str, str]  # (label of the row, name of the column)
 Value = float | str  # a score, or the reason why there is none
+Reader = Callable[[RunResult, str], Counts]  # of the counts of a run, by their path in its folder
 
 
 @dataclass(frozen=True)
@@ -97,9 +99,11 @@ def is_of_runs(column: Column) -> bool:
     return column.efficiency is None
 
 
-def row_cells(table: Table, row: Row, outcomes: Mapping[int, Outcome]) -> dict[CellId, TableCell]:
+def row_cells(
+    table: Table, row: Row, outcomes: Mapping[int, Outcome], reader: Reader
+) -> dict[CellId, TableCell]:
     """The cells of one row, whose runs are given by seed, in columns with values of runs."""
-    by_seed = {seed: _values(table, row, outcome) for seed, outcome in outcomes.items()}
+    by_seed = {seed: _values(table, row, outcome, reader) for seed, outcome in outcomes.items()}
     keys = tuple(run.key for outcome in outcomes.values() for run in outcome.results)
     cells = {}
     for column in filter(is_of_runs, table.columns_of(row)):
@@ -111,7 +115,7 @@ def row_cells(table: Table, row: Row, outcomes: Mapping[int, Outcome]) -> dict[C
     return cells
 
 
-def _values(table: Table, row: Row, outcome: Outcome) -> dict[str, Value]:
+def _values(table: Table, row: Row, outcome: Outcome, reader: Reader) -> dict[str, Value]:
     """Every column's value of one run."""
     counts: dict[str, Counts | str] = {}
     values: dict[str, Value] = {}
@@ -119,7 +123,7 @@ def _values(table: Table, row: Row, outcome: Outcome) -> dict[str, Value]:
     for column in filter(is_counted, columns):
         path = counts_path(column, table)
         if path not in counts:
-            counts[path] = _counts(outcome, path)
+            counts[path] = _counts(outcome, path, reader)
         values[column.name] = _value(metric_of(column, row), counts[path], table)
     for column in columns:
         if column.sources:
@@ -127,11 +131,11 @@ def _values(table: Table, row: Row, outcome: Outcome) -> dict[str, Value]:
     return values
 
 
-def _counts(outcome: Outcome, path: str) -> Counts | str:
+def _counts(outcome: Outcome, path: str, reader: Reader) -> Counts | str:
     if outcome.state != "finished" or not outcome.results:
         return outcome.reason or outcome.state
     try:
-        return outcome.missing.get(path) or outcome.results[0].counts(path)
+        return outcome.missing.get(path) or reader(outcome.results[0], path)
     except (InputError, OSError) as error:
         return str(error)
 
@@ -219,13 +223,14 @@ def score(
     *,
     scale: str,
     sizes: Mapping[CellId, TableCell] | None = None,
+    reader: Reader = lambda run, path: run.counts(path),
 ) -> ScoredTable:
     """Compute every cell of the rows with `runs`; `sizes` are those of efficiency."""
     seeds = sorted({seed for _, seed in runs})  # a row without seeds has a negative one
     cells: dict[CellId, TableCell] = {}
     for row in table.rows:
         outcomes = {seed: runs[row.label, seed] for seed in seeds if (row.label, seed) in runs}
-        cells |= row_cells(table, row, outcomes)
+        cells |= row_cells(table, row, outcomes, reader)
     made_by = {run.key: run.commit for outcome in runs.values() for run in outcome.results}
     return ScoredTable(
         name=name,

@@ -45,6 +45,8 @@ class Claim(Strict):
         at_least: smallest size of the difference that the statement means; below 0 for "not worse
             by more than".
         at_most: largest size, e.g. of a "small improvement".
+        effect: letters of the factors of the table's design; the claim is then about that effect
+            on the outcomes `columns`, by the methods `rows`.
         combine: "all": each contrast is as expected; "most": more than half of them; "any": one of
             them; "mean": their mean is.
         remarks: one sentence each, e.g. why the direction is a reading of ours.
@@ -60,6 +62,7 @@ class Claim(Strict):
     expected: Expected
     at_least: float = 0.0
     at_most: float | None = None
+    effect: str = ""
     combine: Combine = "all"
     remarks: tuple[str, ...] = ()
 
@@ -88,4 +91,6 @@ class Claim(Strict):
             raise ValueError("similar needs at_most, the largest difference that it means.")
         if self.at_most is not None and self.at_most <= self.at_least:
             raise ValueError(f"at_most must be above at_least ({self.at_least:g}).")
+        if self.effect and (self.against or self.minus_column or self.combine == "mean"):
+            raise ValueError("an effect has no against, minus_column or mean.")
         return self

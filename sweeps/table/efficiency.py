@@ -88,7 +88,7 @@ def efficiency_cells(request: TableRequest) -> dict[CellId, TableCell]:
     return cells
 
 
-def exact_sizes(request: TableRequest) -> dict[CellId, float]:
+def exact_sizes(request: TableRequest) -> dict[CellId, TableCell]:
     """Millions of parameters of the cells that claims of the table are about."""
     claimed = {name for claim in request.table.claims for name in claim.columns}
     columns = [each for each in request.table.columns if each.efficiency == "parameters"]
@@ -96,7 +96,7 @@ def exact_sizes(request: TableRequest) -> dict[CellId, float]:
         return {}
     kept = tuple(column for column in columns if column.name in claimed)
     cells = efficiency_cells(replace(request, table=replace(request.table, columns=kept)))
-    return {each: cell.mean for each, cell in cells.items() if not math.isnan(cell.mean)}
+    return {each: cell for each, cell in cells.items() if not math.isnan(cell.mean)}
 
 
 def network_of(request: TableRequest, label: str) -> Network:

@@ -258,7 +258,19 @@ class Table(Strict):
     @model_validator(mode="after")
     def _check_claims(self) -> Table:
         labels = [each.label for each in self.rows]
+        design = self.design
         for claim in self.claims:
+            if claim.effect:
+                methods = [each.name for each in design.methods] if design else []
+                for name in claim.rows:
+                    check_choice(f"claim '{claim.name}', methods", name, methods)
+                for name in claim.columns:
+                    known = design.outcomes if design else ()
+                    check_choice(f"claim '{claim.name}', outcomes", name, known)
+                for letter in claim.effect:
+                    letters = design.letters if design else ()
+                    check_choice(f"claim '{claim.name}', effect", letter, letters)
+                continue
             named = claim.against if claim.against not in ((OTHERS,), (PREVIOUS,)) else ()
             for label in (*claim.rows, *named):
                 check_choice(f"claim '{claim.name}', rows", label, labels)

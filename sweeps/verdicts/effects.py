@@ -1,4 +1,4 @@
-"""Effects of the factors of a design, by method and outcome, from the finished runs of a table."""
+"""Effects of the factors of a design, by method and outcome, and the claims about them."""
 
 from __future__ import annotations
 
@@ -12,11 +12,13 @@ from analysis.uncertainty import Resampling
 from analysis.uncertainty.contrasts import Evidence, Resampler, Term, combine
 from analysis.uncertainty.effects import Noise, estimate_effects
 from analysis.uncertainty.estimates import Estimate
+from analysis.uncertainty.verdicts import FixedSeeds, Rule, decide
 from rgbt.checks import InputError
 from rgbt.metrics import names
 from rgbt.metrics.counts import Counts
 from sweeps.point import Outcome
 from sweeps.table.cells import counts_path, is_counted, metric_of, world_evaluations
+from sweeps.table.claim import Claim
 from sweeps.table.design import (
     TESTED,
     TRAINED,
@@ -29,9 +31,15 @@ from sweeps.table.design import (
     trained_label,
 )
 from sweeps.table.table import Column, Table
-from sweeps.verdicts.contrasts import base_scores
-from sweeps.verdicts.judge import RESAMPLES, CellRunId, finished_runs_of
-from sweeps.verdicts.loaded_counts import LoadedCounts
+from sweeps.verdicts.judge import (
+    RESAMPLES,
+    CellRunId,
+    JudgedClaim,
+    StoredRuns,
+    TableJudge,
+    base_scores,
+    finished_runs_of,
+)
 
 LEVEL = 0.95
 
@@ -98,7 +106,8 @@ class DesignJudge:
 
     table: Table
     resamples: int = RESAMPLES
-    _counts: LoadedCounts = field(default_factory=LoadedCounts, init=False)
+    rule: Rule = field(default_factory=FixedSeeds)
+    stored: StoredRuns = field(default_factory=StoredRuns)
 
     def __post_init__(self) -> None:
         # Scenes of the generator are independent: no neighbouring frames.
@@ -111,8 +120,14 @@ class DesignJudge:
         lines: list[EffectLine] = []
         missing: dict[str, None] = {}
         for part in _parts(self.table):
-            found, reasons = self._counts_of(part, runs)
-            missing |= dict.fromkeys(reasons)
+            found: dict[str, list[Cell]] = {}
+            for method in part.design.methods:
+                if all(label not in self._rows for label, _ in part.places(method.name)):
+                    continue  # rows=... left it out
+                try:
+                    found[method.name] = self._cells(part, method.name, runs)
+                except InputError as error:
+                    missing[f"{part.name}, {method.name}: {error}"] = None
             for outcome, method in product(part.design.outcomes, part.design.methods):
                 try:
                     lines += self._of_method(part, outcome, method, found)
@@ -120,64 +135,75 @@ class DesignJudge:
                     missing[f"{part.name}, {method.name}, {outcome}: {error}"] = None
         return DesignEffects(tuple(lines), tuple(missing))
 
-    def _counts_of(
-        self, part: _Part, runs: Mapping[CellRunId, Outcome]
-    ) -> tuple[dict[str, list[Cell]], list[str]]:
-        """Counts of the methods that have them in every cell, and why others have not."""
-        found, reasons = {}, []
-        for method in part.design.methods:
-            if all(label not in self._rows for label, _ in part.places(method.name)):
-                continue  # rows=... left it out
-            try:
-                found[method.name] = self._cells(part, method.name, runs)
-            except InputError as error:
-                reasons.append(f"{part.name}, {method.name}: {error}")
-        return found, reasons
-
     def _of_method(
-        self,
-        part: _Part,
-        outcome: str,
-        method: DesignMethod,
-        found: Mapping[str, Sequence[Cell]],
+        self, part: _Part, outcome: str, method: DesignMethod, found: Mapping[str, Sequence[Cell]]
     ) -> list[EffectLine]:
         """Effects on a method, and their difference to those on the method it is compared with."""
         own, other = found.get(method.name), found.get(method.against or "")
         if own is None:
             return []
-        cells = self._evidence(outcome, own, _common([own]))
-        lines = part.lines(method.name, "", outcome, cells)
+        lines = part.lines(method.name, "", outcome, self._evidence(outcome, own, _common([own])))
         if other is not None and method.against is not None:
             seeds = _common([own, other])
-            pairs = zip(
-                *(self._evidence(outcome, each, seeds) for each in (own, other)), strict=True
-            )
-            differences = [combine((1.0, -1.0), pair) for pair in pairs]
+            sides = (self._evidence(outcome, each, seeds) for each in (own, other))
+            differences = [combine((1.0, -1.0), pair) for pair in zip(*sides, strict=True)]
             lines += part.lines(method.name, method.against, outcome, differences)
         return lines
+
+    def judge(self, name: str, claim: Claim, runs: Mapping[CellRunId, Outcome]) -> JudgedClaim:
+        """A claim about an effect: in the cells that networks are tested in, else trained in."""
+        evidences: list[Evidence] = []
+        labels: list[str] = []
+        used: list[str] = []
+        reasons: list[str] = []
+        parts = sorted(_parts(self.table), key=lambda part: part.name != TESTED)
+        for method, outcome in product(claim.rows, claim.columns):
+            failed = ["no row of the design is among the rows."]
+            for part in parts:
+                try:
+                    cells = self._cells(part, method, runs)
+                    each = self._evidence(outcome, cells, _common([cells]))
+                except InputError as error:
+                    failed.append(str(error))
+                    continue
+                signs = [sign_of(levels, claim.effect) for levels in part.design.cells(part.part)]
+                evidences.append(combine([2 * sign / len(signs) for sign in signs], each))
+                labels.append(
+                    f"{method}, {outcome}: {claim.effect}+ - {claim.effect}- ({part.name})"
+                )
+                used += [label for label, _ in part.places(method)]
+                break
+            else:
+                reasons.append(failed[-1])
+        if not evidences:
+            return JudgedClaim(
+                table=name, claim=claim, contrast=f"effect of {claim.effect}", reason=reasons[0]
+            )
+        basis = self.stored.basis(
+            run for label in used for run in finished_runs_of(label, runs).values()
+        )
+        verdict = decide(
+            evidences,
+            claim.range,
+            self.rule,
+            claim.combine,
+            starts=basis.starts,
+            missing=f"Some methods have no score: {reasons[0]}" if reasons else "",
+        )
+        return JudgedClaim(
+            table=name,
+            claim=claim,
+            contrast=labels[verdict.decisive],
+            verdict=verdict,
+            complete=not reasons,
+            reason=verdict.reason,
+            basis=basis,
+        )
 
     def _evidence(
         self, outcome: str, cells: Sequence[Cell], seeds: Sequence[int]
     ) -> list[Evidence]:
-        """The outcome in every cell."""
-        weights = self._weights(outcome)
-        return [
-            self._engine.evidence(
-                [
-                    Term(
-                        weight=weight,
-                        metric=metric,
-                        counts={seed: cell[seed][1] for seed in seeds},
-                        keys={seed: cell[seed][0] for seed in seeds},
-                    )
-                    for metric, weight in weights.items()
-                ]
-            )
-            for cell in cells
-        ]
-
-    def _weights(self, outcome: str) -> dict[str, float]:
-        """Metric -> weight of an outcome."""
+        """The outcome in every cell: a sum of scores of the plain test images."""
         row = next(row for row in self.table.rows if row.group)
         weights: dict[str, float] = {}
         for weight, column in base_scores(self.table, row, outcome):
@@ -185,7 +211,16 @@ class DesignJudge:
                 raise InputError(f"'{column.name}' is no score of the plain test images.")
             metric = metric_of(column, row)
             weights[metric] = weights.get(metric, 0.0) + weight
-        return weights
+        found = []
+        for cell in cells:
+            keys = {seed: cell[seed][0] for seed in seeds}
+            counts = {seed: cell[seed][1] for seed in seeds}
+            terms = [
+                Term(weight=weight, metric=metric, counts=counts, keys=keys)
+                for metric, weight in weights.items()
+            ]
+            found.append(self._engine.evidence(terms))
+        return found
 
     @property
     def _plain_path(self) -> str:
@@ -193,24 +228,32 @@ class DesignJudge:
         return counts_path(Column(name=names.MIOU, metric=names.MIOU), self.table)
 
     def _cells(self, part: _Part, method: str, runs: Mapping[CellRunId, Outcome]) -> list[Cell]:
-        """The counts of a method in every cell.
-
-        Raises:
-            InputError: a cell without a finished run, or counts that are missing or damaged.
-        """
+        """The counts of a method in every cell; InputError where a cell has none."""
         cells: list[Cell] = []
         for label, world in part.places(method):
             finished = finished_runs_of(label, runs)
+            if not finished:
+                raise InputError(f"row '{label}' has no finished run.")
             path = self._plain_path
             if world:
                 path = world_evaluations(self.table, self._rows[label])[world].path
             cells.append(
                 {
-                    seed: (f"{run.key}/{path}", self._counts.of(run, path))
+                    seed: (f"{run.key}/{path}", self.stored.counts(run, path))
                     for seed, run in finished.items()
                 }
             )
         return cells
+
+
+def judged_claims(judge: TableJudge, runs: Mapping[CellRunId, Outcome]) -> list[JudgedClaim]:
+    """Every claim of a table, about its rows or about its design, in their order."""
+    table = judge.table
+    design = DesignJudge(table, judge.resamples, judge.rule, judge.stored)
+    return [
+        design.judge(judge.name, claim, runs) if claim.effect else judge.judge(claim, runs)
+        for claim in table.claims
+    ]
 
 
 @dataclass(frozen=True)

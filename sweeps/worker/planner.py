@@ -12,7 +12,7 @@ from rgbt.checks import InputError
 from rgbt.config.command import composing
 from rgbt.config.compose import compose, with_pixels
 from rgbt.runs.run_spec import RunSpec
-from rgbt.runs.specify import specify
+from rgbt.runs.specify import requested_run, specify
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Point
 
@@ -33,10 +33,13 @@ class PlannedPoint:
     fingerprints: Mapping[str, str]
 
 
-def specify_run(overrides: Sequence[str]) -> RunSpec:
-    """The specification of one run; InputError in the words of the command line."""
+def specify_run(overrides: Sequence[str], *, checked: bool = True) -> RunSpec:
+    """The specification of one run; InputError in the words of the command line.
+
+    Without `checked`, no class that the settings name is imported, so that torch is not either.
+    """
     with composing(overrides):
-        return specify(compose(overrides), overrides)
+        return (specify if checked else requested_run)(compose(overrides), overrides)
 
 
 class Planner:
@@ -74,12 +77,12 @@ class Planner:
             self._fingerprints[name] = str(dataset.fingerprint())
         return self._fingerprints[name]
 
-    def specify(self, overrides: tuple[str, ...]) -> RunSpec:
-        """The specification of one run; seeds of the same run are composed once."""
+    def specify(self, overrides: tuple[str, ...], *, checked: bool = True) -> RunSpec:
+        """The specification of one run (`specify_run`); seeds of the same run are composed once."""
         *others, last = overrides
         seed = last.removeprefix("seed=")
         is_seed = seed != last and seed.isdecimal()
         same = tuple(others) if is_seed else overrides
         if same not in self._specified:
-            self._specified[same] = specify_run(overrides)
+            self._specified[same] = specify_run(overrides, checked=checked)
         return self._specified[same].with_seed(int(seed)) if is_seed else self._specified[same]

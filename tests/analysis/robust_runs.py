@@ -12,7 +12,8 @@ from rgbt.metrics.counts import Counts
 from rgbt.runs.folder import Description, RunFolder
 from tests.analysis.counts import counts_of
 
-SCORES = {
+Scores = dict[tuple[str, str, str, float], int]
+SCORES: Scores = {
     ("clean", "clean", "", 0.0): 80,
     ("rgb_removed", "RGB removed (zeroed)", "", 1.0): 20,
     ("features-thermal", "thermal alone (features)", "", 1.0): 30,
@@ -20,7 +21,6 @@ SCORES = {
     ("noise", "noise, RGB and thermal", "grey levels (std)", 16.0): 40,
 }
 """(row, title, unit, severity) -> mIoU in percent."""
-
 
 PIXELS = 100_000
 
@@ -31,36 +31,31 @@ def right(percent: int, images: int = 12) -> Counts:
     With a of N right in both classes, IoU = a / (2 N - a), so a = 2 N IoU / (1 + IoU).
     """
     a = round(2 * PIXELS * percent / (100 + percent))
-    one = [[a, PIXELS - a], [PIXELS - a, a]]
-    return counts_of(np.array([[one]] * images))
+    return counts_of(np.array([[[[a, PIXELS - a], [PIXELS - a, a]]]] * images))
 
 
-def write_levels(folder: Path, scores: dict[tuple[str, str, str, float], int]) -> Path:
+def write_levels(folder: Path, scores: Scores) -> Path:
     """The files of one training."""
     folder.mkdir(parents=True, exist_ok=True)
     for (row, title, unit, severity), percent in scores.items():
         mark = row if row == "clean" or row.startswith("features") else f"{row}-{severity:g}"
         right(percent).save(folder / f"{mark}.npz")
-        made = {"format": "rgbt robustness 1", "row": row, "title": title, "unit": unit}
-        (folder / f"{mark}.json").write_text(json.dumps({**made, "severity": severity}))
+        made = {"row": row, "title": title, "unit": unit, "severity": severity}
+        (folder / f"{mark}.json").write_text(json.dumps(made))
     return folder
 
 
-def write_run(
-    runs: Path, key: str, group: str, seed: int, scores: dict[tuple[str, str, str, float], int]
-) -> Path:
+def write_run(runs: Path, key: str, group: str, seed: int, scores: Scores) -> Path:
     """A finished run that was measured."""
     run = RunFolder(runs / key)
     run.write_config("name: x\n")
-    tags = {"rgbt.group": group, "rgbt.seed": str(seed)}
-    run.describe(Description(f"{group} seed={seed}", tags, {}))
-    clean = replace(right(80), counts=right(80).counts + seed)
-    clean.save(run.path / "counts_test.npz")
+    run.describe(Description(key, {"rgbt.group": group, "rgbt.seed": str(seed)}, {}))
+    replace(right(80), counts=right(80).counts + seed).save(run.path / "counts_test.npz")
     run.finish({"dataset": "fingerprint"})
     write_levels(run.path / "evaluations" / "robustness" / "test", scores)
     return run.path
 
 
-def less(by: int) -> dict[tuple[str, str, str, float], int]:
+def less(by: int) -> Scores:
     """The scores of `SCORES`, lower by so many points."""
     return {level: percent - by for level, percent in SCORES.items()}

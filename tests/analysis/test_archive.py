@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from analysis.archive.__main__ import entry
-from analysis.archive.files import add, archived
+from analysis.archive import add, archived, entry, key_of, unpack
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.runs.folder import RunFolder
 from rgbt.runs.naming import describe
 from rgbt.runs.result import RunResult
 from tests.analysis.counts import counts_of
+from tests.analysis.robust_runs import SCORES, write_levels
 from tests.commands import Call
 from tests.composed import specified
 
@@ -43,14 +43,22 @@ def run(tmp_path: Path) -> RunResult:
     (folder.path / "evaluations").mkdir()
     replace(some(1), night=(True, False) * 6).save(folder.path / "evaluations/test_rgb.npz")
     PAIRS.save(folder.path / "evaluations/consistency_aligned_test.npz")
+    write_levels(folder.path / "evaluations/robustness/test", SCORES)
     folder.finish({"key": spec.key, "dataset": "abc", "test": {"mIoU": 0.5}})
     return RunResult(folder.path)
 
 
 def test_unpacked_run_has_equal_counts(run: RunResult, tmp_path: Path) -> None:
-    unpacked = add(run, tmp_path / "results").unpack(tmp_path / "unpacked")
-    for path in sorted(run.folder.rglob("*.npz")):
-        name = path.relative_to(run.folder).as_posix()
+    unpacked = unpack(add(run, tmp_path / "results"), tmp_path / "unpacked")
+    paths = [path for end in ("npz", "json") for path in sorted(run.folder.rglob(f"*.{end}"))]
+    names = {path.relative_to(run.folder).as_posix() for path in paths}
+    assert names == {
+        path.relative_to(unpacked.folder).as_posix()
+        for path in unpacked.folder.rglob("*.*")
+        if path.suffix in (".npz", ".json")
+    }
+    for name in (each for each in names if each.endswith(".npz")):
+        path = run.folder / name
         first, again = Counts.load(path), unpacked.counts(name)
         assert np.array_equal(first.counts, again.counts)
         assert first.counts.dtype == again.counts.dtype
@@ -66,9 +74,9 @@ def test_same_results_are_one_file_and_others_are_kept(run: RunResult, tmp_path:
     assert add(run, archive) == add(run, archive)
     some(2, run=run.key).save(run.folder / "counts_test.npz")
     other = add(run, archive)
-    assert other.key == run.key
-    assert other.unpack(tmp_path / "unpacked").counts().run == run.key
-    assert [each.path for each in archived(archive)] == [other.path, archive / f"{run.key}.zip"]
+    assert key_of(other) == run.key
+    assert unpack(other, tmp_path / "unpacked").counts().run == run.key
+    assert archived(archive) == [other, archive / f"{run.key}.zip"]
 
 
 def test_images_are_stored_once_for_all_runs(run: RunResult, tmp_path: Path) -> None:
@@ -79,41 +87,37 @@ def test_images_are_stored_once_for_all_runs(run: RunResult, tmp_path: Path) -> 
     before = len(list((tmp_path / "results/shared").iterdir()))
     replace(some(0), counts=wrong).save(run.folder / "counts_test.npz")
     add(run, tmp_path / "results")
-    assert len(list((tmp_path / "results/shared").iterdir())) == before == 3
+    assert len(list((tmp_path / "results/shared").iterdir())) == before == 4
 
 
-def test_unfinished_run_is_refused(run: RunResult, tmp_path: Path) -> None:
-    (run.folder / "result.json").unlink()
-    with pytest.raises(InputError, match="is not finished"):
-        add(run, tmp_path / "results")
-
-
-@pytest.mark.parametrize("place", [0.3, 0.6])
-def test_damaged_archive_is_refused(run: RunResult, tmp_path: Path, place: float) -> None:
-    archived_run = add(run, tmp_path / "results")
-    content = bytearray(archived_run.path.read_bytes())
-    content[int(place * len(content))] ^= 0xFF
-    archived_run.path.write_bytes(content)
-    with pytest.raises(InputError, match="damaged"):
-        archived_run.unpack(tmp_path / "unpacked")
+@pytest.mark.parametrize("damage", [0.3, 0.6, "shared", "/tmp/outside.txt", "../outside.txt"])
+def test_damaged_archive_is_refused(run: RunResult, tmp_path: Path, damage: float | str) -> None:
+    path = add(run, tmp_path / "results")
+    shared, other = sorted((tmp_path / "results/shared").iterdir())[:2]
+    if isinstance(damage, float):
+        content = bytearray(path.read_bytes())
+        content[int(damage * len(content))] ^= 0xFF
+        path.write_bytes(content)
+    elif damage == "shared":  # arrays of other images
+        shared.write_bytes(other.read_bytes())
+    else:
+        with zipfile.ZipFile(path, "a") as archive:
+            archive.writestr(damage, "x")
+    word = "damaged .*does not match its digest" if damage == "shared" else "damaged"
+    with pytest.raises(InputError, match=word):
+        unpack(path, tmp_path / "unpacked")
     assert list((tmp_path / "unpacked").iterdir()) == []
-
-
-@pytest.mark.parametrize("name", ["../outside.txt", "/tmp/outside.txt"])
-def test_archive_writes_nothing_outside(run: RunResult, tmp_path: Path, name: str) -> None:
-    archived_run = add(run, tmp_path / "results")
-    with zipfile.ZipFile(archived_run.path, "a") as archive:
-        archive.writestr(name, "x")
-    with pytest.raises(InputError, match="leads out of the folder"):
-        archived_run.unpack(tmp_path / "unpacked")
-    assert not (tmp_path / "unpacked/outside.txt").exists()
+    assert not (tmp_path / "outside.txt").exists()
 
 
 def test_archive_of_another_run_is_refused(run: RunResult, tmp_path: Path) -> None:
-    path = add(run, tmp_path / "results").path
+    path = add(run, tmp_path / "results")
     path.rename(path.with_name("0123456789ab.zip"))
     with pytest.raises(InputError, match=f"holds the run {run.key}"):
-        archived(tmp_path / "results")[0].unpack(tmp_path / "unpacked")
+        unpack(path.with_name("0123456789ab.zip"), tmp_path / "unpacked")
+    (run.folder / "result.json").unlink()
+    with pytest.raises(InputError, match="is not finished"):
+        add(run, tmp_path / "results")
 
 
 def write_settings(run: RunResult, **changed: object) -> None:
@@ -134,12 +138,7 @@ def write_settings(run: RunResult, **changed: object) -> None:
     ],
 )
 def test_check_reports_changed_keys(
-    call: Call,
-    run: RunResult,
-    tmp_path: Path,
-    changed: dict[str, object],
-    state: str,
-    reason: str,
+    call: Call, run: RunResult, tmp_path: Path, changed: dict[str, object], state: str, reason: str
 ) -> None:
     archive = tmp_path / "results"
     folder = run.folder.rename(run.folder.with_name("0123456789ab"))
@@ -153,8 +152,8 @@ def test_check_reports_changed_keys(
     assert reason in out
     assert call(entry, "rekey", f"archive={archive}")[0] == 0
     (only,) = archived(archive)
-    assert only.path.stem == (run.key if state == "added" else "0123456789ab")
-    assert only.unpack(tmp_path / "unpacked").counts().run == only.key
+    assert only.stem == (run.key if state == "added" else "0123456789ab")
+    assert unpack(only, tmp_path / "unpacked").counts().run == only.stem
     assert call(entry, "check", f"archive={archive}")[0] == (0 if state == "added" else 1)
 
 
@@ -162,7 +161,7 @@ def test_command_adds_all_finished_runs(call: Call, run: RunResult, tmp_path: Pa
     archive = tmp_path / "results"
     words = (f"runs_dir={run.folder.parent}", f"archive={archive}")
     assert call(entry, "add", "run=all", *words)[0] == 0
-    assert [each.key for each in archived(archive)] == [run.key]
+    assert [each.stem for each in archived(archive)] == [run.key]
     code, out, err = call(entry, "check", f"archive={archive}")
     assert (code, err) == (0, "")
     assert "1 runs, 1 have the key of their command" in out

@@ -9,11 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.compare import entry as compare_entry
 from analysis.compare import metrics_of
 from analysis.details import entry
+from analysis.results import open_counts
 from analysis.uncertainty import Resampling, compare, estimate
-from analysis.uncertainty.contrasts import Resampler, Term
 from analysis.uncertainty.same_images import in_order
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
@@ -21,6 +20,7 @@ from rgbt.metrics.details import Details
 from rgbt.metrics.named import value
 from rgbt.metrics.scores import ece
 from tests.analysis.test_results import make_run
+from tests.analysis.uncertainty.simulated import pairs_of
 from tests.commands import Call, assert_one_sentence
 
 IMAGES = 40
@@ -58,14 +58,6 @@ def calibrated(seed: int = 0) -> Counts:
     return counts_of(array, CALIBRATION.partition("ring1"))
 
 
-def test_interval_of_equal_images_has_no_width() -> None:
-    one = boundaries(images=1)
-    same = counts_of(np.repeat(one.counts, IMAGES, 0), one.partition)
-    found = estimate([same], ["boundary_mIoU"], SETTINGS)["boundary_mIoU"]
-    assert found.images is not None
-    assert found.images.low == found.images.high == pytest.approx(found.value)
-
-
 def test_interval_is_that_of_images_drawn_again() -> None:
     counts = boundaries()
     metric = "class/car/region/2/boundary_IoU"
@@ -73,10 +65,8 @@ def test_interval_is_that_of_images_drawn_again() -> None:
     rng = np.random.default_rng(1)
     drawn = [counts.counts[rng.integers(0, IMAGES, IMAGES)][:, 1, :, 1].sum(0) for _ in range(4000)]
     scores = [100 * both / (label + predicted - both) for both, label, predicted in drawn]
-    low, high = np.quantile(scores, [0.025, 0.975])
-    assert found.images is not None
-    assert (found.images.low, found.images.high) == pytest.approx((low, high), abs=0.2)
-    assert found.value == value(metric, counts, "released")
+    ends = np.quantile(scores, [0.025, 0.975])
+    assert [found.images.low, found.images.high] == pytest.approx(ends, abs=0.2)
 
 
 def test_interval_of_a_calibration_error_is_corrected_and_never_negative() -> None:
@@ -84,62 +74,36 @@ def test_interval_of_a_calibration_error_is_corrected_and_never_negative() -> No
     found = estimate([counts], ["ECE"], SETTINGS)["ECE"]
     right = counts.counts[:, 1, 1, 0].sum()
     assert found.value == pytest.approx(100 * (0.8 - right / 4000))
-    assert found.images is not None
     assert 0 <= found.images.low < found.value < found.images.high
     # Right on average: chance alone makes the error, so that the interval begins at 0.
     array = counts.counts.copy()
     array[:, 1, 2, 0] = right * 10_000 // IMAGES
     fair = estimate([counts_of(array, counts.partition)], ["ECE"], SETTINGS)["ECE"]
-    assert fair.images is not None
     assert fair.images.low == 0
 
 
-def test_difference_between_two_methods_has_an_interval_and_a_p_value() -> None:
-    better = boundaries(1)
-    array = better.counts.copy()
-    array[:, :, 0] += 5
-    array[:, :, 2] += 5
-    better = replace(better, counts=array)
+def test_difference_between_two_methods_has_an_interval() -> None:
+    array = boundaries(1).counts.copy()
+    array[:, :, [0, 2]] += 5
+    better = replace(boundaries(1), counts=array)
     metrics = metrics_of("auto", [better], SETTINGS)
     assert metrics == ["boundary_mIoU", "region/1/boundary_mIoU", "region/2/boundary_mIoU"]
     found = compare([boundaries(1)], [better], metrics, SETTINGS).differences[0]
-    assert found.value > 0
-    assert found.interval is not None
     assert found.interval.low > 0
     assert found.difference.p < 0.01
 
 
-def test_other_labels_are_refused() -> None:
-    array = boundaries().counts.copy()
-    array[3, 0, 1, 0] += 1  # one more boundary pixel of the label
+@pytest.mark.parametrize("counts", [boundaries(), calibrated()])
+def test_labels_of_two_methods_are_compared(counts: Counts) -> None:
+    """Pixels of the labelled boundary, or of the region; bins are those of the prediction."""
+    array = counts.counts.copy()
+    array[3, 0, 1 if counts.counts[..., 0].any(0).all() else 0, 1] += 1
     with pytest.raises(InputError, match="'00003' has different labels"):
-        in_order(boundaries(), replace(boundaries(), counts=array), "pixels")
-    array = calibrated().counts.copy()
-    array[3, 0, 0, 1] += 1  # one more pixel
-    with pytest.raises(InputError, match="'00003' has different labels"):
-        in_order(calibrated(), replace(calibrated(), counts=array), "pixels")
-    moved = calibrated().counts.copy()
-    moved[:, 0] = moved[:, 1]
-    moved[:, 1] = 0  # another bin, the same pixels
-    in_order(calibrated(), replace(calibrated(), counts=moved), "pixels")
-    in_order(calibrated(), boundaries(), "labels")  # nothing to compare
-
-
-@pytest.mark.parametrize("blocks", ["none", "auto"])
-def test_contrast_of_two_regions_within_each_run(blocks) -> None:
-    counts = {seed: boundaries(seed) for seed in (1, 2, 3)}
-    keys = {seed: str(seed) for seed in counts}
-    centre, edge = (f"region/{number}/boundary_mIoU" for number in (1, 2))
-    terms = [
-        Term(weight=weight, metric=metric, counts=counts, keys=keys)
-        for weight, metric in ((1.0, edge), (-1.0, centre))
-    ]
-    found = Resampler(Resampling(resamples=200, blocks=blocks)).evidence(terms)
-    expected = [
-        value(edge, each, "released") - value(centre, each, "released") for each in counts.values()
-    ]
-    assert found.values == pytest.approx(expected)
-    assert found.error > 0
+        in_order(counts, replace(counts, counts=array), "pixels")
+    if "calibration" in counts.partition:
+        moved = np.roll(counts.counts, 1, axis=1)
+        in_order(counts, replace(counts, counts=moved), "pixels")
+        in_order(counts, boundaries(), "labels")  # nothing to compare
 
 
 @pytest.fixture
@@ -168,36 +132,44 @@ def test_seeds_of_a_method_are_shown_together(call: Call, runs: Path, tmp_path: 
     assert "intervals over images and seeds" in out
     rows = list(csv.DictReader((tmp_path / "out" / "details.csv").open()))
     assert {(row["details"], row["input"]) for row in rows} == {
-        *(("boundary", view) for view in ("rgbt", "thermal")),
-        *(("calibration", view) for view in ("rgbt", "thermal")),
+        (kind, view) for kind in ("boundary", "calibration") for view in ("rgbt", "thermal")
     }
     (row,) = (each for each in rows if (each["metric"], each["input"]) == ("ECE", "rgbt"))
     expected = [value("ECE", calibrated(seed), "released") for seed in range(2)]
     assert float(row["value"]) == pytest.approx(np.mean(expected))
     assert float(row["low"]) < float(row["value"]) < float(row["high"])
     assert row["seeds"] == "2"
+    # Tables of one line have one for each input.
+    lines = (tmp_path / "out" / "details.md").read_text().splitlines()
+    assert sum(line.startswith(("| rgbt |", "| thermal |")) for line in lines) == 2
+    assert call(entry, "run=plain0", *words)[0] == 0
 
-    file = runs / "plain0" / "evaluations" / "synth_test_rgbt_ring2-boundary.npz"
-    code, out, err = call(entry, f"run={file}", "resamples=200")
-    assert (code, err) == (0, "")
-    code, out, err = call(
-        compare_entry, f"a={file}", f"b={runs / 'plain1' / 'evaluations' / file.name}", *words[1:]
-    )
+
+def test_file_of_pairs_is_shown_by_videos(call: Call, tmp_path: Path) -> None:
+    """Twelve videos of two pairs each."""
+    names = tuple(f"v{index % 12}_{index // 12:03d}" for index in range(24))
+    replace(pairs_of(24, 0.5), names=names).save(tmp_path / "pairs.npz")
+    code, shown, err = call(entry, f"run={tmp_path}/pairs.npz", "resamples=200")
     assert code == 0, err
-    assert "boundary_mIoU" in out
+    text = " ".join(shown.split())
+    assert "Consistency of pairs of frames in percent" in text
+    assert "all images" in text
+    assert "12 blocks of 2 neighbouring frames" in text
+    assert "each is one block" in text
 
 
 def test_missing_details_are_named(call: Call, runs: Path) -> None:
-    code, _, err = call(entry, "run=bare", f"runs_dir={runs}")
-    assert code == 2
-    assert_one_sentence(err, "modality=all details=boundary")
     (runs / "plain1" / "evaluations" / "synth_test_thermal_ring1-calibration.npz").unlink()
-    code, _, err = call(entry, "run=plain", f"runs_dir={runs}")
-    assert code == 2
-    assert_one_sentence(err, "plain1 has no counts of calibration of split 'test'")
-    code, _, err = call(entry)
-    assert code == 2
-    assert_one_sentence(err, "'run' has no value")
+    with pytest.raises(InputError, match="condition=thermal is not counted .* has clean of"):
+        open_counts("plain1", runs, condition="thermal")  # the rest are details
+    for words, sentence in (
+        (["run=bare"], "modality=all details=boundary"),
+        (["run=plain"], "plain1 has no counts of calibration of split 'test'"),
+        ([], "'run' has no value"),
+    ):
+        code, _, err = call(entry, *words, f"runs_dir={runs}")
+        assert code == 2
+        assert_one_sentence(err, sentence)
 
 
 @pytest.mark.slow
@@ -216,10 +188,6 @@ def test_interval_of_a_calibration_error_holds_the_truth(gap: float) -> None:
 
     truth = 100 * float(ece(drawn(50_000).sum(0)))
     settings = Resampling(resamples=300, blocks="none")
-    holds = 0
-    for _ in range(100):
-        counts = counts_of(drawn(60), "ring1-calibration-15")
-        images = estimate([counts], ["ECE"], settings)["ECE"].images
-        assert images is not None
-        holds += truth in images
+    found = [counts_of(drawn(60), "ring1-calibration-15") for _ in range(100)]
+    holds = sum(truth in estimate([each], ["ECE"], settings)["ECE"].images for each in found)
     assert holds >= 88  # 95 but for chance

@@ -8,7 +8,7 @@ import sys
 HEAVY = ("torch", "matplotlib", "mlflow", "pandas", "scipy", "PIL", "cv2")
 SCRIPT = f"""
 import importlib, sys
-for name in ("compare", "score", "spatial", "figures.__main__"):
+for name in ("compare", "score", "spatial"):
     sys.argv = [name, "--help"]
     try:
         importlib.import_module(f"analysis.{{name}}").entry()
@@ -28,4 +28,3 @@ def test_help_waits_for_no_heavy_library() -> None:
     ):
         assert line in done.stdout
     assert "one of: ring, vertical, horizontal (default: ring)" in done.stdout
-    assert "  figure           name of the figure" in done.stdout

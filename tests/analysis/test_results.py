@@ -10,11 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.results import groups_in, label_of, open_counts
+from analysis.archive import add
+from analysis.results import COLUMNS, finished_runs, label_of, open_counts, results
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
+from rgbt.metrics.named import parse, value
 from rgbt.runs.folder import Description, RunFolder, counts_name
-from tests.analysis.uncertainty.simulated import Population, counts_of
+from rgbt.runs.result import RunResult
+from tests.analysis.robust_runs import SCORES, write_levels
+from tests.analysis.uncertainty.simulated import Population, counts_of, pairs_of
 
 CRM, COMMAS = "crm scale=demo", "grbm scale=demo sizes=[1,2]"
 LONG = "grbm " + " ".join(f"a_long_key_of_the_configuration_{n}=0.123" for n in range(10))
@@ -34,7 +38,7 @@ def make_run(runs: Path, key: str, group: str, seed: int, *, finished: bool = Tr
     replace(some(seed + 100), split="val").save(run.path / counts_name("val"))
     (run.path / "mlflow.json").write_text(json.dumps({"run_id": f"mlflow-{key}"}))
     if finished:
-        run.finish({"mIoU": 0.5})
+        run.finish({"dataset": "simulated", "test": {"mIoU": 0.5}})
     return run.path
 
 
@@ -96,68 +100,132 @@ def test_split_and_home_folder_take_effect(runs: Path, monkeypatch: pytest.Monke
     np.testing.assert_array_equal(found.counts.counts, some(7).counts)
 
 
-def test_folder_of_scores_is_opened_by_rings(tmp_path: Path):
+def test_folder_of_scores_is_opened_by_rings(tmp_path: Path) -> None:
     """As `analysis.score` leaves it: rings and strips."""
-    for seed, name in enumerate(("horizontal5", "ring5", "vertical5")):
-        some(seed).save(tmp_path / f"counts_{name}.npz")
+    for name in ("horizontal5", "ring5"):
+        some().save(tmp_path / f"counts_{name}.npz")
     (found,) = open_counts(str(tmp_path), tmp_path)
     assert (found.label, found.key, found.seed) == (tmp_path.name, "", None)
     assert found.path.name == "counts_ring5.npz"
-
-
-@pytest.mark.parametrize("names", [("ring5", "ring9"), ("horizontal5", "vertical5")])
-def test_ambiguous_folder_of_scores_is_refused(tmp_path: Path, names: tuple[str, str]):
-    for name in names:
-        some().save(tmp_path / f"counts_{name}.npz")
-    files = ", ".join(f"counts_{name}.npz" for name in names)
-    with pytest.raises(InputError, match=f"{files}; name one"):
+    some().save(tmp_path / "counts_ring9.npz")
+    with pytest.raises(InputError, match=r"counts_ring5.npz, counts_ring9.npz; name one of these"):
         open_counts(str(tmp_path), tmp_path)
 
 
 @pytest.mark.parametrize(
     ("text", "options", "word"),
     [
-        ("aab0", {}, "'aab0' is not a run folder.*crm scale=demo"),
-        ("/no/such/folder", {}, "is not a run folder"),
-        ("mlflow-none", {}, "is not a run folder"),
+        ("aab0", {}, "'aab0' is not a run.*crm scale=demo"),
         ("crm scale=dem", {}, "did you mean 'crm scale=demo'"),
-        (f"{LONG}1", {}, "is not a run folder"),
-        ("abc", {"runs_dir": "none"}, "'abc' is not a run folder"),
-        ("crm", {"runs_dir": "none"}, r"neither a run \(config.yaml\) nor counts .*rgbt score"),
+        (f"{LONG}1", {}, "is not a run"),
+        ("abc", {"runs_dir": "none"}, "'abc' is not a run"),
+        ("crm", {"runs_dir": "none"}, "is not a run .* nor counts"),
         ("none.npz", {}, "the file of counts"),
         ("images.npz", {}, "is not a readable file of counts"),
-        ("", {}, "expected runs, files of counts or a group"),
         ("aaa0,,aaa1", {}, "expected runs, files of counts or a group"),
         ("aaa0", {"split": "all"}, "no counts of the split 'all'.*rgbt.evaluate"),
         ("other method.npz", {"split": "val"}, "is of split 'test', not of split=val"),
-        ("aaa0,mlflow-aaa0", {}, "twice; one training counts once"),
-        (f"{CRM},aaa1", {}, "twice; one training counts once"),
-        ("aaa0,runs/aaa0/counts_test.npz", {}, "twice"),
-        ("aaa0,link.npz", {}, "twice"),
-        ("other method.npz,copy.npz", {}, "hold the same counts; one training"),
+        ("aaa0,mlflow-aaa0", {}, "names the same counts twice"),
+        (f"{CRM},aaa1", {}, "names the same counts twice"),
+        ("other method.npz,copy.npz", {}, "names the same counts twice"),
         ("aaa0,ggg0", {}, f"names seed 0 of '{CRM}' twice"),  # same overrides, another default
     ],
 )
 def test_other_inputs_and_repeated_runs_are_refused(
     runs: Path, text: str, options: dict[str, str], word: str
 ):
-    (runs.parent / "link.npz").symlink_to(runs / "aaa0" / "counts_test.npz")
     some(7).save(runs.parent / "copy.npz")
     np.savez(runs.parent / "images.npz", x=np.zeros(3))
     if "ggg0" in text:
-        make_run(runs, "ggg0", CRM, 0)
+        some(77).save(make_run(runs, "ggg0", CRM, 0) / "counts_test.npz")
     with pytest.raises(InputError, match=word):
         open_counts(text, **{"runs_dir": runs, **options})
 
 
-@pytest.mark.parametrize("text", ["{", "{}", "[]"])
-def test_damaged_run_stops_nothing_else(runs: Path, capsys: pytest.CaptureFixture[str], text: str):
-    broken = make_run(runs, "hhh0", CRM, 9)
-    for name in ("run.json", "mlflow.json"):
-        (broken / name).write_text(text)
-    assert len(open_counts("other method.npz", runs)) == 1
-    assert CRM in groups_in(runs)
-    with pytest.raises(InputError, match="is not a run folder"):
-        open_counts("mlflow-nobody", runs)
-    open_counts("aaa9", runs)
-    assert "is not finished" in capsys.readouterr().err
+# One frame of a folder of runs and an archive.
+
+
+@pytest.fixture
+def archive(runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The runs of `CRM`, two of them no longer in the folder, and one with other counts."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    folder = tmp_path / "results"
+    for key in ("aaa0", "aaa1", "aaa2"):
+        add(RunResult(runs / key), folder)
+    for key in ("aaa0", "aaa1"):
+        shutil.rmtree(runs / key)
+    some(50).save(runs / "aaa2" / "counts_test.npz")
+    return folder
+
+
+def test_folder_and_archive_are_one(
+    runs: Path, archive: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = finished_runs(runs, archive)
+    keys = " ".join(run.key for run in found)
+    assert keys == "aaa0 aaa1 aaa2 bbb0 bbb1 bbb2 ccc0 ddd0 eee0"
+    np.testing.assert_array_equal(found[1].counts().counts, some(1).counts)
+    np.testing.assert_array_equal(found[2].counts().counts, some(50).counts)
+    err = capsys.readouterr().err
+    assert (err.count("warning"), "aaa2 is stored with other counts" in err) == (1, True)
+    assert [run.key for run in finished_runs("none", archive)] == ["aaa0", "aaa1", "aaa2"]
+    assert finished_runs("none", "none") == []
+    for text, seeds in ((CRM, [0, 1, 2]), ("aaa1", [1])):
+        opened = open_counts(text, "none", archive=archive)
+        assert [each.seed for each in opened] == seeds
+    unpacked = finished_runs("none", archive)[0].folder
+    (unpacked / "mark").touch()
+    assert (finished_runs("none", archive)[0].folder / "mark").exists()  # unpacked once
+
+
+def test_frame_has_a_row_for_each_score(runs: Path, archive: Path) -> None:
+    night = tuple(place < 4 for place in range(12))
+    counts, pairs = replace(some(0), night=night, unscored=("cone",)), pairs_of(12, 0.5)
+    folder = runs / "bbb0"
+    (folder / "evaluations").mkdir()
+    for name, each in (
+        ("synth_test_thermal_ring2", counts),
+        ("consistency_aligned_test", pairs),
+        ("consistency_aligned-0c_test", pairs),
+    ):
+        each.save(folder / f"evaluations/{name}.npz")
+    replace(counts, dataset="other").save(folder / "evaluations/kp_test_rgb_ring2_last.npz")
+    for path in write_levels(folder / "evaluations/robustness/test", SCORES).glob("*.npz"):
+        replace(Counts.load(path), dataset="simulated").save(path)
+    frame = results(runs, archive)
+    at = ["run", "condition", "severity", "partition", "subset", "region", "class", "metric"]
+    assert not frame.duplicated(at).any()
+    assert tuple(frame.columns) == COLUMNS
+    found = frame.set_index(["run", "condition", "subset", "region", "class", "metric"])["value"]
+    for run, condition, of in (
+        *(("bbb0", "clean", some(0)), ("aaa1", "clean", some(1)), ("bbb0", "thermal", counts)),
+        ("bbb0", "rgb last dataset other", counts),
+    ):
+        for name in ("mIoU", "Var", "region/2", "class/car", "class/cone/acc", "pixel_accuracy"):
+            for prefix in ("", "night/")[: 1 + (of is counts)]:
+                each = parse(f"{prefix}{name}")
+                key = each.part or "all", each.region or 0, each.class_name or "", each.score
+                assert found[run, condition, *key] == value(f"{prefix}{name}", of, "released")
+    region = Counts(**{**vars(counts), "counts": counts.counts[:, 1:], "partition": "ring1"})
+    person = value("class/person", region, "released")
+    assert found["bbb0", "thermal", "all", 2, "person", "IoU"] == person
+    for condition in ("clean", "clean 0c"):
+        assert found["bbb0", condition, "all", 0, "", "TC"] == value("TC", pairs, "released")
+    (aligned,) = open_counts("bbb0", runs, frames="aligned")
+    assert aligned.path.stem == "consistency_aligned_test"
+    chosen = (frame["metric"] == "mIoU") & (frame["subset"] == "all") & (frame["region"] == 0)
+    noise = frame[chosen & (frame["condition"] == "noise")]
+    assert dict(zip(noise["severity"], noise["value"].round(2))) == {8.0: 60.0, 16.0: 40.0}
+    seeds = frame[frame["group"] == COMMAS].groupby("run")["seed"].first()
+    assert dict(seeds) == {"bbb0": 0, "bbb1": 1, "bbb2": 2}
+    assert set(results(runs, archive, evaluations=False)["condition"]) == {"clean"}
+    assert len(results("none", "none")) == 0
+
+
+@pytest.mark.parametrize("name", ["result.json", "run.json", "counts_test.npz"])
+def test_damaged_run_is_a_remark(runs: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
+    (runs / "bbb1" / name).write_text("{")
+    keys = set(results(runs, "none")["run"])
+    assert "bbb1" not in keys
+    assert {"bbb0", "aaa1"} <= keys
+    assert capsys.readouterr().err.count("warning") == 1

@@ -1,4 +1,4 @@
-"""Counts of corrupted images of runs; two methods compared on them."""
+"""Counts of corrupted images of runs."""
 
 from __future__ import annotations
 
@@ -7,14 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from analysis.compare import entry
+from analysis import results
 from analysis.results import open_counts
-from analysis.robustness import levels_of, trainings, under
+from analysis.robustness import levels_of, trainings
 from rgbt.checks import InputError
-from rgbt.evaluation.robustness import CLEAN, FOLDER, FORMAT
+from rgbt.evaluation import robustness
 from rgbt.metrics.named import value
 from tests.analysis.robust_runs import SCORES, less, write_levels, write_run
-from tests.commands import Call
 
 
 @pytest.fixture
@@ -25,98 +24,55 @@ def runs(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_is_read_as_the_command_writes_it() -> None:
-    from analysis import robustness
-
-    assert (robustness.CLEAN, robustness.FORMAT) == (CLEAN, FORMAT)
-    assert robustness.FOLDER.name == FOLDER
-
-
-def test_levels_by_title_and_rising_severity(runs: Path) -> None:
-    found = levels_of(runs / "k0" / "evaluations" / "robustness" / "test")
-    assert [(level.mark, level.severity) for level in found] == [
-        ("clean", 0.0),
-        ("rgb_removed-1", 1.0),
-        ("features-thermal", 1.0),
-        ("noise-8", 8.0),
-        ("noise-16", 16.0),
+def test_trainings_have_levels_by_title_and_rising_severity(runs: Path) -> None:
+    assert (results.CLEAN, results.ROBUSTNESS) == (robustness.CLEAN, robustness.FOLDER)
+    first, second = trainings("crm", runs)
+    assert [level.path.stem for level in first.levels] == [
+        *("clean", "rgb_removed-1", "features-thermal", "noise-8", "noise-16")
     ]
-    mious = [value("mIoU", level.counts, "released") for level in found]
+    mious = [value("mIoU", level.counts, "released") for level in first.levels]
     assert mious == pytest.approx([80, 20, 30, 60, 40], abs=1e-3)
-
-
-def test_runs_groups_and_folders_are_trainings(runs: Path) -> None:
-    of_group = trainings("crm", runs)
-    assert [each.label for each in of_group] == ["crm", "crm"]
-    assert value("mIoU", of_group[1].clean, "released") == pytest.approx(70, abs=1e-3)
-    assert [level.severity for level in of_group[0].of("noise")] == [8.0, 16.0]
-    assert of_group[0].of("frozen") == ()
+    assert value("mIoU", second.clean, "released") == pytest.approx(70, abs=1e-3)
+    assert [level.severity for level in first.of("noise")] == [8.0, 16.0]
+    assert first.of("frozen") == ()
     folder = write_levels(runs / "elsewhere", SCORES)
     assert [each.label for each in trainings(f"{folder},k2", runs)] == ["elsewhere", "none"]
 
 
-def test_same_trainings_on_corrupted_images(runs: Path) -> None:
-    stored = open_counts("crm", runs)
-    noisy = under(stored, "noise", "16")
-    assert [value("mIoU", each.counts, "released") for each in noisy] == pytest.approx(
-        [40, 30], abs=1e-3
+@pytest.mark.parametrize(
+    ("condition", "miou"), [("noise 16", 40), ("rgb_removed", 20), ("removed:rgb 1", 20)]
+)
+def test_same_trainings_on_corrupted_images(runs: Path, condition: str, miou: int) -> None:
+    found = open_counts("crm", runs, condition=condition)
+    assert [value("mIoU", each.counts, "released") for each in found] == pytest.approx(
+        [miou, miou - 10], abs=1e-3
     )
-    assert [each.seed for each in noisy] == [0, 1]
-    assert noisy[0].path.name == "noise-16.npz"
-    (black, _) = under(stored, "rgb_removed", "")
-    assert value("mIoU", black.counts, "released") == pytest.approx(20, abs=1e-3)
+    assert [each.seed for each in found] == [0, 1]
+
+
+@pytest.mark.parametrize("condition", ["nois 16", "noise 12", "noise"])
+def test_missing_condition_is_reported(runs: Path, condition: str) -> None:
+    known = "clean, features-thermal 1, noise 16, noise 8, rgb_removed 1"
+    with pytest.raises(InputError, match=f"condition={condition} is not counted .* has {known}"):
+        open_counts("k0", runs, condition=condition)
 
 
 @pytest.mark.parametrize(
-    ("corruption", "severity", "sentence"),
+    ("name", "content", "word"),
     [
-        ("nois", "16", r"'?nois'? was not measured in .*did you mean 'noise'"),
-        ("noise", "12", r"severity=12: .* has noise at 8, 16; give one of these"),
-        ("noise", "", r"severity=: .* has noise at 8, 16"),
+        ("noise-8.npz", "x", "noise-8.npz' is not a readable file of counts"),
+        ("noise-8.json", "{}", r"noise-8.json is not of rgbt robustness \('row'\)"),
+        ("noise-8.json", "{", "noise-8.json is damaged"),
+        (
+            "noise-8.json",
+            json.dumps({"row": 1, "title": "", "unit": "", "severity": "x"}),
+            "is not",
+        ),
+        ("clean.json", "", "has no counts of clean images"),
     ],
 )
-def test_missing_measurement_is_reported(
-    runs: Path, corruption: str, severity: str, sentence: str
-) -> None:
-    with pytest.raises(InputError, match=sentence):
-        under(open_counts("k0", runs), corruption, severity)
-
-
-def test_inputs_without_measurements_are_reported(runs: Path) -> None:
-    place = runs / "k0" / "evaluations" / "robustness"
-    with pytest.raises(InputError, match=r"counts_test.npz is no run; .*robustness run=\.\.\."):
-        under(open_counts(str(runs / "k0" / "counts_test.npz")), "noise", "8")
-    (place / "test" / "noise-8.npz").write_bytes(b"x")
-    with pytest.raises(InputError, match=r"noise-8.npz' is not a readable file of counts"):
-        trainings("k0", runs)
-    (place / "test" / "noise-8.json").write_text("{}")
-    with pytest.raises(InputError, match=r"noise-8.json was not written by rgbt robustness"):
-        trainings("k0", runs)
-    (place / "test" / "noise-8.json").write_text("{")
-    with pytest.raises(InputError, match=r"noise-8.json is damaged"):
-        trainings("k0", runs)
-    (place / "test" / "noise-8.json").write_text(json.dumps({"format": FORMAT}))
-    with pytest.raises(
-        InputError, match=r"noise-8.json does not describe what was measured \('row'\)"
-    ):
-        trainings("k0", runs)
-    (place / "test" / "noise-8.json").unlink()
-    (place / "test" / "clean.json").unlink()
-    with pytest.raises(InputError, match=r"contains no counts of clean images"):
-        trainings("k0", runs)
-    place.rename(place.with_name("gone"))
-    with pytest.raises(InputError, match=r"robustness/test is not there; rgbt robustness run="):
-        trainings("k0", runs)
-
-
-def test_compare_takes_corrupted_images(call: Call, runs: Path) -> None:
-    where = (f"runs_dir={runs}", "metrics=mIoU", "resamples=100", "blocks=none")
-    code, out, err = call(entry, "a=k2", "b=k0", "corruption=noise", "severity=16", *where)
-    assert code == 0, err
-    # 40 against 35 on noisy images (80 against 75 on clean ones).
-    assert "crm (noise 16) minus none (noise 16)" in out
-    assert "35.00" in out
-    assert "40.00" in out
-    code, out, err = call(entry, "a=k2", "b=k0", "corruption=rgb_removed", *where)
-    assert code == 0, err
-    assert "15.00" in out
+def test_damaged_measurement_is_reported(runs: Path, name: str, content: str, word: str) -> None:
+    place = runs / "k0" / "evaluations" / "robustness" / "test"
+    (place / name).write_text(content) if content else (place / name).unlink()
+    with pytest.raises(InputError, match=word):
+        levels_of(place)

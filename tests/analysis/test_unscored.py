@@ -10,21 +10,16 @@ import numpy as np
 import pytest
 
 from analysis.compare import absent_classes, entry
-from analysis.figures import classes, consistency, inputs, maps, panels, profiles, trends
-from analysis.predictions.maps import PixelMaps, iou_map
-from analysis.predictions.table import ScoreKey, score_table
-from analysis.predictions.text import convention_line, region_grid, tidy_csv
-from analysis.report.runs import open_run
+from analysis.figures import inputs, panels, scores, spatialseg
+from analysis.predictions.maps import PixelMaps
+from analysis.score import conventions, score_tables
+from analysis.score import scores as scores_of
 from analysis.uncertainty import Resampling, compare, estimate
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
-from rgbt.runs.folder import counts_name
 from tests.analysis import counts as makes
 from tests.analysis.figures.drawn import statistics, strips
-from tests.analysis.report.stores import counts_of as stored_counts
-from tests.analysis.report.stores import files_of, write_run
-from tests.analysis.report.test_collect_parts import stored
 
 CLASSES = ("road", "car", "person", "void")
 LEFT = [[6, 1, 0, 1], [1, 3, 0, 0], [0, 0, 0, 0], [2, 0, 0, 5]]
@@ -106,13 +101,13 @@ def test_means_over_different_classes_are_refused(tmp_path: Path) -> None:
         lambda: compare([counts], [other], ["mIoU"], FEW),
         lambda: estimate([counts, other], ["class/car"], FEW),
         lambda: inputs.check_same_images({"a": [counts], "b": [other]}),
-        lambda: profiles.means_only("a", [counts, other], "released"),
+        lambda: scores.region_means({"a": [counts, other]}, "released"),
     ):
         with pytest.raises(InputError, match=REFUSED):
             call()
     pairs = [replace(each, partition="aligned1") for each in (pairs_of(), pairs_of())]
     with pytest.raises(InputError, match=REFUSED):
-        consistency.class_consistency(
+        scores.class_consistency(
             {"a": [pairs[0]], "b": [replace(pairs[1], unscored=())]}, "released"
         )
     counts.save(tmp_path / "a.npz")
@@ -125,32 +120,30 @@ def test_means_over_different_classes_are_refused(tmp_path: Path) -> None:
 
 
 def test_score_table_by_hand() -> None:
-    table = score_table(counts_of(), "ours")
-    assert table.scores[ScoreKey()].value == pytest.approx(MEAN)
-    assert table.scores[ScoreKey(region=1)].value == pytest.approx(LEFT_MEAN)
-    assert table.scores[ScoreKey(region=2)].value == pytest.approx(RIGHT_MEAN)
+    counts = counts_of()
+    frame = scores_of("ours", counts)
+    cells = frame.set_index(["subset", "region", "class", "metric", "absent"])["value"]["all"]
+    assert cells[0, "", "mIoU", "released"] == pytest.approx(MEAN)
+    assert cells[1, "", "mIoU", "released"] == pytest.approx(LEFT_MEAN)
+    assert cells[2, "", "mIoU", "released"] == pytest.approx(RIGHT_MEAN)
     acc = 100 * (10 / 12 + 3 / 6 + 2 / 2) / 3
-    assert table.scores[ScoreKey(metric="Acc")].value == pytest.approx(acc)
+    assert cells[0, "", "mAcc", "released"] == pytest.approx(acc)
     spread = ((LEFT_MEAN - RIGHT_MEAN) / 2) ** 2
-    assert table.scores[ScoreKey(metric="Var")].value == pytest.approx(spread)
-    left = ScoreKey(region=1, absent="exclude")
-    assert table.scores[left].value == pytest.approx(1.5 * LEFT_MEAN)
-    assert table.scores[replace(left, class_name="void")].value == pytest.approx(100 * 5 / 8)
-    labels = [row[0] for row in region_grid(table).rows]
-    assert labels[-2:] == ["person", "void (not in means)"]
-    assert table.absent_classes() == ("person",)
-    assert ",void,IoU," in tidy_csv([table])  # data keep their names
+    assert cells[0, "", "Var", "released"] == pytest.approx(spread)
+    assert cells[1, "", "mIoU", "exclude"] == pytest.approx(1.5 * LEFT_MEAN)
+    assert cells[1, "void", "IoU", "exclude"] == pytest.approx(100 * 5 / 8)
+    table, *_, parts = score_tables(frame, counts)
+    assert [row[0] for row in table.rows][-2:] == ["person", "void (not in means)"]
+    assert parts.notes[0].startswith("Without a pixel to count in some region or part: person.")
 
 
 def test_an_unscored_class_without_pixels_changes_no_mean() -> None:
     gone = [[[5, 1, 1, 0], [0, 3, 0, 0], [1, 0, 2, 0], [0, 0, 0, 0]]] * 2
-    table = score_table(counts_of([gone]), "ours")
-    assert table.conventions() == ("released",)
-    assert table.absent_classes() == ()
-    assert "every class of the means has pixels in every region" in convention_line(table)
-    everything = score_table(counts_of([gone], unscored=()), "ours")
-    assert everything.conventions() == ("released", "exclude")
-    assert everything.absent_classes() == ("void",)
+    scored, everything = counts_of([gone]), counts_of([gone], unscored=())
+    assert conventions(scores_of("ours", scored), scored) == ["released"]
+    assert conventions(scores_of("ours", everything), everything) == ["released", "exclude"]
+    *_, parts = score_tables(scores_of("ours", scored), scored)
+    assert "part: no class. released counts" in parts.notes[0]
 
 
 # Figures.
@@ -167,15 +160,16 @@ def pairs_of() -> Counts:
 def test_figures_over_regions() -> None:
     counts = counts_of()
     expected = pytest.approx([LEFT_MEAN, RIGHT_MEAN])
-    shown = profiles.means_only("ours", [counts, counts], "released")
-    assert (shown.means, shown.miou) == (expected, pytest.approx(MEAN))
-    drawn = trends.trend("vertical", np.ones(2), {"ours": counts}, "released")
-    assert drawn.ious["ours"] == expected
+    shown = scores.region_means({"ours": [counts, counts]}, "released")
+    assert (shown["value"].tolist(), shown["mIoU"][0]) == (expected, pytest.approx(MEAN))
+    drawn = spatialseg.trend("vertical", np.ones(2), {"ours": counts}, "released")
+    drawn = drawn.set_index("kind")["score"]
+    assert drawn["IoU"].tolist() == expected
     left, right = (6 / 8 + 3 / 4) / 3, (1 + 0 + 1) / 3
-    assert drawn.accuracies["ours"] == pytest.approx([100 * left, 100 * right])
-    labels = np.zeros((1, 6, 8), np.uint8)
-    stats = statistics(labels, strips(2, "vertical"), None)
-    assert classes.class_regions(stats, "all", ("ours", counts)).miou == expected
+    assert drawn["Acc"].tolist() == pytest.approx([100 * left, 100 * right])
+    stats = statistics(np.zeros((1, 6, 8), np.uint8), strips(2, "vertical"), None)
+    classes = spatialseg.class_regions(stats, "all", ("ours", counts))
+    assert classes["value"][-2:].tolist() == expected
     # One image alone: over the classes that occur in it.
     assert panels.image_mious(counts) == {"00000D": pytest.approx(MEAN)}
     empty = counts_of([[LEFT, np.zeros((4, 4), int).tolist()]])
@@ -196,38 +190,20 @@ def test_pixel_maps_exclude_the_class(tmp_path: Path) -> None:
         unscored=("void",),
         **about,
     )
-    assert iou_map(made)[[0, 5], 0].tolist() == pytest.approx([(1 / 4 + 1 / 2) / 2, 1 / 4])
-    assert maps.iou_heat(made, strips(2, "ring")).whole == pytest.approx((1 / 4 + 1 / 2 + 0) / 3)
+    assert made.iou()[[0, 5], 0].tolist() == pytest.approx([(1 / 4 + 1 / 2) / 2, 1 / 4])
+    whole = spatialseg.iou_heat(made, strips(2, "ring")).image
+    assert whole == pytest.approx(100 * (1 / 4 + 1 / 2 + 0) / 3)
     made.save(tmp_path / "maps.npz")
     assert PixelMaps.load(tmp_path / "maps.npz").unscored == ("void",)
-    with pytest.raises(ValueError, match="some, but not all, of the classes"):
+    with pytest.raises(ValueError, match="expected some, not all, of"):
         replace(made, unscored=("sky",))
 
 
-# The report.
-
-
-def test_report_shows_means_of_the_scored_classes(tmp_path: Path) -> None:
-    run = write_run(tmp_path, "aa0", "grbm", 0)
-    counts = replace(stored_counts(0), unscored=("car",))
-    counts.save(run.path / counts_name("test"))
-    entry = open_run(stored(files_of(run.path)), []).entry
-    (road, over), (miss, _) = counts.counts.sum((0, 1)).tolist()
-    expected = 100 * road / (road + over + miss)
-    assert entry.scores["mIoU"] == entry.scores["class/road"] == pytest.approx(expected)
-    assert entry.region_ious == entry.class_region_ious[0]
-    assert (entry.classes, entry.unscored) == (("road", "car"), ("car",))
-
-
-def test_report_and_comparison_name_absent_classes(tmp_path: Path) -> None:
-    """By the convention of the counts: the stored configuration of this run has none."""
-    run = write_run(tmp_path, "aa0", "grbm", 0)
-    array = stored_counts(0).counts.copy()
+def test_comparison_names_absent_classes() -> None:
+    """By the convention of the counts."""
+    array = random_counts(1).counts[..., :2, :2].copy()
     array[:, :, 1] = array[..., 1] = 0
-    counts = replace(stored_counts(0), counts=array, absent="exclude")
-    counts.save(run.path / counts_name("test"))
-    entry = open_run(stored(files_of(run.path)), []).entry
-    assert entry.notes[0].startswith("absent from the test split: car (")
+    counts = counts_of(array.tolist(), classes=("road", "car"), unscored=(), absent="exclude")
     assert absent_classes([counts, counts], None) == (
         "absent from the test split: car (left out of the mean)",
     )

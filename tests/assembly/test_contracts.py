@@ -19,7 +19,7 @@ from rgbt.maskers.masker import check_masker
 from rgbt.requirements import Record, record_of
 from rgbt.types import MaskPair, Output, Sample
 from tests.conftest import WriteMFNet
-from tests.data.folder_files import refused
+from tests.data.layouts import refused
 
 HW = (4, 6)
 SAMPLE = Sample(np.zeros((*HW, 3), np.uint8), np.zeros(HW, np.uint8), np.zeros(HW, np.uint8), "a")

@@ -15,7 +15,8 @@ from rgbt.assembly.session import names_key
 def session(name: str | None = "rig", **splits: tuple[str, ...]) -> SimpleNamespace:
     return SimpleNamespace(
         domains=SimpleNamespace(named={"source": SimpleNamespace(split="train")}),
-        dataset=SimpleNamespace(names=splits.__getitem__, name="rig", root=Path("/data/rig")),
+        dataset=SimpleNamespace(name="rig", root=Path("/data/rig")),
+        names=splits,
         spec=SimpleNamespace(dataset=SimpleNamespace(plain={"name": name})),
     )
 

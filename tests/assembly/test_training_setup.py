@@ -18,7 +18,7 @@ from rgbt.checks import InputError
 from rgbt.config.compose import compose
 from rgbt.data import rare_classes
 from rgbt.data.pseudo_labels import FORMAT
-from rgbt.engine.network_settings import Recomputed
+from rgbt.engine.device import Recomputed
 from rgbt.run import main
 from rgbt.runs.run_spec import RunSpec
 from rgbt.runs.specify import specify

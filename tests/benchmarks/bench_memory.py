@@ -36,7 +36,7 @@ from torch.utils._pytree import tree_leaves
 
 from rgbt.config.component import build
 from rgbt.config.compose import compose
-from rgbt.engine.network_settings import recompute_activations
+from rgbt.engine.device import recompute_activations
 from rgbt.geometry.padding import padded_hw
 from rgbt.losses import set_criterion
 from rgbt.schemes.crm import CRM

@@ -26,8 +26,9 @@ from tests.analysis.uncertainty.simulated_claims import (
     Rates,
     any_wrong,
     ever_missed,
+    halves,
     rates,
-    seeds_until_shown,
+    running,
     until_decided,
     with_seeds,
 )
@@ -68,6 +69,17 @@ def precisions(sequences: int) -> Iterator[Sequence[str]]:
             for effect in (1.0, 2.0, 3.0, 5.0)
         )
         yield f"{precision:g}", *(f"{each:.1f}" for each in needed)
+
+
+def seeds_until_shown(sequences: int, effect: float, alpha: float, precision: float) -> float:
+    """Mean number of seeds until the interval over seeds is above 0; 200 where it never is."""
+    rng, longest = np.random.default_rng([10, round(10 * effect)]), 200
+    factors, needed = halves(longest, alpha, precision), []
+    for _ in range(sequences):
+        means, sds = running(rng, longest)
+        shown = means + effect > sds * factors
+        needed.append(int(shown.argmax()) + 2 if shown.any() else longest)
+    return float(np.mean(needed))
 
 
 def counted(tables: int) -> Iterator[Sequence[str]]:

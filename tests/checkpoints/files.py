@@ -6,7 +6,6 @@ Such a tensor takes one number on disk, whatever its shape, and still tells wher
 from __future__ import annotations
 
 import copy
-import json
 import zlib
 from collections import OrderedDict
 from collections.abc import Mapping
@@ -18,10 +17,12 @@ from torch import Tensor, nn
 
 from tests.models import golden
 
+SWIN = {"embed_dim": 32, "depths": [1, 1, 2, 1], "num_heads": [1, 2, 4, 8], "window_size": 5}
+MIT = {"embed_dims": [16, 32, 64, 96], "depths": [1, 1, 1, 1], "num_heads": [1, 2, 4, 6]}
+"""Sizes of networks that the files of `tests.checkpoints.imagenet` fill."""
+
 PROTOTYPES: dict[str, nn.Module] = {}
 """Networks that were requested before; composing a configuration takes longer than copying."""
-
-DTYPES = {"float32": torch.float32, "int64": torch.int64}
 
 
 def network(yaml: str, num_classes: int = 9, **changed: Any) -> nn.Module:
@@ -52,14 +53,6 @@ def like(state: Mapping[str, Tensor], prefix: str = "") -> OrderedDict[str, Tens
     return OrderedDict(
         (prefix + key, tensor(prefix + key, value.shape, value.dtype))
         for key, value in state.items()
-    )
-
-
-def released(name: str) -> OrderedDict[str, Tensor]:
-    """The tensors of a released network by their released names, from the reference material."""
-    keys = json.loads((golden.FOLDER / f"{name}.json").read_text())["keys"]
-    return OrderedDict(
-        (key, tensor(key, shape, DTYPES[dtype])) for key, (shape, dtype, _, _) in keys.items()
     )
 
 

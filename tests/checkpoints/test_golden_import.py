@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 import torch
 
+from rgbt.checkpoints.files import read
 from rgbt.checkpoints.load import load_weights, plan_for
-from rgbt.checkpoints.read import read
 from rgbt.config.component import build
 from tests.models import golden
 
@@ -47,7 +47,14 @@ def test_scores_of_a_released_file(name: str, kind: str, tmp_path: Path) -> None
     record, (yaml, unused) = golden.load(name), NETWORKS[name]
     words = [f"model={yaml}", f"model.num_classes={13 if yaml == 'heatnet' else 9}"]
     path = tmp_path / "file.pth"
-    torch.save({"state_dict": released(record)}, path)
+    # Every tensor is filled by the rule, or zeros where the rule leaves it alone.
+    tensors = {
+        key: torch.from_numpy(record.fill.fill(key, shape))
+        if filled
+        else torch.zeros(shape, dtype=getattr(torch, dtype))
+        for key, (shape, dtype, filled, _) in record.facts["keys"].items()
+    }
+    torch.save({"state_dict": tensors}, path)
     with torch.device("meta"):
         on_paper = build(golden.compose(*words).model)
     convention = plan_for(on_paper, read(path)).convention
@@ -60,13 +67,3 @@ def test_scores_of_a_released_file(name: str, kind: str, tmp_path: Path) -> None
     scores = SCORES.get(kind, "logits")
     found = logits[0] if scores == "sem_seg" else logits
     assert golden.deviation(record, scores, found) <= 1
-
-
-def released(record: golden.Golden) -> dict[str, torch.Tensor]:
-    """Every tensor of the release: filled by the rule, or zeros where the rule leaves it alone."""
-    return {
-        key: torch.from_numpy(record.fill.fill(key, shape))
-        if filled
-        else torch.zeros(shape, dtype=getattr(torch, dtype))
-        for key, (shape, dtype, filled, _) in record.facts["keys"].items()
-    }

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import random
 import shutil
 import struct
 import zipfile
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, replace
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import pytest
+import safetensors.torch
 import torch
 
 from rgbt import evaluate
-from rgbt.checkpoints.read import read
-from rgbt.checkpoints.torch_files import save
+from rgbt.checkpoints.files import read, save
 from rgbt.checks import InputError, RunError
 from rgbt.engine.checkpoint import (
     Checkpoints,
@@ -30,7 +32,6 @@ from rgbt.engine.checkpoint import (
 )
 from rgbt.metrics.counts import Counts
 from rgbt.runs.result import RunResult
-from tests.checkpoints.test_read import Calls
 from tests.commands import Call, Trained, short
 from tests.damage import damaged
 
@@ -80,28 +81,18 @@ def test_what_is_saved_is_loaded_by_us_and_by_torch(tmp_path: Path) -> None:
 
 
 def variants(content: bytes, number: int) -> Iterator[bytes]:
-    """Damaged bytes, headers, entries with exchanged names or contents, other comments."""
+    """Damaged bytes, entries with exchanged contents, other comments."""
     draw = random.Random(17)
     with zipfile.ZipFile(BytesIO(content)) as archive:
         entries = {each.filename: archive.read(each) for each in archive.infolist()}
         comment = archive.comment
-    tensors = [name for name in entries if "/data/" in name]
-    sizes = [len(entries[name]) for name in tensors]
-    alike = [name for name in tensors if sizes.count(len(entries[name])) > 1]
-    table, end = content.index(b"PK\x01\x02"), content.rindex(b"PK\x05\x06")
+    sizes = Counter(len(value) for name, value in entries.items() if "/data/" in name)
+    alike = [name for name in entries if "/data/" in name and sizes[len(entries[name])] > 1]
+    end = content.rindex(b"PK\x05\x06")
     yield from (each for _, each in damaged(content, number))
     for _ in range(number // 4):
-        mark = draw.choice([b"PK\x03\x04", b"PK\x01\x02", b"PK\x05\x06"])
-        places = [n for n in range(len(content)) if content.startswith(mark, n)]
-        header = bytearray(content)
-        header[(draw.choice(places) + draw.randrange(46)) % len(header)] = draw.randrange(256)
-        yield bytes(header)
         one = draw.choice(alike)
         other = draw.choice([n for n in alike if len(entries[n]) == len(entries[one]) and n != one])
-        if len(one) == len(other):  # two entries that have changed their names, checksums and all
-            names = content[table:].replace(one.encode(), b"?" * len(one), 1)
-            names = names.replace(other.encode(), one.encode(), 1)
-            yield content[:table] + names.replace(b"?" * len(one), other.encode(), 1)
         exchanged, made = {**entries, one: entries[other], other: entries[one]}, BytesIO()
         with zipfile.ZipFile(made, "w") as archive:  # every checksum fits
             for name, value in exchanged.items():
@@ -113,9 +104,8 @@ def variants(content: bytes, number: int) -> Iterator[bytes]:
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("number", [72, pytest.param(720, marks=pytest.mark.slow)])
-def test_a_damaged_file_is_refused_or_whole(tmp_path: Path, number: int) -> None:
-    path, whole = tmp_path / "last.pt", payload()
+def test_a_damaged_file_is_refused_or_whole(tmp_path: Path) -> None:
+    path, whole, number = tmp_path / "last.pt", payload(), 120
     save(path, whole)
     tried = refused = 0
     for content in variants(path.read_bytes(), number):
@@ -125,7 +115,7 @@ def test_a_damaged_file_is_refused_or_whole(tmp_path: Path, number: int) -> None
             assert same(load_checkpoint(tmp_path / "copy.pt"), whole)
         except InputError:
             refused += 1
-    assert tried >= 1.7 * number
+    assert tried == 1.5 * number
     assert refused > 0.8 * tried
 
 
@@ -145,23 +135,19 @@ def test_files_without_a_digest_are_held_against_their_checksums(tmp_path: Path)
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("kind", ["legacy", "safetensors"])
-def test_damaged_files_of_others_raise_one_kind_of_error(tmp_path: Path, kind: str) -> None:
-    from safetensors.torch import save_file
-
+def test_damaged_files_of_others_raise_one_kind_of_error(tmp_path: Path) -> None:
     tensors = {"a": torch.arange(6.0).reshape(2, 3), "b": torch.tensor([1, 2])}
-    path, refused = tmp_path / "file", 0
-    if kind == "legacy":
-        torch.save({"model": tensors}, path, _use_new_zipfile_serialization=False)
-    else:
-        save_file(tensors, path)
-    for _, content in damaged(path.read_bytes(), 200):
-        path.write_bytes(content)
-        try:
-            assert all(tensor.sum() is not None for tensor in read(path).tensors.values())
-        except InputError:
-            refused += 1
-    assert 10 < refused < 200
+    path = tmp_path / "file"
+    torch.save({"model": tensors}, path, _use_new_zipfile_serialization=False)
+    for whole in (path.read_bytes(), safetensors.torch.save(tensors)):
+        refused = 0
+        for _, content in damaged(whole, 100):
+            path.write_bytes(content)
+            try:
+                assert all(tensor.sum() is not None for tensor in read(path).tensors.values())
+            except InputError:
+                refused += 1
+        assert 5 < refused < 100
 
 
 def test_a_tensor_of_another_shape_or_type_than_its_place_is_refused(tmp_path: Path) -> None:
@@ -170,82 +156,6 @@ def test_a_tensor_of_another_shape_or_type_than_its_place_is_refused(tmp_path: P
     for wrong in (weights[name].double(), weights[name].mT[:, :3], weights[name].to_sparse(), "x"):
         with pytest.raises(InputError, match=f"{name} is .* instead of 8x4x3x3 float32"):
             restore_weights(model, {**weights, name: wrong}, tmp_path / "best.pt")
-
-
-WRONG: list[Any] = [
-    *(None, True, -1, 1.5, "x", b"x", [], [1], {}, {"a": 1}, ("a", "b"), torch.zeros(7)),
-    *(torch.zeros(8, 4, 3, 3, dtype=torch.int64), torch.zeros(8, 4, 3, 3).double()),
-    *(torch.eye(3).to_sparse(), torch.zeros(8, 4, 3, 3, device="meta"), torch.tensor("a" == "b")),
-]
-
-
-def places(node: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
-    """The path of every value inside dictionaries and lists."""
-    if path:
-        yield path
-    for key in (
-        node if isinstance(node, dict) else range(len(node) if isinstance(node, list) else 0)
-    ):
-        yield from places(node[key], (*path, key))
-
-
-@pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("every", [40, pytest.param(3, marks=pytest.mark.slow)])
-def test_values_of_other_types_and_shapes_are_refused_or_trained_with(
-    tmp_path: Path, every: int
-) -> None:
-    """Every value in a checkpoint, replaced by others, removed or doubled; then a step is made."""
-    path, refused, tried = tmp_path / "last.pt", 0, 0
-    base = payload()
-    for index, place in enumerate(places(base)):
-        for number, wrong in enumerate([*WRONG, "removed"]):
-            if (index * len(WRONG) + number) % every:
-                continue
-            content = payload_with(base, place, wrong)
-            save(path, content)
-            model, optimizer = trained()
-            tried += 1
-            try:
-                loaded = load_checkpoint(path)
-                State.of(loaded)
-                restore_weights(model, loaded["model"], path)
-                if loaded.get("optimizers", {}).keys() == {"main"}:
-                    restore_optimizer(optimizer, loaded["optimizers"]["main"], path)
-            except (InputError, TypeError, ValueError):
-                refused += 1
-                continue
-            step(model, optimizer)
-    assert refused > tried / 2
-
-
-def payload_with(base: dict[str, Any], place: tuple[Any, ...], wrong: Any) -> dict[str, Any]:
-    """A copy in which one value is another one."""
-
-    def copied(node: Any) -> Any:
-        if isinstance(node, dict):
-            return {key: copied(each) for key, each in node.items()}
-        return [copied(each) for each in node] if isinstance(node, list) else node
-
-    changed = copied(base)
-    parent = changed
-    for key in place[:-1]:
-        parent = parent[key]
-    if isinstance(wrong, str) and wrong == "removed":
-        del parent[place[-1]]
-    else:
-        parent[place[-1]] = wrong
-    return changed  # type: ignore[no-any-return]
-
-
-def test_nothing_in_a_checkpoint_runs(tmp_path: Path) -> None:
-    marker = tmp_path / "marker"
-    content = payload() | {"step": Calls(os.system, f"touch {marker}")}
-    save(tmp_path / "last.pt", content)  # a digest says that a file is whole, not that it is ours
-    with pytest.raises(InputError, match=r"posix\.system"):
-        load_checkpoint(tmp_path / "last.pt")
-    with pytest.raises(RunError, match=r"posix\.system.*remove .* and rerun"):
-        Checkpoints(tmp_path).load()
-    assert not marker.exists()
 
 
 def test_checkpoints_and_counts_of_another_run_are_refused(
@@ -271,7 +181,6 @@ def test_checkpoints_and_counts_of_another_run_are_refused(
     shutil.copy(other / "counts_test.npz", folder)
     with pytest.raises(InputError, match=f"counts of the run {other.name}"):
         RunResult(folder).counts()
-    # A state of another run is not resumed.
     state = State(seed=3, step=7, best_step=7, key="a", settings="b")
     run = Checkpoints(tmp_path / "a")
     run.commit(payload() | {"state": asdict(state)}, state)
@@ -297,54 +206,39 @@ def test_a_file_that_cannot_be_written_leaves_the_old_one(
     assert [each.name for each in tmp_path.iterdir()] == ["last.pt"]
 
 
-def moment(stored: dict[str, Any]) -> None:
-    stored["state"][0]["exp_avg"] = torch.zeros(7)
+def exchanged(node: dict[str, Any], key: Any, value: Any = None) -> None:
+    """Another value for an entry; None: it is removed."""
+    del node[key]
+    if value is not None:
+        node[key] = value
 
 
-def whole_numbers(stored: dict[str, Any]) -> None:
-    stored["state"][0]["exp_avg"] = torch.zeros_like(
-        stored["state"][0]["exp_avg"], dtype=torch.int64
-    )
+OTHER_STATES: dict[str, Callable[[dict[str, Any]], Any]] = {
+    "exp_avg of parameter 0": lambda s: exchanged(s["state"][0], "exp_avg", torch.zeros(7)),
+    "exp_avg of parameter 1": lambda s: exchanged(s["state"][1], "exp_avg", torch.zeros(8).long()),
+    "differ in kind": lambda s: exchanged(s["state"][0], "exp_avg_sq"),
+    "betas is 0.9": lambda s: exchanged(s["param_groups"][0], "betas", "0.9"),
+    "argument 2 is": lambda s: exchanged(s, "param_groups", 2 * s["param_groups"]),
+    "99": lambda s: s["state"].update({99: s["state"][0]}),
+}
 
 
-def betas(stored: dict[str, Any]) -> None:
-    stored["param_groups"][0]["betas"] = "0.9"
+@pytest.mark.parametrize("said", OTHER_STATES)
+def test_optimizer_state_of_other_shape_or_type_is_refused(said: str) -> None:
+    """A moment of another shape would end the next step by SIGSEGV."""
+    stored = copy.deepcopy(payload()["optimizers"]["main"])
+    restore_optimizer(trained()[1], stored, Path("last.pt"))
+    OTHER_STATES[said](stored)
+    with pytest.raises(InputError, match=rf"last\.pt holds the state of a different .*{said}"):
+        restore_optimizer(trained()[1], stored, Path("last.pt"))
 
 
-def groups(stored: dict[str, Any]) -> None:
-    stored["param_groups"] *= 2
-
-
-def another_parameter(stored: dict[str, Any]) -> None:
-    stored["state"][99] = stored["state"][0]
-
-
-@pytest.mark.parametrize("change", [moment, whole_numbers, betas, groups, another_parameter])
-def test_optimizer_state_of_other_shape_or_type_is_refused(change: Any) -> None:
-    parameter = torch.nn.Parameter(torch.zeros(2, 3))
-    optimizer = torch.optim.AdamW([parameter], lr=0.1)
-    parameter.grad = torch.ones(2, 3)
-    optimizer.step()
-    stored = optimizer.state_dict()
-    restore_optimizer(optimizer, stored, Path("last.pt"))
-    change(stored)
-    with pytest.raises(InputError, match=r"last\.pt holds the state of a different optimizer"):
-        restore_optimizer(optimizer, stored, Path("last.pt"))
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        *({"step": -1}, {"step": 1.5}, {"seed": "3"}, {"best_score": None}, {"skipped": "a"}),
-        *(
-            {"skipped": [3]},
-            {"unlogged": [1.0]},
-            {"unlogged": {"loss": "1"}},
-        ),
-    ],
-)
-def test_state_of_other_types_is_refused(wrong: dict[str, Any]) -> None:
+def test_state_of_other_types_is_refused() -> None:
     stored = payload()
     assert State.of(stored).unlogged == {}
-    with pytest.raises(TypeError):
-        State.of({"state": stored["state"] | wrong})
+    for wrong in (
+        *({"step": -1}, {"step": 1.5}, {"seed": "3"}, {"best_score": None}, {"skipped": "a"}),
+        *({"skipped": [3]}, {"unlogged": [1.0]}, {"unlogged": {"loss": "1"}}),
+    ):
+        with pytest.raises(TypeError):
+            State.of({"state": stored["state"] | wrong})

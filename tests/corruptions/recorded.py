@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -30,24 +29,16 @@ def sample(name: str = "00001D", hw: tuple[int, int] = HW) -> Sample:
 class Recorded:
     """Stands for a data set; notes what is read."""
 
+    root, name, num_classes = Path("root"), "recorded", 9
+    classes = tuple(f"class{index}" for index in range(9))
+    palette, unscored, background = ((0, 0, 0),) * 9, (), ()
+    splits = {"test": "test.txt", "val": "val.txt"}
+
     def __init__(
         self, names: tuple[str, ...] = NAMES, *, by_night: bool = True, sizes: Any = None
     ) -> None:
-        self.root = Path("root")
-        self.name = "recorded"
-        self.num_classes = 9
-        self.classes = tuple(f"class{index}" for index in range(9))
-        self.palette = ((0, 0, 0),) * 9
-        self.unscored: tuple[str, ...] = ()
-        self.background: tuple[str, ...] = ()
-        self.listed = names
-        self.by_night = by_night
-        self.sizes = sizes or {}
+        self.listed, self.by_night, self.sizes = names, by_night, sizes or {}
         self.reads: list[str] = []
-
-    @property
-    def splits(self) -> Mapping[str, str]:
-        return {"test": "test.txt", "val": "val.txt"}
 
     def has(self, split: str) -> bool:
         return split in self.splits

@@ -1,24 +1,28 @@
-"""New images of any folder: which files are pairs, by every data set's own patterns."""
+"""New images of any folder, and predicted label images of any method."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+import yaml
+from PIL import Image
 
 from rgbt.data.freiburg import LAYOUTS as FREIBURG
-from rgbt.data.images import PairPattern, PairReader
+from rgbt.data.images import PairReader
 from rgbt.data.kp import KP
 from rgbt.data.mfnet import MFNet
 from rgbt.data.new_images import of_arrays, of_files, of_path, of_split
+from rgbt.data.patterns import Patterns
+from rgbt.data.predictions import Affixes, FormatOptions, PredictionReader, prediction_paths
 from rgbt.data.pst900 import PST900
 from rgbt.types import Sample
-from tests.conftest import WriteMFNet, write_png
-from tests.data import folder_files as own
-from tests.data.folder_files import refused
+from tests.conftest import write_png
+from tests.data.layouts import folder, refused, write_any, write_folder, write_frame
 
 HW = (6, 8)
 RGB = np.arange(6 * 8 * 3, dtype=np.uint8).reshape(*HW, 3)
@@ -26,72 +30,42 @@ GREY = np.arange(48, dtype=np.uint8).reshape(HW)
 COUNTS = (21800 + 100 * np.arange(48)).astype(np.uint16).reshape(HW)
 
 
-def write(root: Path, *names: str) -> Path:
-    """Files by what their names say: thermal of 16 or 8 bits, RGB, four channels."""
-    for name in names:
-        path = root / name
-        kind = path.parent.name.lower()
-        if "packed" in name:
-            write_png(path, np.dstack([RGB, GREY]))
-        elif kind in ("ir", "fl_ir_aligned", "imagesir"):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            cv2.imwrite(str(path), COUNTS)
-        else:
-            write_png(path, GREY if kind in ("thermal", "lwir") or "_lwir_" in name else RGB)
-    return root
-
-
 class Reading:
     """A data set that only says how its images are read."""
 
-    def __init__(self, images: PairReader) -> None:
-        self.images = images
+    def __init__(self, *layouts: Patterns, **keys: object) -> None:
+        self.images = PairReader(layouts=layouts, **keys)
 
     def pair(self, name: str) -> Sample:
         raise NotImplementedError
 
 
-@pytest.mark.parametrize("dtype", [np.uint16, np.float32])
-def test_arrays_of_camera_values_are_read_like_files(tmp_path: Path, dtype: type) -> None:
-    write(tmp_path, "fl_rgb/fl_rgb_1.png", "fl_ir_aligned/fl_ir_aligned_1.png")
-    images = PairReader(layouts=FREIBURG, crop=(1, 5, 2, 8), thermal_range=(21800, 23700))
-    files = ("fl_rgb/fl_rgb_1.png", "fl_ir_aligned/fl_ir_aligned_1.png")
-    expected = images.read("1", *(tmp_path / each for each in files))
-    sample = of_arrays(Reading(images), RGB, COUNTS.astype(dtype))
+def test_arrays_of_camera_values_are_read_like_files(tmp_path: Path) -> None:
+    rgb, thermal = tmp_path / "1.png", tmp_path / "1_ir.png"
+    write_png(rgb, RGB)
+    cv2.imwrite(str(thermal), COUNTS)
+    dataset = Reading(*FREIBURG, crop=(1, 5, 2, 8), thermal_range=(21800, 23700))
+    expected = dataset.images.read("1", rgb, thermal)
+    sample = of_arrays(dataset, RGB, COUNTS)
     assert np.array_equal(sample.rgb, expected.rgb)
     assert np.array_equal(sample.thermal, expected.thermal)
-    seen = of_arrays(Reading(images), sample.rgb, sample.thermal)
+    seen = of_arrays(dataset, sample.rgb, sample.thermal)
     assert np.array_equal(seen.thermal, expected.thermal), "grey levels are neither cut nor scaled"
 
 
 def test_arrays_of_unclear_or_wrong_values_are_refused() -> None:
-    low = Reading(PairReader(layouts=FREIBURG, thermal_range=(0, 200)))
-    assert "8 bits may be grey levels or values of dataset.thermal_range=[0, 200]" in refused(
-        lambda: of_arrays(low, RGB, GREY)
-    )
-    counts = Reading(PairReader(layouts=FREIBURG, counts=True, thermal_range=(21800, 23700)))
-    assert "expected a thermal image of 16 bits" in refused(
-        lambda: of_arrays(counts, RGB, COUNTS.astype(np.float32))
-    )
-    assert "does not declare how to read new images" in refused(
-        lambda: of_arrays(SimpleNamespace(splits=("test",)), RGB, COUNTS)
-    )
+    low = Reading(*FREIBURG, thermal_range=(0, 200))
+    said = refused(lambda: of_arrays(low, RGB, GREY))
+    assert "8 bits may be grey levels or values of dataset.thermal_range=[0, 200]" in said
+    assert "expected rgb uint8 of shape" in refused(lambda: of_arrays(low, RGB, COUNTS[:3]))
+    said = refused(lambda: of_arrays(SimpleNamespace(splits=("test",)), RGB, COUNTS))
+    assert "does not declare how to read new images" in said
 
 
-def test_an_unlabelled_split_needs_nothing_else(tmp_path: Path) -> None:
-    for name in "12":
-        own.write_frame(tmp_path, "sea", name)
-    for path in (tmp_path / "sea" / "mask").iterdir():
-        path.unlink()
-    changes = {"folders": {"new": "sea"}, "unlabelled": ("new",), "night": "*night*"}
-    dataset = own.folder(tmp_path, **changes)
-    assert dataset.read("sea_1").label is None
-    assert "dataset.label: " in refused(lambda: own.folder(tmp_path, folders={"new": "sea"}))
-
-
-MINE = (PairPattern("{sequence}/rgb/{name}.jpg", "{sequence}/ir/{name}_ir.tif"),)
+MINE = (Patterns.of("{sequence}/rgb/{name}.jpg", "{sequence}/ir/{name}_ir.tif"),)
 DAY = ("test/day/ImagesRGB/1_20_rgb.png", "test/day/ImagesIR/1_2_ir.png")
 NIGHT = ("test/night/ImagesRGB/3_40_rgb.png", "test/night/ImagesIR/3_40_ir.png")
+KAIST = tuple(f"images/set00/V000/{kind}/I1.jpg" for kind in ("visible", "lwir"))
 
 
 @pytest.mark.parametrize(
@@ -103,15 +77,7 @@ NIGHT = ("test/night/ImagesRGB/3_40_rgb.png", "test/night/ImagesIR/3_40_ir.png")
         (MINE, {"1_packed": ("1_packed.png", "1_packed.png")}),
         (MFNet.images.layouts, {"packed": ("images/packed.png", "images/packed.png")}),
         (MFNet.images.layouts, {"1": ("RGB/1.png", "Thermal/1.png")}),
-        (
-            KP.images.layouts,
-            {
-                "set00_V000_I1": (
-                    "images/set00/V000/visible/I1.jpg",
-                    "images/set00/V000/lwir/I1.jpg",
-                )
-            },
-        ),
+        (KP.images.layouts, {"set00_V000_I1": KAIST}),
         (PST900.images.layouts, {"new_a": ("new/rgb/a.png", "new/thermal/a.png")}),
         (FREIBURG, {"test_night_3_40": NIGHT}),
         (FREIBURG[2:], {"test_day_1_2": DAY}),
@@ -119,11 +85,13 @@ NIGHT = ("test/night/ImagesRGB/3_40_rgb.png", "test/night/ImagesIR/3_40_ir.png")
 )
 def test_folder_is_read_by_patterns_of_data_set(
     tmp_path: Path,
-    layouts: tuple[PairPattern, ...],
+    layouts: tuple[Patterns, ...],
     expected: dict[str, tuple[str, str]],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    write(tmp_path, *(name for pair in expected.values() for name in pair))
+    for name in (name for pair in expected.values() for name in pair):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
     read: dict[str, tuple[str, ...]] = {}
 
     def noted(self: PairReader, name: str, *paths: Path) -> Sample:
@@ -131,24 +99,18 @@ def test_folder_is_read_by_patterns_of_data_set(
         return Sample(RGB, GREY, None, name)
 
     monkeypatch.setattr(PairReader, "read", noted)
-    chosen = of_path(Reading(PairReader(layouts=layouts)), str(tmp_path), "raise")
+    chosen = of_path(Reading(*layouts), str(tmp_path), "raise")
     assert [sample.name for sample in chosen.samples("raise")] == sorted(expected, key=len)
     assert read == expected
 
 
-def test_thermal_images_are_not_rgb(tmp_path: Path) -> None:
-    flat = Reading(PairReader(layouts=(PairPattern("{name}.png", "{name}_ir.png"),)))
-    write(tmp_path, *(f"{name}.png" for name in ("10", "9", "7", "9_ir", "10_ir", "7_ir")))
-    assert of_path(flat, str(tmp_path), "raise").names == ("7", "9", "10")
-
-
 def test_new_images_are_read_like_training_images(tmp_path: Path) -> None:
-    dataset = own.folder(own.write_folder(tmp_path / "known"))
+    dataset = folder(write_folder(tmp_path / "known"))
     new = tmp_path / "new"
-    own.write_frame(new, "sea", "1")
+    write_frame(new, "sea", "1")
     (sample,) = of_path(dataset, str(new), "raise").samples("raise")
-    own.write_frame(tmp_path / "known", "sea", "1")
-    expected = own.folder(tmp_path / "known").read("sea_1")
+    write_frame(tmp_path / "known", "sea", "1")
+    expected = folder(tmp_path / "known").read("sea_1")
     files = (new / "sea/rgb/1.png", new / "sea/ir/1_ir.tif")
     (alone,) = of_files(dataset, *files).samples("raise")
     for each in (sample, alone):
@@ -159,42 +121,126 @@ def test_new_images_are_read_like_training_images(tmp_path: Path) -> None:
 
 
 def test_bad_new_images_raise_or_are_skipped(tmp_path: Path) -> None:
-    dataset = own.folder(own.write_folder(tmp_path / "known"))
-    new = tmp_path / "new"
+    dataset, new = folder(write_folder(tmp_path / "known")), tmp_path / "new"
     for name in "123":
-        own.write_frame(new, "sea", name)
+        write_frame(new, "sea", name)
     (new / "sea/ir/3_ir.tif").unlink()
-    assert "1 RGB images have no thermal image: " in refused(
-        lambda: of_path(dataset, str(new), "raise")
-    )
-    own.write_tiff(new / "sea" / "ir" / "2_ir.tif", COUNTS[:3])
+    said = refused(lambda: of_path(dataset, str(new), "raise"))
+    assert "1 RGB images have no thermal image: " in said
+    write_any(new / "sea" / "ir" / "2_ir.tif", COUNTS[:3])
     chosen = of_path(dataset, str(new), "skip")
-    assert "'sea_2': RGB is 6x8 pixels but thermal is 3x8" in refused(
-        lambda: list(chosen.samples("raise"))
-    )
+    assert "'sea_2': RGB is 6x8 pixels but" in refused(lambda: list(chosen.samples("raise")))
     assert [sample.name for sample in chosen.samples("skip")] == ["sea_1"]
     assert sorted(chosen.skipped) == [str(new / "sea/rgb/3.png"), "sea_2"]
     (new / "sea" / "rgb" / "1.png").write_bytes(b"")
-    assert "none of the 2 images can be read" in refused(
-        lambda: list(of_path(dataset, str(new), "skip").samples("skip"))
-    )
+    said = refused(lambda: list(of_path(dataset, str(new), "skip").samples("skip")))
+    assert "none of the 2 images can be read" in said
     for taken in (new, new / "sea" / "rgb", new / "sea" / "ir"):
         assert "holds the input images" in refused(lambda taken=taken: chosen.check_out(taken))
-    chosen.check_out(tmp_path / "out")
-    own.write_frame(new, "sea", "2_overlay")
-    twice = of_path(dataset, str(new), "skip")
-    assert "are the same" in refused(lambda: twice.check_out(tmp_path / "out"))
-    empty = write(tmp_path / "empty", "1.bmp", "2.bmp")
-    assert "holds no pair of images but 1.bmp, 2.bmp; expected RGB {split}/rgb/" in refused(
-        lambda: of_path(dataset, str(empty), "raise")
-    )
-    assert "neither a file, nor a folder, nor a split" in refused(
-        lambda: of_path(dataset, "nowhere", "raise")
-    )
+    write_png(tmp_path / "empty" / "1.bmp", RGB)
+    said = refused(lambda: of_path(dataset, str(tmp_path / "empty"), "raise"))
+    assert "holds no pair of images but 1.bmp; expected RGB {split}/rgb/" in said
+    assert "neither a file, nor a folder" in refused(lambda: of_path(dataset, "nowhere", "raise"))
 
 
-def test_split_is_predicted_without_labels(write_mfnet: WriteMFNet) -> None:
-    root = write_mfnet({"new": ["00001D"]})
-    (root / "labels" / "00001D.png").unlink()
-    (sample,) = of_split(MFNet(str(root), splits={"new": "new.txt"}), "new").samples("raise")
-    assert sample.label is None
+def test_split_is_predicted_without_labels(tmp_path: Path) -> None:
+    root = write_folder(tmp_path)
+    (root / "test" / "mask" / "1.png").unlink()
+    assert [sample.label for sample in of_split(folder(root), "test").samples("raise")] == [
+        None
+    ] * 2
+
+
+# Predictions.
+
+CLASSES = ("ground", "car", "person")
+PALETTE = ((0, 0, 0), (64, 0, 128), (64, 64, 0))
+INDICES = np.array([[0, 1, 2], [2, 1, 0]], np.uint8)
+COLOURS = np.array(PALETTE, np.uint8)[INDICES]
+
+
+def read(path: Path, form: str = "index", **options: Any) -> np.ndarray:
+    stated = FormatOptions(form=form, **options)  # type: ignore[arg-type]
+    return PredictionReader(CLASSES, PALETTE, stated).read(path)
+
+
+def save(path: Path, values: object, palette: object = None) -> Path:
+    image = Image.fromarray(np.asarray(values))
+    if palette is not None:
+        image = Image.frombytes("P", image.size, image.tobytes())
+        image.putpalette(np.array(palette, np.uint8).ravel().tolist())
+    image.save(path)
+    return path
+
+
+def test_files_of_each_kind_give_equal_classes(tmp_path: Path) -> None:
+    opaque = np.dstack([COLOURS, np.full(INDICES.shape, 255, np.uint8)])
+    for form, values, palette in [
+        *(("index", INDICES, None), ("index", INDICES, PALETTE), ("colour", INDICES, PALETTE)),
+        *(("colour", COLOURS, None), ("colour", opaque, None)),
+    ]:
+        path = save(tmp_path / "x.png", values, palette)
+        np.testing.assert_array_equal(read(path, form), INDICES)
+
+
+def test_palette_of_other_classes_is_refused_as_indices(tmp_path: Path) -> None:
+    """The stored numbers are 0, 2, 1 where the colours say 0, 1, 2."""
+    shuffled = save(tmp_path / "p.png", INDICES, [PALETTE[0], PALETTE[2], PALETTE[1]])
+    assert "index 1 (car) is shown in the colour of person" in refused(lambda: read(shuffled))
+    np.testing.assert_array_equal(read(shuffled, "colour"), [[0, 2, 1], [1, 2, 0]])
+    # Colours of a palette of the method's own: the user names it, and its indices are read.
+    own = tmp_path / "own.yaml"
+    own.write_text(yaml.safe_dump({"palette": [[0, 0, 0], [64, 64, 0], [64, 0, 128]]}))
+    for form in ("index", "colour"):
+        np.testing.assert_array_equal(read(shuffled, form, palette=str(own)), INDICES)
+    strange = save(tmp_path / "s.png", INDICES, [(9, 9, 9), (8, 8, 8), (7, 7, 7)])
+    np.testing.assert_array_equal(read(strange), INDICES)
+
+
+@pytest.mark.parametrize(
+    ("form", "values", "said"),
+    [
+        ("index", np.array([[0, 3]], np.uint8), "label value 3 (1 pixels"),
+        ("index", np.array([[0, 255]], np.uint8), "label value 255 (1 pixels"),
+        ("index", COLOURS, "got PNG of mode RGB"),
+        ("index", np.array([[0, 1]], np.uint16), "one channel of 8 bits, got mode I;16"),
+        ("index", np.array([[True, False]]), "got PNG of mode 1"),
+        ("colour", INDICES, "got PNG of mode L"),
+        ("colour", [[[0, 0, 0], [64, 0, 127]]], "colour [64, 0, 127] (1 pixels"),
+        ("colour", np.zeros((1, 2, 4), np.uint8), "transparent"),
+        ("colour", [[[0, 0, 0, 255], [0, 0, 0, 254]]], "transparent"),
+    ],
+)
+def test_other_files_than_stated_are_refused(
+    tmp_path: Path, form: str, values: Any, said: str
+) -> None:
+    kept = values if isinstance(values, np.ndarray) else np.array(values, np.uint8)
+    told = refused(lambda: read(save(tmp_path / "bad.png", kept), form))
+    assert "bad.png: " in told
+    assert said in told
+    Image.fromarray(INDICES).save(tmp_path / "jpeg.png", format="JPEG")
+    assert "got JPEG" in refused(lambda: read(tmp_path / "jpeg.png", form))
+
+
+@pytest.mark.parametrize(
+    ("palette", "said"),
+    [
+        *(
+            ([[0, 0, 256]], "the key palette"),
+            ("red", "the key palette"),
+            (None, "the key palette"),
+        ),
+        ([[0, 0, 0], [1, 1, 1], [1, 1, 1]], "two classes have one colour"),
+        ([[0, 0, 0]], "colour [64, 0, 128] (2 pixels; one of 2 unknown values)"),
+    ],
+)
+def test_invalid_palettes_are_refused(tmp_path: Path, palette: object, said: str) -> None:
+    path, file = save(tmp_path / "x.png", COLOURS), tmp_path / "own.yaml"
+    file.write_text(yaml.safe_dump({"palette": palette}))
+    assert said in refused(lambda: read(path, "colour", palette=str(file)))
+
+
+def test_names_of_files(tmp_path: Path) -> None:
+    paths = prediction_paths(tmp_path, ["a", "b/c"], Affixes("Pred_", "_x"))
+    assert paths == {"a": tmp_path / "Pred_a_x.png", "b/c": tmp_path / "Pred_b/c_x.png"}
+    assert "format: 'colours' is not a valid choice" in refused(lambda: read(tmp_path, "colours"))

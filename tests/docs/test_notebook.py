@@ -74,7 +74,7 @@ def test_every_cell_of_the_notebook_runs(
     plt.close("all")
     assert len(drawn) == 2, "the image pair and the profile"
     scores, difference, by_class = values[0], values[4], values[5]
-    assert sorted(scores["experiment"]) == sorted(METHODS)
+    assert list(scores.index.get_level_values("experiment")) == sorted(METHODS)
     assert list(difference["score"][:3]) == ["mIoU", "Var", "region/1"]
     assert by_class.shape == (9, 6)
 

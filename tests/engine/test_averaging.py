@@ -10,8 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from rgbt.averaging import AveragedNetwork
-from rgbt.engine.averaging import EvaluatedWeights
-from rgbt.engine.checkpoint import State, load_checkpoint
+from rgbt.engine.checkpoint import EvaluatedWeights, State, load_checkpoint
 from rgbt.engine.settings import TrainerSettings
 from tests.checkpoints.test_torch_files import same
 from tests.engine.test_trainer import SETTINGS, batches, make, make_two, stopping_after
@@ -21,51 +20,31 @@ def averaged(model: nn.Module, **changes: Any) -> EvaluatedWeights:
     return EvaluatedWeights(model, TrainerSettings(**{**SETTINGS, **changes}))
 
 
-def scalar(value: float) -> nn.Linear:
+def values_after(weights: list[float], **changes: Any) -> list[float]:
+    """A weight is 1, then one of these after each step: what is evaluated after each."""
     layer = nn.Linear(1, 1, bias=False)
-    set_to(layer, value)
-    return layer
-
-
-def set_to(layer: nn.Linear, value: float) -> None:
-    with torch.no_grad():
-        layer.weight.fill_(value)
-
-
-def value_of(average: EvaluatedWeights) -> float:
-    return average.state()["model"]["weight"].item()
+    nn.init.constant_(layer.weight, 1.0)
+    average, found = averaged(layer, **changes), []
+    for step, weight in enumerate(weights, 1):
+        nn.init.constant_(layer.weight, weight)
+        average.update(step)
+        found.append(average.state()["model"]["weight"].item())
+        assert layer.weight.item() == weight, "the network keeps its own weights"
+        assert ("unaveraged" in average.state()) == (average.network is not layer)
+    return found
 
 
 def test_ema_values_follow_decay_and_warm_up() -> None:
-    layer = scalar(1.0)
-    average = averaged(layer, averaging="ema", ema_decay=0.15)
-    set_to(layer, 2.0)
-    average.update(1)  # decay 1/10, because 1 / (1 + 9) < 0.15
-    assert value_of(average) == pytest.approx(0.1 * 1.0 + 0.9 * 2.0)
-    set_to(layer, 4.0)
-    average.update(2)  # decay 0.15, because 2 / (2 + 9) > 0.15
-    assert value_of(average) == pytest.approx(0.15 * 1.9 + 0.85 * 4.0)
-    assert layer.weight.item() == 4.0, "the network keeps its own weights"
+    """Decay 1/10 first, because 1 / (1 + 9) < 0.15; then 0.15, because 2 / (2 + 9) > 0.15."""
+    found = values_after([2.0, 4.0], averaging="ema", ema_decay=0.15)
+    assert found == pytest.approx([0.1 * 1 + 0.9 * 2, 0.15 * 1.9 + 0.85 * 4])
 
 
 def test_last_values_are_the_mean_of_the_last_share_of_steps() -> None:
-    layer = scalar(1.0)
-    average = averaged(layer, averaging="last", averaged_share=0.5, max_steps=6)
-    expected = {3: 30.0, 4: 40.0, 5: (40 + 50) / 2, 6: (40 + 50 + 60) / 3}
-    for step in range(1, 7):
-        set_to(layer, 10.0 * step)
-        average.update(step)
-        if step in expected:
-            assert value_of(average) == pytest.approx(expected[step])
-        assert ("unaveraged" in average.state()) == (step >= 4)
-
-
-def test_none_evaluates_the_network_itself() -> None:
-    layer = scalar(1.0)
-    average = averaged(layer)
-    average.update(1)
-    assert average.network is layer
-    assert list(average.state()) == ["model"]
+    weights = [10.0, 20.0, 30.0, 40.0, 50.0, 60.0]
+    found = values_after(weights, averaging="last", averaged_share=0.5, max_steps=6)
+    assert found == pytest.approx([10, 20, 30, 40, (40 + 50) / 2, (40 + 50 + 60) / 3])
+    assert values_after(weights) == weights
 
 
 def test_statistics_are_averaged_and_counters_are_the_last() -> None:
@@ -87,24 +66,21 @@ def test_statistics_are_averaged_and_counters_are_the_last() -> None:
 @pytest.mark.parametrize("averaging", ["ema", "last"])
 def test_resume_with_averaging_equals_straight_through(tmp_path: Path, averaging: str) -> None:
     changes = {"averaging": averaging, "ema_decay": 0.6, "averaged_share": 0.5}
-    straight, _ = make(tmp_path / "a", **changes)
-    straight.fit(batches(0), State(seed=7))
-    first, _ = make(tmp_path / "b", **changes)
+    make(tmp_path / "a", **changes)[0].fit(batches(0), State(seed=7))
     with pytest.raises(KeyboardInterrupt):
-        first.fit(stopping_after(5), State(seed=7))
-    second, _ = make(tmp_path / "b", **changes)
-    state = State(seed=7)
+        make(tmp_path / "b", **changes)[0].fit(stopping_after(5), State(seed=7))
+    second, state = make(tmp_path / "b", **changes)[0], State(seed=7)
     assert second.resume(state)
-    assert state.step == 4
-    second.fit(batches(4), state)
+    second.fit(batches(state.step), state)
     for name in ("last.pt", "best.pt"):
         one, other = (load_checkpoint(tmp_path / each / name) for each in "ab")
         assert same(one, other), name
 
 
 def test_checkpoints_hold_what_was_evaluated_and_what_resumes(tmp_path: Path) -> None:
-    trainer, log = make(tmp_path / "ema", averaging="ema", ema_decay=0.6)
-    plain, plain_log = make(tmp_path / "plain")
+    """Training does not read the average; a discriminator has none."""
+    trainer = make_two(tmp_path / "ema", averaging="ema", ema_decay=0.6)
+    plain = make_two(tmp_path / "plain")
     seen: list[Tensor] = []
 
     def validate(step: int) -> float:
@@ -114,21 +90,12 @@ def test_checkpoints_hold_what_was_evaluated_and_what_resumes(tmp_path: Path) ->
     trainer.validate = validate
     for each in (trainer, plain):
         each.fit(batches(0), State(seed=7))
-    losses = [[values["loss"] for _, values in each] for each in (log, plain_log)]
-    assert losses[0] == losses[1], "training does not read the average"
+    losses = [[values["loss"] for _, values in each.log] for each in (trainer, plain)]
+    assert losses[0] == losses[1]
     last, best = (load_checkpoint(tmp_path / "ema" / name) for name in ("last.pt", "best.pt"))
     own = load_checkpoint(tmp_path / "plain/last.pt")
     assert same(last["unaveraged"], own["model"])
+    assert same(last["others"], own["others"])
     assert same(last["model"], best["model"])
     assert torch.equal(last["model"]["0.weight"], seen[-1]), "what was evaluated is saved"
     assert not torch.equal(last["model"]["0.weight"], own["model"]["0.weight"])
-    assert "unaveraged" not in own
-
-
-def test_discriminator_is_not_averaged(tmp_path: Path) -> None:
-    checkpoints = []
-    for name, averaging in (("a", "ema"), ("b", "none")):
-        make_two(tmp_path / name, averaging=averaging).fit(batches(0), State(seed=7))
-        checkpoints.append(load_checkpoint(tmp_path / name / "last.pt"))
-    assert same(checkpoints[0]["others"], checkpoints[1]["others"])
-    assert not same(checkpoints[0]["model"], checkpoints[1]["model"])

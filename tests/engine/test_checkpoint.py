@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 from torch import nn
 
-from rgbt.checkpoints.torch_files import save
+from rgbt.checkpoints.files import save
 from rgbt.checks import InputError, RunError
 from rgbt.engine import checkpoint
 from rgbt.engine.checkpoint import Checkpoints, State, load_checkpoint, restore_weights
 from tests.engine.test_trainer import batches, make
 
 COUNTS = "counts_val.npz"
+RISING = {2: 0.4, 4: 0.5, 6: 0.3}
 
 
-def run(folder: Path, scores: dict[int, float], **changes: object) -> State:
+def run(folder: Path, scores: dict[int, float]) -> State:
     """Train or resume; evaluations have these scores, and leave a file beside their weights."""
-    trainer, _ = make(folder, **{"eval_every": 2, "checkpoint_every": 1, **changes})
+    trainer, _ = make(folder, eval_every=2, checkpoint_every=1)
     latest: list[str] = []
 
     def validate(step: int) -> float:
@@ -35,45 +35,32 @@ def run(folder: Path, scores: dict[int, float], **changes: object) -> State:
     return state
 
 
-RISING = {2: 0.4, 4: 0.5, 6: 0.3}
-
-
 def agree(folder: Path, state: State) -> None:
     """State, best weights and counts are of one evaluation."""
     assert load_checkpoint(folder / "best.pt")["step"] == state.best_step
     assert (folder / COUNTS).read_text() == f"step {state.best_step}: {state.best_score}"
 
 
-@pytest.fixture
-def killed_at(monkeypatch: pytest.MonkeyPatch) -> Callable[[str, int], None]:
-    """End the process, as far as this one can, before the n-th file of a name is written."""
-
-    def prepare(name: str, nth: int) -> None:
-        left = [nth]
-
-        def dying(path: Path, value: Any) -> None:
-            left[0] -= path.name == name
-            if left[0] == 0:
-                monkeypatch.undo()
-                raise KeyboardInterrupt
-            save(path, value)
-
-        monkeypatch.setattr(checkpoint, "save", dying)
-
-    return prepare
-
-
-@pytest.mark.parametrize("name", ["best.pt", "last.pt"])
+@pytest.mark.parametrize(("name", "nth", "best"), [("best.pt", 2, 2), ("last.pt", 4, 4)])
 def test_killed_while_the_best_is_saved_makes_it_again(
-    tmp_path: Path, killed_at: Callable[[str, int], None], name: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, nth: int, best: int
 ) -> None:
     """Killed after the evaluation of step 4, before its best weights or before its state."""
-    killed_at(name, {"best.pt": 2, "last.pt": 4}[name])
-    with pytest.raises(KeyboardInterrupt):
-        run(tmp_path, RISING)
-    payload, state = Checkpoints(tmp_path).load()
+    left = [nth]
+
+    def dying(path: Path, value: Any) -> None:
+        left[0] -= path.name == name
+        if left[0] == 0:
+            raise KeyboardInterrupt
+        save(path, value)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(checkpoint, "save", dying)
+        with pytest.raises(KeyboardInterrupt):
+            run(tmp_path, RISING)
+    _, state = Checkpoints(tmp_path).load()
     assert (state.step, state.best_step) == (3, 2)
-    assert load_checkpoint(tmp_path / "best.pt")["step"] == {"best.pt": 2, "last.pt": 4}[name]
+    assert load_checkpoint(tmp_path / "best.pt")["step"] == best
     state = run(tmp_path, RISING)
     assert (state.best_step, state.best_score) == (4, 0.5)
     agree(tmp_path, state)
@@ -84,13 +71,16 @@ def test_killed_while_the_best_is_saved_makes_it_again(
 def test_damaged_checkpoints_are_refused(tmp_path: Path, name: str, how: str) -> None:
     run(tmp_path, RISING)
     path = tmp_path / name
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 1
-    path.write_bytes(content)
     if how == "missing":
         path.unlink()
-    elif how == "of another step":
-        save(path, {"model": {}, "step": 3})
+    elif how == "damaged":
+        flipped = bytearray(path.read_bytes())
+        flipped[len(flipped) // 2] ^= 1
+        path.write_bytes(flipped)
+    else:
+        content = load_checkpoint(path) | {"step": 3}
+        content.pop("state", None)
+        save(path, content)
     if (name, how) == ("last.pt", "missing"):
         assert run(tmp_path, RISING).step == 6, "the run begins anew"
         return
@@ -107,7 +97,6 @@ def test_finished_training_keeps_three_files_and_trains_no_more(tmp_path: Path) 
 
 def test_checkpoint_of_another_model_is_refused_with_the_keys(tmp_path: Path) -> None:
     weights = nn.Linear(2, 3).state_dict()
-    others = (nn.Linear(2, 4), nn.Linear(2, 3, bias=False), nn.Linear(2, 3).double())
-    for model in others:
+    for model in (nn.Linear(2, 4), nn.Linear(2, 3, bias=False), nn.Linear(2, 3).double()):
         with pytest.raises(InputError, match="of another model: .*(weight|bias)"):
             restore_weights(model, weights, tmp_path / "other.pt")

@@ -16,7 +16,7 @@ from rgbt.config.compose import compose
 from rgbt.data.mfnet import MFNet
 from rgbt.evaluation.request import EvaluationRequest
 from rgbt.evaluation.segmentation import Counted, evaluate, joined
-from rgbt.metrics.details import KINDS, OF_SCENES, DetailKind, default
+from rgbt.metrics.details import DEFAULTS, KINDS, OF_SCENES, DetailKind, Details
 from rgbt.metrics.named import value
 from rgbt.processes import collected, rank
 from rgbt.requirements import Record
@@ -59,7 +59,9 @@ def session_of(data: Path, kind: type[MFNet] = MFNet) -> Session:
 
 
 def request(*kinds: DetailKind, **others: object) -> EvaluationRequest:
-    return EvaluationRequest(split="test", details=tuple(map(default, kinds)), **others)
+    return EvaluationRequest(
+        split="test", details=tuple(Details(each, DEFAULTS[each]) for each in kinds), **others
+    )
 
 
 def test_details_are_of_the_counted_pixels(data: Path) -> None:
@@ -71,7 +73,7 @@ def test_details_are_of_the_counted_pixels(data: Path) -> None:
     assert tuple(result.details) == KINDS
     for kind, counts in result.details.items():
         assert counts.names == tuple(SPLITS["test"])
-        assert counts.partition == default(kind).partition("ring5")
+        assert counts.partition == Details(kind, DEFAULTS[kind]).partition("ring5")
     for kind in OF_SCENES:  # summed over bins
         counts = result.details[kind]
         bins = counts.counts.reshape(3, 5, -1, 9, 9)

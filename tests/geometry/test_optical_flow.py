@@ -15,14 +15,10 @@ MOVED = (3, -5)
 """Rows and columns by which the scene moves from the first to the second frame."""
 
 
-def texture(seed: int = 0) -> np.ndarray:
-    """Smooth noise that is larger than a frame."""
-    noise = numpy_generator(seed, "texture").integers(0, 256, (HW[0] + 40, HW[1] + 40))
-    return cv2.GaussianBlur(noise.astype(np.float32), (0, 0), 2.0)
-
-
-def frames(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    scene = texture(seed)
+def frames() -> tuple[np.ndarray, np.ndarray]:
+    """Two parts of smooth noise."""
+    noise = numpy_generator(0, "texture").integers(0, 256, (HW[0] + 40, HW[1] + 40))
+    scene = cv2.GaussianBlur(noise.astype(np.float32), (0, 0), 2.0)
     scene = (255 * (scene - scene.min()) / np.ptp(scene)).astype(np.uint8)
     (rows, columns), (height, width) = MOVED, HW
     first = scene[20 : 20 + height, 20 : 20 + width]
@@ -30,17 +26,12 @@ def frames(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     return np.ascontiguousarray(first), np.ascontiguousarray(second)
 
 
-def test_flow_leads_to_the_first_frame() -> None:
+def test_flow_leads_to_the_first_frame_and_pixels_that_leave_it_are_not_used() -> None:
     first, second = frames()
     flow = estimate(second, first)
     assert flow.shape == (*HW, 2)
-    inside = flow[10:-10, 10:-10]
     # A point at row r of the second frame was at r - 3 in the first one.
-    np.testing.assert_allclose(np.median(inside, axis=(0, 1)), (-3, 5), atol=0.1)
-
-
-def test_pixels_that_leave_the_first_frame_are_not_used() -> None:
-    first, second = frames()
+    np.testing.assert_allclose(np.median(flow[10:-10, 10:-10], axis=(0, 1)), (-3, 5), atol=0.1)
     found = frame_flow({"rgb": first}, {"rgb": second}, "rgb")
     assert found.used[10:-10, 10:-10].mean() > 0.95
     rows, columns = found.source()
@@ -71,13 +62,11 @@ def test_disagreement_by_hand() -> None:
     flow[..., 1] = 2  # two columns to the right, which leads out of the last two
     back = np.zeros_like(flow)
     back[..., 1] = -1  # and one back: one column is missed
-    error, inside = disagreement(flow, back)
-    assert inside[:, :4].all()
-    assert not inside[:, 4:].any()
+    error = disagreement(flow, back)
     np.testing.assert_allclose(error[:, :4], 1 / (0.01 * (4 + 1) + 0.5))
     assert np.isinf(error[:, 4:]).all()
     back[..., 1] = -2
-    assert (disagreement(flow, back)[0][:, :4] == 0).all()
+    assert (disagreement(flow, back)[:, :4] == 0).all()
 
 
 def test_source_by_hand() -> None:
@@ -88,7 +77,7 @@ def test_source_by_hand() -> None:
     assert columns.tolist() == [[1, 0], [1, -1]]
 
 
-@pytest.mark.parametrize("hw", [(8, 96), (64, 90)])
-def test_other_sizes_are_refused(hw: tuple[int, int]) -> None:
-    with pytest.raises(InputError, match="flow: expected one size"):
-        estimate(np.zeros(hw, np.uint8), frames()[0])
+def test_other_sizes_are_refused() -> None:
+    for hw in ((8, 96), (64, 90)):
+        with pytest.raises(InputError, match="flow: expected one size"):
+            estimate(np.zeros(hw, np.uint8), frames()[0])

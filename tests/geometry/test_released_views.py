@@ -6,8 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from rgbt.geometry.homography import homography
-from rgbt.geometry.rectangle import inner_rectangle
+from rgbt.geometry.camera import homography, inner_rectangle
 from rgbt.geometry.warp import Warp
 from tests.geometry.views import HW, RELEASED, Recorded
 from tests.models.golden import FOLDER
@@ -38,9 +37,8 @@ def test_corners_and_crops(recorded: Recorded, views: Tensor, warp: Warp) -> Non
     frame = [[0, 0, 1], [width - 1, 0, 1], [0, height - 1, 1], [width - 1, height - 1, 1]]
     corners = views.new_tensor(frame) @ views.mT
     corners = corners / corners[..., 2:]
-    torch.testing.assert_close(
-        corners, torch.from_numpy(recorded["corners"]).double(), atol=0.01, rtol=0
-    )
+    expected = torch.from_numpy(recorded["corners"]).double()
+    torch.testing.assert_close(corners, expected, atol=0.01, rtol=0)
     x_min, x_max, y_min, y_max = torch.from_numpy(recorded["crop"]).double().unbind(1)
     assert torch.equal(warp.rectangle, torch.stack([x_min, y_min, x_max, y_max], 1) - 0.5)
 

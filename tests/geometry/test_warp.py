@@ -1,18 +1,24 @@
-"""Warps against slow ones, OpenCV, and themselves: exact shifts, borders, gradients, sizes."""
+"""Warps against slow ones, OpenCV, and themselves: exact shifts, borders, gradients, half sizes."""
 
 from __future__ import annotations
 
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from rgbt.geometry.homography import homography
-from rgbt.geometry.rectangle import inner_rectangle
-from rgbt.geometry.warp import Resampling, Warp
+from rgbt.geometry.camera import homography, inner_rectangle
+from rgbt.geometry.warp import (
+    Resampling,
+    Warp,
+    halved_all,
+    halved_label,
+    halved_mean,
+    normalised,
+    powers_of_two,
+)
 from tests.geometry.views import HW, RELEASED, random_angles, random_views
 
 RESAMPLINGS: tuple[Resampling, ...] = ("once", "twice")
@@ -81,21 +87,10 @@ def slow(warp: Warp, image: Tensor) -> Tensor:
 
 @pytest.mark.parametrize("resampling", RESAMPLINGS)
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("hw", [HW, (7, 5), (64, 48), (1, 3)])
-def test_the_identity_gives_the_input(
-    hw: tuple[int, int], dtype: torch.dtype, resampling: Resampling
-) -> None:
-    values = random_values(1, 2, *hw, dtype=dtype)
-    warp = Warp(shift(0, 0), whole(hw), hw, resampling)
-    assert torch.equal(warp.bilinear(values), values)
-    assert torch.equal(warp.nearest(values, 7.0), values)
-    assert bool(warp.inside().all())
-
-
-@pytest.mark.parametrize("resampling", RESAMPLINGS)
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("hw", [HW, (17, 23)])
-@pytest.mark.parametrize(("x", "y"), [(5, -3), (-1, 0), (0, 16), (-13, 2)])
+@pytest.mark.parametrize(
+    ("x", "y", "hw"),
+    [(0, 0, (1, 3)), (0, 0, (64, 48)), (5, -3, HW), (-1, 0, HW), (0, 16, (17, 23)), (-13, 2, HW)],
+)
 def test_whole_shifts_move_pixels_unchanged(
     x: int, y: int, hw: tuple[int, int], dtype: torch.dtype, resampling: Resampling
 ) -> None:
@@ -110,16 +105,10 @@ def test_whole_shifts_move_pixels_unchanged(
 
 
 @pytest.mark.parametrize("resampling", RESAMPLINGS)
-def test_bilinear_is_the_slow_one(resampling: Resampling) -> None:
+def test_bilinear_is_the_slow_one_and_has_its_gradient(resampling: Resampling) -> None:
     warp, values = small_warp(resampling), random_values(2, 3, 10, 12, dtype=torch.float64)
     torch.testing.assert_close(warp.bilinear(values), slow(warp, values), atol=1e-5, rtol=0)
-
-
-@pytest.mark.parametrize("resampling", RESAMPLINGS)
-def test_the_gradient_is_the_numerical_one(resampling: Resampling) -> None:
-    warp = small_warp(resampling)
-    values = random_values(2, 2, 10, 12, dtype=torch.float64).requires_grad_()
-    assert torch.autograd.gradcheck(warp.bilinear, (values,))
+    assert torch.autograd.gradcheck(warp.bilinear, (values[:, :2].clone().requires_grad_(),))
 
 
 def test_once_repeats_the_border_up_to_the_outline_and_twice_fades_it_out() -> None:
@@ -130,31 +119,33 @@ def test_once_repeats_the_border_up_to_the_outline_and_twice_fades_it_out() -> N
     assert twice.bilinear(ones)[0, 0, 0].tolist() == [0.5, 1, 1, 1, 1, 1]
 
 
+def test_normalised_edges_and_centres_by_hand() -> None:
+    """11 x 13 is padded to 16 x 16: pixel 0 has its centre at 1/16 - 1, its edge at -1."""
+    assert powers_of_two((11, 13)) == (16, 16)
+    x, y = torch.tensor([[[-0.5, 0.0, 12.0]]]), torch.tensor([[[15.5, 7.5, 0.5]]])
+    expected = [[-1.0, 1.0], [-15 / 16, 0.0], [9 / 16, -14 / 16]]
+    assert normalised(x, y, (11, 13))[0, 0].tolist() == expected
+
+
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.int64, torch.float64, torch.bool])
 def test_nearest_takes_any_dtype_with_and_without_channels(dtype: torch.dtype) -> None:
     warp = small_warp("once")
     values = (random_values(2, 3, 10, 12) > 0).to(dtype)
     warped = warp.nearest(values, 1)
-    assert warped.dtype == dtype
-    assert warped.shape == values.shape
+    assert (warped.dtype, warped.shape) == (dtype, values.shape)
     assert torch.equal(warp.nearest(values[:, 1], 1), warped[:, 1])
+    with pytest.raises(ValueError, match="values: expected shape"):
+        warp.nearest(values[..., 1:], 1)
 
 
-def test_a_view_without_a_rectangle_shows_nothing() -> None:
-    none = torch.full((1, 4), torch.nan, dtype=torch.float64)
-    for resampling in RESAMPLINGS:
-        warp = Warp(shift(0, 0), none, (4, 6), resampling)
+@pytest.mark.parametrize("resampling", RESAMPLINGS)
+def test_views_without_a_rectangle_and_from_behind_show_nothing(resampling: Resampling) -> None:
+    behind = homography(torch.tensor([[180.0, 0.0, 0.0]]), RELEASED.matrix((48, 64)), "zyx")
+    for view, edges in ((shift(0, 0), torch.nan * whole((48, 64))), (behind, whole((48, 64)))):
+        warp = Warp(view, edges, (48, 64), resampling)
         assert not bool(warp.inside().any())
-        assert warp.bilinear(torch.ones(1, 1, 4, 6)).abs().sum() == 0
-        assert warp.nearest(torch.zeros(1, 4, 6), 255).unique().tolist() == [255]
-
-
-def test_what_lies_behind_the_camera_is_not_shown() -> None:
-    view = homography(torch.tensor([[180.0, 0.0, 0.0]]), RELEASED.matrix(HW), "zyx")
-    for resampling in RESAMPLINGS:
-        warp = Warp(view, whole(HW), HW, resampling)
-        assert not bool(warp.inside().any())
-        assert warp.bilinear(torch.ones(1, 1, *HW)).abs().sum() == 0
+        assert warp.bilinear(torch.ones(1, 1, 48, 64)).abs().sum() == 0
+        assert warp.nearest(torch.zeros(1, 48, 64), 255).unique().tolist() == [255]
 
 
 def test_a_resized_warp_is_the_warp_by_the_resized_camera() -> None:
@@ -166,7 +157,6 @@ def test_a_resized_warp_is_the_warp_by_the_resized_camera() -> None:
     torch.testing.assert_close(resized.homography, half)
     torch.testing.assert_close(resized.rectangle, inner_rectangle(half, small, "largest"))
     assert resized.image_hw == small
-    assert warp.resized(HW) is warp
 
 
 def test_a_resized_cut_may_begin_within_a_pixel() -> None:
@@ -191,37 +181,49 @@ def test_levels_are_rounded_after_each_interpolation() -> None:
     torch.testing.assert_close(255 * rounded, stepwise, atol=1e-3, rtol=0)
     at_the_end = (255 * both.bilinear(values)).round()
     assert float((255 * rounded - at_the_end).abs().max()) > 0.5
-    # A quarter of a pixel aside, 0 and 9 levels mix to 2.25: 2 with levels, 2.25 without.
-    pair = torch.tensor([[[[9.0, 0.0]]]]) / 255
-    aside = Warp(shift(0.25, 0), whole((1, 2)), (1, 2), "once")
-    assert 255 * aside.bilinear(pair)[0, 0, 0, 1].item() == pytest.approx(2.25, abs=1e-4)
-    assert 255 * aside.bilinear(pair, 255)[0, 0, 0, 1].item() == pytest.approx(2, abs=1e-6)
 
 
-def opencv(warp: Warp, values: Tensor, how: int) -> Tensor:
-    """The release's way for (B, C, H, W) float32: warp, cut whole pixels, resize."""
-    out = []
-    height, width = warp.image_hw
-    edges = (warp.rectangle + 0.5).int().tolist()
-    for image, h, (left, top, right, bottom) in zip(values, warp.homography, edges, strict=True):
-        canvas = cv2.warpPerspective(
-            image.permute(1, 2, 0).numpy(), h.numpy(), (width, height), flags=how
-        )
-        cut = canvas.reshape(height, width, -1)[top:bottom, left:right]
-        resized = cv2.resize(cut, (width, height), interpolation=how)
-        out.append(torch.from_numpy(resized.reshape(height, width, -1)).permute(2, 0, 1))
-    return torch.stack(out)
+# ---- half sizes -----------------------------------------------------------------------------
 
 
-def test_twice_is_what_opencv_does() -> None:
-    """Nearly: OpenCV rounds points to 1/32 pixel for nine channels."""
-    views = random_views(6, 11, "zxy")
-    warp = Warp(views, inner_rectangle(views, HW, "corners"), HW, "twice")
-    coarse = torch.rand(6, 9, 30, 40, generator=torch.Generator().manual_seed(0))
-    values = torch.nn.functional.interpolate(coarse, HW, mode="bilinear")
-    difference = (warp.bilinear(values) - opencv(warp, values, cv2.INTER_LINEAR)).abs()
-    assert float(difference.mean()) < 2e-4
-    assert float(difference.max()) < 0.02
-    label = torch.randint(0, 9, (6, 1, *HW), generator=torch.Generator().manual_seed(1)).float()
-    differs = warp.nearest(label, 0) != opencv(warp, label, cv2.INTER_NEAREST)
-    assert float(differs.float().mean()) < 2e-3  # every pixel its own label: points on a boundary
+@pytest.mark.parametrize("hw", [(4, 6), (5, 6), (4, 7), (5, 7), (1, 1)])
+def test_half_pixels_cover_what_exists_of_two_by_two(hw: tuple[int, int]) -> None:
+    generator = torch.Generator().manual_seed(0)
+    values = torch.randn(2, 3, *hw, generator=generator)
+    mask = torch.rand(2, *hw, generator=generator) < 0.8
+    label = torch.randint(2, (2, *hw), generator=generator)
+    label[0, 0, 0] = 255
+    mean, all_of, agreed = halved_mean(values), halved_all(mask), halved_label(label)
+    half_hw = (-(-hw[0] // 2), -(-hw[1] // 2))
+    assert mean.shape == (2, 3, *half_hw)
+    assert all_of.shape == agreed.shape == (2, *half_hw)
+    for row, column in np.ndindex(half_hw):
+        part = (..., slice(2 * row, 2 * row + 2), slice(2 * column, 2 * column + 2))
+        torch.testing.assert_close(mean[..., row, column], values[part].mean((-2, -1)))
+        assert torch.equal(all_of[:, row, column], mask[part].flatten(1).all(-1))
+        classes = label[part].flatten(1)
+        same = (classes == classes[:, :1]).all(-1)
+        assert torch.equal(agreed[:, row, column], classes[:, 0].where(same, 255))
+    exact = random_values(2, 3, *hw, dtype=torch.float64)
+    for each in (exact, exact.to(memory_format=torch.channels_last)):
+        assert torch.autograd.gradcheck(halved_mean, (each.clone().requires_grad_(),))
+
+
+@pytest.mark.parametrize("hw", [HW, (45, 60), (44, 61), (45, 61)])
+@pytest.mark.parametrize("resampling", RESAMPLINGS)
+def test_a_halved_warp_shows_the_same_points(hw: tuple[int, int], resampling: Resampling) -> None:
+    """Maps of columns and rows: an error of the pixel centres would be at least 0.25 pixels."""
+    views = random_views(3, 4)
+    warp = Warp(views, inner_rectangle(views, HW, "largest"), HW, resampling).resized(hw)
+    half = warp.halved()
+    assert half.image_hw == (-(-hw[0] // 2), -(-hw[1] // 2))
+    places = torch.stack(torch.meshgrid(*(torch.arange(n).float() for n in hw), indexing="ij"))
+    places = places.expand(3, -1, -1, -1)
+    expected = halved_mean(warp.bilinear(places))
+    found = half.bilinear(halved_mean(places))
+    last = torch.tensor(hw).view(1, 2, 1, 1) - 1
+    # Values are repeated, or fade out, at the borders of both frames.
+    away = ((expected > 3) & (expected < last - 3)).all(1, keepdim=True)
+    away[..., :2, :] = away[..., -2:, :] = away[..., :2] = away[..., -2:] = False
+    assert float(away.float().mean()) > 0.6
+    assert float((found - expected).abs().where(away, 0).max()) < 0.05

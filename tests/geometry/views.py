@@ -9,12 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rgbt.geometry.camera import Camera
-from rgbt.geometry.homography import Order, homography
+from rgbt.geometry.camera import Camera, Order, homography
 from tests.models.golden import FOLDER, fill_rule
 
 HW = (480, 640)
-RELEASED = Camera(fx=702.6030497884977, fy=703.4541726858521, cx=320, cy=240, height=480, width=640)
+RELEASED = Camera(
+    fx=702.6030497884977, fy=703.4541726858521, cx=320.0, cy=240.0, height=480, width=640
+)
 LIMITS = torch.tensor([10.0, 10.0, 5.0])
 """Degrees of yaw, pitch and roll in the paper."""
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from rgbt.checks import InputError
-from rgbt.geometry.halving import halved_label
+from rgbt.geometry.warp import halved_label
 from rgbt.losses.cross_entropy import CrossEntropy
 from rgbt.losses.temporal import SIGMA, Form, TemporalLoss, con, con_acc, dice
 from rgbt.types import Frame, Output

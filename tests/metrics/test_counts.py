@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +13,6 @@ import pytest
 from rgbt.checks import InputError
 from rgbt.metrics.archive import Archive
 from rgbt.metrics.counts import Counts, check_same_means, convention
-from tests.damage import damaged
 
 
 def example(night: tuple[bool, ...] | None = (False, True, True), **changes: Any) -> Counts:
@@ -45,17 +43,11 @@ def test_what_is_saved_is_loaded(tmp_path: Path, counts: Counts) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["test.npz"]
 
 
-def test_sums_over_images_and_regions() -> None:
-    counts = example()
-    assert counts.by_region().shape == (5, 2, 2)
-    assert np.array_equal(counts.by_region()[3], counts.counts[:, 3].sum(0))
-    assert np.array_equal(counts.whole(), counts.counts.sum((0, 1)))
-
-
 def test_sums_do_not_overflow_the_type_of_the_file() -> None:
     huge = example(counts=np.full((3, 5, 2, 2), 2**30, np.int32))
     assert huge.whole()[0, 0] == 15 * 2**30
     assert huge.by_region()[0, 0, 0] == 3 * 2**30
+    assert np.array_equal(example().by_region()[3], example().counts[:, 3].sum(0))
 
 
 def test_selected_images_keep_their_order_and_time() -> None:
@@ -64,7 +56,7 @@ def test_selected_images_keep_their_order_and_time() -> None:
     assert chosen.night == (True, False)
     assert chosen.unscored == ("car",)
     assert np.array_equal(chosen.counts, example().counts[[2, 0]])
-    with pytest.raises(InputError, match=r"'00009N'.*split 'test'"):
+    with pytest.raises(InputError, match="'test': image '00009N'"):
         example().select(["00009N"])
 
 
@@ -105,34 +97,6 @@ def test_counts_of_other_means_or_conventions_are_not_compared() -> None:
         convention(both)
 
 
-def test_damaged_files_are_refused_or_whole(tmp_path: Path) -> None:
-    path, draw = tmp_path / "counts.npz", random.Random(3)
-    example().save(path)
-    whole, refused = path.read_bytes(), 0
-    flipped = []
-    for _ in range(200):
-        content = bytearray(whole)
-        content[draw.randrange(len(whole))] ^= 1 << draw.randrange(8)
-        flipped.append(("flipped", bytes(content)))
-    for _, content in [*damaged(whole, 100), *flipped, ("", b""), ("", b"text")]:
-        path.write_bytes(content)
-        try:
-            found = Counts.load(path)
-        except InputError:
-            refused += 1
-            continue
-        assert repr(found) == repr(example())
-    assert refused > 150
-
-
-def _as_stranger(path: Path, change: Callable[[dict[str, Any]], None]) -> None:
-    """Write the file anew with changed arrays and without another digest."""
-    with np.load(path) as stored:
-        arrays = {name: stored[name] for name in stored.files}
-    change(arrays)
-    np.savez_compressed(path, **arrays)
-
-
 def test_other_files_are_refused_and_nothing_in_them_runs(tmp_path: Path) -> None:
     path = tmp_path / "counts.npz"
     changes: dict[str, Callable[[dict[str, Any]], Any]] = {
@@ -142,7 +106,10 @@ def test_other_files_are_refused_and_nothing_in_them_runs(tmp_path: Path) -> Non
     }
     for said, change in changes.items():
         example().save(path)
-        _as_stranger(path, change)
+        with np.load(path) as stored:
+            arrays = {name: stored[name] for name in stored.files}
+        change(arrays)
+        np.savez_compressed(path, **arrays)
         with pytest.raises(InputError, match=f"not a readable file of counts.*{said}"):
             Counts.load(path)
     Archive("rgbt maps 1", "maps", "x").save(path, {})

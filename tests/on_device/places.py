@@ -3,27 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import pytest
 import torch
 
 NAME = os.environ.get("RGBT_TEST_DEVICE") or ("cuda" if torch.cuda.is_available() else "")
-
-ON_DEVICE = [
-    pytest.mark.gpu,
-    pytest.mark.skipif(
-        not NAME, reason="needs a CUDA device; RGBT_TEST_DEVICE=cpu tries it on a CPU"
-    ),
-]
-"""Marks of a test that runs on `device()`."""
-
-
-def on_device(test: Callable[..., None]) -> Callable[..., None]:
-    """Mark one test so."""
-    for mark in ON_DEVICE:
-        test = mark(test)
-    return test
+REASON = "needs a CUDA device; RGBT_TEST_DEVICE=cpu tries it on a CPU"
+ON_DEVICE = [pytest.mark.gpu, pytest.mark.skipif(not NAME, reason=REASON)]
 
 
 def device() -> torch.device:

@@ -10,7 +10,6 @@ from rgbt.config.compose import compose
 from rgbt.run import main
 from rgbt.runs.run_spec import WEIGHTS, RunSpec
 from rgbt.runs.specify import specify
-from rgbt.training.pipeline import topological_order
 from tests.commands import Call
 
 EXPERIMENTS = sorted(path.stem for path in Path("conf/experiment").glob("*.yaml"))
@@ -60,7 +59,7 @@ def test_key_of_the_start_does_not_depend_on_the_arm(typed: str) -> None:
 def test_start_shares_what_does_not_change_its_result() -> None:
     typed = ["runs_dir=/elsewhere", "trainer.accelerator=cpu", "data.num_workers=1"]
     start = start_of("baseline", *typed, "dataset.cache_dir=/cache", "tracking=none")
-    assert (start.runs_dir, start.trainer.accelerator) == ("/elsewhere", "cpu")
+    assert (start.plain["runs_dir"], start.trainer.accelerator) == ("/elsewhere", "cpu")
     assert (start.data.num_workers, start.dataset.plain["cache_dir"]) == (1, "/cache")
     assert start.key == start_of("baseline").key
     for changed in ("model.embed_dim=16", "scale.max_steps=9"):
@@ -72,7 +71,7 @@ def test_start_shares_what_does_not_change_its_result() -> None:
 
 def test_stages_of_a_chain_begin_with_the_start() -> None:
     run = spec_of("multi_head_night", "seed=2", "runs_dir=/none")
-    assert [(each.name, each.seed) for each in topological_order(run)] == [
+    assert [(each.name, each.seed) for each in run.pending] == [
         ("start_deeplabv2_heads", 1002),
         ("start_pspnet", 1002),
         ("thermal_teacher", 2),

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import os
+import pty
 import signal
 import subprocess
 import sys
-import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,7 +17,7 @@ from rgbt.config.plain_command import PlainCommand
 from rgbt.data.loaders import ENDING, start_worker
 from rgbt.engine.checkpoint import State, load_checkpoint
 from rgbt.engine.trainer import Trainer
-from rgbt.runtime.signals import Stopped, answered, deferred
+from rgbt.runtime.signals import Stopped, answered
 from rgbt.types import Batch
 from tests.checkpoints.test_torch_files import same
 from tests.commands import Call, NoOptions, assert_one_sentence
@@ -120,21 +119,10 @@ def test_a_second_ctrl_c_stops_in_the_middle_of_a_step(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_clusters_signal_more_than_once(tmp_path: Path, number: signal.Signals) -> None:
+def test_clusters_signal_more_than_once(tmp_path: Path) -> None:
     trainer, _ = train(tmp_path)
     with pytest.raises(Stopped, match="at step 2"):
-        trainer.fit(sending(number, 1, times=3), State(seed=7))
-
-
-def test_an_error_after_a_signal_is_its_consequence() -> None:
-    def raising() -> None:
-        with deferred():
-            send(signal.SIGTERM)
-            raise RuntimeError("DataLoader worker exited unexpectedly")
-
-    with pytest.raises(Stopped):
-        raising()
+        trainer.fit(sending(signal.SIGTERM, 1, times=3), State(seed=7))
 
 
 @pytest.mark.parametrize(
@@ -171,47 +159,33 @@ def test_what_the_process_ignores_stays_ignored() -> None:
         signal.signal(signal.SIGHUP, before)
 
 
+CLOSED = """
+import sys, time
+from rgbt.runtime.signals import Stopped, answered, at_once, deferred
+with answered():
+    try:
+        with deferred():
+            print("ready", flush=True)
+            while True:
+                time.sleep(0.02)
+                with at_once():
+                    pass
+    except Stopped as stop:
+        print(stop, flush=True)
+        open(sys.argv[1], "w").write(str(stop.code))
+"""
+
+
 def test_a_closed_terminal_is_no_error(tmp_path: Path) -> None:
     """The other end of a pseudo-terminal closes: SIGHUP, and every write fails from then on."""
-    import pty
-
-    script = (
-        "import sys, time\n"
-        "from rgbt.runtime.signals import Stopped, answered, at_once, deferred\n"
-        "with answered():\n"
-        "    try:\n"
-        "        with deferred():\n"
-        "            print('ready', flush=True)\n"
-        "            while True:\n"
-        "                time.sleep(0.02)\n"
-        "                with at_once():\n"
-        "                    pass\n"
-        "    except Stopped as stop:\n"
-        "        print(stop, flush=True)\n"
-        f"        open({str(tmp_path / 'code')!r}, 'w').write(str(stop.code))\n"
-    )
     child, terminal = pty.fork()
     if child == 0:
-        os.execv(sys.executable, [sys.executable, "-c", script])
+        os.execv(sys.executable, [sys.executable, "-c", CLOSED, str(tmp_path / "code")])
     assert b"ready" in os.read(terminal, 100)
     os.close(terminal)
     _, status = os.waitpid(child, 0)
     assert os.waitstatus_to_exitcode(status) == 0
     assert (tmp_path / "code").read_text() == "129"
-
-
-@pytest.fixture
-def thread_after_fork() -> Iterator[None]:
-    """As Arrow does: a thread that every forked process starts before its own code runs."""
-    is_wanted = [True]
-
-    def start() -> None:
-        if is_wanted:
-            threading.Thread(target=time.sleep, args=(600,), daemon=True).start()
-
-    os.register_at_fork(after_in_child=start)
-    yield
-    is_wanted.clear()
 
 
 def started(loader: DataLoader[int]) -> Iterator[int]:
@@ -223,7 +197,6 @@ def started(loader: DataLoader[int]) -> Iterator[int]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-@pytest.mark.usefixtures("thread_after_fork")
 def test_workers_leave_signals_of_a_group_to_the_main_process() -> None:
     """Ctrl-C in a terminal and `killpg` reach them too; the step in progress needs them."""
     loader = DataLoader(
@@ -241,51 +214,6 @@ def test_workers_leave_signals_of_a_group_to_the_main_process() -> None:
     worker.terminate()
     worker.join(5)
     assert worker.exitcode == 0, "the main process ends them"
-
-
-SERVED = """
-import multiprocessing, os, sys
-from torch.utils.data import DataLoader
-from rgbt.data.loaders import start_worker
-
-if __name__ == "__main__":
-    loader = DataLoader(
-        range(9),
-        batch_size=None,
-        num_workers=1,
-        worker_init_fn=start_worker,
-        multiprocessing_context="forkserver",
-    )
-    found = iter(loader)
-    next(found)
-    (worker,) = found._workers
-    print(worker.pid, flush=True)
-    if sys.argv[1] == "die":
-        os.kill(os.getpid(), 9)
-    worker.terminate()
-    worker.join(10)
-    print(worker.exitcode, flush=True)
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("end", ["die", "terminate"])
-def test_workers_of_a_fork_server_end_with_the_main_process(tmp_path: Path, end: str) -> None:
-    """As inside a sweep: the parent of such a worker is the server, which lives on."""
-    script = tmp_path / "served.py"
-    script.write_text(SERVED)
-    process = subprocess.Popen(
-        [sys.executable, str(script), end], stdout=subprocess.PIPE, text=True, cwd=Path.cwd()
-    )
-    assert process.stdout is not None
-    worker = int(process.stdout.readline())
-    if end == "terminate":
-        assert process.stdout.readline() == "0\n"
-    process.wait(60)
-    deadline = time.monotonic() + 20
-    while Path(f"/proc/{worker}").exists() and time.monotonic() < deadline:
-        time.sleep(0.1)
-    assert not Path(f"/proc/{worker}").exists()
 
 
 def test_an_error_of_a_library_that_a_signal_left_halfway_is_its_consequence(call: Call) -> None:

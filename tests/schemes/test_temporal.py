@@ -12,8 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.geometry.camera import Camera
-from rgbt.geometry.halving import halved_all, halved_mean
-from rgbt.geometry.warp import Warp
+from rgbt.geometry.warp import Warp, halved_all, halved_mean
 from rgbt.models.mask2former.network import semantic_logits
 from rgbt.requirements import Record
 from rgbt.schemes.temporal import Temporal

@@ -11,7 +11,6 @@ from rgbt.config.options import types_of
 from sweeps.point import Outcome, Point
 from sweeps.reproduce import OF_THE_TABLE, Options, entry
 from sweeps.settings import SweepSettings
-from sweeps.table import load_table
 from sweeps.table.cells import OWN_COUNTS
 from sweeps.worker import point_list
 from sweeps.worker.planner import Planner
@@ -116,26 +115,6 @@ def test_dry_run_lists_the_cells_and_writes_nothing(
     assert "it broke" in out
     assert "2 runs: 1 failed, 1 waiting." in out
     assert not (place / "runs").exists()
-
-
-def test_all_tables_are_only_listed(
-    call: Call, place: Path, driven: Driven, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked = driven("waiting")
-    monkeypatch.setattr(load_table, "table_names", lambda: ["my/small", "spatialseg/table3"])
-    code, out, _ = call(entry, "table=all", "dry_run=true", "tracking=none")
-    assert code == 0
-    assert [line.split()[:4] for line in out.splitlines() if "/" in line] == [
-        ["my/small", "2", "of", "3"],
-        ["spatialseg/table3", "7", "of", "7"],
-    ]
-    assert len(asked) == 1, "built-in tables are not composed while nothing was run"
-    (place / "runs" / "any").mkdir(parents=True)
-    assert call(entry, "table=all", "dry_run=true", "tracking=none")[1] == out
-    assert len(asked) == 3
-    code, _, err = call(entry, "table=all", "tracking=none")
-    assert code == 2
-    assert_one_sentence(err, "dry_run=true")
 
 
 @pytest.mark.parametrize(

@@ -3,34 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import optuna
-import pytest
 from optuna.trial import TrialState
 
-from rgbt.tracking.mlflow_store import MlflowTracking
 from sweeps import attributes
-from sweeps.report import publish
-from sweeps.report.publish import study_folder
+from sweeps.report.study import study_folder
 from sweeps.study import entry
 from tests.commands import Call, assert_one_sentence
 
-LINK = "http://127.0.0.1:5000/#/run"
-FILES = ["study.md", "trials.csv", "history.png", "slices.png", "parallel.png"]
-
-
-@pytest.fixture
-def recorded(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
-    """What was told to the tracker, which is not asked."""
-    calls: list[dict[str, Any]] = []
-
-    def record(tracking: object, **told: Any) -> list[tuple[str, str]]:
-        calls.append({"tracking": tracking, **told})
-        return [("this run", LINK)]
-
-    monkeypatch.setattr(publish, "record", record)
-    return calls
+FILES = {"study.md", "trials.csv"}
 
 
 def make_study(runs_dir: Path, name: str = "search/grbm", kind: str = "search") -> None:
@@ -53,31 +35,19 @@ def make_study(runs_dir: Path, name: str = "search/grbm", kind: str = "search") 
     study.ask()  # still running
 
 
-def test_study_of_search_is_shown_and_recorded(
-    call: Call, tmp_path: Path, recorded: list[dict[str, Any]]
-) -> None:
+def test_study_of_search_is_shown_and_written(call: Call, tmp_path: Path) -> None:
     make_study(tmp_path)
-    uri = "tracking.uri=http://127.0.0.1:1"
-    code, out, err = call(entry, "name=search/grbm", f"runs_dir={tmp_path}", uri)
+    code, out, err = call(entry, "name=search/grbm", f"runs_dir={tmp_path}")
     assert (code, err) == (0, "")
     folder = study_folder(tmp_path, "search/grbm")
     assert out.index("50.75") < out.index("50.50") < out.index("50.25")
     assert "[Errno 28] disk full" in out
-    assert "No figure importances: they need 10 complete trials, and there are 3." in out
-    links = (f"optuna-dashboard sqlite:///{tmp_path}/studies.db", str(folder / "study.md"), LINK)
-    assert all(link in out for link in links)
-    assert {path.name for path in folder.iterdir()} == set(FILES)
+    assert "Importances: they need 10 complete trials, and there are 3." in out
+    assert f"optuna-dashboard sqlite:///{tmp_path}/studies.db" in out
+    assert {path.name for path in folder.iterdir()} == FILES
     text = (folder / "study.md").read_text()
-    assert "](history.png)" in text
     assert "postgresql://u:***@h/db" in text
-    (told,) = recorded
-    assert isinstance(told["tracking"], MlflowTracking)
-    assert told["tracking"].uri == "http://127.0.0.1:1"
-    assert (told["name"], told["kind"]) == ("study search/grbm", "study")
-    assert told["files"] == [folder / name for name in FILES]
-    assert (told["metrics"]["trials/failed"], told["metrics"]["best/val/mIoU"]) == (1, 50.75)
-    assert "| 50.75 |" in told["note"]
-    assert "![" not in told["note"]
+    assert "| 50.75 |" in text
 
 
 def test_study_unknown_or_missing_name_lists_studies(call: Call, tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import typing
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -29,40 +28,30 @@ from rgbt.synth.datasets import (
     VAL_SEQUENCE,
     VOID,
     counts_of,
-    freiburg_ids,
     kp_ids,
     seen_in_thermal,
     synth,
-    synth_freiburg,
-    synth_kp,
-    synth_pst900,
 )
-from rgbt.synth.export import Layout, Plan, exported, write
-from rgbt.synth.factors import EgoMotion, SceneFactors, with_factors
-from rgbt.synth.scene import Scene, render_pair, render_scene
-from rgbt.synth.shapes import (
-    BIKE,
-    BUMP,
-    CAR,
-    CAR_STOP,
-    COLOR_CONE,
-    CURVE,
-    GUARDRAIL,
-    INDEX,
-    PERSON,
-    Table,
-)
+from rgbt.synth.export import Layout, Plan, exported, shots_of, write
+from rgbt.synth.factors import EgoMotion, SceneFactors
+from rgbt.synth.scene import render_pair, render_scene
+from rgbt.synth.street import INDEX, Table
 
+CAR, PERSON, BIKE, CURVE, CAR_STOP, GUARDRAIL, COLOR_CONE, BUMP = range(1, 9)
 NUMBERS = {"train": 6, "val": 2, "test": 5}
-FREIBURG_NUMBERS = {"train_day": 10, "train_night": 6, "val": 2, "test": 5}
+SMALL = SceneFactors(height=48, width=64)
 FREIBURG_FACTORS = SceneFactors(height=98, width=288, field_of_view_deg=96.0)
+EMPTY = Layout(lambda shots: shots, lambda scene, shot: {})
+
+
+def planned(name: str, numbers: dict[str, int] = NUMBERS, factors: SceneFactors = SMALL) -> Plan:
+    return Plan(name=name, seed=0, numbers=numbers, factors=factors)
 
 
 class Embedded(NamedTuple):
     """One of the data sets, at a small size."""
 
     layout: Layout
-    make: Callable[..., Any]
     reader: Callable[[str], Any]
     background: tuple[str, ...]
     plan: Plan
@@ -70,35 +59,29 @@ class Embedded(NamedTuple):
     def made(self, cache_dir: Path, **changes: Any) -> Any:
         numbers = {f"num_{split}": number for split, number in self.plan.numbers.items()}
         hw = {"height": self.plan.factors.height, "width": self.plan.factors.width}
-        return self.make(cache_dir=str(cache_dir), **{**numbers, **hw, **changes})
+        make = getattr(datasets, self.plan.name)
+        return make(cache_dir=str(cache_dir), **{**numbers, **hw, **changes})
 
 
-def planned(name: str, numbers: dict[str, int], factors: SceneFactors) -> Plan:
-    return Plan(name=name, seed=0, numbers=numbers, factors=factors)
-
-
-def embedded_freiburg(root: str) -> Freiburg:
-    """The ordinary reader, with the sequence that the embedded data set holds out."""
-    return Freiburg(root, crop=(1, 97, 48, 240), val_sequences=(VAL_SEQUENCE,))
-
-
-SMALL = SceneFactors(height=48, width=64)
-WIDE = replace(SMALL, field_of_view_deg=80.0)
 EMBEDDED = {
-    "synth": Embedded(
-        *(datasets.MFNET_LAYOUT, synth, MFNet, ("unlabeled",)), planned("synth", NUMBERS, SMALL)
-    ),
+    "synth": Embedded(datasets.MFNET_LAYOUT, MFNet, ("unlabeled",), planned("synth")),
     "synth_kp": Embedded(
-        *(datasets.KP_LAYOUT, synth_kp, KP, ()),
+        *(datasets.KP_LAYOUT, KP, ()),
         planned("synth_kp", NUMBERS, replace(SMALL, night_share=0.48)),
     ),
     "synth_pst900": Embedded(
-        *(datasets.PST900_LAYOUT, synth_pst900, lambda root: PST900(root, val_bags=(20,))),
-        *(("background",), planned("synth_pst900", NUMBERS, WIDE)),
+        *(datasets.PST900_LAYOUT, lambda root: PST900(root, val_bags=(20,)), ("background",)),
+        planned("synth_pst900", NUMBERS, replace(SMALL, field_of_view_deg=80.0)),
     ),
     "synth_freiburg": Embedded(
-        *(datasets.FREIBURG_LAYOUT, synth_freiburg, embedded_freiburg, ("background", "ignore")),
-        planned("synth_freiburg", FREIBURG_NUMBERS, FREIBURG_FACTORS),
+        datasets.FREIBURG_LAYOUT,
+        lambda root: Freiburg(root, crop=(1, 97, 48, 240), val_sequences=(VAL_SEQUENCE,)),
+        ("background", "ignore"),
+        planned(
+            "synth_freiburg",
+            {"train_day": 10, "train_night": 6, "val": 2, "test": 5},
+            FREIBURG_FACTORS,
+        ),
     ),
 }
 
@@ -117,39 +100,37 @@ def each(request: pytest.FixtureRequest) -> Embedded:
 # ---- what they share ------------------------------------------------------------------------
 
 
-def test_ordinary_reader_reads_the_files(each: Embedded, folder: Path) -> None:
-    data = each.made(folder)
+def test_ordinary_reader_reads_the_scenes(each: Embedded, folder: Path) -> None:
+    data, shots = each.made(folder), shots_of(each.layout, each.plan)
     plain = each.reader(str(data.root))
     assert (data.name, data.background) == (each.plan.name, each.background)
     assert plain.fingerprint() == data.fingerprint()
-    for split, number in each.plan.numbers.items():
-        names = plain.names(split)
-        assert len(names) == number
-        for name in names:
-            sample, same = plain.read(name), data.read(name)
-            assert np.array_equal(sample.rgb, same.rgb)
-            assert (sample.label is None) == (split == "train_night")
-
-
-@pytest.mark.parametrize("name", ["synth", "synth_kp", "synth_pst900"])
-def test_files_hold_the_scenes(folder: Path, name: str) -> None:
-    each = EMBEDDED[name]
-    data, shots = each.made(folder), each.layout.shots(each.plan)
-    assert [shot.scene for shot in shots] == list(range(sum(NUMBERS.values())))
-    ids: dict[str, Callable[[Scene], Any]] = {
-        "synth": lambda scene: scene.label,
-        "synth_kp": lambda scene: np.where(kp_ids(scene) == 19, 255, kp_ids(scene)),
-        "synth_pst900": lambda scene: PST900_IDS[scene.label],
-    }
+    assert {split: len(plain.names(split)) for split in each.plan.numbers} == each.plan.numbers
+    assert [shot.scene for shot in shots] == list(range(sum(each.plan.numbers.values())))
+    names = [name for split in each.plan.numbers for name in data.names(split)]
     for shot in shots[::4]:
-        scene = render_scene(0, shot.scene, each.plan.factors)
-        assert scene.is_night == shot.night
-        sample = data.read(shot.name)
-        assert np.array_equal(sample.label, ids[name](scene))
+        scene = render_scene(
+            0, shot.scene, replace(each.plan.factors, night_share=float(shot.night))
+        )
+        name = sorted(names, key=lambda name: shot.name not in name)[0]
+        sample, (rgb, thermal) = data.read(name), (scene.rgb, scene.thermal)
+        assert np.array_equal(plain.read(name).rgb, sample.rgb)
+        assert (sample.label is None) == (shot.split == "train_night")
+        if each.plan.name == "synth_freiburg":
+            assert np.array_equal(sample.rgb, rgb[1:97, 48:240])
+            # Counts become the grey levels of `synth`, but for rounding to counts first.
+            seen, thermal = (of[1:97, 48:240] for of in (seen_in_thermal(98, 288), thermal))
+            assert np.abs(sample.thermal.astype(int) - thermal)[seen].max() <= 1
+            assert not sample.thermal[~seen].any()
+            continue
+        ids = {"synth": scene.label, "synth_kp": kp_ids(scene)}
+        label = ids.get(each.plan.name, PST900_IDS[scene.label])
+        expected = np.where(label == 19, 255, label)
+        assert np.array_equal(sample.label, expected)
         # JPEG loses a few grey levels, of colours more than of grey
-        limit = 3 if name == "synth_kp" else 0
-        assert np.abs(sample.thermal.astype(int) - scene.thermal).mean() <= limit
-        assert np.abs(sample.rgb.mean((0, 1)) - scene.rgb.mean((0, 1))).max() <= limit / 3
+        limit = 3 if each.plan.name == "synth_kp" else 0
+        assert np.abs(sample.thermal.astype(int) - thermal).mean() <= limit
+        assert np.abs(sample.rgb.mean((0, 1)) - rgb.mean((0, 1))).max() <= limit / 3
 
 
 def test_pool_writes_same_files(
@@ -160,23 +141,23 @@ def test_pool_writes_same_files(
         made.mkdir()
         write(each.layout, replace(each.plan, numbers=dict.fromkeys(each.plan.numbers, 2)), made)
         monkeypatch.setattr(export, "_WORTH_A_POOL", 1)
-    found = sorted(path.relative_to(alone) for path in alone.rglob("*.*"))
-    assert found == sorted(path.relative_to(pooled) for path in pooled.rglob("*.*"))
-    assert all((alone / path).read_bytes() == (pooled / path).read_bytes() for path in found)
+    files = [{p.relative_to(f): p.read_bytes() for p in f.rglob("*.*")} for f in (alone, pooled)]
+    assert files[0] == files[1]
 
 
 def test_folder_is_named_by_plan_and_reused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    empty, plan = Layout(lambda plan: [], lambda scene, shot: {}), EMBEDDED["synth"].plan
+    plan = planned("synth")
     plans = [
         *(plan, plan, replace(plan, seed=4), replace(plan, numbers={**NUMBERS, "val": 3})),
         *(replace(plan, factors=replace(SMALL, glare=0.5)), replace(plan, motion=EgoMotion(1.0))),
         replace(plan, name="other"),
     ]
-    written = [exported(empty, each, tmp_path) for each in plans]
+    monkeypatch.setattr(export, "write", lambda *_: None)
+    written = [exported(EMPTY, each, tmp_path) for each in plans]
     monkeypatch.setattr(export, "VERSION", export.VERSION + 1)
-    written.append(exported(empty, plan, tmp_path))
+    written.append(exported(EMPTY, plans[0], tmp_path))
     assert written[0] == written[1]
     assert len(set(written)) == 7
     assert all(path.name.startswith("synth-") for path in written[:6])
@@ -184,36 +165,22 @@ def test_folder_is_named_by_plan_and_reused(
 
 def test_configuration_has_the_settings_with_their_defaults(each: Embedded) -> None:
     """All of them for `synth`; presets of it change values alone."""
-    name = each.plan.name
+    name, make = each.plan.name, getattr(datasets, each.plan.name)
     node: Any = OmegaConf.to_container(compose([f"dataset={name}"]).dataset, resolve=True)
     assert node.pop("absent") == "released"
-    assert node.pop("_target_") == f"{each.make.__module__}.{name}"
-    parameters = inspect.signature(each.make).parameters
-    defaults = {key: parameter.default for key, parameter in parameters.items()}
+    assert node.pop("_target_") == f"{make.__module__}.{name}"
+    parameters = inspect.signature(make).parameters.items()
+    defaults = {key: parameter.default for key, parameter in parameters}
     plain = {key: list(v) if isinstance(v, tuple) else v for key, v in defaults.items()}
     assert node.items() <= plain.items()
     if name == "synth":
         assert node == plain
         preset = compose(["dataset=synth_calibrated"]).dataset
         assert set(preset) == {*node, "absent", "_target_"}
-        assert (preset.name, preset.object_mix, preset.vignette) == (
-            *("synth_calibrated", "mfnet", 0.18),
-        )
-
-
-def test_factors_are_keywords_of_a_data_set() -> None:
-    def plain(*, seed: int = 3, factors: SceneFactors) -> tuple[int, SceneFactors]:
-        return seed, factors
-
-    made = with_factors("night_share", height=96)(plain)
-    parameters = inspect.signature(made).parameters
-    assert set(parameters) == {"seed", *vars(SceneFactors())} - {"night_share"}
-    assert (parameters["height"].default, parameters["width"].default) == (96, 160)
-    hints = typing.get_type_hints(made)
-    assert (hints["height"], hints["rgb_noise"], hints["seed"]) == (int, float, int)
-    assert made(seed=4, width=80) == (4, SceneFactors(height=96, width=80))
-    with pytest.raises(TypeError, match="night_share"):
-        made(night_share=0.2)
+        assert (preset.name, preset.object_mix) == ("synth_calibrated", "mfnet")
+    if name == "synth_freiburg":
+        with pytest.raises(TypeError, match="night_share"):
+            make(night_share=0.2)
 
 
 def test_interrupted_generation_leaves_nothing(
@@ -235,15 +202,15 @@ def test_interrupted_generation_leaves_nothing(
 
 
 def test_first_of_two_generations_is_kept(tmp_path: Path) -> None:
-    plan, other = EMBEDDED["synth"].plan, []
+    plan, other = planned("synth", {"train": 0}), []
 
-    def shots(_: Plan) -> list[Any]:
+    def named(shots: list[Any]) -> list[Any]:
         if not other:
-            other.append(exported(Layout(lambda plan: [], lambda scene, shot: {}), plan, tmp_path))
+            other.append(exported(EMPTY, plan, tmp_path))
             (other[0] / "first.txt").write_text("")
-        return []
+        return shots
 
-    assert exported(Layout(shots, lambda scene, shot: {}), plan, tmp_path) == other[0]
+    assert exported(Layout(named, EMPTY.images), plan, tmp_path) == other[0]
     assert (other[0] / "first.txt").is_file()
     assert list(tmp_path.iterdir()) == other
 
@@ -265,11 +232,9 @@ def test_synth_lists_have_days_and_nights(folder: Path) -> None:
     root = EMBEDDED["synth"].made(folder).root
     lists = {path.stem: path.read_text().split() for path in root.glob("*.txt")}
     assert lists.keys() == {"train", "val", "test", "test_day", "test_night"}
-    assert sorted(lists["test_day"] + lists["test_night"]) == lists["test"]
-    assert {name[-1] for name in lists["test_day"]} == {"D"}
-    assert {name[-1] for name in lists["test_night"]} == {"N"}
-    stored = cv2.imread(str(root / f"images/{lists['val'][0]}.png"), cv2.IMREAD_UNCHANGED)
-    assert stored.shape == (48, 64, 4)
+    for time in ("day", "night"):
+        named = [name for name in lists["test"] if name[-1] == time[0].upper()]
+        assert lists[f"test_{time}"] == named != []
 
 
 def test_second_frames_form_data_set(tmp_path: Path) -> None:
@@ -299,12 +264,12 @@ def test_maps_of_the_test_split(folder: Path) -> None:
         dataset.scene_maps(dataset.names("train")[0])
 
 
-# ---- synth_pst900 ---------------------------------------------------------------------------
+# ---- the others -----------------------------------------------------------------------------
 
 
 def test_pst900_names_are_those_of_archive() -> None:
     numbers = {"train": 57, "val": 3, "test": 10}
-    shots = datasets.PST900_LAYOUT.shots(planned("x", numbers, SMALL))
+    shots = shots_of(datasets.PST900_LAYOUT, planned("x", numbers))
     assert shots[0].name == "0_bag01_rect_rgb_frame0000000000"
     assert shots[60].name == "60_bag21_rect_rgb_frame0000000600"
     assert [shot.folder for shot in shots] == ["train"] * 60 + ["test"] * 10
@@ -312,24 +277,12 @@ def test_pst900_names_are_those_of_archive() -> None:
     bags = [int(shot.name.split("_")[1].removeprefix("bag")) for shot in shots]
     assert bags[:60] == [bag for bag in range(1, 21) for _ in range(3)]
     assert set(bags[60:]) == {21, 22, 23, 24, 25}
-
-
-def test_pst900_objects_are_present_and_rare() -> None:
     stands = {0: "background", CAR: "background", COLOR_CONE: "fire_extinguisher"}
     stands |= {CAR_STOP: "backpack", BUMP: "hand_drill", PERSON: "survivor"}
     assert {label: pst900.CLASSES[PST900_IDS[label]] for label in stands} == stands
-    factors = SceneFactors(width=214, field_of_view_deg=80.0)
-    labels = [PST900_IDS[render_scene(0, index, factors).label].ravel() for index in range(16)]
-    counts = np.array([np.bincount(label, minlength=5) for label in labels])
-    shares = counts.sum(0) / counts.sum()
-    assert 0.92 < shares[0] < 0.97
-    assert ((shares[1:] > 0.004) & (shares[1:] < 0.03)).all()
 
 
-# ---- synth_kp -------------------------------------------------------------------------------
-
-
-def test_kp_files_have_its_format(folder: Path) -> None:
+def test_kp_files_and_names_have_its_format(folder: Path) -> None:
     data = EMBEDDED["synth_kp"].made(folder)
     rgb, lwir, label = data.files(data.names("test")[0])
     assert [path.suffix for path in (rgb, lwir, label)] == [".jpg", ".jpg", ".png"]
@@ -337,30 +290,20 @@ def test_kp_files_have_its_format(folder: Path) -> None:
     assert thermal.shape == (48, 64, 3)
     assert (thermal == thermal[..., :1]).all()
     assert cv2.imread(str(label), cv2.IMREAD_UNCHANGED).max() == 19, "void is 19 on disk"
-    assert (data.root / "val.txt").read_text().splitlines()[0].endswith(".png")
     for split in ("train", "val", "test"):
         # The lists say what the set numbers say, which is the split of the CRM release.
         assert data.names(split) == KP(str(data.root), lists="sets").names(split)
-
-
-def test_kp_names_belong_to_recordings_of_split() -> None:
     found: dict[str, set[int]] = {"train": set(), "val": set(), "test": set()}
-    plan = replace(planned("x", {"train": 60, "val": 20, "test": 40}, SMALL), seed=3)
-    for shot in datasets.KP_LAYOUT.shots(plan):
+    plan = replace(planned("x", {"train": 60, "val": 20, "test": 40}), seed=3)
+    for shot in shots_of(datasets.KP_LAYOUT, plan):
         found[shot.split].add(int(shot.name[3:5]))
-        assert int(shot.name[-5:]) == shot.scene
-        assert shot.name[6:10] == "V000"
+        assert (shot.name[6:10], int(shot.name[-5:])) == ("V000", shot.scene)
     assert found == {"train": {0, 1, 2, 3, 4, 5}, "val": {6, 10}, "test": {7, 8, 9, 11}}
 
 
-@pytest.fixture(scope="module")
-def scenes() -> list[Scene]:
-    return [render_scene(0, index, SceneFactors()) for index in range(12)]
-
-
-def test_kp_rider_is_not_person(scenes: list[Scene]) -> None:
+def test_kp_rider_is_not_person() -> None:
     persons = riders = 0
-    for scene in scenes:
+    for scene in (render_scene(0, index, SceneFactors()) for index in range(12)):
         ids = kp_ids(scene)
         person, rider = (ids == kp.CLASSES.index(name) for name in ("person", "rider"))
         assert np.array_equal(person | rider, scene.label == PERSON)
@@ -375,30 +318,6 @@ def test_kp_rider_is_not_person(scenes: list[Scene]) -> None:
     assert riders > 3
 
 
-# ---- synth_freiburg -------------------------------------------------------------------------
-
-
-def test_freiburg_frames_are_cut_scenes(folder: Path) -> None:
-    data = EMBEDDED["synth_freiburg"].made(folder)
-    splits = [*data.names("train_day"), *data.names("train_night"), *data.names("val")]
-    for index, name in enumerate([*splits, *data.names("test")]):
-        if index not in (0, 12, 20, 22):
-            continue
-        factors = replace(FREIBURG_FACTORS, night_share=float(data.nights((name,))[0]))
-        scene, sample = render_scene(0, index, factors), data.read(name)
-        assert np.array_equal(sample.rgb, scene.rgb[1:97, 48:240])
-        seen = seen_in_thermal(98, 288)[1:97, 48:240]
-        # With the range of the scenes, counts become the grey levels that `synth` stores, but for
-        # what rounding to counts first can change.
-        off = sample.thermal.astype(int) - scene.thermal[1:97, 48:240]
-        assert np.abs(off[seen]).max() <= 1
-        assert not sample.thermal[~seen].any()
-        if sample.label is not None:
-            label = freiburg_ids(scene)[1:97, 48:240]
-            label = np.where(seen, label, 255) if "test" in name else label
-            assert np.array_equal(sample.label, label)
-
-
 def test_freiburg_archive_peculiarities_are_reproduced(folder: Path) -> None:
     root = EMBEDDED["synth_freiburg"].made(folder).root
 
@@ -409,15 +328,12 @@ def test_freiburg_archive_peculiarities_are_reproduced(folder: Path) -> None:
     assert first("train/seq_00_day/00/fl_rgb_labels/*.png").shape == (98, 288)
     folders = {path.name for path in (root / "test").glob("*/Images*")}
     assert folders == {"ImagesRGB", "ImagesIR", "ImagesRgb", "ImagesIr"}
-    stems = [
-        path.stem.removesuffix("_ir") for path in sorted(root.glob("test/*/Images[Ii]*/*_ir.png"))
-    ]
+    stems = [path.stem.removesuffix("_ir") for path in root.glob("test/*/Images[Ii]*/*_ir.png")]
     assert [stem.endswith("0") for stem in stems].count(True) < len(stems)
     counts = first("train/seq_00_day/00/fl_ir_aligned/*.png")
     assert counts.dtype == np.uint16
     assert not counts[:, [0, 40, 250, 287]].any()
     assert counts[counts > 0].min() > 19_000
-    assert counts.max() > 22_500
     # "ignore" is what only the RGB camera sees, in labels by hand.
     label = np.load(next(root.glob("test/night/SegmentationClass/*.npy")))
     assert np.array_equal(label == 13, ~seen_in_thermal(98, 288))
@@ -425,24 +341,13 @@ def test_freiburg_archive_peculiarities_are_reproduced(folder: Path) -> None:
 
 
 def test_freiburg_scenes_are_in_one_split() -> None:
-    shots = datasets.FREIBURG_LAYOUT.shots(EMBEDDED["synth_freiburg"].plan)
+    shots = shots_of(datasets.FREIBURG_LAYOUT, EMBEDDED["synth_freiburg"].plan)
     assert len({shot.name for shot in shots}) == 23
     assert [shot.folder for shot in shots[:10:2]] == [
         *("train/seq_00_day/00", "train/seq_00_day/01", "train/seq_01_day/01"),
         *("train/seq_02_day/00", "train/seq_03_day/00"),
     ]
     assert [shot.night for shot in shots] == [False] * 10 + [True] * 6 + [False] * 5 + [True] * 2
-
-
-def test_freiburg_classes_occur_by_day_and_night() -> None:
-    for night in (0.0, 1.0):
-        factors = replace(FREIBURG_FACTORS, night_share=night)
-        found = [render_scene(0, index, factors) for index in range(24)]
-        ids = np.stack([freiburg_ids(scene) for scene in found])
-        assert (np.bincount(ids.ravel(), minlength=14)[:13] / ids.size > 0.003).all()
-        for scene, each in zip(found, ids, strict=True):
-            sky = each == freiburg.CLASSES.index("sky")
-            assert np.array_equal(sky, np.isinf(scene.depth))
 
 
 def test_freiburg_counts_and_margins_by_hand() -> None:

@@ -15,12 +15,19 @@ from rgbt.synth.camera import SynthCamera, camera_of, flow_between
 from rgbt.synth.factors import EgoMotion, SceneFactors
 from rgbt.synth.light import is_night
 from rgbt.synth.objects import place_objects
-from rgbt.synth.raster import draw, facets_of, sorted_for_drawing
-from rgbt.synth.render import develop_rgb, squared_radius, texture_strength
-from rgbt.synth.scene import Scene, ScenePair, render_pair, render_scene
-from rgbt.synth.shapes import CAR, CURVE, INDEX, PERSON, Shape, shapes
-from rgbt.synth.street import Placed, draw_road, ground_quads
+from rgbt.synth.scene import (
+    Scene,
+    ScenePair,
+    develop_rgb,
+    render_pair,
+    render_scene,
+    squared_radius,
+    texture_strength,
+)
+from rgbt.synth.street import INDEX, Placed, Shape, draw_road, ground_quads
+from rgbt.synth.surface import draw, facets_of, sorted_for_drawing
 
+CAR, PERSON, CURVE = 1, 2, 4
 FACTORS = SceneFactors()
 DAY, NIGHT = replace(FACTORS, night_share=0.0), replace(FACTORS, night_share=1.0)
 QUIET = replace(FACTORS, rgb_noise=0.0, thermal_noise=0.0, thermal_drift=0.0)
@@ -36,29 +43,6 @@ def images(scene: Scene) -> tuple[bytes, bytes, bytes]:
 
 def quiet(index: int, *, night: bool = False, **changed: Any) -> Scene:
     return render_scene(0, index, replace(QUIET, night_share=float(night), **changed))
-
-
-# ---- scenes and shapes ----------------------------------------------------------------------
-
-
-def test_scene_follows_from_seed_and_index() -> None:
-    first = images(render_scene(0, 7, FACTORS))
-    render_scene(1, 2, FACTORS)
-    assert images(render_scene(0, 7, FACTORS)) == first
-    assert images(render_scene(0, 8, FACTORS))[2] != first[2]
-    assert images(render_scene(1, 7, FACTORS))[2] != first[2]
-
-
-def test_solid_faces_of_every_shape_point_outwards() -> None:
-    assert len(shapes()) == 41
-    assert next(iter(INDEX)) == "sky"
-    for shape in shapes().values():
-        corners = shape.corners
-        middle = (corners.min((0, 1)) + corners.max((0, 1))) / 2
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        outwards = ((corners[:, 0] - middle) * normals).sum(1) >= 0
-        assert (outwards | (shape.meta[:, 3] > 0)).all(), shape.name
-        assert shape.height == corners[..., 1].max()
 
 
 # ---- independence of the factors ------------------------------------------------------------
@@ -108,19 +92,15 @@ def test_night_share_flips_scenes_one_by_one() -> None:
 # ---- what is in the images ------------------------------------------------------------------
 
 
-def test_night_is_darker_than_day_and_noisier() -> None:
-    loud = {"rgb_noise_radius_gain": 0.0, "rgb_noise": 0.02}
-    noise, means = [], []
-    for factors in (DAY, NIGHT):
-        clean = np.stack(
-            [render_scene(0, i, replace(factors, rgb_noise=0.0)).rgb for i in range(6)]
-        )
-        noisy = np.stack([render_scene(0, i, replace(factors, **loud)).rgb for i in range(6)])
-        middle = (clean > 40) & (clean < 215)
-        noise.append((noisy.astype(float) - clean)[middle].std())
-        means.append(clean.mean())
-    assert means[1] < 0.75 * means[0]
-    assert noise[1] > 1.1 * noise[0]
+def test_dark_images_are_noisier() -> None:
+    factors = replace(FACTORS, rgb_noise=0.02, rgb_noise_radius_gain=0.0, vignette=0.0)
+    stds = []
+    for level in (0.2, 0.8):
+        grey = np.full((3, 200, 200), level, np.float32)
+        noise = develop_rgb(grey, factors, numpy_generator(0, "test")).astype(float)
+        stds.append(noise.std())
+        assert noise.mean() == pytest.approx(255 * level, abs=0.5)
+    assert stds[0] / stds[1] == pytest.approx((1 + 1.5 * 0.8) / (1 + 1.5 * 0.2), rel=0.02)
 
 
 @pytest.mark.parametrize("gain", [3.0, -0.8])
@@ -146,13 +126,6 @@ def test_squared_radius_and_texture_by_hand() -> None:
     assert (strength[60, 80], strength[0, 0]) == pytest.approx((2.0, 1.0), abs=0.01)
 
 
-def test_vignette_darkens_the_corners() -> None:
-    dark, even = (
-        render_scene(0, 52, replace(STILL, vignette=v)).rgb[:12, :16].mean() for v in (0.18, 0.0)
-    )
-    assert even > 1.1 * dark
-
-
 def test_persons_are_warmer_than_street_at_night() -> None:
     gaps, spread = [], []
     for index in range(60):
@@ -165,10 +138,6 @@ def test_persons_are_warmer_than_street_at_night() -> None:
     assert np.mean(gaps) > 30
     assert min(gaps) < 0.5 * np.mean(gaps)  # some are dressed so warmly that they hardly show
     assert np.mean(spread) > 10
-
-
-def test_thermal_contrast_zero_is_flat() -> None:
-    assert np.ptp(quiet(0, thermal_contrast=0.0).thermal) == 0
 
 
 def test_night_light_darkens_the_night_alone() -> None:
@@ -195,7 +164,7 @@ def test_without_passive_contrast_thermal_does_not_show_kerbs() -> None:
 
 def test_glare_surrounds_headlights_that_point_at_the_camera() -> None:
     found = 0
-    for index in range(40):
+    for index in range(24):
         plain, veiled = quiet(index, night=True), quiet(index, night=True, glare=1.0)
         assert np.array_equal(plain.thermal, veiled.thermal)
         lit = [thing for thing in plain.placed if thing.lit and np.cos(thing.yaw) < 0]
@@ -203,22 +172,20 @@ def test_glare_surrounds_headlights_that_point_at_the_camera() -> None:
         assert gain >= 0
         assert lit or gain == 0
         found += gain > 0
-    assert found >= 5
+    assert found >= 3
 
 
 def test_far_objects_are_small_central_and_scaled() -> None:
     few = {"rail_share": 0.0, "bump_share": 0.0, "kerb_share": 0.0, "num_objects": 0}
-    sizes, offsets = [], []
-    for factor in (1.0, 2.0):
-        labels = [quiet(index, far_object_scale=factor, **few).label > 0 for index in range(20)]
-        sizes.append(sum(int(label.sum()) for label in labels))
-        rows, columns = np.nonzero(np.any(labels, axis=0))
-        offsets.append(np.hypot(rows - 59.5, columns - 79.5).mean())
-    assert 2.5 < sizes[1] / sizes[0] < 4.5  # four times, less what they hide of one another
     near = {**few, "num_objects": 6, "num_far_objects": 0}
-    others = sum(int((quiet(index, **near).label > 0).sum()) for index in range(20))
-    assert 0 < sizes[0] < 0.35 * others
-    assert offsets[0] < 40
+    far, twice, others = (
+        np.stack([quiet(index, **changed).label > 0 for index in range(12)])
+        for changed in (few, {**few, "far_object_scale": 2.0}, near)
+    )
+    assert 2.5 < twice.sum() / far.sum() < 4.5  # four times, less what they hide of one another
+    assert 0 < far.sum() < 0.35 * others.sum()
+    _, rows, columns = np.nonzero(far)
+    assert np.hypot(rows - 59.5, columns - 79.5).mean() < 40
 
 
 @pytest.mark.parametrize(
@@ -229,8 +196,7 @@ def test_share_of_structures(key: str, label: int) -> None:
         [(quiet(index, **{key: share}).label == label).any() for index in range(8)]
         for share in (0.0, 1.0)
     )
-    assert not any(none)
-    assert sum(all_of_them) > 4
+    assert (sum(none), sum(all_of_them) > 4) == (0, True)
 
 
 # ---- geometry -------------------------------------------------------------------------------
@@ -256,15 +222,13 @@ def test_label_and_depth_of_a_box_follow_the_camera() -> None:
     # The ground 20 rows below the horizon is 1.5 * 100 / 20 = 7.5 m ahead.
     assert 1 / inverse_depth[70, 150] == pytest.approx(7.5, rel=1e-3)
     # A face that is solid is seen where its normal points at the camera: of these, from behind.
-    solid = [(np.array(each[::-1], np.float32), (*meta[:3], 0)) for each in (top, front)]
-    shapes = (Shape.of("box", solid), Shape.of("box", [(c[::-1], m) for c, m in solid]))
-    seen = [
-        (np.concatenate([[0], made.label])[draw(made, camera).ids] == CAR).sum()
-        for each in shapes
-        for made in [facets_of(ground_quads(draw_road(0, 0, FACTORS)), [Placed(each, 0.0, 0.0)])]
-    ]
-    assert sorted(seen)[0] == 0
-    assert sorted(seen)[1] == (label == CAR).sum()
+    seen = []
+    for way in (1, -1):
+        faces = [(np.array(each[::way], np.float32), (*meta[:3], 0)) for each in (top, front)]
+        box = Placed(Shape.of("box", faces), 0.0, 0.0)
+        made = facets_of(ground_quads(draw_road(0, 0, FACTORS)), [box])
+        seen.append((np.concatenate([[0], made.label])[draw(made, camera).ids] == CAR).sum())
+    assert sorted(seen) == [0, (label == CAR).sum()]
 
 
 def test_normals_are_those_of_the_facets_and_point_at_the_camera() -> None:
@@ -303,8 +267,6 @@ def test_flow_by_hand() -> None:
     # From depth 8 to 6 every offset from the centre grows by 8 / 6: (5, 10) becomes (6.67, 13.3).
     ahead = flow_between(wall, camera, camera.moved(EgoMotion(2.0)))
     assert ahead[10, 20] == pytest.approx([5 / 3, 10 / 3], abs=1e-4)
-    with pytest.raises(ValueError, match="same"):
-        flow_between(wall, camera, replace(camera, focal=1.0))
 
 
 # ---- two frames -----------------------------------------------------------------------------
@@ -326,26 +288,24 @@ def inside(pair: ScenePair) -> Array:
 
 @pytest.mark.parametrize("motion", [EgoMotion(0.6, 0.0), EgoMotion(0.5, 2.0), EgoMotion(-0.7, -3)])
 def test_flow_carries_labels_from_frame_to_frame(motion: EgoMotion) -> None:
-    agree, labelled, visible, hidden = [], [], [], []
-    for index in range(8):
-        pair = render_pair(0, index, FACTORS, motion)
-        same = warped(pair.first.label, pair, cv2.INTER_NEAREST) == pair.second.label
-        agree.append(same[pair.visible])
-        labelled.append(same[pair.visible & (pair.second.label > 0)])
-        visible.append(pair.visible.mean())
-        place = np.stack(np.mgrid[:120, :160], -1) + pair.flow
-        within = ((place >= 0) & (place <= (119, 159))).all(-1)
-        hidden.append((within & ~pair.visible).sum())
-    assert np.mean(np.concatenate(agree)) > 0.97
+    pairs = [render_pair(0, index, FACTORS, motion) for index in range(6)]
+    visible = np.stack([p.visible for p in pairs])
+    label = np.stack([p.second.label for p in pairs])
+    moved = np.stack([warped(p.first.label, p, cv2.INTER_NEAREST) for p in pairs])
+    place = np.stack(np.mgrid[:120, :160], -1) + np.stack([p.flow for p in pairs])
+    within = ((place >= 0) & (place <= (119, 159))).all(-1)
+    assert np.mean((moved == label)[visible]) > 0.97
     # Pixels of objects lie on outlines more often, where the nearest pixel may be the neighbour's.
-    assert np.mean(np.concatenate(labelled)) > 0.9
+    assert np.mean((moved == label)[visible & (label > 0)]) > 0.9
     assert np.mean(visible) > 0.75
-    assert np.mean(hidden) > 50  # behind an object in the first frame
+    assert np.sum(within & ~visible) > 50 * len(pairs)  # behind an object in the first frame
 
 
 def test_first_frame_of_a_pair_is_the_scene() -> None:
     pair = render_pair(0, 11, FACTORS, EgoMotion(0.0))
     assert images(pair.first) == images(render_scene(0, 11, FACTORS))
+    assert images(render_scene(0, 8, FACTORS))[2] != images(pair.first)[2]
+    assert images(render_scene(1, 11, FACTORS))[2] != images(pair.first)[2]
     assert np.array_equal(pair.second.label, pair.first.label)
     assert not np.array_equal(pair.second.rgb, pair.first.rgb)  # the noise is another one
     assert np.abs(pair.flow).max() < 1e-3

@@ -9,23 +9,11 @@ import numpy as np
 from rgbt.transforms.crm import CrmTransform
 from rgbt.types import Sample
 
-JITTER: dict[str, Any] = {
-    "brightness_delta": 32.0,
-    "contrast_range": (0.5, 1.5),
-    "saturation_range": (0.5, 1.5),
-    "hue_delta": 18,
-    "thermal_contrast_range": (0.5, 1.5),
-}
 RECIPE: dict[str, Any] = {
-    **JITTER,
-    "sizes": (24, 30, 48, 61, 96),
-    "max_size": 192,
-    "crop_hw": (24, 32),
-    "flip_probability": 0.5,
-    "colour": "intended",
-    "colour_probability": 0.5,
-    "test_short_edge": None,
-    "track_position": True,
+    **dict.fromkeys(("contrast_range", "saturation_range", "thermal_contrast_range"), (0.5, 1.5)),
+    **{"brightness_delta": 32.0, "hue_delta": 18, "colour_probability": 0.5, "colour": "intended"},
+    **{"sizes": (24, 30, 48, 61, 96), "max_size": 192, "crop_hw": (24, 32)},
+    **{"flip_probability": 0.5, "test_short_edge": None, "track_position": True},
 }
 SIZES = ((48, 64), (60, 50), (31, 77), (97, 41), (64, 128), (33, 200))
 

@@ -6,18 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rgbt.transforms.crm import (
-    ColourJitter,
-    scale_and_truncate,
-    scale_saturation,
-    shift_hue,
-)
-from tests.transforms.recipes import JITTER
+from rgbt.transforms.crm import scale_and_truncate, scale_saturation, shift_hue
+from tests.transforms.recipes import crm
 
-
-def jitter(**changes: Any) -> ColourJitter:
-    values = {"colour_probability": 0.5, **JITTER}
-    return ColourJitter(**{**values, **changes})
+BLACK = np.zeros((2, 2), np.uint8)
 
 
 def flat(red: int, green: int, blue: int, dtype: Any = np.uint8) -> np.ndarray:
@@ -31,17 +23,6 @@ def test_scale_and_truncate_by_hand(dtype: Any) -> None:
     assert found.dtype == np.uint8
     assert found.tolist() == [[0, 150, 151, 255]]  # 151.5 is truncated, 300 clipped
     assert scale_and_truncate(image, offset=-100.5).tolist() == [[0, 0, 0, 99]]
-
-
-def test_uint8_and_float_scale_alike() -> None:
-    rng = np.random.default_rng(0)
-    image = rng.integers(0, 256, (16, 16, 3), dtype=np.uint8)
-    for _ in range(20):
-        factor, offset = rng.uniform(0.5, 1.5), rng.uniform(-32, 32)
-        np.testing.assert_array_equal(
-            scale_and_truncate(image, factor, offset),
-            scale_and_truncate(image.astype(np.float32), factor, offset),
-        )
 
 
 @pytest.mark.parametrize("factor", [0.5, 0.8, 1.2, 1.5])
@@ -63,69 +44,51 @@ def test_saturation_of_float_is_all_or_nothing() -> None:
     assert full[0, 0, 0] == 200
 
 
-def test_hue_of_uint8_turns_by_two_degrees_per_step() -> None:
+def test_hue_by_hand() -> None:
     # Red (hue 0) plus 15 steps = 30 degrees: half way to yellow.
     np.testing.assert_allclose(shift_hue(flat(240, 0, 0), 15)[0, 0], (240, 120, 0), atol=1)
     # Red minus 30 steps = 300 degrees: magenta; the hue is a circle.
     np.testing.assert_allclose(shift_hue(flat(240, 0, 0), -30)[0, 0], (240, 0, 240), atol=1)
-
-
-def test_hue_of_float_is_folded() -> None:
-    """In degrees now: red + 15 is 15 degrees; blue, 240 degrees, folds to 60, yellow."""
-    red = flat(240, 0, 0, np.float32)
+    # Of float images in degrees: red + 15 is 15 degrees; blue, 240 degrees, folds to 60, yellow.
+    red, blue = flat(240, 0, 0, np.float32), flat(0, 0, 240, np.float32)
     np.testing.assert_allclose(shift_hue(red, 15)[0, 0], (240, 60, 0), atol=1e-3)
-    blue = flat(0, 0, 240, np.float32)
     np.testing.assert_allclose(shift_hue(blue, 0)[0, 0], (240, 240, 0), atol=1e-3)
 
 
 def test_intended_stays_uint8_and_released_may_turn_grey() -> None:
     """Grey needs: no brightness (1/2), saturation (1/2), and no contrast before it (3/4)."""
     rng = np.random.default_rng(0)
-    images = [jitter().draw_colours(rng).rgb(flat(200, 120, 100, np.float32)) for _ in range(3000)]
+    images = [crm().coloured(flat(200, 120, 100, np.float32), BLACK, rng)[0] for _ in range(3000)]
     grey = np.mean([np.ptp(image[0, 0]) == 0 for image in images])
     assert abs(grey - 3 / 16) < 0.03
-    rng = np.random.default_rng(0)
-    images = [jitter().draw_colours(rng).rgb(flat(200, 120, 100)) for _ in range(1000)]
+    images = [crm().coloured(flat(200, 120, 100), BLACK, rng)[0] for _ in range(1000)]
     assert all(image.dtype == np.uint8 for image in images)
     assert not any(np.ptp(image[0, 0]) == 0 for image in images)
 
 
-def test_probability_zero_changes_nothing() -> None:
-    image = np.random.default_rng(0).integers(0, 256, (4, 5, 3), dtype=np.uint8)
-    off = jitter(colour_probability=0.0)
-    rng = np.random.default_rng(1)
-    np.testing.assert_array_equal(off.draw_colours(rng).rgb(image), image)
-    np.testing.assert_array_equal(off.draw_colours(rng).thermal(image[..., 0]), image[..., 0])
-
-
-def test_brightness_and_contrast_alone() -> None:
-    """The published ranges, each alone, on a mid grey, which saturation and hue leave alone."""
-    rng = np.random.default_rng(2)
-    grey = flat(100, 100, 100)
-    only_brightness = jitter(colour_probability=1.0, contrast_range=(1, 1))
-    values = [int(only_brightness.draw_colours(rng).rgb(grey)[0, 0, 0]) for _ in range(500)]
-    assert (min(values), max(values)) == pytest.approx((68, 131), abs=1)
-    only_contrast = jitter(colour_probability=1.0, brightness_delta=0.0)
-    values = [int(only_contrast.draw_colours(rng).rgb(grey)[0, 0, 0]) for _ in range(500)]
-    assert (min(values), max(values)) == pytest.approx((50, 149), abs=1)
-
-
-def test_thermal_gets_contrast_alone_half_of_the_time() -> None:
-    rng = np.random.default_rng(3)
-    image = np.array([[0, 100]], np.uint8)
-    found = np.array([jitter().draw_colours(rng).thermal(image)[0] for _ in range(1000)])
-    assert (found[:, 0] == 0).all()  # brightness would lift the zero
-    assert 50 <= found[:, 1].min() < 52
-    assert 148 < found[:, 1].max() <= 150
-    assert abs((found[:, 1] == 100).mean() - 0.5) < 0.08
-
-
-def test_hue_reaches_both_ends() -> None:
-    draws = np.random.default_rng(4)
-    found = {
-        jitter(colour_probability=1.0, hue_delta=2).draw_colours(draws).hue for _ in range(200)
-    }
-    assert found == {-2, -1, 0, 1, 2}
+def test_draws_have_their_ranges_and_odds() -> None:
+    """Each alone: saturation and hue leave a mid grey as it is, nothing lifts thermal's black."""
+    rng, grey = np.random.default_rng(2), flat(100, 100, 100)
+    pair = np.array([[0, 100]], np.uint8)
+    same = crm(colour_probability=0.0).coloured(grey, pair, rng)
+    assert (same[0].tolist(), same[1].tolist()) == (grey.tolist(), pair.tolist())
+    still: dict[str, Any] = {"colour_probability": 1.0, "brightness_delta": 0.0}
+    still |= {"contrast_range": (1, 1), "saturation_range": (1, 1), "hue_delta": 0}
+    for changes, expected in (
+        ({"brightness_delta": 32.0}, (68, 131)),
+        ({"contrast_range": (0.5, 1.5)}, (50, 149)),
+    ):
+        only = crm(**{**still, **changes})
+        values = [int(only.coloured(grey, pair, rng)[0][0, 0, 0]) for _ in range(500)]
+        assert (min(values), max(values)) == pytest.approx(expected, abs=1)
+    thermal = np.array([crm().coloured(grey, pair, rng)[1][0] for _ in range(1000)])
+    assert (thermal[:, 0] == 0).all()
+    assert (thermal[:, 1].min(), thermal[:, 1].max()) == pytest.approx((50, 149), abs=1.5)
+    assert abs((thermal[:, 1] == 100).mean() - 0.5) < 0.08
+    # Hues of both ends, as shifts of red.
+    hue, red = crm(**{**still, "hue_delta": 2}), flat(240, 0, 0)
+    found = {tuple(hue.coloured(red, pair, rng)[0][0, 0].tolist()) for _ in range(200)}
+    assert found == {tuple(shift_hue(red, by)[0, 0].tolist()) for by in (-2, -1, 0, 1, 2)}
 
 
 def test_pixels_do_not_depend_on_their_place_in_a_row() -> None:

@@ -1,77 +1,26 @@
-"""Draws, padding and blur of the transforms of fixed size; their steps are in `test_releases`."""
+"""Padding, colours and published numbers of transforms whose steps are in `test_releases`."""
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from rgbt.assembly import training_setup
+from rgbt.assembly.training_setup import TrainingSetup
+from rgbt.checks import InputError
 from rgbt.config.component import build
 from rgbt.config.compose import compose
-from rgbt.transforms.fixed_size import draw_ends, draw_offset, draw_span, recoloured
+from rgbt.requirements import record_of
+from rgbt.transforms.fixed_size import recoloured
 from rgbt.types import IGNORE
-from tests.transforms.recipes import crm, noise
+from tests.composed import specified
+from tests.transforms.recipes import noise
 from tests.transforms.test_releases import made
-
-
-@pytest.mark.parametrize(
-    ("draw", "expected"),
-    [
-        (lambda rng: draw_span(4, 4, rng), {(0, 4)}),
-        (lambda rng: draw_span(3, 4, rng), {(0, 3)}),
-        # 0..3, and the last one lacks a pixel.
-        (lambda rng: draw_span(6, 4, rng), {(0, 4), (1, 4), (2, 4), (3, 3)}),
-        (lambda rng: draw_offset(10, 7, rng), {(0, 7), (1, 7), (2, 7), (3, 7), (4, 6)}),
-        (lambda rng: draw_offset(7, 7, rng), {(0, 7), (1, 6)}),
-        (lambda rng: draw_offset(5, 7, rng), {(0, 5), (1, 4)}),
-        (lambda rng: draw_offset(1, 7, rng), {(0, 1)}),
-        (lambda rng: draw_ends(9, 0.1, rng), {(0, 9)}),
-        (lambda rng: draw_ends(640, 0.0, rng), {(0, 640)}),
-        (lambda rng: draw_ends(10, 0.1, rng), {(0, 9), (0, 10)}),
-        (lambda rng: draw_ends(4, 0.5, rng), {(a, b) for a in (0, 1) for b in (2, 3, 4)}),
-        # x1 in [0, 64), x2 in [576, 640] of MFNet
-        (lambda rng: draw_ends(640, 0.1, rng)[:1], {(first,) for first in range(64)}),
-        (lambda rng: draw_ends(640, 0.1, rng)[1:], {(end,) for end in range(576, 641)}),
-    ],
-)
-def test_draws_are_uniform_over_those_of_the_release(draw: Any, expected: set[Any]) -> None:
-    rng, number = np.random.default_rng(1), 60 * len(expected)
-    counts = Counter(draw(rng) for _ in range(number))
-    assert set(counts) == expected
-    assert max(abs(count - 60) for count in counts.values()) < 40  # five standard deviations
-
-
-def test_mirroring_and_sizes_have_their_odds() -> None:
-    rng, original = np.random.default_rng(6), noise()
-    cmx = replace(made("cmx_released"), factors=(0.25, 0.5))
-    shapes: Counter[Any] = Counter()
-    mirrored = 0
-    for _ in range(600):
-        example = cmx.train(original, rng)
-        shapes[int((example.rgb[..., 0] != example.rgb[0, 0, 0]).any(1).sum())] += 1
-        mirrored += example.position[1, 20, 20] > example.position[1, 20, 40]
-    assert abs(mirrored - 300) < 62
-    assert sorted(shapes) == [12, 24]
-    assert abs(shapes[12] - 300) < 62
-    sizes = Counter(
-        crm(sizes=(24, 48, 96), crop_hw=None, max_size=100).train(original, rng).label.shape
-        for _ in range(300)
-    )
-    assert set(sizes) == {(24, 32), (48, 64), (75, 100)}
-    assert min(sizes.values()) > 60
-
-
-def test_padding_follows_the_order_of_the_means() -> None:
-    for order, expected in (("rgb", [124, 116, 104]), ("bgr", [104, 116, 124])):
-        words = (f"transform.padding_order={order}", "transform.factors=[0.5]")
-        config = ("transform.padding_rgb=[123.675,116.28,103.53]",)
-        example = made("cmx_released", *words, *config).train(noise(), np.random.default_rng(7))
-        assert example.rgb[0, 0].tolist() == expected
-        assert (example.label[0] == IGNORE).all()
 
 
 @pytest.mark.parametrize("inputs", ["cmx", "cmx_released", "temporal", "crm", "unit"])
@@ -102,22 +51,51 @@ def test_recoloured_by_hand() -> None:
     np.testing.assert_array_equal(recoloured(image, 1.0, 1.0, 1.0), image)
 
 
-def test_thesis_blurs_rgb_and_thermal_alone() -> None:
-    """Binomial weights of five pixels along both axes, borders mirrored at the last pixel."""
-
-    def gaussian(image: np.ndarray) -> np.ndarray:
-        weights = np.array([1, 4, 6, 4, 1]) / 16
-        sides = ((2, 2), (2, 2), *((0, 0),) * (image.ndim - 2))
-        padded = np.pad(image.astype(float), sides, "reflect")
-        height, width = image.shape[:2]
-        rows = sum(w * padded[i : i + height] for i, w in enumerate(weights))
-        return np.asarray(sum(w * rows[:, i : i + width] for i, w in enumerate(weights)))
-
-    sharp, soft = (
-        made("thesis", f"transform.blur_probability={p}").train(noise(), np.random.default_rng(6))
-        for p in (0.0, 1.0)
+def test_heatnet_target_keeps_blocks_and_thermal(monkeypatch: pytest.MonkeyPatch) -> None:
+    chances = ("drop_probability", "thermal_probability", "class_probability")
+    full = replace(made("heatnet"), **dict.fromkeys(chances, 1.0))
+    target = record_of(full).for_target
+    assert target == replace(full, **dict.fromkeys(chances, 0.0))
+    assert record_of(target).for_target is None
+    # Training takes the transform of each domain.
+    taken: list[Any] = []
+    monkeypatch.setattr(
+        training_setup, "train_batches", lambda *given: taken.append(given[2]) or SimpleNamespace()
     )
-    for name in ("rgb", "thermal"):
-        assert np.abs(getattr(soft, name) - gaussian(getattr(sharp, name))).max() <= 0.5
-    np.testing.assert_array_equal(soft.label, sharp.label)
-    np.testing.assert_array_equal(soft.confidence, sharp.confidence)
+    monkeypatch.setattr(training_setup, "PairedBatches", lambda *_, **__: None)
+    spec = specified(("+experiment=heatnet_original",))
+    named = {"domains": spec.domains, "loading": spec.data, "trainer": spec.trainer}
+    session: Any = SimpleNamespace(spec=spec, transform=full, drawn=spec.seeds, **named)
+    setup: Any = SimpleNamespace(session=session, datasets=dict.fromkeys(("source", "target")))
+    setup.rare = None
+    TrainingSetup.batches(setup, range(1))
+    assert taken == [full, target]
+
+
+@pytest.mark.parametrize(
+    ("changes", "key"), [({"crop_hw": (48, 77)}, "crop_hw"), ({"drop_height": (5, 41)}, "drop_")]
+)
+def test_heatnet_sizes_that_do_not_fit_are_refused(changes: dict[str, Any], key: str) -> None:
+    with pytest.raises(InputError, match=f"transform.{key}"):
+        replace(made("heatnet"), **changes)
+
+
+def test_published_numbers_of_the_teacher_and_of_heatnet() -> None:
+    """Configuration mv_pspnet50 of the thesis' code; batch and auxiliary weight of semseg."""
+    spec = specified(("+experiment=thermal_teacher_semseg", "scale=paper", "dataset.root=x"))
+    mean, teacher = (123.675, 116.28, 103.53), spec.transform.build()
+    assert (teacher.crop_hw, teacher.padding_rgb) == ((473, 473), mean)
+    assert teacher.padding_thermal == pytest.approx(sum(mean) / 3)
+    optimizer = spec.optimizer.values
+    assert (optimizer["lr"], optimizer["backbone_multiplier"]) == (0.1, 0.1)
+    assert (optimizer["momentum"], optimizer["weight_decay"]) == (0.9, 1e-4)
+    assert (spec.loss.values["weight"], spec.data.batch_size) == (0.4, 16)
+    assert spec.trainer.max_steps == 400 * (12170 // 16)
+    assert (spec.prediction.window_hw, spec.prediction.mirrored) == ((473, 473), True)
+    assert spec.schedule.build()(152000, 304000, 760) == pytest.approx(0.5**0.9)
+    # 320 x 960 of 650 x 1920; columns 148 to 851 in the test, 150 to 849 in training.
+    spec = specified(("+experiment=heatnet_original", "scale=paper", "dataset.root=x"))
+    assert spec.dataset.values["crop"] == (0, 650, 2 * 148, 2 * 852)
+    assert spec.dataset.values["thermal_range"] == (21800, 25000)
+    assert (spec.data.batch_size, spec.trainer.max_steps) == (8, 200 * 1506)
+    assert (spec.prediction.counted, spec.prediction.label_resize) == ("image", "nearest")

@@ -20,6 +20,7 @@ from torch.nn import functional as F
 
 from rgbt.config.component import build, constructor
 from rgbt.config.compose import compose, conf_dir
+from rgbt.transforms.fixed_size import recoloured
 from rgbt.types import IGNORE, Example, Sample
 from tests.transforms.recipes import SIZES, noise
 
@@ -85,12 +86,8 @@ def crm(t: Any, sample: Sample, rng: np.random.Generator) -> Arrays:
     crop = np.minimum(t.crop_hw or (height, width), (height, width)).tolist()
     top, left = (int(rng.integers(a - b + 1)) for a, b in zip((height, width), crop, strict=True))
     arrays = mirrored(cut(arrays, top, left, *crop), rng.random() < t.flip_probability)
-    colours = t.draw_colours(rng)
-    return {
-        **arrays,
-        "rgb": colours.rgb(np.ascontiguousarray(arrays["rgb"])).astype(t.dtype),
-        "thermal": colours.thermal(np.ascontiguousarray(arrays["thermal"])).astype(t.dtype),
-    }
+    images = t.coloured(*(np.ascontiguousarray(arrays[key]) for key in IMAGES), rng)
+    return {**arrays, **{k: image.astype(t.dtype) for k, image in zip(IMAGES, images)}}
 
 
 def cmx(t: Any, sample: Sample, rng: np.random.Generator) -> Arrays:
@@ -110,7 +107,7 @@ def cmx(t: Any, sample: Sample, rng: np.random.Generator) -> Arrays:
 def cmnext(t: Any, sample: Sample, rng: np.random.Generator) -> Arrays:
     rgb = sample.rgb
     if rng.random() < t.colour_probability:
-        rgb = by_loops(rgb, rng.uniform(*t.colour_range, size=3))
+        rgb = recoloured(rgb, *rng.uniform(*t.colour_range, size=3))
     flipped = rng.random() < t.flip_probability
     if rng.random() < t.blur_probability:
         rgb = np.asarray(cv2.GaussianBlur(rgb, (3, 3), t.blur_deviation))
@@ -123,21 +120,6 @@ def cmnext(t: Any, sample: Sample, rng: np.random.Generator) -> Arrays:
         spans.append((first, min(crop, length - first)))
     (top, height), (left, width) = spans
     return framed(cut(arrays, top, left, height, width), t.crop_hw, (0, 0), 0, 0)
-
-
-def by_loops(image: np.ndarray, factors: np.ndarray) -> np.ndarray:
-    """Brightness, contrast and saturation of torchvision, each truncated to whole grey levels."""
-    weights = np.float32([0.2989, 0.587, 0.114])
-
-    def mix(image: np.ndarray, other: Any, factor: float) -> np.ndarray:
-        share = np.float32(factor)
-        both = share * image.astype(np.float32) + (1 - share) * np.float32(other)
-        return np.trunc(np.clip(both, 0, 255)).astype(np.uint8)
-
-    image = mix(image, 0, factors[0])
-    grey = np.trunc(image.astype(np.float32) @ weights)
-    image = mix(image, grey.mean(dtype=np.float32), factors[1])
-    return mix(image, np.trunc(image.astype(np.float32) @ weights)[..., None], factors[2])
 
 
 def rtfnet(t: Any, sample: Sample, rng: np.random.Generator) -> Arrays:
@@ -161,11 +143,81 @@ def thesis(t: Any, sample: Sample, rng: np.random.Generator) -> Arrays:
         mixed = cv2.resize(sample.label, t.crop_hw[::-1], interpolation=cv2.INTER_LINEAR_EXACT)
         arrays["label"] = np.where(ignored > 0, IGNORE, mixed).astype(np.uint8)
     arrays = mirrored(arrays, flipped)
-    if blurred:
-        kernel = (t.blur_kernel, t.blur_kernel)
-        soft = {key: np.ascontiguousarray(arrays[key]) for key in IMAGES}
-        arrays |= {key: cv2.GaussianBlur(each, kernel, 0) for key, each in soft.items()}
-    return arrays
+    return softened(arrays, t.blur_kernel) if blurred else arrays
+
+
+def softened(arrays: Arrays, side: int) -> Arrays:
+    soft = {key: np.ascontiguousarray(arrays[key]) for key in IMAGES}
+    return arrays | {key: cv2.GaussianBlur(each, (side, side), 0) for key, each in soft.items()}
+
+
+def turned(arrays: Arrays, angle: float, middle_xy: Any, fills: Any, middle_yx: Any) -> Arrays:
+    """Places are counted from where the centre moves, rounded and clipped to the image."""
+    matrix, (height, width) = cv2.getRotationMatrix2D(middle_xy, angle, 1), arrays["label"].shape
+    found = {}
+    for key, fill in zip((*IMAGES, "label", "confidence"), (*fills, 0.0)):
+        how = cv2.INTER_LINEAR if key in IMAGES else cv2.INTER_NEAREST
+        size, value = (width, height), np.broadcast_to(fill, 3).tolist()
+        found[key] = cv2.warpAffine(
+            np.ascontiguousarray(arrays[key]), matrix, size, flags=how, borderValue=value
+        )
+    row, column = centre(arrays, middle_yx)
+    x, y = np.rint(matrix @ [column, row, 1]).clip(0, [width - 1, height - 1])
+    rows, columns = np.indices((height, width))
+    return {**found, "row": rows - y + middle_yx[0], "column": columns - x + middle_yx[1]}
+
+
+def centre(arrays: Arrays, middle_yx: Any) -> Any:
+    distance = np.hypot(arrays["row"] - middle_yx[0], arrays["column"] - middle_yx[1])
+    return np.unravel_index(distance.argmin(), distance.shape)
+
+
+def semseg(t: Any, sample: Sample, rng: np.random.Generator) -> Arrays:
+    sides, middle = sample.thermal.shape, [side // 2 for side in sample.thermal.shape]
+    factor = float(rng.uniform(*t.scale_range))
+    arrays = resized(plain(sample, np.float32), tuple(max(1, round(factor * n)) for n in sides))
+    (row, column), (rows, columns) = centre(arrays, middle), np.indices(arrays["label"].shape)
+    arrays |= {"row": rows - row + middle[0], "column": columns - column + middle[1]}
+    height, width = arrays["label"].shape
+    if rng.random() < t.rotate_probability:
+        angle, fills = (
+            rng.uniform(-t.rotate_degrees, t.rotate_degrees),
+            (t.padding_rgb, t.padding_thermal, IGNORE),
+        )
+        arrays = turned(arrays, angle, (width / 2, height / 2), fills, middle)
+    if rng.random() < t.blur_probability:
+        arrays = softened(arrays, t.blur_kernel)
+    arrays = mirrored(arrays, rng.random() < t.flip_probability)
+    full = (max(height, t.crop_hw[0]), max(width, t.crop_hw[1]))
+    arrays = framed(arrays, full, None, t.padding_rgb, t.padding_thermal)
+    top, left = (int(rng.integers(a - b + 1)) for a, b in zip(full, t.crop_hw))
+    return cut(arrays, top, left, *t.crop_hw)
+
+
+def heatnet(t: Any, sample: Sample, rng: np.random.Generator) -> Arrays:
+    """Brought in by a rotation: black, and the label of road."""
+    (height, width), middle = t.crop_hw, [side // 2 for side in sample.thermal.shape]
+    top = int(rng.integers(t.resize_hw[0] - height + 1))
+    left = t.side_margin + int(rng.integers(t.resize_hw[1] - 2 * t.side_margin - width + 1))
+    arrays = cut(resized(plain(sample, np.float32), t.resize_hw), top, left, height, width)
+    arrays = mirrored(arrays, rng.random() < t.flip_probability)
+    if rng.random() < t.rotate_probability:
+        angle = rng.uniform(-t.rotate_degrees, t.rotate_degrees)
+        arrays = turned(arrays, angle, ((width - 1) / 2, (height - 1) / 2), (0, 0, 0), middle)
+    if rng.random() < t.drop_probability:
+        rows, columns = (int(rng.integers(*sides)) for sides in (t.drop_height, t.drop_width))
+        top, left = int(rng.integers(height - rows + 1)), int(rng.integers(width - columns + 1))
+        key = "rgb" if rng.random() < 0.5 else "thermal"
+        arrays[key] = arrays[key].copy()
+        arrays[key][top : top + rows, left : left + columns] = 127.5
+    thermal = arrays["thermal"]
+    if rng.random() < t.thermal_probability:
+        thermal = 127.5 + rng.uniform(*t.thermal_range) * (thermal - 127.5)
+    if rng.random() < t.class_probability:
+        for label in np.unique(arrays["label"]):
+            scaled = 127.5 + rng.uniform(*t.thermal_range) * (thermal - 127.5)
+            thermal = np.where(arrays["label"] == label, scaled, thermal)
+    return {**arrays, "thermal": thermal.astype(np.float32)}
 
 
 STEPS = {
@@ -177,13 +229,27 @@ STEPS = {
     "rtfnet_released": rtfnet,
     "thesis_blur": thesis,
     "thesis_released": thesis,
+    "semseg": semseg,
+    "heatnet": heatnet,
+}
+ROTATING = ("semseg", "heatnet")
+WORDS = {
+    # Truncation after a float32 resize shows its last bit: no colours there, see test_crm.
+    "crm_released": ("transform.colour_probability=0",),
+    "semseg": ("model=semseg",),
+    "heatnet": (
+        *("transform.resize_hw=[48,80]", "transform.crop_hw=[40,60]"),
+        *("transform.drop_height=[5,20]", "transform.drop_width=[5,30]"),
+        "transform.class_probability=0.5",
+    ),
 }
 
 
 def made(name: str, *words: str) -> Any:
     sizes = ("scale.crop_hw=[40,56]", "scale.train_sizes=[30,48,70]")
-    more = () if name == "heatnet" else ("transform.track_position=true",)
-    return build(compose([f"transform={name}", *sizes, *more, *words]).transform)
+    more = () if name in ROTATING else ("transform.track_position=true",)
+    words = (*sizes, *more, *WORDS.get(name, ()), *words)
+    return build(compose([f"transform={name}", *words]).transform)
 
 
 def assert_is(found: Example, expected: Arrays, name: str) -> None:
@@ -192,31 +258,28 @@ def assert_is(found: Example, expected: Arrays, name: str) -> None:
         one, other = getattr(found, key), expected[key]
         assert (one.shape, one.dtype) == (other.shape, other.dtype), (name, key)
         np.testing.assert_allclose(one, other, atol=1e-3 if other.dtype == np.float32 else 0)
-    assert found.position is not None
-    assert found.position.dtype == np.float32
-    np.testing.assert_array_equal(found.position, [expected["row"], expected["column"]])
-    middle = [side // 2 for side in found.original_hw]
-    distance = np.hypot(expected["row"] - middle[0], expected["column"] - middle[1])
-    assert found.centre_yx == np.unravel_index(distance.argmin(), distance.shape)
+    if name not in ROTATING:
+        assert found.position is not None
+        assert found.position.dtype == np.float32
+        np.testing.assert_array_equal(found.position, [expected["row"], expected["column"]])
+    assert found.centre_yx == centre(expected, [side // 2 for side in found.original_hw])
 
 
 @pytest.mark.parametrize("name", STEPS)
 def test_training_is_the_steps_of_the_release(name: str) -> None:
-    # Truncation after a float32 resize shows its last bit: no colours there, see test_crm.
-    words = ["transform.colour_probability=0"] if name == "crm_released" else []
-    transform = made(name, *words)
-    for number in range(90):
+    transform = made(name)
+    for number in range(60):
         sample = noise(number, SIZES[number % len(SIZES)])
         found = transform.train(sample, np.random.default_rng(number))
         assert_is(found, STEPS[name](transform, sample, np.random.default_rng(number)), name)
         assert (found.original_hw, found.name) == (sample.thermal.shape, sample.name)
 
 
-@pytest.mark.parametrize("name", [*STEPS, "heatnet"])
+@pytest.mark.parametrize("name", STEPS)
 def test_labels_and_positions_may_be_missing(name: str) -> None:
     transform = made(name)
     for number in range(4):
-        sample = noise(number, (480, 640) if name == "heatnet" else (48, 64))
+        sample = noise(number)
         whole, bare = (
             transform.train(each, np.random.default_rng(number))
             for each in (sample, replace(sample, label=None, confidence=None))
@@ -225,7 +288,7 @@ def test_labels_and_positions_may_be_missing(name: str) -> None:
         assert bare.confidence is None
         assert bare.centre_yx == whole.centre_yx
         assert (transform.test(replace(sample, label=None)).label == IGNORE).all()
-        if name != "heatnet":
+        if name not in ROTATING:
             silent = replace(transform, track_position=False)
             found = silent.train(sample, np.random.default_rng(number))
             assert found.position is None
@@ -235,18 +298,21 @@ def test_labels_and_positions_may_be_missing(name: str) -> None:
 @pytest.mark.parametrize("name", STEPS)
 def test_evaluation_keeps_files_or_resizes_images_alone(name: str) -> None:
     original, transform = noise(3), made(name)
-    example = replace(transform, test_short_edge=None).test(original)
-    for key in ("rgb", "thermal", "label", "confidence"):
-        np.testing.assert_array_equal(getattr(example, key), getattr(original, key))
-    assert example.centre_yx == (24, 32)
-    smaller = replace(transform, test_short_edge=24).test(original)
+    if name == "heatnet":
+        sizes = {"resize_hw": (24, 32), "crop_hw": (20, 28), "drop_width": (5, 28)}
+        smaller = replace(transform, **sizes).test(original)
+    else:
+        example = replace(transform, test_short_edge=None).test(original)
+        for key in ("rgb", "thermal", "label", "confidence"):
+            np.testing.assert_array_equal(getattr(example, key), getattr(original, key))
+        assert example.centre_yx == (24, 32)
+        smaller = replace(transform, test_short_edge=24).test(original)
     how = cv2.INTER_AREA if name.startswith("thesis") else cv2.INTER_LINEAR_EXACT
     for key in IMAGES:
-        image = getattr(original, key).astype(example.rgb.dtype)
+        image = getattr(original, key).astype(smaller.rgb.dtype)
         expected = cv2.resize(image, (32, 24), interpolation=how)
         np.testing.assert_array_equal(getattr(smaller, key), expected)
-    assert smaller.position is not None
-    assert smaller.position.shape == (2, 24, 32)
+    assert (smaller.position is None) == (name in ROTATING)
     np.testing.assert_array_equal(smaller.label, original.label)
     np.testing.assert_array_equal(smaller.confidence, original.confidence)
 
@@ -259,7 +325,6 @@ PUBLISHED: dict[str, dict[str, Any]] = {
         "thermal_contrast_range": [0.5, 1.5],
     },
     "crm_released": {"colour": "released"},
-    "none": {},
     "rtfnet_released": {"flip_probability": 0.5, "cut_share": 0.1},
     "cmx_released": {"factors": [0.5, 0.75, 1, 1.25, 1.5, 1.75], "flip_probability": 0.5},
     "cmnext_released": {

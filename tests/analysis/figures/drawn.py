@@ -9,8 +9,8 @@ from xml.etree import ElementTree
 import numpy as np
 from matplotlib.figure import Figure
 
-from analysis.figures.style import save
-from analysis.statistics.data import SpatialStatistics
+from analysis.figures.plots import save
+from analysis.statistics.collect import SpatialStatistics
 from rgbt.metrics.metric import Regions
 
 CLASSES = ("unlabeled", "car", "color_cone")
@@ -46,8 +46,7 @@ def statistics(labels: np.ndarray, regions: Regions, night: np.ndarray | None) -
         for label in labels
     ]
     one_hot = np.stack([labels == index for index in range(classes)], axis=1)
-    parts = ("all",) if night is None else ("day", "night")
-    chosen = [np.ones(len(labels), bool)] if night is None else [~night, night]
+    dark = np.zeros(len(labels), bool) if night is None else night
     n, m, r = np.ogrid[: len(labels), :2, :number]
     full = np.zeros((len(labels), 2, number))
     return SpatialStatistics(
@@ -56,7 +55,6 @@ def statistics(labels: np.ndarray, regions: Regions, night: np.ndarray | None) -
         split="train",
         classes=CLASSES,
         background=CLASSES[:1],
-        palette=PALETTE,
         partition=regions.name,
         region_map=region_map,
         kernel="four",
@@ -64,11 +62,10 @@ def statistics(labels: np.ndarray, regions: Regions, night: np.ndarray | None) -
         night=night,
         labels=np.array(inside, np.int64),
         ignored=np.zeros((len(labels), number), np.int64),
-        parts=parts,
-        occupied=np.stack([one_hot[each].sum(0) for each in chosen]).astype(np.int32),
+        occupied=np.stack([one_hot[each].sum(0) for each in (~dark, dark)]).astype(np.int32),
         laplacian=full + 10 * (m + 1) * (n + 1) + r,
         mean=full + 100.0 + n,
-        noise={"immerkaer": full + (m + 1.0) * (r + 1), "std": full + 20.0},
+        noise=np.stack([full + (m + 1.0) * (r + 1), full, full + 20.0], axis=1),
     )
 
 

@@ -1,70 +1,98 @@
-"""Qualitative panels."""
+"""Qualitative panels, pairs of frames and masks: what is shown and which pixels are marked."""
 
 from __future__ import annotations
 
+import json
+import math
+import shutil
+from functools import cache
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import torch
 
-from analysis.figures.inputs import FigureInput
+from analysis.figures.inputs import FIGURES, Config
 from analysis.figures.panels import (
-    QualitativePanel,
-    draw,
+    HIDDEN,
+    OUTLINED,
+    PATCHES,
+    STRIDE,
+    Frame,
+    FramePair,
+    PairOptions,
+    Pairs,
+    draw_pairs,
     image_mious,
-    make_missing,
+    mask_examples,
+    masker_overrides,
     most_different,
     panel,
 )
+from rgbt import consistency
 from rgbt.checks import InputError
+from rgbt.config.component import build
+from rgbt.config.compose import compose
 from rgbt.data.mfnet import MFNet
+from rgbt.data.predictions import FormatOptions
+from rgbt.metrics.counts import Counts
+from rgbt.types import MaskPair, Sample
 from tests.analysis.counts import counts_of
-from tests.analysis.figures.drawn import strips
+from tests.analysis.figures.drawn import CLASSES, PALETTE, texts
+from tests.analysis.figures.framed import METHODS, NAMES, predict, write_framed
+from tests.commands import Call
 
-NAMES = ["00001D", "00002N"]
-RINGS = strips(4, "ring")
+SYNTH = (
+    *("dataset=synth", "dataset.num_train=1", "dataset.num_val=2", "dataset.num_test=2"),
+    *("dataset.height=48", "dataset.width=64", "dataset.ego_forward_m=0.5"),
+)
 
 
 @pytest.fixture
 def dataset(write_mfnet) -> MFNet:
-    return MFNet(str(write_mfnet({"test": NAMES}, hw=(24, 32))))
+    return MFNet(str(write_mfnet({"test": ["00001D", "00002N"]}, hw=(24, 32))))
 
 
-def made(dataset: MFNet, names: list[str] = NAMES, **methods) -> QualitativePanel:
-    return panel(dataset, methods, names, RINGS)
+def shifted(dataset: MFNet, folder: Path, by: int, name: str = "00001D") -> Path:
+    """A folder with a prediction that is so many classes away from the label."""
+    folder.mkdir()
+    label = dataset.read(name).label
+    assert label is not None
+    cv2.imwrite(str(folder / f"{name}.png"), ((label + by) % 9).astype(np.uint8))
+    return folder
 
 
-def right(dataset: MFNet):
-    return lambda name: dataset.read(name).label
+def test_missing_images_are_beside_each_other_with_their_scores(
+    dataset: MFNet, tmp_path: Path
+) -> None:
+    shifts = {"methods": 0, "without_rgb": 1, "without_thermal": 2}
+    values = {key: f"CMX:{shifted(dataset, tmp_path / key, by)}" for key, by in shifts.items()}
+    config = Config(("dataset=mfnet", f"dataset.root={dataset.root}"))
+    figure, frame = FIGURES["crm/fig2"](config, values | {"names": "00001D"})
+    titles = ["RGB", "thermal", "ground truth", "CMX\nboth", "CMX\nno RGB", "CMX\nno thermal"]
+    assert [axes.get_title() for axes in figure.axes] == titles
+    assert frame["mIoU"].tolist() == [100, 0, 0]
+    label, palette = dataset.read("00001D").label, np.array(dataset.palette, np.uint8)
+    np.testing.assert_array_equal(figure.axes[0].images[0].get_array(), dataset.read("00001D").rgb)
+    for axes, by in zip(figure.axes[3:], shifts.values(), strict=True):
+        painted = axes.images[0].get_array()
+        np.testing.assert_array_equal(painted, palette[(label + by) % 9])
+        assert [text.get_text() for text in axes.texts] == ["0.0" if by else "100.0"]
 
 
-def test_rows_hold_the_images_and_their_scores(dataset: MFNet) -> None:
-    def wrong(name: str) -> np.ndarray:
-        return (dataset.read(name).label + 1) % 9
-
-    found = made(dataset, ours=right(dataset), theirs=wrong)
-    assert [row.name for row in found.rows] == NAMES
-    assert found.rows[1].mious == (100, 0)
-    np.testing.assert_array_equal(found.rows[0].rgb, dataset.read("00001D").rgb)
-    np.testing.assert_array_equal(found.rows[0].predictions[0], found.rows[0].label)
-    # The innermost of four rings takes half of each side.
-    assert found.box == (slice(6, 18), slice(8, 24))
-
-
-def test_scores_of_an_image_exclude_unscored_classes(dataset: MFNet) -> None:
+def test_scores_of_an_image_exclude_unscored_classes(dataset: MFNet, tmp_path: Path) -> None:
     label = dataset.read("00001D").label
     present = sorted(set(np.unique(label).tolist()) - {255})
     # One class is taken for another everywhere: 0, and of the other what is its own.
     lost, took = present[:2]
     own, more = (label == took).sum(), (label == lost).sum()
-
-    def merged(name: str) -> np.ndarray:
-        return np.where(dataset.read(name).label == lost, took, dataset.read(name).label)
+    cv2.imwrite(str(tmp_path / "00001D.png"), np.where(label == lost, took, label))
 
     def miou(*left_out: int) -> float:
         dataset.unscored = tuple(dataset.classes[index] for index in left_out)
-        return made(dataset, names=NAMES[:1], ours=merged).rows[0].mious[0]
+        *_, frame = panel(dataset, {"ours": tmp_path}, ["00001D"], FormatOptions())
+        return frame["mIoU"][0]
 
     shared, others = own / (own + more), len(present) - 2
     assert miou() == pytest.approx(100 * (0 + shared + others) / (others + 2))
@@ -72,50 +100,12 @@ def test_scores_of_an_image_exclude_unscored_classes(dataset: MFNet) -> None:
     assert miou(lost, took) == pytest.approx(100)
 
 
-def test_ours_is_painted_in_the_colours_of_the_data_set(dataset: MFNet) -> None:
-    figure = draw(made(dataset, names=NAMES[:1], ours=right(dataset)))
-    shown = figure.axes[3].images[0].get_array()
-    label = dataset.read("00001D").label
-    np.testing.assert_array_equal(shown, np.array(dataset.palette, np.uint8)[label])
-
-
-def test_missing_images_are_beside_each_other_with_their_scores(
-    dataset: MFNet, tmp_path: Path
-) -> None:
-    label = dataset.read("00001D").label
-    shifts = {"both": 0, "dark": 1, "cold": 2}  # classes that the prediction is away from the label
-    for folder, shift in shifts.items():
-        (tmp_path / folder).mkdir()
-        wrong = ((label + shift) % 9).astype(np.uint8)
-        cv2.imwrite(str(tmp_path / folder / "00001D.png"), wrong)
-    options = {"methods": "both", "without_rgb": "dark", "without_thermal": "cold"}
-    values = {key: f"CMX:{tmp_path / folder}" for key, folder in options.items()}
-    words = ("dataset=mfnet", f"dataset.root={dataset.root}")
-    figure = make_missing(FigureInput("crm/fig2", values | {"names": "00001D"}, words, "ring5"))
-    shown = [axes.get_title() for axes in figure.axes]
-    assert shown == [
-        "RGB",
-        "thermal",
-        "ground truth",
-        "CMX\nboth",
-        "CMX\nno RGB",
-        "CMX\nno thermal",
-    ]
-    palette = np.array(dataset.palette, np.uint8)
-    for axes, shift in zip(figure.axes[3:], shifts.values(), strict=True):
-        painted = axes.images[0].get_array()
-        np.testing.assert_array_equal(painted, palette[(label + shift) % 9])
-        assert [text.get_text() for text in axes.texts] == ["0.0" if shift else "100.0"]
-
-
-def test_other_sizes_are_refused(dataset: MFNet) -> None:
-    with pytest.raises(InputError, match="the prediction of '00001D' by 'ours' is 2x2 pixels"):
-        made(dataset, ours=lambda _: np.zeros((2, 2), np.uint8))
-
-
-def test_strips_have_no_centre(dataset: MFNet) -> None:
-    with pytest.raises(InputError, match="no centre to put a box on"):
-        panel(dataset, {"ours": right(dataset)}, NAMES, strips(5))
+def test_other_sizes_and_missing_files_are_refused(dataset: MFNet, tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "00001D.png"), np.zeros((2, 2), np.uint8))
+    with pytest.raises(InputError, match="00001D.png is 2x2 pixels but its image is 24x32"):
+        panel(dataset, {"ours": tmp_path}, ["00001D"], FormatOptions())
+    with pytest.raises(InputError, match="there is no prediction .*00002N.png"):
+        panel(dataset, {"ours": tmp_path}, ["00002N"], FormatOptions())
 
 
 def test_miou_of_images_is_over_the_classes_that_occur() -> None:
@@ -128,13 +118,224 @@ def test_miou_of_images_is_over_the_classes_that_occur() -> None:
 
 def test_largest_difference_between_first_and_last() -> None:
     mious = {
-        "A": {"x": 10, "y": 50, "z": 0, "w": float("nan")},
-        "B": {"x": 99, "y": 99, "z": 99, "w": 99},
-        "C": {"x": 30, "y": 10, "z": 20, "w": 90},
+        "A": {"w": float("nan"), "x": 10, "y": 50, "z": 0},
+        "B": {"w": 99, "x": 99, "y": 99, "z": 99},
+        "C": {"w": 90, "x": 30, "y": 10, "z": 20},
     }
-    names = ("w", "x", "y", "z")
-    assert most_different(mious, names, 3) == ("y", "x", "z")
+    assert most_different(mious, 3) == ("y", "x", "z")
     with pytest.raises(InputError, match="rows=4, but there are only 3 images"):
-        most_different(mious, names, 4)
+        most_different(mious, 4)
     with pytest.raises(InputError, match="compares two methods"):
-        most_different({"A": mious["A"]}, names, 1)
+        most_different({"A": mious["A"]}, 1)
+
+
+# Pairs of frames.
+
+
+@pytest.fixture(scope="module")
+def framed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("framed")
+    write_framed(folder)
+    return folder
+
+
+def config_of(folder: Path, *more: str) -> Config:
+    words = ("dataset=mfnet", f"dataset.root={folder / 'mf'}", *more)
+    return Config(words, {"consistency": "views"})
+
+
+def values(folder: Path, **changed) -> dict:
+    methods = ",".join(f"{each.upper()}:{folder / each}" for each in METHODS)
+    return {"pairs": str(folder / "pairs"), "methods": methods} | changed
+
+
+def opened(folder: Path, config: Config | None = None, **changed) -> Pairs:
+    return Pairs(config or config_of(folder), PairOptions(**values(folder, **changed)))
+
+
+def pixels(counts: Counts, view: int) -> tuple[np.ndarray, np.ndarray]:
+    """(compared, different) pixels of every image, of a set of views from 0."""
+    classes = len(counts.classes)
+    first = view * (classes + 1)
+    labelled = counts.counts[:, first : first + classes].sum(1)
+    total = labelled.sum((1, 2))
+    return total, total - np.trace(labelled, axis1=1, axis2=2)
+
+
+def test_outlined_pixels_are_those_that_the_measurement_counts(
+    call: Call, framed: Path, tmp_path: Path
+) -> None:
+    words = (f"predictions={framed / 'b'}", f"pairs={framed / 'pairs'}", f"out={tmp_path}")
+    data = ("dataset=mfnet", f"dataset.root={framed / 'mf'}")
+    assert call(consistency.entry, *words, *data)[0] == 0
+    counts = Counts.load(tmp_path / "consistency_aligned_test.npz")
+    for view in (1, 2, 3):
+        pairs = opened(framed, view_set=view)
+        for name, total, wrong in zip(counts.names, *pixels(counts, view - 1), strict=True):
+            found = pairs.read(name)
+            assert 0 < wrong < total
+            assert (found.compared.sum(), found.differ[1].sum()) == (total, wrong)
+            assert found.shares[1] == pytest.approx(100 * wrong / total)
+
+
+def test_outlined_pixels_of_true_second_frames_are_those_counted(
+    call: Call, tmp_path: Path
+) -> None:
+    frames = ("frames=next", *SYNTH)
+    assert call(consistency.entry, f"export={tmp_path / 'pairs'}", *frames)[0] == 0
+    names = tuple(path.stem for path in (tmp_path / "pairs" / "rgb").glob("*.png"))
+    predict(tmp_path, names, np.random.default_rng(1))
+    words = (f"predictions={tmp_path / 'a'}", f"pairs={tmp_path / 'pairs'}", f"out={tmp_path}")
+    assert call(consistency.entry, *words, *frames)[0] == 0
+    counts = Counts.load(tmp_path / "consistency_next_test.npz")
+    pairs = opened(tmp_path, Config(SYNTH))
+    assert pairs.second == "next frame"
+    for name, total, wrong in zip(counts.names, *pixels(counts, 0), strict=True):
+        found = pairs.read(name)
+        assert (found.compared.sum(), found.differ[0].sum()) == (total, wrong)
+
+
+def test_frames_are_those_of_the_data_set_and_of_the_export(framed: Path) -> None:
+    packed = cv2.imread(str(framed / "mf" / "images" / "00000D.png"), cv2.IMREAD_UNCHANGED)
+    second = cv2.imread(str(framed / "pairs" / "rgb" / "00000D_view2.png"))
+    heat = cv2.imread(str(framed / "pairs" / "thermal" / "00000D_view2.png"), cv2.IMREAD_GRAYSCALE)
+    first, later = opened(framed, view_set=2).read("00000D").frames
+    np.testing.assert_array_equal(first.rgb, packed[..., 2::-1])
+    np.testing.assert_array_equal(first.thermal, packed[..., 3])
+    np.testing.assert_array_equal(later.rgb, second[..., ::-1])
+    np.testing.assert_array_equal(later.thermal, heat)
+
+
+def frame_pair() -> FramePair:
+    """Two frames of 2 x 3 pixels; method B changes its mind about one of four compared pixels."""
+    frames = tuple(
+        Frame(
+            rgb=np.full((2, 3, 3), 10 * index, np.uint8),
+            thermal=np.array([[50, 100, 50], [50, 60 + 90 * index, 50]], np.uint8),
+            label=np.array([[0, 1, 2], [0, 0, 255 * index]], np.uint8),
+        )
+        for index in (0, 1)
+    )
+    class_map = np.array([[0, 1, 2], [2, 1, 0]], np.uint8)
+    none, one = np.zeros((2, 3), bool), np.zeros((2, 3), bool)
+    one[0, 1] = True
+    compared = np.array([[True, True, False], [True, True, False]])
+    predictions = ((class_map, class_map), (class_map, class_map))
+    return FramePair("00001N", (frames[0], frames[1]), predictions, (none, one), compared)
+
+
+@pytest.mark.parametrize("layout", ["rows", "columns"])
+def test_real_and_synthesised_frames_are_side_by_side(layout: str, tmp_path: Path) -> None:
+    pair = frame_pair()
+    assert pair.shares == (0, 25)
+    legend = (CLASSES, PALETTE, [])
+    figure = draw_pairs([pair, pair], ("A", "B"), legend, "synthesised", layout)
+    said = texts(figure, tmp_path)
+    assert [said.count(each) for each in ("00001N", "synthesised", "0.0 %", "25.0 %")] == [2] * 4
+    assert [said.count(each) for each in ("RGB", "thermal", "A", "B")] == [1] * 4
+    order = np.arange(20).reshape(4, 5)  # frames x what is shown of each
+    order = order if layout == "rows" else order.T
+    for place, axes in zip(order.flat, figure.axes, strict=True):
+        frame, title = divmod(place, 5)
+        picture = axes.images[0].get_array()
+        if title == 0:
+            assert picture[0, 0, 0] == 10 * (frame % 2)
+        if title == 1:  # jet, with the limits 50 and 100 of the first frame in both
+            assert picture[:, 0].tolist() == [[0, 0, 127]] * 2
+            assert (picture[1, 1].tolist() == [127, 0, 0]) == (frame % 2 == 1)
+        # Only of the second frame of method B, at the pixel that differs.
+        lines = [line.get_paths()[0] for line in axes.collections]
+        assert len(lines) == (title == 4 and frame % 2 == 1)
+        for line in lines:
+            assert line.get_extents().bounds == pytest.approx((0.5, -0.5, 1, 1))
+
+
+def test_largest_difference_is_picked_by_the_share_that_differs(framed: Path) -> None:
+    pairs = opened(framed)
+    gaps = {name: np.ptp(pairs.read(name).shares) for name in NAMES}
+    picked = values(framed, pick="largest_difference", rows=1)
+    figure, frame = FIGURES["temporal/fig6"](config_of(framed), picked)
+    assert frame["image"].tolist() == [max(gaps, key=lambda name: gaps[name])] * 2
+    assert OUTLINED in [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+def test_pairs_that_do_not_fit_are_refused(framed: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="view_set=4: the export has no such set"):
+        opened(framed, view_set=4)
+    for config in (config_of(framed, "consistency.view.camera.fx=500"), Config(SYNTH)):
+        with pytest.raises(InputError, match="exported from other images or other second frames"):
+            opened(framed, Config(config.overrides, {"consistency": "views"}))
+    with pytest.raises(InputError, match="there is no prediction"):
+        opened(framed, methods=f"A:{tmp_path}").read("00000D")
+    for wrong, word in (({"names": "00009D"}, "no image '00009D'"), ({"rows": 3}, "rows=3, but")):
+        with pytest.raises(InputError, match=word):
+            FIGURES["temporal/fig1"](config_of(framed), values(framed, **wrong))
+    shutil.copytree(framed / "a", tmp_path / "small")
+    cv2.imwrite(str(tmp_path / "small" / "00000D_view1.png"), np.zeros((4, 4), np.uint8))
+    with pytest.raises(InputError, match="00000D_view1.png is 4x4 pixels but its image is 48x64"):
+        opened(framed, methods=f"A:{tmp_path / 'small'}").read("00000D")
+    listed = json.loads((framed / "pairs" / "pairs.json").read_text())
+    (tmp_path / "pairs.json").write_text(json.dumps(listed | {"complete": False}))
+    with pytest.raises(InputError, match="was interrupted; rerun its command"):
+        opened(framed, pairs=str(tmp_path))
+
+
+# Masks.
+
+
+def sample(height: int = 100, width: int = 140) -> Sample:
+    rng = np.random.default_rng(0)
+    rgb = rng.integers(0, 100, (height, width, 3), dtype=np.uint8)
+    return Sample(rgb=rgb, thermal=rgb[..., 0].copy(), label=None, name="00001D")
+
+
+@cache
+def maskers():
+    return {
+        title: build(compose(words).masker) for title, words in masker_overrides(PATCHES).items()
+    }
+
+
+def examples(seed: int = 0):
+    return mask_examples(sample(), maskers(), math.lcm(STRIDE, *PATCHES), seed)
+
+
+def test_a_known_mask_hides_its_cells_in_the_cut_image() -> None:
+    """100 x 140 cut to 64 x 128 around the middle: from row 18, column 6."""
+
+    def left_half(image_hw, centre_yx, generator):
+        assert (image_hw, centre_yx.tolist()) == ((64, 128), [[32, 64]])
+        cells = torch.tensor([[[True, False]]])
+        return MaskPair(cells, ~cells)
+
+    (found,) = mask_examples(sample(), {"left": left_half}, 64, seed=0)
+    assert found.rgb_hidden[:, :64].all()
+    assert not found.rgb_hidden[:, 64:].any()
+    np.testing.assert_array_equal(found.thermal_hidden, ~found.rgb_hidden)
+    assert (found.rgb[:, :64] == HIDDEN).all()
+    np.testing.assert_array_equal(found.rgb[:, 64:], sample().rgb[18:82, 70:134])
+    np.testing.assert_array_equal(found.thermal[:, :64, 1], sample().thermal[18:82, 6:70])
+
+
+def test_the_maskers_of_the_paper() -> None:
+    found = {each.title: each for each in examples()}
+    assert list(found) == ["square", *(f"{n} x {n} pixels" for n in PATCHES)]
+    for each in found.values():
+        np.testing.assert_array_equal(each.thermal_hidden, ~each.rgb_hidden)
+    for size in PATCHES:
+        hidden = found[f"{size} x {size} pixels"].rgb_hidden
+        cells = hidden[::size, ::size]
+        np.testing.assert_array_equal(np.kron(cells, np.ones((size, size), bool)), hidden)
+        assert cells.mean() == 0.5
+    rows, columns = np.nonzero(found["square"].rgb_hidden)
+    box = found["square"].rgb_hidden[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
+    assert box.all()
+    assert box.shape == (32, 64)  # half of each side
+
+
+def test_seed_decides_the_masks() -> None:
+    first, again, other = (examples(seed)[1].rgb_hidden for seed in (0, 0, 1))
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).any()
+    with pytest.raises(InputError, match=r"\(100, 140\) pixels, less than 128"):
+        mask_examples(sample(), {}, 128, seed=0)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from analysis.predictions.maps import MapSum, PixelMaps, iou_map
+from analysis.predictions.maps import MapSum, PixelMaps
 from rgbt.checks import InputError
 
 
@@ -50,7 +50,7 @@ def test_sums_are_those_of_a_loop_over_pixels() -> None:
 def test_mean_over_classes_by_hand() -> None:
     # pixels: a 2/4, b 1/1 | a 1/2, b absent | nothing labelled
     found = maps([[[2, 1, 0]], [[1, 0, 0]]], [[[4, 2, 0]], [[1, 0, 0]]])
-    np.testing.assert_allclose(iou_map(found), [[0.75, 0.5, np.nan]])
+    np.testing.assert_allclose(found.iou(), [[0.75, 0.5, np.nan]])
 
 
 def test_saved_and_loaded_are_equal(tmp_path: Path) -> None:

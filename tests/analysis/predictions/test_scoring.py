@@ -7,9 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from analysis.predictions.maps import iou_map
-from analysis.predictions.scoring import ScoringOptions, score_folder
-from analysis.predictions.text import remarks_on
+from analysis.predictions.scoring import ScoringOptions, find, score_folder
 from rgbt.checks import InputError
 from rgbt.data.mfnet import MFNet
 from rgbt.data.predictions import Affixes, FormatOptions
@@ -42,7 +40,7 @@ def test_unscored_classes_are_stored_with_counts(tiny: MFNet, write: Write) -> N
     assert [counts.unscored for counts in scored.counts] == [("person",)] * 2
     # Row 3 as below, without the person 0/1.
     assert scored.maps is not None
-    np.testing.assert_allclose(iou_map(scored.maps)[3], [1.0, 1.0, 1 / 2, 1.0])
+    np.testing.assert_allclose(scored.maps.iou()[3], [1.0, 1.0, 1 / 2, 1.0])
 
 
 def test_indices_palettes_and_colours_give_equal_counts(tiny: MFNet, write: Write) -> None:
@@ -64,7 +62,7 @@ def test_indices_palettes_and_colours_give_equal_counts(tiny: MFNet, write: Writ
 
 def test_how_files_are_read_and_called_can_be_chosen(tiny: MFNet, write: Write) -> None:
     folder = write({f"{name}_out": value for name, value in PREDICTIONS.items()})
-    with pytest.raises(InputError, match=r"has a file NAME\.png"):
+    with pytest.raises(InputError, match=r"lacks 2 of the 2 .*00001D\.png"):
         score_folder(folder, tiny, "test", ScoringOptions(regions=2))
     form = FormatOptions(affixes=Affixes(suffix="_out"))
     chosen = ScoringOptions(partitions=("vertical",), regions=2, format=form, name="mine")
@@ -119,7 +117,7 @@ def test_excluded_images_are_in_no_number(tiny: MFNet, write: Write) -> None:
     assert scored.counts[0].names == ("00002N",)
     assert scored.counts[0].night == (True,)
     assert scored.counts[0].whole().sum() == 16
-    assert scored.found.missing == ("00001D",)
+    assert scored.missing == ("00001D",)
     assert scored.maps is not None
     assert scored.maps.images == 1
 
@@ -137,7 +135,7 @@ def test_another_size_is_refused_or_read_at_the_nearest_pixel(tiny: MFNet, write
     first = scored.counts[0].counts[0]
     np.testing.assert_array_equal(first.sum(0), [[8, 0, 0], [0, 4, 0], [0, 0, 3]])
     assert scored.resized == dict.fromkeys(LABELS, "2x2 to 4x4")
-    assert remarks_on(scored) == [
+    assert scored.remarks() == [
         "2 predictions were resized to their label by the nearest pixel, from 2x2 to 4x4.",
     ]
 
@@ -145,7 +143,7 @@ def test_another_size_is_refused_or_read_at_the_nearest_pixel(tiny: MFNet, write
 def test_a_turned_prediction_is_no_resized_one(tiny: MFNet, write: Write) -> None:
     folder = write({name: np.zeros((8, 4), np.uint8) for name in ("00001D", "00002N")})
     options = ScoringOptions(partitions=("vertical",), regions=2, resize="nearest")
-    with pytest.raises(InputError, match=r"is 8x4 pixels and its label 4x4, .*resize=stretch"):
+    with pytest.raises(InputError, match=r"is 8x4 pixels but its label is 4x4, .*resize=stretch"):
         score_folder(folder, tiny, "test", options)
     scored = score_folder(folder, tiny, "test", replace(options, resize="stretch"))
     assert scored.resized == dict.fromkeys(LABELS, "8x4 to 4x4")
@@ -163,7 +161,7 @@ def test_the_nearest_pixel_is_nearest_by_centres(tiny: MFNet, write: Write) -> N
 def test_the_first_bad_file_of_the_split_is_named(tiny: MFNet, write: Write) -> None:
     bad = write({name: np.full((4, 4), 7) for name in PREDICTIONS})
     for _ in range(3):
-        with pytest.raises(InputError, match=r"00001D\.png: 16 pixels are 7, which is no class"):
+        with pytest.raises(InputError, match=r"00001D\.png: label value 7 .16 pixels"):
             score_folder(bad, tiny, "test", STRIPS)
 
 
@@ -175,7 +173,44 @@ def test_images_of_different_sizes_have_counts_but_no_map(tiny: MFNet, write: Wr
     assert scored.counts[0].counts.sum((1, 2, 3)).tolist() == [15, 48]
 
 
-@pytest.mark.parametrize("wrong", [{"missing": "leave"}, {"resize": "linear"}])
-def test_unknown_choices_are_refused(wrong) -> None:
-    with pytest.raises(InputError, match="is not a valid choice"):
-        ScoringOptions(**wrong)
+NAMES = ("00001D", "00002N")
+
+
+def put(folder: Path, *names: str) -> Path:
+    folder.mkdir()
+    for name in names:
+        (folder / name).touch()
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("form", "affixes"),
+    [("{}.png", ("", "")), ("{}_pred.png", ("", "_pred")), ("P_{}.png", ("P_", ""))],
+)
+def test_only_names_of_the_split_are_taken(
+    tmp_path: Path, form: str, affixes: tuple[str, str]
+) -> None:
+    others = ("mean.png", "00001D_overlay.png", "notes.txt")
+    folder = put(tmp_path / "p", *map(form.format, NAMES[::-1]), *others)
+    paths, missing, extra = find(folder, NAMES, Affixes(*affixes), "refuse")
+    assert list(paths.items()) == [(name, folder / form.format(name)) for name in NAMES]
+    assert missing == ()
+    assert extra == ("mean",)  # pictures of rgbt.predict are no stray predictions
+
+
+def test_missing_files_are_refused_unless_excluded(tmp_path: Path) -> None:
+    folder = put(tmp_path / "p", "00001D.png")
+    with pytest.raises(InputError, match=r"lacks 1 of the 2 .*\(00002N\.png\).*missing=leave"):
+        find(folder, NAMES, Affixes(), "refuse")
+    paths, missing, _ = find(folder, NAMES, Affixes(), "leave_out")
+    assert (list(paths), missing) == (["00001D"], ("00002N",))
+
+
+@pytest.mark.parametrize("missing", ["refuse", "leave_out"])
+def test_folders_without_predictions(tmp_path: Path, missing) -> None:
+    with pytest.raises(InputError, match="predictions: no such folder"):
+        find(tmp_path / "none", NAMES, Affixes(), missing)
+    for files, held in (((), "nothing"), (("a.npy", "b.png", "c.png", "d.png"), "and 1 more")):
+        folder = put(tmp_path / held.split()[0], *files)
+        with pytest.raises(InputError, match=f"lacks 2 of the 2 .* contains .*{held}"):
+            find(folder, NAMES, Affixes(), missing)

@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from analysis.statistics.data import SpatialStatistics
-from analysis.statistics.measure import ESTIMATORS
+from analysis.statistics.collect import SpatialStatistics
 from rgbt.data.mfnet import CLASSES, PALETTE
 from rgbt.types import Sample
 
@@ -68,7 +67,6 @@ def made(
     }
     noise = given.pop("noise", np.full((images, 2, regions), 2.0))
     at_night = np.arange(images) >= images // 2
-    parts = ("day", "night") if night else ("all",)
     region_map = np.repeat(np.arange(regions, dtype=np.uint8), 4).reshape(regions, 4)
     return SpatialStatistics(
         dataset="made",
@@ -76,14 +74,12 @@ def made(
         split="train",
         classes=classes,
         background=background,
-        palette=np.zeros((len(classes), 3), np.uint8),
         partition=partition or f"ring{regions}",
         region_map=region_map,
         kernel="four",
         names=tuple(f"{n:05d}{'DN'[int(late)]}" for n, late in enumerate(at_night)),
         night=at_night if night else None,
-        parts=parts,
-        occupied=np.zeros((len(parts), len(classes), *region_map.shape), np.int32),
-        noise={name: noise for name in ESTIMATORS},
+        occupied=np.zeros((2, len(classes), *region_map.shape), np.int32),
+        noise=np.stack([noise] * 3, axis=1),
         **(values | given),
     )

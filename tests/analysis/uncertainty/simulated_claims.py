@@ -125,14 +125,3 @@ def ever_missed(sequences: int, longest: int, ratio: float) -> dict[str, float]:
         missed["squares, half"] += bool((off > np.hypot(sds * split, quantiles[1] * error)).any())
         missed["sum, half"] += bool((off > sds * split + quantiles[1] * error).any())
     return {way: count / sequences for way, count in missed.items()}
-
-
-def seeds_until_shown(sequences: int, effect: float, alpha: float, precision: float) -> float:
-    """Mean number of seeds until the interval over seeds is above 0; 200 where it never is."""
-    rng, longest = np.random.default_rng([10, round(10 * effect)]), 200
-    factors, needed = halves(longest, alpha, precision), []
-    for _ in range(sequences):
-        means, sds = running(rng, longest)
-        shown = means + effect > sds * factors
-        needed.append(int(shown.argmax()) + 2 if shown.any() else longest)
-    return float(np.mean(needed))

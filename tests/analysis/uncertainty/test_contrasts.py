@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from analysis.uncertainty import Resampling, compare
-from analysis.uncertainty.contrasts import FIXED, Evidence, Resampler, Term
-from analysis.uncertainty.scores import RunScores
+from analysis.uncertainty.blocks import ImageBlocks
+from analysis.uncertainty.contrasts import FIXED, Resampler, Term
 from analysis.uncertainty.verdicts import FixedSeeds, decide
 from rgbt.checks import InputError
 from rgbt.metrics.counts import Counts
@@ -61,9 +61,24 @@ def by_loop(terms: Sequence[Term], seeds: Sequence[int]) -> tuple[np.ndarray, fl
     return scored(np.ones(count, int)), float(np.std(means))
 
 
-@pytest.mark.parametrize("metric", METRICS)
-def test_evidence_equals_a_loop_over_resamples(metric: str) -> None:
-    terms = difference(rows_of(), metric)
+def regions(rows: Sequence[Mapping[int, Counts]]) -> list[Term]:
+    """The centre gains more than the edge."""
+    minus = [replace(each, weight=-each.weight) for each in difference(rows, "region/2")]
+    return [*difference(rows, "region/1"), *minus]
+
+
+def with_pairs(rows: Sequence[Mapping[int, Counts]]) -> list[Term]:
+    views = {seed: pairs_of(30, 0.8, seed) for seed in rows[0]}
+    return [term(1.0, rows[0], "frames"), term(-1.0, views, "pairs", "TC")]
+
+
+def with_fixed(rows: Sequence[Mapping[int, Counts]]) -> list[Term]:
+    return [term(1.0, {FIXED: rows[1][0]}, "folder"), term(-1.0, rows[0], "a")]
+
+
+@pytest.mark.parametrize("make", [*METRICS, regions, with_pairs, with_fixed])
+def test_evidence_equals_a_loop_over_resamples(make: object) -> None:
+    terms = difference(rows_of(), make) if isinstance(make, str) else make(rows_of())
     found = Resampler(SETTINGS).evidence(terms)
     values, error = by_loop(terms, (0, 1, 2))
     assert found.values == pytest.approx(values)
@@ -71,63 +86,34 @@ def test_evidence_equals_a_loop_over_resamples(metric: str) -> None:
     assert (found.seeds, found.blocks, found.said) == ((0, 1, 2), 30, "30 single images")
 
 
-def test_evidence_of_two_differences_equals_a_loop() -> None:
-    """The centre gains more than the edge."""
-    rows = rows_of()
-    terms = [
-        term(weight * sign, row, name, f"region/{region}")
-        for weight, region in ((1.0, 1), (-1.0, 2))
-        for sign, row, name in ((1.0, rows[1], "b"), (-1.0, rows[0], "a"))
-    ]
-    found = Resampler(SETTINGS).evidence(terms)
-    values, error = by_loop(terms, (0, 1, 2))
-    assert found.values == pytest.approx(values)
-    assert found.error == pytest.approx(error * math.sqrt(30 / 29))
-
-
 @pytest.mark.parametrize("blocks", ["none", "auto", 3])
-@pytest.mark.parametrize("metric", ["mIoU", "Var", "region/1"])
-def test_evidence_gives_the_interval_of_paired_comparisons(blocks, metric: str) -> None:
+def test_evidence_gives_the_interval_of_paired_comparisons(blocks) -> None:
     """Scenes of four neighbours, so that "auto" draws blocks."""
     rng = np.random.default_rng(2)
     arrays = Population(block=4).pair(rng, 60, 4, Population(skill=1.8, training_sd=0.1))
     rows = [dict(enumerate(map(counts_of, each))) for each in arrays]
     settings = replace(SETTINGS, blocks=blocks)
-    (wanted,) = compare(
-        *(list(row.values()) for row in rows), [metric], settings, paired=True
-    ).differences
-    found = Resampler(settings).evidence(difference(rows, metric))
-    both = wanted.difference.both
-    assert both is not None
-    if blocks == "auto":
-        assert "neighbouring frames" in found.said
+    sides = [list(row.values()) for row in rows]
+    (wanted,) = compare(*sides, ["Var"], settings, paired=True).differences
+    found = Resampler(settings).evidence(difference(rows, "Var"))
+    assert ("neighbouring frames" in found.said) == (blocks != "none")
     verdict = decide([found], (0.0, math.inf), FixedSeeds(), "all")
     assert verdict.interval is not None
-    assert verdict.interval.low == pytest.approx(both.low)
-    assert verdict.interval.high == pytest.approx(both.high)
-    assert verdict.estimate == pytest.approx(wanted.value)
+    assert (verdict.interval.low, verdict.interval.high, verdict.estimate) == pytest.approx(
+        (wanted.interval.low, wanted.interval.high, wanted.value)
+    )
 
 
 def test_evidence_of_the_night_gives_other_images_no_weight() -> None:
     """18 of 30 images by night: the draws are those of all images."""
-    night = tuple(place % 5 < 3 for place in range(30))
-    terms = difference(rows_of(night=night), "night/mIoU")
-    resampler = Resampler(SETTINGS)
-    found = resampler.evidence(terms)
-    values, error = by_loop(terms, (0, 1, 2))
-    assert found.values == pytest.approx(values)
-    assert found.error == pytest.approx(error * math.sqrt(18 / 17))
-    assert (found.blocks, found.said) == (18, "18 of 30 single images")
-    both = [*terms, *difference(rows_of(night=night), "mIoU")]
-    values, error = by_loop(both, (0, 1, 2))
-    found = resampler.evidence(both)
-    assert found.values == pytest.approx(values)
-    assert found.error == pytest.approx(error * math.sqrt(18 / 17))
-
-
-def test_evidence_of_the_night_without_nights_is_refused() -> None:
-    with pytest.raises(InputError, match="does not contain both images marked as day"):
-        Resampler(SETTINGS).evidence(difference(rows_of(), "night/mIoU"))
+    rows = rows_of(night=tuple(place % 5 < 3 for place in range(30)))
+    terms = difference(rows, "night/mIoU")
+    for each in (terms, [*terms, *difference(rows, "mIoU")]):
+        found = Resampler(SETTINGS).evidence(each)
+        values, error = by_loop(each, (0, 1, 2))
+        assert found.values == pytest.approx(values)
+        assert found.error == pytest.approx(error * math.sqrt(18 / 17))
+        assert (found.blocks, found.said) == (18, "18 of 30 single images")
 
 
 def test_evidence_terms_may_have_other_regions() -> None:
@@ -138,39 +124,7 @@ def test_evidence_terms_may_have_other_regions() -> None:
         for seed, each in row.items()
     }
     found = Resampler(SETTINGS).evidence([term(1.0, row, "two"), term(-1.0, whole, "one")])
-    assert found.values == (0.0, 0.0, 0.0)
-    assert found.error == 0.0
-
-
-def test_evidence_joins_single_frames_and_pairs_of_frames() -> None:
-    row, _ = rows_of()
-    views = {seed: pairs_of(30, 0.8, seed) for seed in row}
-    terms = [term(1.0, row, "frames"), term(-1.0, views, "pairs", "TC")]
-    found = Resampler(SETTINGS).evidence(terms)
-    values, error = by_loop(terms, (0, 1, 2))
-    assert found.values == pytest.approx(values)
-    assert found.error == pytest.approx(error * math.sqrt(30 / 29))
-
-
-def test_evidence_pairs_a_fixed_method_with_every_seed() -> None:
-    row, other = rows_of()
-    fixed = {FIXED: other[0]}
-    terms = [term(1.0, fixed, "folder"), term(-1.0, row, "a")]
-    found = Resampler(SETTINGS).evidence(terms)
-    values, error = by_loop(terms, (0, 1, 2))
-    assert found.seeds == (0, 1, 2)
-    assert found.values == pytest.approx(values)
-    assert found.error == pytest.approx(error * math.sqrt(30 / 29))
-
-
-def test_evidence_of_fixed_methods_alone_has_one_value_and_no_seeds() -> None:
-    row, other = rows_of()
-    terms = [term(1.0, {FIXED: other[0]}, "b"), term(-1.0, {FIXED: row[0]}, "a")]
-    found = Resampler(SETTINGS).evidence(terms)
-    (wanted,) = compare([row[0]], [other[0]], ["mIoU"], SETTINGS).differences
-    assert found.seeds == ()
-    assert found.values == pytest.approx([wanted.value])
-    assert decide([found], (0.0, math.inf), FixedSeeds(), "all").covers == "images"
+    assert (found.values, found.error) == ((0.0, 0.0, 0.0), 0.0)
 
 
 def test_evidence_uses_the_seeds_that_all_rows_have() -> None:
@@ -179,8 +133,10 @@ def test_evidence_uses_the_seeds_that_all_rows_have() -> None:
     second = {seed: other[seed] for seed in (3, 1, 2)}
     found = Resampler(SETTINGS).evidence(difference([first, second]))
     whole = Resampler(SETTINGS).evidence(difference([row, other]))
-    assert found.seeds == (2, 3)
-    assert found.values == whole.values[2:]
+    assert (found.seeds, found.values) == ((2, 3), whole.values[2:])
+    fixed = [term(1.0, {FIXED: other[0]}, "b"), term(-1.0, {FIXED: row[0]}, "a")]
+    found = Resampler(SETTINGS).evidence(fixed)
+    assert (found.seeds, len(found.values)) == ((), 1)
 
 
 def test_evidence_does_not_depend_on_the_order_of_images_or_on_other_contrasts() -> None:
@@ -198,73 +154,43 @@ def test_evidence_does_not_depend_on_the_order_of_images_or_on_other_contrasts()
 
 def test_evidence_again_draws_no_images(monkeypatch: pytest.MonkeyPatch) -> None:
     rows, resampler, calls = rows_of(), Resampler(SETTINGS), []
-    draw = RunScores._weights
-
-    def counted(self: RunScores, blocks: int) -> object:
-        calls.append(blocks)
-        return draw(self, blocks)
-
-    monkeypatch.setattr(RunScores, "_weights", counted)
+    draw = ImageBlocks.draws
+    monkeypatch.setattr(ImageBlocks, "draws", lambda *given: calls.append(1) or draw(*given))
     less = [{seed: row[seed] for seed in (0, 1)} for row in rows]
     first = resampler.evidence(difference(less))
     more = resampler.evidence(difference(rows))
-    assert calls == [30] * 4
+    assert len(calls) == 4
     assert resampler.evidence(difference(rows)) == more
-    assert calls == [30] * 4
+    assert len(calls) == 4
     assert more.values[:2] == first.values
 
 
 def test_evidence_of_too_few_images_has_values_and_no_error() -> None:
     found = Resampler(SETTINGS).evidence(difference(rows_of(9)))
-    assert len(found.values) == 3
+    assert (len(found.values), found.blocks) == (3, 9)
     assert math.isnan(found.error)
-    assert found.blocks == 9
 
 
-def test_evidence_of_the_mean_contrast_has_divided_weights() -> None:
-    rows, resampler = rows_of(), Resampler(SETTINGS)
-    single = [resampler.evidence(difference(rows, f"region/{number}")) for number in (1, 2)]
-    terms = [
-        replace(each, weight=each.weight / 2)
-        for number in (1, 2)
-        for each in difference(rows, f"region/{number}")
-    ]
-    found = resampler.evidence(terms)
-    assert found.values == pytest.approx(np.mean([each.values for each in single], axis=0))
-    assert isinstance(found, Evidence)
-    assert decide([found], (0.0, math.inf), FixedSeeds(), "mean").estimate == pytest.approx(
-        np.mean([each.values for each in single])
-    )
+def test_what_cannot_be_compared_is_refused() -> None:
+    row, other = rows_of()
 
+    def refused(terms: list[Term], word: str) -> None:
+        with pytest.raises(InputError, match=word):
+            Resampler(SETTINGS).evidence(terms)
 
-def test_evidence_refuses_what_cannot_be_compared() -> None:
-    (row, other), resampler = rows_of(), Resampler(SETTINGS)
-    with pytest.raises(InputError, match="no seed in common: 1, 2 and 0. Train the same seeds"):
-        resampler.evidence(difference([{0: row[0]}, {1: other[1], 2: other[2]}]))
-    foreign = {
-        seed: replace(each, names=tuple(f"x{n}" for n in range(30))) for seed, each in row.items()
-    }
-    with pytest.raises(InputError, match="the counts are of different images"):
-        Resampler(SETTINGS).evidence(difference([row, foreign]))
-    relabelled = {seed: replace(each, counts=each.counts * 2) for seed, each in row.items()}
-    with pytest.raises(InputError, match="has different labels in the two counts"):
-        Resampler(SETTINGS).evidence(difference([row, relabelled]))
-    with pytest.raises(InputError, match="'class/tree'"):
-        resampler.evidence(difference([row, other], "class/tree"))
-    with pytest.raises(InputError, match="the counts have the regions 1 to 2"):
-        resampler.evidence(difference([row, other], "region/3"))
+    def changed(**fields: object) -> list[Term]:
+        return difference([row, {seed: replace(each, **fields) for seed, each in row.items()}])
+
+    apart = [{0: row[0]}, {1: other[1], 2: other[2]}]
+    refused(difference(apart), "no seed in common: 1, 2 and 0. Train the same seeds")
+    refused(changed(names=tuple(f"x{n}" for n in range(30))), "are not of the same images")
+    refused(changed(counts=row[0].counts * 2), "has different labels in the two counts")
+    refused(difference([row, other], "class/tree"), "'class/tree'")
+    refused(difference([row, other], "region/3"), "the counts have the regions 1 to 2")
+    refused(difference([row, other], "night/mIoU"), "both images marked as day")
     emptied = {seed: replace(each, counts=each.counts * 0) for seed, each in row.items()}
-    with pytest.raises(
-        InputError, match="'pixel_accuracy' of one of a/0, a/1, a/2 has nothing to score"
-    ):
-        Resampler(SETTINGS).evidence([term(1.0, emptied, "a", "pixel_accuracy")])
-    with pytest.raises(ValueError, match="expected one term or more"):
-        resampler.evidence([])
-
-
-def test_term_wrong_seeds_are_refused() -> None:
-    row, _ = rows_of()
-    with pytest.raises(ValueError, match="expected counts of one seed or more, and a key for each"):
-        Term(weight=1.0, metric="mIoU", counts=row, keys={0: "a"})
-    with pytest.raises(ValueError, match="either counts by seed or fixed counts, got both"):
-        term(1.0, {FIXED: row[0], 1: row[1]}, "a")
+    word = "'pixel_accuracy' of one of a/0, a/1, a/2 has nothing to score"
+    refused([term(1.0, emptied, "a", "pixel_accuracy")], word)
+    for keys, counts in (({0: "a"}, row), ({FIXED: "a", 1: "b"}, {FIXED: row[0], 1: row[1]})):
+        with pytest.raises(ValueError, match="expected counts and keys of one seed or more"):
+            Term(weight=1.0, metric="mIoU", counts=counts, keys=keys)

@@ -43,24 +43,34 @@ def looped(seeds: list[Counts], metric: str, absent: str = "released") -> np.nda
     )
 
 
-@pytest.mark.parametrize("absent", ["released", "exclude"])
-@pytest.mark.parametrize("metric", ["mIoU", "class/car", "class/cone/region/1"])
-def test_interval_is_students_over_a_loop_over_images(metric: str, absent: Any) -> None:
-    seeds = drawn(20, trainings=2)
+def scores(seeds: list[Counts], metric: str = "mIoU") -> np.ndarray:
+    return np.array([value(metric, counts, "released") for counts in seeds])
+
+
+def welch(*parts: tuple[float, float]) -> tuple[float, float]:
+    """Error and degrees of freedom of a sum of independent (error, freedom)."""
+    total = sum(error**2 for error, _ in parts)
+    return math.sqrt(total), total**2 / sum(error**4 / freedom for error, freedom in parts)
+
+
+@pytest.mark.parametrize(
+    ("metric", "absent", "pairs"),
+    [
+        *(("mIoU", "released", False), ("class/cone/region/1", "exclude", False)),
+        *(("TC", "released", True), ("CA", "released", True), ("class/cone/TC", "released", True)),
+    ],
+)
+def test_interval_is_students_over_a_loop_over_images(
+    metric: str, absent: Any, pairs: bool
+) -> None:
+    """Pairs of frames are drawn with all their sets."""
+    seeds = [pairs_of(20, 0.6, n) for n in range(2)] if pairs else drawn(20, trainings=2)
     found = estimate(seeds, [metric], replace(SETTINGS, absent=absent))[metric]
     draws = looped(seeds, metric, absent)
     np.testing.assert_allclose(found.evidence.drawn, draws, rtol=1e-12)
     half = stats.t.ppf(0.975, 19) * draws.std() * math.sqrt(20 / 19)
-    assert found.images is not None
-    assert found.images.low == pytest.approx(max(0.0, found.value - half))
-    assert found.images.high == pytest.approx(found.value + half)
-
-
-def test_pairs_of_frames_are_drawn_with_all_their_sets() -> None:
-    seeds = [pairs_of(14, 0.6, seed) for seed in range(2)]
-    for metric in ("TC", "CA", "CA_released", "class/cone/TC"):
-        found = estimate(seeds, [metric], SETTINGS)[metric]
-        np.testing.assert_allclose(found.evidence.drawn, looped(seeds, metric), rtol=1e-12)
+    ends = [max(0.0, found.value - half), found.value + half]
+    assert [found.images.low, found.images.high] == pytest.approx(ends)
 
 
 def test_values_are_means_over_seeds_in_requested_order() -> None:
@@ -68,72 +78,65 @@ def test_values_are_means_over_seeds_in_requested_order() -> None:
     found = estimate(seeds, METRICS, SETTINGS)
     assert tuple(found) == METRICS
     for metric, each in found.items():
-        scores = [value(metric, counts, "released") for counts in seeds]
-        assert each.value == pytest.approx(np.mean(scores), rel=1e-12)
-        assert each.sd == pytest.approx(np.std(scores, ddof=1), rel=1e-9)
+        assert each.value == pytest.approx(scores(seeds, metric).mean(), rel=1e-12)
+        assert each.sd == pytest.approx(scores(seeds, metric).std(ddof=1), rel=1e-9)
         assert (each.seeds, each.said) == (3, "40 single images")
 
 
 def test_variance_interval_is_without_the_bias() -> None:
     """The estimate is inside, and so is a true 0, which quantiles of the resamples never hold."""
-    for seed in range(5):
+    for seed in range(3):
         alike = estimate(drawn(tilt=0.0, seed=seed), ["Var"], SETTINGS)["Var"]
-        assert alike.images is not None
         assert 0.0 in alike.images
         assert alike.value in alike.images
         assert np.quantile(alike.evidence.drawn, 0.025) > 0
+    # Two trainings whose variance differs by much: Student's interval is cut.
+    wide = [drawn(trainings=1, tilt=tilt)[0] for tilt in (0.1, 0.9)]
+    found = estimate(wide, ["Var"], SETTINGS)["Var"]
+    assert found.value - stats.t.ppf(0.975, 1) * found.sd / math.sqrt(2) < 0
+    assert (found.trainings.low, found.both.low) == (0.0, 0.0)
 
 
 def test_both_adds_the_errors_up() -> None:
     """Many seeds, so that Satterthwaite's interval is the wider one: by hand from its parts."""
     seeds = drawn(trainings=8, training_sd=0.1)
     found = estimate(seeds, ["mIoU"], SETTINGS)["mIoU"]
-    scores = np.array([value("mIoU", counts, "released") for counts in seeds])
     of_images = looped(seeds, "mIoU").std() * math.sqrt(40 / 39)
-    of_seeds = scores.std(ddof=1) / math.sqrt(8)
-    squares = of_images**2 + of_seeds**2
-    freedom = squares**2 / (of_images**4 / 39 + of_seeds**4 / 7)
-    half = stats.t.ppf(0.975, freedom) * math.sqrt(squares)
-    assert found.trainings is not None
+    error, freedom = welch((of_images, 39), (scores(seeds).std(ddof=1) / math.sqrt(8), 7))
+    half, mean = stats.t.ppf(0.975, freedom) * error, scores(seeds).mean()
     assert half > found.trainings.half
     assert found.interval == found.both is not None
-    ends = [scores.mean() - half, scores.mean() + half]
-    assert [found.both.low, found.both.high] == pytest.approx(ends, rel=1e-10)
+    assert [found.both.low, found.both.high] == pytest.approx([mean - half, mean + half], rel=1e-10)
 
 
 def test_too_few_images_use_seeds_only() -> None:
     seeds = drawn(9, trainings=3, training_sd=0.2)
     found = estimate(seeds, ["mIoU"], SETTINGS)["mIoU"]
-    assert (found.images, found.both) == (None, None)
-    assert found.trainings is not None
+    assert (found.images, found.both, found.trainings is None) == (None, None, False)
     alone = estimate(seeds[:1], ["mIoU"], SETTINGS)["mIoU"]
     assert (alone.images, alone.trainings, alone.both) == (None, None, None)
     assert estimate(drawn(10), ["mIoU"], SETTINGS)["mIoU"].images is not None
 
 
 def test_nothing_to_score_is_nan() -> None:
-    counts = drawn(20)[0]
-    without = counts.counts.copy()
-    without[:, :, 3, :] = without[:, :, :, 3] = 0
-    empty = replace(counts, counts=without)
-    found = estimate([empty, empty], ["class/cone", "mIoU"], replace(SETTINGS, absent="exclude"))
+    """It does not count for Holm's correction."""
+    sides = []
+    for (counts,) in pair(Population()):
+        without = counts.counts.copy()
+        without[..., 0] += without[..., 3]  # the labels of the others stay what they are
+        without[..., 3, :] = without[..., 3] = 0
+        sides.append([replace(counts, counts=without)])
+    settings = replace(SETTINGS, absent="exclude")
+    found = estimate(sides[0], ["class/cone", "mIoU"], settings)
     assert math.isnan(found["class/cone"].value)
-    assert (found["class/cone"].images, found["class/cone"].both) == (None, None)
-    assert found["mIoU"].images is not None
-    released = estimate([empty], ["class/cone"], SETTINGS)["class/cone"]
+    assert (found["class/cone"].images, found["mIoU"].images is None) == (None, False)
+    released = estimate(sides[0], ["class/cone"], SETTINGS)["class/cone"]
     assert released.images == Interval(0.0, 0.0)
-
-
-def test_correlated_neighbours_make_wider_intervals() -> None:
-    """Ten frames of each scene are nearly one piece of evidence."""
-    seeds = drawn(300, block=10, noise_sd=0.0, image_sd=1.0)
-    halves = {}
-    for blocks in ("none", "auto", 10):
-        found = estimate(seeds, ["mIoU"], replace(SETTINGS, blocks=blocks))["mIoU"]
-        assert found.images is not None
-        halves[blocks] = found.images.half
-    assert halves[10] > 2 * halves["none"]
-    assert halves["auto"] > 1.7 * halves["none"]
+    metrics = ["class/cone", "class/car", "class/car"]
+    nothing, some = compare(*sides, metrics, settings).differences
+    assert nothing.interval is None
+    assert all(map(math.isnan, (nothing.value, nothing.difference.p, nothing.p_corrected)))
+    assert some.p_corrected == some.difference.p
 
 
 def test_night_is_scored_on_its_own_images() -> None:
@@ -143,7 +146,6 @@ def test_night_is_scored_on_its_own_images() -> None:
     for metric, each in found.items():
         assert each.value == pytest.approx(value(metric, counts, "released"))
     assert found["night/mIoU"].said == "20 of 40 single images"
-    assert found["mIoU"].said == "40 single images"
 
 
 @pytest.mark.parametrize(
@@ -153,22 +155,12 @@ def test_night_is_scored_on_its_own_images() -> None:
         *(({"resamples": value}, "resamples must be between") for value in (99, 10**9)),
         ({"absent": "zero"}, "absent: 'zero' is not a valid choice"),
         ({"blocks": 0}, "blocks must be between"),
-        ({"blocks": "abc"}, "expected auto, none, sequence or a number of images"),
+        ({"blocks": "abc"}, "'abc' is not a valid choice"),
     ],
 )
 def test_settings_out_of_range_are_refused(changes: Any, word: str) -> None:
     with pytest.raises(InputError, match=word):
         Resampling(**changes)
-
-
-def test_no_score_is_below_zero() -> None:
-    """Two trainings whose variance over regions differs by much: Student's interval is cut."""
-    wide = [drawn(trainings=1, tilt=tilt)[0] for tilt in (0.1, 0.9)]
-    found = estimate(wide, ["Var"], SETTINGS)["Var"]
-    assert found.trainings is not None
-    assert found.both is not None
-    assert found.value - stats.t.ppf(0.975, 1) * found.sd / math.sqrt(2) < 0
-    assert (found.trainings.low, found.both.low) == (0.0, 0.0)
 
 
 # Differences.
@@ -178,20 +170,13 @@ def test_planted_difference_is_found_with_its_size() -> None:
     """Skill 1.5 against 2.3; the true size is that of 20,000 images."""
     metrics = ("mIoU", "Var", "region/1", "class/car")
     arrays = Population().pair(np.random.default_rng(7), 20_000, 1, Population(skill=2.3))
-    truth = {
-        metric: value(metric, counts_of(arrays[1][0]), "released")
-        - value(metric, counts_of(arrays[0][0]), "released")
-        for metric in metrics
-    }
+    sides = [counts_of(each[0]) for each in arrays]
     found = compare(*pair(Population(skill=2.3), 200), metrics, replace(SETTINGS, level=0.99))
-    assert [each.metric for each in found.differences] == list(metrics)
     assert (found.images, found.said) == (200, "200 single images")
-    for each in found.differences:
-        assert each.interval is not None
-        assert truth[each.metric] in each.interval
-    for each in found.differences[::2]:
-        assert each.difference.p < 0.001
-        assert each.value == pytest.approx(truth[each.metric], abs=3)
+    for metric, each in zip(metrics, found.differences, strict=True):
+        before, after = (value(metric, side, "released") for side in sides)
+        assert after - before in each.interval
+        assert (each.metric, each.difference.p < 0.001) == (metric, metric != "Var")
 
 
 def test_seeds_of_two_methods_are_not_paired() -> None:
@@ -199,19 +184,12 @@ def test_seeds_of_two_methods_are_not_paired() -> None:
     a, b = pair(Population(skill=1.7, training_sd=0.02), 40, 8)
     b = b[:6]
     (found,) = compare(a, b, ["mIoU"], SETTINGS).differences
-    scores = [np.array([value("mIoU", each, "released") for each in side]) for side in (a, b)]
-    of_images = (looped(b, "mIoU") - looped(a, "mIoU")).std() * math.sqrt(40 / 39)
-    errors = [each.std(ddof=1) / math.sqrt(len(each)) for each in scores]
-    of_seeds = errors[0] ** 2 + errors[1] ** 2
-    seeds_freedom = of_seeds**2 / (errors[0] ** 4 / 7 + errors[1] ** 4 / 5)
-    total = of_images**2 + of_seeds
-    freedom = total**2 / (of_images**4 / 39 + of_seeds**2 / seeds_freedom)
-    half = max(
-        stats.t.ppf(0.975, freedom) * math.sqrt(total),
-        stats.t.ppf(0.975, seeds_freedom) * math.sqrt(of_seeds),
-    )
-    difference = scores[1].mean() - scores[0].mean()
-    assert found.difference.both is not None
+    of_images = (looped(b, "mIoU") - looped(a, "mIoU")).std() * math.sqrt(40 / 39), 39
+    errors = [(scores(each).std(ddof=1) / math.sqrt(len(each)), len(each) - 1) for each in (a, b)]
+    of_seeds = welch(*errors)
+    ways = (welch(of_images, *[of_seeds]), of_seeds)
+    half = max(stats.t.ppf(0.975, freedom) * error for error, freedom in ways)
+    difference = scores(b).mean() - scores(a).mean()
     ends = [found.difference.both.low, found.difference.both.high]
     assert ends == pytest.approx([difference - half, difference + half], rel=1e-9)
 
@@ -220,11 +198,13 @@ def test_both_is_never_narrower_than_seeds_only() -> None:
     """Two trainings each: else 6 % false alarms at 5 % (1000 simulations), and 3 % so."""
     a, b = pair(Population(training_sd=0.3), 40, 2)
     (found,) = compare(a, b, ["mIoU"], SETTINGS).differences
-    scores = [[value("mIoU", each, "released") for each in side] for side in (a, b)]
-    welch = stats.ttest_ind(scores[1], scores[0], equal_var=False).confidence_interval(0.95)
-    assert found.difference.both is not None
+    theirs = stats.ttest_ind(scores(b), scores(a), equal_var=False).confidence_interval(0.95)
     assert (found.difference.p < 0.05) == (0.0 not in found.difference.both)
-    assert found.difference.both.half >= (welch.high - welch.low) / 2 - 1e-9
+    assert found.difference.both.half >= (theirs.high - theirs.low) / 2 - 1e-9
+    for one, other in ((a[:1], b), (a, b[:1])):  # one seed on one side: images only
+        (found,) = compare(one, other, ["mIoU"], SETTINGS).differences
+        assert found.difference.both is None
+        assert found.interval == found.difference.images is not None
 
 
 def test_same_predictions_differ_by_nothing() -> None:
@@ -232,40 +212,6 @@ def test_same_predictions_differ_by_nothing() -> None:
     for each in compare(a, a, METRICS[:4], SETTINGS).differences:
         assert (each.value, each.interval) == (0.0, Interval(0.0, 0.0))
         assert (each.difference.p, each.p_corrected) == (1.0, 1.0)
-
-
-def test_one_seed_on_one_side_uses_images_only() -> None:
-    a, b = pair(Population(), trainings=3)
-    for one, other in ((a[:1], b), (a, b[:1])):
-        (found,) = compare(one, other, ["mIoU"], SETTINGS).differences
-        assert found.difference.both is None
-        assert found.interval == found.difference.images is not None
-
-
-def test_what_cannot_be_scored_does_not_count_for_holm() -> None:
-    a, b = pair(Population())
-    emptied = []
-    for counts in (a[0], b[0]):
-        without = counts.counts.copy()
-        without[..., 0] += without[..., 3]  # the labels of the others stay what they are
-        without[..., 3, :] = without[..., 3] = 0
-        emptied.append([replace(counts, counts=without)])
-    settings = replace(SETTINGS, absent="exclude")
-    nothing, some = compare(*emptied, ["class/cone", "class/car"], settings).differences
-    assert nothing.interval is None
-    assert all(map(math.isnan, (nothing.value, nothing.difference.p, nothing.p_corrected)))
-    assert some.p_corrected == some.difference.p
-    twice = compare(a, b, ["mIoU", "mIoU", "Var"], SETTINGS)
-    assert len(twice.differences) == 2
-
-
-def test_too_few_images_are_refused() -> None:
-    a, b = pair(Population(), 60)
-    night = tuple(place < 9 for place in range(60))
-    a, b = ([replace(side[0], night=night)] for side in (a, b))
-    assert compare(a, b, ["mIoU", "night/mIoU"], SETTINGS).differences[1].interval is None
-    with pytest.raises(InputError, match="9 of 60 single images are too few"):
-        compare(a, b, ["night/mIoU"], SETTINGS)
 
 
 def test_order_of_names_and_seed_of_draws() -> None:
@@ -279,27 +225,22 @@ def test_order_of_names_and_seed_of_draws() -> None:
 
 def test_two_evaluations_of_the_same_trainings_are_paired() -> None:
     """Trainings differ by much, and what the second evaluation loses hardly: a narrow interval."""
-    first = drawn(200, 3, training_sd=0.8)
-    second = [replace(counts, counts=_shifted(counts.counts)) for counts in first]
+    first, second = drawn(200, 3, training_sd=0.8), []
+    for counts in first:
+        moved = counts.counts.copy()
+        for row in range(4):  # a tenth of what was right is wrong
+            lost = counts.counts[..., row, row] // 10
+            moved[..., row, row] -= lost
+            moved[..., row, row - 1] += lost
+        second.append(replace(counts, counts=moved))
     (paired,) = compare(first, second, ["mIoU"], SETTINGS, paired=True).differences
     (apart,) = compare(first, second, ["mIoU"], SETTINGS).differences
-    scores = [[value("mIoU", each, "released") for each in side] for side in (first, second)]
-    drops = np.subtract(scores[1], scores[0])
+    drops = scores(second) - scores(first)
     assert paired.value == pytest.approx(drops.mean())
     assert paired.difference.both.half >= stats.t.ppf(0.975, 2) * stats.sem(drops) - 1e-9
     assert paired.difference.both.half < apart.difference.both.half / 2
-    with pytest.raises(ValueError, match="as many counts in a and b"):
+    with pytest.raises(InputError, match="as many counts in a and b"):
         compare(first, second[:2], ["mIoU"], SETTINGS, paired=True)
-
-
-def _shifted(counts: np.ndarray) -> np.ndarray:
-    """A tenth of what was right is wrong."""
-    moved = counts.copy()
-    for row in range(counts.shape[-1]):
-        lost = counts[..., row, row] // 10
-        moved[..., row, row] -= lost
-        moved[..., row, row - 1] += lost
-    return moved
 
 
 # Images.
@@ -310,22 +251,29 @@ def _shifted(counts: np.ndarray) -> np.ndarray:
     [
         ({"classes": ("road", "car", "person", "pole")}, "counts of the classes"),
         ({"partition": "vertical2"}, "cannot be compared with counts by vertical2"),
-        ({"names": tuple(f"x{n}" for n in range(60))}, "are of different images"),
+        ({"names": tuple(f"x{n}" for n in range(60))}, "not of the same images: 60 .*none is in"),
         ({"unscored": ("car",)}, "leave out"),
+        ({"night": tuple(n % 2 > 0 for n in range(60))}, "which images were taken at night"),
     ],
 )
 def test_counts_of_other_things_are_refused(changed: dict[str, Any], word: str) -> None:
     a, b = pair(Population())
+    a = [replace(a[0], night=tuple(n % 2 == 0 for n in range(60)))]
     with pytest.raises(InputError, match=word):
         compare(a, [replace(b[0], **changed)], ["mIoU"], SETTINGS)
 
 
-def test_other_labels_of_an_image_are_refused() -> None:
+def test_other_labels_and_too_few_images_are_refused() -> None:
     a, b = pair(Population())
     array = b[0].counts.copy()
     array[7, 0, 1] += 1
     with pytest.raises(InputError, match="has different labels in the two counts"):
         compare(a, [replace(b[0], counts=array)], ["mIoU"], SETTINGS)
+    night = tuple(place < 9 for place in range(60))
+    a, b = ([replace(side[0], night=night)] for side in (a, b))
+    assert compare(a, b, ["mIoU", "night/mIoU"], SETTINGS).differences[1].interval is None
+    with pytest.raises(InputError, match="9 of 60 single images are too few"):
+        compare(a, b, ["night/mIoU"], SETTINGS)
 
 
 def test_common_images_are_those_of_all_counts() -> None:

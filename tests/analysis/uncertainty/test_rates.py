@@ -15,7 +15,6 @@ from analysis.uncertainty import Resampling, compare, estimate
 from rgbt.metrics.counts import Counts
 from rgbt.metrics.named import value
 from tests.analysis.uncertainty.simulated import Population, counts_of
-from tests.analysis.uncertainty.simulated_regions import Tilted
 
 METRICS = ("mIoU", "Var", "region/1", "class/cone")
 RUNS = 300
@@ -40,130 +39,94 @@ def true_values(population: Population) -> dict[str, float]:
 
 
 def coverage(
-    population: Population, images: int, trainings: int, settings: Resampling
+    population: Population, images: int, trainings: int, settings: Resampling, gap: int = 0
 ) -> dict[str, float]:
-    """Share of simulations whose widest interval holds the true value, by metric."""
-    true = true_values(population)
-    rng = np.random.default_rng(11)
-    held = dict.fromkeys(METRICS, 0)
+    """Share of simulations whose widest interval holds the true value, by metric.
+
+    `gap`: numbers of frames between the scenes of the population.
+    """
+    true, rng, held = true_values(population), np.random.default_rng(11), dict.fromkeys(METRICS, 0)
+    names = tuple(f"{place + gap * (place // population.block):06d}D" for place in range(images))
     for number in range(RUNS):
-        seeds = as_counts(population.draw(rng, images, trainings))
+        seeds = [
+            replace(each, names=names)
+            for each in as_counts(population.draw(rng, images, trainings))
+        ]
         found = estimate(seeds, METRICS, replace(settings, seed=number))
         for metric in METRICS:
-            interval = found[metric].both or found[metric].images
-            assert interval is not None
-            held[metric] += true[metric] in interval
+            held[metric] += true[metric] in found[metric].interval
+    print(population, images, trainings, settings.blocks, held)
     return {metric: count / RUNS for metric, count in held.items()}
 
 
-def alarms(
-    population: Population, images: int, trainings: int, settings: Resampling
-) -> tuple[dict[str, float], float]:
-    """Share of simulations with p <= 0.05 by metric, and with any such corrected p."""
-    rng = np.random.default_rng(12)
-    raised, any_of_all = dict.fromkeys(METRICS, 0), 0
-    for number in range(RUNS):
-        a, b = population.pair(rng, images, trainings, population)
-        comparison = compare(as_counts(a), as_counts(b), METRICS, replace(settings, seed=number))
-        for each in comparison.differences:
-            raised[each.metric] += each.difference.p <= 0.05
-        any_of_all += any(each.p_corrected <= 0.05 for each in comparison.differences)
-    return {metric: count / RUNS for metric, count in raised.items()}, any_of_all / RUNS
-
-
 @pytest.mark.parametrize("images", [100, 300])
-def test_intervals_over_images(images: int):
+def test_intervals_over_images(images: int) -> None:
     rates = coverage(Population(), images, 1, SETTINGS)
-    print(images, rates)
     assert all(0.88 <= rate <= 0.99 for rate in rates.values())
     assert 0.91 <= np.mean(list(rates.values())) <= 0.97
 
 
-@pytest.mark.parametrize("blocks", ["none", "auto", 10])
-def test_intervals_over_correlated_neighbours(blocks):
-    """Thirty scenes of ten frames: single images say far too much; "auto" is told no length."""
-    rates = coverage(Population(block=10), 300, 1, replace(SETTINGS, blocks=blocks))
-    print(blocks, rates)
-    mean = np.mean(list(rates.values()))
-    if blocks == "none":
-        assert mean < 0.65
-    else:
-        assert mean > {"auto": 0.83, 10: 0.88}[blocks]
+@pytest.mark.parametrize(
+    ("block", "images", "blocks", "gap", "least", "most"),
+    [
+        # Thirty scenes of ten frames: single images say far too much; "auto" is told no length.
+        *(
+            (10, 300, "none", 0, 0.0, 0.65),
+            (10, 300, "auto", 0, 0.83, 1),
+            (10, 300, 10, 0, 0.88, 1),
+        ),
+        # Forty scenes of eight frames with other frames between them: "auto" takes the scenes.
+        (8, 320, "auto", 100, 0.91, 1),
+    ],
+)
+def test_intervals_over_correlated_neighbours(
+    block: int, images: int, blocks, gap: int, least: float, most: float
+) -> None:
+    rates = coverage(Population(block=block), images, 1, replace(SETTINGS, blocks=blocks), gap)
+    assert least < np.mean(list(rates.values())) < most
 
 
-def test_runs_of_consecutive_numbers_are_scenes():
-    """Forty scenes of eight frames with other frames between them: "auto" takes the scenes."""
-    population, rates = Population(block=8), {}
-    true, rng = true_values(population), np.random.default_rng(11)
-    for gap in (0, 100):
-        held = dict.fromkeys(METRICS, 0)
-        for number in range(RUNS):
-            (array,) = population.draw(rng, 320, 1)
-            names = tuple(f"{place + gap * (place // 8):06d}D" for place in range(320))
-            counts = replace(counts_of(array), names=names)
-            settings = replace(SETTINGS, blocks="auto", seed=number)
-            found = estimate([counts], METRICS, settings)
-            for metric in METRICS:
-                held[metric] += true[metric] in found[metric].images
-        rates[gap] = float(np.mean(list(held.values()))) / RUNS
-    print(rates)
-    assert rates[100] > 0.91
-    assert rates[100] > rates[0] > 0.83
-
-
-@pytest.mark.parametrize("tilt", [0.0, 0.1, 0.2, 0.3])
-@pytest.mark.parametrize("images", [100, 300])
-def test_intervals_of_a_variance_of_few_regions(tilt: float, images: int):
-    """True variances of 0 to 15, as in the papers' tables; quantiles never hold a true 0."""
-    method, rng = Tilted(tilt), np.random.default_rng(4)
-    held = 0
+@pytest.mark.parametrize("tilt", [0.0, 0.2])
+def test_intervals_of_a_variance_of_few_regions(tilt: float) -> None:
+    """Also of a true 0, which quantiles of the resamples never hold."""
+    rng, held = np.random.default_rng(4), 0
+    true = true_values(Population(tilt=tilt))["Var"] if tilt else 0.0
     for number in range(RUNS):
-        found = estimate(method.draw(rng, images), ["Var"], replace(SETTINGS, seed=number))["Var"]
-        assert found.value in found.images
+        seeds = as_counts(Population(tilt=tilt).draw(rng, 100, 1))
+        found = estimate(seeds, ["Var"], replace(SETTINGS, seed=number))["Var"]
         assert found.images.low >= 0
-        held += method.true_variance in found.images
-    print(images, method.true_variance, held / RUNS)
-    assert held / RUNS >= (0.97 if tilt == 0 else 0.89)
+        held += true in found.images
+    assert held / RUNS >= 0.89
 
 
-@pytest.mark.parametrize("tilts", [(0.0, 0.0), (0.2, 0.2), (0.1, 0.3)])
-def test_intervals_of_a_difference_of_variances(tilts: tuple[float, float]):
-    a, b = (Tilted(tilt) for tilt in tilts)
-    true, rng, held = b.true_variance - a.true_variance, np.random.default_rng(5), 0
-    for number in range(RUNS):
-        first, second = a.draw(rng, 200, b)
-        settings = replace(SETTINGS, resamples=400, seed=number)
-        held += (
-            true in compare([first], [second], ["Var"], settings).differences[0].difference.images
-        )
-    print(tilts, held / RUNS)
-    assert held / RUNS >= 0.9
-
-
-@pytest.mark.parametrize("training_sd", [0.05, 0.15, 0.5])
-@pytest.mark.parametrize("trainings", [2, 3, 5])
-def test_intervals_over_images_and_seeds(training_sd: float, trainings: int):
+@pytest.mark.parametrize("training_sd", [0.05, 0.5])
+@pytest.mark.parametrize("trainings", [2, 5])
+def test_intervals_over_images_and_seeds(training_sd: float, trainings: int) -> None:
     rates = coverage(Population(training_sd=training_sd), 100, trainings, SETTINGS)
-    print(trainings, training_sd, rates)
     assert all(rate >= 0.88 for rate in rates.values())
 
 
 @pytest.mark.parametrize(
-    ("images", "blocks", "block"), [(20, "none", 1), (60, "none", 1), (200, "auto", 10)]
+    ("images", "blocks", "block", "trainings", "training_sd"),
+    [
+        *((20, "none", 1, 1, 0.0), (60, "none", 1, 1, 0.0), (200, "auto", 10, 1, 0.0)),
+        *((60, "none", 1, 2, 0.0), (60, "none", 1, 2, 0.5), (60, "none", 1, 3, 0.15)),
+    ],
 )
-def test_false_alarms_over_images(images: int, blocks, block: int):
-    population = Population(block=block)
-    rates, any_of_all = alarms(population, images, 1, replace(SETTINGS, blocks=blocks))
-    print(images, blocks, rates, any_of_all)
-    assert all(rate <= 0.09 for rate in rates.values())
-    assert 0.02 <= np.mean(list(rates.values())) <= 0.075
-    assert any_of_all <= 0.09
-
-
-@pytest.mark.parametrize("training_sd", [0.0, 0.15, 0.5])
-@pytest.mark.parametrize("trainings", [2, 3])
-def test_false_alarms_over_images_and_seeds(training_sd: float, trainings: int):
-    rates, any_of_all = alarms(Population(training_sd=training_sd), 60, trainings, SETTINGS)
-    print(trainings, training_sd, rates, any_of_all)
-    assert all(rate <= 0.1 for rate in rates.values())
-    assert any_of_all <= 0.1
+def test_false_alarms(images: int, blocks, block: int, trainings: int, training_sd: float) -> None:
+    """Share of simulations with p <= 0.05 by metric, and with any such corrected p."""
+    population = Population(block=block, training_sd=training_sd)
+    rng, raised, any_of_all = np.random.default_rng(12), dict.fromkeys(METRICS, 0), 0
+    for number in range(RUNS):
+        a, b = map(as_counts, population.pair(rng, images, trainings, population))
+        settings = replace(SETTINGS, blocks=blocks, seed=number)
+        found = compare(a, b, METRICS, settings).differences
+        for each in found:
+            raised[each.metric] += each.difference.p <= 0.05
+        any_of_all += any(each.p_corrected <= 0.05 for each in found)
+    rates = [count / RUNS for count in raised.values()]
+    print(images, blocks, trainings, training_sd, rates, any_of_all / RUNS)
+    assert max(rates) <= 0.1
+    assert any_of_all / RUNS <= 0.1
+    if trainings == 1:
+        assert 0.02 <= np.mean(rates) <= 0.075

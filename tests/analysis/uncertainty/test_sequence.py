@@ -12,27 +12,6 @@ from analysis.uncertainty.sequence import e_value, half_width
 from tests.analysis.uncertainty.simulated_claims import ever_missed, halves, running
 
 
-@pytest.mark.parametrize("precision", [0.1, 0.25, 1.0])
-def test_e_value_is_the_ratio_of_marginal_likelihoods(precision: float) -> None:
-    """Three values; normal prior over the effect size, 1 / sigma over the scale."""
-    values = np.array([0.4, 1.7, 0.9])
-
-    effects = np.linspace(-12, 12, 401) / math.sqrt(precision)
-    logs = np.linspace(-6, 8, 401)  # of the scale, so that d sigma / sigma is even
-
-    def likelihood(effect: np.ndarray, scale: np.ndarray) -> np.ndarray:
-        squares = ((values - (effect * scale)[..., None]) ** 2).sum(-1) / scale**2
-        return np.exp(-squares / 2) / scale**3
-
-    every = likelihood(*np.meshgrid(effects, np.exp(logs), indexing="ij"))
-    prior = stats.norm.pdf(effects, 0, precision**-0.5)
-    over_effects = integrate.trapezoid(every * prior[:, None], effects, axis=0)
-    above = integrate.trapezoid(over_effects, logs)
-    below = integrate.trapezoid(likelihood(np.zeros_like(logs), np.exp(logs)), logs)
-    t = values.mean() * math.sqrt(3) / values.std(ddof=1)
-    assert e_value(t, 3, precision) == pytest.approx(above / below, rel=2e-3)
-
-
 @pytest.mark.parametrize("count", [2, 5, 20])
 def test_e_value_is_the_mean_ratio_of_noncentral_t_densities(count: int) -> None:
     precision = 0.25
@@ -45,33 +24,22 @@ def test_e_value_is_the_mean_ratio_of_noncentral_t_densities(count: int) -> None
         found, _ = integrate.quad(ratio, -12, 12, limit=200)
         wanted = found / stats.t.pdf(t, count - 1)
         assert e_value(t, count, precision) == pytest.approx(wanted, rel=1e-5)
+    assert e_value(3.0, 1) == 1.0  # without a variance
 
 
-def test_e_value_without_a_variance_says_nothing() -> None:
-    assert e_value(3.0, 1) == 1.0
-
-
-@pytest.mark.parametrize("count", [4, 5, 20, 300])
+@pytest.mark.parametrize("count", [4, 20, 300])
 def test_half_width_is_where_the_e_value_is_one_over_alpha(count: int) -> None:
     for alpha in (0.025, 0.05):
         half = half_width(1.7, count, alpha)
         assert e_value(half * math.sqrt(count) / 1.7, count) == pytest.approx(1 / alpha)
-        inside = e_value(0.99 * half * math.sqrt(count) / 1.7, count)
-        assert inside < 1 / alpha < e_value(1.01 * half * math.sqrt(count) / 1.7, count)
 
 
 def test_half_width_is_infinite_where_no_t_decides() -> None:
     """The largest e-value of n values is r^((1 - n) / 2): 11.7 for 3, and 70 for 4."""
-    assert math.isinf(half_width(1.0, 1, 0.05))
-    for count in (2, 3, 4):
-        shrunk = 0.25 / (count + 0.25)
-        largest = shrunk ** ((1 - count) / 2)
-        assert e_value(1e9, count) == pytest.approx(largest)
-        assert math.isinf(half_width(1.0, count, 0.05)) == (largest <= 20)
+    assert [math.isinf(half_width(1.0, count, 0.05)) for count in (1, 2, 3, 4)] == [True] * 3 + [
+        False
+    ]
     assert half_width(0.0, 4, 0.05) == 0.0
-
-
-def test_half_width_falls_with_every_value() -> None:
     widths = halves(1000, 0.025)
     finite = widths[np.isfinite(widths)]
     assert len(finite) == 997
@@ -82,16 +50,16 @@ def test_sequence_ever_misses_the_mean_in_less_than_alpha() -> None:
     """1500 sequences of 2 to 200 values; the t interval alone misses in more than half of them."""
     rng, factors = np.random.default_rng(1), halves(200, 0.05)
     naive = stats.t.ppf(0.975, np.arange(1, 200)) / np.sqrt(np.arange(2, 201))
-    missed, fixed = 0, 0
-    for _ in range(1500):
-        means, sds = running(rng, 200)
-        missed += bool((np.abs(means) > sds * factors).any())
-        fixed += bool((np.abs(means) > sds * naive).any())
-    assert 0.01 < missed / 1500 < 0.05
-    assert fixed / 1500 > 0.3
+    drawn = [running(rng, 200) for _ in range(1500)]
+    missed, fixed = (
+        np.mean([(np.abs(means) > sds * each).any() for means, sds in drawn])
+        for each in (factors, naive)
+    )
+    assert 0.01 < missed < 0.05
+    assert fixed > 0.3
 
 
-@pytest.mark.parametrize("ratio", [0.0, 0.2, 1.0, 3.0])
+@pytest.mark.parametrize("ratio", [0.0, 0.2, 3.0])
 def test_images_and_seeds_together_ever_miss_in_less_than_alpha(ratio: float) -> None:
     """`AnyTime` joins squares at half of the error rate each; the whole rate is too much."""
     missed = ever_missed(1500, 200, ratio)

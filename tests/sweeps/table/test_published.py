@@ -13,8 +13,7 @@ import yaml
 
 from sweeps.table.load_table import load_table, table_names
 from sweeps.table.table import Row
-from sweeps.verdicts.contrasts import contrasts_of, printed_value
-from sweeps.verdicts.judge import as_claimed
+from sweeps.verdicts.judge import as_claimed, contrasts_of, printed_value
 
 SHARED = Path(os.environ.get("RGBT_SHARED", Path(__file__).resolve().parents[3].parent / "shared"))
 FOLDER = SHARED / "published"

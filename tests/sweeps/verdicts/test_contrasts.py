@@ -4,7 +4,7 @@ import pytest
 
 from sweeps.table.claim import Claim
 from sweeps.table.table import Column, Row
-from sweeps.verdicts.contrasts import Contrast, base_scores, contrasts_of, printed_value
+from sweeps.verdicts.judge import Contrast, base_scores, contrasts_of, printed_value
 from tests.sweeps.tabled import table
 
 COLUMNS = (

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
 
 from rgbt.metrics.counts import Counts
 from sweeps.table.cells import world_evaluations
+from sweeps.table.claim import Claim
 from sweeps.table.design import Design, DesignFactor, DesignMethod, Part
 from sweeps.table.table import Column, Row, Table
-from sweeps.verdicts.effects import MEAN, DesignJudge
+from sweeps.verdicts.effects import MEAN, DesignJudge, judged_claims
+from sweeps.verdicts.judge import TableJudge
 from tests.sweeps.tabled import counts_of, failed, outcome, table
 
 WHOLE = Part()
@@ -105,6 +108,33 @@ def test_seeds_that_not_all_cells_have_are_left_out() -> None:
     assert found["baseline", "", "noise"].seeds == 2
     assert found["crm", "", "noise"].seeds == 3
     assert found["crm", "baseline", "noise"].seeds == 2
+
+
+def test_claims_about_effects_are_judged() -> None:
+    """Noise makes region 1 worse, and with it the difference of the regions."""
+    names = {"worse": ("N", "lower"), "better": ("N", "higher"), "texture": ("T", "higher")}
+    claims = tuple(
+        Claim(
+            name=name,
+            says="A sentence.",
+            source="own",
+            rows=("baseline",),
+            columns=("contrast",),
+            effect=letter,
+            expected=expected,  # type: ignore[arg-type]
+        )
+        for name, (letter, expected) in names.items()
+    )
+    made = replace(design_table(), claims=claims)
+    judge = TableJudge("own/t", made, resamples=100)
+    worse, better, texture = judged_claims(judge, trained(3))  # type: ignore[arg-type]
+    assert [each.word for each in (worse, better)] == ["holds", "contradicted"]
+    assert texture.word != "holds"
+    assert worse.verdict is not None
+    assert worse.verdict.estimate == pytest.approx(EFFECT, abs=0.5)
+    assert "N+ - N- (trained)" in worse.contrast
+    unfinished = {run: each for run, each in trained(3).items() if run[0] != "baseline N+T-"}
+    assert judged_claims(judge, unfinished)[0].word == "not run"  # type: ignore[arg-type]
 
 
 def test_networks_tested_in_worlds_use_the_counts_of_each_world() -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from analysis.uncertainty.contrasts import FIXED
 from sweeps.point import Outcome
+from sweeps.table.cells import CellId, TableCell, score
 from sweeps.table.claim import Claim
 from sweeps.table.table import Column, Row, Table
 from sweeps.verdicts.judge import CellRunId, JudgedClaim, TableJudge, as_claimed
@@ -39,6 +40,10 @@ def of(*claims: Claim, rows: tuple[str, ...] = tuple(SHARES), **others: Any) -> 
 def judge(one: Claim, runs: dict[CellRunId, Outcome] | None = None, **others: Any) -> JudgedClaim:
     runs = planted(SHARES) if runs is None else runs
     return TableJudge("own/t", of(one, **others), resamples=200).judge(one, runs)
+
+
+def marked(judge: TableJudge, runs: Any) -> dict[CellId, int]:
+    return judge.marks(score("own/t", judge.table, runs, scale="demo"), runs)
 
 
 def test_true_false_and_undecidable_claims_come_out_so() -> None:
@@ -81,6 +86,18 @@ def test_best_of_all_needs_every_other_row() -> None:
     worse = {**SHARES, "high": (40.0, 41.0, 39.0)}
     refuted = judge(best, planted({label: worse[label] for label in ("low", "high")}))
     assert (refuted.word, refuted.missing) == ("contradicted", ("same",))
+
+
+def test_most_with_rows_not_run_is_never_contradicted() -> None:
+    """The rows that were not run may all be as claimed: three of five would be most."""
+    rows = ("low", "same", "first", "second", "third")
+    most = claim(rows=rows, against=("high",), combine="most")
+    shares = {"low": (50.0, 51.0, 49.0), "same": (55.0, 56.0, 54.0), "high": (90.0, 91.0, 89.5)}
+    made = TableJudge("own/t", of(most, rows=("high", *rows)), resamples=200)
+    found = made.judge(most, planted(shares))  # type: ignore[arg-type]
+    assert (found.word, found.missing) == ("undecided", ("first", "second", "third"))
+    every = planted({**dict.fromkeys(rows, shares["low"]), "high": shares["high"]})
+    assert made.judge(most, every).word == "contradicted"  # type: ignore[arg-type]
 
 
 def test_claim_without_runs_is_not_run() -> None:
@@ -138,11 +155,11 @@ def test_best_row_is_marked_where_it_is_shown(best: Any, marks: dict[str, int]) 
     made = table(rows, (column,))
     found = TableJudge("own/t", made, resamples=200)
     given = planted(shares)
-    assert found.marks(given) == {(label, "acc"): rank for label, rank in marks.items()}  # type: ignore[arg-type]
+    assert marked(found, given) == {(label, "acc"): rank for label, rank in marks.items()}  # type: ignore[arg-type]
     noisy = planted({**shares, "high": (90.0, 60.0, 70.0), "low": (50.0, 80.0, 70.0)})
-    assert TableJudge("own/t", made, resamples=200).marks(noisy) == {}  # type: ignore[arg-type]
+    assert marked(TableJudge("own/t", made, resamples=200), noisy) == {}  # type: ignore[arg-type]
     single = {run: each for run, each in given.items() if run[1] == 0}
-    assert found.marks(single) == {}  # type: ignore[arg-type]
+    assert marked(found, single) == {}  # type: ignore[arg-type]
 
 
 def test_rows_of_the_same_runs_share_a_mark() -> None:
@@ -151,7 +168,7 @@ def test_rows_of_the_same_runs_share_a_mark() -> None:
     rows = tuple(Row(label=label, experiment="crm") for label in ("low", "high", "again"))
     one = claim(rows=("high",), against=("again",))
     made = TableJudge("own/t", table(rows, (ACC,), claims=(one,)), resamples=200)
-    assert made.marks(runs) == {("high", "acc"): 1, ("again", "acc"): 1}  # type: ignore[arg-type]
+    assert marked(made, runs) == {("high", "acc"): 1, ("again", "acc"): 1}  # type: ignore[arg-type]
     found = made.judge(one, runs)  # type: ignore[arg-type]
     assert found.word == "not run"
     assert found.reason == "rows 'high' and 'again' are the same runs at this scale."
@@ -161,8 +178,12 @@ def test_claims_about_counted_sizes_are_exact() -> None:
     size = Column(name="size", efficiency="parameters")
     rows = tuple(Row(label=label, experiment="crm") for label in ("small", "large"))
     one = claim(rows=("small",), against=("large",), columns=("size",), expected="lower")
-    sizes = {("small", "size"): 3.0, ("large", "size"): 5.0}
-    for given, word in ((sizes, "holds"), ({**sizes, ("small", "size"): 6.0}, "contradicted")):
+    sizes = {
+        (label, "size"): TableCell(mean, math.nan, 0)
+        for label, mean in (("small", 3.0), ("large", 5.0))
+    }
+    more = {**sizes, ("small", "size"): TableCell(6.0, math.nan, 0)}
+    for given, word in ((sizes, "holds"), (more, "contradicted")):
         made = TableJudge("own/t", table(rows, (size,), claims=(one,)), sizes=given)
         assert made.judge(one, {}).word == word
     assert TableJudge("own/t", table(rows, (size,), claims=(one,))).judge(one, {}).word == "not run"

@@ -1,0 +1,340 @@
+"""Keep the results of runs in the repository, one small file per finished run.
+
+usage: rgbt archive add run=all, rgbt archive check, or rgbt archive rekey
+
+``results/<key>.zip`` holds the configuration, the result, the provenance and all counts of a run.
+What runs on the same images share is in ``results/shared/`` once: names of images and classes, and
+the number of pixels of each label. Of the counts a run then keeps the wrong predictions only: the
+right ones are what is left of the labelled pixels. Unpacked, a run is a folder that
+`rgbt.runs.result.RunResult` reads; its counts are equal, bit for bit. No file depends on another
+run, so two machines that add runs never conflict.
+
+Exit code 1 of ``check``: a run is damaged, or its command now has another key.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import lzma
+import os
+import tempfile
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rgbt.checks import InputError, one_line
+from rgbt.config.common_options import RunsDir
+from rgbt.config.options import Help
+from rgbt.config.plain_command import CommandGroup, PlainCommand
+from rgbt.files.atomic import write_atomic
+from rgbt.metrics.counts import Counts
+from rgbt.metrics.details import details_of
+from rgbt.metrics.pairs import protocol_of
+from rgbt.runs.folder import find_run, is_finished, read_result, runs_in
+from rgbt.runs.result import RunResult
+from rgbt.tables import TextTable
+from rgbt.terminal import plain_text, print_rich, rich_table, warn
+
+SHARED = "shared"
+COUNTS = ("counts_*.npz", "evaluations/*.npz", "evaluations/robustness/*/*.npz")
+TEXTS = ("config.yaml", "run.json", "result.json", "evaluations/robustness/*/*.json")
+"""Files of a run folder that are archived: its counts, and what is kept as it is."""
+
+PROVENANCE = (
+    *("started", "command", "git_commit", "git_dirty", "code", "python", "threads"),
+    *("platform", "cpu", "cpu_usable", "gpus", "cuda"),
+)
+PACKAGES = ("torch", "numpy", "opencv-python-headless", "lightning-fabric", "hydra-core", "optuna")
+"""Entries of the provenance, and the packages whose versions are archived. Paths and the name of
+the machine are of no use elsewhere."""
+
+DAMAGED = (
+    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, NotImplementedError),
+    *(KeyError, ValueError, TypeError, OSError),
+)
+
+
+def archived(folder: Path) -> list[Path]:
+    """All runs of an archive, by key: ``<key>.zip``, ``<key>-<digest>.zip`` with other results."""
+    return sorted(folder.glob("*.zip"))
+
+
+def key_of(path: Path) -> str:
+    """Key of an archived run."""
+    return path.stem.partition("-")[0]
+
+
+def unpack(path: Path, folder: Path | None = None) -> RunResult:
+    """An archived run as ``<digest of the file>/<key>`` in `folder` (None: the user's cache), once.
+
+    InputError: a damaged file, or one that belongs to another run.
+    """
+    cache, key = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", key_of(path)
+    folder = folder or Path(cache, "rgbt", "archive")
+    target = folder / _digest(path.read_bytes()) / key
+    if target.is_dir():
+        return RunResult(target)
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=folder) as scratch:
+        unpacked = Path(scratch, "run")
+        try:
+            _write_members(path, unpacked)
+        except DAMAGED as error:
+            raise InputError(f"{path} is damaged ({one_line(error)}).") from error
+        result = RunResult(unpacked).result
+        if result.get("key", key) != key:
+            raise InputError(f"{path} holds the run {result['key']}; rename the file.")
+        target.parent.mkdir(exist_ok=True)
+        try:
+            unpacked.rename(target)
+        except OSError:
+            if not target.is_dir():  # another process was not faster
+                raise
+    return RunResult(target)
+
+
+def _write_members(path: Path, folder: Path) -> None:
+    with zipfile.ZipFile(path) as archive:
+        for entry in archive.namelist():
+            file = folder / entry.removesuffix(".xz")
+            if not file.resolve().is_relative_to(folder.resolve()):
+                raise ValueError(f"'{entry}' leads out of the folder")
+            file.parent.mkdir(parents=True, exist_ok=True)
+            if entry.endswith(".npz.xz"):
+                _unpack_counts(archive.read(entry), path.parent / SHARED).save(file)
+            else:
+                write_atomic(file, archive.read(entry))
+
+
+def counts_of(folder: Path) -> list[Path]:
+    """The files of counts of a run folder."""
+    return sorted(each for pattern in COUNTS for each in folder.glob(pattern))
+
+
+def add(run: RunResult, folder: Path) -> Path:
+    """Put a finished run into the archive `folder`; the same results are written once.
+
+    Other results of the same key, from another machine, are kept beside as ``<key>-<digest>.zip``.
+    InputError: the run is not finished, or one of its files is damaged.
+    """
+    if not run.is_finished:
+        raise InputError(f"{run.folder} is not finished; rerun its command.")
+    content = _packed(run, folder / SHARED)
+    path = folder / f"{run.key}.zip"
+    if path.exists() and path.read_bytes() != content:
+        path = folder / f"{run.key}-{_digest(content)[:8]}.zip"
+    if not path.exists():
+        write_atomic(path, content)
+    return path
+
+
+def _packed(run: RunResult, shared: Path) -> bytes:
+    """The bytes of ``<key>.zip``, equal for equal runs; shared arrays are written to `shared`."""
+    shared.mkdir(parents=True, exist_ok=True)
+    texts = [path for name in TEXTS for path in sorted(run.folder.glob(name))]
+    members = {path.relative_to(run.folder).as_posix(): path.read_bytes() for path in texts}
+    entries = [
+        {name: entry.get(name) for name in PROVENANCE}
+        | {"packages": {name: entry.get("packages", {}).get(name) for name in PACKAGES}}
+        for entry in run.provenance
+    ]
+    members["provenance.json"] = json.dumps(entries, indent=1).encode()
+    for path in counts_of(run.folder):
+        name = path.relative_to(run.folder).as_posix()
+        members[f"{name}.xz"] = _packed_counts(Counts.load(path), shared)
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, content in members.items():
+            how = zipfile.ZIP_STORED if name.endswith(".xz") else zipfile.ZIP_DEFLATED
+            archive.writestr(zipfile.ZipInfo(name), content, how)  # the time of an info is fixed
+    return file.getvalue()
+
+
+def _packed_counts(counts: Counts, shared: Path) -> bytes:
+    """LZMA of a JSON line and of the bytes of the counts, images last and by significance."""
+    fields, array = vars(counts).copy(), counts.counts
+    arrays = {name: np.array(fields.pop(name)) for name in ("names", "classes")}
+    arrays["night"] = np.array(fields.pop("night") or (), bool)
+    arrays["unscored"] = np.array(fields.pop("unscored"), str)
+    # Of confusion matrices alone do the rows sum to the pixels of the label.
+    if details_of(counts.partition) is None and protocol_of(counts.partition) is None:
+        arrays["labelled"] = array.sum(-1, dtype=np.int64)
+        array = array.copy()
+        array[..., range(array.shape[-1]), range(array.shape[-1])] = 0
+    file = io.BytesIO()
+    np.savez(file, allow_pickle=False, **arrays)
+    name = _digest(file.getvalue())
+    if not (path := shared / f"{name}.npz.xz").exists():
+        write_atomic(path, lzma.compress(file.getvalue(), preset=9))
+    header = fields | {"counts": [array.dtype.str, *array.shape], "shared": name}
+    images_last = np.ascontiguousarray(np.moveaxis(array, 0, -1))
+    planes = images_last.view(np.uint8).reshape(-1, array.itemsize).T
+    return lzma.compress(json.dumps(header).encode() + b"\n" + planes.tobytes(), preset=9)
+
+
+def _unpack_counts(content: bytes, shared: Path) -> Counts:
+    line, _, planes = lzma.decompress(content).partition(b"\n")
+    fields: dict[str, Any] = json.loads(line)
+    arrays = _shared_arrays(shared, str(fields.pop("shared")))
+    kind, images, *rest = fields.pop("counts")
+    flat = np.frombuffer(planes, np.uint8).reshape(np.dtype(kind).itemsize, -1).T
+    images_last = np.ascontiguousarray(flat).view(kind).reshape(*rest, images)
+    array = np.ascontiguousarray(np.moveaxis(images_last, -1, 0))
+    if "labelled" in arrays:
+        classes = range(array.shape[-1])
+        array[..., classes, classes] = arrays["labelled"] - array.sum(-1)
+    fields |= {name: tuple(arrays[name].tolist()) for name in ("names", "classes", "unscored")}
+    return Counts(**fields, counts=array, night=tuple(arrays["night"].tolist()) or None)
+
+
+def _shared_arrays(shared: Path, name: str) -> dict[str, NDArray[Any]]:
+    """The arrays of a file that is named by the digest of its content."""
+    content = lzma.decompress((shared / f"{Path(name).name}.npz.xz").read_bytes())
+    if _digest(content) != name:
+        raise ValueError(f"shared/{name} does not match its digest")
+    with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+        return dict(arrays)
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:16]
+
+
+# Commands.
+
+Archive = Annotated[Path, Help("folder of the archive")]
+
+
+@dataclass(frozen=True)
+class AddOptions:
+    """Options of `add_runs`."""
+
+    run: Annotated[str, Help("run folder or config key; all: every finished run of runs_dir")]
+    runs_dir: RunsDir = Path("runs")
+    archive: Archive = Path("results")
+
+
+@dataclass(frozen=True)
+class ArchiveOptions:
+    """Options of `check` and `rekey`."""
+
+    archive: Archive = Path("results")
+
+
+def add_runs(options: AddOptions, _: list[str]) -> int:
+    """Add finished runs to the archive; a run that is in it already is left as it is."""
+    folders = [run.path for run in runs_in(options.runs_dir) if is_finished(run.path)]
+    if options.run != "all":
+        folders = [find_run(options.run, options.runs_dir)]
+    for folder in folders:
+        added = add(RunResult(folder), options.archive)
+        print_rich(plain_text(f"{added}  {added.stat().st_size} bytes"))
+        if added.stem != key_of(added):
+            warn(f"{options.archive / key_of(added)}.zip has other results; both are kept.")
+    return 0
+
+
+def check(options: ArchiveOptions, _: list[str]) -> int:
+    """Compose the command of every archived run again, and report whose key has changed."""
+    found = list(_compared(options.archive))
+    rows = [(each.path.stem, each.state, each.reason) for each in found if each.state != "same"]
+    if rows:
+        print_rich(rich_table(TextTable("archive", ("run", "state", "reason"), tuple(rows))))
+    print_rich(f"{len(found)} runs, {len(found) - len(rows)} have the key of their command.")
+    return int(bool(rows))
+
+
+def rekey(options: ArchiveOptions, _: list[str]) -> int:
+    """Rename runs whose configuration differs from today's in added settings alone.
+
+    The default of an added setting has to keep the behaviour. Who adds it knows.
+    """
+    from omegaconf import OmegaConf
+
+    from rgbt.files.plain_files import write_json
+
+    for each in [each for each in _compared(options.archive) if each.state == "added"]:
+        with tempfile.TemporaryDirectory() as scratch:
+            folder = unpack(each.path, Path(scratch)).folder
+            settings = OmegaConf.to_yaml(OmegaConf.create(dict(each.settings)))
+            (folder / "config.yaml").write_text(settings)
+            write_json(folder / "result.json", {**(read_result(folder) or {}), "key": each.key})
+            for path in counts_of(folder):
+                counts = Counts.load(path)
+                replace(counts, run=each.key if counts.run else "").save(path)
+            new = folder.rename(folder.with_name(each.key))
+            path = add(RunResult(new), options.archive)
+        each.path.unlink()
+        print_rich(plain_text(f"{each.path}  ->  {path}"))
+    return 0
+
+
+class Compared(NamedTuple):
+    """An archived run beside the run that its command requests today.
+
+    `state` is "same" (key); "added" (another key, but only for settings that were added);
+    "changed" (other settings); or "damaged", if the command does not compose any more, too.
+    """
+
+    path: Path
+    state: str
+    reason: str = ""
+    key: str = ""
+    settings: Mapping[str, Any] = {}
+
+
+def _compared(archive: Path) -> Iterator[Compared]:
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    with tempfile.TemporaryDirectory() as scratch:
+        for path in archived(archive):
+            try:
+                yield _compare(path, unpack(path, Path(scratch)))
+            except (InputError, HydraException, OmegaConfBaseException) as error:
+                yield Compared(path, "damaged", str(error))
+
+
+def _compare(path: Path, stored: RunResult) -> Compared:
+    from rgbt.config.compose import compose, flatten
+    from rgbt.config.stored_config import read_settings
+    from rgbt.runs.run_spec import NOT_IN_KEY
+    from rgbt.runs.specify import requested_run
+
+    words = stored.description.overrides
+    spec = requested_run(compose(words), words)
+    if spec.key == stored.key:
+        return Compared(path, "same")
+    before = flatten(read_settings(stored.folder / "config.yaml"))
+    now, none = flatten(spec.plain), object()
+    differing = [
+        key
+        for key in sorted(before.keys() | now.keys())
+        if before.get(key, none) != now.get(key, none)
+        and not any(key == out or key.startswith(f"{out}.") for out in NOT_IN_KEY)
+    ]
+    # Nothing says how an upstream run differs.
+    is_added = bool(differing) and all(key not in before for key in differing)
+    reason = ", ".join(differing) or "a run that it depends on"
+    return Compared(path, "added" if is_added else "changed", reason, spec.key, spec.plain)
+
+
+entry = CommandGroup(
+    __doc__,
+    {
+        "add": PlainCommand(AddOptions, add_runs, heeds=(), name="rgbt archive add"),
+        "check": PlainCommand(ArchiveOptions, check, heeds=(), name="rgbt archive check"),
+        "rekey": PlainCommand(ArchiveOptions, rekey, heeds=(), name="rgbt archive rekey"),
+    },
+)
+
+if __name__ == "__main__":
+    entry()

@@ -1,1 +1,0 @@
-"""The results of runs as small files in the repository."""

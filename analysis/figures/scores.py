@@ -1,0 +1,439 @@
+"""Scores of methods: by region, under corruptions, by class of pairs of frames; and an equation."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from analysis.arguments import Blocks, Level, Resamples
+from analysis.figures import plots
+from analysis.figures.inputs import (
+    Drawn,
+    RunOptions,
+    check_same_images,
+    figure,
+)
+from analysis.results import CLEAN
+from analysis.robustness import Training, trainings
+from analysis.uncertainty import Resampling, estimate
+from rgbt.checks import InputError, nearest, split_list
+from rgbt.config.options import Help
+from rgbt.metrics import names
+from rgbt.metrics.counts import Counts, check_same_means, convention, scored_classes
+from rgbt.metrics.metric import Absent, Regions
+from rgbt.metrics.named import value
+from rgbt.metrics.pairs import HEADLINES, Protocol, protocol_of
+from rgbt.metrics.scores import class_mean, miou
+from rgbt.runs.naming import row_name
+from rgbt.tables import class_labels
+from rgbt.tracking.pictures import colour_limits
+
+TITLES: dict[Protocol, str] = {
+    "aligned": "virtual views, first frame warped into the second",
+    "released": "virtual views, frames not warped (as released)",
+    "next": "consecutive frames",
+}
+COLUMNS = 4
+HEIGHT, HEIGHT_BELOW = 1.55, 1.35
+"""Panels in a line of the figure of corruptions; inches of a line, and of the panel below them."""
+
+MISSING = "one image missing"
+"""Title of the panel of corruptions without a severity."""
+
+SPREAD = 0.3
+"""Regions over which bars of several methods stand side by side."""
+
+SHORTEST, LONGEST = 16, 4096
+"""Sides of a heat map of regions in pixels."""
+
+BANDS = {"images": "images", "seeds": "trainings", "both": "both"}
+"""``band=`` -> the interval of `analysis.uncertainty.Estimate`."""
+
+
+@figure("temporal/fig5", "TC and CA of variants by class")
+def consistency(
+    given: RunOptions,
+    *,
+    frames: Annotated[
+        Literal["aligned", "released", "next"],
+        Help(
+            "pairs of frames, counted by rgbt consistency: aligned or released (virtual views), or "
+            "next (consecutive frames)"
+        ),
+    ] = "aligned",
+) -> Drawn:
+    """TC and CA by class, of counts of pairs of frames (rgbt consistency)."""
+    frame = class_consistency(given.counts(frames), given.absent)
+    return draw_consistency(frame), frame
+
+
+def class_consistency(
+    methods: Mapping[str, Sequence[Counts]], absent: Absent | None
+) -> pd.DataFrame:
+    """TC (value) and CA (low, by the union of the protocol) of variants by class, mean over seeds.
+
+    In percent; CA is never above TC. mean_tc and mean_ca are over the scored classes, the cells of
+    the paper's Table I. InputError: counts of single frames, or of different kinds.
+    """
+    every = [counts for seeds in methods.values() for counts in seeds]
+    reference, convened = every[0], absent or convention(every)
+    for counts in every:
+        if (counts.partition, counts.classes) != (reference.partition, reference.classes):
+            both = f"{reference.partition} and {counts.partition}"
+            raise InputError(f"runs: counts of different classes or protocols ({both}).")
+        check_same_means(reference, counts)
+    protocol = protocol_of(reference.partition)
+    if protocol is None:
+        raise InputError(f"runs: {reference.partition} are counts of single frames.")
+    labels = class_labels(reference.classes, reference.unscored)
+    scored, rows = scored_classes(reference.classes, reference.unscored), []
+    for label, seeds in methods.items():
+        metrics = [
+            [names.of_class(k, each) for k in reference.classes] for each in HEADLINES[protocol]
+        ]
+        both_ = [[[value(m, each, convened) for m in of] for of in metrics] for each in seeds]
+        tc, ca = np.mean(both_, axis=0)
+        means = float(class_mean(tc, scored)), float(class_mean(ca, scored))
+        rows += [(protocol, label, *cells, *means) for cells in zip(labels, tc, ca, strict=True)]
+    columns = ["protocol", "series", "tick", "value", "low", "mean_tc", "mean_ca"]
+    return pd.DataFrame(rows, columns=columns).assign(high=math.nan)
+
+
+@plots.styled
+def draw_consistency(frame: pd.DataFrame) -> Figure:
+    """TC as full and CA as open marker, joined by a line; variants side by side in each class."""
+    made = plots.new_figure(plots.PAGE, 2.6)
+    axes = made.subplots()
+    protocol: Protocol = frame["protocol"][0]
+    said = [
+        f"{name} (TC {tc:.1f}, CA {ca:.1f})"
+        for name, tc, ca in frame[["series", "mean_tc", "mean_ca"]].to_numpy()
+    ]
+    plots.dot_plot(axes, frame.assign(series=said), open_low=True)
+    axes.set_ylim(bottom=0)
+    union = " (released)" if HEADLINES[protocol][1] == names.CA_RELEASED else ""
+    axes.set_ylabel(f"percent: TC full,\nCA{union} open")
+    axes.set_title(TITLES[protocol], fontsize=plots.SMALL)
+    plots.series_legend(made, axes, columns=frame["series"].nunique())
+    return made
+
+
+Corruptions = Annotated[
+    str, Help("corruptions to show, with commas: noise:rgb,frozen; default: all that were measured")
+]
+
+
+@figure("robustness", "mIoU under corruptions, one panel per corruption, one line per method")
+def robustness(given: RunOptions, *, corruptions: Corruptions = "") -> Drawn:
+    """Mean over trainings, band of one standard deviation, of runs after rgbt robustness."""
+    rows = split_list(corruptions, "corruptions") if corruptions else []
+    frame = corrupted(given.open(trainings), given.absent, rows)
+    return draw_robustness(frame), frame
+
+
+@figure("robustness/relative", "the same in percent of the mIoU on clean images")
+def robustness_relative(given: RunOptions, *, corruptions: Corruptions = "") -> Drawn:
+    """Each training in percent of what it reaches on clean images."""
+    _, frame = robustness(given, corruptions=corruptions)
+    return draw_robustness(frame, "relative"), frame
+
+
+def corrupted(
+    methods: Mapping[str, Sequence[Training]], absent: Absent | None, rows: Sequence[str] = ()
+) -> pd.DataFrame:
+    """Scores of the trainings of methods under corruptions, those called `rows`, or all.
+
+    mIoU and relative are means over trainings, in percent, and in percent of what each training
+    reaches on clean images; mIoU_sd and relative_sd standard deviations (n - 1; NaN of one).
+    InputError: methods on other images or at different severities, or a row not measured.
+    """
+    levels = [
+        (method, number, level)
+        for method, each in methods.items()
+        for number, training in enumerate(each)
+        for level in training.levels
+    ]
+    check_same_images({f"{m} {n} {each.path.stem}": [each.counts] for m, n, each in levels})
+    convened = absent or convention(level.counts for *_, level in levels)
+    cells = []
+    for method, number, level in levels:
+        score = 100 * miou(level.counts.whole(), convened, level.counts.scored)
+        about = level.row, level.title, level.unit, level.severity
+        cells.append((*about, method, number, float(score)))
+    names_ = ["row", "title", "unit", "severity", "method", "training", "mIoU"]
+    every = pd.DataFrame(cells, columns=names_)
+    known = [row for row in every["row"].unique() if row != CLEAN]
+    shown = [row_name(row) for row in rows] or known
+    for row in shown or [""]:
+        if row not in known:
+            raise InputError(f"corruptions: '{row}' was not measured; {nearest(row, known)}.")
+    every = every[every["row"].isin([CLEAN, *shown])]
+    ladders = every[every["unit"] != ""].groupby(["row", "method", "training"])["severity"]
+    for row, each in ladders.agg(list).groupby("row"):
+        if each.map(str).nunique() > 1:
+            found = "; ".join(f"{key[1]} {severities}" for key, severities in each.items())
+            raise InputError(f"runs: {row} was measured at different severities: {found}.")
+    clean = every[every["row"] == CLEAN].set_index(["method", "training"])["mIoU"]
+    places = pd.MultiIndex.from_frame(every[["method", "training"]])
+    every["relative"] = 100 * every["mIoU"] / clean.reindex(places).to_numpy()
+    keys = ["row", "title", "unit", "severity", "method"]
+    found = every.groupby(keys, sort=False, as_index=False).agg(
+        seeds=("training", "size"),
+        mIoU=("mIoU", "mean"),
+        mIoU_sd=("mIoU", "std"),
+        relative=("relative", "mean"),
+        relative_sd=("relative", "std"),
+    )
+    # What only some trainings of a method were measured at is not shown.
+    return found[found["seeds"] == found["method"].map(clean.groupby("method").size())]
+
+
+@plots.styled
+def draw_robustness(frame: pd.DataFrame, score: str = "mIoU") -> Figure:
+    """One panel per corruption; the dashed line is the score on clean images.
+
+    Corruptions without a severity, such as missing images, stand side by side below.
+    """
+    seeds = frame["seeds"].astype(str) + " seed" + np.where(frame["seeds"] > 1, "s", "")
+    data = frame.assign(
+        series=frame["method"] + " (" + seeds + ")",
+        x=frame["severity"],
+        value=frame[score],
+        low=frame[score] - frame[f"{score}_sd"],
+        high=frame[score] + frame[f"{score}_sd"],
+        tick=frame["title"],
+    )
+    clean, others = data[data["row"] == CLEAN], data[data["row"] != CLEAN]
+    order = clean["series"].tolist()
+    curves, missing = [*others[others["unit"] != ""]["row"].unique()], others[others["unit"] == ""]
+    has_below = int(len(missing) > 0)
+    lines, columns = -(-len(curves) // COLUMNS), min(COLUMNS, max(1, len(curves)))
+    width = plots.PAGE * max(columns, 2 + has_below) / COLUMNS
+    made = plots.new_figure(width, HEIGHT * lines + HEIGHT_BELOW * has_below + 0.25)
+    heights = [*[HEIGHT] * lines, *[HEIGHT_BELOW] * has_below]
+    grid = made.add_gridspec(len(heights), columns, height_ratios=heights)
+    first: Axes | None = None
+    for index, row in enumerate([*curves, *[""] * has_below]):
+        line, column = divmod(index, COLUMNS) if row else (lines, 0)
+        axes = made.add_subplot(grid[line, column] if row else grid[line, :], sharey=first)
+        first = first or axes
+        panel = others[others["row"] == row] if row else missing
+        panel = pd.concat([clean, panel]).sort_values(
+            "series", key=lambda each: each.map(order.index), kind="stable"
+        )
+        for number, each in enumerate(clean["value"]):
+            colour = plots.series_style(number)["color"]
+            axes.axhline(each, color=colour, linestyle="--", linewidth=0.6, zorder=1)
+        if row:  # dashes are for clean images
+            plots.line_plot(axes, panel, {name: {"linestyle": "-"} for name in order})
+            axes.set_xticks(panel["x"].unique(), [f"{each:g}" for each in panel["x"].unique()])
+            axes.set_xlabel(panel["unit"].iloc[-1], fontsize=plots.SMALL)
+        else:
+            plots.dot_plot(axes, panel)
+        title = panel["title"].iloc[-1] if row else MISSING
+        room = width / columns if row else width
+        axes.set_title(plots.folded(title, room - 0.3), fontsize=plots.SMALL)
+        axes.tick_params(labelleft=column == 0)
+        if column == 0:
+            axes.set_ylabel("% of clean mIoU" if score == "relative" else "mIoU (%)")
+    assert first is not None, "a figure has a panel"
+    first.set_ylim(0, 1.08 * first.get_ylim()[1])
+    plots.series_legend(made, first, columns=4)
+    return made
+
+
+@figure("regions/heat", "mIoU of each region as a heat map, one per method")
+def region_heat(
+    given: RunOptions,
+    *,
+    size: Annotated[
+        str, Help(f"size of the map, HEIGHTxWIDTH, {SHORTEST} to {LONGEST} pixels each")
+    ] = "480x640",
+) -> Drawn:
+    """Regions painted by their mIoU."""
+    match = re.fullmatch(r"([0-9]{1,4})x([0-9]{1,4})", size)
+    hw = (int(match[1]), int(match[2])) if match else (0, 0)
+    if not SHORTEST <= min(hw) <= max(hw) <= LONGEST:
+        raise InputError(f"size={size}: expected HEIGHTxWIDTH, {SHORTEST} to {LONGEST} each.")
+    frame = region_means(given.counts(), given.absent)
+    return draw_heat(frame, hw), frame
+
+
+@figure("regions/profile", "mIoU by region with intervals, one line per method")
+def region_profile(
+    given: RunOptions,
+    *,
+    band: Annotated[
+        Literal["widest", "images", "seeds", "both"],
+        Help("interval over images, seeds or both; widest: both if possible"),
+    ] = "widest",
+    resamples: Resamples = 10_000,
+    level: Level = 0.95,
+    blocks: Blocks = "auto",
+) -> Drawn:
+    """MIoU over the regions with bands."""
+    drawn = Resampling(resamples=resamples, level=level, blocks=blocks)
+    frame = region_means(given.counts(), given.absent, drawn, band)
+    return draw_profiles(frame, level), frame
+
+
+def region_means(
+    methods: Mapping[str, Sequence[Counts]],
+    absent: Absent | None,
+    settings: Resampling | None = None,
+    band: str = "widest",
+) -> pd.DataFrame:
+    """MIoU by region (value) and of the image of methods, mean over seeds, in percent.
+
+    `band`: what the intervals are over; "widest": both where there are several seeds, else images;
+    without `settings` there are none. InputError: an interval over seeds of a single seed, or
+    counts that do not belong together.
+    """
+    every = [counts for seeds in methods.values() for counts in seeds]
+    reference, convened, rows = every[0], absent or convention(every), []
+    for counts in every:
+        if counts.partition != reference.partition:
+            both = f"{reference.partition} and {counts.partition}"
+            raise InputError(f"runs: {both}; give counts with one partition.")
+        check_same_means(reference, counts)
+    regions = [names.region(region) for region in range(1, reference.counts.shape[1] + 1)]
+    for label, seeds in methods.items():
+        kind = ("both" if len(seeds) > 1 else "images") if band == "widest" else band
+        if len(seeds) == 1 and kind != "images":
+            raise InputError(f"band={band} needs at least two seeds, but '{label}' has one.")
+        metrics = (*regions, names.MIOU)
+        means = [float(np.mean([value(m, each, convened) for each in seeds])) for m in metrics]
+        ends, covers = [(math.nan, math.nan)] * len(regions), "nothing"
+        if settings is not None:
+            found = estimate(seeds, regions, replace(settings, absent=convened))
+            intervals = [getattr(found[name], BANDS[kind]) for name in regions]
+            if None not in intervals:
+                ends = [(each.low, each.high) for each in intervals]
+                covers = "images and seeds" if kind == "both" else kind
+        about = means.pop(), len(seeds), len(seeds[0].names), covers
+        for region, (mean, bounds) in enumerate(zip(means, ends, strict=True), 1):
+            rows.append((label, reference.partition, region, mean, *bounds, *about))
+    columns = ["series", "partition", "x", "value", "low", "high"]
+    return pd.DataFrame(rows, columns=[*columns, "mIoU", "seeds", "images", "covers"])
+
+
+@plots.styled
+def draw_profiles(frame: pd.DataFrame, level: float) -> Figure:
+    """MIoU over the regions, one line per method, with the mIoU of the image in the legend.
+
+    Intervals of one or two methods are bands; those of more are bars side by side, because bands
+    would hide each other.
+    """
+    methods = frame.drop_duplicates("series")
+    made = plots.new_figure(plots.COLUMN, 2.4 + plots.LINE * len(methods))
+    axes = made.subplots()
+    styles = {
+        str(row.series): {"label": f"{row.series} (mIoU {row.mIoU:.1f})"}
+        for row in methods.itertuples()
+    }
+    is_crowded = len(methods) > 2
+    plots.line_plot(axes, frame, styles, bars=is_crowded, spread=SPREAD * is_crowded)
+    plots.region_axis(axes, frame["x"].max(), f"region ({frame['partition'][0]})")
+    axes.set_ylabel("mIoU (%)")
+    # For example "95 % intervals over images and seeds", and their numbers below.
+    numbers = [
+        f"{' or '.join(map(str, sorted(set(many))))} {word}{'' if set(many) == {1} else 's'}"
+        for word, many in (("seed", methods["seeds"]), ("image", methods["images"]))
+    ]
+    title = f"{100 * level:g} % intervals over {' or '.join(methods['covers'].unique())}"
+    axes.set_title(f"{title}\n{', '.join(numbers)}", fontsize=plots.SMALL)
+    plots.series_legend(made, axes, columns=1)
+    return made
+
+
+@plots.styled
+def draw_heat(frame: pd.DataFrame, image_hw: tuple[int, int]) -> Figure:
+    """One (H, W) map per method with the mIoU of each region written into it, in one scale."""
+    methods = [*frame.groupby("series", sort=False)]
+    low, high = colour_limits([each / 100 for each in frame["value"]])
+    region_map = map_of(frame["partition"][0], image_hw)
+    height, width = image_hw
+    columns = 2 if len(methods) == 4 else min(3, len(methods))
+    rows = -(-len(methods) // columns)
+    page = plots.COLUMN if columns == 1 else plots.PAGE
+    panel = (page - 0.6) / columns
+    titles = [
+        f"{plots.folded(str(name), panel - 0.2)}\nmIoU {each['mIoU'].iloc[0]:.1f}"
+        for name, each in methods
+    ]
+    lines = 1 + max(title.count("\n") for title in titles)
+    tall = rows * (panel * height / width + 0.06 + plots.LINE * lines)
+    made = plots.new_figure(page, tall + 0.05)
+    panels = made.subplots(rows, columns, squeeze=False).ravel()
+    for axes, (_, each), title in zip(panels, methods, titles, strict=False):
+        values = each["value"].to_numpy()
+        numbers = ["-" if math.isnan(number) else f"{number:.1f}" for number in values]
+        picture = values[region_map]
+        shown: Any = plots.heat(axes, picture, region_map, numbers, panel, vmin=low, vmax=high)
+        axes.set_title(title)
+    for axes in panels[len(methods) :]:
+        axes.set_axis_off()
+    label = "mIoU of the region (%)"
+    made.colorbar(shown, ax=[*panels], shrink=0.85, pad=0.015, label=label)
+    return made
+
+
+def map_of(partition: str, image_hw: tuple[int, int]) -> NDArray[np.uint8]:
+    """The map of a partition by the name that counts carry ("ring5", "ring9_released_3_4").
+
+    Raises:
+        InputError: no such partition, or an image too small for it.
+    """
+    match = re.fullmatch(r"(ring|vertical|horizontal)(\d+)(_released_3_4)?", partition)
+    if match is None:
+        raise InputError(f"runs: '{partition}' is not a partition of the image, such as ring5.")
+    kind, number, released = match.groups()
+    aspect = ("released_3_4" if released else "image") if kind == "ring" else None
+    made = Regions(partition=kind, regions=int(number), aspect=aspect, absent="released")  # type: ignore[arg-type]
+    return made.map(image_hw)
+
+
+@figure("multihead/fig3", "gradients of entropy minimisation and maximum squares loss")
+@plots.styled
+def gradients() -> Drawn:
+    """Both curves over the probability; analytic, without input."""
+    frame = gradient_curves()
+    made = plots.new_figure(plots.COLUMN, 2.3)
+    axes = made.subplots()
+    plots.line_plot(axes, frame, {name: {"marker": ""} for name in frame["series"].unique()})
+    axes.set(xlim=(0, 1), xlabel="predicted probability", ylabel="gradient magnitude")
+    axes.set_ylim(bottom=0, top=6)
+    axes.legend(loc="upper center")
+    return made, frame
+
+
+def gradient_curves(points: int = 999) -> pd.DataFrame:
+    """The two gradients of one pixel with two classes of probability p and 1 - p.
+
+        entropy          E = -(p log p + (1 - p) log(1 - p)) / log 2,  |dE/dp| = |log2(p / (1 - p))|
+        maximum squares  M = -(p^2 + (1 - p)^2) / 2,                   |dM/dp| = |2 p - 1|
+
+    Source: Multi-head, Eqs. (1) and (2) with C = 2 and one pixel, constants as printed there. The
+    paper that Fig. 3 is taken from (Chen et al., ICCV 2019) leaves out 1 / log 2 and 1 / 2, which
+    multiplies the curves by 0.69 and by 2; the forms, linear against unbounded, are the same.
+
+    Returns:
+        series, x (p, evenly inside (0, 1), because the entropy's gradient is infinite at the ends;
+        of an odd number of points 0.5, where both vanish, is one) and value.
+    """
+    p = np.arange(1, points + 1) / (points + 1)
+    curves = {
+        "entropy minimisation": np.abs(np.log2(p / (1 - p))),
+        "maximum squares": np.abs(2 * p - 1),
+    }
+    series = [pd.DataFrame({"series": name, "x": p, "value": v}) for name, v in curves.items()]
+    return pd.concat(series, ignore_index=True).assign(low=math.nan, high=math.nan)

@@ -1,1 +1,0 @@
-"""One page from the store: what was run, beside what was published."""

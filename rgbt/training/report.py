@@ -1,0 +1,196 @@
+"""Say what a run works with before its first progress bar, and show its result.
+
+A finished run is shown without torch and without its store where both can be avoided. Torch is
+needed where the consistency of the run is measured on virtual views. The store is needed where it
+lacks something of the run (`Tracking.refresh`).
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.text import Text
+
+from rgbt.checks import InputError, without_controls
+from rgbt.runs.folder import (
+    GROUP,
+    Description,
+    RunFolder,
+    read_description,
+    read_result,
+    read_tables,
+)
+from rgbt.runs.naming import describe
+from rgbt.runs.provenance import warn_of_result
+from rgbt.runs.run_spec import RunSpec
+from rgbt.tables import ResultTables, percent, subset_mious
+from rgbt.terminal import info, path_lines, print_rich, result_view
+from rgbt.tracking.tracker import Tracking
+
+if TYPE_CHECKING:  # they import torch, which takes seconds
+    from torch import nn
+
+    from rgbt.assembly.session import Session
+    from rgbt.assembly.training_setup import TrainingSetup
+
+
+def announce_training(setup: TrainingSetup, name: str, folder: Path) -> None:
+    """Print device, network, images, their sizes, steps and run folder of a training.
+
+    With rare class sampling, also the probability of each class.
+    """
+    session, trainer = setup.session, setup.session.trainer
+    trained = {key: net for key, net in setup.others.items() if key in setup.optimizers}
+    others = "".join(f", {key} {_millions(net)}" for key, net in trained.items())
+    counts = [f"{len(names)} {split}" for split, names in session.names.items()]
+    lines = [
+        ("device", device_line(session)),
+        ("network", f"{network_line(session)}{others}"),
+        ("images", f"{session.dataset.name}: {', '.join(counts)}"),
+        ("sizes", ", ".join(f"{name} {h}x{w}" for name, (h, w) in setup.sizes.items())),
+        *([("drawn", setup.rare.shares())] if setup.rare else []),
+        ("steps", f"{trainer.max_steps} {_of_steps(setup)}"),
+        ("folder", str(folder)),
+    ]
+    _write(name, *(f"  {line}" for line in path_lines(lines).plain.splitlines()))
+
+
+def announce_upstream(setup: TrainingSetup, name: str, downstream: str, folder: Path) -> None:
+    """Print an upstream run, the run that needs it, network, steps and folder in one line."""
+    steps = f"{setup.session.trainer.max_steps} steps {_of_steps(setup)}"
+    parts = ", ".join([network_line(setup.session), steps, str(folder)])
+    _write(f"upstream run {name} for {downstream}: {parts}")
+
+
+def announce_network(session: Session) -> None:
+    """Print device, network and checkpoint of a prediction in one line."""
+    from rgbt.exported.onnx_network import ExportedNetwork  # which is never trained
+
+    checkpoint = f"checkpoint of step {session.step}" if session.step else session.label
+    network = network_line(session)
+    if isinstance(session.model, ExportedNetwork):
+        network = f"{session.model.description.network} in onnxruntime"
+    _write(f"{device_line(session)}; {network}; {checkpoint}")
+
+
+def device_line(session: Session) -> str:
+    """The device with its precision: "cpu, 2 threads, 32-true"."""
+    import torch
+
+    from rgbt.processes import num_processes
+
+    device, number = session.device, num_processes()
+    gpu = f" ({torch.cuda.get_device_name(device)})" if device.type == "cuda" else ""
+    threads = f"{(n := torch.get_num_threads())} thread{'s' * (n > 1)}"
+    name, each = (f"{number} x {device.type}", " each") if number > 1 else (f"{device}", "")
+    return f"{name}{gpu}, {threads}{each}, {session.trainer.precision}"
+
+
+def network_line(session: Session) -> str:
+    """Class and number of parameters: "Mask2Former, 1.23 M parameters", and of trained ones."""
+    every, trained = _millions(session.model), _millions(session.model, only_trained=True)
+    of_which = f", {trained} trained" if trained != every else ""
+    return f"{type(session.model).__name__}, {every} parameters{of_which}"
+
+
+def _of_steps(setup: TrainingSetup) -> str:
+    """Batch, epochs and validation: "of batch 2 (6 epochs), validated every 3"."""
+    session, trainer = setup.session, setup.session.trainer
+    batch = session.loading.batch_size * trainer.accumulate
+    epochs = trainer.max_steps * trainer.accumulate / setup.steps_per_epoch
+    validated = f"validated every {trainer.eval_every}"
+    if session.selection_split is None:
+        validated = f"not validated: {session.dataset.name} has no {trainer.selection_split}"
+    return f"of batch {batch} ({epochs:.3g} epochs), {validated}"
+
+
+def _write(*lines: str) -> None:
+    # Not as a message (`info`): drivers of sweeps take the last remark for what went wrong.
+    sys.stderr.write(without_controls("".join(f"{line}\n" for line in lines)))
+
+
+def _millions(network: nn.Module, *, only_trained: bool = False) -> str:
+    parameters = (p for p in network.parameters() if p.requires_grad or not only_trained)
+    return f"{sum(each.numel() for each in parameters) / 1e6:.2f} M"
+
+
+def show(run: RunSpec, extra_tags: Mapping[str, str] | None = None) -> None:
+    """Print the tables of a finished run, and what differs from the run that is requested now.
+
+    Args:
+        run: the requested run, which is finished.
+        extra_tags: MLflow tags of the request.
+    """
+    requested = describe(run, extra_tags)
+    folder, tracking = RunFolder(run.folder), run.tracking.build()
+    folder.clean()
+    known = read_description(folder.path)
+    assert known is not None, "a finished run has its description"
+    info(
+        f"{requested.name} is already finished; its result follows. For a new run, choose "
+        "another value of seed=..."
+    )
+    # A point of a grid may be the default of an experiment: the longer name says what it varies.
+    lengths = [len(each.tags.get(GROUP, "")) for each in (requested, known)]
+    named = requested if lengths[0] > lengths[1] else known
+    merged = Description(named.name, {**known.tags, **named.tags}, known.params)
+    tracking.refresh(folder, merged)
+    warn_of_result(folder.path)
+    _report_other_files(run, folder)
+    _report_consistency(run, folder)
+    print_result(run, folder, tracking)
+
+
+def print_result(run: RunSpec, folder: RunFolder, tracking: Tracking) -> None:
+    """Print the tables of a finished run, its folder and how its pages are opened."""
+    heads = run.domains.heads_in_words(run.domains.tested_head)
+    links = [*([("heads", heads)] if heads else []), *tracking.links()]
+    print_rich(result_view(_tables_of(folder), folder.path, links))
+
+
+def print_upstream_result(folder: RunFolder, name: str) -> None:
+    """Print the scores and the folder of a finished upstream run in one line."""
+    tables = _tables_of(folder)
+    values = {"mIoU": tables.regions.miou, **subset_mious(tables.classes)}
+    found = ", ".join(f"{part} {percent(value)}" for part, value in values.items())
+    print_rich(Text(f"upstream run {name}: {found}  {folder.path}"))
+
+
+def _tables_of(folder: RunFolder) -> ResultTables:
+    tables = read_tables(folder.path)
+    assert tables is not None, "a finished run has its tables"
+    return tables
+
+
+def _report_other_files(run: RunSpec, folder: RunFolder) -> None:
+    """Report a finished run of the same key that was made on another copy of the data set."""
+    if "root" not in run.plain["dataset"]:
+        return  # drawn from its settings alone, which are in the key
+    result = read_result(folder.path)
+    try:
+        now = run.dataset.build().fingerprint()
+    except InputError:
+        return  # a result can be shown without its data
+    if result is not None and result["dataset"] != now:
+        info(
+            f"this run was trained on other files of the data set ({result['dataset'][:8]}, now "
+            f"{now[:8]}). To train on the present files, set runs_dir=... or dataset.name=..."
+        )
+
+
+def _report_consistency(run: RunSpec, folder: RunFolder) -> None:
+    """Report a request for views on which the run was not measured."""
+    if not run.plain["consistency"]["sets"]:
+        return
+    from rgbt.metrics.pairs import file_name  # NumPy
+
+    views = run.consistency.build()
+    measured = [folder.path / file_name("aligned", each, views.mark) for each in views.splits]
+    if not all(path.is_file() for path in measured):
+        info(
+            "the consistency of this run has not been measured on these views and splits. To "
+            f"measure it: rgbt consistency run={folder.path} split=..."
+        )

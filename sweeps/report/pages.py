@@ -1,0 +1,356 @@
+"""Pages of results from finished runs: Markdown by one template, and one HTML file of the same."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import re
+import shlex
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rgbt.checks import InputError, one_line
+from rgbt.files.yaml_files import read_yaml
+from rgbt.metrics import names
+from rgbt.metrics.named import value
+from rgbt.runs.folder import GROUP
+from rgbt.runs.provenance import commit_of, without_passwords
+from rgbt.runs.result import RunResult
+from rgbt.tables import ABSENT, TextTable, number
+from sweeps.rendering.claims import (
+    claim_grids,
+    claim_lines,
+    claims_frame,
+    counted,
+    counts_grid,
+    statement,
+)
+from sweeps.rendering.publish import drawn_of, grid_of, grids_of
+from sweeps.rendering.table import MARKDOWN
+from sweeps.table.cells import OWN_COUNTS
+from sweeps.table.efficiency import million_parameters
+from sweeps.table.load_table import PUBLISHED
+from sweeps.table.request import TAG
+from sweeps.verdicts.stored import TableResult, TableResults
+from sweeps.worker.progress import duration
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+TEMPLATES = Path(__file__).with_name("templates")
+STUDIES = "studies"
+SCALES = ("smoke", "demo", "bench", "paper")
+"""In the order in which a verdict counts more."""
+
+ABSOLUTE = re.compile(r"(?<![\w.:/)\]])/(?:[\w.+@%~-]+/)+([\w.+@%~-]*)")
+"""A path from the root of a machine; addresses of pages and relative paths do not match."""
+
+MARKUP = re.compile(r"<(?!!-- |/?details\b|/?summary\b|https://)")
+"""What is no markup of ours, such as an element in a text of a run."""
+
+MARKED = re.compile(r"(<!-- results:(.+?) -->).*?(<!-- /results -->)", re.DOTALL)
+"""Numbers in a page written by hand, between two comments."""
+
+FOLDED = re.compile(r'^(<details markdown="1"><summary>[^<]*</summary>|</details>)$', re.MULTILINE)
+OF_RUN = ["method", "images", "scale", "dataset"]
+PACKAGES = ("torch", "numpy", "hydra-core", "lightning-fabric", "opencv-python-headless")
+ODD = (InputError, OSError, KeyError, ValueError, TypeError, AttributeError)
+"""What a record that somebody has edited may raise."""
+
+
+class TableView:
+    """A table as a section of a page; texts are Markdown.
+
+    Attributes:
+        name: of its page: the folder of its file; all studies of ours have one.
+        how: scale, form and overrides of every row.
+        drawn: its figure, and `figure` the name of its file; None, and "", without one.
+    """
+
+    def __init__(self, result: TableResult) -> None:
+        request, seeds = result.request, result.scored.seeds
+        folder, slash, _ = request.name.partition("/")
+        self.result, self.is_run = result, bool(result.runs)
+        self.name = folder if slash else STUDIES
+        form = "released form" if request.form == "released" else ""
+        words = " ".join(request.extra)
+        self.how = ", ".join(filter(None, (f"scale={request.scale}", form, words)))
+        title = request.table.number if slash else request.name
+        self.title = f"{title} ({self.how})" if self.is_run else title
+        self.caption = request.table.caption.rstrip(".") + "."
+        self.frame = claims_frame(result.claims, ", ".join(filter(None, (form, words))))
+        self.counted = counted(self.frame)
+        self.claims = "\n".join(claim_lines(self.frame))
+        grid = grid_of(result, MARKDOWN)
+        self.grid = markdown(TextTable("", grid.header, grid.rows, grid.notes))
+        self.grids = list(map(markdown, grids_of(result)))
+        self.drawn = drawn_of(result) if self.is_run else None
+        file = f"{request.name.replace('/', '-')}_{request.variant}.svg"
+        self.figure = file if self.drawn is not None else ""
+        count = str(len(seeds)) if seeds == tuple(range(len(seeds))) else ",".join(map(str, seeds))
+        typed = [f"table={request.name}", f"seeds={count if seeds else 3}"]
+        typed += [] if request.scale == "demo" else [f"scale={request.scale}"]
+        typed += [] if request.form == "paper" else [f"form={request.form}"]
+        self.command = shlex.join(["rgbt", "reproduce", *typed, *request.extra])
+
+
+class PaperView:
+    """A page of tables: those of a paper, of ours, or of the user."""
+
+    def __init__(self, name: str, title: str, reference: str, views: Sequence[TableView]) -> None:
+        self.name, self.title, self.reference = name, title, reference
+        self.views = [view for view in views if view.name == name]
+        frame = claims_of(self.views)
+        is_run = frame["verdict"] != "not run"
+        self.counted = counted(frame)
+        self.judged = list(map(markdown, claim_grids(frame[is_run])))
+        self.not_run = "\n".join(claim_lines(frame[~is_run]))
+
+
+def markdown(grid: TextTable) -> str:
+    """A grid in Markdown; "" for one without rows."""
+    return grid.to_markdown().rstrip() if grid.rows else ""
+
+
+def claims_of(views: Sequence[TableView]) -> pd.DataFrame:
+    """The claims of all these tables, once for every way that they were run."""
+    import pandas as pd
+
+    frames = [view.frame for view in views if len(view.frame)]
+    return pd.concat(frames, ignore_index=True) if frames else claims_frame(())
+
+
+class Report:
+    """Everything that the pages show, computed once from finished runs.
+
+    Args:
+        source: the tables.
+        runs: the finished runs.
+        studies: name of a study -> its report in Markdown.
+        track: shows the progress of going over something.
+    """
+
+    def __init__(
+        self,
+        source: TableResults,
+        runs: Sequence[RunResult],
+        studies: Mapping[str, str],
+        track: Callable[[Iterable[Any]], Iterable[Any]] = iter,
+    ) -> None:
+        self.texts = read_yaml(TEMPLATES / "pages.yaml")
+        self.source, self.runs, self.studies = source, runs, studies.items()
+        self.views = [TableView(result) for result in track(source)]
+        self.every = claims_of(self.views)
+        # Of a claim the verdict by the most seeds at the largest scale counts.
+        ranks = self.every["scale"].map({scale: rank for rank, scale in enumerate(SCALES)})
+        order = self.every.assign(rank=ranks.fillna(-1)).sort_values(
+            ["rank", "seeds"], kind="stable"
+        )
+        self.claims = order.drop_duplicates(["table", "claim"], keep="last").sort_index()
+        self.remarks = source.remarks
+        self.data = self._of_runs()
+        known = {name: tuple(each.values()) for name, each in self.texts["papers"].items()}
+        known[STUDIES] = ("Studies", "Tables of this project that no paper prints.")
+        known |= {
+            v.name: (v.name, "Tables of the user.") for v in self.views if v.name not in known
+        }
+        self.papers = [PaperView(name, *each, self.views) for name, each in known.items()]
+
+    def _of_runs(self) -> dict[str, Any]:
+        """Runs by method, what they are about, and where they come from, as Markdown."""
+        import pandas as pd
+
+        rows, facts = [], []
+        for run in self.runs:
+            try:
+                rows.append(self._scores(run))
+                first = next(iter(run.provenance), {})
+                packages, gpus = first.get("packages") or {}, ", ".join(first.get("gpus") or [])
+                machine = gpus or f"{first['cpu']}, {first['cpu_usable']} cores"
+                versions = {name: packages.get(name) for name in PACKAGES}
+                commit = {"git commit": commit_of(first), "Python": first.get("python")}
+                facts.append({**commit, **versions, "hardware": machine})
+            except ODD as error:
+                self.remarks.append(f"Run {run.key} is left out: {one_line(error)}.")
+        if not rows:
+            return {"runs": "", "origin": "", "bases": []}
+        frame, lines = pd.DataFrame(rows), []
+        metrics = [name for name in frame if name not in (*OF_RUN, "seed", "time", "tables")]
+        for key, each in frame.groupby(OF_RUN):
+            cells = [
+                f"{number(each[name].mean())}{f' ± {number(each[name].std())}' * (len(each) > 1)}"
+                for name in metrics
+            ]
+            seeds = ", ".join(map(str, sorted(each["seed"])))
+            tables = "; ".join(dict.fromkeys("; ".join(each["tables"]).split("; ")))
+            lines.append((*key[:3], seeds, *cells, duration(each["time"].median()), tables))
+        header = (*OF_RUN[:3], "seeds", *metrics, "time", "rows of")
+        known = pd.DataFrame(facts)
+        texts = {name: sorted(set(known[name].dropna()) - {""}) for name in known}
+        origin = tuple((name, ", ".join(each) or ABSENT) for name, each in texts.items())
+        counts = frame.groupby(OF_RUN[1:3]).size()
+        return {
+            "runs": markdown(TextTable("", header, tuple(lines))),
+            "origin": markdown(TextTable("", ("what", "value"), origin)),
+            "bases": [f"{n} on {images} images, scale={s}" for (images, s), n in counts.items()],
+        }
+
+    def _scores(self, run: RunResult) -> dict[str, Any]:
+        """Of a run: the keys `OF_RUN`, seed, scores, time and tables."""
+        tags, stored = run.tags, self.source.stored
+        counts, basis = stored.counts(run, OWN_COUNTS), stored.basis([run])
+        group = (tags.get(GROUP, run.key), basis.images, basis.scale, counts.dataset)
+        regions = [names.region(place + 1) for place in range(counts.counts.shape[1])]
+        metrics = (names.MIOU, names.VAR, *regions)
+        return {
+            **dict(zip(OF_RUN, group, strict=True)),
+            "seed": int(tags["rgbt.seed"]),
+            **{name: value(name, counts, counts.absent) for name in metrics},
+            "time": float(run.result["seconds_of_last_process"]),
+            "tables": "; ".join(sorted(t.removeprefix(TAG) for t in tags if t.startswith(TAG))),
+        }
+
+    @property
+    def limits(self) -> list[str]:
+        """What the verdicts do not say, one sentence or two each."""
+        judged, said = self.every[self.every["verdict"] != "not run"], []
+        if "paper" not in set(judged["scale"]):
+            said.append(
+                "**Networks:** no verdict is at paper scale. Small networks on small images say "
+                "something about a method at that scale, and neither confirm nor refute a number."
+            )
+        for column, word, text in (
+            ("images", "synthetic", "is on synthetic scenes: what these lack, it cannot show"),
+            ("start", "one start for all seeds", "is from one start, see the warning beside it"),
+            ("covers", "images", "is of one training: other trainings are not covered"),
+        ):
+            if count := int((judged[column] == word).sum()):
+                said.append(f"**{column.capitalize()}:** the verdict of {count} claims {text}.")
+        chance = f"**Chance:** of {len(judged)} claims without any effect, up to"
+        return [*said, f"{chance} {0.025 * len(judged):.1f} would be called holding."]
+
+    def page(self, name: str) -> str:
+        """A page as Markdown: "index", "claims", "networks", "all" or the name of a paper."""
+        from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+        environment = Environment(
+            loader=FileSystemLoader(TEMPLATES),
+            autoescape=False,  # Markdown; `MARKUP` makes plain what looks like an element
+            undefined=StrictUndefined,
+            trim_blocks=True,
+            lstrip_blocks=True,
+        )
+        own = [view for view in self.views if view.is_run or view.name not in self.texts["papers"]]
+        data = {
+            **self.data,
+            "num_runs": len(self.runs),
+            "at_paper_scale": any("scale=paper" in each for each in self.data["bases"]),
+            "remarks": self.remarks,
+            "counts": markdown(counts_grid(self.claims)),
+            "papers": self.papers,
+            "limits": self.limits,
+            "own": [view for view in own if view.is_run or view.name != STUDIES],
+            "papers_tables": [view for view in self.views if view not in own],
+            "studies": self.studies,
+            "any_verdict": bool((self.claims["verdict"] != "not run").any()),
+            **(_networks(self.texts["networks"]) if name == "networks" else {}),
+        }
+        paper = next((each for each in self.papers if each.name == name), None)
+        text = environment.get_template("pages.md.j2").render(data=data, page=name, paper=paper)
+        text = re.sub(r"\n{3,}", "\n\n", text).strip() + "\n"
+        return MARKUP.sub("&lt;", ABSOLUTE.sub(r".../\1", without_passwords(text)))
+
+    def pages(self) -> dict[str, str]:
+        """Every page of ``docs/results`` by the name of its file; those of a user's tables too."""
+        every = ["index", "claims", "networks", *(each.name for each in self.papers)]
+        return {f"{name}.md": self.page(name) for name in every}
+
+    def html(self) -> str:
+        """All of it as one file, which loads nothing and runs only its own script."""
+        from jinja2 import Environment, FileSystemLoader
+        from markdown_it import MarkdownIt
+
+        text = re.sub(r"<!--.*?-->\n", "", self.page("all"))
+        reader = MarkdownIt("commonmark", {"html": False}).enable("table")
+        parts = enumerate(FOLDED.split(text))
+        body = "".join(part if place % 2 else reader.render(part) for place, part in parts)
+        body = body.replace("<table>", '<div class="scroll"><table>')
+        body = body.replace("</table>", "</table></div>")
+        for name, content in self.images().items():
+            address = f"data:image/svg+xml;base64,{base64.b64encode(content).decode()}"
+            body = body.replace(f'src="{name}"', f'src="{address}"')
+        script = (TEMPLATES / "sort.js").read_text()
+        digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+        shell = Environment(loader=FileSystemLoader(TEMPLATES), autoescape=True)
+        page = shell.get_template("page.html.j2")
+        return page.render(body=body, script=script, hash=f"sha256-{digest}")
+
+    def images(self) -> dict[str, bytes]:
+        """The figures of the pages that were made, as SVG by the names of their files."""
+        import tempfile
+
+        from sweeps.rendering.figure import write_figure
+
+        with tempfile.TemporaryDirectory() as folder:
+            return {
+                view.figure: write_figure(view.drawn, Path(folder, view.figure)).read_bytes()
+                for view in self.views
+                if view.drawn is not None
+            }
+
+    def filled(self, text: str) -> str:
+        """A page written by hand with its marked numbers made again.
+
+        Marks: ``claim TABLE NAME`` is a claim with its verdict, ``count`` the number of claims of
+        the papers, ``effects TABLE OUTCOME`` the effects of a design on an outcome.
+
+        Raises:
+            InputError: a mark that names nothing.
+        """
+        return MARKED.sub(lambda mark: f"{mark[1]}{self._block(mark[2])}{mark[3]}", text)
+
+    def _block(self, mark: str) -> str:
+        kind, *words = mark.split()
+        if kind == "count":
+            return str(int(self.claims["table"].str.contains("/").sum()))
+        views = [view for view in self.views if view.result.request.name == words[0]]
+        if kind == "claim":
+            found = self.claims[(self.claims["table"] == words[0])]
+            found = found[found["claim"] == words[1]]
+            if len(found):
+                row = found.iloc[0]
+                command = f" (`rgbt reproduce table={words[0]} scale=bench seeds=4`)"
+                return statement(row) + command * (row["verdict"] == "not run")
+        if kind == "effects" and views and views[0].result.effects is not None:
+            grids = [grid for grid in views[0].grids if f"Effects on {words[1]}," in grid]
+            rows = "rows=tested scale=bench seeds=3"
+            empty = f"No run yet: `rgbt reproduce table={words[0]} {rows}`."
+            picture = f"![{views[0].title}]({views[0].figure})" if views[0].figure else ""
+            texts = [picture, *grids] if picture else grids
+            return "\n\n" + "\n\n".join(texts or [empty]) + "\n\n"
+        raise InputError(f"<!-- results:{mark} --> names no claim, design or number.")
+
+
+def _networks(networks: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    """The grids of the page of networks; each is built without memory to count its parameters."""
+    sizes, weights, tests = [], [], []
+    for each in networks:
+        for model in each["models"]:
+            words = [*each.get("overrides", ()), *f"model={model}".split()]
+            sizes.append((each["name"], f"`model={model}`", f"{million_parameters(words):.2f}"))
+        weights += [(each["name"], file, f"<{address}>") for file, address in each["weights"]]
+        tests.append((each["name"], ", ".join(f"`{test}`" for test in each["tests"])))
+    headers = (
+        ("network", "configuration", "million parameters"),
+        ("network", "file", "published at"),
+    )
+    grids = {
+        "networks": TextTable("", headers[0], tuple(sizes)),
+        "weights": TextTable("", headers[1], tuple(weights)),
+        "tests": TextTable("", ("network", "test"), tuple(tests)),
+    }
+    return {name: markdown(grid) for name, grid in grids.items()}
+
+
+PAPERS = tuple(sorted(path.name for path in PUBLISHED.iterdir()))

@@ -1,0 +1,51 @@
+"""Finished runs of tables with planted scores, as a driver leaves them."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from omegaconf import OmegaConf
+
+from rgbt.runs.folder import RunFolder
+from rgbt.runs.naming import describe
+from sweeps.table.load_table import load_table
+from sweeps.table.request import TAG
+from sweeps.table_plan import TableWords, make_request
+from sweeps.worker.planner import Planner
+from tests.sweeps.verdicts.accuracies import accuracy
+
+PROVENANCE = {
+    **{"started": "2026-01-01T00:00:00+00:00", "command": "/home/me/python -m rgbt.run seed=0"},
+    **{"git_commit": "0123456789abcdef", "git_dirty": False, "python": "3.11.7", "gpus": []},
+    **{"host": "desk", "cpu": "EPYC", "cpu_usable": 2, "packages": {"torch": "2.0"}},
+}
+
+
+def plant(
+    runs_dir: Path,
+    name: str,
+    shares: Mapping[str, Sequence[float]],
+    *extra: str,
+    scale: str = "demo",
+) -> list[Path]:
+    """Runs of rows of a table with these accuracies by seed; `extra` are overrides of every row."""
+    words = TableWords(seeds=(0,), scale=scale, overrides=extra)
+    request, _ = make_request(name, load_table(name), words)
+    planner, folders = Planner((f"runs_dir={runs_dir}",)), []
+    for label, percents in shares.items():
+        for seed, percent in enumerate(percents):
+            typed = (*planner.base, *request.overrides(label, seed))
+            spec = planner.specify(typed, checked=False)
+            folder = RunFolder(runs_dir / spec.key)
+            folder.describe(describe(spec, {f"{TAG}{name}": label}))
+            folder.write_config(OmegaConf.to_yaml(OmegaConf.create(dict(spec.plain))))
+            folder.add_provenance(PROVENANCE)
+            counts = accuracy(percent, zlib.crc32(str(seed).encode()) % 97)
+            replace(counts, dataset="data", run=spec.key).save(folder.path / "counts_test.npz")
+            result = {"name": spec.name, "key": spec.key, "dataset": "data"}
+            folder.finish({**result, "seconds_of_last_process": 60.0 + seed})
+            folders.append(folder.path)
+    return folders
