@@ -15,8 +15,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-HEADER = ("method", "effect", "difference", "95 % interval", "shown")
-HEADER += ("of seeds", "of images", "seeds")
+HEADER = (
+    *("method", "effect", "difference", "95 % interval", "shown"),
+    *("of seeds", "of images", "seeds"),
+)
 CSV_HEADER = (
     *("part", "outcome", "method", "against", "effect", "value", "low", "high", "p", "p_holm"),
     *("shown", "error_seeds", "error_images", "seeds", "cells"),

@@ -7,12 +7,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from analysis.arguments import Resamples, check_out
 from rgbt.config.common_options import RunsDir
 from rgbt.config.options import Help
 from rgbt.config.plain_command import PlainCommand
+
+if TYPE_CHECKING:
+    from sweeps.report.pages import Report
 
 MAX_REMARKS = 5
 """Remarks that are printed to stderr; the page has all."""
@@ -76,14 +79,14 @@ def main(options: Options, overrides: list[str]) -> int:
     return 0
 
 
-def report_of(runs_dir: Path, archive: Path, resamples: int, *, counted: bool):  # type: ignore[no-untyped-def]  # noqa: ANN201
+def report_of(runs_dir: Path, archive: Path, resamples: int, *, counted: bool) -> Report:
     """The report of a folder of runs and an archive; `counted`: with sizes of networks."""
     from rich.console import Console
     from rich.progress import track
 
     from analysis.results import finished_runs
     from rgbt.config.options import readable_paths
-    from sweeps.report.pages import Report
+    from sweeps.report import pages
     from sweeps.table.load_table import OWN
     from sweeps.verdicts.stored import FinishedRuns, TableResults
     from sweeps.worker.planner import Planner
@@ -94,7 +97,7 @@ def report_of(runs_dir: Path, archive: Path, resamples: int, *, counted: bool): 
     notes = {path.parent.name: path for path in sorted(runs_dir.glob("studies/*/study.md"))}
     studies = {name: path.read_text(errors="replace") for name, path in notes.items()}
     console = Console(stderr=True)
-    return Report(
+    return pages.Report(
         source, runs, studies, lambda items: track(list(items), "tables", console=console)
     )
 

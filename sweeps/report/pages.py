@@ -150,7 +150,9 @@ class Report:
         self.claims = order.drop_duplicates(["table", "claim"], keep="last").sort_index()
         self.remarks = source.remarks
         self.data = self._of_runs()
-        known = {name: tuple(each.values()) for name, each in self.texts["papers"].items()}
+        known: dict[str, tuple[str, str]] = {
+            name: (each["title"], each["reference"]) for name, each in self.texts["papers"].items()
+        }
         known[STUDIES] = ("Studies", "Tables of this project that no paper prints.")
         known |= {
             v.name: (v.name, "Tables of the user.") for v in self.views if v.name not in known
@@ -321,7 +323,7 @@ class Report:
             if len(found):
                 row = found.iloc[0]
                 command = f" (`rgbt reproduce table={words[0]} scale=bench seeds=4`)"
-                return statement(row) + command * (row["verdict"] == "not run")
+                return statement(row) + (command if row["verdict"] == "not run" else "")
         if kind == "effects" and views and views[0].result.effects is not None:
             grids = [grid for grid in views[0].grids if f"Effects on {words[1]}," in grid]
             rows = "rows=tested scale=bench seeds=3"

@@ -151,8 +151,9 @@ class StudyData:
         factors = {trial.user_attrs.get(attributes.PIXELS) for trial in self.trials}
         if isinstance(value, str) and PIXELS.search(value):
             factor = factors.pop() if len(factors) == 1 else None
-            is_known = isinstance(factor, float | int)
-            return with_pixels(value, factor) if is_known else PIXELS.sub(r"\1px", value)
+            if isinstance(factor, float | int):
+                return with_pixels(value, factor)
+            return PIXELS.sub(r"\1px", value)
         return f"{value:.4g}" if isinstance(value, float) else str(value)
 
     def label(self, trial: FrozenTrial) -> str:

@@ -275,8 +275,8 @@ class Table(Strict):
             for label in (*claim.rows, *named):
                 check_choice(f"claim '{claim.name}', rows", label, labels)
             for name in (*claim.columns, *([claim.minus_column] if claim.minus_column else [])):
-                known = [each.name for each in self.columns]
-                check_choice(f"claim '{claim.name}', columns", name, known)
+                names = [each.name for each in self.columns]
+                check_choice(f"claim '{claim.name}', columns", name, names)
             if not claim.columns or not any(True for _ in claim.pairs(labels)):
                 raise ValueError(f"claim '{claim.name}': there is nothing to compare.")
         return self

@@ -138,7 +138,9 @@ def test_index_has_runs_with_seeds_spread_and_time(report: Report) -> None:
     line = next(line for line in text.splitlines() if line.startswith("| baseline |"))
     cells = [cell.strip() for cell in line.split("|")]
     assert cells[2:5] == ["synthetic", "demo", "0, 1, 2"]
-    assert re.fullmatch(r"\d+\.\d\d ± \d+\.\d\d", cells[5])
+    found = re.fullmatch(r"(\d+\.\d\d) ± \d+\.\d\d", cells[5])
+    assert found is not None
+    assert float(found[1]) > 10, "in percent"
     assert cells[-3:-1] == ["61 s", "my/planted"]
     assert "| git commit | 0123456789 |" in text
     assert "desk" not in text
