@@ -11,7 +11,6 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
-import torch
 from torch import Tensor, nn
 
 Tensors = Mapping[str, Tensor]
@@ -35,7 +34,6 @@ class Kind:
         unused: regular expression for names of the file that the network has no place for.
         fresh: for entries that such a file does not hold; a backbone has some.
         stems: for first convolutions, which may have other input channels than in the file.
-        converted: tensors of the file -> under the names that `source` gives.
         convention: overrides for inputs and evaluation of the release, which weights do not show.
     """
 
@@ -47,7 +45,6 @@ class Kind:
     unused: str = NONE
     fresh: str = NONE
     stems: str = NONE
-    converted: Callable[[Tensors], Tensors] = dict
     convention: tuple[str, ...] = ()
 
     def recognises(self, names: Tensors) -> bool:
@@ -188,28 +185,7 @@ SIZE = ("model/inputs=cmx", "model.position_resize=size")
 """Convention of files with registers."""
 
 
-def _dinov2_of_timm(tensors: Tensors) -> Tensors:
-    """With registers, the position of the class is part of its token: here it is 0 then.
-
-    Source: timm/models/vision_transformer.py, `_convert_dinov2`.
-    """
-    found = dict(tensors)
-    if "reg_token" in found:
-        found["register_tokens"] = found.pop("reg_token")
-        table = found["pos_embed"]
-        found["pos_embed"] = torch.cat([torch.zeros_like(table[:, :1]), table], 1)
-    return found
-
-
-DINOV2_TIMM = replace(
-    DINOV2,
-    title="DINOv2 vision transformer of timm",
-    has=("cls_token", "pos_embed", "blocks.0.ls1.", *BLOCK),
-    fresh=rf"{OUTSIDE}|{ENCODER}mask_token$",
-    converted=_dinov2_of_timm,
-)
-# The released files hold the periods of the positions rounded to bfloat16; the other forms lack
-# them, and both programs compute them, as the network does. The bias of keys is 0 here too.
+# The released files hold the periods of the positions rounded to bfloat16.
 DINOV3 = Kind(
     "DINOv3 vision transformer",
     has=("storage_tokens", "rope_embed.periods", "blocks.0.ls1.", *BLOCK),
@@ -219,67 +195,6 @@ DINOV3 = Kind(
     convention=("model/inputs=cmx", "model.norm_eps=1e-05", "model.rope_base=100.0"),
 )
 
-
-def _dinov3_of(others: Names, gated: Names, plain: Names = ()) -> Callable[[Tensors], Tensors]:
-    """A function from the names of another program to the released ones.
-
-    Networks with gated layers have the names `gated`, those without `plain`. Queries, keys and
-    values become one projection. Its bias, which keys do not have, is 0 where no block has one; a
-    lone one keeps its name, and is reported.
-    """
-
-    def converted(tensors: Tensors) -> Tensors:
-        is_gated = any(re.search(gated[0][0], name) for name in tensors)
-        name_of = renaming(*others, *(gated if is_gated else plain))
-        found = {name_of(name): tensor for name, tensor in tensors.items()}
-        if "mask_token" in found:
-            found["mask_token"] = found["mask_token"].flatten(0, -2)
-        has_bias = any(name.endswith((".attn.q.bias", ".attn.v.bias")) for name in found)
-        for start in {name.partition(".attn.")[0] for name in found if ".attn." in name}:
-            parts = [f"{start}.attn.{part}.weight" for part in "qkv"]
-            joint = f"{start}.attn.qkv"
-            if all(part in found for part in parts):
-                found[f"{joint}.weight"] = torch.cat([found.pop(part) for part in parts])
-            first, last = (f"{start}.attn.{part}.bias" for part in "qv")
-            if first in found and last in found:
-                query, value = found.pop(first), found.pop(last)
-                found[f"{joint}.bias"] = torch.cat([query, torch.zeros_like(query), value])
-            elif not has_bias and (weight := found.get(f"{joint}.weight")) is not None:
-                found[f"{joint}.bias"] = weight.new_zeros(len(weight))
-        return found
-
-    return converted
-
-
-# Source: transformers, models/dinov3_vit.
-_dinov3_of_hugging_face = _dinov3_of(
-    (
-        (r"^embeddings\.patch_embeddings\.", "patch_embed.proj."),
-        (r"^embeddings\.register_tokens$", "storage_tokens"),
-        (r"^embeddings\.", ""),
-        (r"^layer\.", "blocks."),
-        (r"\.layer_scale(\d)\.lambda1$", r".ls\1.gamma"),
-        (r"\.attention\.o_proj\.", ".attn.proj."),
-        (r"\.attention\.([qkv])_proj\.", r".attn.\1."),
-    ),
-    gated=(
-        *((r"\.mlp\.gate_proj\.", ".mlp.w1."), (r"\.mlp\.up_proj\.", ".mlp.w2.")),
-        (r"\.mlp\.down_proj\.", ".mlp.w3."),
-    ),
-    plain=((r"\.mlp\.up_proj\.", ".mlp.fc1."), (r"\.mlp\.down_proj\.", ".mlp.fc2.")),
-)
-# Source: timm/models/eva.py.
-_dinov3_of_timm = _dinov3_of(
-    (
-        (r"^reg_token$", "storage_tokens"),
-        (r"\.gamma_(\d)$", r".ls\1.gamma"),
-        (r"\.attn\.([qv])_bias$", r".attn.\1.bias"),
-    ),
-    gated=(
-        *((r"\.mlp\.fc1_g\.", ".mlp.w1."), (r"\.mlp\.fc1_x\.", ".mlp.w2.")),
-        (r"\.mlp\.fc2\.", ".mlp.w3."),
-    ),
-)
 
 KINDS: Mapping[str, tuple[Kind, ...]] = {
     "mask2former": (CRM, replace(CRM, prefix=""), SWIN, TIMM_SWIN),
@@ -345,23 +260,7 @@ KINDS: Mapping[str, tuple[Kind, ...]] = {
     "dinov2": (
         replace(DINOV2, has=(*DINOV2.has, "register_tokens"), convention=SIZE),
         DINOV2,
-        replace(DINOV2_TIMM, has=(*DINOV2_TIMM.has, "reg_token"), convention=SIZE),
-        DINOV2_TIMM,
         DINOV3,
-        replace(
-            DINOV3,
-            title="DINOv3 vision transformer of Hugging Face",
-            has=("embeddings.register_tokens", "layer.0.attention.k_proj.", "layer.0.layer_scale1"),
-            fresh=rf"{OUTSIDE}|{ENCODER}rope_embed\.periods$",
-            converted=_dinov3_of_hugging_face,
-        ),
-        replace(
-            DINOV3,
-            title="DINOv3 vision transformer of timm",
-            has=("reg_token", "blocks.0.gamma_1", *BLOCK),
-            fresh=rf"{OUTSIDE}|{ENCODER}(rope_embed\.periods|mask_token)$",
-            converted=_dinov3_of_timm,
-        ),
     ),
 }
 """Module of rgbt.models -> kinds of files for its networks, in the order they are tried."""

@@ -139,7 +139,7 @@ def plan_for(
     kind = _kind_of(model, contents)
     # Of a backbone alone: a file of the whole network holds what was drawn.
     drawn = tuple(record_of(model).drawn_anew) if kind.fresh != NONE else ()
-    tensors = kind.converted(contents.tensors)
+    tensors = dict(contents.tensors)
     sources = {entry: kind.prefix + kind.source(entry) for entry in state}
     found: dict[str, list[str]] = defaultdict(list)
     values = {}
