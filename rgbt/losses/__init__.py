@@ -1,5 +1,1 @@
-"""Losses of predictions, with labels and without.
-
-With labels: set criterion, cross-entropy, self-distillation. Without: maximum squares, entropy,
-adversarial. Losses are pure functions and frozen settings; `rgbt.schemes` combines them.
-"""
+"""Losses, with labels and without: pure functions and settings that `rgbt.schemes` combines."""

@@ -1,5 +1,1 @@
-"""Schemes, which define the passes and losses of one training step.
-
-A scheme is built with the network, the loss and the masker and yields phases; the loop in
-`rgbt.engine` runs them without knowing which scheme it is.
-"""
+"""Schemes, which define the passes and losses of one training step as phases."""

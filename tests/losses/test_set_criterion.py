@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from rgbt.checks import InputError, RunError
+from rgbt.checks import InputError
 from rgbt.losses import set_criterion
 from rgbt.losses.points import Points, class_shares, most_uncertain, sample
 from rgbt.losses.set_criterion import (
@@ -314,24 +314,6 @@ def test_a_batch_without_targets() -> None:
     classes, masks = gradients(parts, output)  # masks stay part of the graph
     assert classes.any()
     assert not masks.any()
-
-
-def test_predictions_and_labels_that_do_not_fit_are_refused() -> None:
-    output, batch = problem_of(1, 2, 2)
-    criterion, label, aux = criterion_of(), batch.label, output.aux
-    nan = {**aux, "class_logits": aux["class_logits"] * float("nan")}
-    cut = {**aux, "mask_logits": aux["mask_logits"][:, :1]}
-    for loss, given, changed, error, word in (
-        (criterion_of(num_classes=4), output, batch, ValueError, "do not fit"),
-        (criterion, Output(None, cut), batch, ValueError, "do not fit"),
-        (criterion, output, replace(batch, label=label[:1]), ValueError, "do not fit"),
-        (criterion, output, replace(batch, label=label.repeat(1, 2, 1)), ValueError, "do not fit"),
-        (criterion, output, replace(batch, label=label + 1), ValueError, "expected 0 to 4 or 255"),
-        (criterion_of(spatial=EDGE), output, replace(batch, position=None), InputError, "position"),
-        (criterion, Output(None, nan), batch, RunError, "matching cost"),
-    ):
-        with pytest.raises(error, match=word):
-            loss(given, changed, seeded())
 
 
 def test_plain_losses_by_hand() -> None:

@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from rgbt.checks import InputError
 from rgbt.geometry.warp import halved_label
 from rgbt.losses.cross_entropy import CrossEntropy
 from rgbt.losses.temporal import SIGMA, Form, TemporalLoss, con, con_acc, dice
@@ -228,18 +227,6 @@ def test_means_of_two_by_two_pixels_are_compared_where_so_many_are_given(
     forms = {"con": lambda: con(warped, p, valid, "paper")}
     forms["con_acc"] = lambda: con_acc(warped, p, label, "paper")
     torch.testing.assert_close(parts[second], forms[second]())
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"second": "none"}, r"^loss\.second=none does not fit loss\.beta=1"),
-        ({"beta": 0.0}, r"^loss\.second=con does not fit loss\.beta=0"),
-    ],
-)
-def test_settings_that_do_not_fit(changes: dict[str, Any], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        loss_of(**changes)
 
 
 class Recorded:

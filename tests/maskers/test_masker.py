@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ import torch
 from rgbt.checks import InputError
 from rgbt.config.component import build
 from rgbt.config.compose import compose
-from rgbt.maskers.masker import Masker, bernoulli, fixed_count, num_taken, square
+from rgbt.maskers.masker import Masker, fixed_count, num_taken, square
 from rgbt.randomness import torch_generator
 from rgbt.types import MaskPair
 from tests.models.golden import FOLDER
@@ -221,18 +220,6 @@ def test_fixed_count_is_drawing_one_after_the_other() -> None:
     share = fixed_count(log_weight, 2, torch_generator(1, "t")).double().mean(0)[0]
     # Standard error at most 0.0025.
     assert share.tolist() == pytest.approx([expected[i] for i in range(3)], abs=0.01)
-
-
-def test_weights_that_vanish_in_float32_are_drawn_by_their_logarithm() -> None:
-    log_weight = torch.full((500, 1, 4), -1e4)
-    log_weight[..., 0] = 0.0
-    taken = fixed_count(log_weight, 2, torch_generator(0, "t"))
-    assert taken[..., 0].all()
-    assert (taken.sum((1, 2)) == 2).all()
-    assert taken[..., 1:].any(0).all()
-    log_probability = torch.tensor([0.0, math.log(0.25), -1e4]).expand(40000, 1, 3)
-    share = bernoulli(log_probability, torch_generator(0, "t")).double().mean(0)[0]
-    assert share.tolist() == [1, pytest.approx(0.25, abs=0.01), 0]
 
 
 def test_square_is_one_rectangle_of_half_the_sides() -> None:

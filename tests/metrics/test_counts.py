@@ -69,24 +69,6 @@ def test_day_and_night() -> None:
     assert example((True, True, True)).parts() == {}
 
 
-@pytest.mark.parametrize(
-    ("changes", "named"),
-    [
-        ({"names": ("a", "b"), "night": None}, "N=2"),
-        ({"classes": ("a",)}, "K=1"),
-        ({"counts": np.zeros((3, 5, 2, 2))}, "float64"),
-        ({"counts": np.zeros((3, 2, 2), int)}, "counts"),
-        ({"partition": "ring5-size-64"}, "a multiple of 3"),
-        ({"night": (True,)}, "night"),
-        ({"absent": "zero"}, "absent"),
-        *(({"unscored": each}, "unscored") for each in (("sky",), ("unlabeled", "car"))),
-    ],
-)
-def test_values_that_do_not_agree_are_named(changes: dict[str, Any], named: str) -> None:
-    with pytest.raises(ValueError, match=named):
-        example(**changes)
-
-
 def test_counts_of_other_means_or_conventions_are_not_compared() -> None:
     check_same_means(example(unscored=("car",)), example(unscored=("car",)))
     with pytest.raises(InputError, match=r"leave out car .* leave out no class\. .*unscored"):

@@ -215,20 +215,6 @@ def test_requested_details() -> None:
     assert every[2].bins == ("0-5", "5-7.5", "7.5-inf")
 
 
-@pytest.mark.parametrize(
-    ("kinds", "width", "edges", "words"),
-    [
-        ("boundry", 0.02, "1", "did you mean 'boundary'"),
-        ("size,all", 0.02, "1", "'all'"),
-        ("boundary", 0.5, "1", "boundary_width"),
-        *(("size", 0.02, each, f"sizes={each}: ") for each in ("10,5", "near", "0,5", "inf")),
-    ],
-)
-def test_wrong_settings_are_refused(kinds: str, width: float, edges: str, words: str) -> None:
-    with pytest.raises(InputError, match=words):
-        requested(kinds, (width, False), "1", edges)
-
-
 def test_fractions_are_shown_in_percent() -> None:
     for name in ("ECE", "day/boundary_mIoU", "region/1/ECE", "distance/0-10", "size/0-64"):
         assert in_percent(name, 0.5) == 50.0

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from rgbt.checks import InputError
 from rgbt.config.component import build
 from rgbt.config.compose import conf_dir
 from rgbt.metrics.metric import Regions, ring_map, ring_rectangle, strip_map
@@ -93,19 +92,3 @@ def test_maps_are_computed_once_and_cannot_be_changed() -> None:
     assert regions.map((48, 64)) is configured("ring5", aspect="released_3_4").map((48, 64))
     with pytest.raises(ValueError, match="read-only"):
         regions.map((48, 64))[0, 0] = 1
-
-
-@pytest.mark.parametrize(
-    ("name", "changes", "words"),
-    [
-        ("ring5", {"aspect": None}, "metric.aspect"),
-        ("ring5", {"regions": 0}, "metric.regions"),
-        ("ring5", {"regions": 256}, "metric.regions"),
-        ("vertical5", {"aspect": "image"}, "metric.aspect"),
-        ("ring5", {"aspect": "released_3_4"}, r"metric\.aspect=released_3_4 .*2, 12"),
-        ("horizontal5", {}, r"metric\.regions=5.*2, 12"),
-    ],
-)
-def test_wrong_settings_are_named(name: str, changes: dict[str, object], words: str) -> None:
-    with pytest.raises(InputError, match=words):
-        configured(name, **changes).map((2, 12))

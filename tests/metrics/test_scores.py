@@ -141,18 +141,3 @@ def test_means_by_hand(absent: Any) -> None:
     )
     expected = np.var(ious) if absent == "released" else spread
     assert value("Var", counts, absent) == pytest.approx(expected)
-
-
-def test_absent_notes_by_hand() -> None:
-    """Two regions: person nowhere, void predicted on 5 road pixels of region 2 only."""
-    regions = np.zeros((2, 4, 4), int)
-    regions[:, 0, 0], regions[0, 1, 1], regions[1, 0, 3] = (90, 95), 10, 5
-    every = np.ones(4, bool)
-    for absent, counted in (("released", "counted as 0"), ("exclude", "left out of the mean")):
-        assert scores.absent_notes(regions, CLASSES, every, "test", absent) == (
-            f"absent from the test split: person ({counted})",
-            "predicted, but not labelled in the test split: void (IoU 0)",
-            f"absent from some regions: car (region 2), void (region 1); {counted} there",
-        )
-    scored = np.array([True, False, False, False])
-    assert scores.absent_notes(regions, CLASSES, scored, "test", "released") == ()

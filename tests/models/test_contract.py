@@ -9,7 +9,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from rgbt.checks import InputError
 from rgbt.types import VIEWS, MaskPair
 from tests.models.golden import network
 from tests.models.plain import NANO, cells, count, generator, images, nano, normal, randomise
@@ -140,46 +139,7 @@ def test_bfloat16_autocast_trains(name: str, changes: dict[str, Any]) -> None:
     assert all(p.grad.isfinite().all() for p in net.parameters() if p.grad is not None)
 
 
-@NETWORKS
-def test_views_and_images_that_do_not_fit_are_refused(name: str, changes: dict[str, Any]) -> None:
-    net, (rgb, thermal) = nano(name, **changes).eval(), images(2)
-    first, *_ = net.record.views
-    assert torch.equal(net(rgb, thermal).logits, net(rgb, thermal, views=(first,)).logits)
-    unknown: list[tuple[str, ...]] = [("infrared",)]
-    if net.record.outputs == "scores":
-        unknown += [(first, "rgb"), ({"rgbt": "rgb"}.get(first, "rgbt"),)]
-    for views in unknown:
-        with pytest.raises(InputError, match="predicts from|view"):
-            net(rgb, thermal, views=views)
-    with pytest.raises(ValueError, match="thermal"):
-        net(rgb, thermal[:1])
-
-
 ROTARY = {"position_grid": None, "position_resize": None, "rope_base": 9.0}
-
-
-@pytest.mark.parametrize(
-    ("name", "changes", "word"),
-    [
-        ("deeplabv2", {"decoder": "modified_thesis"}, "model.ceil_mode"),
-        ("deeplabv2", {"summed_rates": (2, 3)}, "model.summed_rates"),
-        *((name, {"num_heads": (3, 1, 1, 1)}, "model.num_heads") for name in ("cmx", "cmnext")),
-        ("mask2former", {"num_heads": (3, 1, 1, 1)}, "model.num_heads"),
-        ("mask2former", {"attention_heads": 3}, "model.attention_heads"),
-        *(("dinov2", {"layers": each}, "model.layers") for each in ((5,), (1, 4), (1, 3, 2, 4))),
-        ("dinov2", {"num_heads": 3}, "model.num_heads"),
-        ("dinov2", {"position_grid": None}, "model.rope_base"),
-        ("dinov2", {"position_resize": None}, "model.rope_base"),
-        ("dinov2", {"rope_base": 100.0}, "model.rope_base"),
-        ("dinov2", {**ROTARY, "num_heads": 4}, "model.rope_base"),
-        ("critic", {"align_corners": True}, "critic.align_corners"),
-    ],
-)
-def test_settings_that_do_not_fit_name_the_key(
-    name: str, changes: dict[str, Any], word: str
-) -> None:
-    with pytest.raises(InputError, match=word):
-        nano(name, **changes)
 
 
 R50 = {"depths": "[3,4,6,3]"}

@@ -11,7 +11,6 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rgbt.checks import InputError
-from rgbt.config.component import build
 from rgbt.models.inputs import Inputs, expand_cells
 from rgbt.models.parts import (
     BasicBlock,
@@ -22,7 +21,6 @@ from rgbt.models.parts import (
     keep_factors,
 )
 from rgbt.types import MaskPair
-from tests.models.golden import compose
 from tests.models.plain import Plain, generator, half, images, nano, normal, randomise
 from tests.models.test_contract import CASES, LITERAL, MODIFIED
 
@@ -87,27 +85,6 @@ def test_cells_become_squares_of_units() -> None:
             expand_cells(MaskPair(hidden, hidden), 1, (32, 64), unit)
 
 
-@pytest.mark.parametrize(
-    ("option", "rgb", "thermal"),
-    [
-        # White and mid-grey thermal in each release's convention, by hand.
-        ("crm", [2.248908, 2.428571, 2.640000], [(127.5 - 127) / 60]),
-        ("unit", [1.0] * 3, [0.5]),
-        ("half_three", [1.0] * 3, [0.0] * 3),
-        ("gray_three", [(1 - 0.369) / 0.321] * 3, [0.0] * 3),
-        ("temporal", [1.0] * 3, [1.0] * 3),
-        ("cmx", [2.248908, 2.428571, 2.640000], [0.065502, 0.196429, 0.417778]),
-        ("cmx_released", [2.248908, 2.428571, 2.640000], [0.065502, 0.196429, 0.417778]),
-        ("caffe", [255 - 104.007, 255 - 116.669, 255 - 122.679],
-         [127.5 - 104.007, 127.5 - 116.669, 127.5 - 122.679]),
-    ],
-)  # fmt: skip
-def test_conventions_of_the_releases(option: str, rgb: list[float], thermal: list[float]) -> None:
-    found = build(compose(f"model/inputs={option}").model.inputs)(*ones())
-    for image, expected in zip(found, (rgb, thermal), strict=True):
-        assert image[0, :, 0, 0].tolist() == pytest.approx(expected, rel=1e-6, abs=1e-5)
-
-
 # ---- parts and the discriminator ----
 
 
@@ -159,18 +136,6 @@ def test_whole_channels_are_dropped_before_the_first_block_and_after_every_one()
     assert torch.equal(enlarge(x, blocks, (0.0, 0.0), None), x)
     with pytest.raises(ValueError, match="generator"):
         drop_channels(x, 0.5, None)
-
-
-@pytest.mark.parametrize("align_corners", [False, True])
-@torch.no_grad()
-def test_critic_verdicts_are_enlarged_between_their_centres(align_corners: bool) -> None:
-    small, large = nano("critic"), nano("critic", upsample=True, align_corners=align_corners)
-    large.load_state_dict(randomise(small))
-    x, rows = normal(1, 2, 64, 32), torch.arange(64)
-    top, bottom = small(x)[0, 0, :, 0]
-    share = rows / 63 if align_corners else ((rows + 0.5) / 32 - 0.5).clamp(0, 1)
-    expected = top + share * (bottom - top)
-    torch.testing.assert_close(large(x)[0, 0], expected[:, None].expand(64, 32))
 
 
 # ---- networks ----

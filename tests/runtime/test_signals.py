@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import os
-import pty
 import signal
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -157,35 +155,6 @@ def test_what_the_process_ignores_stays_ignored() -> None:
             send(signal.SIGHUP)
     finally:
         signal.signal(signal.SIGHUP, before)
-
-
-CLOSED = """
-import sys, time
-from rgbt.runtime.signals import Stopped, answered, at_once, deferred
-with answered():
-    try:
-        with deferred():
-            print("ready", flush=True)
-            while True:
-                time.sleep(0.02)
-                with at_once():
-                    pass
-    except Stopped as stop:
-        print(stop, flush=True)
-        open(sys.argv[1], "w").write(str(stop.code))
-"""
-
-
-def test_a_closed_terminal_is_no_error(tmp_path: Path) -> None:
-    """The other end of a pseudo-terminal closes: SIGHUP, and every write fails from then on."""
-    child, terminal = pty.fork()
-    if child == 0:
-        os.execv(sys.executable, [sys.executable, "-c", CLOSED, str(tmp_path / "code")])
-    assert b"ready" in os.read(terminal, 100)
-    os.close(terminal)
-    _, status = os.waitpid(child, 0)
-    assert os.waitstatus_to_exitcode(status) == 0
-    assert (tmp_path / "code").read_text() == "129"
 
 
 def started(loader: DataLoader[int]) -> Iterator[int]:

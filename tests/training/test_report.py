@@ -14,9 +14,8 @@ import torch
 
 from rgbt.assembly.training_setup import set_up_training
 from rgbt.run import main
-from rgbt.runs.folder import Description, RunFolder, read_description
 from rgbt.training.report import announce_network, announce_training, network_line
-from tests.commands import Call, Trained, only_run, short, words_of
+from tests.commands import Call, Trained, short, words_of
 from tests.composed import specified
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -92,21 +91,3 @@ def test_a_finished_run_is_compared_with_the_present_files(
     code, out, err = call(main, *words)
     assert (code, "mIoU" in out) == (0, True)
     assert "other files" not in err, "a result can be shown without its data"
-
-
-def test_a_finished_run_keeps_its_name_unless_the_new_one_says_more(
-    call: Call, words: list[str], tmp_path: Path
-) -> None:
-    folder = RunFolder(only_run(tmp_path / "runs"))
-    known = read_description(folder.path)
-    assert known is not None
-    longer = {**known.tags, "rgbt.group": f"{known.tags['rgbt.group']} masker=none", "row": "a"}
-    for stored, shown in (
-        (Description("of a grid", longer, known.params), "of a grid"),
-        (Description("short", {**longer, "rgbt.group": "crm"}, known.params), known.name),
-    ):
-        folder.describe(stored)
-        call(main, *words)
-        kept = read_description(folder.path)
-        assert kept is not None
-        assert (kept.name, kept.tags["row"]) == (shown, "a")
