@@ -229,5 +229,9 @@ class TableResults:
                     self.remarks.append(f"Table '{name}' cannot be scored: {error}")
             found = [result for result in found if result.runs]
             yield from found
-            waiting += [] if found else [name]
+            if not found:
+                waiting.append(name)
+                self.remarks.append(
+                    f"No run that is tagged with '{name}' has the key of a row today."
+                )
         yield from (self.of(name) for name in waiting)
