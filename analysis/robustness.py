@@ -17,9 +17,6 @@ from analysis.results import (
 from rgbt.checks import InputError, split_list
 from rgbt.metrics.counts import Counts
 
-Level = Evaluation
-"""One severity of one corruption."""
-
 
 @dataclass(frozen=True)
 class Training:

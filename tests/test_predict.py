@@ -59,10 +59,12 @@ def test_a_network_of_other_classes_needs_a_label_map(
         "trainer.accelerator=cpu",
     )
     out = tmp_path / "out"
-    for words in (("pseudo_labels=true",), ("label_map=vistas_to_freiburg",)):
-        code, _, err = call(PREDICT, *named, f"out={out}", *words)
+    said = {"pseudo_labels=true": "model.num_classes is 14"}
+    said["label_map=vistas_to_freiburg"] = "label_map maps 66 classes"
+    for word, sentence in said.items():
+        code, _, err = call(PREDICT, *named, f"out={out}", word)
         assert code == 2
-        assert_one_sentence(err, "model.num_classes is 14")
+        assert_one_sentence(err, sentence)
 
     mapped = (*named, "label_map=freiburg_to_mfnet")
     code, _, err = call(PREDICT, *mapped, f"out={out}", "pseudo_labels=true")

@@ -78,28 +78,34 @@ def judged(sample: Sample) -> pd.DataFrame:
         "holds", "contradicted", "undecided"), contrast, value, low, high (NaN: too few blocks),
         wanted, finding (verdict of this contrast alone), blocks.
     """
-    assert sample.settings is not None, "a verdict needs resamples"
-    rule, rows = FixedSeeds(level=sample.settings.level), []
-    every = [*product(ESTIMATORS, AVERAGES)]
+    rows = []
     for stated in STATEMENTS:
-        wanted = RANGES[stated["wanted"]]
-        for way in every if stated["quantity"] == "snr" else [("", "")]:
-            found = [*_contrasts(sample.by(way) if way[0] else sample, stated)]
-            evidences = [sample.evidence(each.values, each.part, each.present) for each in found]
-            if not found:
-                continue
-            whole = decide(evidences, wanted, rule, stated.get("combine", "all")).kind
-            for each, evidence in zip(found, evidences, strict=True):
-                alone = decide([evidence], wanted, rule, "all")
-                half = alone.smallest  # NaN without an interval
-                numbers = alone.estimate + np.array([0.0, -half, half])
-                numbers = np.clip(numbers, -each.limit, each.limit)
-                if stated["wanted"] not in ("> 0", "< 0"):
-                    numbers = np.exp(numbers)
-                about = (stated["key"], stated["place"], stated["says"], *way, whole)
-                judged = (stated["wanted"], alone.kind, evidence.blocks)
-                rows.append((*about, each.what, *numbers.tolist(), *judged))
+        ways = product(ESTIMATORS, AVERAGES) if stated["quantity"] == "snr" else [("", "")]
+        for way in ways:
+            about = stated["key"], stated["place"], stated["says"], *way
+            of_way = sample.by(way) if way[0] else sample
+            rows += [(*about, *row) for row in _decided(of_way, stated)]
     return pd.DataFrame(rows, columns=COLUMNS)
+
+
+def _decided(sample: Sample, stated: dict[str, Any]) -> Iterator[tuple[object, ...]]:
+    """Verdict of a statement, and each of its numbers with its own interval and verdict."""
+    assert sample.settings is not None, "a verdict needs resamples"
+    wanted, rule = RANGES[stated["wanted"]], FixedSeeds(level=sample.settings.level)
+    found = [*_contrasts(sample, stated)]
+    evidences = [sample.evidence(each.values, each.part, each.present) for each in found]
+    if not found:
+        return
+    whole = decide(evidences, wanted, rule, stated.get("combine", "all")).kind
+    for each, evidence in zip(found, evidences, strict=True):
+        alone = decide([evidence], wanted, rule, "all")
+        half = alone.smallest  # NaN without an interval
+        numbers = alone.estimate + np.array([0.0, -half, half])
+        numbers = np.clip(numbers, -each.limit, each.limit)
+        if stated["wanted"] not in ("> 0", "< 0"):
+            numbers = np.exp(numbers)
+        of_number = stated["wanted"], alone.kind, evidence.blocks
+        yield whole, each.what, *numbers.tolist(), *of_number
 
 
 def thirds(values: Values) -> tuple[Values, Values]:

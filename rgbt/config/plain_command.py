@@ -15,7 +15,6 @@ from typing import Any, Generic, NamedTuple, TypeVar
 
 from rgbt.checks import InputError, RunError, nearest, without_controls
 from rgbt.config.options import help_text, parse, readable_paths
-from rgbt.runtime.resources import reporting_exhaustion
 from rgbt.runtime.signals import Stopped, answered, ending_command
 
 T = TypeVar("T")
@@ -58,7 +57,7 @@ COMMANDS = {
 def exit_code(work: Callable[[], int | None], *, catch_interrupt: bool = True) -> int:
     """Run `work` and return its exit code. In a grid, Ctrl-C is not caught: it ends all points."""
     try:
-        with ending_command(), reporting_exhaustion():
+        with ending_command():
             return work() or 0
     except (InputError, RunError) as error:
         return say(str(error), 2 if isinstance(error, InputError) else 1)

@@ -1,1 +1,1 @@
-"""Handle signals, full disks and exhausted memory."""
+"""Handle signals, and processes of one run."""

@@ -1,8 +1,6 @@
 """Say what a run works with before its first progress bar, and show its result.
 
-A finished run is shown without torch and without its store where both can be avoided. Torch is
-needed where the consistency of the run is measured on virtual views. The store is needed where it
-lacks something of the run (`Tracking.refresh`).
+A finished run is shown without torch, and without its store unless it lacks something of the run.
 """
 
 from __future__ import annotations
@@ -140,7 +138,6 @@ def show(run: RunSpec, extra_tags: Mapping[str, str] | None = None) -> None:
     tracking.refresh(folder, merged)
     warn_of_result(folder.path)
     _report_other_files(run, folder)
-    _report_consistency(run, folder)
     print_result(run, folder, tracking)
 
 
@@ -178,19 +175,4 @@ def _report_other_files(run: RunSpec, folder: RunFolder) -> None:
         info(
             f"this run was trained on other files of the data set ({result['dataset'][:8]}, now "
             f"{now[:8]}). To train on the present files, set runs_dir=... or dataset.name=..."
-        )
-
-
-def _report_consistency(run: RunSpec, folder: RunFolder) -> None:
-    """Report a request for views on which the run was not measured."""
-    if not run.plain["consistency"]["sets"]:
-        return
-    from rgbt.metrics.pairs import file_name  # NumPy
-
-    views = run.consistency.build()
-    measured = [folder.path / file_name("aligned", each, views.mark) for each in views.splits]
-    if not all(path.is_file() for path in measured):
-        info(
-            "the consistency of this run has not been measured on these views and splits. To "
-            f"measure it: rgbt consistency run={folder.path} split=..."
         )

@@ -217,12 +217,15 @@ class TableResults:
         return TableResult.of(request, runs, judge, sizes)
 
     def __iter__(self) -> Iterator[TableResult]:
-        """Tables with runs in every way that they were run, then those without a run."""
-        variants = self.variants()
-        waiting = [name for name in self.tables if name not in variants]
-        for name, each in variants.items():
+        """Tables with runs in every way that they were run, then those without a run.
+
+        Tables share runs, so a way without further words is tried for each of them.
+        """
+        variants, waiting = self.variants(), []
+        plain = {each for ways in variants.values() for each in ways if not each.extra}
+        for name in self.tables:
             found = []
-            for variant in each:
+            for variant in sorted({*variants.get(name, ()), *plain}):
                 try:
                     found.append(self.of(name, variant))
                 except InputError as error:

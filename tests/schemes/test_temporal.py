@@ -247,25 +247,6 @@ def test_half_pixel_beyond_the_first_frame_does_not_count() -> None:
     assert not loss.valid.any()
 
 
-def test_mask2former_passes_equal_two_calls() -> None:
-    net, apart = nano().train(), nano().train()
-    loss = step(scheme(net), batch(2, (96, 128)))
-    frames = loss.first, loss.second
-    for frame in frames:
-        given = frame.batch
-        single = apart(given.rgb, given.thermal, generator=generator_of("stochastic depth"))
-        assert frame.output.logits is None
-        for name, values in single.aux.items():
-            torch.testing.assert_close(frame.output.aux[name], values, rtol=1e-4, atol=1e-4)
-        dense = apart.dense_logits(single, (96, 128))
-        torch.testing.assert_close(frame.logits, dense, rtol=1e-4, atol=1e-4)
-    for mine, theirs in zip(net.buffers(), apart.buffers(), strict=True):
-        torch.testing.assert_close(mine, theirs)
-    idle = [name for name, p in net.named_parameters() if p.grad is None or not p.grad.any()]
-    # Nothing is hidden; at initialisation, the sampling offsets ignore where they are.
-    assert {name.rpartition(".")[2] for name in idle} <= {"mask_token", "level_embed"}
-
-
 def test_dense_logits_are_the_logarithm_of_semantic_scores() -> None:
     net, hw = nano().train(), (60, 84)
     output = net(*images(2, *hw))
