@@ -232,8 +232,8 @@ class TableResults:
                     self.remarks.append(f"Table '{name}' cannot be scored: {error}")
             found = [result for result in found if result.runs]
             yield from found
-            if not found:
-                waiting.append(name)
+            waiting += [] if found else [name]
+            if name in variants and not found:
                 self.remarks.append(
                     f"No run that is tagged with '{name}' has the key of a row today."
                 )

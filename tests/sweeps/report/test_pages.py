@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import os
 import re
 import shutil
 import subprocess
@@ -319,7 +320,13 @@ def test_report_needs_no_torch(place: Path, tmp_path: Path) -> None:
         "try: m.entry()\n"
         "except SystemExit as end: print(end.code, {'torch', 'mlflow'} & set(sys.modules))"
     )
+    here = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
     done = subprocess.run(
-        [sys.executable, "-c", code], cwd=place, capture_output=True, text=True, check=True
+        [sys.executable, "-c", code],
+        cwd=place,
+        env=here,
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert done.stdout.strip().endswith("0 set()"), done.stderr
