@@ -233,4 +233,8 @@ class TableResults:
             found = [result for result in found if result.runs]
             yield from found
             waiting += [] if found else [name]
+            if name in variants and not found:
+                self.remarks.append(
+                    f"No run that is tagged with '{name}' has the key of a row today."
+                )
         yield from (self.of(name) for name in waiting)

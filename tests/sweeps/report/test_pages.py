@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import os
 import re
 import shutil
 import subprocess
@@ -214,6 +215,14 @@ def test_odd_record_is_a_remark_and_not_the_end(
     assert "| high | " in text
 
 
+def test_runs_whose_keys_have_changed_are_a_remark(place: Path, tmp_path: Path) -> None:
+    for number, path in enumerate(sorted((place / "runs").glob("*/run.json"))):
+        if "my/planted" in path.read_text():
+            shutil.copytree(path.parent, tmp_path / "runs" / f"{number:012d}")
+    text = made(tmp_path / "runs").page("index")
+    assert "No run that is tagged with 'my/planted' has the key of a row today." in text
+
+
 def test_text_of_a_run_is_no_markup_and_names_no_folder(place: Path, tmp_path: Path) -> None:
     shutil.copytree(place / "runs", tmp_path / "runs")
     files = sorted((tmp_path / "runs").glob("*/run.json"))
@@ -311,7 +320,13 @@ def test_report_needs_no_torch(place: Path, tmp_path: Path) -> None:
         "try: m.entry()\n"
         "except SystemExit as end: print(end.code, {'torch', 'mlflow'} & set(sys.modules))"
     )
+    here = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
     done = subprocess.run(
-        [sys.executable, "-c", code], cwd=place, capture_output=True, text=True, check=True
+        [sys.executable, "-c", code],
+        cwd=place,
+        env=here,
+        capture_output=True,
+        text=True,
+        check=True,
     )
     assert done.stdout.strip().endswith("0 set()"), done.stderr
