@@ -294,7 +294,8 @@ def test_arguments_that_make_no_sense_are_refused(
 ) -> None:
     make_run(tmp_path / "runs", "aaa0", "crm", 0)
     (tmp_path / "empty").mkdir()
-    given = dict(each.split("=", 1) for each in (*files, *FAST, f"runs_dir={tmp_path}/runs"))
+    words = (*files, *FAST, f"runs_dir={tmp_path}/runs", "archive=none")
+    given = dict(each.split("=", 1) for each in words)
     if "aaa0" in arguments[0]:
         given["a"] = "aaa0"
     given |= dict(each.format(tmp_path).split("=", 1) for each in arguments)

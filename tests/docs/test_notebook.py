@@ -65,6 +65,7 @@ def test_every_cell_of_the_notebook_runs(
     runs: Path, cells: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("RGBT_RUNS_DIR", str(runs))
+    monkeypatch.chdir(runs.parent)  # without the archive of the repository
     drawn: list[int] = []
     monkeypatch.setattr(plt, "show", lambda: drawn.append(plt.gcf().number))
     names: dict[str, Any] = {"__name__": "__main__"}
