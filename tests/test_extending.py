@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -73,12 +73,12 @@ SMOKE = ("+debug=smoke", "tracking=none", "trainer.accelerator=cpu", "trainer.th
 
 
 @pytest.fixture
-def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Path]:
+def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], Path]]:
     """Writes the files of a tutorial to an empty folder, which is searched for them."""
+    sys.modules.pop("my_lab", None)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setenv("RGBT_CONF", str(tmp_path / "conf"))
-    monkeypatch.delitem(sys.modules, "my_lab", raising=False)
 
     def written(name: str) -> Path:
         for block in Page.read(ROOT / "docs" / "tutorials" / name).blocks:
@@ -86,7 +86,8 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Path
                 write(block, tmp_path)
         return tmp_path
 
-    return written
+    yield written
+    sys.modules.pop("my_lab", None)  # each folder has its own
 
 
 @pytest.mark.parametrize(
