@@ -46,6 +46,14 @@ def pytest_collection_finish() -> None:
     gc.set_threshold(100_000, 20, 20)
 
 
+@pytest.fixture(autouse=True)
+def modules_of_the_reader() -> Iterator[None]:
+    """Forget the reader's module `my_lab`: every test has its own."""
+    sys.modules.pop("my_lab", None)
+    yield
+    sys.modules.pop("my_lab", None)
+
+
 @pytest.fixture(scope="session", autouse=True)
 def no_flush_to_disk() -> Iterator[None]:
     """No test cuts the power: thirty waits for the disk in each run would take as long as it."""

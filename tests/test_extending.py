@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -73,9 +72,8 @@ SMOKE = ("+debug=smoke", "tracking=none", "trainer.accelerator=cpu", "trainer.th
 
 
 @pytest.fixture
-def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], Path]]:
+def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Path]:
     """Writes the files of a tutorial to an empty folder, which is searched for them."""
-    sys.modules.pop("my_lab", None)
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setenv("RGBT_CONF", str(tmp_path / "conf"))
@@ -86,8 +84,7 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[s
                 write(block, tmp_path)
         return tmp_path
 
-    yield written
-    sys.modules.pop("my_lab", None)  # each folder has its own
+    return written
 
 
 @pytest.mark.parametrize(
