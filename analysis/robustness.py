@@ -15,7 +15,6 @@ from analysis.results import (
     open_counts,
 )
 from rgbt.checks import InputError, split_list
-from rgbt.metrics.counts import Counts
 
 
 @dataclass(frozen=True)
@@ -25,15 +24,6 @@ class Training:
     label: str
     place: Path
     levels: tuple[Evaluation, ...]
-
-    @property
-    def clean(self) -> Counts:
-        """Of the images as they are."""
-        return self.levels[0].counts
-
-    def of(self, row: str) -> tuple[Evaluation, ...]:
-        """The severities of one row, rising; () where it was not measured."""
-        return tuple(level for level in self.levels if level.row == row)
 
 
 def trainings(text: str, runs_dir: Path | str = "runs", split: str = "") -> list[Training]:

@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, TypeAdapter
 
-from rgbt.checks import InputError, without_controls
+from rgbt.checks import without_controls
 from rgbt.metrics.names import DAY, NIGHT
 
 ABSENT = "-"
@@ -206,19 +206,3 @@ def _safe(cell: object) -> object:
     except ValueError:
         return f"'{text}" if FORMULA.match(text) else text or cell
     return text
-
-
-def read_csv(text: str) -> tuple[list[str], list[dict[str, str]]]:
-    """Header and lines of what `csv_text` wrote, cells as they were given to it, as text.
-
-    Raises:
-        InputError: a line has another number of cells than the header.
-    """
-    lines = [
-        [cell[1:] if cell.startswith("'") and FORMULA.match(cell) else cell for cell in line]
-        for line in csv.reader(io.StringIO(text, newline=""))
-    ]
-    header = lines.pop(0) if lines else []
-    if any(len(line) != len(header) for line in lines):
-        raise InputError("a CSV file of the store is damaged: lines differ in their cells.")
-    return header, [dict(zip(header, line, strict=True)) for line in lines]

@@ -14,8 +14,6 @@ from dataclasses import dataclass, replace
 from torch import Tensor, nn
 
 Tensors = Mapping[str, Tensor]
-Names = tuple[tuple[str, str], ...]
-"""(regular expression, replacement), applied one after the other."""
 
 NONE = r"(?!)"
 """Regular expression that fits no name."""
@@ -53,7 +51,7 @@ class Kind:
 
 
 def renaming(*names: tuple[str, str]) -> Callable[[str], str]:
-    """A function that replaces regular expressions in a name."""
+    """A function that replaces pairs (regular expression, replacement) in turn in a name."""
 
     def renamed(name: str) -> str:
         for pattern, replacement in names:

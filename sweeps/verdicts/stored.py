@@ -137,7 +137,7 @@ class TableResults:
     """The results of all tables of the papers, of ours, and of the user.
 
     Attributes:
-        finished: the runs; they belong to the tables that their tags name.
+        finished: the runs; a run belongs to every table with a row of its key.
         planner: composes the rows.
         resamples: of the images.
         counted: whether the sizes of networks are counted, which needs torch.
