@@ -61,8 +61,7 @@ class Outcome:
     """A point with its state and its finished runs.
 
     Attributes:
-        state: "finished", "failed", "running" (by another driver), "waiting" (not started) or
-            "missing" (not in the store that is read).
+        state: "running" is by another driver, "missing" not in the store that is read.
         reason: why it failed, or "".
         results: its finished runs; of a waiting point, runs that lack further evaluations only.
         keys: of its runs; () where its configuration is wrong.

@@ -40,10 +40,7 @@ class Queue:
     """The runs of several tables, those that decide most claims a minute first.
 
     A missing run is worth, for every open claim that needs it, one over the number of missing runs
-    of that claim.
-
-    Attributes:
-        claims, decided: number of all claims about scores, and of the decided ones; see `more`.
+    of that claim. `claims` and `decided` count claims about scores, see `more`.
     """
 
     plans: Sequence[TablePlan]
@@ -112,14 +109,19 @@ class Queue:
         return str(self.planner.specify((*self.planner.base, *point.overrides)).model.target)
 
     def preview(self, outcomes: Sequence[Outcome]) -> TextTable:
-        """The missing runs in the order in which they would be run today."""
-        places = [place for place, each in enumerate(outcomes) if each.state == "waiting"]
-        places.sort(key=lambda place: self.rank(outcomes[place].point), reverse=True)
+        """The missing runs in the order in which they would be run today, each once."""
+        tables: dict[tuple[str, ...], list[str]] = defaultdict(list)
+        missing: dict[tuple[str, ...], Point] = {}
+        for outcome, owner in zip(outcomes, self.owners, strict=False):
+            if outcome.state == "waiting":
+                point = outcome.point
+                missing.setdefault(point.overrides, point)
+                tables[point.overrides].append(self.plans[owner].request.name)
         rows, total = list[tuple[str, ...]](), 0.0
-        for place in places:
-            point, name = outcomes[place].point, self.plans[self.owners[place]].request.name
+        for point in sorted(missing.values(), key=self.rank, reverse=True):
             minutes, worth = self.seconds(point) / 60, self._worth[point.overrides]
             total += minutes
+            name = ", ".join(dict.fromkeys(tables[point.overrides]))
             rows.append((point.label, name, f"{worth:.2f}", f"{minutes:.1f}", f"{total:.0f}"))
         header = ("run", "table", "claims", "minutes", "total")
         return TextTable("Missing runs in their order", header, tuple(rows))
@@ -149,7 +151,7 @@ def run_queue(
             info(f"{name} is left out: {error}")
     if not plans:
         raise InputError(f"table={options.table}: none of them can be trained.")
-    queue, title = Queue(plans, runs, planner), f"tables scale={options.scale}"
+    queue, title = Queue(plans, runs, planner), f"tables {options.scale}"
     points = PointList(
         *(title, title, "list", queue.points, runs, planner.base), more=queue.more, rank=queue.rank
     )

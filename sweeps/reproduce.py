@@ -56,7 +56,6 @@ class Options:
     wait: Annotated[bool, Help("true: wait for cells that other commands run")] = True
     storage: Annotated[str | None, Help("of all machines: postgresql://user@host/name")] = None
     timeout_minutes: Annotated[float | None, Help("time limit of one run")] = None
-    max_failures: Annotated[int | None, Help("start no more runs after so many failures")] = None
     trust: Trust = ""
 
 

@@ -14,12 +14,9 @@ from rgbt.metrics import names as scores
 from rgbt.metrics.scores import MEANS
 from rgbt.ranges import Names, Positive, Text
 
-SCORES = (*MEANS, scores.VAR, "region/<n>", "class/<name>")
-AT_THE_END = tuple(
-    scores.consistency(score, protocol)
-    for score in (scores.TC, scores.CA)
-    for protocol in ("aligned", "released")
-)
+AT_THE_END = [
+    scores.consistency(s, p) for s in (scores.TC, scores.CA) for p in ("aligned", "released")
+]
 """Scores that a run measures once, of its best checkpoint."""
 
 
@@ -39,12 +36,11 @@ class Objective:
     def __post_init__(self) -> None:
         split, _, score = self.metric.partition("/")
         whole = score.removeprefix(f"{scores.DAY}/").removeprefix(f"{scores.NIGHT}/")
-        is_known = {whole, score} & {*SCORES, *AT_THE_END} or score.startswith(
-            ("region/", "class/")
-        )
+        known = [*MEANS, scores.VAR, *AT_THE_END]
+        is_known = {whole, score} & {*known} or score.startswith(("region/", "class/"))
         if split not in ("val", "test") or not is_known:
-            known = nearest(score, (*SCORES, *AT_THE_END))
-            raise InputError(f"objective '{self.metric}': val/<score> or test/<score>; {known}.")
+            told = f"val/<score> or test/<score>; {nearest(score, known)}, region/<n>, class/<name>"
+            raise InputError(f"objective '{self.metric}': {told}.")
 
     @property
     def is_consistency(self) -> bool:
@@ -76,7 +72,6 @@ class SweepSettings:
     gpus: Annotated[tuple[GpuSlot, ...], Len(1, 1024)] | None
     retry: Literal["none", "failed"]
     timeout_minutes: Positive | None
-    max_failures: NumRuns | None
     wait: bool
     dry_run: bool
     study: Text | None

@@ -37,13 +37,9 @@ Space = Mapping[str, Distribution]
 def parse_space(entries: Mapping[str, Mapping[str, Any]]) -> Space:
     """The distributions of a space, in the order of the file.
 
-    Args:
-        entries: key -> type (float, int, categorical) and arguments of the distribution.
-            Interpolations are kept as text: ``${px:64}`` is resolved by the run that gets it. A
-            list among the choices is text too, because Optuna's storages hold plain values.
-
-    Raises:
-        InputError: what the distribution refuses, or choices that Optuna takes for equal.
+    `entries`: key -> type (float, int, categorical) and arguments of the distribution. An
+    interpolation (``${px:64}``), which the run resolves, and a list among the choices are text.
+    InputError: what the distribution refuses, or choices that Optuna takes for equal.
     """
     space: dict[str, Distribution] = {}
     for key, entry in entries.items():
@@ -86,9 +82,7 @@ def ends(space: Space) -> tuple[tuple[str, ...], tuple[str, ...]]:
 def as_overrides(params: Mapping[str, Any]) -> tuple[str, ...]:
     """``key=value`` for every value, such that Hydra reads exactly that value.
 
-    Args:
-        params: None, booleans, numbers, texts or lists of these, by key. Text with an
-            interpolation, and text of a list ("[48,64]"), is passed on as it is.
+    Text with an interpolation, and text of a list ("[48,64]"), is passed on as it is.
     """
     return tuple(f"{key}={_text(value)}" for key, value in params.items())
 
@@ -126,17 +120,10 @@ def split(
 
     Like in Hydra's own sweeper, a repeated key keeps its first position and its last value.
 
-    Args:
-        overrides: as typed, e.g. ``["+experiment=grbm", "masker.sigma_div=1,2", "seed=0,1"]``.
-        config_loader: answers ``model=glob(*)``.
-
     Returns:
         fixed overrides as typed; swept: key (with its ``+``) -> values; intervals: key -> entry of
         a search space, ``tag(log, interval(1, 8))`` on a logarithmic scale and
-        ``int(interval(1, 8))`` in whole numbers.
-
-    Raises:
-        InputError: a sweep without values, a tag that means nothing.
+        ``int(interval(1, 8))`` in whole numbers. InputError: a sweep without values.
     """
     fixed: list[str] = []
     swept: SweptValues = {}
@@ -192,13 +179,9 @@ def merge_space(
     swept: SweptValues,
     intervals: Mapping[str, Mapping[str, Any]],
 ) -> Space:
-    """The space of a search; the command line has priority for every key.
+    """The space of a search from a file and the command line, which has priority for every key.
 
-    Args:
-        entries: as in ``conf/search``.
-        fixed: overrides as typed; one for a key of `entries` takes it out of the search.
-        swept: key -> values; they are the choices of the key.
-        intervals: key -> entry of a space, in the place of the one in `entries`.
+    A key that is `fixed` is not searched; `swept` values are choices.
     """
     merged = dict(entries)
     for key, texts in swept.items():
@@ -244,12 +227,7 @@ class PerTrialSampler(BaseSampler):
 
     Optuna's samplers draw from one generator for all trials: two drivers with one seed, or a search
     that is resumed, would propose the same points again. Here every trial has a sampler by its
-    number in the storage. No two trials share draws, and one worker repeats a search exactly, even
-    if it was stopped and resumed.
-
-    Args:
-        make: the sampler that chooses, from a seed; it keeps nothing outside the storage.
-        seed: of the search.
+    number in the storage, which `make` makes of a seed.
     """
 
     def __init__(self, make: Callable[[int], BaseSampler], seed: int) -> None:
@@ -270,11 +248,9 @@ def trial_seed(seed: int, number: int) -> int:
 
 
 def build_sampler(node: Mapping[str, Any]) -> PerTrialSampler:
-    """The sampler of a search.
+    """The sampler of a search, one of `SAMPLERS` with options of its constructor.
 
-    Args:
-        node: with `_target_`, one of `SAMPLERS`, and options of its constructor; one worker with
-            the same `seed` (0 if it has none) proposes the same points, see `PerTrialSampler`.
+    One worker with the same `seed` (0 if it has none) proposes the same points.
     """
     path = "hydra.sweeper.sampler"
     check_choice(f"{path}._target_", str(node.get("_target_")), SAMPLERS)
@@ -283,12 +259,9 @@ def build_sampler(node: Mapping[str, Any]) -> PerTrialSampler:
 
 
 def build_pruner(node: Mapping[str, Any] | None) -> BasePruner:
-    """The pruner of a search; trials report at their validation steps.
+    """The pruner of a search, any of Optuna; trials report at their validation steps.
 
-    Args:
-        node: with `_target_`, a pruner of Optuna, and options of its constructor; None: no pruner.
-            Those that count steps (``n_warmup_steps``, ``min_resource``) count steps of the
-            optimizer, not validations.
+    Options such as ``n_warmup_steps`` count steps of the optimizer, not validations.
     """
     pruner: BasePruner = build_optuna(node, "hydra.sweeper.pruner") if node else NopPruner()
     return pruner

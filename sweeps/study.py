@@ -26,18 +26,12 @@ if TYPE_CHECKING:
     import optuna
     import pandas as pd
 
-WORDS = {
-    "COMPLETE": "complete",
-    "PRUNED": "pruned",
-    "FAIL": "failed",
-    "RUNNING": "running",
-    "WAITING": "waiting",
-}
+WORDS = {"COMPLETE": "complete", "PRUNED": "pruned", "FAIL": "failed"}
+WORDS |= {"RUNNING": "running", "WAITING": "waiting"}
 """Optuna's states as shown."""
 
-MIN_TRIALS, ADVISED = 10, 50
-"""Complete trials below which importances would be noise, because PED-ANOVA looks at the best
-tenth; and from which that tenth has the five trials that its authors ask for."""
+MIN_TRIALS = 10
+"""Complete trials below which importances would be noise: PED-ANOVA looks at the best tenth."""
 
 TOP, POINTS = 10, 50
 """Rows of the tables of best trials, and of points of a grid or list; the CSV has all."""
@@ -76,7 +70,7 @@ class StudyData:
 
     Attributes:
         kind: "search", "grid" or "list".
-        metrics: names of the objectives; `maximize`: whether more is better.
+        metrics: names of the objectives, and whether more is better.
         params: names of the parameters.
         frame: trials that count, one a row: trial (its number), state, label, the parameters, the
             scores in percent, objectives first, seconds, last_step, runs, reason; and the key of
@@ -85,8 +79,7 @@ class StudyData:
 
     study: optuna.Study
     kind: str
-    metrics: Sequence[str]
-    maximize: Sequence[bool]
+    metrics: Mapping[str, bool]
     params: Sequence[str]
     frame: pd.DataFrame
 
@@ -98,24 +91,21 @@ class StudyData:
         from rgbt.config.compose import with_pixels
         from sweeps.worker.storage import counted_trials
 
-        trials, rows = counted_trials(study), []
-        metrics = study.metric_names or [f"objective {n + 1}" for n in range(len(study.directions))]
-        params = list(dict.fromkeys(name for trial in trials for name in trial.params))
-        scores = dict.fromkeys(metrics)
-        for trial in trials:
-            notes, factor = trial.user_attrs, trial.user_attrs.get(names.PIXELS, 1.0)
-            found = {
-                **notes.get(names.RESULTS, {}),
-                **dict(zip(metrics, trial.values or (), strict=False)),
-            }
-            scores |= dict.fromkeys(found)
+        ways = [direction.name == "MAXIMIZE" for direction in study.directions]
+        metrics = study.metric_names or [f"objective {n + 1}" for n in range(len(ways))]
+        params, scores, rows = dict[str, None](), dict.fromkeys(metrics), []
+        for trial in counted_trials(study):
+            notes, values = trial.user_attrs, zip(metrics, trial.values or (), strict=False)
+            found = {**notes.get(names.RESULTS, {}), **dict(values)}
+            factor = notes.get(names.PIXELS, 1.0)
             chosen = {
                 name: with_pixels(value, factor) if isinstance(value, str) else value
                 for name, value in trial.params.items()
             }
+            params, scores = params | dict.fromkeys(chosen), scores | dict.fromkeys(found)
             of_trial = {
-                **{"trial": trial.number, "state": WORDS[trial.state.name]},
-                **{"label": notes.get(names.LABEL, f"#{trial.number}"), **chosen, **found},
+                **{"trial": trial.number, "state": WORDS[trial.state.name], **chosen, **found},
+                "label": notes.get(names.LABEL, f"#{trial.number}"),
                 "seconds": notes.get(names.SECONDS),
                 "last_step": trial.last_step,
                 "runs": " ".join(notes.get(names.RUNS, ())) or None,
@@ -125,34 +115,27 @@ class StudyData:
             rows.append({name: v for name, v in of_trial.items() if v is not None})
         columns = ["trial", "state", "label", *params, *scores, "seconds", "last_step", "runs"]
         frame = pd.DataFrame(rows, columns=[*columns, "reason", "key"], dtype=object)
-        maximize = [direction.name == "MAXIMIZE" for direction in study.directions]
         kind = str(study.user_attrs.get(names.KIND, "search"))
-        return cls(study, kind, metrics, maximize, params, frame)
+        return cls(study, kind, dict(zip(metrics, ways, strict=True)), list(params), frame)
 
-    @property
-    def complete(self) -> pd.DataFrame:
-        """Trials whose objectives are known."""
-        return self.frame[self.frame["state"] == "complete"]
-
-    @property
-    def latest(self) -> pd.DataFrame:
-        """The latest trial of each point: earlier ones failed and were retried."""
-        return self.frame.drop_duplicates("key", keep="last")
+    def of_state(self, state: str) -> pd.DataFrame:
+        """The latest trials of each point that are in a state: earlier ones were repeated."""
+        latest = self.frame.drop_duplicates("key", keep="last")
+        return latest[latest["state"] == state] if state else latest
 
 
 def tables(data: StudyData) -> list[TextTable]:
     """Trials by state, the most important trials, the failed ones; empty tables are left out."""
     counts = data.frame["state"].value_counts()
     row = (str(len(data.frame)), *(str(counts.get(word, 0)) for word in WORDS.values()))
-    first = TextTable(
-        f"Study {data.study.study_name} ({data.kind})", ("trials", *WORDS.values()), (row,)
-    )
-    failed = data.latest[data.latest["state"] == "failed"].copy()
-    failed["reason"] = failed["reason"].map(one_line)
-    again = counts.get("failed", 0) - len(failed)
-    title = "Failed trials" + (f" ({again} more were retried)" if again else "")
-    columns = {name: name for name in ("reason", "trial", "label", "runs", "seconds")}
-    found = [first, trials_grid(data), _grid(title, failed, columns)]
+    title = f"Study {data.study.study_name} ({data.kind})"
+    failed = data.of_state("failed")
+    failed = failed.assign(reason=failed["reason"].map(one_line))
+    found = [
+        TextTable(title, ("trials", *WORDS.values()), (row,)),
+        trials_grid(data),
+        _grid("Failed trials", failed, dict.fromkeys(("reason", "trial", "label", "runs"))),
+    ]
     return [grid for grid in found if grid.rows]
 
 
@@ -164,84 +147,76 @@ def trials_grid(data: StudyData) -> TextTable:
     """
     from sweeps.point import short_names
 
-    complete, metric = data.complete, data.metrics[0]
-    best = complete.sort_values(metric, ascending=not data.maximize[0], kind="stable")
+    complete, (metric, is_up) = data.of_state("complete"), next(iter(data.metrics.items()))
+    best = complete.sort_values(metric, ascending=not is_up, kind="stable")
     if data.kind != "search":
-        title, shown = "Points", data.latest.head(POINTS)
-        title += f" (the first {POINTS}; all in trials.csv)" if len(data.latest) > POINTS else ""
+        title, shown = f"Points (the first {POINTS})", data.of_state("").head(POINTS)
     elif len(data.metrics) == 1:
-        way = "highest" if data.maximize[0] else "lowest"
+        way = "highest" if is_up else "lowest"
         title, shown = f"Best trials: {way} {metric}", best.head(TOP)
     else:
         front = [trial.number for trial in data.study.best_trials]
         shown = best[best["trial"].isin(front)]
         title = f"Pareto front: {len(shown)} of {len(complete)} complete trials"
-    what = {"label": "point", "state": "state"}
-    if data.kind == "search":
-        what = short_names(data.params)
+    is_search = data.kind == "search"
+    what = short_names(data.params) if is_search else {"label": "point", "state": "state"}
     # Objectives and the scores of `ALWAYS`, validation and test side by side.
     ends = [metric.removeprefix("val/").removeprefix("test/") for metric in data.metrics]
     wanted = [f"{split}{end}" for end in (*ends, *ALWAYS) for split in ("", "val/", "test/")]
     scores = [name for name in dict.fromkeys(wanted) if name in shown and shown[name].notna().any()]
-    columns = {name: name for name in (*scores, "seconds", "runs")}
-    return _grid(title, shown, {"trial": "trial", **what, **columns})
+    return _grid(
+        title, shown, {"trial": None, **what, **dict.fromkeys((*scores, "seconds", "runs"))}
+    )
 
 
 def importances(data: StudyData) -> tuple[TextTable | None, str]:
     """How much the objectives depend on each parameter, by PED-ANOVA: of reaching the best tenth.
 
     Returns:
-        shares in percent by objective, the most important parameter for the first one first, or
-        None; and why there are none, or how uncertain they are.
+        shares in percent by objective, the most important parameter for the first one first; or
+        None, and why.
 
     Source: Watanabe et al., "PED-ANOVA", IJCAI 2023, arXiv 2304.10255.
     """
     import pandas as pd
     from optuna.importance import get_param_importances
 
-    complete = data.complete
+    complete = data.of_state("complete")
     if data.kind != "search":
         return None, ""
     if len(complete) < MIN_TRIALS:
         return None, f"they need {MIN_TRIALS} complete trials, and there are {len(complete)}."
     varied = [name for name in data.params if complete[name].nunique() > 1]
     found = {}
-    for place, metric in enumerate(data.metrics):
+    for place, (metric, is_up) in enumerate(data.metrics.items()):
 
-        def loss(trial: Any, place: int = place) -> float:  # PED-ANOVA takes less as better
-            return -float(trial.values[place]) if data.maximize[place] else trial.values[place]
+        def loss(trial: Any, place: int = place, is_up: bool = is_up) -> float:  # less is better
+            return float(-trial.values[place] if is_up else trial.values[place])
 
         if varied and complete[metric].nunique() > 1:
-            with warnings.catch_warnings():  # of the sign, and of few trials: the remark says so
+            with warnings.catch_warnings():  # of the sign, and of few trials
                 warnings.simplefilter("ignore")
-                found[f"for {metric}, %"] = get_param_importances(
-                    data.study, params=varied, target=loss
-                )
+                found[metric] = get_param_importances(data.study, params=varied, target=loss)
     if not found:
         return None, "no parameter, or no objective, took two values."
-    shares = 100 * pd.DataFrame(found)
-    shares = shares.sort_values(shares.columns[0], ascending=False)
-    columns = {"index": "parameter", **{name: name for name in found}}
-    rough = f"rough: {len(complete)} complete trials, {ADVISED} are recommended."
-    grid = _grid("Importance of the parameters", shares.reset_index(), columns, ".2f")
-    return grid, rough if len(complete) < ADVISED else ""
+    shares = (100 * pd.DataFrame(found)).map("{:.2f}".format).reset_index()
+    order = shares.sort_values(next(iter(found)), key=pd.to_numeric, ascending=False)
+    columns = {"index": "parameter", **{name: f"for {name}, %" for name in found}}
+    return _grid("Importance of the parameters", order, columns), ""
 
 
-def _grid(
-    title: str, frame: pd.DataFrame, columns: Mapping[str, str], digits: str = ""
-) -> TextTable:
-    """Columns of a frame under other names, as text."""
+def _grid(title: str, frame: pd.DataFrame, columns: Mapping[str, str | None]) -> TextTable:
+    """Columns of a frame, some under other names, as text."""
     import pandas as pd
 
     def text(name: str, value: object) -> str:
-        if pd.isna(value):
-            return ABSENT
-        form = digits or {"seconds": ".0f"}.get(name, ".2f" if "/" in name else ".4g")
-        return format(value, form) if isinstance(value, float) else str(value)
+        form = {"seconds": ".0f"}.get(name, ".2f" if "/" in name else ".4g")
+        shown = format(value, form) if isinstance(value, float) else str(value)
+        return ABSENT if pd.isna(value) else shown
 
     rows = frame[list(columns)].itertuples(index=False, name=None)
     cells = tuple(tuple(map(text, columns, row)) for row in rows)
-    return TextTable(title, tuple(columns.values()), cells)
+    return TextTable(title, tuple(new or old for old, new in columns.items()), cells)
 
 
 def trials_csv(data: StudyData) -> str:
@@ -262,12 +237,11 @@ def publish_study(study: optuna.Study, out: Path, url: str) -> None:
     important, remark = importances(data)
     grids = [*tables(data), *([important] if important else [])]
     out.mkdir(parents=True, exist_ok=True)
-    way = ["highest" if up else "lowest" for up in data.maximize]
-    objectives = ", ".join(f"{w} {metric}" for w, metric in zip(way, data.metrics, strict=True))
+    ways = (f"{'highest' if up else 'lowest'} {metric}" for metric, up in data.metrics.items())
     command = without_passwords(study.user_attrs.get(names.COMMAND, ""))
     remarks = [f"Importances: {remark}"] if remark else []
     text = [
-        *(f"# Study {study.study_name}", f"Kind: {data.kind}. Objectives: {objectives}."),
+        *(f"# Study {study.study_name}", f"Kind: {data.kind}. Objectives: {', '.join(ways)}."),
         *([f"Created by `{command}`."] if command else []),
         *(grid.to_markdown() for grid in grids),
         *remarks,

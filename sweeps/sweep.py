@@ -28,19 +28,13 @@ from sweeps.settings import SweepSettings, read_settings
 from sweeps.space import Space, as_overrides, build_pruner, build_sampler, key_of, signature
 from sweeps.study import publish_study, study_folder
 from sweeps.worker import point_list
+from sweeps.worker import storage as stores
 from sweeps.worker.driver import drive
 from sweeps.worker.planner import Planner, specify_run
 from sweeps.worker.point_list import PointList
 from sweeps.worker.progress import ProgressView, duration
 from sweeps.worker.run_store import RunStore, open_run_store
-from sweeps.worker.storage import (
-    TrialStore,
-    counted_trials,
-    known_studies,
-    open_storage,
-    open_study,
-    storage_url,
-)
+from sweeps.worker.storage import TrialStore, counted_trials, known_studies
 from sweeps.worker.trial_sources import SamplerSource
 
 PATHS = ("runs_dir", "dataset.root", "dataset.cache_dir", "tracking")
@@ -48,16 +42,9 @@ PATHS = ("runs_dir", "dataset.root", "dataset.cache_dir", "tracking")
 
 
 def sweep(arguments: Sequence[str], config: DictConfig, loader: ConfigLoader) -> None:
-    """Run the grid, list or search that the overrides of ``-m`` describe.
+    """Run the grid, list or search of ``-m``, whose overrides were typed and composed.
 
-    Args:
-        arguments: the task's overrides as typed.
-        config: composed from them, with Hydra's own node.
-        loader: of Hydra.
-
-    Raises:
-        InputError: invalid settings, space or points.
-        RunError: points failed; all others were run.
+    InputError: invalid settings, space or points. RunError: points failed; all others were run.
     """
     settings = read_settings(config.hydra.sweeper)
     runs = open_run_store(config)
@@ -92,8 +79,6 @@ def sweep(arguments: Sequence[str], config: DictConfig, loader: ConfigLoader) ->
             for each in grid
             for own in spaces.list_points(settings.points, each.overrides)
         ]
-    if len(grid) == 1:
-        info("no list of values was given (such as seed=0,1,2); the sweep has one point.")
     identity = signature([_plain(each.overrides) for each in grid])
     name = settings.study or _name(config.name, list(grid[0].params), identity)
     tags = {f"rgbt.study/{name}": "grid"}
@@ -154,10 +139,8 @@ def _grid(points: PointList, settings: SweepSettings) -> None:
 class Search:
     """A search to run.
 
-    Attributes:
-        study: name of the study.
-        fixed: overrides that all trials share.
-        identity: signature of what must not change in a study; the data set is added to it.
+    `fixed` are overrides that all trials share; `identity` is a signature of what must not change
+    in a study, to which the data set is added.
     """
 
     study: str
@@ -170,9 +153,8 @@ class Search:
 def search(request: Search, settings: SweepSettings) -> None:
     """Run trials until the budget is spent, then report the study.
 
-    Raises:
-        InputError: settings that do not fit, or a study of that name with another space.
-        RunError: no trial has finished.
+    InputError: settings that do not fit, or a study of that name with another space. RunError: no
+    trial has finished.
     """
     if settings.trials is None and settings.hours is None:
         raise InputError("a search needs hydra.sweeper.trials=40, hydra.sweeper.hours=8, or both.")
@@ -192,11 +174,11 @@ def search(request: Search, settings: SweepSettings) -> None:
         sys.stdout.write("\n".join([*lines, ""]))
         return
     dataset = probe(request, settings).dataset
-    storage = open_storage(settings.storage, runs_dir)
+    storage = stores.open_storage(settings.storage, runs_dir)
     request.runs.create_tables()
     attributes = {names.KIND: "search", names.SIGNATURE: signature(request.identity, dataset)}
     given = {"sampler": sampler, "pruner": pruner}
-    study = open_study(request.study, storage, settings.objectives, attributes, **given)
+    study = stores.open_study(request.study, storage, settings.objectives, attributes, **given)
     if names.COMMAND not in study.user_attrs:
         study.set_user_attr(names.COMMAND, command_line(sys.orig_argv))
     store = TrialStore(study, storage)
@@ -206,7 +188,7 @@ def search(request: Search, settings: SweepSettings) -> None:
         return sum(trial.state.is_finished() for trial in store.trials()), settings.trials
 
     view = ProgressView(request.study, settings.workers, progress)
-    source = SamplerSource(request.fixed, request.space, store, Planner(), settings, view.rejected)
+    source = SamplerSource(request.fixed, request.space, store, Planner(), settings, view.say)
     drive(view, source, request.runs, settings)
 
     trials = store.trials()
@@ -215,7 +197,7 @@ def search(request: Search, settings: SweepSettings) -> None:
         info(f"trial {trial.number} failed: {trial.user_attrs.get(names.REASON)}")
     if trials and not states["COMPLETE"] and not states["RUNNING"]:
         raise RunError(f"no trial of {request.study} has finished; see the reasons above.")
-    url = storage_url(settings.storage, runs_dir)
+    url = stores.storage_url(settings.storage, runs_dir)
     publish_study(study, study_folder(runs_dir, request.study), url)
 
 

@@ -16,8 +16,7 @@ from omegaconf import DictConfig
 class StudySweeper(Sweeper):
     """Runs a grid, a list or a search, each point in a separate process (`sweeps.sweep`).
 
-    Args:
-        settings: keys of ``conf/hydra/sweeper/study.yaml``; checked when the sweep begins.
+    `settings` are the keys of ``conf/hydra/sweeper/study.yaml``; checked when the sweep begins.
     """
 
     def __init__(self, **settings: Any) -> None:
@@ -28,18 +27,12 @@ class StudySweeper(Sweeper):
     ) -> None:
         """Store the configuration; the task function is not used, because points are commands."""
         del task_function
-        self.config = config
-        self.hydra_context = hydra_context
+        self.config, self.hydra_context = config, hydra_context
 
     def sweep(self, arguments: list[str]) -> None:
-        """Run every point of the overrides `arguments`.
-
-        Raises:
-            InputError: settings, space or a point that do not fit.
-            RunError: points failed; the others were run.
-        """
-        assert self.hydra_context is not None, "Hydra calls setup() before sweep()"
-        assert self.config is not None, "as above"
+        """Run every point of the overrides `arguments`; errors as of `sweeps.sweep.sweep`."""
         from sweeps.sweep import sweep
 
+        assert self.hydra_context is not None, "Hydra calls setup() before sweep()"
+        assert self.config is not None, "as above"
         sweep(arguments, self.config, self.hydra_context.config_loader)

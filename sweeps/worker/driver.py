@@ -42,7 +42,6 @@ class TrialSource(Protocol):
     """Gives a driver its trials."""
 
     store: TrialStore
-    rejected: int  # points whose configuration is wrong
 
     def next(self) -> ClaimedTrial | None:
         """The next trial, claimed for this driver; None when there is none at the moment."""
@@ -61,7 +60,6 @@ class Driver:
     settings: SweepSettings
     view: ProgressView
     running: dict[int, RunningTrial] = field(default_factory=dict)
-    failures: int = 0
     _began: float = field(default_factory=time.monotonic)
     _last_claim: float = -math.inf
     _last_heartbeat: float = field(default_factory=time.monotonic)
@@ -145,10 +143,8 @@ class Driver:
         return True
 
     def _is_over(self) -> bool:
-        """Whether the budget of this call is spent."""
-        most, hours = self.settings.max_failures, self.settings.hours
-        spent = time.monotonic() - self._began > 3600 * (hours or math.inf)
-        return spent or self.failures + self.source.rejected >= (most or math.inf)
+        """Whether the time of this call is spent."""
+        return time.monotonic() - self._began > 3600 * (self.settings.hours or math.inf)
 
     def _start(
         self, slot: int, tags: Mapping[str, str], command: Sequence[str], log: Path
@@ -176,7 +172,6 @@ class Driver:
             self.view.ended(trial, "pruned", str(reason))
         except TrialError as error:
             self.store.fail(trial.number, str(error), notes)
-            self.failures += 1
             self.view.ended(trial, "failed", str(error))
         else:
             values = [scores[name] for name in metrics]

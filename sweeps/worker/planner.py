@@ -15,7 +15,6 @@ from rgbt.runs.provenance import without_passwords
 from rgbt.runs.run_spec import RunSpec
 from rgbt.runs.specify import requested_run, specify
 from sweeps import attributes as names
-from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Point
 
 
@@ -23,10 +22,8 @@ from sweeps.point import Point
 class PlannedPoint:
     """A point with its runs: one, or one per seed.
 
-    Attributes:
-        key: identifies the point in a study: the key of its run; of several runs or with further
-            evaluations, a hash.
-        fingerprints: key of a run -> fingerprint of its data set.
+    `key` identifies it in a study: the key of its run, or a hash of several or of further
+    evaluations. `fingerprints`: key of a run -> fingerprint of its data set.
     """
 
     point: Point
@@ -68,12 +65,7 @@ class Planner:
         runs = tuple(self.specify((*self.base, *overrides)) for overrides in point.runs())
         key = runs[0].key
         if len(runs) > 1 or point.evaluations:
-            defaults = vars(ExtraEvaluation())
-            changed = [
-                {name: value for name, value in vars(each).items() if value != defaults[name]}
-                for each in point.evaluations
-            ]
-            parts = [[run.key for run in runs], changed]
+            parts = [[run.key for run in runs], [vars(each) for each in point.evaluations]]
             key = hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:12]
         label = with_pixels(point.label, runs[0].scale.pixel_factor)
         fingerprints = {run.key: self.fingerprint(run) for run in runs}

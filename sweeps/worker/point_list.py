@@ -15,20 +15,16 @@ from rgbt.terminal import info
 from sweeps import attributes as names
 from sweeps.point import UNFINISHED, Outcome, Point, State, varied_keys
 from sweeps.settings import SweepSettings
+from sweeps.worker import storage as stores
 from sweeps.worker.driver import drive
 from sweeps.worker.planner import PlannedPoint, Planner
 from sweeps.worker.progress import ProgressView, bars
 from sweeps.worker.run_store import RunStore
 from sweeps.worker.running_trial import ClaimedTrial
-from sweeps.worker.storage import (
-    TrialStore,
-    known_studies,
-    open_storage,
-    open_study,
-    trials_by_key,
-)
+from sweeps.worker.storage import TrialStore, known_studies, trials_by_key
 
 if TYPE_CHECKING:
+    import optuna
     from optuna.trial import FrozenTrial
 
 
@@ -62,7 +58,6 @@ class ListSource:
     With `strict`, one wrong point is refused, and not only a list of wrong points.
     """
 
-    rejected = 0
     store: TrialStore
 
     def __init__(
@@ -153,29 +148,23 @@ class ListSource:
         by_key = trials_by_key(self.store.study)
         return [self._status(plan, by_key).state for plan in self._different()]
 
-    def outcomes(self) -> list[Outcome]:
-        """One outcome per point, in order, by the study."""
-        by_key = trials_by_key(self.store.study)
-        return self._each(lambda plan: self._status(plan, by_key))
-
-    def preview(self, trials: Mapping[str, list[FrozenTrial]]) -> list[Outcome]:
-        """One outcome per point, in order, by the trials of a study and by all finished runs."""
-
-        def status(plan: PlannedPoint) -> Outcome:
-            results = finished_runs(plan, self._list.runs)
-            known = self._status(plan, trials)
-            state: State = "finished" if is_evaluated(plan, results) else known.state
-            return replace(known, state=state, results=results)
-
-        return self._each(status)
-
-    def _each(self, status: Callable[[PlannedPoint], Outcome]) -> list[Outcome]:
-        return [
-            Outcome(point, "failed", self.errors[index])
-            if index in self.errors
-            else status(self._plans[index])
-            for index, point in enumerate(self._points)
-        ]
+    def outcomes(
+        self, study: optuna.Study | None = None, *, preview: bool = False
+    ) -> list[Outcome]:
+        """One outcome per point, in order, by the study; of a preview by all finished runs too."""
+        by_key = trials_by_key(study if preview else self.store.study)
+        found = []
+        for index, point in enumerate(self._points):
+            if index in self.errors:
+                found.append(Outcome(point, "failed", self.errors[index]))
+                continue
+            outcome = self._status(plan := self._plans[index], by_key)
+            if preview:
+                results = finished_runs(plan, self._list.runs)
+                state = "finished" if is_evaluated(plan, results) else outcome.state
+                outcome = replace(outcome, state=state, results=results)
+            found.append(outcome)
+        return found
 
     def _different(self) -> Iterator[PlannedPoint]:
         plans = (self._plans[indices[0]] for indices in self._same.values())
@@ -235,7 +224,7 @@ def preview_points(
     """The present state of the points; nothing is run and nothing written."""
     source = ListSource(points, settings, planner)
     study = known_studies(settings.storage, points.runs.runs_dir).get(points.study)
-    return source.preview(trials_by_key(study))
+    return source.outcomes(study, preview=True)
 
 
 def run_points(
@@ -252,8 +241,8 @@ def run_points(
             configuration, or with `strict` one of them.
     """
     source = ListSource(points, settings, planner, strict=strict)
-    storage = open_storage(settings.storage, points.runs.runs_dir)
-    study = open_study(points.study, storage, settings.objectives, {names.KIND: points.kind})
+    storage = stores.open_storage(settings.storage, points.runs.runs_dir)
+    study = stores.open_study(points.study, storage, settings.objectives, {names.KIND: points.kind})
     source.store = TrialStore(study, storage)
 
     def progress() -> tuple[int, int]:

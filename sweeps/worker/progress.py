@@ -66,22 +66,22 @@ class ProgressView:
 
     def began(self, trial: RunningTrial) -> None:
         """Show that a trial begins."""
-        if self._bars.disable:
-            self._say(f"started  {trial.plan.point.label}")
+        self.say("started", trial.plan.point.label)
 
     def ended(self, trial: RunningTrial, how: str, reason: str) -> None:
         """Show that a trial ended: "finished", "failed" or "pruned", and why."""
-        self._ended[how] += 1
-        because = f": {reason}" if reason else ""
+        text = f"{trial.plan.point.label}  {trial.seconds:.0f} s{_score(trial)}"
         log = f"; see {trial.log}" if how == "failed" and trial.log else ""
-        if how != "finished" or self._bars.disable:
-            text = f"{how:<8} {trial.plan.point.label}  {trial.seconds:.0f} s{_score(trial)}"
-            self._say(text + because + log)
+        self.say(how, f"{text}: {reason}{log}" if reason else text)
 
-    def rejected(self, label: str, reason: str) -> None:
-        """Show that the configuration of a point is wrong."""
-        self._ended["failed"] += 1
-        self._say(f"failed   {label}: {reason}")
+    def say(self, how: str, text: str) -> None:
+        """Print a line; in a terminal, of what is not as it should be alone."""
+        self._ended[how] += 1
+        is_log = self._bars.disable
+        if is_log or how not in ("started", "finished"):
+            clock = f"{time.strftime('%H:%M:%S')} " if is_log else ""
+            line = f"{clock}{how:<8} {without_controls(text)}"
+            self._bars.console.print(line, markup=False, highlight=False, soft_wrap=True)
 
     def update(self, trials: Sequence[RunningTrial]) -> None:
         """Draw the running trials."""
@@ -91,7 +91,7 @@ class ProgressView:
             self._counted_at = time.monotonic()
             self._done, total = self._count()
             self._bars.update(self._all, total=total)
-        ended = (f", {n} {how}" for how, n in self._ended.items() if how != "finished")
+        ended = (f", {self._ended[how]} {how}" for how in ("failed", "pruned") if self._ended[how])
         done = self._done + sum(trial.done_share for trial in trials)
         self._bars.update(self._all, completed=done, description="".join([self._title, *ended]))
         for number in set(self._tasks) - {trial.number for trial in trials}:
@@ -102,11 +102,6 @@ class ProgressView:
             label = without_controls(trial.plan.point.label)
             text, task = f"  {label}  {trial.status}{_score(trial)}", self._tasks[trial.number]
             self._bars.update(task, completed=100 * trial.done_share, description=text)
-
-    def _say(self, text: str) -> None:
-        clock = f"{time.strftime('%H:%M:%S')} " if self._bars.disable else ""
-        line = clock + without_controls(text)
-        self._bars.console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
 def _score(trial: RunningTrial) -> str:

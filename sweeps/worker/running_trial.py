@@ -170,11 +170,6 @@ class RunningTrial:
     def _evaluate(
         self, run: RunSpec, result: RunResult, evaluation: ExtraEvaluation
     ) -> Iterator[None]:
-        if result.run_id:
-            raise TrialError(
-                f"run {result.key} was trained on another machine, and only there can it be "
-                f"evaluated further ({evaluation.label})"
-            )
         self.status = f"evaluating {evaluation.label}"
         module, *arguments = evaluation.command
         # Each protocol of consistency has a fixed file inside the run folder.

@@ -30,7 +30,7 @@ class SamplerSource:
 
     Attributes:
         fixed: overrides that all trials share.
-        on_reject: called with (label, reason) for a point whose configuration is wrong.
+        say: called with ("failed", label and reason) for a point whose configuration is wrong.
     """
 
     fixed: Sequence[str]
@@ -38,8 +38,7 @@ class SamplerSource:
     store: TrialStore
     planner: Planner
     settings: SweepSettings
-    on_reject: Callable[[str, str], None]
-    rejected: int = 0
+    say: Callable[[str, str], None]
 
     def next(self) -> ClaimedTrial | None:
         """See `TrialSource.next`."""
@@ -62,8 +61,7 @@ class SamplerSource:
             plan = self.planner.plan(point)
         except InputError as error:
             self.store.fail(number, str(error), {names.LABEL: point.label})
-            self.rejected += 1
-            self.on_reject(point.label, str(error))
+            self.say("failed", f"{point.label}: {error}")
             return None
         self.store.update_unfinished(number, plan.attributes)
         return ClaimedTrial(plan, number, self._pruning_callback(trial))

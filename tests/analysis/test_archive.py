@@ -71,7 +71,15 @@ def test_unpacked_run_has_equal_counts(run: RunResult, tmp_path: Path) -> None:
 
 def test_same_results_are_one_file_and_others_are_kept(run: RunResult, tmp_path: Path) -> None:
     archive = tmp_path / "results"
+    own = run.folder / "counts_test.npz"
     assert add(run, archive) == add(run, archive)
+    first = own.read_bytes()
+    for name in ("counts_a.npz", "counts_b.npz"):  # further counts, of two machines
+        (run.folder / name).write_bytes(first)
+        assert add(run, archive) == archive / f"{run.key}.zip"
+        (run.folder / name).unlink()
+    whole = unpack(archive / f"{run.key}.zip", tmp_path / "unpacked").folder
+    assert {"counts_a.npz", "counts_b.npz"} <= {path.name for path in whole.iterdir()}
     some(2, run=run.key).save(run.folder / "counts_test.npz")
     other = add(run, archive)
     assert key_of(other) == run.key

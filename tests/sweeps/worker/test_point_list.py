@@ -102,7 +102,7 @@ def test_untrusted_class_is_refused_before_training(
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(tmp_path))
         source = ListSource(wanted, settings(trust=trust), OwnLoss())  # type: ignore[arg-type]
-    states = {each.point.label: each for each in source.preview({})}
+    states = {each.point.label: each for each in source.outcomes(preview=True)}
     assert states["a"].state == "waiting", "nothing opens its run"
     assert ("my_lab.Loss" in states["b"].reason) == is_refused
 
@@ -114,7 +114,7 @@ def test_equal_points_are_one_run_and_share_their_tags(tmp_path: Path) -> None:
 
     rows = tuple(Point(label, (f"x={label}",), tags={"table": label}) for label in ("1", "1.0"))
     source = ListSource(replace(a_list(tmp_path), points=rows), settings(), SameRun())  # type: ignore[arg-type]
-    found = source.preview({})
+    found = source.outcomes(preview=True)
     tags = {"table": "1 | 1.0", VARIED: "x"}
     assert [each.point.tags for each in found] == [tags, tags]
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -11,12 +10,11 @@ from unittest.mock import Mock
 import pytest
 
 from rgbt.checks import RunError
-from rgbt.runs.folder import RunFolder, read_result
+from rgbt.runs.folder import RunFolder
 from rgbt.runs.result import RunResult
 from rgbt.tracking.mlflow_store import MlflowTracking, NoTracking
-from sweeps.evaluation import ExtraEvaluation
-from sweeps.worker.run_store import FETCHED, RunStore
-from tests.sweeps.fakes import DATASET, counts, finish
+from sweeps.worker.run_store import RunStore
+from tests.sweeps.fakes import DATASET, finish
 
 
 @pytest.fixture
@@ -34,7 +32,6 @@ def test_find_returns_finished_runs_only(runs: RunStore) -> None:
     assert runs.find("b", DATASET) is None
     assert runs.find("c", DATASET) is None
     assert not (runs.runs_dir / "c").exists()
-    assert not (runs.runs_dir / FETCHED).exists()
 
 
 def test_find_run_on_other_data_raises(runs: RunStore) -> None:
@@ -67,7 +64,6 @@ def test_run_store_unreachable_mlflow_warns_once(
     runs = RunStore(tmp_path, MlflowTracking("http://127.0.0.1:9", **place))
     runs.create_tables()
     finish(tmp_path / "a")
-    assert runs.find("b", DATASET) is None
     found = runs.find("a", DATASET)
     assert found is not None
     runs.tag(found, {"rgbt.table/one": "row"})
@@ -76,61 +72,3 @@ def test_run_store_unreachable_mlflow_warns_once(
     (told,) = capsys.readouterr().err.splitlines()
     assert "no route to" in told
     away.assert_called_once()
-
-
-class Machines:
-    """Folders of runs that share one MLflow store."""
-
-    def __init__(self, root: Path) -> None:
-        self.root = root
-        self.uri = f"sqlite:///{root / 'mlflow.db'}"
-
-    def runs(self, name: str) -> RunStore:
-        folder = self.root / name
-        folder.mkdir(exist_ok=True)
-        place = (self.root / "artifacts").as_uri()
-        tracking = MlflowTracking(
-            self.uri, artifact_uri=place, experiment="rgbt", runs_dir=str(folder)
-        )
-        return RunStore(folder, tracking)
-
-    def send(self, key: str) -> RunFolder:
-        """A run finished at the first machine, and sent."""
-        there = self.runs("there")
-        run = finish(there.runs_dir / key, tags={"rgbt.table/one": "row"})
-        run.add_provenance({"git_commit": "0123456789abcdef"})
-        there.sync(RunResult(run.path))
-        return run
-
-
-@pytest.mark.slow
-def test_find_fetches_remote_run_and_later_evaluations(tmp_path: Path) -> None:
-    machines = Machines(tmp_path)
-    made = machines.send("a")
-    here, there = machines.runs("here"), machines.runs("there")
-    found = here.find("a", DATASET)
-    assert found is not None
-    assert found.folder == here.runs_dir / FETCHED / "a"
-    assert found.run_id
-    assert found.result == read_result(made.path)
-    assert found.counts().counts.tolist() == counts().counts.tolist()
-    assert found.commit == "0123456789"
-    assert not (here.runs_dir / "a").exists(), "a run folder is for runs made here"
-    assert here.find("a", "another data set") is None
-    assert machines.runs("third").find("a", "another data set") is None
-
-    ring = ExtraEvaluation("thermal", "ring9")
-    (made.path / ring.path).parent.mkdir()
-    counts(right=7).save(made.path / ring.path)
-    there.sync(RunResult(made.path))
-    assert here.find("a", DATASET) == found, "what was fetched is kept"
-    assert not ring.is_stored(found)
-    assert here.find("a", DATASET, (ring,)) == found
-    assert found.counts(ring.path).counts.tolist() == counts(right=7).counts.tolist()
-
-    shutil.rmtree(found.folder)
-    found.folder.mkdir()
-    (found.folder / "result.json").write_text("{}")  # a copy that was interrupted
-    again = here.find("a", DATASET)
-    assert again is not None
-    assert again.result == read_result(made.path)

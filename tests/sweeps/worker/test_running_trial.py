@@ -265,17 +265,6 @@ def test_running_trial_failed_evaluation_fails_trial(tmp_path: Path) -> None:
             Bench(tmp_path, plan, behaviour).run()
 
 
-def test_running_trial_remote_run_cannot_be_evaluated(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    finish(tmp_path / "copy")
-    bench = Bench(tmp_path, evaluated(evaluations=(RING,)))
-    monkeypatch.setattr(bench.runs, "find", lambda *_, **__: RunResult(tmp_path / "copy", "7"))
-    with pytest.raises(TrialError, match="trained on another machine.*thermal_ring9"):
-        bench.run()
-    assert bench.executor.calls == []
-
-
 def test_running_trial_unsent_report_is_retried(tmp_path: Path) -> None:
     told: list[int] = []
 

@@ -9,18 +9,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import optuna
 import pytest
 from mlflow import MlflowClient
 
-from rgbt.runs.folder import read_result
-from rgbt.tracking.mlflow_store import MlflowTracking
 from sweeps.attributes import LABEL, RUNS
-from sweeps.worker.run_store import RunStore
 from sweeps.worker.storage import counted_trials, open_storage
 from tests.commands import SMALL, short
-from tests.sweeps.fakes import counts, finish, until
+from tests.sweeps.fakes import until
 from tests.sweeps.servers import mlflow_server, new_database, postgres
 from tests.sweeps.worker.test_lost_drivers import survive
 
@@ -61,26 +57,6 @@ def test_one_of_two_drivers_killed_on_postgresql(
 ) -> None:
     """Both open a fresh database at once."""
     survive(tmp_path, kind, new_database(database, f"{kind}{series}"), random.Random(series))
-
-
-def test_run_of_one_machine_is_found_on_another(servers: Servers, tmp_path: Path) -> None:
-    here, there = tmp_path / "here", tmp_path / "there"
-
-    def tracking(runs_dir: Path) -> MlflowTracking:
-        return MlflowTracking(
-            servers.mlflow, artifact_uri=None, experiment="rgbt", runs_dir=str(runs_dir)
-        )
-
-    folder = finish(here / "0123456789ab", dataset="feed")
-    tracking(here).sync(folder, "FINISHED")
-    assert list(servers.artifacts.rglob("counts_test.npz")), "files go through the server"
-
-    runs = RunStore(there, tracking(there))
-    assert runs.find("0123456789ab", "other data") is None
-    found = runs.find("0123456789ab", "feed")
-    assert found is not None
-    assert found.result == read_result(folder.path)
-    np.testing.assert_array_equal(found.counts().counts, counts().counts)
 
 
 def search_command(servers: Servers, data: Path, runs: Path) -> list[str]:

@@ -1,0 +1,145 @@
+"""Several tables at once: the order of their runs, the time, the archive."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from analysis.archive import archived
+from rgbt.tracking.mlflow_store import NoTracking
+from sweeps import queue as queues
+from sweeps.point import Point
+from sweeps.reproduce import Options, settings_of
+from sweeps.worker import driver as drivers
+from sweeps.worker.planner import PlannedPoint
+from sweeps.worker.run_store import RunStore
+from tests.sweeps.fakes import (
+    Behaviour,
+    Call,
+    FakeExecutor,
+    FakePlanner,
+    Process,
+    fail,
+    only,
+    quick,
+    succeed,
+)
+
+__all__ = ["quick"]
+pytestmark = pytest.mark.usefixtures("quick")
+
+HEAD = "paper: my\nnumber: {0}\ncaption: rows\ndata: none\n"
+COLUMNS = "columns: [{name: acc, metric: pixel_accuracy}]\nrows:\n"
+ROW = "  - {{label: {0}, experiment: {1}, values: {{acc: 1}}}}\n"
+CLAIM = (
+    "  - {{name: {0}_{1}, says: more, source: text, rows: [{0}], against: [{1}], "
+    "columns: [acc], expected: higher}}\n"
+)
+
+
+def write_table(name: str, rows: Sequence[str], claims: Sequence[tuple[str, str]]) -> None:
+    """A table whose rows are named by their experiments."""
+    text = HEAD.format(name) + COLUMNS + "".join(ROW.format(row, row) for row in rows)
+    text += "claims:\n" + "".join(CLAIM.format(*claim) for claim in claims) if claims else ""
+    Path("tables/my").mkdir(parents=True, exist_ok=True)
+    Path(f"tables/my/{name}.yaml").write_text(text)
+
+
+class QuickPlanner(FakePlanner):
+    """Networks are named by the experiment; "grbm" does not fit."""
+
+    base = ()
+
+    def plan(self, point: Point) -> PlannedPoint:
+        if "+experiment=grbm" in point.overrides:
+            point = replace(point, overrides=(*point.overrides, "wrong"))
+        return super().plan(point)
+
+    def specify(self, words: Sequence[str]) -> Any:
+        return SimpleNamespace(key=words[0], model=SimpleNamespace(target=words[0]))
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(queues, "study_names", list)
+    write_table("one", ("crm", "baseline"), [("crm", "baseline")])
+    write_table("two", ("cmx", "rtfnet", "mfnet"), [("cmx", "rtfnet"), ("cmx", "mfnet")])
+    write_table("wrong", ("grbm",), [])
+    return tmp_path
+
+
+def run(
+    place: Path,
+    behaviour: Behaviour = succeed,
+    table: str = "my/one,my/two,my/wrong",
+    **options: Any,
+) -> tuple[int, list[str]]:
+    """Exit code, and the experiments that were run, in their order."""
+    chosen = Options(table=table, runs_dir=place / "runs", **options)
+    executor = FakeExecutor(place / "runs", behaviour)
+    runs, planner = RunStore(place / "runs", NoTracking()), QuickPlanner()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(drivers, "LocalExecutor", lambda workers: executor)
+        code = queues.run_queue(chosen, [], settings_of(chosen), runs, planner)  # type: ignore[arg-type]
+    return code, [words[0].removeprefix("+experiment=") for words in executor.started()]
+
+
+def test_runs_that_decide_most_claims_a_minute_come_first(
+    place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # cmx is needed by two claims of two runs each; with it, the other claims lack one run each.
+    assert run(place) == (0, ["cmx", "rtfnet", "mfnet", "crm", "baseline"])
+    said = capsys.readouterr().err
+    assert "my/wrong is left out: wrong=1 is no key." in said
+    assert "5 of 5 runs are finished, 0 failed; 0 of 3 claims are decided" in said
+
+
+def test_measured_seconds_of_a_network_count(place: Path) -> None:
+    """Of seed 0 each run takes 2.5 s; what has not been measured is estimated at four minutes."""
+    write_table("more", ("cmx", "crmx"), [("cmx", "crmx")])
+    run(place, table="my/one,my/one")
+    code, order = run(place, table="my/two,my/one", seeds="2")
+    assert (code, order[:2]) == (0, ["crm", "baseline"])
+
+
+def test_no_run_starts_after_the_time(place: Path) -> None:
+    def slow(call: Call) -> Process:
+        time.sleep(0.4)
+        return (yield from succeed(call))
+
+    assert run(place, slow, minutes=0.6 / 60) == (0, ["cmx", "rtfnet"])
+
+
+def test_finished_runs_are_archived_and_count_on_another_machine(place: Path) -> None:
+    assert run(place, table="my/two,my/wrong")[0] == 0
+    assert len(archived(place / "results")) == 3
+    there = place / "there"
+    there.mkdir()
+    assert run(there, archive=place / "results") == (0, ["crm", "baseline"])
+    assert len(archived(place / "results")) == 5
+
+
+def test_a_failed_run_does_not_end_the_queue(place: Path) -> None:
+    first = "+experiment=cmx"
+    code, order = run(place, only(first, fail))
+    assert (code, sorted(order)) == (1, ["baseline", "cmx", "crm", "mfnet", "rtfnet"])
+    assert len(archived(place / "results")) == 4
+    assert run(place, fail) == (1, []), "it is not repeated"
+
+
+def test_dry_run_prints_the_order_with_minutes(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(place, dry_run=True) == (0, [])
+    lines = [line.split() for line in capsys.readouterr().out.splitlines() if "seed=0" in line]
+    assert [line[0] for line in lines] == ["cmx", "crm", "baseline", "rtfnet", "mfnet"]
+    assert lines[0][2:] == ["my/two", "1.00", "4.0", "4"]
+    assert lines[-1][2:] == ["my/two", "0.50", "4.0", "20"]
+    assert not (place / "runs").exists()
