@@ -25,7 +25,7 @@ from tests.sweeps.fakes import counts, finish, until
 from tests.sweeps.servers import mlflow_server, new_database, postgres
 from tests.sweeps.worker.test_lost_drivers import survive
 
-pytestmark = pytest.mark.servers
+pytestmark = pytest.mark.slow
 
 
 @dataclass(frozen=True)
