@@ -46,8 +46,6 @@ from tests.data.layouts import (
     write_folder,
     write_freiburg,
     write_kp,
-    write_mvseg,
-    write_pst900,
 )
 
 NO_PATCH = "masker.patch_size=null"
@@ -56,13 +54,13 @@ OF_SYNTH = (
     *("dataset.height=48", "dataset.width=64", *SMALL),
 )
 ON_DATA = {
-    **{name: (NO_PATCH,) for name in ("baseline", "cmx", "cmnext", "mfnet", "rtfnet")},
-    **{name: (NO_PATCH,) for name in ("dinov2", "dinov3", "temporal_con_released")},
+    **{name: (NO_PATCH,) for name in ("baseline", "mfnet")},
+    **{name: (NO_PATCH,) for name in ("dinov2", "temporal_con_released")},
     **{"grbm": (), "spatialseg_released": ()},
     "crm_pst900": ("dataset=synth_pst900", *OF_SYNTH),
     "spatialseg_kp": ("dataset=synth_kp", *OF_SYNTH),
 }
-"""One experiment for each network, scheme and loss; `tests/test_behaviour.py` has all."""
+"""One experiment for each scheme and kind of network; `tests/test_behaviour.py` has all."""
 
 
 @pytest.mark.parametrize("experiment", ON_DATA)
@@ -88,7 +86,7 @@ OWN = (
 )
 FREIBURG = ("dataset.crop=null", "dataset.val_sequences=[seq_04_day]")
 FILES: dict[str, tuple[Callable[[Path], Path], tuple[str, ...]]] = {
-    **{"pst900": (write_pst900, ()), "kp": (write_kp, ()), "mvseg": (write_mvseg, ())},
+    "kp": (write_kp, ()),
     **{"freiburg": (write_freiburg, FREIBURG), "folder": (write_folder, OWN)},
 }
 
@@ -133,18 +131,14 @@ def test_seeds_decide_losses_and_key(trained: Trained) -> None:
         assert steps != first[1], others
 
 
-KILLED = (
-    ("+experiment=temporal_con", NO_PATCH),
-    ("+experiment=sh_adversarial", "model.weights=null", *DAYS_AND_NIGHTS),
-    ("+experiment=heatnet", *DAYS_AND_NIGHTS),
-)
+KILLED = ("+experiment=sh_adversarial", "model.weights=null", *DAYS_AND_NIGHTS)
 
 
 @pytest.mark.parametrize(
     "words",
     [
         ("+experiment=grbm", "trainer.averaging=ema"),
-        *(pytest.param(each, marks=pytest.mark.slow) for each in KILLED),
+        pytest.param(KILLED, marks=pytest.mark.slow),
     ],
 )
 def test_killed_run_resumed_equals_uninterrupted(

@@ -13,7 +13,12 @@ from rgbt.runs.specify import specify
 from tests.commands import Call
 
 EXPERIMENTS = sorted(path.stem for path in Path("conf/experiment").glob("*.yaml"))
-ARMS = [name for name in EXPERIMENTS if not name.startswith("start_")]
+SOME = ("baseline", "cmnext", "crm_kp", "dinov3", "mfnet", "sh_max_squares", "thermal_teacher")
+ARMS = [
+    pytest.param(name, marks=() if name in SOME else pytest.mark.slow)
+    for name in EXPERIMENTS
+    if not name.startswith("start_")
+]
 
 
 def spec_of(experiment: str, *overrides: str, scale: str = "bench") -> RunSpec:

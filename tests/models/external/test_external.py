@@ -49,33 +49,6 @@ def test_namespaces_have_attributes_and_keys(tmp_path: Path) -> None:
         external(folder, arguments={}, namespaces={"cfg": cfg})
 
 
-@pytest.mark.parametrize(
-    ("changes", "key"),
-    [
-        ({"constructor": "model.nets:Net"}, r"constructor=model.nets:Net: ModuleNotFoundError"),
-        ({"constructor": "model.net:Nett"}, "constructor=model.net:Nett: AttributeError"),
-        ({"constructor": "os:system"}, "constructor=os:system: os is not a module of"),
-        ({"constructor": "none.py:network"}, "constructor=none.py:network: FileNotFoundError"),
-        (
-            {"constructor": "model.net:build", "arguments": {}},
-            "constructor=model.net:build returned int 3",
-        ),
-        ({"arguments": {"classes": 3}}, "constructor=.*unexpected keyword argument 'classes'"),
-        ({"constructor": "model.stops:Net"}, "constructor=model.stops:Net: SystemExit: 2"),
-        ({"root": "nowhere"}, "checkout: no such folder: .*nowhere"),
-        ({"root": "../evil"}, "root=../evil leads out of model.checkout="),
-        ({"root": "link"}, "root=link leads out of model.checkout="),
-    ],
-)
-def test_mistake_names_its_setting(tmp_path: Path, changes: dict[str, object], key: str) -> None:
-    files = {"model/net.py": f"{STACKED}\ndef build():\n    return 3\n"}
-    folder = write_checkout(tmp_path / "code", {**files, "model/stops.py": "raise SystemExit(2)"})
-    evil = write_checkout(tmp_path / "evil", {"model/net.py": "raise KeyboardInterrupt"})
-    (folder / "link").symlink_to(evil)
-    with pytest.raises(InputError, match=rf"^model\.{key}"):
-        external(folder, **changes)
-
-
 def test_second_checkout_of_a_process_is_refused(tmp_path: Path) -> None:
     first = external(write_checkout(tmp_path / "a", {"model/net.py": STACKED}))
     again = external(tmp_path / "a")

@@ -50,7 +50,7 @@ TABLE3 = {"CRM baseline": (50.0, 51.0, 49.0), "Ny/4": (60.0, 61.0, 59.0)}
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def place(tmp_path_factory: pytest.TempPathFactory, composed_once: None) -> Path:
     """A folder with a table of the user, and with runs of it and of a paper's table."""
     folder = tmp_path_factory.mktemp("report")
     (folder / "tables" / "my").mkdir(parents=True)
