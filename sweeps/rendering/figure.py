@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from sweeps.table.cells import ScoredTable, headline_columns, published
+from sweeps.table.cells import ScoredTable, published
 from sweeps.table.efficiency import SCALE
 from sweeps.table.table import Column, Row
 
@@ -63,7 +63,7 @@ def figure_of(scored: ScoredTable) -> Figure | None:
     columns = [each for each in scored.table.columns if any(_values(scored, rows, each))]
     if not columns:
         return None
-    shown = headline_columns(columns)[:MAX_HEADLINES]
+    shown = [each for each in scored.table.headlines() if each in columns][:MAX_HEADLINES]
     shown = shown or columns[:MAX_PANELS]
     with_x = [row for row in rows if row.x is not None]
     return _over_factor(scored, shown) if len(with_x) > 1 else _by_row(scored, shown)

@@ -12,22 +12,19 @@ from pydantic import model_validator
 
 from rgbt.checks import InputError, check_choice
 from rgbt.config.compose import available, chosen_scale
-from rgbt.config.values import check_value
+from rgbt.metrics import names
 from rgbt.metrics.named import OF_PAIRS, parse
 from rgbt.metrics.pairs import Protocol
-from rgbt.ranges import Size
 from sweeps.evaluation import BatchNorm, Head
 from sweeps.table.claim import OTHERS, PREVIOUS, Claim, Strict
 from sweeps.table.design import Design
 
 Form = Literal["paper", "released"]  # what a row is run as
 
-Efficiency = Literal["parameters", "gflops", "peak_memory", "latency", "images_per_second"]
-"""Millions of parameters, GFLOPs, MiB, milliseconds for one image, images per second."""
+RELEASED = ", released"
+"""Ending of the label of a row in its released form, beside the row of the paper's form."""
 
-COUNTED: tuple[Efficiency, ...] = ("parameters", "gflops")  # the same on every machine
-MEASURED: tuple[Efficiency, ...] = ("peak_memory", "latency", "images_per_second")
-"""Of one device, shown with the ratio to the first row."""
+HEADLINES = (names.MIOU, names.VAR, names.TC, names.CA, names.CA_RELEASED)  # of a table
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,8 +38,8 @@ class Column(Strict):
             ``{key}`` is replaced by that entry of the row's settings.
         minus: (a, b): column a minus column b.
         mean: of two or more other columns of the row, e.g. of day and night.
-        efficiency: of the row's network at scale=paper (`sweeps.table.efficiency`), without any
-            run; on images of the size `settings.image_hw` of the row, or 480 x 640.
+        efficiency: of the row's network, without any run: millions of "parameters" at scale=paper
+            (`sweeps.table.efficiency`), or the "speed" that the paper prints, which is shown alone.
         modality: what is predicted from; "default": what the network is made for.
         frames: of a consistency metric: its protocol, see `rgbt.metrics.pairs`.
         head: of a network with a head per domain, the one that predicts.
@@ -58,7 +55,7 @@ class Column(Strict):
     metric: str | None = None
     minus: tuple[str, str] | None = None
     mean: Annotated[tuple[str, ...], MinLen(2)] | None = None
-    efficiency: Efficiency | None = None
+    efficiency: Literal["parameters", "speed"] | None = None
     modality: Literal["default", "rgbt", "rgb", "thermal"] = "default"
     frames: Protocol | None = None
     head: Head = "as trained"
@@ -163,8 +160,6 @@ class Row(Strict):
         for experiment in (self.experiment, released):
             if experiment is not None:
                 check_choice("experiment", experiment, available("experiment"))
-        if size := self.settings.get("image_hw"):
-            check_value("settings.image_hw", size, Size)
         return self
 
 
@@ -211,9 +206,9 @@ class Table(Strict):
     @model_validator(mode="after")
     def _check_names(self) -> Table:
         for each in (self.columns, self.rows, self.claims):
-            names = [getattr(part, "label", None) or getattr(part, "name", "") for part in each]
-            if len(set(names)) < len(names):
-                raise ValueError(f"'{max(names, key=names.count)}' is used twice.")
+            used = [getattr(part, "label", None) or getattr(part, "name", "") for part in each]
+            if len(set(used)) < len(used):
+                raise ValueError(f"'{max(used, key=used.count)}' is used twice.")
         released = (row.released.at for row in self.rows if row.released)
         for at in (self.at, *(row.at for row in self.rows), *released):
             for scale in at or ():
@@ -235,7 +230,7 @@ class Table(Strict):
 
     @model_validator(mode="after")
     def _check_rows(self) -> Table:
-        names = [each.name for each in self.columns]
+        columns = [each.name for each in self.columns]
         printed = [each.name for each in self.columns if each.printed]
         labels = [each.label for each in self.rows]
         for index, row in enumerate(self.rows):
@@ -243,7 +238,7 @@ class Table(Strict):
             if row.same_as is not None:
                 check_choice(f"{where}, same_as (an earlier row)", row.same_as, labels[:index])
             for name in row.without:
-                check_choice(f"{where}, without", name, names)
+                check_choice(f"{where}, without", name, columns)
             for name in (*row.values, *row.doubtful):
                 check_choice(f"{where}, printed column", name, printed)
             is_log = self.factor is not None and self.factor.axis == "log"
@@ -275,8 +270,8 @@ class Table(Strict):
             for label in (*claim.rows, *named):
                 check_choice(f"claim '{claim.name}', rows", label, labels)
             for name in (*claim.columns, *([claim.minus_column] if claim.minus_column else [])):
-                names = [each.name for each in self.columns]
-                check_choice(f"claim '{claim.name}', columns", name, names)
+                columns = [each.name for each in self.columns]
+                check_choice(f"claim '{claim.name}', columns", name, columns)
             if not claim.columns or not any(True for _ in claim.pairs(labels)):
                 raise ValueError(f"claim '{claim.name}': there is nothing to compare.")
         return self
@@ -304,3 +299,51 @@ class Table(Strict):
         experiment = chosen.experiment or row.experiment
         shared, own = (each.get(chosen_scale(scale, each), ()) for each in (self.at, at))
         return (f"+experiment={experiment}", *shared, *overrides, *own)
+
+    def headlines(self) -> list[Column]:
+        """Columns of `HEADLINES`, over all images or those of the day or the night."""
+        shown = {f"{part}{each}" for part in ("", "day/", "night/") for each in HEADLINES}
+        return [each for each in self.columns if each.metric in shown]
+
+    def both_forms(self) -> Table:
+        """With a row below each one that the release makes in another way, and claims about both.
+
+        The claims are that the released form scores higher; those of the paper are left out, as
+        they are about the rows of one form.
+
+        Raises:
+            InputError: no row has a released form of its own.
+        """
+        rows: list[Row] = []
+        claims: list[Claim] = []
+        scores = [each for each in self.columns if each.metric is not None]
+        for row in self.rows:
+            rows.append(row)
+            if row.released is None:
+                continue
+            label = f"{row.label}{RELEASED}"
+            own = {key: each for key, each in vars(row.released).items() if each is not None}
+            rows.append(
+                replace(
+                    row, **own, label=label, released=None, same_as=row.label, x=None, doubtful=()
+                )
+            )
+            claims += [
+                Claim(
+                    name=f"{label}, {column.name}",
+                    says=f"{row.label}: the released form has a higher {column.name}.",
+                    source="form=both",
+                    rows=(label,),
+                    against=(row.label,),
+                    columns=(column.name,),
+                    expected="higher",
+                )
+                for column in self.headlines() or scores
+                if column in self.columns_of(row)
+            ]
+        if not claims:
+            raise InputError(
+                f"form=both: no row of {self.paper}, {self.number} has a released form of its own; "
+                "use form=paper."
+            )
+        return replace(self, rows=tuple(rows), claims=tuple(claims))

@@ -421,7 +421,7 @@ def test_network_for_weights_is_the_published_one(network: tuple[str, ...]) -> N
     assert run.dataset.plain["name"] == expected
     assert run.model.plain["num_classes"] == run.dataset.plain["num_classes"]
     model = next(word for word in network if word.startswith("model=")).removeprefix("model=")
-    assert million_parameters(words) == pytest.approx(MILLIONS[model], rel=1e-3)
+    assert million_parameters(tuple(words)) == pytest.approx(MILLIONS[model], rel=1e-3)
     inputs = run.model.plain["inputs"]
     if "cmx" in model:  # the public weights
         assert (inputs["rgb_order"], run.model.plain["decoder_norm_eps_eval"]) == ("bgr", 1e-5)

@@ -115,6 +115,21 @@ def test_form_and_rows_make_another_table() -> None:
     assert made[2].overrides("Ny/4", 0)[0] == "+experiment=grbm_released"
 
 
+def test_both_forms_are_compared_by_claims() -> None:
+    name, published = read_named("spatialseg/table3")
+    words = TableWords(seeds=(0,), scale="demo", form="both", rows="Ny/4,Ny/8")
+    request, _ = make_request(name, published, words)
+    labels = ["Ny/4", "Ny/4, released", "Ny/8", "Ny/8, released"]
+    assert [row.label for row in request.table.rows] == labels
+    words_of = [request.overrides(label, 0)[0] for label in labels[:2]]
+    assert words_of == ["+experiment=grbm", "+experiment=grbm_released"]
+    claims = request.table.claims
+    assert [(c.rows, c.against, c.columns) for c in claims[:2]] == [
+        (("Ny/4, released",), ("Ny/4",), (column,)) for column in ("mIoU", "Var")
+    ]
+    assert len(claims) == 4
+
+
 def claim(name: str, rows: tuple[str, ...], against: tuple[str, ...]) -> Claim:
     about: Any = {"says": "", "source": "", "columns": ("acc",), "expected": "higher"}
     return Claim(name=name, rows=rows, against=against, **about)
