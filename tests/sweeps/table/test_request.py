@@ -6,9 +6,11 @@ from typing import Any
 import pytest
 
 from rgbt.checks import InputError
+from rgbt.config.compose import available, compose
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Outcome
 from sweeps.table.claim import Claim
+from sweeps.table.load_table import load_table
 from sweeps.table.request import TableRequest, seeds_of
 from sweeps.table.table import Column, Row
 from sweeps.table_plan import (
@@ -134,6 +136,16 @@ def test_both_forms_are_compared_by_claims() -> None:
         (("Ny/4, released",), ("Ny/4",), (column,)) for column in ("mIoU", "Var")
     ]
     assert len(claims) == 4
+
+
+@pytest.mark.parametrize("scale", available("scale"))
+def test_every_seed_of_a_table_has_a_start_of_its_own(scale: str) -> None:
+    """A verdict about one start would not be general."""
+    request = TableRequest("t", load_table("spatialseg/table3"), scale, (0,))
+    config = compose(request.overrides("Ny/4", 0))
+    is_common = str(config.pretrained).startswith("common:")
+    assert is_common == (scale == "bench")
+    assert not is_common or config.seeds.start == "run"
 
 
 def claim(name: str, rows: tuple[str, ...], against: tuple[str, ...]) -> Claim:
