@@ -309,9 +309,7 @@ class Table(Strict):
             label = f"{row.label}{RELEASED}"
             own = {key: each for key, each in vars(row.released).items() if each is not None}
             rows.append(
-                replace(
-                    row, **own, label=label, released=None, same_as=row.label, x=None, doubtful=()
-                )
+                replace(row, **own, label=label, released=None, same_as=row.label, doubtful=())
             )
             claims += [
                 Claim(
