@@ -88,14 +88,6 @@ class Column(Strict):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Factor(Strict):
-    """The x axis of the figure: its label, and "log" for values > 0."""
-
-    name: str
-    axis: Literal["linear", "log"] = "linear"
-
-
-@dataclass(frozen=True, kw_only=True)
 class ReleasedForm(Strict):
     """How the release makes a row; what is None is as in the paper's form.
 
@@ -125,7 +117,6 @@ class Row(Strict):
         same_as: label of an earlier row that may be the same run.
         network: overrides that describe the row's network for an evaluation with a file of weights;
             (): those of `experiment`, if there is one.
-        x: where the row lies on the axis of `Table.factor`.
         without: columns that the row's network has no score for; columns computed from them are
             left out too.
         tested_in: name -> overrides of the data set with which the row's network is tested too.
@@ -145,7 +136,6 @@ class Row(Strict):
     released: ReleasedForm | None = None
     same_as: str | None = None
     network: tuple[str, ...] = ()
-    x: float | None = None
     without: tuple[str, ...] = ()
     tested_in: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     values: Mapping[str, float | None] = field(default_factory=dict)
@@ -174,7 +164,6 @@ class Table(Strict):
         regions: a file of ``conf/metric`` the table is evaluated with, or "as trained".
         absent: how a class without a pixel scores, see `rgbt.metrics.scores`; None: by the
             convention of the data set (`rgbt.metrics.counts.Counts.absent`).
-        factor: x axis of the figure; None: no figure over a factor.
         forms: one sentence per form that says what the rows are run as.
         remarks: footnotes of the whole table, one sentence each.
         design: a factorial design whose rows follow `rows`.
@@ -189,7 +178,6 @@ class Table(Strict):
     regions: str = "as trained"
     absent: Literal["released", "exclude"] | None = None
     columns: tuple[Column, ...]
-    factor: Factor | None = None
     forms: Mapping[Form, str] = field(default_factory=dict)
     claims: tuple[Claim, ...] = ()
     remarks: tuple[str, ...] = ()
@@ -241,9 +229,6 @@ class Table(Strict):
                 check_choice(f"{where}, without", name, columns)
             for name in (*row.values, *row.doubtful):
                 check_choice(f"{where}, printed column", name, printed)
-            is_log = self.factor is not None and self.factor.axis == "log"
-            if row.x is not None and (self.factor is None or (is_log and row.x <= 0)):
-                raise ValueError(f"{where}: 'x' needs a factor, and must be > 0 on a log axis.")
             for metric in (each.metric for each in self.columns if each.metric is not None):
                 for key in re.findall(r"{(\w+)}", metric):
                     check_choice(f"{where}, settings for '{metric}'", key, row.settings)
@@ -324,9 +309,7 @@ class Table(Strict):
             label = f"{row.label}{RELEASED}"
             own = {key: each for key, each in vars(row.released).items() if each is not None}
             rows.append(
-                replace(
-                    row, **own, label=label, released=None, same_as=row.label, x=None, doubtful=()
-                )
+                replace(row, **own, label=label, released=None, same_as=row.label, doubtful=())
             )
             claims += [
                 Claim(

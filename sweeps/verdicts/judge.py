@@ -121,6 +121,11 @@ class Contrast(NamedTuple):
     label: str
     cells: tuple[Cell, ...]
 
+    @property
+    def rows(self) -> set[str]:
+        """Labels of its rows."""
+        return {cell.row for cell in self.cells}
+
     def printed(self, table: Table) -> float | None:
         """The contrast of the printed values; None where one of them is not printed."""
         rows = {row.label: row for row in table.rows}
@@ -251,7 +256,7 @@ class TableJudge:
         """One claim; a contrast without scores leaves a claim about all of them undecided."""
         contrasts = contrasts_of(claim, self.table) or self._effects(claim, runs)
         printed = [each.printed(self.table) for each in contrasts]
-        rows = {cell.row for each in contrasts for cell in each.cells}
+        rows = {label for each in contrasts for label in each.rows}
         finished = {label: finished_runs_of(label, runs) for label in self._rows if label in rows}
         judged = partial(
             JudgedClaim,

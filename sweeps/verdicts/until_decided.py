@@ -81,7 +81,7 @@ class SeedsUntilDecided:
     def _trained(self, claim: Claim) -> list[str]:
         """Labels of the trained rows of a claim."""
         contrasts = contrasts_of(claim, self.request.table)
-        named = {cell.row for each in contrasts for cell in each.cells}
+        named = {label for each in contrasts for label in each.rows}
         return [row.label for row in self.request.trained_rows if row.label in named]
 
 

@@ -19,9 +19,8 @@ SMALL: dict[str, Any] = {
     "caption": "Cells of two sizes.",
     "data": "nothing yet",
     "columns": [{"name": "mIoU", "metric": "mIoU"}, {"name": "Var", "metric": "Var"}],
-    "factor": {"name": "size", "axis": "log"},
     "rows": [
-        {"label": "small", "experiment": "grbm", "overrides": ["masker.sigma_div=1"], "x": 1},
+        {"label": "small", "experiment": "grbm", "overrides": ["masker.sigma_div=1"]},
         {"label": "large", "settings": {"kind": "a"}, "values": {"mIoU": 61, "Var": None}},
     ],
 }
@@ -84,7 +83,6 @@ def claim(**keys: Any) -> dict[str, Any]:
         (row(experiment="grmb"), "experiment: 'grmb'.*did you mean 'grbm'"),
         (row(at={"papr": ["a=1"]}), "at: 'papr'"),
         (row(same_as="large"), "same_as"),
-        (row(x=0), "'x'"),
         ({"rows": [{"label": "a"}, {"label": "a"}]}, "'a' is used twice"),
         ({"at": {"big": []}}, "at: 'big'"),
         (column(metric="Var", name="mIoU"), "'mIoU' is used twice"),

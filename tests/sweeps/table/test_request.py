@@ -6,9 +6,11 @@ from typing import Any
 import pytest
 
 from rgbt.checks import InputError
+from rgbt.config.compose import available, compose
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.point import Outcome
 from sweeps.table.claim import Claim
+from sweeps.table.load_table import load_table
 from sweeps.table.request import TableRequest, seeds_of
 from sweeps.table.table import Column, Row
 from sweeps.table_plan import check_equal_runs, make_request, read_named, select_rows
@@ -117,8 +119,8 @@ def test_form_and_rows_make_another_table() -> None:
 
 def test_both_forms_are_compared_by_claims() -> None:
     name, published = read_named("spatialseg/table3")
-    words = TableWords(seeds=(0,), scale="demo", form="both", rows="Ny/4,Ny/8")
-    request, _ = make_request(name, published, words)
+    typed = TableRequest(name, published, "demo", (0,))
+    request, _ = make_request(typed, "Ny/4,Ny/8", both=True)
     labels = ["Ny/4", "Ny/4, released", "Ny/8", "Ny/8, released"]
     assert [row.label for row in request.table.rows] == labels
     words_of = [request.overrides(label, 0)[0] for label in labels[:2]]
@@ -128,6 +130,16 @@ def test_both_forms_are_compared_by_claims() -> None:
         (("Ny/4, released",), ("Ny/4",), (column,)) for column in ("mIoU", "Var")
     ]
     assert len(claims) == 4
+
+
+@pytest.mark.parametrize("scale", available("scale"))
+def test_every_seed_of_a_table_has_a_start_of_its_own(scale: str) -> None:
+    """A verdict about one start would not be general."""
+    request = TableRequest("t", load_table("spatialseg/table3"), scale, (0,))
+    config = compose(request.overrides("Ny/4", 0))
+    is_common = str(config.pretrained).startswith("common:")
+    assert is_common == (scale == "bench")
+    assert not is_common or config.seeds.start == "run"
 
 
 def claim(name: str, rows: tuple[str, ...], against: tuple[str, ...]) -> Claim:
