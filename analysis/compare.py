@@ -82,7 +82,10 @@ class Options(DrawOptions):
 def main(options: Options, _: list[str]) -> int:
     """Compare two methods on the same images."""
     check_out(options.out)
-    opened = _opened(options)
+    if options.condition and options.frames:
+        raise InputError(f"condition={options.condition} is of single frames; omit frames=.")
+    stored = options.runs_dir, options.split, options.frames, options.condition, options.archive
+    opened = [open_counts(side, *stored) for side in (options.a, options.b)]
     if shared := {each.path for each in opened[0]} & {each.path for each in opened[1]}:
         raise InputError(f"a and b both contain {min(shared)}; give two different methods.")
     a, b = ([each.counts for each in side] for side in opened)
@@ -98,7 +101,7 @@ def main(options: Options, _: list[str]) -> int:
     parts = [f"{part}: {text}." for part, text in drawn.items() if part is not None]
     remark = (
         f"Percent points (Var: squared). Intervals: Student, {settings.resamples} resamples of the "
-        f"images, seeds by Welch; p of the last interval; Holm: corrected for the number of lines."
+        "images, seeds by Welch; p of the last interval; Holm: corrected for the number of lines."
     )
     lines = [said, *parts, found.evidence.reason, remark]
     print_rich(plain_text("\n".join(filter(None, lines))))
@@ -185,14 +188,6 @@ def absent_classes(every: Sequence[Counts], absent: Absent | None) -> tuple[str,
     summed = np.sum([counts.by_region() for counts in every], axis=0)
     notes = absent_notes(summed, first.classes, first.scored, first.split, used)
     return (absent_rule(used), *notes)
-
-
-def _opened(options: Options) -> list[tuple[Evaluation, ...]]:
-    """The trainings of both methods."""
-    if options.condition and options.frames:
-        raise InputError(f"condition={options.condition} is of single frames; omit frames=.")
-    stored = options.runs_dir, options.split, options.frames, options.condition, options.archive
-    return [open_counts(side, *stored) for side in (options.a, options.b)]
 
 
 def _labels(opened: Sequence[tuple[Evaluation, ...]]) -> list[str]:

@@ -47,11 +47,6 @@ AbsentClasses = Annotated[
 ]
 
 
-@dataclass(frozen=True, kw_only=True)
-class NoOptions:
-    """Of a figure that shares none with others."""
-
-
 @dataclass(frozen=True)
 class FigureSpec:
     """One figure.
@@ -74,8 +69,8 @@ class FigureSpec:
             (p.name, hints[p.name], MISSING if p.default is p.empty else p.default)
             for p in self._keywords
         ]
-        shared = hints.get("given", NoOptions)
-        return make_dataclass("Options", own, bases=(shared,), frozen=True, kw_only=True)
+        shared = (hints["given"],) if "given" in hints else ()
+        return make_dataclass("Options", own, bases=shared, frozen=True, kw_only=True)
 
     @property
     def words(self) -> list[str]:
