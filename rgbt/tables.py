@@ -68,6 +68,7 @@ class ConsistencyTable:
     mean_tc: Mapping[str, Score]
     mean_ca: Mapping[str, Score]
     unscored: tuple[str, ...] = ()  # classes that are left out of the means
+    notes: tuple[str, ...] = ()  # how classes without a pixel count
 
 
 @dataclass(frozen=True)
@@ -150,7 +151,7 @@ def consistency_grid(table: ConsistencyTable, title: str) -> TextTable:
         columns.append((*table.ca[protocol], table.mean_ca[protocol]))
     labels = (*class_labels(table.names, table.unscored), "mean")
     rows = [(name, *map(percent, row)) for name, *row in zip(labels, *columns, strict=True)]
-    return TextTable(title, tuple(header), tuple(rows))
+    return TextTable(title, tuple(header), tuple(rows), table.notes)
 
 
 def result_grids(tables: ResultTables) -> tuple[TextTable, ...]:

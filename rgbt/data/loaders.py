@@ -12,6 +12,7 @@ import os
 import re
 import signal
 import threading
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields, replace
 from itertools import count
@@ -191,21 +192,24 @@ class Batches(Iterator[Kind]):
         self, reader: BatchReader, *, keys: Iterable[list[Any]], settings: LoaderSettings
     ) -> None:
         self.skipped: dict[str, str] = {}
-        loader = DataLoader(
-            reader,
-            sampler=keys,
-            batch_size=None,  # a key is a whole batch
-            num_workers=settings.num_workers,
-            prefetch_factor=settings.prefetch if settings.num_workers else None,
-            worker_init_fn=start_worker,
-            pin_memory=torch.cuda.is_available(),
-            # Without it the loader draws the seed of its workers from the global generator.
-            generator=torch.Generator(),
-        )
         # Blocked in all threads of the new processes: some libraries start some when forked.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
         try:
-            self._loaded = cast(Iterator[LoadedBatch], iter(loader))
+            with warnings.catch_warnings():
+                # More workers than cores wait for each other; nothing else is wrong with them.
+                warnings.filterwarnings("ignore", "This DataLoader will create")
+                loader = DataLoader(
+                    reader,
+                    sampler=keys,
+                    batch_size=None,  # a key is a whole batch
+                    num_workers=settings.num_workers,
+                    prefetch_factor=settings.prefetch if settings.num_workers else None,
+                    worker_init_fn=start_worker,
+                    pin_memory=torch.cuda.is_available(),
+                    # Without it the loader draws the seed of its workers from the global generator.
+                    generator=torch.Generator(),
+                )
+                self._loaded = cast(Iterator[LoadedBatch], iter(loader))
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 

@@ -31,7 +31,7 @@ from rgbt.types import View
 
 FORMAT = "rgbt robustness 1"
 FOLDER = "robustness"
-"""Inside ``evaluations/`` of a run; `analysis.robustness` looks for curves there."""
+"""Inside ``evaluations/`` of a run; `analysis.results` looks for curves there."""
 
 CLEAN = "clean"
 FEATURES: dict[View, str] = {
