@@ -48,10 +48,12 @@ def pytest_collection_finish() -> None:
 
 @pytest.fixture(autouse=True)
 def modules_of_the_reader() -> Iterator[None]:
-    """Forget the reader's module `my_lab`: every test has its own."""
-    sys.modules.pop("my_lab", None)
+    """Forget the reader's modules `my_lab`: every test has its own."""
+    for name in [name for name in sys.modules if name.partition(".")[0] == "my_lab"]:
+        del sys.modules[name]
     yield
-    sys.modules.pop("my_lab", None)
+    for name in [name for name in sys.modules if name.partition(".")[0] == "my_lab"]:
+        del sys.modules[name]
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -73,13 +73,13 @@ SMOKE = ("+debug=smoke", "tracking=none", "trainer.accelerator=cpu", "trainer.th
 
 @pytest.fixture
 def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Path]:
-    """Writes the files of a tutorial to an empty folder, which is searched for them."""
+    """Writes the files of a page to an empty folder, which is searched for them."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setenv("RGBT_CONF", str(tmp_path / "conf"))
 
     def written(name: str) -> Path:
-        for block in Page.read(ROOT / "docs" / "tutorials" / name).blocks:
+        for block in Page.read(ROOT / "docs" / name).blocks:
             if block.title:
                 write(block, tmp_path)
         return tmp_path
@@ -88,34 +88,38 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Path
 
 
 @pytest.mark.parametrize(
-    ("page", "name", "old", "new", "sentence"),
+    ("module", "old", "new", "sentence"),
     [
         (
-            *("own-masker.md", "halves", "height // self.cell", "height // 7"),
-            "masker: Halves returned Tensor (1, 18, 10) bool",
+            "masker",
+            "height // self.cell",
+            "height // 7",
+            "masker: Halves returned Tensor (1, 18, 10)",
         ),
         (
-            *("own-loss.md", "mfnet_lovasz", "return {", "return cross_entropy\n        return {"),
-            "loss: CrossEntropyAndLovasz returned Tensor () float32",
+            "loss",
+            "return {",
+            "return costs.mean()\n        return {",
+            "loss: Focal returned Tensor ()",
         ),
     ],
 )
 def test_wrong_part_is_reported(
-    lab: Callable[[str], Path], call: Call, page: str, name: str, old: str, new: str, sentence: str
+    lab: Callable[[str], Path], call: Call, module: str, old: str, new: str, sentence: str
 ) -> None:
-    module = lab(page) / "my_lab.py"
-    text = module.read_text()
-    assert old in text, f"docs/tutorials/{page} has changed: {old}"
-    module.write_text(text.replace(old, new))
-    code, _, err = call(main, f"+experiment={name}", *SMOKE)
+    path = lab("tutorials/own-components.md") / f"my_lab/{module}.py"
+    text = path.read_text()
+    assert old in text, f"docs/tutorials/own-components.md has changed: {old}"
+    path.write_text(text.replace(old, new))
+    code, _, err = call(main, "+experiment=mfnet_focal", *SMOKE)
     assert code == 2, err
     assert_one_sentence(err, sentence)
 
 
 def test_data_set_without_new_images_is_reported(lab: Callable[[str], Path], call: Call) -> None:
-    folder = lab("own-data-set.md")
+    folder = lab("how-to/add-other-components.md")
     rng = numpy_generator(0, "arrays")
-    for path in (folder / "data/arrays" / s / n for s in ("train", "val", "test") for n in "ab"):
+    for path in (folder / "arrays" / s / n for s in ("train", "val", "test") for n in "ab"):
         path.parent.mkdir(parents=True, exist_ok=True)
         rgb, thermal = (rng.integers(0, 256, (40, 64, *c), np.uint8) for c in ((3,), ()))
         np.savez(path, rgb=rgb, thermal=thermal, label=thermal // 128)
