@@ -17,7 +17,7 @@ from torch import Tensor
 
 from rgbt import evaluate, export, predict
 from rgbt.config.component import build
-from rgbt.config.compose import compose
+from rgbt.config.compose import available, compose
 from rgbt.evaluation.export import Comparison, compare, only_head
 from rgbt.exported.onnx_network import (
     Description,
