@@ -23,6 +23,7 @@ import numpy as np
 import pytest
 
 from rgbt.randomness import numpy_generator
+from rgbt.runs.run_spec import RunSpec
 from rgbt.runtime.signals import WORDS
 from tests.commands import SPLITS, Call, Trained, without_pictures, words_of
 
@@ -161,11 +162,16 @@ def data(write_mfnet: Callable[..., Path]) -> Path:
 
 @pytest.fixture(scope="module")
 def composed_once() -> Iterator[None]:
-    """The runs of rows and points are composed once for all tests of a module."""
+    """The runs of rows are composed once for a module, whatever folder they are in."""
     from sweeps.worker import planner
 
+    once = cache(planner.specify_run)
+
+    def specify(words: tuple[str, ...], *, checked: bool = True) -> RunSpec:
+        return once(tuple(w for w in words if not w.startswith("runs_dir=")), checked=checked)
+
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(planner, "specify_run", cache(planner.specify_run))
+        patch.setattr(planner, "specify_run", specify)
         yield
 
 

@@ -134,13 +134,8 @@ def test_seeds_decide_losses_and_key(trained: Trained) -> None:
 KILLED = ("+experiment=sh_adversarial", "model.weights=null", *DAYS_AND_NIGHTS)
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("+experiment=grbm", "trainer.averaging=ema"),
-        pytest.param(KILLED, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("words", [("+experiment=grbm", "trainer.averaging=ema"), KILLED])
 def test_killed_run_resumed_equals_uninterrupted(
     call: Call, data: Path, trained: Trained, tmp_path: Path, words: tuple[str, ...]
 ) -> None:

@@ -174,7 +174,7 @@ def test_killed_run_resumes_with_another_number(
     assert len(members) == 2
     os.kill(first.process.pid if killed == "command" else members[int(killed[-1])].pid, signal_)
     assert first.wait() == code, first.text
-    assert not psutil.wait_procs(members, timeout=30)[1]
+    assert not psutil.wait_procs(members, timeout=120)[1]
     if killed != "command":
         assert_one_sentence(first.text, f"{killed} of 2 was stopped by SIGKILL")
     elif signal_ != signal.SIGKILL:

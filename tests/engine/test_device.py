@@ -173,7 +173,7 @@ def test_resumed_optimizer_has_the_layout_of_the_network(formats: tuple[str, str
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "changes"), [CASES[0], CASES[5]])
+@pytest.mark.parametrize(("name", "changes"), CASES[:1])
 def test_compiled_steps_give_the_same_losses(name: str, changes: dict[str, Any]) -> None:
     torch._dynamo.reset()
     plain, net = nano(name, **changes), nano(name, **changes)

@@ -95,7 +95,7 @@ def test_a_slow_server_and_a_pipe_are_given_up(
             tracker = MlflowTracking(uri, runs_dir=str(tmp_path))
             tracker.start(RunFolder(tmp_path / "key"), Description("grbm", {}, {}))
             tracker.after_step()
-            assert time.monotonic() - began < 20
+            assert time.monotonic() - began < 60
             error = capsys.readouterr().err
             assert error.count("\n") == 1
             assert reason in error

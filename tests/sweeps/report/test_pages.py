@@ -314,8 +314,6 @@ def test_command_writes_pages_fills_marks_and_removes_old_figures(
     assert {"my-planted_demo.svg", "spatialseg-table3_bench-20e4b0.svg"} <= found
     assert "stale.svg" not in found
     assert "stale" not in page.read_text()
-    code, said, err = call(entry, f"out={tmp_path / 'page'}", "resamples=200")
-    assert (code, "index.html" in said) == (0, True)
     for wrong in ("resamples=10", "format=pdf", f"out={page}"):
         assert call(entry, wrong)[0] == 2
 
@@ -338,3 +336,4 @@ def test_report_needs_no_torch(place: Path, tmp_path: Path) -> None:
         check=True,
     )
     assert done.stdout.strip().endswith("0 set()"), done.stderr
+    assert (tmp_path / "index.html").is_file()
