@@ -126,6 +126,7 @@ def make_request(
     """
     check_choice("scale", request.scale, available("scale"))
     table = select_rows(request.table, rows) if rows else request.table
+    table = both_forms(table) if both else table
     external, others = external_rows(request.extra, table)
     files = [word.removeprefix(PRETRAINED) for word in others if word.startswith(PRETRAINED)]
     typed = [f"{row.kind}.{row.label}={row.path}" for row in external]

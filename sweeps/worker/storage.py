@@ -163,6 +163,10 @@ class TrialStore:
         self._study_id = storage.get_study_id_from_name(study.study_name)
         self._begun: set[int] = set()
 
+    def trials(self) -> list[FrozenTrial]:
+        """All trials that count, by number."""
+        return counted_trials(self.study)
+
     def claim(self, attributes: Mapping[str, Any], replaced: Collection[int] = ()) -> int | None:
         """The number of a new running trial of ours; None if an earlier trial has the point.
 
@@ -192,13 +196,13 @@ class TrialStore:
         """
         from optuna.storages import RetryHeartbeatStaleTrialCallback
 
-        trials = counted_trials(self.study)
+        trials = self.trials()
         is_waiting = any(trial.state.name == "WAITING" for trial in trials)
         if total is not None and len(trials) >= total and not is_waiting:
             return None
         trial = self.study.ask(dict(space or {}))
         self._storage.record_heartbeat(trial._trial_id)
-        before = [other for other in counted_trials(self.study) if other.number < trial.number]
+        before = [other for other in self.trials() if other.number < trial.number]
         # Two drivers may ask for the last one at the same time: the lower number wins.
         is_surplus = total is not None and len(before) >= total
         if names.KEY in trial.user_attrs:
@@ -228,7 +232,7 @@ class TrialStore:
         """
         from optuna.storages import fail_stale_trials
 
-        for trial in counted_trials(self.study):
+        for trial in self.trials():
             is_begun = names.LABEL in trial.user_attrs or trial.number in self._begun
             if trial.state.name == "RUNNING" and not is_begun:
                 self._begun.add(trial.number)

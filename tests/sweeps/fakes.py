@@ -38,7 +38,7 @@ DEADLINE_S = 180.0
 
 def settings(**changes: Any) -> SweepSettings:
     """Settings of a sweep, as in study.yaml but for `changes`."""
-    none = ("storage", "gpus", "timeout_minutes", "max_failures", "study", "pruner", "trials")
+    none = ("storage", "gpus", "timeout_minutes", "study", "pruner", "trials")
     plain: dict[str, Any] = {
         **dict.fromkeys((*none, "hours")),
         **{"workers": 1, "retry": "none"},
@@ -254,7 +254,7 @@ class FakeView:
 
     def __init__(self, look: Look = lambda works: None) -> None:
         self.ends: list[tuple[str, str, str]] = []
-        self.rejections: list[tuple[str, str]] = []
+        self.said: list[tuple[str, str]] = []
         self.update = look
 
     def began(self, work: RunningTrial) -> None:
@@ -263,8 +263,8 @@ class FakeView:
     def ended(self, work: RunningTrial, how: str, reason: str) -> None:
         self.ends.append((work.plan.point.label, how, reason))
 
-    def rejected(self, label: str, reason: str) -> None:
-        self.rejections.append((label, reason))
+    def say(self, how: str, text: str) -> None:
+        self.said.append((how, text))
 
 
 def interrupt_when(condition: Callable[[Sequence[RunningTrial]], bool]) -> FakeView:
@@ -368,7 +368,7 @@ def search_desk(
     searched = parse_space(space or {"x": {"type": "float", "low": 0, "high": 1}})
     executor, seen = FakeExecutor(runs_dir, behaviour), view or FakeView()
     planner = planner or FakePlanner()
-    source = SamplerSource((), searched, store, planner, wanted, seen.rejected)
+    source = SamplerSource((), searched, store, planner, wanted, seen.say)
     driver = Driver(source, runs, executor, wanted, seen)  # type: ignore[arg-type]
     return Desk(driver, store, executor, runs, seen)
 

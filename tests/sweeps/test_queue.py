@@ -109,12 +109,18 @@ def test_measured_seconds_of_a_network_count(place: Path) -> None:
     assert (code, order[:2]) == (0, ["crm", "baseline"])
 
 
-def test_no_run_starts_after_the_time(place: Path) -> None:
+def test_no_run_starts_after_the_time(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    minutes = [0.0]
+
     def slow(call: Call) -> Process:
-        time.sleep(0.4)
+        minutes[0] += 1
         return (yield from succeed(call))
 
-    assert run(place, slow, minutes=0.6 / 60) == (0, ["cmx", "rtfnet"])
+    def now() -> float:
+        return 60 * minutes[0] + time.monotonic()
+
+    monkeypatch.setattr(drivers, "time", SimpleNamespace(monotonic=now, sleep=time.sleep))
+    assert run(place, slow, minutes=1.5) == (0, ["cmx", "rtfnet"])
 
 
 def test_finished_runs_are_archived_and_count_on_another_machine(place: Path) -> None:

@@ -18,7 +18,6 @@ from tests.sweeps.fakes import (
     Call,
     Desk,
     FakeView,
-    PickyPlanner,
     Process,
     fail,
     finish,
@@ -100,13 +99,6 @@ def test_driver_score_that_is_no_number_fails(tmp_path: Path, score: float | Non
     desk = list_desk(tmp_path, points(1), no_score).run()
     assert desk.states() == {"x=0": ["FAIL"]}
     assert "no test/mIoU that is a number" in reason(desk, 0)
-
-
-def test_driver_stops_at_max_failures(tmp_path: Path) -> None:
-    desk = list_desk(tmp_path, points(3), fail, max_failures=2).run()
-    assert len(desk.executor.calls) == 2
-    rejecting = search_desk(tmp_path, planner=PickyPlanner(), trials=3, max_failures=2).run()
-    assert len(rejecting.view.rejections) == 2
 
 
 def test_driver_timeout_starts_next_trial(tmp_path: Path) -> None:
@@ -203,7 +195,6 @@ def test_driver_prunes_hopeless_trial(tmp_path: Path) -> None:
     assert trial(desk, 0).values == [75.0]
     assert [call.stops for call in desk.executor.calls] == [0, 1, 0]
     assert ("pruned", "pruned at step 4") in [end[1:] for end in desk.view.ends]
-    assert desk.driver.failures == 0
 
 
 def test_driver_replicates_average_and_report_first(tmp_path: Path) -> None:

@@ -41,7 +41,7 @@ def test_progress_in_log_prints_begin_and_end(console: Make) -> None:
         view.update([TRIAL])
         view.ended(TRIAL, "finished", "")
         view.ended(TRIAL, "failed", "a bad day")
-        view.rejected("p", "x does not fit.")
+        view.say("failed", "p: x does not fit.")
     assert [line[9:] for line in text.getvalue().splitlines()] == [
         f"started  {LABEL}",
         f"finished {LABEL}  100 s  val mIoU 45.67",

@@ -63,7 +63,7 @@ def test_sampler_source_wrong_point_fails_and_is_reported(tmp_path: Path) -> Non
     (trial,) = desk.store.trials()
     assert trial.state.name == "FAIL"
     assert trial.user_attrs[names.REASON] == "x does not fit."
-    assert desk.view.rejections == [(trial.user_attrs[names.LABEL], "x does not fit.")]
+    assert desk.view.said == [("failed", f"{trial.user_attrs[names.LABEL]}: x does not fit.")]
     assert desk.source.is_exhausted(wait=False)
 
 
