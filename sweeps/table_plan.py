@@ -126,7 +126,7 @@ def make_request(
     """
     check_choice("scale", request.scale, available("scale"))
     table = select_rows(request.table, rows) if rows else request.table
-    table = both_forms(table) if both else table
+    table = table.both_forms() if both else table
     external, others = external_rows(request.extra, table)
     files = [word.removeprefix(PRETRAINED) for word in others if word.startswith(PRETRAINED)]
     typed = [f"{row.kind}.{row.label}={row.path}" for row in external]
@@ -134,7 +134,7 @@ def make_request(
     typed += ["form=both"] if both else []
     made = replace(
         request,
-        table=table.both_forms() if both else table,
+        table=table,
         extra=tuple(word for word in others if not word.startswith(PRETRAINED)),
         pretrained={word.partition("=")[0]: word.partition("=")[2] for word in files},
         evaluated=tuple(row.label for row in external),
