@@ -29,6 +29,10 @@ RUN_SETTINGS: dict[str, dict[str, Any]] = {
     "dataset": {"absent": Literal["released", "exclude"]},
 }
 """Settings, by node, that the run reads itself and that are not passed to the constructor."""
+PAGES = {
+    "dataset.root": " (docs/how-to/prepare-data-sets.md says where the images come from)",
+}
+"""What follows the message that a setting has no value, for a new user."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +73,9 @@ class Component:
             if key == "_target_":
                 continue
             if value == "???":
-                raise InputError(f"'{name}' has no value; give one with {name}=...")
+                raise InputError(
+                    f"'{name}' has no value; give one with {name}=...{PAGES.get(name, '')}"
+                )
             if key in run_settings:
                 check_value(name, value, run_settings[key])
             elif key not in parameters:
