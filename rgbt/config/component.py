@@ -24,15 +24,15 @@ from rgbt.checks import InputError, nearest, one_line
 from rgbt.config.values import check_value
 from rgbt.ranges import Text
 
+# Settings, by node, that the run reads itself and that are not passed to the constructor.
 RUN_SETTINGS: dict[str, dict[str, Any]] = {
     "model": {"weights": Text | None, "fresh": tuple[Text, ...]},
     "dataset": {"absent": Literal["released", "exclude"]},
 }
-"""Settings, by node, that the run reads itself and that are not passed to the constructor."""
+# Text after the message that a setting has no value.
 PAGES = {
     "dataset.root": " (docs/how-to/prepare-data-sets.md says where the images come from)",
 }
-"""What follows the message that a setting has no value, for a new user."""
 
 
 @dataclass(frozen=True)

@@ -16,11 +16,11 @@ from rgbt import ranges
 
 Precision = Literal["32-true", "bf16-mixed"]
 
-OF_MACHINE = (
+# Settings of the training loop that do not change the result.
+MACHINE_SETTINGS = (
     *("accelerator", "log_every", "checkpoint_every", "devices"),
     *("activation_checkpointing", "memory_format", "compile"),
 )
-"""Settings of the training loop that do not change the result."""
 
 
 def _not_gpu(value: object) -> object:
