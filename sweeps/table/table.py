@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal
 
 from annotated_types import MinLen
-from pydantic import model_validator
+from pydantic import BeforeValidator, model_validator
 
 from rgbt.checks import InputError, check_choice
 from rgbt.config.compose import available, chosen_scale
@@ -188,7 +188,8 @@ class Table(Strict):
     """
 
     paper: str
-    number: str
+    # YAML reads `number: 1` as a number.
+    number: Annotated[str, BeforeValidator(lambda n: str(n) if type(n) is int else n)]
     caption: str
     data: str
     unit: str = "percent"

@@ -5,9 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import optuna
+import pytest
 from optuna.trial import TrialState
 
 from sweeps import attributes
+from sweeps.report import study as study_report
 from sweeps.report.study import study_folder
 from sweeps.study import entry
 from tests.commands import Call, assert_one_sentence
@@ -35,15 +37,19 @@ def make_study(runs_dir: Path, name: str = "search/grbm", kind: str = "search") 
     study.ask()  # still running
 
 
-def test_study_of_search_is_shown_and_written(call: Call, tmp_path: Path) -> None:
+@pytest.mark.parametrize("installed", [None, "optuna_dashboard"])
+def test_study_of_search_is_shown_and_written(
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, installed: str | None
+) -> None:
     make_study(tmp_path)
+    monkeypatch.setattr(study_report, "find_spec", lambda _: installed)
     code, out, err = call(entry, "name=search/grbm", f"runs_dir={tmp_path}")
     assert (code, err) == (0, "")
     folder = study_folder(tmp_path, "search/grbm")
     assert out.index("50.75") < out.index("50.50") < out.index("50.25")
     assert "[Errno 28] disk full" in out
     assert "Importances: they need 10 complete trials, and there are 3." in out
-    assert f"optuna-dashboard sqlite:///{tmp_path}/studies.db" in out
+    assert (f"optuna-dashboard sqlite:///{tmp_path}/studies.db" in out) == bool(installed)
     assert {path.name for path in folder.iterdir()} == FILES
     text = (folder / "study.md").read_text()
     assert "postgresql://u:***@h/db" in text
