@@ -19,17 +19,17 @@ from pydantic import BeforeValidator, TypeAdapter
 from rgbt.checks import without_controls
 from rgbt.metrics.names import DAY, NIGHT
 
+# Text of an undefined score, e.g. the IoU of a class that occurs nowhere.
 ABSENT = "-"
-"""Shown for an undefined score, e.g. the IoU of a class that occurs nowhere."""
 
+# Cells of text: words, and names longer than a key or a number.
 LABEL = re.compile(r"[^\W\d_]{3}.* |.{32}")
-"""Cells of text: words, and names longer than a key or a number."""
 
+# Beginning of a cell that a spreadsheet may execute, also behind apostrophes.
 FORMULA = re.compile(r"'*[=+\-@\t\r\n]")
-"""Beginning of a cell that a spreadsheet may execute, also behind apostrophes."""
 
+# A fraction; NaN, where undefined, is None in files.
 Score = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
-"""A fraction; NaN, where undefined, is None in files."""
 
 
 @dataclass(frozen=True)

@@ -29,12 +29,17 @@ from tests.conftest import write_data
 TEMPORAL = ("+experiment=temporal_con", "masker.patch_size=null")
 
 RUN = [
-    *(("+experiment=gbrm", "'grbm'"), ("optimizer.lrr=1", "'optimizer.lrr'")),
+    *(
+        ("+experiment=gbrm", "did you mean 'grbm', 'crm' or 'grbm_kp'? known: 71"),
+        ("optimizer.lrr=1", "'optimizer.lrr'"),
+    ),
     *(("+loss.spatial.alfa=1", "'loss.spatial.alfa'"), ("+sead=1", "'sead'")),
     *(("optimizer.lr=fast", "'optimizer.lr'"), ("trainer.clip_norm=nan", "'trainer.clip_norm'")),
     *(("seed=[0,1]", "'seed'"), ("seeds=3", "'seeds'"), ("learning", "'learning'")),
     ("--experiment=grbm", "'--experiment=grbm' is not an option"),
     ("hydra.searchpath=[/no/where]", "the folder /no/where does not exist"),
+    ("trainer.accelerator=gpu", "'trainer.accelerator': write cuda"),
+    ("dataset.root=???", "docs/how-to/prepare-data-sets.md"),
     *(("trainer.accelerator=mps", "trainer.accelerator"), ("out=x.png", "out=x.png")),
     *(("model.num_classes=5", "num_classes is 5"), ("trainer.selection_split=vall", "'vall'")),
     *(

@@ -24,11 +24,15 @@ from rgbt.checks import InputError, nearest, one_line
 from rgbt.config.values import check_value
 from rgbt.ranges import Text
 
+# Settings, by node, that the run reads itself and that are not passed to the constructor.
 RUN_SETTINGS: dict[str, dict[str, Any]] = {
     "model": {"weights": Text | None, "fresh": tuple[Text, ...]},
     "dataset": {"absent": Literal["released", "exclude"]},
 }
-"""Settings, by node, that the run reads itself and that are not passed to the constructor."""
+# Text after the message that a setting has no value.
+PAGES = {
+    "dataset.root": " (docs/how-to/prepare-data-sets.md says where the images come from)",
+}
 
 
 @dataclass(frozen=True)
@@ -69,7 +73,9 @@ class Component:
             if key == "_target_":
                 continue
             if value == "???":
-                raise InputError(f"'{name}' has no value; give one with {name}=...")
+                raise InputError(
+                    f"'{name}' has no value; give one with {name}=...{PAGES.get(name, '')}"
+                )
             if key in run_settings:
                 check_value(name, value, run_settings[key])
             elif key not in parameters:

@@ -20,8 +20,8 @@ from rgbt.data.patterns import Frame, Patterns
 from rgbt.requirements import Record
 from rgbt.types import Sample
 
+# Split -> names, of the splits whose names could be read.
 SplitNames = Mapping[str, tuple[str, ...]]
-"""Split -> names, of the splits whose names could be read."""
 
 
 class FileDataset:

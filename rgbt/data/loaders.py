@@ -41,15 +41,15 @@ CROP_ADVICE = "; choose a transform.crop_hw that fits into every resized image"
 EVAL_ADVICE = "; set data.eval_batch_size=1"
 DEAD_WORKER = re.compile(r"DataLoader worker .*(exited unexpectedly|killed by signal)")
 
+# Signals that end a command (`rgbt.runtime.signals`).
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""Signals that end a command (`rgbt.runtime.signals`)."""
 
+# Interval at which a worker checks that its main process exists.
 LOOK_S = 2.0
-"""Interval at which a worker checks that its main process exists."""
 
 Kind = TypeVar("Kind", bound=Loadable)
+# (key, skipped) -> example, or None if it is left out; adds unreadable names to `skipped`.
 MakeExample = Callable[[Any, dict[str, str]], Any]
-"""(key, skipped) -> example, or None if it is left out; adds unreadable names to `skipped`."""
 
 
 class Transform(Protocol):
@@ -346,7 +346,7 @@ def start_worker(_: int) -> None:
 
 def _end_with_parent() -> None:
     """Exit when the main process sends SIGTERM, or has ended."""
-    # Not os.getppid: in a sweep a server forks the workers, and lives longer than the main process.
+    # In a sweep, os.getppid is a server that forks the workers and outlives the main process.
     parent = multiprocessing.parent_process()
     assert parent is not None, "a worker has a main process"
     while parent.is_alive():

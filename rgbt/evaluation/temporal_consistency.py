@@ -30,8 +30,8 @@ from rgbt.metrics.scores import absent_rule, class_mean
 from rgbt.tables import ConsistencyTable, TextTable
 from rgbt.tracking.pair_pictures import PairExample
 
+# Number of the set of views -> (K + 1, K, K) of one scene.
 CountsBySet = dict[int, NDArray[np.int64]]
-"""Number of the set of views -> (K + 1, K, K) of one scene."""
 
 
 @dataclass(frozen=True)

@@ -92,5 +92,5 @@ class WithAuxiliary:
 
 
 def single(values: Tensor) -> Tensor:
-    """At least float32: sums over millions of pixels are kept in it under autocast too."""
+    """The tensor in float32 at least, so that autocast does not sum millions of pixels in less."""
     return values.to(torch.promote_types(values.dtype, torch.float32))

@@ -28,9 +28,9 @@ Kind = Literal["train", "val", "test"]
 
 ADVICE = "restore it from a copy, or remove the run's folder to train it again"
 
+# Folder and tag of finished runs that another training of the same key replaced (``fresh=true``),
+# and the tag that the seeds of one configuration share.
 REPLACED, REPLACED_TAG, GROUP = "replaced", "rgbt.replaced", "rgbt.group"
-"""Folder and tag of finished runs that another training of the same key replaced (``fresh=true``),
-and the tag that the seeds of one configuration share."""
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,8 @@ from rgbt.runs.folder import (
 )
 from rgbt.runs.provenance import commit_of, other_code
 
+# The checkpoint of evaluations, and the pattern of the counts that a run ended with.
 CHECKPOINT, ALL_COUNTS = "best.pt", "counts_*.npz"
-"""The checkpoint of evaluations, and the pattern of the counts that a run ended with."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class RunResult:
 
     @property
     def fingerprint(self) -> str:
-        """Of the data set that the run was made on."""
+        """Fingerprint of the data set that the run was made on."""
         return str(self.result["dataset"])
 
     @property

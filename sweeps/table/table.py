@@ -8,12 +8,13 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal
 
 from annotated_types import MinLen
-from pydantic import model_validator
+from pydantic import BeforeValidator, model_validator
 
 from rgbt.checks import InputError, check_choice
 from rgbt.config.compose import available, chosen_scale
+from rgbt.config.values import check_value
 from rgbt.metrics import names
-from rgbt.metrics.named import OF_PAIRS, parse
+from rgbt.metrics.named import PAIR_SCORES, parse
 from rgbt.metrics.pairs import Protocol
 from sweeps.evaluation import BatchNorm, Head
 from sweeps.table.claim import OTHERS, PREVIOUS, Claim, Strict
@@ -77,9 +78,11 @@ class Column(Strict):
         given = [key for key in kinds if getattr(self, key) is not None]
         if len(given) != 1:
             raise ValueError(f"expected one of {', '.join(kinds)}, got {given}.")
-        of_pairs = (self.metric or "").rpartition("/")[2] in OF_PAIRS
+        of_pairs = (self.metric or "").rpartition("/")[2] in PAIR_SCORES
         if of_pairs != (self.frames is not None):
-            raise ValueError(f"'frames' is needed for {', '.join(OF_PAIRS)}, and only for these.")
+            raise ValueError(
+                f"'frames' is needed for {', '.join(PAIR_SCORES)}, and only for these."
+            )
         if of_pairs or self.metric is None:  # these would have no effect
             for key in ("modality", "head", "corruption", "batch_norm"):
                 if getattr(self, key) not in (None, "as trained", "default"):
@@ -170,7 +173,8 @@ class Table(Strict):
     """
 
     paper: str
-    number: str
+    # YAML reads `number: 1` as a number.
+    number: Annotated[str, BeforeValidator(lambda n: str(n) if type(n) is int else n)]
     caption: str
     data: str
     unit: str = "percent"

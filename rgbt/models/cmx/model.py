@@ -137,7 +137,7 @@ class MlpDecoder(nn.Module):
             nn.init.kaiming_normal_(convolution.weight, nonlinearity="relu")
 
     def train(self, mode: bool = True) -> MlpDecoder:
-        """Also chooses the eps of the normalisation, of any class that normalises a batch."""
+        """Set the mode, and the eps of all layers that normalise a batch."""
         self.linear_fuse[1].eps = self.norm_eps[0 if mode else 1]  # type: ignore[assignment]
         return super().train(mode)
 

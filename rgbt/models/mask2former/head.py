@@ -20,8 +20,8 @@ GROUPS = 32  # of every group normalisation (Mask2Former release)
 NUM_LEVELS = 3
 POINTS = 4  # sampled per head and level (Deformable DETR, Sec. 4.1; Mask2Former release)
 
+# Rows and columns of every level.
 Levels = tuple[tuple[int, int], ...]
-"""Rows and columns of every level."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -48,8 +48,9 @@ def behind(**keys: Any) -> dict[str, Any]:
 
 
 def test_own_table_needs_no_printed_values(tmp_path: Path) -> None:
-    write(tmp_path)
+    write(tmp_path, number=1)
     table = load_table("my/ablation", tmp_path)
+    assert table.number == "1"
     assert [row.label for row in table.rows] == ["small", "large"]
     assert (table.unit, table.regions, table.absent) == ("percent", "as trained", None)
     assert table.columns[1].best == "highest"
