@@ -47,7 +47,7 @@ def test_recipe_has_the_classes_of_the_data_set(nodes: DictConfig, classes: int)
         counts = [each[key] for each in spaces for key in each if re.match(r"n(um)?_class", key)]
         assert counts == [classes], f"{name}: exactly one argument has the number of classes"
         adapter = adapter_of(values["constructor"])
-        pattern = r"[\w.]+:\w+" if adapter is None else rf"{name}\.py:network"
+        pattern = r"[\w.]+:\w+" if adapter is None else rf"adapters\.py:{name}"
         assert re.fullmatch(pattern, values["constructor"])
         assert set(values) == set(inspect.signature(ExternalNetwork).parameters)
         # A stacked tensor has four channels in all recipes; both images apart have three each.
