@@ -64,4 +64,5 @@ def test_recipe_has_keys_that_differ_and_states_its_source(name: str) -> None:
     head = " ".join(line[2:] for line in text.splitlines() if line.startswith("# "))
     assert re.search(r"Repository: [\w.-]+/[\w.-]+ ", head)
     assert re.search(r"Commit: [0-9a-f]{8} \(20\d\d-\d\d-\d\d\)\. Licence: ", head)
+    assert re.search(r"Licence: .*?\. Lists: (trained on|not checked)", head)
     assert re.search(r"[\d,]{9,} parameters at (nine|five) classes", head)

@@ -192,6 +192,13 @@ def _report_unpublished_settings(session: Session, names: Lists) -> None:
             f"for {name}; choose another recipe=..., or set them and recipe.dataset={name}."
         )
     picked = session.trainer.selection_split
+    is_selected = session.trainer.tested == "best" and session.selection_split is not None
+    trained = set(names[session.domains.source.split])
+    if is_selected and (common := len(trained & set(names[picked]))):
+        info(
+            f"trainer.selection_split={picked}: {common} of its {len(names[picked])} images are "
+            "trained on."
+        )
     is_selected = session.trainer.tested == "best" and picked != "test"
     if is_selected and (shared := _shared_with_test(names, picked)):
         info(

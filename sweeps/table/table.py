@@ -133,6 +133,7 @@ class Row(Strict):
             left out too.
         tested_in: name -> overrides of the data set with which the row's network is tested too.
         values: printed values by column; None where the paper prints a dash.
+        lists: those of the published row, where they are not those of the table.
         doubtful: columns whose printed value carries the row's remarks as a footnote.
         remarks: one sentence each.
     """
@@ -152,6 +153,7 @@ class Row(Strict):
     without: tuple[str, ...] = ()
     tested_in: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     values: Mapping[str, float | None] = field(default_factory=dict)
+    lists: str = ""
     doubtful: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
 
@@ -175,6 +177,7 @@ class Table(Strict):
     Attributes:
         paper: folder of its file; in a table of the user, any name.
         data: what the printed values were measured on.
+        lists: which lists the published rows were trained and their checkpoints selected on.
         at: overrides of every row by scale.
         regions: a file of ``conf/metric`` the table is evaluated with, or "as trained".
         absent: how a class without a pixel scores, see `rgbt.metrics.scores`; None: by the
@@ -189,6 +192,7 @@ class Table(Strict):
     number: str
     caption: str
     data: str
+    lists: str = ""
     unit: str = "percent"
     at: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     regions: str = "as trained"

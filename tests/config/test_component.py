@@ -47,6 +47,8 @@ def test_every_option_of_every_group_passes_the_check(
     needed = {} if group != "dataset" or option.startswith("synth") else {"root": "unused"}
     if option == "folder":
         needed |= {"num_classes": 2, "classes": "[a,b]", "rgb": "a", "thermal": "b", "label": "c"}
+    if option == "cart":
+        needed |= {"thermal_range": "[0,9]"}
     words = [f"dataset.{key}={needed[key]}" for key in needed]
     if option == "external":
         words = ["model.checkout=unused", "model.constructor=a:B"]

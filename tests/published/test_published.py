@@ -41,6 +41,8 @@ NOT_OF_A_RECIPE = {
     "starts of scale=bench": "experiment/start",
     "networks of other authors": "model/external model/inputs/dformer model/inputs/imagenet_449 "
     "model/inputs/unit_three",
+    "data sets and losses that no paper here uses": "dataset/fmb dataset/semanticrt dataset/msrs "
+    "dataset/cart loss/ohem loss/focal loss/lovasz_softmax",
     "videos, which no paper here has": "dataset/video dataset/mvseg",
 }
 """Files without a number of a recipe at scale=paper: the beginnings of their paths, by reason.
