@@ -122,22 +122,34 @@ def counts_of(folder: Path) -> list[Path]:
 def add(run: RunResult, folder: Path) -> Path:
     """Put a finished run into the archive `folder`; the same results are written once.
 
-    Other results of the same key, from another machine, are kept beside as ``<key>-<digest>.zip``.
+    Further counts of the same results are added to the file. Other results of the same key, from
+    another machine, are kept beside as ``<key>-<digest>.zip``.
     InputError: the run is not finished, or one of its files is damaged.
     """
     if not run.is_finished:
         raise InputError(f"{run.folder} is not finished; rerun its command.")
-    content = _packed(run, folder / SHARED)
+    members = _packed(run, folder / SHARED)
     path = folder / f"{run.key}.zip"
-    if path.exists() and path.read_bytes() != content:
+    old = _stored(path) if path.exists() else {}
+    if any(old[each] != members[each] for each in old.keys() & members if each.endswith(".xz")):
+        content, old = _zipped(members), {}
         path = folder / f"{run.key}-{_digest(content)[:8]}.zip"
-    if not path.exists():
-        write_atomic(path, content)
+    if not path.exists() or members.keys() - old.keys():
+        write_atomic(path, _zipped({**old, **members}))
     return path
 
 
-def _packed(run: RunResult, shared: Path) -> bytes:
-    """The bytes of ``<key>.zip``, equal for equal runs; shared arrays are written to `shared`."""
+def _stored(path: Path) -> dict[str, bytes]:
+    """The members of an archived run; InputError: the file is damaged."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return {name: archive.read(name) for name in archive.namelist()}
+    except DAMAGED as error:
+        raise InputError(f"{path} is damaged ({one_line(error)}).") from error
+
+
+def _packed(run: RunResult, shared: Path) -> dict[str, bytes]:
+    """The members of ``<key>.zip``; shared arrays are written to `shared`."""
     shared.mkdir(parents=True, exist_ok=True)
     texts = [path for name in TEXTS for path in sorted(run.folder.glob(name))]
     members = {path.relative_to(run.folder).as_posix(): path.read_bytes() for path in texts}
@@ -150,6 +162,11 @@ def _packed(run: RunResult, shared: Path) -> bytes:
     for path in counts_of(run.folder):
         name = path.relative_to(run.folder).as_posix()
         members[f"{name}.xz"] = _packed_counts(Counts.load(path), shared)
+    return members
+
+
+def _zipped(members: Mapping[str, bytes]) -> bytes:
+    """A file of members, equal for equal ones."""
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w") as archive:
         for name, content in members.items():

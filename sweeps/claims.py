@@ -75,13 +75,8 @@ def judge_all(options: Options, overrides: Sequence[str]) -> list[JudgedClaim]:
     from analysis.results import finished_runs
     from sweeps.table.efficiency import exact_sizes
     from sweeps.table.load_table import is_own, table_names
-    from sweeps.table_plan import (
-        TableWords,
-        check_equal_runs,
-        check_override,
-        make_request,
-        read_named,
-    )
+    from sweeps.table.request import TableRequest
+    from sweeps.table_plan import check_equal_runs, check_override, make_request, read_named
     from sweeps.verdicts.effects import judged_claims
     from sweeps.verdicts.judge import StoredRuns, TableJudge, rule_of
     from sweeps.verdicts.stored import FinishedRuns, stored_runs
@@ -91,14 +86,15 @@ def judge_all(options: Options, overrides: Sequence[str]) -> list[JudgedClaim]:
     finished = FinishedRuns(finished_runs(options.runs_dir, options.archive))
     for word in overrides:
         check_override(word)
-    words = TableWords(seeds=(0,), scale=options.scale, form=options.form, overrides=overrides)
     planner, stored = Planner(readable_paths([f"runs_dir={options.runs_dir}"])), StoredRuns()
     judged: list[JudgedClaim] = []
     for each in track(names, "judging", console=Console(stderr=True), transient=True):
         name, table = read_named(each)
         if not table.claims:
             continue
-        request, external = make_request(name, table, words)
+        request, external = make_request(
+            TableRequest(name, table, options.scale, (0,), tuple(overrides), form=options.form)
+        )
         if external:
             raise InputError(
                 f"{external[0].kind}.{external[0].label}: only finished runs are judged here; "

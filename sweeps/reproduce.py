@@ -5,9 +5,9 @@ Rerun the command to resume. Any number of machines may run it at the same time.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from annotated_types import Interval
 
@@ -26,7 +26,9 @@ NEW = PlainCommand(NewOptions, new, name="rgbt reproduce new")
 class Options:
     """Options of ``rgbt reproduce``; the sweeper's file explains those of execution too."""
 
-    table: Annotated[str, Help("spatialseg/table3, my/ablation (in ./tables), or a file")]
+    table: Annotated[
+        str, Help("spatialseg/table3, my/ablation (in ./tables), a file, a list, or all")
+    ]
     seeds: Annotated[str, Help("a number (3: 0, 1, 2), a list (0,4,7), or until_decided")] = "1"
     max_seeds: Annotated[int, Interval(ge=4, le=1000), Help("most, with until_decided")] = 20
     scale: Annotated[str, Help("demo (minutes, embedded data), bench or paper")] = "demo"
@@ -44,27 +46,32 @@ class Options:
         Help("GPU of each worker: gpus=[0,1]; or several: gpus=[[0,1],[2,3]]"),
     ] = None
     retry: Annotated[Literal["none", "failed"], Help("failed: those of earlier calls")] = "none"
-    retries: Annotated[int, Help("how often a failed run is retried in this call")] = 0
+    minutes: Annotated[
+        float | None, Interval(gt=0, le=10**6), Help("start no run after this time")
+    ] = None
+    archive: Annotated[Path, Help("of several tables: where finished runs are kept, and found")] = (
+        Path("results")
+    )
     fresh: Annotated[bool, Help("true: retrain runs of other code, and keep the old ones")] = False
     wait: Annotated[bool, Help("true: wait for cells that other commands run")] = True
     storage: Annotated[str | None, Help("of all machines: postgresql://user@host/name")] = None
     timeout_minutes: Annotated[float | None, Help("time limit of one run")] = None
     max_failures: Annotated[int | None, Help("start no more runs after so many failures")] = None
-    executor: Annotated[Literal["local", "submitit"], Help("here, or as cluster jobs")] = "local"
     trust: Trust = ""
-    submitit: Annotated[dict[str, Any] | None, Help("options of jobs: {timeout_min: 60}")] = field(
-        default_factory=dict
-    )
 
 
-OF_THE_TABLE = ("table", "seeds", "max_seeds", "scale", "form", "rows", "runs_dir", "out", "fresh")
-"""Options that are no settings of execution."""
+OF_THE_TABLE = (
+    *("table", "seeds", "max_seeds", "scale", "form", "rows", "runs_dir", "out", "fresh"),
+    *("minutes", "archive"),
+)
+"""Options that are no settings of execution of that name."""
 
 
 def main(options: Options, overrides: list[str]) -> int:
     """Run the missing runs of a table and print our values beside the published ones.
 
-    The table is a published one or your own. It ends with a verdict on each claim of its paper.
+    The table is a published one or your own. It ends with a verdict on each claim of its paper. Of
+    several tables (a,b, or all) the runs that decide most claims a minute come first.
     Words with other keys are overrides of every row: dataset.root=/data/MFNet
     tracking.uri=http://host:5000. pretrained.mask2former_swin_b=FILE sets the initial weights of
     all rows with that network. weights.ROW=FILE evaluates the network of a row with a file of
@@ -75,19 +82,23 @@ def main(options: Options, overrides: list[str]) -> int:
     To write your own table:
     rgbt reproduce new table=my/ablation experiment=grbm masker.sigma_div=1,2,4
     """
+    from sweeps.queue import run_queue
     from sweeps.rendering.preview import print_preview
     from sweeps.rendering.publish import publish_table
-    from sweeps.table_plan import plan_table
+    from sweeps.table_plan import plan_table, stored_and_planner
     from sweeps.verdicts.judge import rule_of
     from sweeps.worker.point_list import preview_points, run_points
 
     settings = settings_of(options)
-    plan = plan_table(options, overrides)
+    runs, planner = stored_and_planner(options, overrides)
+    if options.table == "all" or "," in options.table:
+        return run_queue(options, overrides, settings, runs, planner)
+    plan = plan_table(options, overrides, runs, planner)
     if settings.dry_run:
         outcomes = preview_points(plan.points, settings, plan.planner)
         print_preview(plan, outcomes, settings.workers)
         return 0
-    plan.evaluate_external(plan.points.runs.runs_dir, options.trust)
+    plan.evaluate_external(options.trust)
     outcomes = run_points(plan.points, settings, plan.planner) if plan.points.points else []
     if plan.until_decided is None:  # an earlier command may have added seeds
         plan.judge.rule = rule_of(result for each in outcomes for result in each.results)
@@ -107,6 +118,7 @@ def settings_of(options: Options) -> SweepSettings:
     assert isinstance(node, DictConfig), "the file is a mapping"
     # What Optuna's own pages show of a table; nothing is chosen by it.
     node.objectives = [{"metric": f"test/{MIOU}", "direction": "maximize"}]
+    node.hours = options.minutes and options.minutes / 60
     for key, value in vars(options).items():
         if key not in OF_THE_TABLE:
             node[key] = value

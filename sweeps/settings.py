@@ -74,9 +74,6 @@ class SweepSettings:
     storage: Text | None
     workers: Annotated[int, Interval(ge=1, le=1024), doc("processes at the same time")]
     gpus: Annotated[tuple[GpuSlot, ...], Len(1, 1024)] | None
-    executor: Literal["local", "submitit"]
-    submitit: dict[str, Any] | None
-    retries: Annotated[int, Interval(ge=0, le=1000)]
     retry: Literal["none", "failed"]
     timeout_minutes: Positive | None
     max_failures: NumRuns | None
@@ -93,12 +90,6 @@ class SweepSettings:
     hours: Positive | None
     replicates: Annotated[int, Interval(ge=1, le=1000)]
     trust: Annotated[str, Len(0, 4096)]
-
-    def __post_init__(self) -> None:
-        if self.submitit and self.executor != "submitit":
-            raise InputError("submitit={...} has an effect only with executor=submitit; add it.")
-        if self.executor == "submitit" and self.timeout_minutes is not None:
-            raise InputError("timeout_minutes would include the queue; use submitit.timeout_min.")
 
 
 UNRESOLVED: dict[str, Any] = {"space": {}, "params": {}, "points": []}

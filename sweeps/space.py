@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import lru_cache
 from itertools import product
 from typing import Any
 
@@ -20,10 +21,8 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import IntervalSweep, Override, Quote, QuotedString
 from hydra.errors import HydraException
 from optuna import distributions as kinds
-from optuna.pruners import BasePruner
+from optuna.pruners import BasePruner, NopPruner
 from optuna.samplers import BaseSampler
-from optuna.study import Study
-from optuna.trial import FrozenTrial, TrialState
 
 from rgbt.checks import InputError, check_choice, one_line
 from rgbt.config.component import Component
@@ -48,8 +47,7 @@ def parse_space(entries: Mapping[str, Mapping[str, Any]]) -> Space:
     """
     space: dict[str, Distribution] = {}
     for key, entry in entries.items():
-        path = f"hydra.sweeper.space.{key}"
-        options = dict(entry)
+        path, options = f"hydra.sweeper.space.{key}", dict(entry)
         kind = str(options.pop("type", None))
         check_choice(f"{path}.type", kind, ("float", "int", "categorical"))
         if "choices" in options:
@@ -188,23 +186,6 @@ def key_of(override: str) -> str:
     return override.partition("=")[0].lstrip("+~")
 
 
-def distributions(points: Sequence[Point]) -> dict[str, kinds.BaseDistribution]:
-    """Distributions of the parameters of a grid or a list, for Optuna's figures.
-
-    Numbers are ranges, which may grow in a study; other choices may not.
-    """
-    found: dict[str, kinds.BaseDistribution] = {}
-    for key in dict.fromkeys(key for point in points for key in point.params):
-        seen: list[Any] = [point.params[key] for point in points if key in point.params]
-        types = {type(value) for value in seen}
-        if types <= {int, float}:
-            make = kinds.IntDistribution if types == {int} else kinds.FloatDistribution
-            found[key] = make(min(seen), max(seen))
-        else:
-            found[key] = kinds.CategoricalDistribution(tuple(dict.fromkeys(seen)))
-    return found
-
-
 def merge_space(
     entries: Mapping[str, Mapping[str, Any]],
     fixed: Sequence[str],
@@ -238,10 +219,9 @@ def _point(fixed: Sequence[str], own: Sequence[str]) -> Point:
         value = override.value()
         if override.is_sweep_override():
             raise InputError(f"hydra.sweeper.points: '{override.input_line}' is not one value.")
-        if value is None or isinstance(value, str | int | float):
-            params[override.get_key_element()] = value
-        else:
-            params[override.get_key_element()] = override.get_value_element_as_str()
+        if not (value is None or isinstance(value, str | int | float)):
+            value = override.get_value_element_as_str()
+        params[override.get_key_element()] = value
     return Point("", (*fixed, *own), params)
 
 
@@ -249,19 +229,23 @@ SAMPLERS = [f"optuna.samplers.{n}Sampler" for n in ("TPE", "Random", "GP", "NSGA
 """Samplers without state outside the storage: others (QMC, grid, brute force) keep a counter or
 stop the study, which neither several drivers nor a resumed search can share."""
 
-PRUNERS = [
-    f"optuna.pruners.{name}Pruner"
-    for name in ("Nop", "Median", "Percentile", "SuccessiveHalving", "Hyperband", "Patient")
-]
+
+def _of_trial(name: str) -> Any:
+    """The method `name` of the sampler that a trial has for itself."""
+
+    def call(self: PerTrialSampler, study: Any, trial: Any, *arguments: Any) -> Any:
+        return getattr(self.of(trial.number), name)(study, trial, *arguments)
+
+    return call
 
 
 class PerTrialSampler(BaseSampler):
     """Draws of a trial follow from the seed and the number of the trial, and the trials before it.
 
     Optuna's samplers draw from one generator for all trials: two drivers with one seed, or a search
-    that is resumed, would propose the same points again. Here every trial draws by its own number
-    in the storage. No two trials share draws, and one worker repeats a search exactly, even if it
-    was stopped and resumed.
+    that is resumed, would propose the same points again. Here every trial has a sampler by its
+    number in the storage. No two trials share draws, and one worker repeats a search exactly, even
+    if it was stopped and resumed.
 
     Args:
         make: the sampler that chooses, from a seed; it keeps nothing outside the storage.
@@ -269,42 +253,14 @@ class PerTrialSampler(BaseSampler):
     """
 
     def __init__(self, make: Callable[[int], BaseSampler], seed: int) -> None:
-        self.make = make
-        self.seed = seed
-        self._inner: dict[int, BaseSampler] = {}
+        self.make, self.seed = make, seed
+        self.of = lru_cache(lambda number: make(trial_seed(seed, number)))
 
-    def before_trial(self, study: Study, trial: FrozenTrial) -> None:
-        """Begin a trial, also one that another process began and this one resumes."""
-        self._inner[trial.number] = self.make(trial_seed(self.seed, trial.number))
-        self._inner[trial.number].before_trial(study, trial)
-
-    def infer_relative_search_space(
-        self, study: Study, trial: FrozenTrial
-    ) -> dict[str, kinds.BaseDistribution]:
-        """See `BaseSampler`."""
-        return self._of(trial).infer_relative_search_space(study, trial)
-
-    def sample_relative(
-        self, study: Study, trial: FrozenTrial, search_space: dict[str, kinds.BaseDistribution]
-    ) -> dict[str, Any]:
-        """See `BaseSampler`."""
-        return self._of(trial).sample_relative(study, trial, search_space)
-
-    def sample_independent(
-        self, study: Study, trial: FrozenTrial, param_name: str, param_distribution: Any
-    ) -> Any:
-        """See `BaseSampler`."""
-        return self._of(trial).sample_independent(study, trial, param_name, param_distribution)
-
-    def after_trial(
-        self, study: Study, trial: FrozenTrial, state: TrialState, values: Sequence[float] | None
-    ) -> None:
-        """End a trial; one that this process never began is ended all the same."""
-        self._of(trial).after_trial(study, trial, state, values)
-        self._inner.pop(trial.number, None)
-
-    def _of(self, trial: FrozenTrial) -> BaseSampler:
-        return self._inner.get(trial.number) or self.make(trial_seed(self.seed, trial.number))
+    before_trial = _of_trial("before_trial")
+    infer_relative_search_space = _of_trial("infer_relative_search_space")
+    sample_relative = _of_trial("sample_relative")
+    sample_independent = _of_trial("sample_independent")
+    after_trial = _of_trial("after_trial")
 
 
 def trial_seed(seed: int, number: int) -> int:
@@ -330,13 +286,9 @@ def build_pruner(node: Mapping[str, Any] | None) -> BasePruner:
     """The pruner of a search; trials report at their validation steps.
 
     Args:
-        node: with `_target_`, one of `PRUNERS`, and options of its constructor; None: no pruner.
+        node: with `_target_`, a pruner of Optuna, and options of its constructor; None: no pruner.
             Those that count steps (``n_warmup_steps``, ``min_resource``) count steps of the
             optimizer, not validations.
     """
-    path, node = "hydra.sweeper.pruner", node or {"_target_": "optuna.pruners.NopPruner"}
-    check_choice(f"{path}._target_", str(node.get("_target_")), PRUNERS)
-    # A patient pruner may wrap another one, which the node then holds.
-    alone = {} if "wrapped_pruner" in node else {"wrapped_pruner": None}
-    pruner: BasePruner = build_optuna(node, path, **alone)
+    pruner: BasePruner = build_optuna(node, "hydra.sweeper.pruner") if node else NopPruner()
     return pruner

@@ -24,18 +24,24 @@ from sweeps import attributes as names
 from sweeps import space as spaces
 from sweeps.point import UNFINISHED, Point, short_names
 from sweeps.rendering.seed_groups import group_grid, unfinished_grid
-from sweeps.report.study import publish_study, study_folder
 from sweeps.settings import SweepSettings, read_settings
 from sweeps.space import Space, as_overrides, build_pruner, build_sampler, key_of, signature
+from sweeps.study import publish_study, study_folder
 from sweeps.worker import point_list
 from sweeps.worker.driver import drive
 from sweeps.worker.planner import Planner, specify_run
 from sweeps.worker.point_list import PointList
 from sweeps.worker.progress import ProgressView, duration
 from sweeps.worker.run_store import RunStore, open_run_store
-from sweeps.worker.storage import find_study, open_storage, open_study, storage_url
+from sweeps.worker.storage import (
+    TrialStore,
+    counted_trials,
+    known_studies,
+    open_storage,
+    open_study,
+    storage_url,
+)
 from sweeps.worker.trial_sources import SamplerSource
-from sweeps.worker.trial_store import TrialStore, counted_trials
 
 PATHS = ("runs_dir", "dataset.root", "dataset.cache_dir", "tracking")
 """Beginnings of overrides that may differ between two calls of the same sweep."""
@@ -92,8 +98,8 @@ def sweep(arguments: Sequence[str], config: DictConfig, loader: ConfigLoader) ->
     name = settings.study or _name(config.name, list(grid[0].params), identity)
     tags = {f"rgbt.study/{name}": "grid"}
     points = tuple(replace(each, label=_label(each) or name, tags=tags) for each in grid)
-    kind, known = "list" if settings.points else "grid", spaces.distributions(grid)
-    _grid(PointList(name, name, kind, points, runs, tuple(base), known), settings)
+    kind = "list" if settings.points else "grid"
+    _grid(PointList(name, name, kind, points, runs, tuple(base)), settings)
 
 
 def _label(point: Point) -> str:
@@ -135,7 +141,7 @@ def _grid(points: PointList, settings: SweepSettings) -> None:
         return
     words = [f"name={points.study}", f"runs_dir={points.runs.runs_dir}"]
     words += [f"storage={without_passwords(settings.storage)}"] if settings.storage else []
-    info(f"study {points.study}; its figures: rgbt study {shlex.join(words)}")
+    info(f"study {points.study}: rgbt study {shlex.join(words)}")
     failed = [outcome for outcome in outcomes if outcome.state == "failed"]
     if failed:
         raise RunError(
@@ -174,26 +180,34 @@ def search(request: Search, settings: SweepSettings) -> None:
     is_reported = len(settings.objectives) == 1 and settings.objectives[0].is_reported
     if settings.pruner is not None and not is_reported:
         raise InputError("hydra.sweeper.pruner needs one objective that is reported, as val/mIoU.")
+    runs_dir = request.runs.runs_dir
     if settings.dry_run:
-        _preview(request, settings)
+        known = known_studies(settings.storage, runs_dir).get(request.study)
+        done = 0 if known is None else len(counted_trials(known))
+        lines = [
+            *(f"{key}: {one}" for key, one in request.space.items()),
+            *(f"{objective.direction} {objective.metric}" for objective in settings.objectives),
+            f"study {request.study}: {done} of {settings.trials or 'any number of'} trials exist.",
+        ]
+        sys.stdout.write("\n".join([*lines, ""]))
         return
     dataset = probe(request, settings).dataset
-    runs_dir = request.runs.runs_dir
     storage = open_storage(settings.storage, runs_dir)
     request.runs.create_tables()
     attributes = {names.KIND: "search", names.SIGNATURE: signature(request.identity, dataset)}
-    study = open_study(request.study, storage, settings.objectives, attributes, sampler, pruner)
+    given = {"sampler": sampler, "pruner": pruner}
+    study = open_study(request.study, storage, settings.objectives, attributes, **given)
     if names.COMMAND not in study.user_attrs:
         study.set_user_attr(names.COMMAND, command_line(sys.orig_argv))
     store = TrialStore(study, storage)
     info(f"study {request.study}: run the same command on other machines to share it.")
 
-    def num_done() -> int:
-        return sum(trial.state.is_finished() for trial in store.trials())
+    def progress() -> tuple[int, int | None]:
+        return sum(trial.state.is_finished() for trial in store.trials()), settings.trials
 
-    view = ProgressView(request.study, settings.trials, settings.workers, num_done)
+    view = ProgressView(request.study, settings.workers, progress)
     source = SamplerSource(request.fixed, request.space, store, Planner(), settings, view.rejected)
-    drive(view, source, store, request.runs, settings)
+    drive(view, source, request.runs, settings)
 
     trials = store.trials()
     states = Counter(trial.state.name for trial in trials)
@@ -219,30 +233,11 @@ def probe(request: Search, settings: SweepSettings) -> RunSpec:
     measured = views["splits"] if views["sets"] else ()
     is_validated = trainer.tested == "best" or highest.dataset.build().has(trainer.selection_split)
     for objective in settings.objectives:
-        split = objective.metric.partition("/")[0]
+        split, why = objective.metric.partition("/")[0], ""
         if split == "val" and not is_validated:
-            what = (
-                f"the data set has no {trainer.selection_split}; hold images out, or use test/..."
-            )
-            raise InputError(f"objective '{objective.metric}': {what}")
+            why = f"the data set has no {trainer.selection_split}; hold images out, or use test/..."
         if objective.is_consistency and split not in measured:
-            what = f"not measured; add consistency=views and {split} to consistency.splits."
-            raise InputError(f"objective '{objective.metric}': {what}")
+            why = f"not measured; add consistency=views and {split} to consistency.splits."
+        if why:
+            raise InputError(f"objective '{objective.metric}': {why}")
     return lowest
-
-
-def _preview(request: Search, settings: SweepSettings) -> None:
-    """Print what would be searched and the existing trials; write nothing."""
-    study = find_study(request.study, settings.storage, request.runs.runs_dir)
-    trials = [] if study is None else counted_trials(study)
-    states = Counter(trial.state.name.lower() for trial in trials)
-    lines = [
-        f"study {request.study}: {dict(states) or 'not started'}",
-        *(f"  {key}: {one}" for key, one in request.space.items()),
-        *(f"  {objective.direction} {objective.metric}" for objective in settings.objectives),
-        f"  python -m rgbt.run {command_line(request.fixed)} ...",
-    ]
-    if settings.trials is not None:
-        left = max(0, settings.trials - len(trials))
-        lines.append(f"{left} of {settings.trials} trials would be run.")
-    sys.stdout.write("\n".join([*lines, ""]))

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from analysis.uncertainty.contrasts import FIXED
 from analysis.uncertainty.verdicts import AnyTime, FixedSeeds
-from rgbt.checks import InputError, check_choice, nearest, split_list
+from rgbt.checks import InputError, check_choice, split_list
 from rgbt.config.command import composing
 from rgbt.config.component import Component
 from rgbt.config.compose import available, compose
@@ -27,7 +27,7 @@ from sweeps.verdicts.judge import CellRunId, TableJudge
 from sweeps.verdicts.until_decided import START, SeedsUntilDecided
 from sweeps.worker.planner import Planner
 from sweeps.worker.point_list import PointList
-from sweeps.worker.run_store import open_run_store
+from sweeps.worker.run_store import RunStore, open_run_store
 
 if TYPE_CHECKING:
     from sweeps.reproduce import Options
@@ -117,56 +117,33 @@ def _origins(table: Table) -> dict[str, str]:
     return origin
 
 
-@dataclass(frozen=True, kw_only=True)
-class TableWords:
-    """What a command says about a table, see `sweeps.table.request.TableRequest`.
+def make_request(
+    request: TableRequest, rows: str = "", *, both: bool = False
+) -> tuple[TableRequest, list[ExternalRow]]:
+    """A request as it was typed with selected rows, `both` forms, and rows that are not trained.
 
-    `overrides` are those of every row, with pretrained.NETWORK=FILE, weights.ROW=FILE and
+    Its `extra` are all overrides, with pretrained.NETWORK=FILE, weights.ROW=FILE and
     predictions.ROW=FOLDER.
     """
-
-    seeds: Sequence[int]
-    scale: str
-    form: Literal["paper", "released", "both"] = "paper"
-    rows: str = ""
-    overrides: Sequence[str] = ()
-    until_decided: bool = False
-
-
-def make_request(
-    name: str, table: Table, words: TableWords
-) -> tuple[TableRequest, list[ExternalRow]]:
-    """The request of a table, and its rows that are evaluated and not trained."""
-    check_choice("scale", words.scale, available("scale"))
-    table = select_rows(table, words.rows) if words.rows else table
-    table = both_forms(table) if words.form == "both" else table
-    external, others = external_rows(words.overrides, table)
+    check_choice("scale", request.scale, available("scale"))
+    table = select_rows(request.table, rows) if rows else request.table
+    external, others = external_rows(request.extra, table)
     files = [word.removeprefix(PRETRAINED) for word in others if word.startswith(PRETRAINED)]
     typed = [f"{row.kind}.{row.label}={row.path}" for row in external]
-    typed += [f"rows={words.rows}"] if words.rows else []
-    typed += ["form=both"] if words.form == "both" else []
-    request = TableRequest(
-        name,
-        table,
-        words.scale,
-        tuple(words.seeds),
-        tuple(word for word in others if not word.startswith(PRETRAINED)),
+    typed += [f"rows={rows}"] if rows else []
+    typed += ["form=both"] if both else []
+    made = replace(
+        request,
+        table=both_forms(table) if both else table,
+        extra=tuple(word for word in others if not word.startswith(PRETRAINED)),
         pretrained={word.partition("=")[0]: word.partition("=")[2] for word in files},
-        form="paper" if words.form == "both" else words.form,
-        until_decided=words.until_decided,
         evaluated=tuple(row.label for row in external),
         typed=tuple(typed),
     )
-    for model in request.pretrained:
-        if model not in request.models():
-            raise InputError(
-                f"{PRETRAINED}{model}: no row of {name} uses that network at "
-                f"scale={words.scale}; {nearest(model, request.models())}."
-            )
-    return request, external
-
-
-UNTIL_DECIDED = "until_decided"
+    for model in made.pretrained:
+        what = f"{PRETRAINED}NETWORK of {request.name} at scale={request.scale}"
+        check_choice(what, model, made.models())
+    return made, external
 
 
 @dataclass(frozen=True)
@@ -187,9 +164,10 @@ class TablePlan:
     rows: Sequence[ExternalRow]
     external: dict[CellRunId, Outcome]
 
-    def evaluate_external(self, runs_dir: Path, trust: str) -> None:
+    def evaluate_external(self, trust: str) -> None:
         """Count the rows that are not trained; InputError: a path that does not fit its row."""
         for row in self.rows:
+            runs_dir = self.points.runs.runs_dir
             run = ExternalRun.of(row, self.request, self.points.base, runs_dir)
             outcome = run.outcome(self.request.table, trust)
             if outcome.state == "failed":
@@ -197,28 +175,35 @@ class TablePlan:
             self.external[row.label, FIXED] = outcome
 
 
-def plan_table(options: Options, overrides: Sequence[str]) -> TablePlan:
-    """A table as a command runs it; `overrides` are of every row and of the tracker."""
+def stored_and_planner(options: Options, overrides: Sequence[str]) -> tuple[RunStore, Planner]:
+    """The finished runs, and the planner of runs in the same folder and tracker."""
     for word in overrides:
         check_override(word)
-    tracker = [word for word in overrides if word.lstrip("+~").startswith("tracking")]
-    base = (*readable_paths([f"runs_dir={options.runs_dir}"]), *tracker)
+    base = (*readable_paths([f"runs_dir={options.runs_dir}"]), *filter(_is_tracker, overrides))
     with composing(base):
         config = compose([*base, f"fresh={str(options.fresh).lower()}"])
         Component.from_node(config.tracking)
-    runs, planner = open_run_store(config), Planner(base)
-    extra = [word for word in overrides if word not in tracker]
-    adds = options.seeds == UNTIL_DECIDED
+    return open_run_store(config), Planner(base)
+
+
+def _is_tracker(override: str) -> bool:
+    return override.lstrip("+~").startswith("tracking")
+
+
+def plan_table(
+    options: Options, overrides: Sequence[str], runs: RunStore, planner: Planner
+) -> TablePlan:
+    """A table as a command runs it; `overrides` are of every row and of the tracker."""
+    extra = [word for word in overrides if not _is_tracker(word)]
+    adds = options.seeds == "until_decided"
     name, table = read_named(options.table)
-    words = TableWords(
-        seeds=range(START) if adds else seeds_of(options.seeds),
-        scale=options.scale,
-        form=options.form,
-        rows=options.rows,
-        overrides=extra,
-        until_decided=adds,
+    seeds = tuple(range(START)) if adds else seeds_of(options.seeds)
+    both = options.form == "both"
+    form = "paper" if options.form == "both" else options.form
+    typed = TableRequest(
+        name, table, options.scale, seeds, tuple(extra), form=form, until_decided=adds
     )
-    request, rows = make_request(name, table, words)
+    request, rows = make_request(typed, options.rows, both=both)
     if extra or is_own(options.table):  # a test checks the others
         check_equal_runs(request, planner)
     if adds and not request.table.claims:
@@ -230,13 +215,6 @@ def plan_table(options: Options, overrides: Sequence[str]) -> TablePlan:
     judge = TableJudge(name, request.table, AnyTime() if adds else FixedSeeds(), sizes=sizes)
     external: dict[CellRunId, Outcome] = {}
     more = SeedsUntilDecided(request, judge, options.max_seeds, external) if adds else None
-    points = PointList(
-        study=f"table/{name}",
-        title=f"{name} scale={request.scale}",
-        kind="list",
-        points=tuple(request.points()),
-        runs=runs,
-        base=base,
-        more=more,
-    )
-    return TablePlan(request, judge, points, planner, more, rows, external)
+    title, points = f"{name} scale={request.scale}", tuple(request.points())
+    planned = PointList(f"table/{name}", title, "list", points, runs, planner.base, more)
+    return TablePlan(request, judge, planned, planner, more, rows, external)

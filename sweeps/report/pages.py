@@ -305,7 +305,8 @@ class Report:
         """A page written by hand with its marked numbers made again.
 
         Marks: ``claim TABLE NAME`` is a claim with its verdict, ``count`` the number of claims of
-        the papers, ``effects TABLE OUTCOME`` the effects of a design on an outcome.
+        the papers and ``count runs`` that of runs, ``cell TABLE COLUMN ROW`` a mean over seeds with
+        its standard deviation, ``effects TABLE OUTCOME`` the effects of a design on an outcome.
 
         Raises:
             InputError: a mark that names nothing.
@@ -314,7 +315,9 @@ class Report:
 
     def _block(self, mark: str) -> str:
         kind, *words = mark.split()
-        if kind == "count":
+        if mark == "count runs":
+            return str(len(self.runs))
+        if mark == "count":
             return str(int(self.claims["table"].str.contains("/").sum()))
         views = [view for view in self.views if view.result.request.name == words[0]]
         if kind == "claim":
@@ -324,6 +327,10 @@ class Report:
                 row = found.iloc[0]
                 command = f" (`rgbt reproduce table={words[0]} scale=bench seeds=4`)"
                 return statement(row) + (command if row["verdict"] == "not run" else "")
+        if kind == "cell" and views:
+            cell = views[0].result.scored.cells.get((" ".join(words[2:]), words[1]))
+            if cell is not None:
+                return f"{number(cell.mean)} ± {number(cell.sd)}"
         if kind == "effects" and views and views[0].result.effects is not None:
             grids = [grid for grid in views[0].grids if f"Effects on {words[1]}," in grid]
             rows = "rows=tested scale=bench seeds=3"

@@ -8,24 +8,28 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Protocol
 
-from rgbt.checks import InputError, RunError
+from rgbt.checks import RunError
 from rgbt.runs.naming import TAGS
 from sweeps import attributes as names
 from sweeps.settings import SweepSettings
-from sweeps.worker.processes import GPUS, Executor, Job, LocalExecutor, check_gpus, gpus_of
+from sweeps.worker.processes import GPUS, LocalExecutor, LocalJob, check_gpus, gpus_of
 from sweeps.worker.progress import ProgressView
 from sweeps.worker.run_store import RunStore
-from sweeps.worker.running_trial import RunningTrial, TrialError, TrialPruned, mean_scores
-from sweeps.worker.storage import HEARTBEAT_S
-from sweeps.worker.trial_sources import TrialSource
-from sweeps.worker.trial_store import TrialStore
+from sweeps.worker.running_trial import (
+    ClaimedTrial,
+    RunningTrial,
+    TrialError,
+    TrialPruned,
+    mean_scores,
+)
+from sweeps.worker.storage import HEARTBEAT_S, TrialStore
 
 POLL_S = 0.2
 PAUSE_S, RECONNECT_S = 5.0, 600.0
@@ -34,14 +38,26 @@ CLAIM_S = 2.0
 """Seconds between two searches for trials to claim, after one without result."""
 
 
+class TrialSource(Protocol):
+    """Gives a driver its trials."""
+
+    store: TrialStore
+    rejected: int  # points whose configuration is wrong
+
+    def next(self) -> ClaimedTrial | None:
+        """The next trial, claimed for this driver; None when there is none at the moment."""
+
+    def is_exhausted(self, *, wait: bool) -> bool:
+        """Whether no trial is left; with `wait`, whether other drivers have finished too."""
+
+
 @dataclass
 class Driver:
     """One process that executes trials of one study; `running` are those in progress, by slot."""
 
-    store: TrialStore
     source: TrialSource
     runs: RunStore
-    executor: Executor
+    executor: LocalExecutor
     settings: SweepSettings
     view: ProgressView
     running: dict[int, RunningTrial] = field(default_factory=dict)
@@ -49,8 +65,9 @@ class Driver:
     _began: float = field(default_factory=time.monotonic)
     _last_claim: float = -math.inf
     _last_heartbeat: float = field(default_factory=time.monotonic)
-    _unreachable_since: float = math.inf
-    _attempts: Counter[str] = field(default_factory=Counter)
+
+    def __post_init__(self) -> None:
+        self.store = self.source.store
 
     def run(self) -> None:
         """Execute trials until none is left; on Ctrl-C or SIGTERM release the unfinished ones.
@@ -60,8 +77,7 @@ class Driver:
         from optuna.exceptions import StorageInternalError
 
         try:
-            while self._step_or_wait():
-                time.sleep(POLL_S)
+            self._loop()
         except BaseException:
             for trial in self.running.values():
                 trial.stop()
@@ -73,20 +89,19 @@ class Driver:
                     self.store.release(trial.number)
             raise
 
-    def _step_or_wait(self) -> bool:
+    def _loop(self) -> None:
         from optuna.exceptions import StorageInternalError
 
-        try:
-            more = self._step()
-        except StorageInternalError as error:
-            now = time.monotonic()
-            self._unreachable_since = min(self._unreachable_since, now)
-            if now - self._unreachable_since > RECONNECT_S:
-                raise RunError(f"storage: {str(error).splitlines()[0]}") from error
-            time.sleep(PAUSE_S)
-            return True
-        self._unreachable_since = math.inf
-        return more
+        more, reached = True, time.monotonic()
+        while more:
+            try:
+                more = self._step()
+                reached = time.monotonic()
+                time.sleep(POLL_S)
+            except StorageInternalError as error:
+                if time.monotonic() - reached > RECONNECT_S:
+                    raise RunError(f"storage: {str(error).splitlines()[0]}") from error
+                time.sleep(PAUSE_S)
 
     def _step(self) -> bool:
         """Advance all trials and claim new ones; whether there is more to do."""
@@ -135,11 +150,13 @@ class Driver:
         spent = time.monotonic() - self._began > 3600 * (hours or math.inf)
         return spent or self.failures + self.source.rejected >= (most or math.inf)
 
-    def _start(self, slot: int, tags: Mapping[str, str], command: Sequence[str], log: Path) -> Job:
+    def _start(
+        self, slot: int, tags: Mapping[str, str], command: Sequence[str], log: Path
+    ) -> LocalJob:
         environment = {TAGS: json.dumps(dict(tags))}
         if self.settings.gpus:
             gpus = gpus_of(self.settings.gpus[slot % len(self.settings.gpus)])
-            environment[GPUS] = ",".join(map(str, gpus))
+            environment[GPUS] = ",".join(gpus)
         return self.executor.start(command, environment, log)
 
     def _advance(self, trial: RunningTrial) -> bool:
@@ -158,13 +175,8 @@ class Driver:
             self.store.fail(trial.number, str(reason), notes, "PRUNED")
             self.view.ended(trial, "pruned", str(reason))
         except TrialError as error:
-            key = trial.plan.key
-            if self.source.requeues and self._attempts[key] < self.settings.retries:
-                self.store.release(trial.number)  # a search gives the same point again
-            else:
-                self.store.fail(trial.number, str(error), notes)
-                self.failures += 1
-            self._attempts[key] += 1
+            self.store.fail(trial.number, str(error), notes)
+            self.failures += 1
             self.view.ended(trial, "failed", str(error))
         else:
             values = [scores[name] for name in metrics]
@@ -173,23 +185,8 @@ class Driver:
         return True
 
 
-def drive(
-    view: ProgressView,
-    source: TrialSource,
-    store: TrialStore,
-    runs: RunStore,
-    settings: SweepSettings,
-) -> None:
-    """Execute the trials of `source` with the executor of the settings, and show the progress."""
-    executor: Executor
-    if settings.executor == "local":
-        check_gpus(settings.gpus)
-        executor = LocalExecutor(settings.workers)
-    else:
-        try:
-            from sweeps.worker.submitit_executor import SubmititExecutor
-        except ImportError as error:
-            raise InputError(f"executor=submitit: {error}; pip install 'rgbt[cluster]'") from error
-        executor = SubmititExecutor(runs.runs_dir / ".submitit", settings.submitit or {})
+def drive(view: ProgressView, source: TrialSource, runs: RunStore, settings: SweepSettings) -> None:
+    """Execute the trials of `source` in processes of this machine, and show the progress."""
+    check_gpus(settings.gpus)
     with view:
-        Driver(store, source, runs, executor, settings, view).run()
+        Driver(source, runs, LocalExecutor(settings.workers), settings, view).run()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from statistics import median
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rgbt.checks import InputError, RunError
 from rgbt.config.stored_config import check_targets, parse_trust
@@ -20,9 +20,13 @@ from sweeps.worker.planner import PlannedPoint, Planner
 from sweeps.worker.progress import ProgressView, bars
 from sweeps.worker.run_store import RunStore
 from sweeps.worker.running_trial import ClaimedTrial
-from sweeps.worker.storage import find_study, open_storage, open_study
-from sweeps.worker.trial_sources import trial_attributes
-from sweeps.worker.trial_store import TrialStore, counted_trials, trials_by_key
+from sweeps.worker.storage import (
+    TrialStore,
+    known_studies,
+    open_storage,
+    open_study,
+    trials_by_key,
+)
 
 if TYPE_CHECKING:
     from optuna.trial import FrozenTrial
@@ -37,8 +41,9 @@ class PointList:
         kind: "grid" or "list".
         runs: finished runs; the points' overrides name the same folder.
         base: overrides that all have.
-        distributions: of the parameters of a grid, by name.
-        more: further points, from the outcomes until now; asked for when no point is waiting.
+        more: further points, from the outcomes until now; requested when no point is waiting.
+        rank: which waiting point is the next: the one of the highest rank, and `more` is requested
+            before each; None: they are run in their order.
     """
 
     study: str
@@ -47,8 +52,8 @@ class PointList:
     points: tuple[Point, ...]
     runs: RunStore
     base: tuple[str, ...] = ()
-    distributions: Mapping[str, Any] | None = None
     more: Callable[[Sequence[Outcome]], Sequence[Point]] | None = None
+    rank: Callable[[Point], float] | None = None
 
 
 class ListSource:
@@ -57,7 +62,7 @@ class ListSource:
     With `strict`, one wrong point is refused, and not only a list of wrong points.
     """
 
-    requeues, rejected = False, 0
+    rejected = 0
     store: TrialStore
 
     def __init__(
@@ -72,12 +77,12 @@ class ListSource:
         self._planner = planner or Planner(points.base)
         self._points: list[Point] = []
         self._plans: dict[int, PlannedPoint] = {}
-        self._errors: dict[int, str] = {}
+        self.errors: dict[int, str] = {}
         self._same: dict[str, list[int]] = {}
         """Indices of equal points, by key; the first one is run."""
         self._forgiven: set[int] | None = None
         self._finished: dict[str, tuple[RunResult, ...]] = {}
-        self._seen: set[int] = set()  # failed trials whose runs were looked for
+        self._seen: set[int | str] = set()  # failed trials whose runs were looked for, and keys
         self._add(points.points)
 
     def _add(self, points: Sequence[Point]) -> bool:
@@ -88,9 +93,9 @@ class ListSource:
             title = f"{self._list.title}: planning"
             for index, point in enumerate(shown.track(points, description=title), first):
                 self._plan(index, point)
-        if self._errors and (self._strict or not self._plans):
+        if self.errors and (self._strict or not self._plans):
             # An error of every point is one of the command and not of a point.
-            index, reason = next(iter(self._errors.items()))
+            index, reason = next(iter(self.errors.items()))
             raise InputError(f"{self._points[index].label}: {reason}" if self._plans else reason)
         varied = " ".join(varied_keys(self._points))
         for indices in self._same.values():
@@ -98,8 +103,7 @@ class ListSource:
             tags: dict[str, dict[str, None]] = {}
             for name, value in (pair for i in indices for pair in self._points[i].tags.items()):
                 tags.setdefault(name, {})[value] = None
-            merged = {name: " | ".join(values) for name, values in tags.items()}
-            merged |= {VARIED: varied}
+            merged = {VARIED: varied} | {name: " | ".join(values) for name, values in tags.items()}
             for index in indices:
                 plan = self._plans[index]
                 self._plans[index] = replace(plan, point=replace(plan.point, tags=merged))
@@ -111,29 +115,30 @@ class ListSource:
             for run in plan.runs if point.evaluations else ():
                 check_targets(run.plain, parse_trust(self._settings.trust), point.label)
         except InputError as error:
-            self._errors[index] = str(error)
+            self.errors[index] = str(error)
         else:
             self._plans[index] = plan
             self._same.setdefault(plan.key, []).append(index)
 
     def next(self) -> ClaimedTrial | None:
         """See `TrialSource.next`."""
-        more, claimed = self._list.more, self._claim()
+        more, rank = self._list.more, self._list.rank
+        if more and rank:
+            self._add(more(self.outcomes()))
+        claimed = self._claim()
         # Points that were added before this command was stopped are finished: others follow them.
         while claimed is None and more and self._add(more(self.outcomes())):
             claimed = self._claim()
         return claimed
 
     def _claim(self) -> ClaimedTrial | None:
-        by_key = self.store.by_key()
+        by_key = trials_by_key(self.store.study)
         for plan in self._different():
-            if self.status(plan, by_key).state != "waiting":
+            if self._status(plan, by_key).state != "waiting":
                 continue
-            params, known = plan.point.params, self._list.distributions or {}
-            own = {name: known[name] for name in params if name in known}
             # Failed trials of the point, and those whose runs were deleted.
             replaced = [trial.number for trial in by_key.get(plan.key, ())]
-            number = self.store.claim(trial_attributes(plan), params, own, replaced)
+            number = self.store.claim(plan.attributes, replaced)
             if number is not None:
                 return ClaimedTrial(plan, number)
         return None
@@ -145,28 +150,40 @@ class ListSource:
 
     def states(self) -> list[State]:
         """The states of the different points."""
-        by_key = self.store.by_key()
-        return [self.status(plan, by_key).state for plan in self._different()]
+        by_key = trials_by_key(self.store.study)
+        return [self._status(plan, by_key).state for plan in self._different()]
 
-    def outcomes(self, status: Callable[[PlannedPoint], Outcome] | None = None) -> list[Outcome]:
-        """One outcome per point, in order; by the study, or by `status`."""
-        by_key = {} if status else self.store.by_key()
-        status = status or (lambda plan: self.status(plan, by_key))
+    def outcomes(self) -> list[Outcome]:
+        """One outcome per point, in order, by the study."""
+        by_key = trials_by_key(self.store.study)
+        return self._each(lambda plan: self._status(plan, by_key))
+
+    def preview(self, trials: Mapping[str, list[FrozenTrial]]) -> list[Outcome]:
+        """One outcome per point, in order, by the trials of a study and by all finished runs."""
+
+        def status(plan: PlannedPoint) -> Outcome:
+            results = finished_runs(plan, self._list.runs)
+            known = self._status(plan, trials)
+            state: State = "finished" if is_evaluated(plan, results) else known.state
+            return replace(known, state=state, results=results)
+
+        return self._each(status)
+
+    def _each(self, status: Callable[[PlannedPoint], Outcome]) -> list[Outcome]:
         return [
-            Outcome(point, "failed", self._errors[index])
-            if index in self._errors
+            Outcome(point, "failed", self.errors[index])
+            if index in self.errors
             else status(self._plans[index])
             for index, point in enumerate(self._points)
         ]
 
-    def errors(self) -> list[tuple[str, str]]:
-        """Label of each point that cannot be run, and why."""
-        return [(self._points[index].label, reason) for index, reason in self._errors.items()]
-
     def _different(self) -> Iterator[PlannedPoint]:
-        return (self._plans[indices[0]] for indices in self._same.values())
+        plans = (self._plans[indices[0]] for indices in self._same.values())
+        if (rank := self._list.rank) is None:
+            return plans
+        return iter(sorted(plans, key=lambda plan: rank(plan.point), reverse=True))
 
-    def status(self, plan: PlannedPoint, by_key: Mapping[str, list[FrozenTrial]]) -> Outcome:
+    def _status(self, plan: PlannedPoint, by_key: Mapping[str, list[FrozenTrial]]) -> Outcome:
         """The state of a point by the study and the finished runs."""
         if self._forgiven is None:
             before = sum(by_key.values(), []) if self._settings.retry == "failed" else []
@@ -174,8 +191,10 @@ class ListSource:
         trials = by_key.get(plan.key, ())
         states = {trial.state.name for trial in trials}
         failed = [trial for trial in trials if trial.state.name == "FAIL"]
-        # The runs of a failed point may have been finished by hand since.
-        unseen = {trial.number for trial in failed} - self._seen
+        # The runs of a failed point may have been finished by hand since; what is ranked depends
+        # on all that has ever been run.
+        looked: set[int | str] = {trial.number for trial in failed}
+        unseen = (looked | ({plan.key} if self._list.rank else set())) - self._seen
         self._seen |= unseen
         if ("COMPLETE" in states or unseen) and plan.key not in self._finished:
             results = finished_runs(plan, self._list.runs)
@@ -187,7 +206,7 @@ class ListSource:
             return replace(outcome, state="finished", results=self._finished[plan.key])
         if "RUNNING" in states:
             return replace(outcome, state="running")
-        if len(counted) > self._settings.retries:
+        if counted:
             reason = str(counted[-1].user_attrs[names.REASON])
             return replace(outcome, state="failed", reason=reason)
         return outcome
@@ -195,8 +214,9 @@ class ListSource:
 
 def finished_runs(plan: PlannedPoint, runs: RunStore) -> tuple[RunResult, ...]:
     """The runs of a point if all are finished, evaluated or not; () otherwise."""
+    wanted = plan.point.evaluations
     try:
-        found = [runs.find(run.key, plan.fingerprints[run.key]) for run in plan.runs]
+        found = [runs.find(run.key, plan.fingerprints[run.key], wanted) for run in plan.runs]
     except RunError:  # raised again when the point is executed
         return ()
     results = tuple(result for result in found if result is not None)
@@ -214,16 +234,8 @@ def preview_points(
 ) -> list[Outcome]:
     """The present state of the points; nothing is run and nothing written."""
     source = ListSource(points, settings, planner)
-    study = find_study(points.study, settings.storage, points.runs.runs_dir)
-    trials = trials_by_key(() if study is None else counted_trials(study))
-
-    def status(plan: PlannedPoint) -> Outcome:
-        results = finished_runs(plan, points.runs)
-        known = source.status(plan, trials)
-        state: State = "finished" if is_evaluated(plan, results) else known.state
-        return replace(known, state=state, results=results)
-
-    return source.outcomes(status)
+    study = known_studies(settings.storage, points.runs.runs_dir).get(points.study)
+    return source.preview(trials_by_key(study))
 
 
 def run_points(
@@ -244,14 +256,15 @@ def run_points(
     study = open_study(points.study, storage, settings.objectives, {names.KIND: points.kind})
     source.store = TrialStore(study, storage)
 
-    def num_done() -> int:
-        return sum(state in ("finished", "failed") for state in source.states())
+    def progress() -> tuple[int, int]:
+        states = source.states()
+        return sum(state in ("finished", "failed") for state in states), len(states)
 
-    for label, reason in source.errors():  # before hours of training
+    for index, reason in source.errors.items():  # before hours of training
+        label = points.points[index].label
         info(f"{label}: {reason.removeprefix(f'{label}: ')}")
-    total = lambda: len(source.states())  # noqa: E731
-    view = ProgressView(points.title, total, settings.workers, num_done)
-    drive(view, source, source.store, points.runs, settings)
+    view = ProgressView(points.title, settings.workers, progress)
+    drive(view, source, points.runs, settings)
     return source.outcomes()
 
 

@@ -16,7 +16,6 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Protocol
 
 from rgbt.checks import InputError
 from rgbt.runs.source_code import counted_modules
@@ -25,23 +24,6 @@ CWD_LAST, PRELOADED = "rgbt.runtime.cwd_last", "sweeps.worker.preload"
 GPUS = "CUDA_VISIBLE_DEVICES"
 GRACE_S = 20.0
 """Time between SIGTERM and SIGKILL of a process that is stopped."""
-
-
-class Job(Protocol):
-    """A process that was started."""
-
-    def poll(self) -> int | None:
-        """Its exit code, negative for a signal; None while it runs."""
-
-    def stop(self) -> None:
-        """Request that it stops; if it does not, later calls of `poll` kill it."""
-
-
-class Executor(Protocol):
-    """Starts commands; it does not wait for them."""
-
-    def start(self, command: Sequence[str], environment: Mapping[str, str], log: Path) -> Job:
-        """Start ``python -m <command>`` with more variables; its output is appended to `log`."""
 
 
 class LocalExecutor:
@@ -54,8 +36,8 @@ class LocalExecutor:
             os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
         self._context = multiprocessing.get_context("forkserver")
 
-    def start(self, command: Sequence[str], environment: Mapping[str, str], log: Path) -> Job:
-        """See `Executor.start`."""
+    def start(self, command: Sequence[str], environment: Mapping[str, str], log: Path) -> LocalJob:
+        """Start ``python -m <command>`` with more variables; its output is appended to `log`."""
         log.parent.mkdir(parents=True, exist_ok=True)
         # Without effect once the server runs. The user's own modules that planned points have read.
         self._context.set_forkserver_preload([CWD_LAST, *counted_modules(), PRELOADED])
@@ -66,20 +48,20 @@ class LocalExecutor:
 
 
 class LocalJob:
-    """See `Job`. The process leads a process group, so that its workers go with it."""
+    """A process that was started; it leads a process group, so that its workers go with it."""
 
     def __init__(self, process: multiprocessing.process.BaseProcess) -> None:
         self._process = process
         self._kill_at = float("inf")
 
     def poll(self) -> int | None:
-        """See `Job.poll`."""
+        """Its exit code, negative for a signal; None while it runs."""
         if self._process.exitcode is None and time.monotonic() > self._kill_at:
             self._signal(signal.SIGKILL)
         return self._process.exitcode
 
     def stop(self) -> None:
-        """See `Job.stop`."""
+        """Request that it stops; if it does not, later calls of `poll` kill it."""
         self._kill_at = min(self._kill_at, time.monotonic() + GRACE_S)
         self._signal(signal.SIGTERM)
 
@@ -133,14 +115,14 @@ def failure_reason(code: int, log: Path, begin: int) -> str:
     return found[-1].removeprefix("rgbt: ")[:300]
 
 
-def gpus_of(slot: int | tuple[int, ...]) -> tuple[int, ...]:
+def gpus_of(slot: int | tuple[int, ...]) -> list[str]:
     """The GPUs of one entry of `gpus`."""
-    return (slot,) if isinstance(slot, int) else slot
+    return [str(slot)] if isinstance(slot, int) else list(map(str, slot))
 
 
 def check_gpus(gpus: Sequence[int | tuple[int, ...]] | None) -> None:
-    """Refuse numbers of GPUs that this machine does not have or that are hidden."""
-    for number in (str(each) for slot in gpus or () for each in gpus_of(slot)):
+    """Refuse GPUs that this machine does not have or hides: a run would train on the CPU."""
+    for number in (each for slot in gpus or () for each in gpus_of(slot)):
         shown = os.environ.get(GPUS)
         if shown is None:
             import torch

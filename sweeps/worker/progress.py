@@ -24,7 +24,6 @@ from rgbt.checks import without_controls
 from sweeps.worker.running_trial import RunningTrial
 
 CONSOLE = Console(stderr=True)
-Total = int | None
 
 
 def bars() -> Progress:
@@ -44,17 +43,17 @@ class ProgressView:
 
     Args:
         title: e.g. the table.
-        total: number of points, or what returns it; None for a search that ends by time.
         workers: processes at a time.
-        count: returns the number of points done by all drivers; called every few seconds.
+        count: returns the number of points done by all drivers, and of all points (None: a search
+            that ends by time); called every few seconds.
     """
 
     def __init__(
-        self, title: str, total: Total | Callable[[], Total], workers: int, count: Callable[[], int]
+        self, title: str, workers: int, count: Callable[[], tuple[int, int | None]]
     ) -> None:
-        self._title, self._total, self._count = f"{title}, {workers} at a time", total, count
+        self._title, self._count = f"{title}, {workers} at a time", count
         self._ended: Counter[str] = Counter()
-        self._counted, self._done = -math.inf, 0
+        self._counted_at, self._done = -math.inf, 0
         self._bars = bars()
         self._all = self._bars.add_task(title)
         self._tasks: dict[int, TaskID] = {}
@@ -75,8 +74,8 @@ class ProgressView:
         self._ended[how] += 1
         because = f": {reason}" if reason else ""
         log = f"; see {trial.log}" if how == "failed" and trial.log else ""
-        text = f"{how:<8} {trial.plan.point.label}  {trial.seconds:.0f} s{_score(trial)}"
         if how != "finished" or self._bars.disable:
+            text = f"{how:<8} {trial.plan.point.label}  {trial.seconds:.0f} s{_score(trial)}"
             self._say(text + because + log)
 
     def rejected(self, label: str, reason: str) -> None:
@@ -88,14 +87,13 @@ class ProgressView:
         """Draw the running trials."""
         if self._bars.disable:
             return
-        if time.monotonic() - self._counted > 5:
-            self._counted, self._done = time.monotonic(), self._count()
-            total = self._total() if callable(self._total) else self._total
+        if time.monotonic() - self._counted_at > 5:
+            self._counted_at = time.monotonic()
+            self._done, total = self._count()
             self._bars.update(self._all, total=total)
         ended = (f", {n} {how}" for how, n in self._ended.items() if how != "finished")
         done = self._done + sum(trial.done_share for trial in trials)
-        text = "".join([self._title, *ended])
-        self._bars.update(self._all, completed=done, description=text)
+        self._bars.update(self._all, completed=done, description="".join([self._title, *ended]))
         for number in set(self._tasks) - {trial.number for trial in trials}:
             self._bars.remove_task(self._tasks.pop(number))
         for trial in trials:

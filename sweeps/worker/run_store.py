@@ -1,14 +1,16 @@
-"""Finished runs: in the folder of runs, or in MLflow where another machine has sent them."""
+"""Finished runs: in the folder of runs, in an archive, or in MLflow of several machines."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
 from omegaconf import DictConfig
 
+from analysis.archive import unpack
 from rgbt.checks import InputError, RunError
 from rgbt.config.component import build
 from rgbt.runs.folder import RunFolder, counts_name, is_finished, read_description, set_aside
@@ -29,23 +31,33 @@ Answer = TypeVar("Answer")
 class RunStore:
     """All finished runs that this machine can reach.
 
-    MLflow of `tracking` is searched for runs without a result here. With `fresh`, finished runs
-    that other code made are ignored, so that they are trained again.
+    Runs without a result here are looked for in the folder `archive`, and in MLflow of `tracking`.
+    With `fresh`, finished runs that other code made are ignored, so that they are trained again.
     """
 
     runs_dir: Path
     tracking: Tracking
     fresh: bool = False
+    archive: Path | None = None
     _is_unreachable: bool = field(default=False, init=False)
 
-    def find(self, key: str, dataset: str) -> RunResult | None:
+    def find(
+        self, key: str, dataset: str, evaluations: Sequence[ExtraEvaluation] = ()
+    ) -> RunResult | None:
         """The finished run `key` on the data set with that fingerprint; None if there is none.
 
+        An archived run cannot be evaluated further: it counts if it has all `evaluations`.
         RunError: the run folder is finished, but on other files of the data set.
         """
-        result: RunResult | None = RunResult(self.runs_dir / key)
-        if not is_finished(self.runs_dir / key):
-            result = self._with_mlflow(lambda tracking: self._fetched(tracking, key, dataset))
+        folder = self.runs_dir / key
+        result = RunResult(folder) if is_finished(folder) else None
+        if result is None and self.archive and (path := self.archive / f"{key}.zip").exists():
+            archived = unpack(path)
+            is_whole = all(each.is_stored(archived) for each in evaluations)
+            result = archived if is_whole and archived.fingerprint == dataset else None
+        if result is None:
+            fetch = partial(self._fetched, key=key, dataset=dataset, evaluations=evaluations)
+            result = self._with_mlflow(fetch)
         if result is None:
             return None
         try:
@@ -59,21 +71,20 @@ class RunStore:
             )
         return None if self._is_outdated(result) else result
 
-    def fetch_counts(self, result: RunResult, evaluation: ExtraEvaluation) -> bool:
-        """Download what another machine evaluated since; whether `evaluation` is among it."""
-        key, dataset = result.folder.name, result.fingerprint
-        self._with_mlflow(lambda tracking: self._fetched(tracking, key, dataset, again=True))
-        return evaluation.is_stored(result)
-
     def _fetched(
-        self, tracking: MlflowTracking, key: str, dataset: str, *, again: bool = False
+        self,
+        tracking: MlflowTracking,
+        key: str,
+        dataset: str,
+        evaluations: Sequence[ExtraEvaluation],
     ) -> RunResult | None:
-        """The copy of a run from MLflow; fetched, if it is not there yet or `again`."""
+        """The copy of a run from MLflow; fetched where it is not there yet with all evaluations."""
         copy = self.runs_dir / FETCHED / key
         marker = copy / "run_id"
-        if marker.exists() and not again:
+        if marker.exists():
             result = RunResult(copy, marker.read_text())
-            if result.fingerprint == dataset:
+            is_whole = all(each.is_stored(result) for each in evaluations)
+            if result.fingerprint == dataset and is_whole:
                 return result
         file = tracking.uri.partition("sqlite:///")[2]
         if file and (Path(file).parent == self.runs_dir or not Path(file).exists()):
@@ -101,20 +112,21 @@ class RunStore:
         result = RunResult(self.runs_dir / key)
         if result.is_finished and self._is_outdated(result):
             kept = set_aside(RunFolder(result.folder))
-            known = None if kept is None else read_description(kept.path)
-            if kept is not None and known is not None:
+            if kept is not None and (known := read_description(kept.path)) is not None:
                 self.tracking.refresh(kept, known)
 
     def _is_outdated(self, result: RunResult) -> bool:
         return self.fresh and result.other_code is not None
 
+    def is_own(self, result: RunResult) -> bool:
+        """Whether a run is a run folder here, and not a copy."""
+        return result.folder.parent == self.runs_dir
+
     def tag(self, result: RunResult, tags: Mapping[str, str]) -> None:
         """Add MLflow tags to a finished run of this machine that lacks them."""
-        if not result.run_id and not tags.items() <= result.tags.items():
-            folder = RunFolder(result.folder)
-            description = read_description(folder.path)
-            assert description is not None, "a finished run has run.json"
-            folder.describe(replace(description, tags={**description.tags, **tags}))
+        if self.is_own(result) and not tags.items() <= result.tags.items():
+            known = result.description
+            RunFolder(result.folder).describe(replace(known, tags={**known.tags, **tags}))
             self.sync(result)
 
     def sync(self, result: RunResult) -> None:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-import os
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from statistics import fmean
 from typing import NamedTuple
@@ -19,7 +19,7 @@ from rgbt.runs.result import RunResult
 from rgbt.runs.run_spec import RunSpec
 from sweeps.evaluation import ExtraEvaluation
 from sweeps.worker.planner import PlannedPoint
-from sweeps.worker.processes import Job, failure_reason
+from sweeps.worker.processes import LocalJob, failure_reason
 from sweeps.worker.run_store import RunStore
 
 LOGS = ".logs"  # Folder inside the folder of runs: output of the processes, one file per run
@@ -27,12 +27,12 @@ LOGS = ".logs"  # Folder inside the folder of runs: output of the processes, one
 PruningCallback = Callable[[MetricLine], str]
 """Gets a line of the selection split; returns why the trial is pruned, or ""."""
 
-Start = Callable[[Sequence[str], Path], Job]
+Start = Callable[[Sequence[str], Path], LocalJob]
 """Starts ``python -m <command>`` with its output in a file."""
 
 
 class ClaimedTrial(NamedTuple):
-    """A trial that this driver executes; `report` gets every validation of the first run."""
+    """A trial that this driver executes; `report` gets every validation of the first run, once."""
 
     plan: PlannedPoint
     number: int
@@ -45,32 +45,6 @@ class TrialError(Exception):
 
 class TrialPruned(Exception):  # noqa: N818 - not an error, Optuna's name for it
     """The trial was pruned; the message names the step."""
-
-
-class MetricsReader:
-    """Reads ``metrics.jsonl`` of a run as it grows, up to `step`; the folder need not exist yet."""
-
-    def __init__(self, folder: Path) -> None:
-        self._path = folder / "metrics.jsonl"
-        self._inode, self._offset, self.step = -1, 0, 0
-
-    def new_lines(self) -> list[MetricLine]:
-        """Whole lines since the last call; all of them again where the run has resumed."""
-        try:
-            with self._path.open("rb") as file:
-                inode = os.fstat(file.fileno()).st_ino
-                if inode != self._inode:  # a run that resumes writes the file anew
-                    self._inode, self._offset = inode, 0
-                file.seek(self._offset)
-                whole, newline, _ = file.read().rpartition(b"\n")
-        except FileNotFoundError:
-            return []
-        self._offset += len(whole) + len(newline)
-        lines: list[MetricLine] = []
-        with suppress(ValueError):  # the run itself reports a damaged line when it resumes
-            lines = MetricLine.read_all(whole.splitlines())
-        self.step = lines[-1].step if lines else self.step
-        return lines
 
 
 @dataclass(eq=False)
@@ -97,8 +71,9 @@ class RunningTrial:
     def __post_init__(self) -> None:
         self.plan, self.number, self._report = self.claimed
         self._began = time.monotonic()
-        self._job: Job | None = None
-        self._metrics = MetricsReader(Path())
+        self._job: LocalJob | None = None
+        self._folder = Path()
+        self._size, self._step, self._validated = 0, 0, 0  # of the metrics of the present run
         self._results: tuple[RunResult, ...] = ()
         self._end: Exception | None = None
         self._unreported: list[MetricLine] = []
@@ -110,7 +85,7 @@ class RunningTrial:
         """Steps done of all steps of the trial, 0..1."""
         index, count = len(self._results), len(self.plan.runs)
         run = self.plan.runs[min(index, count - 1)]
-        return min(1.0, (index + min(1.0, self._metrics.step / run.trainer.max_steps)) / count)
+        return min(1.0, (index + min(1.0, self._step / run.trainer.max_steps)) / count)
 
     @property
     def seconds(self) -> float:
@@ -154,25 +129,29 @@ class RunningTrial:
         return self._job is None or self._job.poll() is not None
 
     def _execute(self) -> Iterator[None]:
+        evaluations = self.plan.point.evaluations
         for run in self.plan.runs:
-            result = self.runs.find(run.key, self.plan.fingerprints[run.key])
+            find = partial(
+                self.runs.find, run.key, self.plan.fingerprints[run.key], evaluations=evaluations
+            )
+            result = find()
             if result is None:
                 yield from self._train(run)
-                result = self.runs.find(run.key, self.plan.fingerprints[run.key])
+                result = find()
             if result is None:
                 raise TrialError(
                     f"the run finished with another key than {run.key}: its configuration, its "
                     "data set or your own code changed during the sweep; rerun the command"
                 )
             self.runs.tag(result, self.plan.point.tags)
-            for evaluation in self.plan.point.evaluations:
+            for evaluation in evaluations:
                 if not evaluation.is_stored(result):
                     yield from self._evaluate(run, result, evaluation)
             self._results = (*self._results, result)
 
     def _train(self, run: RunSpec) -> Iterator[None]:
-        folder = self.runs.runs_dir / run.key
-        self._metrics = MetricsReader(folder)
+        self._folder = folder = self.runs.runs_dir / run.key
+        self._size = self._step = self._validated = 0
         self.runs.replace_outdated(run.key)
         while not is_finished(folder):
             if is_held(folder / "lock"):
@@ -192,12 +171,9 @@ class RunningTrial:
         self, run: RunSpec, result: RunResult, evaluation: ExtraEvaluation
     ) -> Iterator[None]:
         if result.run_id:
-            if self.runs.fetch_counts(result, evaluation):
-                return
             raise TrialError(
-                f"run {result.key} was trained on another machine: its further evaluations "
-                f"({evaluation.label}) can run only there; to train it here, delete MLflow "
-                f"run {result.run_id} and {result.folder}"
+                f"run {result.key} was trained on another machine, and only there can it be "
+                f"evaluated further ({evaluation.label})"
             )
         self.status = f"evaluating {evaluation.label}"
         module, *arguments = evaluation.command
@@ -231,11 +207,10 @@ class RunningTrial:
         until = time.monotonic() + self.timeout_s
         while True:
             code = poll()
-            lines = [line for line in self._metrics.new_lines() if line.kind == "val"]
-            if lines:
-                self.score = lines[-1].values.get("mIoU", math.nan)
-            if self._report is not None and not self._results:
-                self._unreported += lines
+            for line in self._new_validations():
+                self.score = line.values.get("mIoU", math.nan)
+                if self._report is not None and not self._results:
+                    self._unreported.append(line)
             if code is not None:
                 return code
             if self._prune_reason or time.monotonic() > until:
@@ -246,6 +221,19 @@ class RunningTrial:
                     raise TrialPruned(self._prune_reason)
                 raise TrialError("stopped after timeout_minutes")
             yield
+
+    def _new_validations(self) -> list[MetricLine]:
+        """Whole lines of new steps; a run that resumes repeats those before its checkpoint."""
+        path, lines = self._folder / "metrics.jsonl", list[MetricLine]()
+        # It may not exist yet; the run itself reports a damaged line when it resumes.
+        with suppress(FileNotFoundError, ValueError):
+            before, self._size = self._size, path.stat().st_size
+            if self._size != before:
+                lines = MetricLine.read_all(path.read_bytes().split(b"\n")[:-1])
+        self._step = lines[-1].step if lines else self._step
+        found = [line for line in lines if line.kind == "val" and line.step > self._validated]
+        self._validated = found[-1].step if found else self._validated
+        return found
 
 
 def mean_scores(results: Sequence[RunResult]) -> Mapping[str, float]:

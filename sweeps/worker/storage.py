@@ -1,22 +1,29 @@
-"""The storage of studies: SQLite, or PostgreSQL for several machines."""
+"""Studies in Optuna's storage, shared by any number of drivers: SQLite, or PostgreSQL for several
+machines.
+
+A driver claims a point of a list by adding a running trial with the point's key, and drops it again
+if a trial with a lower number has the same key. A search asks the sampler. A trial without a
+heartbeat is failed by Optuna: the point of a list is free again, that of a search is enqueued.
+"""
 
 from __future__ import annotations
 
 import re
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from rgbt.checks import InputError, nearest
+from rgbt.checks import InputError
 from rgbt.runs.provenance import without_passwords
 from sweeps import attributes as names
 from sweeps.settings import Objective
 
 if TYPE_CHECKING:
     import optuna
-    from optuna.trial import FrozenTrial
+    from optuna.storages import BaseStorage, RDBStorage
+    from optuna.trial import FrozenTrial, Trial
 
 Opened = TypeVar("Opened")
 
@@ -26,9 +33,7 @@ NAME = r"[\w\-. :/]+"
 HEARTBEAT_S, STALE_S = 20, 120
 """Seconds between two heartbeats of a trial, and without one until it is lost."""
 
-ATTEMPTS, PAUSE_S = 8, 0.7
-FINAL = ("refused", "could not translate", "authentication", "unable to open", "parse", "plugin")
-"""Words of errors that no later attempt cures."""
+ATTEMPTS, PAUSE_S = 5, 0.7
 
 
 def storage_url(storage: str | None, runs_dir: Path) -> str:
@@ -38,13 +43,7 @@ def storage_url(storage: str | None, runs_dir: Path) -> str:
     return re.sub(r"^postgres(ql)?://", "postgresql+psycopg://", url)
 
 
-def storage_file(url: str) -> Path | None:
-    """The file of a storage; None for a database server."""
-    path = url.removeprefix("sqlite:///")
-    return None if "://" in path else Path(path)
-
-
-def open_storage(storage: str | None, runs_dir: Path) -> optuna.storages.RDBStorage:
+def open_storage(storage: str | None, runs_dir: Path) -> RDBStorage:
     """Open a storage, and create it if it does not exist.
 
     `storage` is None for the file ``<runs_dir>/studies.db``, or sqlite:///FILE, or
@@ -85,27 +84,26 @@ def enqueue_again(study: optuna.Study, trial: FrozenTrial) -> None:
 
 def _retry(opening: Callable[[], Opened], what: str) -> Opened:
     """Retry: of two processes that create the tables of a new database at once, one may fail."""
-    for attempt in range(ATTEMPTS):
+    for attempt in range(1, ATTEMPTS):
         try:
             return opening()
-        except Exception as error:  # Any error of the driver: a later try finds the tables.
-            is_final = isinstance(error, ImportError) or any(w in str(error).lower() for w in FINAL)
-            if is_final or attempt == ATTEMPTS - 1:
-                reason = without_passwords(f"{what}: {str(error).splitlines()[0]}")
-                raise InputError(reason) from error
-            time.sleep(PAUSE_S * (1 + attempt))
-    raise AssertionError("the last attempt returns or raises")
+        except Exception:  # Any error of the driver: a later try finds the tables.
+            time.sleep(PAUSE_S * attempt)
+    try:
+        return opening()
+    except Exception as error:
+        reason = without_passwords(f"{what}: {str(error).splitlines()[0]}")
+        raise InputError(reason) from error
 
 
 def open_study(
     name: str,
-    storage: optuna.storages.BaseStorage,
+    storage: BaseStorage,
     objectives: Sequence[Objective],
     attributes: Mapping[str, Any],
-    sampler: optuna.samplers.BaseSampler | None = None,
-    pruner: optuna.pruners.BasePruner | None = None,
+    **samplers: Any,
 ) -> optuna.Study:
-    """The study called `name`, created if it does not exist.
+    """The study called `name`, created if it does not exist; with `sampler` and `pruner`.
 
     InputError: there is one with other objectives, points of another kind or another space.
     """
@@ -113,16 +111,10 @@ def open_study(
 
     if not re.fullmatch(NAME, name):
         raise InputError(f"study={name}: only letters, digits, spaces and _ - . : / are possible.")
+    directions = [objective.direction for objective in objectives]
+    made: dict[str, Any] = {"study_name": name, "storage": storage, "directions": directions}
     study = _retry(
-        lambda: optuna.create_study(
-            study_name=name,
-            storage=storage,
-            directions=[objective.direction for objective in objectives],
-            sampler=sampler,
-            pruner=pruner,
-            load_if_exists=True,
-        ),
-        f"study={name}",
+        lambda: optuna.create_study(**made, **samplers, load_if_exists=True), f"study={name}"
     )
     metrics = [objective.metric for objective in objectives]
     wanted, known = {names.METRICS: metrics, **attributes}, study.user_attrs
@@ -137,21 +129,152 @@ def open_study(
     return study
 
 
-def find_study(name: str, storage: str | None, runs_dir: Path) -> optuna.Study | None:
-    """The study called `name`; None where it does not exist."""
-    file = storage_file(storage_url(storage, runs_dir))
-    if file is not None and not file.exists():
-        return None
-    found = open_storage(storage, runs_dir)
-    is_known = name in {study.study_name for study in found.get_all_studies()}
-    return load_study(name, found) if is_known else None
-
-
-def load_study(name: str, storage: optuna.storages.BaseStorage) -> optuna.Study:
-    """The study called `name`; InputError, which names the nearest one, if there is none."""
+def known_studies(storage: str | None, runs_dir: Path) -> dict[str, optuna.Study]:
+    """The studies of a storage by name; none where it does not exist, and nothing is created."""
     import optuna
 
-    known = [study.study_name for study in storage.get_all_studies()]
-    if name not in known:
-        raise InputError(f"name={name}: there is no such study; {nearest(name, known)}.")
-    return optuna.load_study(study_name=name, storage=storage)
+    path = storage_url(storage, runs_dir).removeprefix("sqlite:///")
+    if "://" not in path and not Path(path).exists():
+        return {}
+    opened = open_storage(storage, runs_dir)
+    found = [study.study_name for study in opened.get_all_studies()]
+    return {name: optuna.load_study(study_name=name, storage=opened) for name in found}
+
+
+def counted_trials(study: optuna.Study) -> list[FrozenTrial]:
+    """Trials of a study, by number, without those that were lost, released or duplicates."""
+    trials = study.get_trials(deepcopy=False)
+    return [t for t in trials if t.state.name != "FAIL" or names.REASON in t.user_attrs]
+
+
+def trials_by_key(study: optuna.Study | None) -> dict[str, list[FrozenTrial]]:
+    """Trials that count by the key of their point, earlier ones first."""
+    groups: dict[str, list[FrozenTrial]] = {}
+    for trial in counted_trials(study) if study else ():
+        groups.setdefault(trial.user_attrs.get(names.KEY, ""), []).append(trial)
+    return groups
+
+
+class TrialStore:
+    """One study and the driver that works on it."""
+
+    def __init__(self, study: optuna.Study, storage: RDBStorage) -> None:
+        self.study = study
+        self._storage = storage
+        self._study_id = storage.get_study_id_from_name(study.study_name)
+        self._begun: set[int] = set()
+
+    def trials(self) -> list[FrozenTrial]:
+        """All trials that count, by number."""
+        return counted_trials(self.study)
+
+    def claim(self, attributes: Mapping[str, Any], replaced: Collection[int] = ()) -> int | None:
+        """The number of a new running trial of ours; None if an earlier trial has the point.
+
+        `replaced` are numbers of earlier trials that do not count: of failed or deleted runs.
+        """
+        from optuna.trial import TrialState, create_trial
+
+        first = dict(attributes)
+        label = {names.LABEL: first.pop(names.LABEL)}  # after the heartbeat, see `fail_stale`
+
+        trial = create_trial(state=TrialState.RUNNING, user_attrs=first)
+        trial_id = self._storage.create_new_trial(self._study_id, trial)
+        self._storage.record_heartbeat(trial_id)
+        number = self._storage.get_trial(trial_id).number
+        self.update_unfinished(number, label)
+        for other in trials_by_key(self.study)[attributes[names.KEY]]:
+            is_earlier = other.number < number and other.number not in replaced
+            if is_earlier and other.state.name in ("RUNNING", "COMPLETE", "PRUNED"):
+                self._finish(number, "FAIL", {})
+                return None
+        return number
+
+    def ask(self, total: int | None, space: Mapping[str, Any] | None = None) -> Trial | None:
+        """A trial of a search, with parameters of `space`.
+
+        It is an enqueued one, or a new one while there are fewer than `total`.
+        """
+        from optuna.storages import RetryHeartbeatStaleTrialCallback
+
+        trials = self.trials()
+        is_waiting = any(trial.state.name == "WAITING" for trial in trials)
+        if total is not None and len(trials) >= total and not is_waiting:
+            return None
+        trial = self.study.ask(dict(space or {}))
+        self._storage.record_heartbeat(trial._trial_id)
+        before = [other for other in self.trials() if other.number < trial.number]
+        # Two drivers may ask for the last one at the same time: the lower number wins.
+        is_surplus = total is not None and len(before) >= total
+        if names.KEY in trial.user_attrs:
+            # Two drivers may enqueue the same lost trial, and take both up: the same.
+            frozen = self._storage.get_trial(trial._trial_id)
+            replaced = RetryHeartbeatStaleTrialCallback.retry_history(frozen)
+            is_surplus = any(
+                other.number not in replaced
+                and (other.state.is_finished() or other.number < trial.number)
+                for other in trials_by_key(self.study)[trial.user_attrs[names.KEY]]
+                if other.number != trial.number
+            )
+        if is_surplus:
+            self._finish(trial.number, "FAIL", {})
+        return None if is_surplus else trial
+
+    def send_heartbeats(self, numbers: Iterable[int]) -> None:
+        """Record that this driver is still executing these trials."""
+        for number in numbers:
+            self._storage.record_heartbeat(self._id(number))
+
+    def fail_stale(self) -> None:
+        """Fail the trials of lost drivers; `enqueue_again` is called for each.
+
+        Optuna never fails a trial without any heartbeat, whose driver was killed just after it had
+        made the trial: it gets one from us, once, and is stale later unless its driver lives.
+        """
+        from optuna.storages import fail_stale_trials
+
+        for trial in self.trials():
+            is_begun = names.LABEL in trial.user_attrs or trial.number in self._begun
+            if trial.state.name == "RUNNING" and not is_begun:
+                self._begun.add(trial.number)
+                self._storage.record_heartbeat(trial._trial_id)
+        fail_stale_trials(self.study)
+
+    def complete(self, number: int, values: Sequence[float], notes: Mapping[str, Any]) -> None:
+        """Finish a trial with its values; without effect if another driver has finished it."""
+        self._finish(number, "COMPLETE", notes, values)
+
+    def fail(self, number: int, reason: str, notes: Mapping[str, Any], state: str = "FAIL") -> None:
+        """Finish a trial as failed or pruned; see `complete`."""
+        self._finish(number, state, {**notes, names.REASON: reason})
+
+    def release(self, number: int) -> None:
+        """Give up a running trial, which does not count; of a search, its point is enqueued."""
+        trial = self._storage.get_trial(self._id(number))
+        if trial.state.name == "RUNNING":
+            enqueue_again(self.study, trial)  # first, so that a crash in between loses nothing
+            self._finish(number, "FAIL", {})
+
+    def update_unfinished(
+        self, number: int, attributes: Mapping[str, Any], then: Callable[[], object] | None = None
+    ) -> None:
+        """Write user attributes, and do more; no error if another driver has finished the trial."""
+        try:
+            for name, value in attributes.items():
+                self._storage.set_trial_user_attr(self._id(number), name, value)
+            if then is not None:
+                then()
+        except (RuntimeError, ValueError):  # Optuna: UpdateFinishedTrialError is a RuntimeError
+            if not self._storage.get_trial(self._id(number)).state.is_finished():
+                raise
+
+    def _id(self, number: int) -> int:
+        return self._storage.get_trial_id_from_study_id_trial_number(self._study_id, number)
+
+    def _finish(
+        self, number: int, state: str, notes: Mapping[str, Any], values: Any = None
+    ) -> None:
+        from optuna.trial import TrialState
+
+        end = TrialState[state]
+        self.update_unfinished(number, notes, lambda: self.study.tell(number, values, state=end))

@@ -1,52 +1,27 @@
-"""Selects the next trial of a driver: the interface, and the proposals of a search sampler."""
+"""The trials of a search: what its sampler proposes, and what is reported of them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING
 
 from rgbt.checks import InputError
 from rgbt.metrics.names import in_percent
 from rgbt.runs.folder import MetricLine
 from rgbt.runs.naming import VARIED
-from rgbt.runs.provenance import without_passwords
 from sweeps import attributes as names
 from sweeps.point import Point
 from sweeps.settings import SweepSettings
-from sweeps.worker.planner import PlannedPoint, Planner
+from sweeps.worker.planner import Planner
 from sweeps.worker.running_trial import ClaimedTrial, PruningCallback
-from sweeps.worker.trial_store import TrialStore
+from sweeps.worker.storage import TrialStore
 
 if TYPE_CHECKING:
     from optuna.trial import Trial
 
     from sweeps.space import Space
-
-
-class TrialSource(Protocol):
-    """Gives a driver its trials."""
-
-    requeues: bool  # whether the study gives a point that failed to a driver again
-    rejected: int  # points whose configuration is wrong
-
-    def next(self) -> ClaimedTrial | None:
-        """The next trial, claimed for this driver; None when there is none at the moment."""
-
-    def is_exhausted(self, *, wait: bool) -> bool:
-        """Whether no trial is left; with `wait`, whether other drivers have finished too."""
-
-
-def trial_attributes(plan: PlannedPoint) -> Mapping[str, Any]:
-    """User attributes of a trial of a point."""
-    return {
-        names.KEY: plan.key,
-        names.OVERRIDES: [without_passwords(word) for word in plan.point.overrides],
-        names.RUNS: [run.key for run in plan.runs],
-        names.PIXELS: plan.runs[0].scale.pixel_factor,
-        names.LABEL: plan.point.label,
-    }
 
 
 @dataclass
@@ -64,7 +39,6 @@ class SamplerSource:
     planner: Planner
     settings: SweepSettings
     on_reject: Callable[[str, str], None]
-    requeues: bool = True
     rejected: int = 0
 
     def next(self) -> ClaimedTrial | None:
@@ -91,8 +65,7 @@ class SamplerSource:
             self.rejected += 1
             self.on_reject(point.label, str(error))
             return None
-        noted = trial_attributes(plan)
-        self.store.update_unfinished(number, lambda: self.store.set_attributes(number, noted))
+        self.store.update_unfinished(number, plan.attributes)
         return ClaimedTrial(plan, number, self._pruning_callback(trial))
 
     def is_exhausted(self, *, wait: bool) -> bool:
@@ -106,15 +79,12 @@ class SamplerSource:
         if self.settings.pruner is None and len(self.settings.objectives) > 1:
             return None
         metric = self.settings.objectives[0].metric.removeprefix("val/")
-        reported: set[int] = set()
 
         def report(line: MetricLine) -> str:
-            value = line.values.get(metric)
-            if value is None or line.step in reported:
+            if metric not in line.values:
                 return ""
-            percent = in_percent(metric, value)
-            self.store.update_unfinished(trial.number, lambda: trial.report(percent, line.step))
-            reported.add(line.step)
+            percent = in_percent(metric, line.values[metric])
+            self.store.update_unfinished(trial.number, {}, lambda: trial.report(percent, line.step))
             is_pruned = self.settings.pruner is not None and trial.should_prune()
             return f"pruned at step {line.step}" if is_pruned else ""
 

@@ -28,9 +28,8 @@ from sweeps.worker.planner import PlannedPoint
 from sweeps.worker.point_list import ListSource, PointList
 from sweeps.worker.run_store import RunStore
 from sweeps.worker.running_trial import RunningTrial
-from sweeps.worker.storage import STALE_S, open_storage, open_study
+from sweeps.worker.storage import STALE_S, TrialStore, open_storage, open_study
 from sweeps.worker.trial_sources import SamplerSource
-from sweeps.worker.trial_store import TrialStore
 
 DATASET = "fingerprint-of-the-data"
 DEADLINE_S = 60.0
@@ -42,7 +41,7 @@ def settings(**changes: Any) -> SweepSettings:
     none = ("storage", "gpus", "timeout_minutes", "max_failures", "study", "pruner", "trials")
     plain: dict[str, Any] = {
         **dict.fromkeys((*none, "hours")),
-        **{"workers": 1, "executor": "local", "submitit": {}, "retries": 0, "retry": "none"},
+        **{"workers": 1, "retry": "none"},
         **{"wait": False, "dry_run": False, "params": {}, "points": (), "space": {}},
         "objectives": (Objective("test/mIoU", "maximize"),),
         "sampler": {"_target_": "optuna.samplers.RandomSampler", "seed": 0},
@@ -337,16 +336,15 @@ def list_desk(
     storage: Any = None,
     view: FakeView | None = None,
     more: Any = None,
-    distributions: Mapping[str, Any] | None = None,
     **changes: Any,
 ) -> Desk:
     """A driver of a list of points, which are planned."""
     wanted, runs = settings(**changes), RunStore(runs_dir, NoTracking())
-    wished = PointList("study", "s", "list", tuple(given), runs, (), distributions, more)
+    wished = PointList("study", "s", "list", tuple(given), runs, (), more)
     source = ListSource(wished, wanted, FakePlanner())  # type: ignore[arg-type]
     source.store = store_on(memory() if storage is None else storage, wanted)
     executor, seen = FakeExecutor(runs_dir, behaviour), view or FakeView()
-    driver = Driver(source.store, source, runs, executor, wanted, seen)  # type: ignore[arg-type]
+    driver = Driver(source, runs, executor, wanted, seen)  # type: ignore[arg-type]
     return Desk(driver, source.store, executor, runs, seen, [plan_of(point) for point in given])
 
 
@@ -371,7 +369,7 @@ def search_desk(
     executor, seen = FakeExecutor(runs_dir, behaviour), view or FakeView()
     planner = planner or FakePlanner()
     source = SamplerSource((), searched, store, planner, wanted, seen.rejected)
-    driver = Driver(store, source, runs, executor, wanted, seen)  # type: ignore[arg-type]
+    driver = Driver(source, runs, executor, wanted, seen)  # type: ignore[arg-type]
     return Desk(driver, store, executor, runs, seen)
 
 

@@ -57,8 +57,6 @@ def objective(metric: str) -> dict[str, Any]:
     [
         ({"worker": 2}, "hydra.sweeper.worker'"),
         ({"workers": 0}, "hydra.sweeper.workers'"),
-        ({"submitit": {"cluster": "slurm"}}, "executor=submitit"),
-        ({"executor": "submitit", "timeout_minutes": 3}, "timeout_minutes"),
         (objective("mIoU"), "objective 'mIoU'"),
         (objective("val/TC/align"), "did you mean 'TC/aligned'"),
         ({"points": ["a=1"]}, r"hydra.sweeper.points\[0\]"),

@@ -1,50 +1,173 @@
-"""`rgbt study` on studies in a file, as a user calls it."""
+"""`rgbt study`: results of a study as tables and files, with values by hand."""
 
 from __future__ import annotations
 
+import csv
+import io
+import warnings
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import optuna
-from optuna.trial import TrialState
+import pytest
+from optuna.distributions import CategoricalDistribution, FloatDistribution
+from optuna.trial import TrialState, create_trial
 
-from sweeps import attributes
-from sweeps.report.study import study_folder
-from sweeps.study import entry
+from rgbt.tables import TextTable
+from sweeps import attributes, study
+from sweeps.study import StudyData, entry, importances, study_folder
 from tests.commands import Call, assert_one_sentence
 
-FILES = {"study.md", "trials.csv"}
+ALPHA = FloatDistribution(0, 1)
+SIZES = CategoricalDistribution(("${px:64}", "${px:8}"))
+DIRECTIONS = {"val/mIoU": "maximize", "val/Var": "minimize", "up": "maximize", "down": "minimize"}
 
 
-def make_study(runs_dir: Path, name: str = "search/grbm", kind: str = "search") -> None:
+def new_study(*metrics: str, kind: str = "search", **where: Any) -> optuna.Study:
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    url = f"sqlite:///{runs_dir}/studies.db"
-    study = optuna.create_study(study_name=name, storage=url, direction="maximize")
-    study.set_user_attr(attributes.KIND, kind)
-    study.set_user_attr(attributes.METRICS, ["val/mIoU"])
-    study.set_user_attr(attributes.COMMAND, "python -m rgbt.run -m storage=postgresql://u:pw@h/db")
-    for alpha in (0.25, 0.75, 0.5):
-        trial = study.ask()
-        trial.suggest_float("masker.alpha", 0, 1)
-        trial.set_user_attr(attributes.LABEL, f"alpha={alpha}")
-        trial.set_user_attr(attributes.RUNS, [f"key{trial.number}"])
-        trial.set_user_attr(attributes.RESULTS, {"val/mIoU": 50 + alpha, "test/mIoU": 48 + alpha})
-        study.tell(trial, 50 + alpha)
-    failed = study.ask()
-    failed.set_user_attr(attributes.REASON, "exit code 1: [Errno 28] disk full")
-    study.tell(failed, state=TrialState.FAIL)
-    study.ask()  # still running
+    directions = [DIRECTIONS[metric] for metric in metrics]
+    made = optuna.create_study(**{"study_name": "s", "directions": directions, **where})
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # experimental
+        made.set_metric_names(list(metrics))
+    made.set_user_attr(attributes.KIND, kind)
+    return made
+
+
+def add(
+    to: optuna.Study,
+    values: Sequence[float] | None = None,
+    *,
+    state: str = "COMPLETE",
+    params: Mapping[str, Any] = {},  # noqa: B006 - nobody changes it
+    reported: Mapping[int, float] = {},  # noqa: B006
+    **attrs: Any,
+) -> None:
+    """A text among `params` is one of the choices `SIZES`, a number lies in 0..1."""
+    trial = create_trial(
+        state=TrialState[state],
+        values=values,
+        params=dict(params),
+        distributions={k: SIZES if isinstance(v, str) else ALPHA for k, v in params.items()},
+        intermediate_values=dict(reported),
+        user_attrs={f"rgbt.{name}": value for name, value in attrs.items()},
+    )
+    to.add_trial(trial)
+
+
+def grid_of(made: optuna.Study) -> TextTable:
+    return study.trials_grid(StudyData.read(made))
+
+
+def test_trials_grid_sorts_by_objective_direction() -> None:
+    made = new_study("val/Var")
+    results = {"val/Var": 8.0, "test/Var": 9.5, "val/mIoU": 50.0, "test/mIoU": 48.25}
+    first = {"masker.alpha": 0.123456, "optimizer.lr": 0.5, "head.lr": 1.0}
+    add(made, [8.0], params=first, results=results, seconds=61.6, runs=["a1"])
+    for value in (*range(12, 22), 4.0):
+        add(made, [float(value)], params={"masker.alpha": 0.25})
+    grid = grid_of(made)
+    assert grid.title == "Best trials: lowest val/Var"
+    assert grid.header == (
+        *("trial", "alpha", "optimizer.lr", "head.lr", "val/Var", "test/Var", "val/mIoU"),
+        *("test/mIoU", "seconds", "runs"),
+    )
+    assert [row[0] for row in grid.rows] == ["11", "0", *map(str, range(1, 9))]
+    scores = ("8.00", "9.50", "50.00", "48.25", "62", "a1")
+    assert grid.rows[1] == ("0", "0.1235", "0.5", "1", *scores)
+    assert grid.rows[0][2:] == ("-", "-", "4.00", "-", "-", "-", "-", "-")
+
+
+def test_pareto_front_of_five_points() -> None:
+    # mIoU up, Var down. (50, 9) is beaten by (55, 8); (54, 10) by (55, 8): three remain.
+    made = new_study("val/mIoU", "val/Var")
+    add(made, state="FAIL", reason="so that numbers are not places in a list")
+    size = {"params": {"size": "${px:64}"}, "pixels": 0.5}
+    for values in ((50.0, 9.0), (55.0, 8.0), (60.0, 12.0), (54.0, 10.0), (40.0, 2.0)):
+        add(made, values, **size)
+    grid = grid_of(made)
+    assert [row[0] for row in grid.rows] == ["3", "2", "5"]
+    values = [("32", "60.00", "12.00"), ("32", "55.00", "8.00"), ("32", "40.00", "2.00")]
+    assert [row[1:4] for row in grid.rows] == values
+
+
+def test_tables_of_list_keep_point_order_and_last_trials() -> None:
+    made = new_study("val/mIoU", kind="list")
+    add(made, [51.0], label="Ny/4 seed=1", key="k1", runs=["k1"])
+    add(made, state="FAIL", label="Ny/2 seed=1", key="k2", reason="exit code 1")
+    add(made, [52.0], label="Ny/2 seed=1", key="k2", runs=["k2"])
+    add(made, state="RUNNING", label="Ny seed=1", key="k3")
+    add(made, state="FAIL", label="x", key="k4", reason="by\nsignal | 9", runs=["r1", "r2"])
+    counts, points, failed = study.tables(StudyData.read(made))
+    assert counts.rows == (("5", "2", "0", "2", "1", "0"),)
+    assert points.header[:4] == ("trial", "point", "state", "val/mIoU")
+    assert [row[:4] for row in points.rows[:3]] == [
+        ("0", "Ny/4 seed=1", "complete", "51.00"),
+        ("2", "Ny/2 seed=1", "complete", "52.00"),
+        ("3", "Ny seed=1", "running", "-"),
+    ]
+    assert failed.title == "Failed trials (1 more were retried)"
+    assert failed.rows == (("by signal | 9", "4", "x", "r1 r2", "-"),)
+
+
+def test_trials_csv_has_all_trials_with_full_numbers() -> None:
+    made = new_study("val/mIoU")
+    add(made, [100 / 3], params={"a.x": 0.1}, results={"test/mIoU": 31.0}, seconds=2.5, runs=["r"])
+    reported = {10: 1.0, 20: 2.0}
+    add(made, state="PRUNED", params={"a.x": 0.2}, reported=reported, reason="at 20, low")
+    first, second = csv.DictReader(io.StringIO(study.trials_csv(StudyData.read(made))))
+    assert float(first["val/mIoU"]) == 100 / 3
+    assert list(first.values())[5:] == ["31.0", "2.5", "", "r", ""]
+    assert list(second.values())[3:] == ["0.2", "", "", "", "20", "", "at 20, low"]
+    assert (second["state"], second["label"]) == ("pruned", "#1")
+
+
+def test_importances_name_the_deciding_parameter() -> None:
+    """`big` decides the first objective, `small` the second; `same` never changes."""
+    made = new_study("up", "down")
+    for index in range(40):
+        big, small = index / 40, (index * 7 % 40) / 40
+        params = {"small": small, "big": big, "same": 0.5}
+        add(made, [10 * big + 0.01 * small, 5 * small + 0.001 * big], params=params)
+    grid, remark = importances(StudyData.read(made))
+    assert grid is not None
+    (first, *of_big), (second, *of_small) = grid.rows
+    assert (first, second) == ("big", "small")
+    assert (float(of_big[0]) > 80, float(of_small[1]) > 80) == (True, True)
+    assert [float(a) + float(b) for a, b in zip(of_big, of_small, strict=True)] == [
+        pytest.approx(100, abs=0.02)
+    ] * 2
+    assert remark.startswith("rough: 40 complete trials")
+
+
+def test_importances_missing_have_a_reason() -> None:
+    few, fixed = (new_study("up") for _ in range(2))
+    for index in range(12):
+        add(fixed, [float(index)], params={"x": 0.5})
+    for index in range(9):
+        add(few, [float(index)], params={"x": index / 20})
+    found = [importances(StudyData.read(each)) for each in (few, fixed)]
+    assert found[0] == (None, "they need 10 complete trials, and there are 9.")
+    assert found[1] == (None, "no parameter, or no objective, took two values.")
 
 
 def test_study_of_search_is_shown_and_written(call: Call, tmp_path: Path) -> None:
-    make_study(tmp_path)
+    url = f"sqlite:///{tmp_path}/studies.db"
+    made = new_study("val/mIoU", study_name="search/grbm", storage=url)
+    made.set_user_attr(attributes.COMMAND, "python -m rgbt.run -m storage=postgresql://u:pw@h/db")
+    for alpha in (0.25, 0.75, 0.5):
+        add(made, [50 + alpha], params={"masker.alpha": alpha}, runs=["key"])
+    add(made, state="FAIL", reason="exit code 1: [Errno 28] disk full")
+    made.ask()  # still running
     code, out, err = call(entry, "name=search/grbm", f"runs_dir={tmp_path}")
     assert (code, err) == (0, "")
     folder = study_folder(tmp_path, "search/grbm")
     assert out.index("50.75") < out.index("50.50") < out.index("50.25")
     assert "[Errno 28] disk full" in out
     assert "Importances: they need 10 complete trials, and there are 3." in out
-    assert f"optuna-dashboard sqlite:///{tmp_path}/studies.db" in out
-    assert {path.name for path in folder.iterdir()} == FILES
+    assert f"optuna-dashboard {url}" in out
+    assert {path.name for path in folder.iterdir()} == {"study.md", "trials.csv"}
     text = (folder / "study.md").read_text()
     assert "postgresql://u:***@h/db" in text
     assert "| 50.75 |" in text
@@ -53,9 +176,9 @@ def test_study_of_search_is_shown_and_written(call: Call, tmp_path: Path) -> Non
 def test_study_unknown_or_missing_name_lists_studies(call: Call, tmp_path: Path) -> None:
     code, _, err = call(entry, "name=x", f"runs_dir={tmp_path}")
     assert code == 2
-    assert_one_sentence(err, "there is no storage")
+    assert_one_sentence(err, "studies.db")
     assert list(tmp_path.iterdir()) == []
-    make_study(tmp_path)
+    new_study("up", study_name="search/grbm", storage=f"sqlite:///{tmp_path}/studies.db")
     for words in (["name=search/grb"], []):
         code, _, err = call(entry, *words, f"runs_dir={tmp_path}")
         assert code == 2

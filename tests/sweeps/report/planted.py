@@ -12,8 +12,8 @@ from omegaconf import OmegaConf
 from rgbt.runs.folder import RunFolder
 from rgbt.runs.naming import describe
 from sweeps.table.load_table import load_table
-from sweeps.table.request import TAG
-from sweeps.table_plan import TableWords, make_request
+from sweeps.table.request import TAG, TableRequest
+from sweeps.table_plan import make_request
 from sweeps.worker.planner import Planner
 from tests.sweeps.verdicts.accuracies import accuracy
 
@@ -32,8 +32,7 @@ def plant(
     scale: str = "demo",
 ) -> list[Path]:
     """Runs of rows of a table with these accuracies by seed; `extra` are overrides of every row."""
-    words = TableWords(seeds=(0,), scale=scale, overrides=extra)
-    request, _ = make_request(name, load_table(name), words)
+    request, _ = make_request(TableRequest(name, load_table(name), scale, (0,), tuple(extra)))
     planner, folders = Planner((f"runs_dir={runs_dir}",)), []
     for label, percents in shares.items():
         for seed, percent in enumerate(percents):

@@ -256,20 +256,29 @@ def test_archive_gives_the_same_pages_and_a_run_changes_them(place: Path, tmp_pa
 
 
 MARKS = """
-<!-- results:count -->stale<!-- /results --> claims.
+<!-- results:count -->stale<!-- /results --> claims,
+<!-- results:count runs -->stale<!-- /results --> runs.
 <!-- results:claim my/planted true_one -->stale<!-- /results -->
+<!-- results:cell my/planted acc low -->stale<!-- /results --> points.
 <!-- results:effects spatial_bias centre -->stale<!-- /results -->
 """
 
 
 def test_marked_numbers_are_made_again_and_nothing_else(report: Report) -> None:
     text = report.filled(MARKS)
-    assert "<!-- results:count -->162<!-- /results --> claims." in text  # 158 of the papers, 4
+    assert "<!-- results:count -->162<!-- /results --> claims," in text  # 158 of the papers, 4
+    assert f"count runs -->{len(report.runs)}<!-- /results --> runs." in text
     assert "High is above low. **Holds**: high - low, acc +9.87" in text
+    assert "acc low -->49.92 ± 1.31<!-- /results --> points." in text
     assert "No run yet: `rgbt reproduce table=spatial_bias rows=tested" in text
     assert report.filled(text) == text
     assert "stale" not in text
-    for wrong in ("claim my/planted none", "nothing x", "effects crm/table1 x"):
+    for wrong in (
+        "claim my/planted none",
+        "cell my/planted acc none",
+        "nothing x",
+        "effects crm/table1 x",
+    ):
         with pytest.raises(InputError, match=wrong.split()[0]):
             report.filled(f"<!-- results:{wrong} --><!-- /results -->")
 

@@ -18,7 +18,6 @@ from rgbt.checks import InputError
 from rgbt.config.compose import conf_dir
 from sweeps.space import (
     as_overrides,
-    distributions,
     grid_points,
     list_points,
     merge_space,
@@ -94,21 +93,6 @@ def test_list_points_go_in_pairs_and_replace_fixed() -> None:
     assert points[1].overrides == ("seed=1", "experiment=crm", "~x")
     with pytest.raises(InputError, match="hydra.sweeper.points: 'seed=0,1'"):
         list_points([["seed=0,1"]], [])
-
-
-def test_distributions_of_grid_take_its_trials() -> None:
-    _, swept, _ = split(["n=1,2", "f=1,2.5", "b=true,false", "l=[1,2],[3]", "m=x,null"], LOADER)
-    points = grid_points((), swept)
-    found = distributions(points)
-    assert found == {
-        "n": IntDistribution(1, 2),
-        "f": FloatDistribution(1.0, 2.5),
-        "b": CategoricalDistribution((True, False)),
-        "l": CategoricalDistribution(("[1,2]", "[3]")),
-        "m": CategoricalDistribution(("x", None)),
-    }
-    trial = optuna.create_trial(params=dict(points[-1].params), distributions=found, value=0)
-    assert trial.params == points[-1].params
 
 
 @pytest.mark.parametrize(

@@ -21,8 +21,9 @@ from sweeps.point import Outcome
 from sweeps.table import external
 from sweeps.table.cells import score
 from sweeps.table.external import ExternalRow, ExternalRun, content_hash, external_rows
+from sweeps.table.request import TableRequest
 from sweeps.table.table import Column, Row, Table
-from sweeps.table_plan import TableWords, make_request
+from sweeps.table_plan import make_request
 from tests.commands import SMALL, SPLITS, Call, Trained, code_of, short
 from tests.conftest import pair
 from tests.sweeps.tabled import table as table_of
@@ -125,8 +126,8 @@ def predictions(data: Path, tmp_path: Path) -> Path:
 def runs_of(data: Path, tmp_path: Path) -> Runs:
     def run(*words: str, table: Table = TABLE, trust: str = "") -> dict[str, Outcome]:
         place = ("dataset=mfnet", f"dataset.root={data}", "data.num_workers=0")
-        every = TableWords(seeds=(0,), scale="demo", overrides=[*place, *SMALL, *words])
-        request, rows = make_request("my/t", table, every)
+        every = (*place, *SMALL, *words)
+        request, rows = make_request(TableRequest("my/t", table, "demo", (0,), every))
         base, runs_dir = ("tracking=none",), tmp_path / "runs"
         return {
             row.label: ExternalRun.of(row, request, base, runs_dir).outcome(table, trust)

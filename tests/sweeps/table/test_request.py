@@ -11,13 +11,7 @@ from sweeps.point import Outcome
 from sweeps.table.claim import Claim
 from sweeps.table.request import TableRequest, seeds_of
 from sweeps.table.table import Column, Row
-from sweeps.table_plan import (
-    TableWords,
-    check_equal_runs,
-    make_request,
-    read_named,
-    select_rows,
-)
+from sweeps.table_plan import check_equal_runs, make_request, read_named, select_rows
 from sweeps.worker.planner import Planner
 from tests.sweeps.tabled import table
 
@@ -92,8 +86,8 @@ def test_rows_of_different_networks_start_from_separate_files() -> None:
         "x=1",
     )
     name, published = read_named("spatialseg/table7")
-    words = TableWords(seeds=(0,), scale="paper", overrides=given)
-    wanted, external = make_request(name, published, words)
+    words = TableRequest(name, published, "paper", (0,), given)
+    wanted, external = make_request(words)
     assert external == []
     assert wanted.overrides("Ours (Swin-T)", 0)[-3:] == (
         *("x=1", "model.weights='/w/t=1.pth'", "seed=0"),
@@ -101,17 +95,17 @@ def test_rows_of_different_networks_start_from_separate_files() -> None:
     assert "model.weights=b.pth" in wanted.overrides("Ours (Swin-B)", 0)
     assert not [word for word in wanted.overrides("Ours (Swin-S)", 0) if "weights" in word]
     assert wanted.typed_overrides() == ("x=1", *given[:2])
-    misspelt = replace(words, overrides=("pretrained.mask2former_swinb=x",))
+    misspelt = replace(words, extra=("pretrained.mask2former_swinb=x",))
     with pytest.raises(InputError, match="did you mean 'mask2former_swin_b'"):
-        make_request(name, published, misspelt)
+        make_request(misspelt)
 
 
 def test_form_and_rows_make_another_table() -> None:
     name, published = read_named("spatialseg/table3")
-    plain = TableWords(seeds=(0,), scale="demo")
-    some = replace(plain, rows="Ny/4,Ny/8")
+    plain = TableRequest(name, published, "demo", (0,))
     released = replace(plain, form="released")
-    made = [make_request(name, published, each)[0] for each in (plain, some, released)]
+    chosen = ((plain, ""), (plain, "Ny/4,Ny/8"), (released, ""))
+    made = [make_request(each, rows)[0] for each, rows in chosen]
     variants = [each.variant for each in made]
     assert variants[0] == "demo"
     assert variants[1].startswith("demo-")

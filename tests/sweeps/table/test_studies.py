@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from sweeps.table.load_table import load_table
-from sweeps.table_plan import TableWords, make_request
+from sweeps.table.request import TableRequest
+from sweeps.table_plan import make_request
 from sweeps.worker.planner import Planner
 
 MISSING = "missing_image"
@@ -16,7 +17,7 @@ def test_missing_image_has_the_runs_of_the_ablation_of_crm() -> None:
     planner = Planner()
 
     def keys(name: str) -> dict[str, str]:
-        request, _ = make_request(name, load_table(name), TableWords(seeds=(0,), scale="demo"))
+        request, _ = make_request(TableRequest(name, load_table(name), "demo", (0,)))
         return {
             row.label: planner.specify(request.overrides(row.label, 0)).key
             for row in request.trained_rows
@@ -29,7 +30,7 @@ def test_missing_image_has_the_runs_of_the_ablation_of_crm() -> None:
         "Masks": ablation["(2)"],
         "CRM": ablation["Ours"],
     }
-    request, _ = make_request(MISSING, load_table(MISSING), TableWords(seeds=(0,), scale="demo"))
+    request, _ = make_request(TableRequest(MISSING, load_table(MISSING), "demo", (0,)))
     corruptions = [each.corruption for each in request.evaluations()]
     assert corruptions == ["removed:rgb", "removed:thermal"]
 
@@ -38,8 +39,7 @@ def test_missing_image_has_the_runs_of_the_ablation_of_crm() -> None:
 def test_self_training_is_compared_with_as_many_steps_of_the_same_start(task: str) -> None:
     """All second stages of one head start from one run, the source alone among them."""
     name = f"self_training_{task}"
-    words = TableWords(seeds=(0,), scale="bench")
-    request, _ = make_request(name, load_table(name), words)
+    request, _ = make_request(TableRequest(name, load_table(name), "bench", (0,)))
     planner = Planner()
     specs = {
         row.label: planner.specify(request.overrides(row.label, 0)) for row in request.trained_rows

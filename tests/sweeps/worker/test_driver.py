@@ -22,7 +22,6 @@ from tests.sweeps.fakes import (
     Process,
     fail,
     finish,
-    first,
     hang,
     interrupt_when,
     leave,
@@ -33,7 +32,6 @@ from tests.sweeps.fakes import (
     quick,
     scored,
     search_desk,
-    succeed,
 )
 
 __all__ = ["quick"]
@@ -90,17 +88,6 @@ def test_driver_failed_points_keep_reason_until_retried(tmp_path: Path) -> None:
     again = list_desk(tmp_path, points(4), fail, storage=storage, retry="failed").run()
     assert sorted(again.executor.started()) == [("x=1",), ("x=2",)], "forgiven once"
     assert again.states()["x=1"] == ["FAIL", "FAIL"]
-
-
-def test_driver_retries_point_in_same_call(tmp_path: Path) -> None:
-    desk = list_desk(tmp_path, points(2), only("x=1", first(fail, succeed)), retries=1).run()
-    assert desk.states() == {"x=0": ["COMPLETE"], "x=1": ["FAIL", "COMPLETE"]}
-    desk = list_desk(tmp_path / "2", points(1), fail, retries=1).run()
-    assert desk.states() == {"x=0": ["FAIL", "FAIL"]}
-    desk = search_desk(tmp_path / "3", first(fail, succeed), trials=1, retries=1).run()
-    assert (len(desk.executor.calls), len(desk.numbers("COMPLETE"))) == (2, 1)
-    desk = search_desk(tmp_path / "4", fail, trials=1, retries=1).run()
-    assert (len(desk.executor.calls), len(desk.numbers("FAIL"))) == (2, 1)
 
 
 @pytest.mark.parametrize("score", [None, float("inf")])

@@ -15,13 +15,13 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
+import optuna
 import pytest
-from optuna import get_all_study_names
 
 from sweeps import attributes as names
 from sweeps.worker import driver as drivers
 from sweeps.worker import storage as stores
-from sweeps.worker.storage import load_study, open_storage
+from sweeps.worker.storage import open_storage
 from tests.sweeps.fakes import list_desk, points, scored, search_desk, until
 
 
@@ -50,7 +50,11 @@ def end(process: BaseProcess) -> int | None:
 
 def trials_of(runs: Path, url: str) -> list[Any]:
     storage = open_storage(url, runs)
-    return load_study("study", storage).trials if "study" in get_all_study_names(storage) else []
+    return (
+        optuna.load_study(study_name="study", storage=storage).trials
+        if "study" in optuna.get_all_study_names(storage)
+        else []
+    )
 
 
 def until_running(runs: Path, url: str) -> None:

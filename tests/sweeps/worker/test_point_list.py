@@ -10,7 +10,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from optuna.distributions import CategoricalDistribution
 
 from rgbt.checks import InputError
 from rgbt.runs.naming import VARIED
@@ -103,9 +102,7 @@ def test_untrusted_class_is_refused_before_training(
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(tmp_path))
         source = ListSource(wanted, settings(trust=trust), OwnLoss())  # type: ignore[arg-type]
-    states = {
-        each.point.label: each for each in source.outcomes(lambda p: Outcome(p.point, "waiting"))
-    }
+    states = {each.point.label: each for each in source.preview({})}
     assert states["a"].state == "waiting", "nothing opens its run"
     assert ("my_lab.Loss" in states["b"].reason) == is_refused
 
@@ -117,10 +114,9 @@ def test_equal_points_are_one_run_and_share_their_tags(tmp_path: Path) -> None:
 
     rows = tuple(Point(label, (f"x={label}",), tags={"table": label}) for label in ("1", "1.0"))
     source = ListSource(replace(a_list(tmp_path), points=rows), settings(), SameRun())  # type: ignore[arg-type]
-    found: list[PlannedPoint] = []
-    source.outcomes(lambda plan: found.append(plan) or Outcome(plan.point, "waiting"))
+    found = source.preview({})
     tags = {"table": "1 | 1.0", VARIED: "x"}
-    assert [plan.point.tags for plan in found] == [tags, tags]
+    assert [each.point.tags for each in found] == [tags, tags]
 
 
 def taken(desk: Desk) -> ClaimedTrial:
@@ -137,25 +133,13 @@ def done(desk: Desk, task: ClaimedTrial) -> None:
 
 
 def test_list_source_claims_points_in_order(tmp_path: Path) -> None:
-    known = {"x": CategoricalDistribution((0, 1))}
-    desk = list_desk(tmp_path, points(2), distributions=known)
+    desk = list_desk(tmp_path, points(2))
     assert [taken(desk).plan.point.label for _ in range(2)] == ["x=0", "x=1"]
     assert desk.source.next() is None
     trial = desk.store.trials()[1]
-    assert trial.params == {"x": 1}
     assert trial.user_attrs[names.LABEL] == "x=1"
     assert trial.user_attrs[names.OVERRIDES] == ["x=1"]
     assert trial.user_attrs[names.RUNS] == [desk.plans[1].runs[0].key]
-
-
-def test_list_source_retries_are_shared_by_drivers(tmp_path: Path) -> None:
-    storage = memory()
-    a, b = (list_desk(tmp_path, points(1), storage=storage, retries=2) for _ in range(2))
-    for desk in (a, b, a):
-        desk.store.fail(taken(desk).number, "a bad day", {})
-    assert a.source.next() is None
-    assert b.source.next() is None
-    assert len(a.store.trials()) == 3
 
 
 def test_a_point_whose_run_was_deleted_is_run_again(tmp_path: Path) -> None:

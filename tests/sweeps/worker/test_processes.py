@@ -18,7 +18,13 @@ import pytest
 
 from rgbt.checks import InputError
 from sweeps.worker import processes
-from sweeps.worker.processes import Job, LocalExecutor, check_gpus, failure_reason, run_command
+from sweeps.worker.processes import (
+    LocalExecutor,
+    LocalJob,
+    check_gpus,
+    failure_reason,
+    run_command,
+)
 from tests.sweeps.fakes import DEADLINE_S, is_alive, until
 
 MODULE = """
@@ -83,7 +89,7 @@ def executor(module: Path) -> Iterator[LocalExecutor]:
     forkserver._forkserver._stop()
 
 
-Start = Callable[..., Job]
+Start = Callable[..., LocalJob]
 
 
 @pytest.fixture
@@ -91,7 +97,7 @@ def start(executor: LocalExecutor, tmp_path: Path) -> Iterator[Start]:
     """Start the module; what is left of its processes is ended after the test."""
     jobs: list[Any] = []
 
-    def run(*words: str, environment: dict[str, str] | None = None) -> Job:
+    def run(*words: str, environment: dict[str, str] | None = None) -> LocalJob:
         job = executor.start(("tiny_run", *words), environment or {}, tmp_path / "logs" / "log")
         jobs.append(job)
         return job
@@ -103,7 +109,7 @@ def start(executor: LocalExecutor, tmp_path: Path) -> Iterator[Start]:
             code(job)
 
 
-def code(job: Job) -> int | None:
+def code(job: LocalJob) -> int | None:
     until(lambda: job.poll() is not None, "the end of a process")
     return job.poll()
 

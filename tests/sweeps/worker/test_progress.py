@@ -35,7 +35,7 @@ def console(monkeypatch: pytest.MonkeyPatch) -> Make:
 
 def test_progress_in_log_prints_begin_and_end(console: Make) -> None:
     text = console(False)
-    view = ProgressView("table", 3, 1, lambda: 0)
+    view = ProgressView("table", 1, lambda: (0, 3))
     with view:
         view.began(TRIAL)
         view.update([TRIAL])
@@ -52,7 +52,7 @@ def test_progress_in_log_prints_begin_and_end(console: Make) -> None:
 
 def test_progress_in_terminal_draws_bars_and_prints_failures(console: Make) -> None:
     text = console(True)
-    view = ProgressView("table", lambda: 4, 2, lambda: 1)
+    view = ProgressView("table", 2, lambda: (1, 4))
     with view:
         view.began(TRIAL)
         view.ended(TRIAL, "finished", "")

@@ -124,7 +124,8 @@ def test_find_fetches_remote_run_and_later_evaluations(tmp_path: Path) -> None:
     counts(right=7).save(made.path / ring.path)
     there.sync(RunResult(made.path))
     assert here.find("a", DATASET) == found, "what was fetched is kept"
-    assert here.fetch_counts(found, ring)
+    assert not ring.is_stored(found)
+    assert here.find("a", DATASET, (ring,)) == found
     assert found.counts(ring.path).counts.tolist() == counts(right=7).counts.tolist()
 
     shutil.rmtree(found.folder)

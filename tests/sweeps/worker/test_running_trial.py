@@ -22,7 +22,6 @@ from sweeps.worker.run_store import RunStore
 from sweeps.worker.running_trial import (
     LOGS,
     ClaimedTrial,
-    MetricsReader,
     PruningCallback,
     RunningTrial,
     TrialError,
@@ -271,8 +270,8 @@ def test_running_trial_remote_run_cannot_be_evaluated(
 ) -> None:
     finish(tmp_path / "copy")
     bench = Bench(tmp_path, evaluated(evaluations=(RING,)))
-    monkeypatch.setattr(bench.runs, "find", lambda key, dataset: RunResult(tmp_path / "copy", "7"))
-    with pytest.raises(TrialError, match="trained on another machine: .*thermal_ring9"):
+    monkeypatch.setattr(bench.runs, "find", lambda *_, **__: RunResult(tmp_path / "copy", "7"))
+    with pytest.raises(TrialError, match="trained on another machine.*thermal_ring9"):
         bench.run()
     assert bench.executor.calls == []
 
@@ -294,28 +293,22 @@ def test_running_trial_unsent_report_is_retried(tmp_path: Path) -> None:
     assert told == [2, 2, 4]
 
 
-def test_lines_come_once_and_whole(tmp_path: Path) -> None:
-    follower = MetricsReader(tmp_path / "run")
-    assert follower.new_lines() == []
-    run = RunFolder(tmp_path / "run")
+def test_running_trial_reports_whole_lines_once(tmp_path: Path) -> None:
+    steps: list[int] = []
+    bench = Bench(tmp_path, PLAN, hang, lambda line: steps.append(line.step) or "")
+    assert bench.work.advance() is None
+    run = RunFolder(tmp_path / KEY)
     run.append(1, "train", {"loss": 2.0})
     run.append(2, "val", {"mIoU": 0.5, "class/car": math.nan})
-    seen = follower.new_lines()
-    assert [(line.step, line.kind) for line in seen] == [(1, "train"), (2, "val")]
-    assert seen[1].values["mIoU"] == 0.5
-    assert math.isnan(seen[1].values["class/car"])
-    assert follower.step == 2
-    assert follower.new_lines() == []
-
     text = json.dumps({"step": 3, "kind": "val", "time": 0.0, "values": {"mIoU": 0.6}})
     with (run.path / "metrics.jsonl").open("a") as file:
-        file.write(text[:20])
-        file.flush()
-        assert follower.new_lines() == [], "half a line"
-        file.write(text[20:] + "\n")
-    assert [line.step for line in follower.new_lines()] == [3]
-    assert follower.step == 3
-    run.truncate_after(2)  # a run that resumes is read from its begin
+        for part, seen, score in ((text[:20], [2], 0.5), (text[20:] + "\n", [2, 3], 0.6)):
+            file.write(part)
+            file.flush()
+            assert bench.work.advance() is None
+            assert (steps, bench.work.score) == (seen, score)
+    run.truncate_after(2)  # a run that resumes writes its lines again
+    run.append(3, "val", {"mIoU": 0.1})
     run.append(4, "val", {"mIoU": 0.2})
-    assert [line.step for line in follower.new_lines()] == [1, 2, 4]
-    assert follower.step == 4
+    assert bench.work.advance() is None
+    assert (steps, bench.work.done_share) == ([2, 3, 4], 1.0)

@@ -10,16 +10,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import optuna
 import pytest
 from mlflow import MlflowClient
-from optuna import get_all_study_names
 
 from rgbt.runs.folder import read_result
 from rgbt.tracking.mlflow_store import MlflowTracking
 from sweeps.attributes import LABEL, RUNS
 from sweeps.worker.run_store import RunStore
-from sweeps.worker.storage import load_study, open_storage
-from sweeps.worker.trial_store import counted_trials
+from sweeps.worker.storage import counted_trials, open_storage
 from tests.commands import SMALL, short
 from tests.sweeps.fakes import counts, finish, until
 from tests.sweeps.servers import mlflow_server, new_database, postgres
@@ -108,8 +107,10 @@ def test_search_on_four_drivers_survives_killed_driver(
     victim = drivers[2]
 
     def is_noted() -> bool:
-        found = "shared-search" in get_all_study_names(storage)
-        trials = load_study("shared-search", storage).trials if found else ()
+        found = "shared-search" in optuna.get_all_study_names(storage)
+        trials = (
+            optuna.load_study(study_name="shared-search", storage=storage).trials if found else ()
+        )
         return sum(t.state.name == "RUNNING" and LABEL in t.user_attrs for t in trials) >= 4
 
     until(is_noted, "a trial of each driver")
@@ -118,8 +119,8 @@ def test_search_on_four_drivers_survives_killed_driver(
         code, log = driver.wait(timeout=300), tmp_path / f"driver{number}.log"
         assert code == (-9 if driver is victim else 0), log.read_text()[-3000:]
 
-    trials = load_study("shared-search", storage).trials
-    counted = counted_trials(load_study("shared-search", storage))
+    trials = optuna.load_study(study_name="shared-search", storage=storage).trials
+    counted = counted_trials(optuna.load_study(study_name="shared-search", storage=storage))
     assert [trial.state.name for trial in counted] == ["COMPLETE"] * 10
     assert all(trial.state.is_finished() for trial in trials)
     assert len(trials) > 10, "that of the victim is lost"

@@ -10,7 +10,7 @@ from rgbt.checks import InputError
 from sweeps import attributes as names
 from sweeps.settings import Objective
 from sweeps.worker import storage as stores
-from sweeps.worker.storage import find_study, open_storage, open_study
+from sweeps.worker.storage import known_studies, open_storage, open_study
 
 UP = (Objective("test/mIoU", "maximize"),)
 BOTH = (*UP, Objective("test/Var", "minimize"))
@@ -19,11 +19,10 @@ BOTH = (*UP, Objective("test/Var", "minimize"))
 @pytest.mark.parametrize("named", [None, "sqlite:///{}/two.db"])
 def test_a_study_is_there_again_in_a_named_storage(tmp_path: Path, named: str | None) -> None:
     where = named and named.format(tmp_path)
-    assert find_study("study", where, tmp_path / "runs") is None
+    assert known_studies(where, tmp_path / "runs") == {}
     assert list(tmp_path.iterdir()) == [], "looking for a study makes nothing"
     open_study("study", open_storage(where, tmp_path / "runs"), BOTH, {names.KIND: "list"})
-    study = find_study("study", where, tmp_path / "runs")
-    assert study is not None
+    study = known_studies(where, tmp_path / "runs")["study"]
     assert study.user_attrs[names.KIND] == "list"
     assert study.user_attrs[names.METRICS] == ["test/mIoU", "test/Var"]
     assert study.metric_names == ["test/mIoU", "test/Var"]
@@ -37,7 +36,10 @@ def test_a_study_is_there_again_in_a_named_storage(tmp_path: Path, named: str | 
         "postgresql://me:secret@127.0.0.1:9/x",
     ],
 )
-def test_open_storage_invalid_address_raises_without_password(tmp_path: Path, named: str) -> None:
+def test_open_storage_invalid_address_raises_without_password(
+    tmp_path: Path, named: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stores, "PAUSE_S", 0.0)
     with pytest.raises(InputError, match=r"^storage=[^\n]*$") as error:
         open_storage(named, tmp_path)
     assert "secret" not in str(error.value)

@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from optuna.distributions import CategoricalDistribution
 
 from sweeps import attributes as names
 from sweeps.space import build_sampler
-from sweeps.worker.trial_store import TrialStore
+from sweeps.worker.storage import TrialStore
 from tests.sweeps.fakes import memory, silence, store_on
 
 
@@ -41,15 +40,8 @@ def taken(store: TrialStore, total: int | None = None) -> tuple[int, float]:
     asked = store.ask(total)
     assert asked is not None
     x = asked.suggest_float("x", 0, 1)
-    store.set_attributes(asked.number, {names.KEY: f"x={x}", names.LABEL: f"#{asked.number}"})
+    store.update_unfinished(asked.number, {names.KEY: f"x={x}", names.LABEL: f"#{asked.number}"})
     return asked.number, x
-
-
-def test_claim_with_other_choices_of_a_grid_loses_only_the_parameter(store: TrialStore) -> None:
-    for number, choices in enumerate([(1, 2), (1, 2, 3)]):
-        known = {"x": CategoricalDistribution(choices)}
-        assert claim(store, f"k{number}", params={"x": 1}, distributions=known) == number
-    assert [trial(store, number).params for number in (0, 1)] == [{"x": 1}, {}]
 
 
 def test_claim_of_running_point_is_dropped(store: TrialStore) -> None:
@@ -143,7 +135,7 @@ def test_release_without_point_or_after_its_failure_enqueues_nothing() -> None:
     store.release(0)
     assert states(store) == []
     number, _ = taken(store)
-    store.set_attributes(number, {names.REASON: "killed while its failure was noted"})
+    store.update_unfinished(number, {names.REASON: "killed while its failure was noted"})
     store.release(number)
     assert states(store) == ["FAIL"]
 

@@ -1,0 +1,181 @@
+"""Several tables at once: ``rgbt reproduce table=all scale=bench seeds=until_decided minutes=120``.
+
+What decides most claims a minute is run first. Finished runs are added to an archive, and what is
+in it counts as finished, so that the same command continues on any machine.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from statistics import median
+from typing import TYPE_CHECKING
+
+from analysis.archive import add
+from rgbt.checks import InputError, split_list
+from rgbt.tables import TextTable
+from rgbt.terminal import info, print_rich, rich_table
+from sweeps.point import Outcome, Point
+from sweeps.settings import SweepSettings
+from sweeps.table.load_table import study_names, table_names
+from sweeps.table.request import TAG
+from sweeps.table_plan import TablePlan, plan_table
+from sweeps.verdicts.judge import contrasts_of
+from sweeps.worker.planner import Planner
+from sweeps.worker.point_list import PointList, preview_points, run_points
+from sweeps.worker.run_store import RunStore
+
+if TYPE_CHECKING:
+    from sweeps.reproduce import Options
+
+DEFAULT_S = 240.0
+"""Estimated duration of a run as long as no run of its network has finished: that of an arm at
+bench scale on two cores."""
+
+
+@dataclass
+class Queue:
+    """The runs of several tables, those that decide most claims a minute first.
+
+    A missing run is worth, for every open claim that needs it, one over the number of missing runs
+    of that claim.
+
+    Attributes:
+        claims, decided: number of all claims about scores, and of the decided ones; see `more`.
+    """
+
+    plans: Sequence[TablePlan]
+    runs: RunStore
+    planner: Planner
+    claims: int = 0
+    decided: int = 0
+    _worth: Counter[tuple[str, ...]] = field(default_factory=Counter)  # by overrides
+    _seconds: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+    _seen: set[int] = field(default_factory=set)  # places of finished points
+
+    def __post_init__(self) -> None:
+        self.points = tuple(point for plan in self.plans for point in plan.points.points)
+        self.owners = [n for n, plan in enumerate(self.plans) for _ in plan.points.points]
+
+    def more(self, outcomes: Sequence[Outcome]) -> list[Point]:
+        """The next seeds of open claims; adds new finished runs to the archive.
+
+        Args:
+            outcomes: of all points until now, in their order.
+        """
+        finished = {n for n, outcome in enumerate(outcomes) if outcome.state == "finished"}
+        for outcome in (outcomes[place] for place in finished - self._seen):
+            for result in filter(self.runs.is_own, outcome.results):
+                if self.runs.archive is not None:
+                    add(result, self.runs.archive)
+            if outcome.seconds is not None:
+                self._seconds[self._network(outcome.point)].append(outcome.seconds)
+        self._seen = finished
+        added, owners = list[Point](), list(self.owners)
+        self.claims = self.decided = 0
+        self._worth.clear()
+        for place, plan in enumerate(self.plans):
+            own = [each for each, owner in zip(outcomes, owners, strict=True) if owner == place]
+            new = plan.until_decided(own) if plan.until_decided else []
+            self._count(plan, own, [*(o.point for o in own if o.state == "waiting"), *new])
+            added += new
+            self.owners += [place] * len(new)
+        return added
+
+    def _count(self, plan: TablePlan, outcomes: Sequence[Outcome], missing: list[Point]) -> None:
+        """Add what the missing runs of a table are worth; claims on a design need all its rows."""
+        request, table = plan.request, plan.request.table
+        judged = {each.claim.name: each.word for each in plan.judge.claims(request.runs(outcomes))}
+        rows = {p.overrides: set(p.tags[TAG + request.name].split(" | ")) for p in missing}
+        sizes = {column.name for column in table.columns if column.efficiency is not None}
+        for claim in (each for each in table.claims if not sizes & set(each.columns)):
+            named = {row for each in contrasts_of(claim, table) for row in each.rows}
+            needed = [each for each, labels in rows.items() if labels & named or not named]
+            is_open = judged.get(claim.name) not in ("holds", "contradicted")
+            self.claims += 1
+            self.decided += not is_open
+            for overrides in needed if is_open else ():
+                self._worth[overrides] += 1 / len(needed)  # type: ignore[assignment]
+
+    def rank(self, point: Point) -> float:
+        """Claims a second that a missing run decides, as far as that is known."""
+        return self._worth[point.overrides] / self.seconds(point)
+
+    def seconds(self, point: Point) -> float:
+        """Estimated duration of a run."""
+        return median(self._seconds.get(self._network(point)) or [DEFAULT_S])
+
+    def _network(self, point: Point) -> str:
+        """The class of the network of a run."""
+        return str(self.planner.specify((*self.planner.base, *point.overrides)).model.target)
+
+    def preview(self, outcomes: Sequence[Outcome]) -> TextTable:
+        """The missing runs in the order in which they would be run today."""
+        places = [place for place, each in enumerate(outcomes) if each.state == "waiting"]
+        places.sort(key=lambda place: self.rank(outcomes[place].point), reverse=True)
+        rows, total = list[tuple[str, ...]](), 0.0
+        for place in places:
+            point, name = outcomes[place].point, self.plans[self.owners[place]].request.name
+            minutes, worth = self.seconds(point) / 60, self._worth[point.overrides]
+            total += minutes
+            rows.append((point.label, name, f"{worth:.2f}", f"{minutes:.1f}", f"{total:.0f}"))
+        header = ("run", "table", "claims", "minutes", "total")
+        return TextTable("Missing runs in their order", header, tuple(rows))
+
+
+def run_queue(
+    options: Options,
+    overrides: Sequence[str],
+    settings: SweepSettings,
+    runs: RunStore,
+    planner: Planner,
+) -> int:
+    """Run what several tables lack until the time is over; 1 if a run failed.
+
+    A table that cannot be trained with these options is left out with a line.
+    """
+    every = [*table_names(Path("none")), *study_names()]
+    names = every if options.table == "all" else split_list(options.table, "tables")
+    plans, runs.archive = list[TablePlan](), options.archive
+    for name in names:
+        try:
+            # Nothing is counted of the networks themselves.
+            plan = plan_table(replace(options, table=name, dry_run=True), overrides, runs, planner)
+            _check(plan, planner)
+            plans.append(plan)
+        except InputError as error:
+            info(f"{name} is left out: {error}")
+    if not plans:
+        raise InputError(f"table={options.table}: none of them can be trained.")
+    queue, title = Queue(plans, runs, planner), f"tables scale={options.scale}"
+    points = PointList(
+        *(title, title, "list", queue.points, runs, planner.base), more=queue.more, rank=queue.rank
+    )
+    if options.dry_run:
+        outcomes = preview_points(points, settings, planner)
+        queue.more(outcomes)
+        print_rich(rich_table(queue.preview(outcomes)))
+    else:
+        outcomes = run_points(points, settings, planner)
+        queue.more(outcomes)
+    states = Counter(outcome.state for outcome in outcomes)
+    info(
+        f"{states['finished']} of {len(outcomes)} runs are finished, {states['failed']} failed; "
+        f"{queue.decided} of {queue.claims} claims are decided: rgbt claims scale={options.scale}"
+    )
+    return int(states["failed"] > 0)
+
+
+def _check(plan: TablePlan, planner: Planner) -> None:
+    """InputError: no row of a table can be trained, and why."""
+    reasons = []
+    for point in plan.points.points:
+        try:
+            planner.plan(point)
+        except InputError as error:
+            reasons.append(error)
+        else:
+            return
+    raise reasons[0] if reasons else InputError("none of its rows is trained.")
