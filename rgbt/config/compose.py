@@ -152,8 +152,8 @@ def _variants(file: str, _changed: int) -> dict[str, dict[str, Any] | None]:
     text = Path(file).read_text(encoding="utf-8")
     if f"\n{VARIANTS}:" not in text:
         return {}
-    found: Any = OmegaConf.to_container(OmegaConf.create(text)[VARIANTS])
-    return {str(key): values for key, values in found.items()}
+    plain: Any = OmegaConf.to_container(OmegaConf.create(text))
+    return {str(key): values for key, values in plain[VARIANTS].items()}
 
 
 def _place(folder: str, name: str) -> tuple[Path, str | None] | None:
@@ -177,9 +177,10 @@ def _parsed(folder: str, provider: str, name: str) -> bytes:
     if place is None:  # Hydra's own message
         return pickle.dumps(source.load_config(name))
     result = source.load_config(str(place[0].relative_to(folder)))
-    result.config.pop(VARIANTS, None)
+    config = cast("DictConfig", result.config)
+    config.pop(VARIANTS, None)
     if place[1] is not None:
-        result.config.merge_with(variants_of(place[0])[place[1]] or {})
+        config.merge_with(variants_of(place[0])[place[1]] or {})
     return pickle.dumps(result)
 
 

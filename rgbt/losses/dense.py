@@ -154,7 +154,7 @@ class LovaszSoftmax:
     def of_image(shares: Tensor, label: Tensor) -> Tensor:
         """The loss of one image: of probabilities (K, P) and the labels (P,) of its pixels."""
         costs = []
-        for index in label.unique():
+        for index in torch.unique(label).tolist():
             is_class = (label == index).float()
             errors, order = (is_class - shares[index]).abs().sort(descending=True)
             right = is_class[order]
