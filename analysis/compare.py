@@ -99,6 +99,9 @@ def main(options: Options, _: list[str]) -> int:
     # Scores by day and by night are over other images.
     drawn = {parse(each.metric).part: each.a.evidence.said for each in found.differences}
     parts = [f"{part}: {text}." for part, text in drawn.items() if part is not None]
+    lists = [" or ".join(sorted({e.run.lists for e in each if e.run})) for each in opened]
+    if lists[0] != lists[1] and all(lists):
+        parts.append(f"Other lists: {labels[0]} {lists[0]}; {labels[1]} {lists[1]}.")
     remark = (
         f"Percent points (Var: squared). Intervals: Student, {settings.resamples} resamples of the "
         "images, seeds by Welch; p of the last interval; Holm: corrected for the number of lines."

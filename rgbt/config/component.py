@@ -89,10 +89,13 @@ class Component:
         return cls(path, node["_target_"], values, dict(node))
 
     def build(self, **collaborators: Any) -> Any:
-        """The object, with those `collaborators` (a network for a scheme) that it takes."""
+        """The object, with those `collaborators` (a network for a scheme) that it takes.
+
+        Components inside get those that they take, too.
+        """
         parameters = inspect.signature(constructor(self.target, self.path)).parameters
         values = {
-            key: value.build() if isinstance(value, Component) else value
+            key: value.build(**collaborators) if isinstance(value, Component) else value
             for key, value in self.values.items()
         }
         values |= {key: value for key, value in collaborators.items() if key in parameters}

@@ -70,7 +70,7 @@ class RTFNet(Network):
 
     Source: RTFNet (Sun, Zuo, Liu, RA-L 2019).   Released: yuxiangsun/RTFNet.
 
-    The arguments are the keys of ``conf/model/rtfnet_50.yaml``. A thermal stem of three channels
+    The arguments are the keys of ``conf/model/rtfnet.yaml``. A thermal stem of three channels
     starts as a copy of RGB's instead of its mean; `thermal_stem` holds for ImageNet's weights too.
     """
 

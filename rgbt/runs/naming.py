@@ -13,7 +13,7 @@ from collections.abc import Mapping
 
 from rgbt.checks import InputError
 from rgbt.config.compose import flatten
-from rgbt.runs.folder import GROUP, Description
+from rgbt.runs.folder import GROUP, Description, lists_of
 from rgbt.runs.run_spec import RunSpec
 
 # Environment variable with more MLflow tags of a run, as JSON; the sweeper names tables in it.
@@ -61,6 +61,7 @@ def describe(spec: RunSpec, extra_tags: Mapping[str, str] | None = None) -> Desc
         "rgbt.experiment": spec.name,
         GROUP: " ".join([spec.name, *words.values()]),
         "rgbt.seed": str(spec.seed),
+        "rgbt.lists": lists_of(params),
         **(extra_tags or {}),
     }
     # What varies, a dot, and what does not; outside of a sweep everything may vary.

@@ -15,6 +15,7 @@ from rgbt.runs.folder import (
     Description,
     counts_name,
     is_finished,
+    lists_of,
     read_description,
     read_provenance,
     read_result,
@@ -75,6 +76,12 @@ class RunResult:
     def tags(self) -> dict[str, str]:
         """Tags by name."""
         return self.description.tags
+
+    @property
+    def lists(self) -> str:
+        """Which lists it was trained and selected on, in words; "" without ``run.json``."""
+        params = self.description.params
+        return lists_of(params) if params else ""
 
     @property
     def provenance(self) -> list[dict[str, Any]]:

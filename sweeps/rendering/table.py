@@ -91,6 +91,7 @@ def _remarks(scored: ScoredTable, extra: Sequence[str]) -> list[str]:
     table, seeds = scored.table, scored.seeds
     printed = any(row.values for row in table.rows)
     remarks = [f"Published: {table.data}; {table.unit}."] if printed else []
+    remarks += _lists(scored) if printed or scored.lists else []
     if seeds:
         listed, many = ", ".join(map(str, seeds)), len(seeds) > 1
         over = "mean ± standard deviation (n - 1) over seeds" if many else "of seed"
@@ -108,6 +109,21 @@ def _remarks(scored: ScoredTable, extra: Sequence[str]) -> list[str]:
         commits = ", ".join(f"{commit} ({count})" for commit, count in named)
         remarks.append(f"Our runs come from several git commits: {commits}.")
     return remarks
+
+
+def _lists(scored: ScoredTable) -> list[str]:
+    """Which lists the rows were trained and selected on; whether rows of ours differ in them."""
+    own = {row.label: row.lists for row in scored.table.rows if row.lists and row.values}
+    printed = [f"Lists of published rows: {scored.table.lists}."] if scored.table.lists else []
+    if own:
+        printed.append(f"{'; '.join(f'{label}: {text}' for label, text in own.items())}.")
+    groups: dict[str, list[str]] = {}
+    for label, text in scored.lists.items():
+        groups.setdefault(text, []).append(label)
+    if len(groups) < 2:
+        return [*printed, *(f"Lists of our rows: {text}." for text in groups)]
+    shown = "; ".join(f"{text} ({', '.join(labels)})" for text, labels in groups.items())
+    return [*printed, f"Our rows have different lists: {shown}."]
 
 
 @dataclass

@@ -177,6 +177,7 @@ class ScoredTable:
     Attributes:
         cells: only of rows that were run, and of sizes of networks.
         commits: git commit -> number of runs made by it.
+        lists: label of a row that was run -> the lists of its runs, in words.
         marks: 1 for a row that is shown to be the best of the column, 2 for the second best; see
             `sweeps.verdicts.judge.TableJudge.marks`.
     """
@@ -188,6 +189,7 @@ class ScoredTable:
     cells: Mapping[CellId, TableCell]
     commits: Mapping[str, int]
     form: Form = "paper"
+    lists: Mapping[str, str] = field(default_factory=dict)
     marks: Mapping[CellId, int] = field(default_factory=dict)
 
     def difference(self, row: Row, column: Column) -> float:
@@ -218,6 +220,9 @@ def score(
     for row in table.rows:
         outcomes = {seed: runs[row.label, seed] for seed in seeds if (row.label, seed) in runs}
         cells |= row_cells(table, row, outcomes, reader)
+    lists: dict[str, list[str]] = {}
+    for (label, _), outcome in runs.items():
+        lists.setdefault(label, []).extend(run.lists for run in outcome.results if run.lists)
     made_by = {run.key: run.commit for outcome in runs.values() for run in outcome.results}
     return ScoredTable(
         name=name,
@@ -226,6 +231,7 @@ def score(
         seeds=tuple(seed for seed in seeds if seed >= 0),
         cells=cells | dict(sizes or {}),
         commits=Counter(commit for commit in made_by.values() if commit is not None),
+        lists={label: " or ".join(sorted(set(each))) for label, each in lists.items() if each},
     )
 
 

@@ -12,7 +12,6 @@ from pydantic import BeforeValidator, model_validator
 
 from rgbt.checks import InputError, check_choice
 from rgbt.config.compose import available, chosen_scale
-from rgbt.config.values import check_value
 from rgbt.metrics import names
 from rgbt.metrics.named import PAIR_SCORES, parse
 from rgbt.metrics.pairs import Protocol
@@ -124,6 +123,7 @@ class Row(Strict):
             left out too.
         tested_in: name -> overrides of the data set with which the row's network is tested too.
         values: printed values by column; None where the paper prints a dash.
+        lists: those of the published row, where they are not those of the table.
         doubtful: columns whose printed value carries the row's remarks as a footnote.
         remarks: one sentence each.
     """
@@ -142,6 +142,7 @@ class Row(Strict):
     without: tuple[str, ...] = ()
     tested_in: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     values: Mapping[str, float | None] = field(default_factory=dict)
+    lists: str = ""
     doubtful: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
 
@@ -163,6 +164,7 @@ class Table(Strict):
     Attributes:
         paper: folder of its file; in a table of the user, any name.
         data: what the printed values were measured on.
+        lists: which lists the published rows were trained and their checkpoints selected on.
         at: overrides of every row by scale.
         regions: a file of ``conf/metric`` the table is evaluated with, or "as trained".
         absent: how a class without a pixel scores, see `rgbt.metrics.scores`; None: by the
@@ -177,6 +179,7 @@ class Table(Strict):
     number: Annotated[str, BeforeValidator(lambda n: str(n) if type(n) is int else n)]
     caption: str
     data: str
+    lists: str = ""
     unit: str = "percent"
     at: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     regions: str = "as trained"

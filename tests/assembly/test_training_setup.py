@@ -9,6 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -49,6 +50,23 @@ def composed(words: Callable[..., list[str]]) -> Composed:
         return specify(compose(words(name, *more)))
 
     return make
+
+
+def test_class_weights_are_those_of_the_training_split(composed: Composed) -> None:
+    """Of the loss, and of a loss inside another one; numbers do not read a label."""
+    spec = composed("start_deeplabv2", "loss.class_weights=inverse")
+    setup = set_up_training(spec)
+    data = setup.session.dataset
+    labels = [data.label(name) for name in data.names("train_day")]
+    pixels = np.bincount(np.ravel(labels), minlength=256)[: data.num_classes]
+    expected = [pixels.sum() / len(pixels) / each if each else 0 for each in pixels]
+    assert setup.scheme.loss.class_weights == pytest.approx(expected)  # type: ignore[attr-defined]
+    inner = ["loss=cross_entropy_auxiliary", "model.auxiliary=true", "loss.loss.class_weights=enet"]
+    nested = set_up_training(composed("start_deeplabv2", *inner)).scheme.loss.loss  # type: ignore[attr-defined]
+    assert len(nested.class_weights) == data.num_classes
+    taught = ["domains.source.labels=experiment:thermal_teacher/best.pt", "loss.class_weights=enet"]
+    with pytest.raises(InputError, match=r"loss\.class_weights: expected numbers"):
+        set_up_training(composed("start_deeplabv2", *taught), upstream_finished=False)
 
 
 def test_rare_classes_are_those_of_the_source_as_it_is_labelled(

@@ -210,7 +210,7 @@ class CMX(CmxNetwork):
     huaaaliu/RGBX_Semantic_Segmentation; lab-sun/Temporal-Consistent-RGBT-Segmentation (the same
     network, other inputs, and an unused layer `voting`).
 
-    The arguments are the keys of ``conf/model/cmx_b2.yaml``. The release trains with a
+    The arguments are the keys of ``conf/model/cmx.yaml``. The release trains with a
     `decoder_norm_eps` of 1e-3, and evaluates with 1e-5, without the set-up of weights.
     """
 

@@ -26,7 +26,7 @@ Levels = tuple[tuple[int, int], ...]
 
 @dataclass(frozen=True, kw_only=True)
 class HeadShape:
-    """Sizes of both decoders; keys of ``conf/model/mask2former_swin_t.yaml``."""
+    """Sizes of both decoders; keys of ``conf/model/mask2former.yaml``."""
 
     num_classes: int
     hidden_dim: int

@@ -127,10 +127,10 @@ def test_untrained_functions_ignore_pretrained() -> None:
     assert (changed.build, module.build(2)) == (1, (2, False))  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize("name", ["../external/gmnet.py", "/tmp/gmnet.py", "none.py"])  # noqa: S108
+@pytest.mark.parametrize("name", ["../external/adapters.py", "/tmp/adapters.py", "none.py"])  # noqa: S108
 def test_adapter_lies_beside_a_recipe(name: str) -> None:
     assert adapter_of("model.net:Net") is None
-    found = adapter_of("gmnet.py:network")
+    found = adapter_of("adapters.py:network")
     assert found is not None
     assert found.with_suffix(".yaml").is_file()
     with pytest.raises(FileNotFoundError):
