@@ -8,6 +8,7 @@ import re
 import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -288,6 +289,10 @@ class Report:
 
     def images(self) -> dict[str, bytes]:
         """The figures of the pages that were made, as SVG by the names of their files."""
+        return self._images
+
+    @cached_property
+    def _images(self) -> dict[str, bytes]:  # a second drawing has another layout
         import tempfile
 
         from sweeps.rendering.figure import write_figure

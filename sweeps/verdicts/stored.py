@@ -226,11 +226,11 @@ class TableResults:
             for variant in sorted({*variants.get(name, ()), *plain}):
                 try:
                     result = self.of(name, variant)
-                    if result.runs:
-                        _ = result.scored, result.claims  # here, where an error is a remark
-                        found.append(result)
+                    _ = result.runs and (result.scored, result.claims)  # an error is a remark here
+                    found.append(result)
                 except InputError as error:
                     self.remarks.append(f"Table '{name}' cannot be scored: {error}")
+            found = [result for result in found if result.runs]
             yield from found
             waiting += [] if found else [name]
             if name in variants and not found:
