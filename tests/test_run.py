@@ -96,7 +96,12 @@ FILES: dict[str, tuple[Callable[[Path], Path], tuple[str, ...]]] = {
 def test_smoke_runs_on_files_of_every_layout(call: Call, tmp_path: Path, dataset: str) -> None:
     write, own = FILES[dataset]
     words = (f"dataset={dataset}", f"dataset.root={write(tmp_path / 'data')}", *own, *ON_CPU)
-    smoke = ("+experiment=grbm", "+debug=smoke", f"runs_dir={tmp_path / 'runs'}")
+    smoke = (
+        "+experiment=grbm",
+        "+debug=smoke",
+        "masker.patch_size=32",
+        f"runs_dir={tmp_path / 'runs'}",
+    )
     code, _, err = call(main, *smoke, *words)
     assert code == 0, err
     assert len(logged(only_run(tmp_path / "runs"), "train")) == 2
