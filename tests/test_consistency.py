@@ -104,7 +104,7 @@ def test_run_measures_its_consistency(trained: Trained) -> None:
         assert table[score.lower()][protocol] == pytest.approx(by_class, abs=1e-12)
 
 
-def test_run_image_of_another_shape_does_not_cost_the_training(
+def test_image_of_another_shape_does_not_end_the_training(
     call: Call, data: Path, tmp_path: Path
 ) -> None:
     name = SPLITS["test"][1]
@@ -201,7 +201,7 @@ def predicted(exported: Path, tmp_path: Path) -> Path:
     return tmp_path / "predicted"
 
 
-def test_export_writes_both_frames_of_every_pair_and_their_list(exported: Path, data: Path) -> None:
+def test_export_writes_frames_and_list_of_every_pair(exported: Path, data: Path) -> None:
     for name in (f"{name}{view}" for name in SPLITS["test"] for view in ("", "_view1", "_view3")):
         for kind, shape in (("rgb", (48, 64, 3)), ("thermal", (48, 64))):
             path = exported / kind / f"{name}.png"

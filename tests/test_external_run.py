@@ -40,7 +40,7 @@ def words(checkout: Path, *more: str) -> list[str]:
     ]
 
 
-def test_stored_run_executes_a_checkout_only_if_it_is_trusted(
+def test_stored_run_executes_only_a_trusted_checkout(
     call: Call, data: Path, tmp_path: Path
 ) -> None:
     marked = f"open({str(tmp_path / 'executed')!r}, 'a').write('x')\n{DROPPING}"
@@ -67,7 +67,7 @@ def test_stored_run_executes_a_checkout_only_if_it_is_trusted(
         open_run(run, [f"dataset.root={data}"])
 
 
-def test_auxiliary_scores_are_trained_with_a_loss_that_reads_them(
+def test_auxiliary_scores_are_trained_with_their_loss(
     call: Call, data: Path, tmp_path: Path
 ) -> None:
     checkout = write_checkout(tmp_path / "code", {"model/net.py": PAIR})
@@ -92,7 +92,7 @@ def test_two_frames_are_trained_and_measured(call: Call, data: Path, tmp_path: P
     assert len(list((tmp_path / "maps").rglob("*.png"))) >= len(SPLITS["test"])
 
 
-def test_trained_weights_are_exported_under_the_names_of_the_author(tmp_path: Path) -> None:
+def test_trained_weights_are_exported_under_their_authors_names(tmp_path: Path) -> None:
     state = {"network.conv.weight": torch.ones(2), "network.network.bias": torch.zeros(1)}
     save(tmp_path / "author.pth", "released", "external", state, {})
     found = torch.load(tmp_path / "author.pth", weights_only=True)

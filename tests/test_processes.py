@@ -167,12 +167,12 @@ def renamed() -> None:
     synchronise_batch_norm(nn.Sequential(type("OfUser", (nn.BatchNorm2d,), {})(3)))
 
 
-def test_a_derived_normalisation_is_refused_where_there_are_several_processes() -> None:
+def test_derived_normalisation_is_refused_in_several_processes() -> None:
     assert found_by_rank()[1]["subclass"]
     assert not is_refused(renamed)
 
 
-def test_batch_norm_parts_are_one_or_the_number_of_devices() -> None:
+def test_batch_norm_parts_are_one_or_number_of_devices() -> None:
     for parts, size in ((1, 1), (1, 4), (4, 4)):
         check_batch_norm_parts(parts, size)
     for parts, size in ((2, 1), (2, 4), (8, 4)):

@@ -112,7 +112,7 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(("text", "word"), ADAPTATION, ids=[text for text, _ in ADAPTATION])
-def test_run_on_two_domains_that_do_not_fit_is_one_sentence(
+def test_domains_that_do_not_fit_are_one_sentence(
     call: Call, drawn: Path, tmp_path: Path, text: str, word: str
 ) -> None:
     folder = tmp_path / "labels"
@@ -208,7 +208,7 @@ CASES = [(e, w, text, word) for e, (w, cases) in OF_A_RUN.items() for text, word
 
 
 @pytest.mark.parametrize(("entry", "words", "text", "word"), CASES, ids=[c[2] for c in CASES])
-def test_request_of_a_run_that_does_not_fit_is_one_sentence(
+def test_request_that_does_not_fit_is_one_sentence(
     call: Call,
     trained: Trained,
     tmp_path: Path,

@@ -294,9 +294,7 @@ def test_run_on_days_and_nights_counts_every_image(trained: Trained) -> None:
     assert scores == pytest.approx(scores_by_hand(counts))
 
 
-def test_statistics_of_each_domain_change_the_counts_and_not_the_run(
-    trained: Trained, call: Call
-) -> None:
+def test_statistics_of_each_domain_change_only_the_counts(trained: Trained, call: Call) -> None:
     folder = trained(*NIGHT)
     files = {path: path.read_bytes() for path in folder.glob("*") if path.is_file()}
     code, out, err = call(evaluate.entry, f"run={folder}", "batch_norm=adabn")

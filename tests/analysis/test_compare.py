@@ -47,7 +47,7 @@ def lines_of(folder: Path) -> list[dict[str, str]]:
     return list(csv.DictReader((folder / "comparison.csv").open()))
 
 
-def test_table_sentence_and_files_hold_the_numbers_of_the_comparison(
+def test_table_sentence_and_files_hold_the_compared_numbers(
     call: Call, files: tuple[str, str], tmp_path: Path
 ) -> None:
     code, out, err = call(entry, *files, *FAST, f"out={tmp_path / 'new' / 'out'}")
@@ -141,7 +141,7 @@ def paired_runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return runs
 
 
-def test_difference_in_tc_has_its_interval_over_images_and_seeds(
+def test_difference_in_tc_has_interval_over_images_and_seeds(
     call: Call, paired_runs: Path, tmp_path: Path
 ) -> None:
     words = (f"runs_dir={paired_runs}", "a=plain", "b=temporal", *FAST, "frames=aligned")
@@ -171,7 +171,7 @@ def test_auto_metrics_are_those_of_the_protocol(protocol: str) -> None:
     assert metrics_of("auto", [counts], Resampling()) == [*whole, *parts]
 
 
-def test_triples_of_two_methods_have_other_classes_in_the_first_frame() -> None:
+def test_triples_of_methods_differ_in_first_frame_classes() -> None:
     first = np.repeat([0, 1], 50)[None]
     found = []
     for index in range(24):

@@ -50,7 +50,7 @@ def calibrated(seed: int = 0) -> Counts:
     return counts_of(array, CALIBRATION.partition("ring1"))
 
 
-def test_interval_of_a_calibration_error_is_corrected_and_never_negative() -> None:
+def test_interval_of_calibration_error_is_corrected_and_never_negative() -> None:
     counts = calibrated()
     found = estimate([counts], ["ECE"], SETTINGS)["ECE"]
     right = counts.counts[:, 1, 1, 0].sum()

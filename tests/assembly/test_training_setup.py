@@ -69,7 +69,7 @@ def test_class_weights_are_those_of_the_training_split(composed: Composed) -> No
         set_up_training(composed("start_deeplabv2", *taught), upstream_finished=False)
 
 
-def test_rare_classes_are_those_of_the_source_as_it_is_labelled(
+def test_rare_classes_follow_the_labels_of_the_source(
     composed: Composed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Target images and upstream runs are shuffled; an upstream run has the batch size."""
@@ -202,7 +202,7 @@ def test_network_settings_are_applied_and_keep_the_loss(composed: Composed) -> N
 
 
 @pytest.mark.parametrize(("source", "changed"), [("weights", 0), ("order", 1), ("masks", None)])
-def test_seed_of_a_source_changes_what_is_drawn_from_it_alone(
+def test_seed_of_source_changes_only_its_own_draws(
     composed: Composed, source: str, changed: int | None
 ) -> None:
     def drawn(*more: str) -> tuple[list[torch.Tensor], list[torch.Tensor]]:

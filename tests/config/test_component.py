@@ -62,7 +62,7 @@ def test_every_option_of_every_group_passes_the_check(
     assert component.target == component.plain["_target_"] == chosen[group]["_target_"]
 
 
-def test_a_node_is_built_with_converted_values_and_offered_objects() -> None:
+def test_node_is_built_with_converted_values_and_offered_objects() -> None:
     inner = {"_target_": f"{__name__}.Knob", "size": [3, 4], "kind": "b"}
     node = OmegaConf.create({"knob": {**inner, "kind": "a", "inner": inner}}).knob
     offered = object()

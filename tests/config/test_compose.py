@@ -115,7 +115,7 @@ def test_random_words_are_composed_or_refused_as_hydra_does(seed: int) -> None:
             assert found == result(hydra.compose, "config", words), words
 
 
-def test_values_are_set_on_a_copy_of_what_hydra_composed_once() -> None:
+def test_values_are_set_on_copy_of_composed_configuration() -> None:
     composing_module._by_hydra.cache_clear()
     first = compose(("masker=square", "seed=1"))
     first.masker.patch_size = 99

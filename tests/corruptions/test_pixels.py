@@ -111,7 +111,7 @@ def test_noise_has_its_deviation_and_no_bias() -> None:
     assert 0.4 < (found.rgb == 0).mean() < 0.6
 
 
-def test_blur_of_a_step_is_the_normal_distribution_of_that_width() -> None:
+def test_blur_of_step_is_normal_distribution_of_its_width() -> None:
     step = np.zeros((120, 160), np.uint8)
     step[:, 80:] = 255
     source = Sample(np.repeat(step[..., None], 3, 2), step, None, "a")

@@ -195,7 +195,7 @@ def test_reliability_of_an_estimated_flow_by_hand() -> None:
     assert _record("a", found)[:3] == ("a", 0.75, 3.0)
 
 
-def test_an_oracle_scores_on_true_frames_what_its_labels_do(tmp_path: Path) -> None:
+def test_oracle_scores_what_labels_do_on_true_frames(tmp_path: Path) -> None:
     session = on_synth(tmp_path)
     after, oracle = NextFrames(session.dataset), Oracle()
     agree, union = np.zeros(9), np.zeros(9)

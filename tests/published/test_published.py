@@ -178,7 +178,7 @@ def test_no_number_is_read_as_text() -> None:
     ]
 
 
-def test_a_group_without_source_has_no_key_that_no_experiment_has() -> None:
+def test_group_without_source_has_only_keys_of_experiments() -> None:
     known = {key for name in EXPERIMENTS for key in configuration(*words(name))}
     stale = {key for group in unpublished() for key in group.keys} - known
     assert not stale
@@ -212,7 +212,7 @@ def _at_paper_scale(name: str) -> str:
     return by_scale[1] if by_scale else name
 
 
-def test_every_file_with_a_number_of_a_recipe_is_in_the_table() -> None:
+def test_files_with_numbers_of_recipes_are_in_the_table() -> None:
     reached = chosen_files("config") | chosen_files("scale/paper")
     for entry in entries():
         for word in words(entry):

@@ -162,7 +162,7 @@ def test_outlined_pixels_of_true_second_frames_are_those_counted(
         assert (found.compared.sum(), found.differ[0].sum()) == (total, wrong)
 
 
-def test_frames_are_those_of_the_data_set_and_of_the_export(framed: Path) -> None:
+def test_frames_equal_those_of_data_set_and_export(framed: Path) -> None:
     packed = cv2.imread(str(framed / "mf" / "images" / "00000D.png"), cv2.IMREAD_UNCHANGED)
     second = cv2.imread(str(framed / "pairs" / "rgb" / "00000D_view2.png"))
     heat = cv2.imread(str(framed / "pairs" / "thermal" / "00000D_view2.png"), cv2.IMREAD_GRAYSCALE)
@@ -251,7 +251,7 @@ def examples(seed: int = 0):
     return mask_examples(sample(), maskers(), math.lcm(STRIDE, *PATCHES), seed)
 
 
-def test_a_known_mask_hides_its_cells_in_the_cut_image() -> None:
+def test_known_mask_hides_its_cells_in_the_cut_image() -> None:
     """100 x 140 cut to 64 x 128 around the middle: from row 18, column 6."""
 
     def left_half(image_hw, centre_yx, generator):

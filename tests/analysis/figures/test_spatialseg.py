@@ -88,7 +88,7 @@ def test_the_three_numbers_are_those_of_the_tables(tmp_path: Path, absent: Absen
     np.testing.assert_allclose([heat.centre, heat.edge, heat.image], wanted)
 
 
-def test_occupancy_is_the_share_of_labels_that_are_not_background() -> None:
+def test_occupancy_is_the_share_of_labels_beside_background() -> None:
     labels = np.zeros((4, 6, 8), np.uint8)
     inner = RINGS.map((6, 8)) == 0
     labels[0][inner] = 1
@@ -150,7 +150,7 @@ def test_shares_of_the_largest_region_and_miou_by_hand(tmp_path: Path) -> None:
     assert {"car", "color cone", "mIoU (CRM-B)"} <= set(found)
 
 
-def test_the_miou_is_of_the_same_part_as_the_shares() -> None:
+def test_miou_covers_the_same_part_as_the_shares() -> None:
     matrices = np.array([[TWO[0]] * 2, [TWO[1]] * 2])
     counts = counts_of(matrices, partition="vertical2")
     stats = statistics(two_images(), HALVES, np.array([False, True]))

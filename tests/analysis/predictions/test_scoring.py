@@ -73,7 +73,7 @@ def test_every_partition_against_a_loop_over_pixels(tmp_path: Path, write: Write
     np.testing.assert_array_equal(one.maps.intersection.sum((1, 2)), right)
 
 
-def test_another_size_is_refused_or_read_at_the_nearest_pixel(tiny: MFNet, write: Write) -> None:
+def test_other_size_is_refused_or_read_at_nearest_pixel(tiny: MFNet, write: Write) -> None:
     half = {name: np.array(value)[::2, ::2] for name, value in PREDICTIONS.items()}
     folder = write(half)
     with pytest.raises(

@@ -69,7 +69,7 @@ def test_day_and_night_are_the_images_of_each() -> None:
             np.testing.assert_allclose(getattr(ours, name)(part), getattr(theirs, name)())
 
 
-def test_an_image_of_another_size_or_without_label_is_refused() -> None:
+def test_image_of_other_size_or_without_label_is_refused() -> None:
     rng = np.random.default_rng(0)
     first, other = random_sample("1D", (24, 32), rng), random_sample("2N", (24, 30), rng)
     with pytest.raises(InputError, match="'2N' is 24x30 pixels but '1D' is 24x32"):

@@ -148,7 +148,7 @@ def test_freedom_is_blocks_less_strata() -> None:
         assert found.error == pytest.approx(math.sqrt(6 / 5))
 
 
-def test_blocks_never_join_day_and_night_and_each_part_is_drawn_alone() -> None:
+def test_blocks_of_day_and_night_are_drawn_apart() -> None:
     sample = Sample(made(images=100), TENS)
     is_night = np.arange(100) >= 50
     for block in range(sample.blocks.count):

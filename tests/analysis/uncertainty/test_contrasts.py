@@ -139,7 +139,7 @@ def test_evidence_uses_the_seeds_that_all_rows_have() -> None:
     assert (found.seeds, len(found.values)) == ((), 1)
 
 
-def test_evidence_does_not_depend_on_the_order_of_images_or_on_other_contrasts() -> None:
+def test_evidence_ignores_order_of_images_and_other_contrasts() -> None:
     rows = rows_of()
     names = np.random.default_rng(1).permutation(rows[0][0].names).tolist()
     shuffled = [{seed: each.select(names) for seed, each in row.items()} for row in rows]
@@ -165,7 +165,7 @@ def test_evidence_again_draws_no_images(monkeypatch: pytest.MonkeyPatch) -> None
     assert more.values[:2] == first.values
 
 
-def test_evidence_of_too_few_images_has_values_and_no_error() -> None:
+def test_evidence_of_too_few_images_raises_no_error() -> None:
     found = Resampler(SETTINGS).evidence(difference(rows_of(9)))
     assert (len(found.values), found.blocks) == (3, 9)
     assert math.isnan(found.error)

@@ -204,7 +204,7 @@ def test_more_seeds_never_widen_an_interval() -> None:
 BOUND = 0.05 + 3 * math.sqrt(0.05 * 0.95 / 100)
 
 
-def test_rates_of_a_rule_that_may_stop_at_any_time() -> None:
+def test_error_rates_of_rule_stopping_at_any_time() -> None:
     true, none = (rates(100, effect, 0.3, until_decided, ANY) for effect in (2.0, 0.0))
     assert true.holds > 0.9
     assert true.contradicted <= 0.01
@@ -271,7 +271,7 @@ def test_rates_of_equivalence_at_its_margin() -> None:
 
 
 @pytest.mark.parametrize("count", [2, 5, 20])
-def test_e_value_is_the_mean_ratio_of_noncentral_t_densities(count: int) -> None:
+def test_e_value_is_mean_ratio_of_noncentral_t_densities(count: int) -> None:
     precision = 0.25
     for t in (0.5, 2.0, -4.0):
 
@@ -286,7 +286,7 @@ def test_e_value_is_the_mean_ratio_of_noncentral_t_densities(count: int) -> None
 
 
 @pytest.mark.parametrize("count", [4, 20, 300])
-def test_half_width_is_where_the_e_value_is_one_over_alpha(count: int) -> None:
+def test_e_value_at_half_width_is_one_over_alpha(count: int) -> None:
     for alpha in (0.025, 0.05):
         half = half_width(1.7, count, alpha)
         assert e_value(half * math.sqrt(count) / 1.7, count) == pytest.approx(1 / alpha)
@@ -318,7 +318,7 @@ def test_sequence_ever_misses_the_mean_in_less_than_alpha() -> None:
 
 
 @pytest.mark.parametrize("ratio", [0.0, 0.2, 3.0])
-def test_images_and_seeds_together_ever_miss_in_less_than_alpha(ratio: float) -> None:
+def test_images_and_seeds_miss_in_less_than_alpha(ratio: float) -> None:
     """`AnyTime` joins squares at half of the error rate each; the whole rate is too much."""
     missed = ever_missed(1500, 200, ratio)
     assert missed["squares, half"] < 0.05

@@ -58,7 +58,7 @@ def test_second_checkout_of_a_process_is_refused(tmp_path: Path) -> None:
         external(other)
 
 
-def test_module_of_another_folder_is_not_taken_for_the_checkouts(tmp_path: Path) -> None:
+def test_module_of_other_folder_is_not_the_checkouts(tmp_path: Path) -> None:
     mine = ModuleType("model.net")
     mine.Net = torch.nn.Identity  # type: ignore[attr-defined]
     sys.modules["model.net"] = mine
@@ -209,7 +209,7 @@ def test_paths_lead_through_lists_keys_attributes_and_elements() -> None:
     assert structure([1, (2, 3.0), None, "a"]) == words
 
 
-def test_scores_of_several_paths_are_added_and_other_outputs_refused() -> None:
+def test_scores_of_paths_are_added_and_others_refused() -> None:
     scores = torch.ones(2, 3, 4, 5)
     found = scores_at((scores, [2 * scores]), ((0,), (1, 0)), "model.scores", (2, 3))
     assert torch.equal(found, 3 * scores)
@@ -225,7 +225,7 @@ STRIDED = STACKED.replace(
 )
 
 
-def test_forward_returns_scores_of_every_pixel_also_of_odd_sides(tmp_path: Path) -> None:
+def test_forward_scores_every_pixel_also_of_odd_sides(tmp_path: Path) -> None:
     folder = write_checkout(tmp_path, {"model/net.py": STRIDED})
     net = external(folder, multiple=4, resize=True)
     for training in (False, True):

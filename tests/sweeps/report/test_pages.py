@@ -106,7 +106,7 @@ def test_own_table_shows_values_verdicts_and_their_basis(report: Report) -> None
     assert "rgbt reproduce table=my/planted seeds=3\n" in text
 
 
-def test_runs_of_one_start_are_apart_and_carry_the_warning(report: Report) -> None:
+def test_runs_of_one_start_are_apart_with_a_warning(report: Report) -> None:
     text = report.page("spatialseg")
     each = section(text, "## TABLE III (scale=bench)")
     one = section(text, "## TABLE III (scale=bench, seeds.start=common)")
@@ -225,7 +225,7 @@ def test_runs_whose_keys_have_changed_are_a_remark(place: Path, tmp_path: Path) 
     assert "No run that is tagged with 'my/planted' has the key of a row today." in text
 
 
-def test_text_of_a_run_is_no_markup_and_names_no_folder(place: Path, tmp_path: Path) -> None:
+def test_text_of_run_is_no_markup_without_folders(place: Path, tmp_path: Path) -> None:
     shutil.copytree(place / "runs", tmp_path / "runs")
     files = sorted((tmp_path / "runs").glob("*/run.json"))
     file = next(each for each in files if "my/planted" in each.read_text())
@@ -237,7 +237,7 @@ def test_text_of_a_run_is_no_markup_and_names_no_folder(place: Path, tmp_path: P
     assert "&lt;script&gt;alert(1)" in page
 
 
-def test_archive_gives_the_same_pages_and_a_run_changes_them(
+def test_archive_gives_same_pages_and_run_changes_them(
     report: Report, place: Path, tmp_path: Path
 ) -> None:
     archive = tmp_path / "results"

@@ -384,9 +384,7 @@ STARRED = {
 
 
 @pytest.mark.parametrize(("name", "label"), STARRED)
-def test_starred_rows_as_released_are_the_basic_network_in_two_stages(
-    name: str, label: str
-) -> None:
+def test_released_starred_rows_train_basic_network_in_two_stages(name: str, label: str) -> None:
     """The scripts import the basic network; the modified decoder is that of the paper's form."""
     (row,) = (each for each in TABLES[name].rows if each.label == label)
     paper, second = (run_of(TABLES[name], row, form, "paper") for form in FORMS)

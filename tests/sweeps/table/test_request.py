@@ -162,7 +162,7 @@ def test_selected_rows_keep_their_claims() -> None:
     assert select_rows(made, "a,b,c").claims == made.claims
 
 
-def test_twins_of_a_row_that_is_left_out_stay_declared() -> None:
+def test_twins_of_a_row_left_out_stay_declared() -> None:
     rows = (
         Row(label="a", experiment="crm"),
         Row(label="b", experiment="crm", same_as="a"),
@@ -177,7 +177,7 @@ def test_twins_of_a_row_that_is_left_out_stay_declared() -> None:
         select_rows(table(rows), "e")
 
 
-def test_rows_that_are_one_run_are_refused_unless_the_table_says_so() -> None:
+def test_undeclared_rows_of_one_run_are_refused() -> None:
     first, third = (Row(label=each, experiment="baseline") for each in "ac")
     same = Row(label="b", experiment="baseline", same_as="a")
     with pytest.raises(InputError, match=r"'a' and 'c' of own/t would be the same run .* same_as"):

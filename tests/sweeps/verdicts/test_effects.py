@@ -96,7 +96,7 @@ def test_effects_are_of_contrasts_within_runs() -> None:
     assert found["crm", "baseline", "noise"].value == pytest.approx(own - EFFECT)
 
 
-def test_method_with_a_missing_cell_is_named_and_others_are_analysed() -> None:
+def test_method_with_missing_cell_is_named_others_are_analysed() -> None:
     runs = trained()
     for seed in (0, 1):
         runs["crm N+T-", seed] = failed("no memory")
@@ -141,7 +141,7 @@ def test_claims_about_effects_are_judged() -> None:
     assert judge.claims(unfinished)[0].word == "not run"  # type: ignore[arg-type]
 
 
-def test_networks_tested_in_worlds_use_the_counts_of_each_world() -> None:
+def test_networks_tested_in_worlds_use_counts_of_each() -> None:
     table = design_table(trained=None, tested=Part())
     worlds = world_evaluations(table, table.rows[0])
     assert list(worlds) == list(CELLS)
