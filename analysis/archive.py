@@ -46,16 +46,16 @@ from rgbt.terminal import plain_text, print_rich, rich_table, warn
 
 SHARED = "shared"
 COUNTS = ("counts_*.npz", "evaluations/*.npz", "evaluations/robustness/*/*.npz")
+# Files of a run folder that are archived: its counts, and what is kept as it is.
 TEXTS = ("config.yaml", "run.json", "result.json", "evaluations/robustness/*/*.json")
-"""Files of a run folder that are archived: its counts, and what is kept as it is."""
 
 PROVENANCE = (
     *("started", "command", "git_commit", "git_dirty", "code", "python", "threads"),
     *("platform", "cpu", "cpu_usable", "gpus", "cuda"),
 )
+# Entries of the provenance, and the packages whose versions are archived. Paths and the name of
+# the machine are of no use elsewhere.
 PACKAGES = ("torch", "numpy", "opencv-python-headless", "lightning-fabric", "hydra-core", "optuna")
-"""Entries of the provenance, and the packages whose versions are archived. Paths and the name of
-the machine are of no use elsewhere."""
 
 DAMAGED = (
     *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, NotImplementedError),

@@ -30,8 +30,8 @@ if TYPE_CHECKING:  # --help answers without waiting for pandas, SciPy and OpenCV
 
 T = TypeVar("T")
 
+# Largest value of a count that has no other limit.
 MOST = 1_000_000
-"""Largest value of a count that has no other limit."""
 
 Resamples = Annotated[int, Interval(ge=100, le=MOST), Help("number of resamples of the images")]
 

@@ -30,8 +30,8 @@ from rgbt.types import VIEWS
 if TYPE_CHECKING:  # --help answers without waiting for pandas
     import pandas as pd
 
+# Input of the network ("" where a file does not tell), and partition of the counts.
 Key = tuple[str, str]
-"""Input of the network ("" where a file does not tell), and partition of the counts."""
 
 Scores = tuple[ScoreGrid, Mapping[str, Estimate]]
 

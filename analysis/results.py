@@ -37,24 +37,24 @@ if TYPE_CHECKING:
     import pandas as pd
 
 SEED, EXPERIMENT = "rgbt.seed", "rgbt.experiment"
+# Tags of runs; folder of their evaluations, and the one below it of corrupted images.
 EVALUATIONS, ROBUSTNESS = "evaluations", "robustness"
-"""Tags of runs; folder of their evaluations, and the one below it of corrupted images."""
 
+# Condition of images as they are, as the run is made for; subset of all images of a split.
 CLEAN, ALL = "clean", "all"
-"""Condition of images as they are, as the run is made for; subset of all images of a split."""
 
 SCORE_COLUMNS = ("subset", "region", "class", "metric", "value")
+# Columns of `score_frame` and `results`.
 COLUMNS = (
     *("run", "experiment", "group", "seed", "split", "condition", "severity", "partition"),
     *SCORE_COLUMNS,
 )
-"""Columns of `score_frame` and `results`."""
 
+# What a list may contain, for messages.
 RUNS = "runs, files of counts or a group"
-"""What a list may contain, for messages."""
 
+# Counts of single frames, or of pairs of frames by one protocol.
 Frames = Literal["", "aligned", "released", "next", "flow", "triples"]
-"""Counts of single frames, or of pairs of frames by one protocol."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class Evaluation:
 
     @property
     def seed(self) -> int | None:
-        """Of the run; None for a file."""
+        """The seed of the run; None for a file."""
         text = "" if self.run is None else self.run.tags.get(SEED, "")
         return int(text) if text.isdecimal() else None
 

@@ -38,18 +38,18 @@ if TYPE_CHECKING:  # --help answers without waiting for pandas and OpenCV
     from rgbt.metrics.counts import Counts
     from rgbt.tables import TextTable
 
+# File in a folder of scores that records what was scored.
 SOURCE = "source.txt"
-"""File in a folder of scores that records what was scored."""
 
 COLUMNS = (
     *("method", "split", "partition", "subset", "images", "region", "class", "metric", "absent"),
     *("value", "low", "high"),
 )
+# Means in the tables; the file of scores holds more.
 SHOWN = (names.MIOU, names.MACC, names.VAR)
-"""Means in the tables; the file of scores holds more."""
 
-OF_PREDICTIONS = ("regions", "resize", "name", "format", "palette", "prefix", "suffix")
-"""Options that have no effect on counts of runs."""
+# Options that have no effect on counts of runs.
+PREDICTION_OPTIONS = ("regions", "resize", "name", "format", "palette", "prefix", "suffix")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -281,7 +281,7 @@ def _stored_counts(options: Options, overrides: list[str]) -> list[tuple[str, Co
     from analysis.results import open_counts
 
     default = Options()
-    idle = [key for key in OF_PREDICTIONS if getattr(options, key) != getattr(default, key)]
+    idle = [key for key in PREDICTION_OPTIONS if getattr(options, key) != getattr(default, key)]
     idle += [word.partition("=")[0] for word in overrides]
     if idle:
         raise InputError(f"'{idle[0]}' has no effect on stored counts.")

@@ -59,7 +59,7 @@ class Options:
     trust: Trust = ""
 
 
-OF_THE_TABLE = (
+TABLE_OPTIONS = (
     *("table", "seeds", "max_seeds", "scale", "form", "rows", "runs_dir", "out", "fresh"),
     *("minutes", "archive"),
 )
@@ -118,7 +118,7 @@ def settings_of(options: Options) -> SweepSettings:
     node.objectives = [{"metric": f"test/{MIOU}", "direction": "maximize"}]
     node.hours = options.minutes and options.minutes / 60
     for key, value in vars(options).items():
-        if key not in OF_THE_TABLE:
+        if key not in TABLE_OPTIONS:
             node[key] = value
     try:
         return read_settings(node)

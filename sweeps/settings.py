@@ -14,7 +14,7 @@ from rgbt.metrics import names as scores
 from rgbt.metrics.scores import MEANS
 from rgbt.ranges import Names, Positive, Text
 
-AT_THE_END = [
+FINAL_METRICS = [
     scores.consistency(s, p) for s in (scores.TC, scores.CA) for p in ("aligned", "released")
 ]
 """Scores that a run measures once, of its best checkpoint."""
@@ -36,7 +36,7 @@ class Objective:
     def __post_init__(self) -> None:
         split, _, score = self.metric.partition("/")
         whole = score.removeprefix(f"{scores.DAY}/").removeprefix(f"{scores.NIGHT}/")
-        known = [*MEANS, scores.VAR, *AT_THE_END]
+        known = [*MEANS, scores.VAR, *FINAL_METRICS]
         is_known = {whole, score} & {*known} or score.startswith(("region/", "class/"))
         if split not in ("val", "test") or not is_known:
             told = f"val/<score> or test/<score>; {nearest(score, known)}, region/<n>, class/<name>"
@@ -45,7 +45,7 @@ class Objective:
     @property
     def is_consistency(self) -> bool:
         """Whether it is a score of two frames, which only some runs measure."""
-        return self.metric.partition("/")[2] in AT_THE_END
+        return self.metric.partition("/")[2] in FINAL_METRICS
 
     @property
     def is_reported(self) -> bool:

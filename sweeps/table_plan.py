@@ -31,7 +31,7 @@ from sweeps.worker.run_store import RunStore, open_run_store
 if TYPE_CHECKING:
     from sweeps.reproduce import Options
 
-OF_THE_ROWS = {
+ROW_SETTINGS = {
     "seed": "the rows set it; choose seeds=3.",
     "experiment": "the rows set it; choose another table.",
     "metric": "the columns define what is counted; set `regions` in your own table.",
@@ -53,8 +53,8 @@ def read_named(name: str) -> tuple[str, Table]:
 def check_override(word: str) -> None:
     """Refuse an override that belongs to the rows or columns of a table."""
     key = word.lstrip("+~").partition("=")[0].rpartition("@")[2].partition(".")[0]
-    if key in OF_THE_ROWS:
-        raise InputError(f"'{word}': {OF_THE_ROWS[key]}")
+    if key in ROW_SETTINGS:
+        raise InputError(f"'{word}': {ROW_SETTINGS[key]}")
 
 
 def select_rows(table: Table, text: str) -> Table:

@@ -158,7 +158,7 @@ def test_run_bad_files_are_named(
 
 CRM = ("+experiment=crm", *short(1))
 TWO_FRAMES = (*TEMPORAL, *short(2))
-OF_A_RUN = {
+RUN_REFUSALS = {
     evaluate.entry: (
         CRM,
         [
@@ -204,7 +204,7 @@ OF_A_RUN = {
         ],
     ),
 }
-CASES = [(e, w, text, word) for e, (w, cases) in OF_A_RUN.items() for text, word in cases]
+CASES = [(e, w, text, word) for e, (w, cases) in RUN_REFUSALS.items() for text, word in cases]
 
 
 @pytest.mark.parametrize(("entry", "words", "text", "word"), CASES, ids=[c[2] for c in CASES])

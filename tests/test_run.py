@@ -49,7 +49,7 @@ from tests.data.layouts import (
 )
 
 NO_PATCH = "masker.patch_size=null"
-OF_SYNTH = (
+SMALL_SYNTH = (
     *("dataset.num_train=3", "dataset.num_val=3", "dataset.num_test=3"),
     *("dataset.height=48", "dataset.width=64", *SMALL),
 )
@@ -57,8 +57,8 @@ ON_DATA = {
     **{name: (NO_PATCH,) for name in ("baseline", "mfnet")},
     **{name: (NO_PATCH,) for name in ("dinov2", "temporal_con_released")},
     **{"grbm": (), "spatialseg_released": ()},
-    "crm_pst900": ("dataset=synth_pst900", *OF_SYNTH),
-    "spatialseg_kp": ("dataset=synth_kp", *OF_SYNTH),
+    "crm_pst900": ("dataset=synth_pst900", *SMALL_SYNTH),
+    "spatialseg_kp": ("dataset=synth_kp", *SMALL_SYNTH),
 }
 """One experiment for each scheme and kind of network; `tests/test_behaviour.py` has all."""
 

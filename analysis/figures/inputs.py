@@ -27,8 +27,8 @@ from rgbt.metrics.metric import Regions
 if TYPE_CHECKING:
     from rgbt.dataset import LabelledDataset
 
+# A figure, and the numbers that it shows.
 Drawn = tuple[Figure, pd.DataFrame]
-"""A figure, and the numbers that it shows."""
 
 Make = TypeVar("Make", bound=Callable[..., Drawn])
 

@@ -54,21 +54,21 @@ if TYPE_CHECKING:
 Bytes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
+# The image as one region.
 WHOLE = Regions(partition="ring", regions=1, aspect="image", absent="exclude")
-"""The image as one region."""
 
 OUTLINE, OUTLINED = "#FF2A2A", "predictions of both frames differ"
+# Temporal, captions of Figs. 1 and 2.
 THERMAL_COLOURS = "jet"
-"""Temporal, captions of Figs. 1 and 2."""
 
+# Sides in pixels that the paper draws (CRM, Fig. 5 and Table 3b).
 PATCHES = (8, 16, 32, 64)
-"""Sides in pixels that the paper draws (CRM, Fig. 5 and Table 3b)."""
 
+# Maskers cut images whose sides are multiples of this; others they would pad with black.
 STRIDE = 32
-"""Maskers cut images whose sides are multiples of this; others they would pad with black."""
 
+# Colour of a hidden pixel: a grey one would be lost in a thermal image.
 HIDDEN = (150, 190, 230)
-"""Colour of a hidden pixel: a grey one would be lost in a thermal image."""
 
 
 Rows = Annotated[Count, Help("number of images")]
@@ -318,7 +318,7 @@ def pair_rows(config: Config, given: PairOptions, *, rows: Rows = 1) -> Drawn:
 
 @figure("temporal/fig6", "four pairs of frames, two columns each", "dataset", "consistency")
 def pair_columns(config: Config, given: PairOptions, *, layout: Layout = "columns") -> Drawn:
-    """As `pair_rows`, with the number and the layout of the printed figure."""
+    """The frames of `pair_rows` in the layout of the printed figure."""
     return pair_rows(config, replace(given, layout=layout), rows=given.rows)
 
 

@@ -27,41 +27,41 @@ from rgbt.checks import InputError
 from rgbt.files.atomic import write_atomic
 from rgbt.tracking.pictures import number_places
 
+# Width in inches of one column and of a page of two columns (IEEE).
 COLUMN, PAGE = 3.4, 7.0
-"""Width in inches of one column and of a page of two columns (IEEE)."""
 
+# Points of numbers on small pictures, and of ticks, legends and other small letters.
 TINY, SMALL = 5.0, 7.0
-"""Points of numbers on small pictures, and of ticks, legends and other small letters."""
 
+# Of labels and titles, on average.
 LETTERS_PER_INCH = 17
-"""Of labels and titles, on average."""
 
+# Letters whose room the line and the gap of a legend's entry take.
 HANDLE_LETTERS = 7
-"""Letters whose room the line and the gap of a legend's entry take."""
 
+# Inches that a class takes in a legend.
 LEGEND_ENTRY = 0.72
-"""Inches that a class takes in a legend."""
 
+# Inches of a line of text, and of a small digit.
 LINE, DIGIT = 0.14, 0.06
-"""Inches of a line of text, and of a small digit."""
 
 SUFFIXES = (".pdf", ".svg", ".png")
 
+# Okabe and Ito's, the strong ones first; grey and olive (Tol) instead of their yellow, which is
+# lost as a thin line on white, and of black, which stands for what is set apart.
 COLOURS = (
     *("#0072B2", "#D55E00", "#009E73", "#CC79A7"),
     *("#E69F00", "#56B4E9", "#777777", "#999933"),
 )
-"""Okabe and Ito's, the strong ones first; grey and olive (Tol) instead of their yellow, which is
-lost as a thin line on white, and of black, which stands for what is set apart."""
 
 APART = "black"
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<")
 LINES = ("-", "--", "-.", ":")
 
+# Decorator: draw with the letters, lines and sizes of the style sheet.
 styled = rc_context(
     rc_params_from_file(Path(__file__).with_name("paper.mplstyle"), use_default_template=False)
 )
-"""Decorator: draw with the letters, lines and sizes of the style sheet."""
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -203,8 +203,8 @@ def staircase(region_map: NDArray[np.integer], step: int) -> list[tuple[int, int
     return places
 
 
+# Classes below a grid of pictures: K names, (K, 3) uint8 colours, and further entries.
 Legend = tuple[Sequence[str], NDArray[np.uint8], Sequence[Artist]]
-"""Classes below a grid of pictures: K names, (K, 3) uint8 colours, and further entries."""
 
 
 @styled

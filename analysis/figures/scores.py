@@ -42,17 +42,17 @@ TITLES: dict[Protocol, str] = {
     "next": "consecutive frames",
 }
 COLUMNS = 4
+# Panels in a line of the figure of corruptions; inches of a line, and of the panel below them.
 HEIGHT, HEIGHT_BELOW = 1.55, 1.35
-"""Panels in a line of the figure of corruptions; inches of a line, and of the panel below them."""
 
+# Title of the panel of corruptions without a severity.
 MISSING = "one image missing"
-"""Title of the panel of corruptions without a severity."""
 
+# Regions over which bars of several methods stand side by side.
 SPREAD = 0.3
-"""Regions over which bars of several methods stand side by side."""
 
+# Size of a heat map of regions in pixels.
 MAP_HW = (480, 640)
-"""Size of a heat map of regions in pixels."""
 
 
 @figure("temporal/fig5", "TC and CA of variants by class")

@@ -46,17 +46,17 @@ TRENDS = {
     "ring": "(c) rings (inside to outside)",
 }
 NAMES = {"rgb": "RGB", "thermal": "thermal"}
+# Marker and line of each part; the modality is the colour.
 MARKS = {"all": ("o", "-"), "day": ("s", "--"), "night": ("^", ":")}
-"""Marker and line of each part; the modality is the colour."""
 
+# Regions over which six series are drawn side by side, so that their bars do not overlap.
 SPREAD = 0.5
-"""Regions over which six series are drawn side by side, so that their bars do not overlap."""
 
+# A logarithmic axis where one modality's median is more than this many times the other's.
 FAR_APART = 5.0
-"""A logarithmic axis where one modality's median is more than this many times the other's."""
 
+# Of the bars of Figs. 5 and 6.
 RESAMPLING = Resampling(resamples=2000)
-"""Of the bars of Figs. 5 and 6."""
 
 
 @dataclass(frozen=True, kw_only=True)

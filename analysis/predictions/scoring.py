@@ -25,11 +25,11 @@ Resize = Literal["refuse", "nearest", "stretch"]
 
 PARTITIONS: tuple[Partition, ...] = get_args(Partition)
 
+# Ratio of the aspects of prediction and label, less 1, up to which one is a resized other.
 MOST_STRETCH = 0.05
-"""Ratio of the aspects of prediction and label, less 1, up to which one is a resized other."""
 
+# Most names that a message lists.
 SHOWN = 3
-"""Most names that a message lists."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,8 +25,8 @@ from rgbt.metrics.metric import Regions
 from rgbt.metrics.names import DAY, NIGHT
 from rgbt.types import Sample
 
+# Order of the modality axis. RGB is measured as grey (ITU-R BT.601), rounded to 8 bits.
 MODALITIES = ("rgb", "thermal")
-"""Order of the modality axis. RGB is measured as grey (ITU-R BT.601), rounded to 8 bits."""
 
 ALL = "all"
 

@@ -29,16 +29,16 @@ std: standard deviation of the pixel values of the region. No noise estimate: al
     as noise, and the ratio is the inverse coefficient of variation. Offered because papers use it.
 """
 
+# Neighbours that the Laplacian reads. Four is the default: Pertuz et al., whom the paper cites
+# for this measure, and `cv2.Laplacian` use it by default.
 KERNELS = ("four", "eight")
-"""Neighbours that the Laplacian reads. Four is the default: Pertuz et al., whom the paper cites
-for this measure, and `cv2.Laplacian` use it by default."""
 
 EIGHT = np.array([[1, 1, 1], [1, -8, 1], [1, 1, 1]], np.float32)
+# Immerkaer's mask N is its outer product with itself.
 SECOND_DIFFERENCE = np.array([1, -2, 1], np.float32)
-"""Immerkaer's mask N is its outer product with itself."""
 
+# Median of ``|x|`` for a standard normal x.
 MEDIAN_OF_NORMAL = 0.6744897501960817
-"""Median of ``|x|`` for a standard normal x."""
 
 Image = NDArray[np.uint8]
 Ints = NDArray[np.int64]
@@ -168,8 +168,8 @@ class ImageMeter:
         return median / 2 / MEDIAN_OF_NORMAL
 
 
+# Values of ``|a - b - c + d|`` of four bytes, which is twice the Haar coefficient HH.
 HAAR_BINS = 2 * 255 + 1
-"""Values of ``|a - b - c + d|`` of four bytes, which is twice the Haar coefficient HH."""
 
 
 def grouped_median(histogram: NDArray[np.integer]) -> Floats:

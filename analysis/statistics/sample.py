@@ -19,8 +19,8 @@ from analysis.uncertainty.intervals import over_images, student
 from rgbt.checks import InputError, check_choice
 from rgbt.metrics.names import NIGHT
 
+# Eq. 4's "very small number", in grey levels.
 EPSILON = 1e-6
-"""Eq. 4's "very small number", in grey levels."""
 
 AVERAGES = ("pooled", "images")
 """How ratios of many images become one; the first is the default.
@@ -30,13 +30,13 @@ pooled: mean signal of all images over mean noise of all images. The default: a 
 images: mean over images of each image's own ratio.
 """
 
+# Fewer blocks of day or night say too little about how blocks differ.
 LEAST = 5
-"""Fewer blocks of day or night say too little about how blocks differ."""
 
 COLUMNS = ["quantity", "modality", "class", "estimator", "average"]
 
+# Below with 1 + B rows: the sample, then its resamples.
 Values = NDArray[np.float64]
-"""Below with 1 + B rows: the sample, then its resamples."""
 
 
 class Sample:

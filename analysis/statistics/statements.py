@@ -26,10 +26,11 @@ from rgbt.metrics.names import DAY, NIGHT
 
 STATEMENTS: list[dict[str, Any]] = read_yaml(Path(__file__).with_name("statements.yaml"))
 
+# The class that the paper excepts from "most classes are concentrated in the centre", and the one
+# that it names as more evenly distributed.
 EXCEPT, EVEN = "bump", "curve"
-"""The class that the paper excepts from "most classes are concentrated in the centre", and the one
-that it names as more evenly distributed."""
 
+# Open range as stated -> of the number that is judged, which of a quotient is the logarithm.
 RANGES = {
     "> 0": (0.0, math.inf),
     "< 0": (-math.inf, 0.0),
@@ -37,18 +38,17 @@ RANGES = {
     "< 1": (-math.inf, 0.0),
     "about 10": (math.log(10) / 2, math.log(10) * 3 / 2),
 }
-"""Open range as stated -> of the number that is judged, which of a quotient is the logarithm."""
 
 
 COLUMNS = [
     *("key", "place", "statement", "estimator", "average", "verdict"),
     *("contrast", "value", "low", "high", "wanted", "finding", "blocks"),
 ]
-OF_CENTRE = (
+# Contrasts that need rings, two of them or more.
+NEEDS_CENTRE = (
     *("falls", "central", "central_except", "even"),
     *("centre_edge", "centre_edge_by_part", "centre_less_edge"),
 )
-"""Contrasts that need rings, two of them or more."""
 
 
 class Contrast(NamedTuple):
@@ -119,7 +119,7 @@ def _contrasts(sample: Sample, stated: dict[str, Any]) -> Iterator[Contrast]:
     stats, kind, quantity = sample.stats, stated["contrast"], stated["quantity"]
     has_centre = stats.partition.startswith("ring") and stats.num_regions > 1
     is_known = stats.background or quantity != "occupancy"
-    if not is_known or (kind in OF_CENTRE and not has_centre):
+    if not is_known or (kind in NEEDS_CENTRE and not has_centre):
         return
     if quantity == "occupancy":
         yield from _of_occupancy(sample, kind)

@@ -11,10 +11,10 @@ from analysis.commands import text_table
 from analysis.statistics.collect import ALL, SpatialStatistics
 from rgbt.tables import ABSENT, TextTable
 
+# More regions than this become rows.
 WIDEST = 12
-"""More regions than this become rows."""
 
-OF_CLASSES = {
+CLASS_QUANTITIES = {
     "class_occupancy": "by class, % of the pixels",
     "class_occupancy_normalised": "by class, % of its largest region (Fig. 3)",
 }
@@ -37,13 +37,13 @@ def region_tables(
     """The quantities by region, a table each; of noise by one `way` to estimate it, or by all."""
     titles = {
         "occupancy": "sample occupancy rate, % (Eq. 2)",
-        **OF_CLASSES,
+        **CLASS_QUANTITIES,
         "laplacian": f"Laplacian variance ({stats.kernel} neighbours, Eq. 3)",
         "noise": "noise, grey levels ({}; rounding alone is 0.29)",
         "snr": "signal to noise (Eq. 4; {}, {})",
         "label entropy": "label entropy, bits (Eq. 5)",
     }
-    by_class = frame["quantity"].isin([*OF_CLASSES])
+    by_class = frame["quantity"].isin([*CLASS_QUANTITIES])
     objects = frame["class"].isin([stats.classes[index] for index in stats.objects])
     rows = frame[~by_class | (objects & (frame["part"] == ALL))]
     labels = rows[["modality", "part"]].agg(", ".join, axis=1).str.removeprefix(", ")

@@ -20,17 +20,17 @@ NamedBlocks = Literal["auto", "none", "sequence"]
 Places = NDArray[np.int64]
 Values = NDArray[np.float64]
 
+# Most resamples: more take time without a visible effect.
 MOST = 1_000_000
-"""Most resamples: more take time without a visible effect."""
 
+# Blocks below which an interval would rest on almost nothing.
 FEWEST = 10
-"""Blocks below which an interval would rest on almost nothing."""
 
+# Most numbers of one set of draws that is kept, as many scores need the same.
 KEPT = 2**21
-"""Most numbers of one set of draws that is kept, as many scores need the same."""
 
+# Resamples computed at once, which limits the memory that their counts take.
 CHUNK = 500
-"""Resamples computed at once, which limits the memory that their counts take."""
 
 GAP = 3.0
 """Typical steps between frames of a sequence above which the next frame begins another run. In the
@@ -39,8 +39,8 @@ lists of MFNet neighbours are 1 or 3 numbers apart (a frame left out) or at leas
 
 ALONE = "each image is drawn alone, as if it were independent evidence"
 
+# Standard errors ``1 / sqrt(n)`` above which an autocorrelation counts as one.
 BAND = 1.96
-"""Standard errors ``1 / sqrt(n)`` above which an autocorrelation counts as one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,7 +188,7 @@ def block_length(series: Values, sequences: Sequence[Places]) -> int:
     covered = math.ceil(math.sqrt(count)) + 5
 
     def autocovariance(lag: int) -> float:
-        """Of pairs `lag` frames apart in one sequence, over the number of all images."""
+        """The sum over pairs `lag` frames apart in one sequence, over the number of all images."""
         long = [centred[each] for each in sequences if len(each) > lag]
         return float(sum(each[: len(each) - lag] @ each[lag:] for each in long)) / count
 

@@ -28,8 +28,8 @@ from rgbt.metrics.named import ParsedMetric, images_of, parse, value, values
 from rgbt.metrics.pairs import HEADLINES, protocol_of
 from rgbt.metrics.score_grid import headlines
 
+# Seed of counts that belong to no seed: a folder of predictions, one file of weights.
 FIXED = -1
-"""Seed of counts that belong to no seed: a folder of predictions, one file of weights."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,7 +122,7 @@ class Resampler:
         self._influences: dict[tuple[str, Absent], Values] = {}
 
     def evidence(self, terms: Sequence[Term], *, paired: bool = True) -> Evidence:
-        """As `contrast`; InputError where a run has nothing to score."""
+        """The same as `contrast`, with an InputError where a run has nothing to score."""
         found = self.contrast(terms, paired=paired)
         if np.isnan(found.values).any():
             keys = ", ".join(dict.fromkeys(key for term in terms for key in term.keys.values()))

@@ -21,10 +21,10 @@ from analysis.uncertainty.contrasts import Evidence, combine
 from analysis.uncertainty.estimates import Estimate, estimate_of
 from analysis.uncertainty.intervals import Spread, holm
 
+# Whose spread over seeds is the error: "cells", what is left of all cells after their means and
+# those of the seeds (every cell is a training of its own, so all cells tell of the same noise);
+# "effects", that of the effect itself over seeds (all cells are tests of one network).
 Noise = Literal["cells", "effects"]
-"""Whose spread over seeds is the error: "cells", what is left of all cells after their means and
-those of the seeds (every cell is a training of its own, so all cells tell of the same noise);
-"effects", that of the effect itself over seeds (all cells are tests of one network)."""
 
 
 @dataclass(frozen=True)

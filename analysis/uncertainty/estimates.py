@@ -130,7 +130,7 @@ class Difference:
 
     @property
     def interval(self) -> Interval | None:
-        """Of the difference, see `Estimate.interval`."""
+        """The interval of the difference, see `Estimate.interval`."""
         return self.difference.interval
 
 
@@ -151,7 +151,7 @@ class Comparison:
 
     @property
     def evidence(self) -> Evidence:
-        """Of the first metric; it says how the images were drawn, and why."""
+        """The evidence of the first metric; it says how the images were drawn, and why."""
         return self.differences[0].difference.evidence
 
 

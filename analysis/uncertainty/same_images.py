@@ -12,10 +12,10 @@ from rgbt.metrics.counts import Counts, check_same_means
 from rgbt.metrics.details import LABEL, NUMBER, details_of
 from rgbt.metrics.pairs import protocol_of
 
+# What counts must have in common beside the names of images and the classes: the labelled pixels
+# of each region; those of the whole image where the regions differ, if both are of single frames or
+# of the same pairs; or nothing else.
 Alike = Literal["pixels", "labels", "names"]
-"""What counts must have in common beside the names of images and the classes: the labelled pixels
-of each region; those of the whole image where the regions differ, if both are of single frames or
-of the same pairs; or nothing else."""
 
 
 def in_order(first: Counts, other: Counts, alike: Alike) -> Counts:

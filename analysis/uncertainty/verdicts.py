@@ -35,15 +35,15 @@ Combine = Literal["all", "most", "any", "mean"]
 Kind = Literal["holds", "contradicted", "undecided"]
 Covers = Literal["images and seeds", "images", "none"]
 
+# Largest number of seeds that is searched for `Verdict.seeds_needed`.
 MOST_SEEDS = 1000
-"""Largest number of seeds that is searched for `Verdict.seeds_needed`."""
 
+# Warning of a verdict on one common start; rates of `FixedSeeds` in simulations.
 ONE_START = (
     "All seeds began from one start, and the interval does not contain the spread between starts. "
     "If a start shifts a difference by two standard deviations of the seeds, 18 % of claims about "
     "no difference hold with 3 seeds and 29 % with 5, and as many are contradicted."
 )
-"""Warning of a verdict on one common start; rates of `FixedSeeds` in simulations."""
 
 PRECISION = 0.25
 """Precision of the prior over the effect size: its standard deviation is ``1 / sqrt(0.25) = 2``.
@@ -115,7 +115,7 @@ class AnyTime:
     level: float = 0.95
 
     def half(self, trainings: Spread, images: Spread, level: float) -> float:
-        """As in `FixedSeeds`; infinite where the seeds are too few for a confidence sequence."""
+        """The rule of `FixedSeeds`; infinite where seeds are too few for a confidence sequence."""
         alpha = (1 - level) / 2
         count = round(trainings.freedom) + 1
         of_seeds = half_width(trainings.error * math.sqrt(count), count, alpha)

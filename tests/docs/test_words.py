@@ -18,7 +18,7 @@ from tests.docs.pages import INLINE_CODE, ROOT, Page, pages
 
 pytestmark = pytest.mark.docs
 
-OF_HYDRA = ("run", "check", "masks")
+HYDRA_COMMANDS = ("run", "check", "masks")
 """Commands whose arguments are all overrides."""
 
 LINK_TARGET = re.compile(r"\]\([^)]*\)|<[^<>]+>|https?://\S+")
@@ -64,7 +64,7 @@ def of_page(page: Page) -> Iterator[tuple[str, str]]:
 def of_help(name: str) -> Iterator[tuple[str, str]]:
     """Lines of ``rgbt NAME --help``."""
     yield f"rgbt --help ({name})", COMMANDS[name].about
-    if name in OF_HYDRA:
+    if name in HYDRA_COMMANDS:
         return
     entry = importlib.import_module(COMMANDS[name].module).entry
     members = [entry] if isinstance(entry, PlainCommand) else list(entry.commands.values())

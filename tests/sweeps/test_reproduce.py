@@ -9,7 +9,7 @@ import pytest
 
 from rgbt.config.options import types_of
 from sweeps.point import Outcome, Point
-from sweeps.reproduce import OF_THE_TABLE, Options, entry
+from sweeps.reproduce import TABLE_OPTIONS, Options, entry
 from sweeps.settings import SweepSettings
 from sweeps.table.cells import OWN_COUNTS
 from sweeps.worker import point_list
@@ -138,4 +138,4 @@ def test_mistakes_are_reported_in_one_sentence(
 
 
 def test_reproduce_options_are_sweep_settings() -> None:
-    assert set(types_of(Options)) - set(OF_THE_TABLE) < set(SweepSettings.__dataclass_fields__)
+    assert set(types_of(Options)) - set(TABLE_OPTIONS) < set(SweepSettings.__dataclass_fields__)

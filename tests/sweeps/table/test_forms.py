@@ -53,7 +53,7 @@ RELEASED_CMX = f"loss scheme {CMX_INPUTS} {LATE_POLY} | {SIZES} schedule.warmup_
 FIRST_CON = f"loss scheme // {RELEASED_CMX}"
 TWO_HEADS = "domains.source.head domains.target.head domains.target_is model.heads"
 DECODER = "model.align_corners model.ceil_mode model.decoder"
-OF_ONE_HEAD = "loss model.auxiliary model.weights scheme transform.blur_probability"
+ONE_HEAD = "loss model.auxiliary model.weights scheme transform.blur_probability"
 NIGHT_LABELS = "domains.target.confidence domains.target.labels domains.target.teacher_view"
 
 EXPECTED: dict[str, dict[str, str]] = {
@@ -139,7 +139,7 @@ EXPECTED: dict[str, dict[str, str]] = {
         ),
     },
     "multihead/table3": {
-        "SH-Adv": f"{OF_ONE_HEAD} | {SIZES}",
+        "SH-Adv": f"{ONE_HEAD} | {SIZES}",
         "SH-Adv(Seg. on IR)": "model.weights",
         "Multi-head": f"{TWO_HEADS} model.weights | {SIZES}",
         "Multi-head*": f"{DECODER} model.weights | model.dropout",
